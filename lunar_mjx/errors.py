@@ -1,0 +1,56 @@
+"""A user's mistake: one clear sentence, and exit status 2 at the command line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+EXIT_STATUS = 2
+
+
+class UserError(ValueError):
+    """Bad input, told in one sentence that names the file, the field, the value and the remedy.
+
+    The command line prints the sentence without a traceback and exits with status 2.
+    """
+
+
+def bad_input(source: str | Path, field: str, value: Any, problem: str, remedy: str) -> UserError:
+    """Builds the error for one bad value.
+
+    Args:
+      source: file or function that brought the value.
+      field: name of the field, channel or argument.
+      value: the offending value, shown as given.
+      problem: what is wrong with it, such as "is negative".
+      remedy: what to do, as an imperative clause, such as "give the mass in kg".
+
+    Returns:
+      The error, to be raised by the caller.
+    """
+    shown = f"{value!r}" if isinstance(value, str) else f"{value}"
+    if len(shown) > 120:
+        shown = shown[:117] + "..."
+    return UserError(f"{source}: {field} = {shown} {problem}; {remedy}.")
+
+
+def require_finite(source: str | Path, field: str, value: float) -> float:
+    """Returns `value` as a float, or raises `UserError` if it is not a finite number."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise bad_input(source, field, value, "is not a number", "give a finite number") from None
+    if not math.isfinite(number):
+        raise bad_input(source, field, value, "is not finite", "give a finite number")
+    return number
+
+
+def require_file(path: str | Path, what: str) -> Path:
+    """Returns `path` if it is a readable file, or raises `UserError` saying that `what` is missing there."""
+    path = Path(path)
+    if path.is_dir():
+        raise UserError(f"{path}: {what} is a folder, not a file; give the path of the file itself.")
+    if not path.is_file():
+        raise UserError(f"{path}: {what} is not there; check the path or its spelling.")
+    return path

@@ -1,0 +1,22 @@
+"""Frozen dataclasses as pytrees: arrays are leaves, fields marked `static()` are part of the tree's structure."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+
+T = TypeVar("T")
+
+
+def static(**kwargs: Any) -> Any:
+    """A dataclass field that is compile-time metadata: hashable, and never traced."""
+    return dataclasses.field(metadata={"static": True}, **kwargs)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, static))
+def pytree(cls: type[T]) -> type[T]:
+    """Makes `cls` a frozen dataclass that JAX transformations accept; change a field with `dataclasses.replace`."""
+    frozen = dataclasses.dataclass(frozen=True)(cls)
+    return jax.tree_util.register_dataclass(frozen)
