@@ -1,0 +1,1 @@
+"""Terrains: height fields sampled on the device, DEM readers, procedural detail, rocks and soil maps."""

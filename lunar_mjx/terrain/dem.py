@@ -1,0 +1,208 @@
+"""Digital elevation models on the host: float64 heights and their place on the map, cropped, resampled, sampled."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import interpolate, ndimage
+
+from lunar_mjx.errors import bad_input, require_finite
+from lunar_mjx.terrain.heightfield import HeightField
+
+MOST_NODATA = 0.5
+"""A DEM that misses more than this share of its heights is refused."""
+MOST_CELLS = 50_000_000
+"""A grid of more nodes than this is refused before memory runs out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Dem:
+    """Heights of a square grid in float64, row 0 in the south.
+
+    Attributes:
+      heights: m, shape (rows, cols); finite.
+      cell: spacing of the grid, m.
+      x0: map coordinate (easting) of `heights[0, 0]`, the centre of the south-western pixel, m.
+      y0: map coordinate (northing) of the same, m.
+      source: file or generator that the heights came from.
+      reference: what a height of zero means.
+      notes: what was done to the data, one sentence each.
+    """
+
+    heights: np.ndarray
+    cell: float
+    x0: float = 0.0
+    y0: float = 0.0
+    source: str = "array"
+    reference: str = "as in the source"
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        heights = np.asarray(self.heights, np.float64)
+        object.__setattr__(self, "heights", heights)
+        require_cell(self.source, "cell", self.cell)
+        if heights.ndim != 2 or min(heights.shape) < 2:
+            raise bad_input(
+                self.source, "heights", f"shape {heights.shape}", "is not a grid of at least 2 x 2", "give more heights"
+            )
+        if not np.isfinite(heights).all():
+            count = int((~np.isfinite(heights)).sum())
+            raise bad_input(
+                self.source, "heights", f"{count} of {heights.size}", "are not finite", "fill or crop away the holes"
+            )
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east and north node of the grid, m."""
+        rows, cols = self.heights.shape
+        return self.x0, self.y0, self.x0 + (cols - 1) * self.cell, self.y0 + (rows - 1) * self.cell
+
+    def crop(self, x: float, y: float, width: float, height: float) -> Dem:
+        """Cuts out the nodes within a rectangle.
+
+        Args:
+          x: easting of the rectangle's centre, m.
+          y: northing of the rectangle's centre, m.
+          width: extent to the east, m.
+          height: extent to the north, m.
+
+        Raises:
+          UserError: the rectangle leaves the grid, or holds fewer than 2 x 2 nodes.
+        """
+        for field, value in (("width", width), ("height", height)):
+            if require_finite(self.source, f"crop {field}", value) <= 0:
+                raise bad_input(self.source, f"crop {field}", value, "is not positive", "give it in m above zero")
+        west, south, east, north = self.bounds
+        slack = 1e-6 * self.cell
+        spans = []
+        for axis, middle, extent, low, high in (("x", x, width, west, east), ("y", y, height, south, north)):
+            start, stop = require_finite(self.source, f"crop {axis}", middle) - extent / 2, middle + extent / 2
+            if start < low - self.cell / 2 - slack or stop > high + self.cell / 2 + slack:
+                raise bad_input(
+                    self.source,
+                    f"crop {axis}",
+                    f"{start:g} .. {stop:g} m",
+                    "leaves the DEM",
+                    f"stay within {low:g} .. {high:g} m",
+                )
+            first = max(0, int(np.ceil((start - low - slack) / self.cell)))
+            last = min(round((high - low) / self.cell), int(np.floor((stop - low + slack) / self.cell)))
+            spans.append((first, last + 1))
+        (c0, c1), (r0, r1) = spans
+        if c1 - c0 < 2 or r1 - r0 < 2:
+            raise bad_input(
+                self.source, "crop", f"{width:g} x {height:g} m", f"holds fewer than 2 x 2 nodes {self.cell:g} m apart",
+                "crop a larger rectangle",
+            )  # fmt: skip
+        return dataclasses.replace(
+            self, heights=self.heights[r0:r1, c0:c1], x0=west + c0 * self.cell, y0=south + r0 * self.cell
+        )
+
+    def resample(self, cell: float) -> Dem:
+        """Puts the heights on a grid of another spacing that starts at the same south-western node.
+
+        A finer grid is interpolated by bicubic splines; a coarser one is first low-pass filtered, so that
+        roughness below the new spacing does not alias.
+
+        Args:
+          cell: new spacing, m.
+
+        Raises:
+          UserError: the spacing is not positive, or leaves fewer than 2 x 2 or too many nodes.
+        """
+        require_cell(self.source, "cell", cell)
+        rows, cols = (int(np.floor((n - 1) * self.cell / cell + 1e-9)) + 1 for n in self.heights.shape)
+        if min(rows, cols) < 2:
+            raise bad_input(self.source, "cell", cell, "leaves fewer than 2 x 2 nodes", "give a smaller spacing")
+        require_size(self.source, rows, cols)
+        heights = self.heights
+        ratio = cell / self.cell
+        if ratio > 1:
+            # A Gaussian of half the new spacing leaves 1 % of a wave at the new Nyquist limit's double.
+            heights = ndimage.gaussian_filter(heights, 0.5 * np.sqrt(ratio**2 - 1), mode="nearest")
+        note = f"resampled from {self.cell:g} m to {cell:g} m"
+        return dataclasses.replace(
+            self, heights=spline(heights, rows, cols, ratio), cell=float(cell), notes=(*self.notes, note)
+        )
+
+    def to_heightfield(self, dtype: np.dtype | type = np.float32) -> tuple[HeightField, np.ndarray]:
+        """Makes the field that simulations sample, about an origin in the middle of the grid.
+
+        Map coordinates and altitudes are tens of kilometres; in float32 they would leave millimetres and less for the
+        rover. So the origin is taken off here, in float64. It is made of whole metres, which float32 holds exactly.
+
+        Returns:
+          The field, and the origin: easting, northing and altitude (m) of its point (0, 0, 0).
+        """
+        west, south, east, north = self.bounds
+        rows, cols = self.heights.shape
+        middle = self.heights[(rows - 1) // 2, (cols - 1) // 2]
+        origin = np.round(np.array([(west + east) / 2, (south + north) / 2, middle]))
+        field = HeightField(
+            heights=jnp.asarray(self.heights - origin[2], dtype),
+            x0=jnp.asarray(west - origin[0], dtype),
+            y0=jnp.asarray(south - origin[1], dtype),
+            cell=jnp.asarray(self.cell, dtype),
+        )
+        return field, origin
+
+
+def require_cell(source: str, field: str, value: float) -> float:
+    """Returns a grid spacing, or raises `UserError` if it is not a positive number."""
+    if require_finite(source, field, value) <= 0:
+        raise bad_input(source, field, value, "is not positive", "give the grid spacing in m")
+    return float(value)
+
+
+def require_size(source: str, rows: int, cols: int) -> None:
+    """Raises `UserError` for a grid too large to hold."""
+    if rows * cols > MOST_CELLS:
+        raise bad_input(
+            source, "grid", f"{rows} x {cols}", f"has more than {MOST_CELLS} nodes", "crop it or use a larger cell"
+        )
+
+
+def spline(heights: np.ndarray, rows: int, cols: int, ratio: float) -> np.ndarray:
+    """Bicubic spline through `heights`, at rows x cols nodes that lie `ratio` of a cell apart."""
+    y, x = np.arange(heights.shape[0]), np.arange(heights.shape[1])
+    degrees = [min(3, n - 1) for n in heights.shape]
+    patch = interpolate.RectBivariateSpline(y, x, heights, kx=degrees[0], ky=degrees[1])
+    return patch(np.minimum(np.arange(rows) * ratio, y[-1]), np.minimum(np.arange(cols) * ratio, x[-1]))
+
+
+def fill_holes(heights: np.ndarray, source: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Fills nodes without data (NaN) by linear interpolation between the rims of their holes.
+
+    Args:
+      heights: m, with NaN where there is no data.
+      source: file that they came from, for the message.
+
+    Returns:
+      The heights without holes, and a note that says how many were filled.
+
+    Raises:
+      UserError: more than half of the heights are missing.
+    """
+    hole = ~np.isfinite(heights)
+    count = int(hole.sum())
+    if count == 0:
+        return heights, ()
+    if count == heights.size:
+        raise bad_input(source, "heights", "only nodata", "leave nothing to drive on", "give a DEM with heights in it")
+    if count > MOST_NODATA * heights.size:
+        raise bad_input(
+            source, "heights", f"{count} of {heights.size} nodata", "are more than half", "crop to the part with data"
+        )
+    rim = ndimage.binary_dilation(hole, np.ones((3, 3))) & ~hole
+    at, values = np.argwhere(rim), heights[rim]
+    where = np.argwhere(hole)
+    # Nearest for what the rims do not enclose: holes that touch the edge of the grid.
+    filled = interpolate.NearestNDInterpolator(at, values)(where)
+    if len(at) >= 4 and np.ptp(at[:, 0]) > 0 and np.ptp(at[:, 1]) > 0:
+        linear = interpolate.LinearNDInterpolator(at, values)(where)
+        filled = np.where(np.isfinite(linear), linear, filled)
+    result = heights.copy()
+    result[hole] = filled
+    return result, (f"{count} of {heights.size} nodata cells filled by interpolation",)

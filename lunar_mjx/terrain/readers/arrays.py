@@ -1,0 +1,89 @@
+"""Plain grids of numbers: NumPy arrays (.npy) and ESRI ASCII grids (.asc)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size
+from lunar_mjx.terrain.readers.options import ReadOptions
+
+
+def read_npy(path: Path, options: ReadOptions) -> Dem:
+    """Reads a two-dimensional array of heights in m; as in all readers, its first row is the north. See `read_dem`."""
+    if options.cell is None:
+        raise bad_input(path, "cell", "nothing", "leaves the array without a scale", "give cell, the spacing in m")
+    cell = require_cell(str(path), "cell", options.cell)
+    try:
+        data = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        reason = "it holds pickled objects" if "ickle" in str(error) else str(error).splitlines()[0]
+        raise UserError(f"{path}: the array cannot be read ({reason}); save plain numbers with numpy.save.") from None
+    if not isinstance(data, np.ndarray) or data.ndim != 2:
+        shape = getattr(data, "shape", type(data).__name__)
+        raise bad_input(path, "shape", shape, "is not two-dimensional", "save an array of rows x columns")
+    if data.dtype.kind not in "iuf":
+        raise bad_input(path, "dtype", data.dtype, "is not a real number", "save heights in m")
+    require_size(str(path), *data.shape)
+    heights, notes = fill_holes(data.astype(np.float64), str(path))
+    return Dem(heights[::-1], cell, 0.0, 0.0, str(path), notes=notes)
+
+
+def read_asc(path: Path, options: ReadOptions) -> Dem:
+    """Reads an ESRI ASCII grid; see `read_dem`."""
+    del options
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: the file is not text; give an ESRI ASCII grid.") from None
+    header, body = _header(path, lines)
+    rows, cols = (_count(path, header, key) for key in ("nrows", "ncols"))
+    require_size(str(path), rows, cols)
+    try:
+        numbers = np.array(" ".join(body).split(), np.float64)
+    except ValueError as error:
+        raise UserError(f"{path}: heights hold something else than numbers ({error}); repair the file.") from None
+    if numbers.size != rows * cols:
+        raise bad_input(
+            path, "heights", f"{numbers.size} numbers", f"are not nrows x ncols = {rows} x {cols}", "repair the file"
+        )
+    heights = numbers.reshape(rows, cols)
+    heights[heights == header.get("nodata_value", -9999.0)] = np.nan
+    heights, notes = fill_holes(heights, str(path))
+    cell = _asc_cell(path, header)
+    x0 = header.get("xllcenter", header.get("xllcorner", 0.0) + cell / 2)
+    y0 = header.get("yllcenter", header.get("yllcorner", 0.0) + cell / 2)
+    return Dem(heights[::-1], cell, x0, y0, str(path), notes=notes)
+
+
+def _header(path: Path, lines: list[str]) -> tuple[dict[str, float], list[str]]:
+    header: dict[str, float] = {}
+    for k, line in enumerate(lines):
+        words = line.split()
+        if len(words) != 2 or not words[0][0].isalpha() or words[0].lower() in ("nan", "inf"):
+            return header, lines[k:]
+        try:
+            header[words[0].lower()] = float(words[1])
+        except ValueError:
+            raise bad_input(path, words[0], words[1], "is not a number", "repair the header") from None
+    return header, []
+
+
+def _count(path: Path, header: dict[str, float], key: str) -> int:
+    value = header.get(key)
+    if value is None or value != value or value < 1 or value != int(value):
+        raise bad_input(path, key, value, "is not a positive whole number", "repair the header")
+    return int(value)
+
+
+def _asc_cell(path: Path, header: dict[str, float]) -> float:
+    if "cellsize" in header:
+        return require_cell(str(path), "cellsize", header["cellsize"])
+    dx, dy = header.get("dx"), header.get("dy")
+    if dx is None or dy is None:
+        raise bad_input(path, "cellsize", "nothing", "is not in the header", "repair the header")
+    if abs(dx - dy) > 1e-6 * abs(dx):
+        raise bad_input(path, "dx, dy", f"{dx:g}, {dy:g}", "are not equal", "resample it to square cells")
+    return require_cell(str(path), "dx", dx)

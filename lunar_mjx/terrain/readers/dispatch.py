@@ -1,0 +1,70 @@
+"""Chooses the reader by the file's suffix."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+from lunar_mjx.errors import UserError, require_file
+from lunar_mjx.terrain.dem import Dem
+from lunar_mjx.terrain.readers.arrays import read_asc, read_npy
+from lunar_mjx.terrain.readers.geotiff import read_geotiff
+from lunar_mjx.terrain.readers.image import read_image
+from lunar_mjx.terrain.readers.options import ReadOptions, Window
+from lunar_mjx.terrain.readers.pds import read_pds
+
+_READERS: dict[str, Callable[[Path, ReadOptions], Dem]] = {
+    ".tif": read_geotiff,
+    ".tiff": read_geotiff,
+    ".xml": read_geotiff,  # PDS4 label, through the same library
+    ".img": read_pds,
+    ".lbl": read_pds,
+    ".png": read_image,
+    ".npy": read_npy,
+    ".asc": read_asc,
+}
+SUFFIXES = tuple(_READERS)
+_LOG = logging.getLogger(__name__)
+
+
+def read_dem(
+    path: str | Path,
+    *,
+    cell: float | None = None,
+    height_scale: float | None = None,
+    dequantise: bool = True,
+    band: int = 1,
+    crop: Window | tuple[float, float, float, float] | None = None,
+) -> Dem:
+    """Reads a digital elevation model.
+
+    Args:
+      path: GeoTIFF (.tif), PDS3 (.img with .lbl beside it, or the .lbl), PDS4 (.xml), PNG, npy or ESRI ASCII (.asc).
+      cell: spacing of the grid in m, for formats that do not say it (PNG, npy, a GeoTIFF without georeference).
+      height_scale: height of full white above black in m, for PNG.
+      dequantise: for PNG, removes the steps of the grey levels, staying within half a level of the data.
+      band: of a GeoTIFF, from 1.
+      crop: x, y of the centre, width and height in m of the part to read.
+
+    Returns:
+      The DEM; its notes say what was done, such as how many nodata cells were filled.
+
+    Raises:
+      UserError: the file is missing, broken, of an unknown kind, not in metres, or without usable heights.
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise UserError(
+            f"{path}: suffix = '{path.suffix}' is not a DEM format that is known; convert it to one of "
+            f"{', '.join(SUFFIXES)}."
+        )
+    require_file(path, "the DEM")
+    window = crop if crop is None or isinstance(crop, Window) else Window(*crop)
+    dem = reader(path, ReadOptions(cell, height_scale, dequantise, band, window))
+    if window is not None:
+        dem = dem.crop(window.x, window.y, window.width, window.height)
+    for note in dem.notes:
+        _LOG.info("%s: %s", path, note)
+    return dem

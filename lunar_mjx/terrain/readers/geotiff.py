@@ -1,0 +1,114 @@
+"""GeoTIFF (and, through the same library, PDS4): LOLA south-pole products and their like."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.windows import Window as PixelWindow
+
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size
+from lunar_mjx.terrain.readers.options import ReadOptions, Window
+
+_SQUARE = 1e-4  # relative difference of pixel width and height that counts as square
+
+
+def read_geotiff(path: Path, options: ReadOptions) -> Dem:
+    """Reads one band of a projected raster; see `read_dem`."""
+    try:
+        with warnings.catch_warnings():
+            # A raster without georeference is answered below, with what to do about it.
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path) as raster:
+                return _read(path, raster, options)
+    except (RasterioError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{path}: the raster cannot be read ({reason}); fetch the file again.") from None
+
+
+def _read(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> Dem:
+    if not 1 <= options.band <= raster.count:
+        raise bad_input(path, "band", options.band, "is not in the file", f"choose 1 to {raster.count}")
+    west, north, cell = _grid(path, raster, options)
+    window = _pixels(raster, options.crop, west, north, cell)
+    require_size(str(path), int(window.height), int(window.width))
+    band = options.band
+    data = raster.read(band, window=window, masked=True)
+    if not np.issubdtype(data.dtype, np.number) or np.issubdtype(data.dtype, np.complexfloating):
+        raise bad_input(path, "data type", data.dtype, "is not a real number", "give a raster of heights")
+    heights = np.ma.filled(data.astype(np.float64), np.nan)
+    heights = heights * raster.scales[band - 1] + raster.offsets[band - 1]
+    unit = _unit(path, raster.units[band - 1])
+    heights, notes = fill_holes(heights * unit, str(path))
+    if raster.count > 1:
+        notes = (*notes, f"band {band} of {raster.count} used")
+    return Dem(
+        heights=heights[::-1],  # row 0 of a raster is the north
+        cell=cell,
+        x0=west + (window.col_off + 0.5) * cell,
+        y0=north - (window.row_off + window.height - 0.5) * cell,
+        source=str(path),
+        notes=notes,
+    )
+
+
+def _grid(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> tuple[float, float, float]:
+    """West and north edge and the pixel's size, all in metres."""
+    transform, crs = raster.transform, raster.crs
+    if crs is None and transform.is_identity:
+        if options.cell is None:
+            raise bad_input(
+                path,
+                "georeference",
+                "none",
+                "leaves the pixel's size unknown",
+                "give cell = <m> or a georeferenced file",
+            )
+        cell = require_cell(str(path), "cell", options.cell)
+        return 0.0, raster.height * cell, cell
+    if crs is not None and crs.is_geographic:
+        raise bad_input(
+            path, "projection", "geographic (degrees)", "has no metres",
+            "reproject it to a projection in metres, such as lunar polar stereographic, with gdalwarp",
+        )  # fmt: skip
+    if transform.b or transform.d:
+        raise bad_input(path, "transform", "rotated", "is not north up", "resample it with gdalwarp")
+    if transform.a <= 0 or transform.e >= 0:
+        raise bad_input(path, "transform", "mirrored", "is not north up", "rewrite it with gdalwarp")
+    if abs(transform.a + transform.e) > _SQUARE * transform.a:
+        raise bad_input(
+            path, "pixel size", f"{transform.a:g} x {-transform.e:g}", "is not square", "resample it with gdalwarp -tr"
+        )
+    metres = 1.0
+    if crs is not None and crs.is_projected:
+        metres = float(crs.linear_units_factor[1])
+    return transform.c * metres, transform.f * metres, transform.a * metres
+
+
+def _pixels(raster: rasterio.DatasetReader, crop: Window | None, west: float, north: float, cell: float) -> PixelWindow:
+    """The pixels around a crop, so that a mosaic of gigabytes is not read whole; the exact crop follows later."""
+    if crop is None or not (crop.width > 0 and crop.height > 0):
+        return PixelWindow(0, 0, raster.width, raster.height)  # pyright: ignore[reportCallIssue]
+    c0, c1 = ((crop.x + s * crop.width / 2 - west) / cell for s in (-1, 1))
+    r0, r1 = ((north - crop.y + s * crop.height / 2) / cell for s in (-1, 1))
+    if not (c0 >= -1 and r0 >= -1 and c1 <= raster.width + 1 and r1 <= raster.height + 1):
+        raise bad_input(
+            raster.name, "crop", f"x {crop.x:g}, y {crop.y:g}, {crop.width:g} x {crop.height:g} m", "leaves the DEM",
+            f"stay within x {west:g} .. {west + raster.width * cell:g} m, "
+            f"y {north - raster.height * cell:g} .. {north:g} m",
+        )  # fmt: skip
+    c0, r0 = max(0, int(c0) - 1), max(0, int(r0) - 1)
+    c1, r1 = min(raster.width, int(np.ceil(c1)) + 1), min(raster.height, int(np.ceil(r1)) + 1)
+    return PixelWindow(c0, r0, c1 - c0, r1 - r0)  # pyright: ignore[reportCallIssue]
+
+
+def _unit(path: Path, unit: str | None) -> float:
+    factors = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0, "km": 1e3, "kilometer": 1e3}
+    try:
+        return factors[(unit or "").strip().lower()]
+    except KeyError:
+        raise bad_input(path, "unit", unit, "is not known", "give heights in m or km") from None

@@ -1,0 +1,59 @@
+"""Grey images (PNG) of 8 or 16 bits, with the height of white and the pixel's size given by the user."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from lunar_mjx.errors import UserError, bad_input, require_finite
+from lunar_mjx.terrain.dem import Dem, require_cell, require_size
+from lunar_mjx.terrain.dequantise import dequantise
+from lunar_mjx.terrain.readers.options import ReadOptions
+
+_WHITE = {"L": 255, "I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I": 65535}
+
+
+def read_image(path: Path, options: ReadOptions) -> Dem:
+    """Reads a grey image of heights; see `read_dem`."""
+    for field, value, meaning in (
+        ("height_scale", options.height_scale, "the height of white above black in m"),
+        ("cell", options.cell, "the pixel's size in m"),
+    ):
+        if value is None:
+            raise bad_input(path, field, "nothing", "leaves the image without a scale", f"give {field}, {meaning}")
+    scale = require_finite(path, "height_scale", options.height_scale)  # pyright: ignore[reportArgumentType]
+    if scale <= 0:
+        raise bad_input(path, "height_scale", scale, "is not positive", "give the height of white above black in m")
+    cell = require_cell(str(path), "cell", options.cell)  # pyright: ignore[reportArgumentType]
+    levels, white = _levels(path)
+    heights = levels * (scale / white)
+    notes: tuple[str, ...] = ()
+    if options.dequantise:
+        heights = dequantise(heights, scale / white)
+        notes = (f"grey levels of {scale / white:.3g} m smoothed within half a level",)
+    return Dem(heights[::-1], cell, 0.0, 0.0, str(path), "black of the image", notes)
+
+
+def _levels(path: Path) -> tuple[np.ndarray, int]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                require_size(str(path), image.height, image.width)
+                mode = image.mode
+                if mode not in _WHITE:
+                    raise bad_input(
+                        path,
+                        "mode",
+                        mode,
+                        "is not grey of 8 or 16 bits",
+                        "save it as a grey image without transparency",
+                    )
+                return np.asarray(image, np.float64), _WHITE[mode]
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise UserError(f"{path}: the image cannot be read ({error}); fetch the file again.") from None
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError):
+        raise bad_input(path, "size", "huge", "is beyond what an image may be", "crop it") from None

@@ -1,0 +1,34 @@
+"""What a user may say about a DEM file beyond the file itself."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """A rectangle of the map, m: its centre and its extent."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadOptions:
+    """Options of `read_dem`.
+
+    Attributes:
+      cell: spacing of the grid, m; for formats that do not say it (PNG, npy), or to overrule none other.
+      height_scale: height of full white above black, m; for images of 8 or 16 bits.
+      dequantise: removes the steps of an image's few grey levels.
+      band: which band of a GeoTIFF, from 1.
+      crop: reads only this part.
+    """
+
+    cell: float | None = None
+    height_scale: float | None = None
+    dequantise: bool = True
+    band: int = 1
+    crop: Window | None = None
