@@ -1,0 +1,236 @@
+"""Converts a URDF into a rover folder: MJCF with a free base, motors and closed loops, and `rover.toml` beside it."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import tomli_w
+from scipy.spatial import ConvexHull, QhullError
+
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.rover.description import GROUPS, Description, read_description
+from lunar_mjx.rover.load import FORMAT, MARKER, load_rover
+from lunar_mjx.rover.loops import PlacedLoop, place_loops
+from lunar_mjx.rover.mjcf import build_spec, to_xml, write_scene
+from lunar_mjx.rover.roles import Roles, assign_roles
+from lunar_mjx.rover.rover import Rover
+from lunar_mjx.rover.statics import gains, level_springs
+from lunar_mjx.rover.tree import Body, bodies_of
+from lunar_mjx.rover.urdf import Geometry, Urdf, read_urdf
+
+MAXIMUM_CHASSIS_POINTS = 16
+DESCRIPTION_SUFFIX = ".rover.toml"
+_LEVEL = 1e-3  # m; wheels whose lowest points differ by more do not stand level
+
+
+def convert(urdf: str | Path, out: str | Path, description: str | Path | None = None, name: str | None = None) -> Rover:
+    """Converts a URDF and writes `<name>.xml`, `scene.xml` and `rover.toml`.
+
+    Args:
+      urdf: the URDF. Forward is +x, up is +z, as REP 103 has it.
+      out: folder to write; made if absent.
+      description: what URDF cannot say (loops, motors, springs, controls, roles; see `description.py`). By default the
+        file beside the URDF called `<stem>.rover.toml`, if there is one; without it, everything is inferred.
+      name: name of the rover; by default the description's, or else the URDF's.
+
+    Returns:
+      The rover, loaded from `out`.
+
+    Raises:
+      UserError: a file is missing or broken, or the URDF lacks what a rover needs; nothing is written then.
+    """
+    source = read_urdf(urdf)
+    told = _describe(source, description)
+    name = _file_name(source, name or told.name or source.name)
+    bodies = bodies_of(source)
+    roles = assign_roles(source, bodies, told)
+    loops = place_loops(source, roles.bodies, told)
+    height, height_notes = _standing_height(roles)
+    spec = build_spec(name, roles, loops, told, height)
+    model = _compile(source, spec)
+    level_springs(spec, model, roles, told)
+    model = _compile(source, spec)
+    xml = to_xml(spec)
+    _assert_nothing_lost(source, roles, loops, mujoco.MjModel.from_xml_string(xml))
+    record = _record(source, name, roles, loops, told, model, height, height_notes)
+    out = Path(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{name}.xml").write_text(xml, encoding="utf-8")
+        write_scene(out / "scene.xml", name)
+        (out / MARKER).write_text(
+            f"# Written by `lunar-mjx convert` from {source.path.name}; edit that and convert again.\n"
+            + _compact(tomli_w.dumps(record)),
+            encoding="utf-8",
+        )
+    except OSError as error:
+        raise UserError(f"{out}: cannot be written ({error.strerror}); give another output folder.") from None
+    return load_rover(out.resolve())
+
+
+def _compact(text: str) -> str:
+    """Puts arrays of numbers on one line, which the TOML writer spreads over several."""
+    numbers = re.compile(r"\[\s+([-+.\de,\s]+?),\s+\]")
+    return numbers.sub(lambda match: f"[{', '.join(match[1].replace(',', ' ').split())}]", text)
+
+
+def _describe(urdf: Urdf, description: str | Path | None) -> Description:
+    beside = urdf.path.with_name(urdf.path.stem + DESCRIPTION_SUFFIX)
+    if description is not None:
+        return read_description(description)
+    return read_description(beside) if beside.is_file() else Description()
+
+
+def _file_name(urdf: Urdf, name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name == "scene":
+        raise bad_input(urdf.path, "name", name, "cannot name a file", "use letters, digits, _ and - (and not 'scene')")
+    return name
+
+
+def _compile(urdf: Urdf, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise UserError(
+            f"{urdf.path}: MuJoCo cannot compile the converted model ({' '.join(str(error).split())}); mend the URDF."
+        ) from None
+
+
+def _standing_height(roles: Roles) -> tuple[float, list[str]]:
+    """Height of the base frame above the plane under the lowest wheel, in m."""
+    bottoms = np.array([w.center[2] - w.radius for w in roles.wheels])
+    notes = []
+    if np.ptp(bottoms) > _LEVEL:
+        notes.append(f"the wheels' lowest points differ by {1e3 * np.ptp(bottoms):.1f} mm at zero angles")
+    return round(float(-bottoms.min()), 9), notes
+
+
+def _assert_nothing_lost(urdf: Urdf, roles: Roles, loops: tuple[PlacedLoop, ...], model: mujoco.MjModel) -> None:
+    """Compares the MJCF, read back from its text, with the URDF.
+
+    Raises:
+      UserError: mass, joints, limits, inertia, motors or loops of the MJCF are not the URDF's.
+    """
+    expected = sum(link.mass for link in urdf.links.values())
+    total = float(model.body_mass.sum())
+    if abs(total - expected) > 1e-9 * expected:
+        raise bad_input(
+            urdf.path, "total mass", f"{expected:.12g} kg", f"became {total:.12g} kg in the MJCF", "report this"
+        )
+    joints = {b.joint.name: b.joint for b in roles.bodies if b.joint is not None}
+    moving = {j.name for j in urdf.joints if j.kind not in ("fixed", "floating")}
+    found = {model.joint(i).name for i in range(model.njnt)} - {"free"}
+    if found != moving or set(joints) != moving:
+        raise bad_input(urdf.path, "joints", sorted(moving ^ found), "were lost or invented", "report this")
+    for joint in joints.values():
+        limits = joint.limits if np.isfinite(joint.limits).all() else (0.0, 0.0)
+        if not np.allclose(model.joint(joint.name).range, limits, rtol=0, atol=1e-9):
+            raise bad_input(urdf.path, f"joint '{joint.name}' limit", limits, "was lost in the MJCF", "report this")
+    if model.body_mass[1:].min() <= 0 or model.body_inertia[1:].min() <= 0:
+        raise bad_input(urdf.path, "inertia", model.body_inertia[1:].min(), "is not positive", "report this")
+    motors = [model.actuator(i).name for i in range(model.nu)]
+    if motors != [j for g in GROUPS for j in roles.group(g)] or model.neq != len(loops):
+        raise bad_input(urdf.path, "motors", ", ".join(motors), "are not one for each joint in a role", "report this")
+
+
+def _record(
+    urdf: Urdf,
+    name: str,
+    roles: Roles,
+    loops: tuple[PlacedLoop, ...],
+    description: Description,
+    model: mujoco.MjModel,
+    height: float,
+    notes: list[str],
+) -> dict[str, Any]:
+    """The contents of `rover.toml`."""
+    base = roles.bodies[0]
+    points, point_notes = _chassis_points(base, roles)
+    wheels = []
+    for w in roles.wheels:
+        entry = {"corner": w.corner, "body": w.body, "radius": w.radius, "width": w.width, "drive": w.drive}
+        entry.update({k: getattr(w, k) for k in ("steer", "suspension") if getattr(w, k) is not None})
+        wheels.append(entry)
+    groups = {}
+    for group in GROUPS:
+        if not roles.group(group):
+            continue
+        told, gain = description.groups[group], gains(model, roles, description, group)
+        groups[group] = {
+            "joints": list(roles.group(group)),
+            "mode": told.mode,
+            "position_gain": gain.position,
+            "velocity_gain": gain.velocity,
+            "gear_ratio": told.gear_ratio,
+            "gear_efficiency": told.gear_efficiency,
+            "rotor_inertia": told.rotor_inertia_kg_m2,
+            "winding": told.winding,
+        }
+    return {
+        "format": FORMAT,
+        "name": name,
+        "source": urdf.path.name,
+        "mjcf": f"{name}.xml",
+        "mass": float(f"{model.body_mass.sum():.12g}"),
+        "standing_height": height,
+        "chassis": base.name,
+        "chassis_points": [[round(float(v), 6) + 0.0 for v in p] for p in points],
+        "notes": [*urdf.notes, *roles.notes, *notes, *point_notes],
+        "groups": groups,
+        "wheels": wheels,
+        "loops": [
+            {
+                "body1": x.body1,
+                "body2": x.body2,
+                "anchor1": [float(v) for v in x.anchor1],
+                "anchor2": [float(v) for v in x.anchor2],
+            }
+            for x in loops
+        ],
+    }
+
+
+def _chassis_points(base: Body, roles: Roles) -> tuple[np.ndarray, list[str]]:
+    """At most 16 points (k, 3) of the base's convex hull, so that it neither sinks into ground nor rolls through it."""
+    corners = np.array([c for shape in base.geometry for c in _box_corners(shape)])
+    notes = []
+    if not len(corners):
+        centers = np.array([w.center for w in roles.wheels])
+        low, high = centers.min(axis=0), centers.max(axis=0)
+        high[2] = low[2] + max(w.radius for w in roles.wheels) * 2
+        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        notes.append("the chassis has no primitive shape: its contact points are the box between the wheel centres")
+    corners = np.unique(np.round(corners, 6), axis=0)
+    # A flat chassis has no hull of volume; all its corners are on the outside then.
+    with contextlib.suppress(QhullError):
+        corners = corners[np.sort(ConvexHull(corners).vertices)]
+    if len(corners) > MAXIMUM_CHASSIS_POINTS:
+        corners = _farthest(corners, MAXIMUM_CHASSIS_POINTS)
+    return corners, notes
+
+
+def _box_corners(shape: Geometry) -> list[np.ndarray]:
+    """The eight corners (3,) of the shape's bounding box, in the body frame."""
+    if shape.kind == "box":
+        half = np.array(shape.size) / 2
+    elif shape.kind == "cylinder":
+        half = np.array([shape.size[0], shape.size[0], shape.size[1] / 2])
+    else:
+        half = np.full(3, shape.size[0])
+    return [shape.pose.apply(half * [x, y, z]) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+
+
+def _farthest(points: np.ndarray, count: int) -> np.ndarray:
+    """`count` of the points, each the farthest from those taken before, in the order given."""
+    distance = np.round(np.linalg.norm(points - points.mean(axis=0), axis=1), 9)
+    taken: list[int] = []
+    for _ in range(count):
+        taken.append(int(np.argmax(distance)))
+        step = np.round(np.linalg.norm(points - points[taken[-1]], axis=1), 9)
+        distance = step if len(taken) == 1 else np.minimum(distance, step)
+    return points[np.sort(taken)]

@@ -1,0 +1,229 @@
+"""The description beside a URDF (`<name>.rover.toml`): what URDF cannot say about a rover.
+
+It names wheels and joint roles (otherwise inferred), closes kinematic loops, and gives motors, springs and controls.
+Every key is optional; an unknown key is an error.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+
+GROUPS = ("drive", "steer", "suspension")
+MODES = ("position", "velocity", "torque", "current")
+WINDINGS = (12, 18, 24, 36, 48)  # nominal voltages of the maxon ECX TORQUE 22 XL
+
+
+@dataclass(frozen=True)
+class GroupDescription:
+    """One joint group as described; None means that the converter chooses (see `statics.default_gains`).
+
+    `stiffness` N m/rad, `damping` N m s/rad and `spring_reference` rad describe a passive spring and damper on the
+    joint; the reference "level" is computed such that the rover stands level at zero angles.
+    """
+
+    mode: str
+    position_gain: float | None = None
+    velocity_gain: float | None = None
+    gear_ratio: float = 243.0
+    gear_efficiency: float = 0.75
+    rotor_inertia_kg_m2: float = 9e-7  # estimate for a brushless motor of 22 mm
+    winding: int = 48
+    stiffness: float = 0.0
+    damping: float = 0.0
+    spring_reference: float | str = 0.0
+
+
+@dataclass(frozen=True)
+class WheelDescription:
+    """A wheel named by its link; None means inferred from the URDF's tree and geometry. Lengths in m."""
+
+    link: str
+    corner: str | None = None
+    radius: float | None = None
+    width: float | None = None
+    steer: str | None = None
+    suspension: str | None = None
+
+
+@dataclass(frozen=True)
+class LoopDescription:
+    """Two points, each (3,) in m in its link's frame, that a pin holds together."""
+
+    link1: str
+    link2: str
+    anchor1: tuple[float, float, float]
+    anchor2: tuple[float, float, float]
+
+
+def _default_groups() -> dict[str, GroupDescription]:
+    geared = {"gear_ratio": 1526.0, "gear_efficiency": 0.6}
+    return {
+        "drive": GroupDescription("velocity"),
+        "steer": GroupDescription("position", **geared),
+        "suspension": GroupDescription("position", **geared),
+    }
+
+
+@dataclass(frozen=True)
+class Description:
+    """Everything the converter is told beyond the URDF."""
+
+    path: Path | None = None
+    name: str | None = None
+    gravity: float = 1.625
+    timestep: float = 0.002
+    solref: tuple[float, ...] = (0.004, 1.0)
+    solimp: tuple[float, ...] = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+    passive_damping: float = 0.0
+    wheels: tuple[WheelDescription, ...] = ()
+    loops: tuple[LoopDescription, ...] = ()
+    groups: dict[str, GroupDescription] = field(default_factory=_default_groups)
+
+
+_TOP = {"name", "gravity", "timestep", "solref", "solimp", "passive_damping", "wheels", "loops", "joints"}
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Reads a TOML file, or raises `UserError`."""
+    path = require_file(path, what)
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: {what} is not valid TOML ({error}); mend the file at that place.") from None
+
+
+def read_description(path: str | Path) -> Description:
+    """Reads a `<name>.rover.toml`.
+
+    Raises:
+      UserError: the file is missing or not TOML, or a key is unknown or has a wrong type or value.
+    """
+    path = Path(path)
+    data = read_toml(path, "the rover description")
+    check_keys(path, "", data, _TOP)
+    given: dict[str, Any] = {"path": path}
+    if "name" in data:
+        given["name"] = text(path, "name", data["name"])
+    for key in ("gravity", "timestep", "passive_damping"):
+        if key in data:
+            given[key] = at_least(path, key, data[key], 0.0, strict=key == "timestep")
+    for key, count in (("solref", 2), ("solimp", 5)):
+        if key in data:
+            given[key] = numbers(path, key, data[key], count)
+    given["wheels"] = tuple(_wheel(path, f"wheels[{i}]", w) for i, w in enumerate(tables(path, "wheels", data)))
+    given["loops"] = tuple(_loop(path, f"loops[{i}]", x) for i, x in enumerate(tables(path, "loops", data)))
+    joints = data.get("joints", {})
+    check_keys(path, "joints", joints, set(GROUPS))
+    groups = _default_groups()
+    for name, table in joints.items():
+        groups[name] = _group(path, f"joints.{name}", table, groups[name])
+    return Description(**given, groups=groups)
+
+
+def _wheel(path: Path, where: str, table: Mapping[str, Any]) -> WheelDescription:
+    check_keys(path, where, table, {"link", "corner", "radius", "width", "steer", "suspension"}, {"link"})
+    lengths = {k: at_least(path, f"{where}.{k}", table[k], 0.0, strict=True) for k in ("radius", "width") if k in table}
+    names = {k: text(path, f"{where}.{k}", table[k]) for k in ("link", "corner", "steer", "suspension") if k in table}
+    return WheelDescription(**names, **lengths)
+
+
+def _loop(path: Path, where: str, table: Mapping[str, Any]) -> LoopDescription:
+    keys = {"link1", "link2", "anchor1", "anchor2"}
+    check_keys(path, where, table, keys, keys)
+    first, second = (numbers(path, f"{where}.{k}", table[k], 3) for k in ("anchor1", "anchor2"))
+    return LoopDescription(
+        text(path, f"{where}.link1", table["link1"]),
+        text(path, f"{where}.link2", table["link2"]),
+        (first[0], first[1], first[2]),
+        (second[0], second[1], second[2]),
+    )
+
+
+def _group(path: Path, where: str, table: Mapping[str, Any], default: GroupDescription) -> GroupDescription:
+    check_keys(path, where, table, set(GroupDescription.__dataclass_fields__))
+    given: dict[str, Any] = {}
+    for key, value in table.items():
+        field_name = f"{where}.{key}"
+        if key == "mode":
+            given[key] = one_of(path, field_name, value, MODES)
+        elif key == "winding":
+            given[key] = one_of(path, field_name, value, WINDINGS)
+        elif key == "spring_reference":
+            given[key] = "level" if value == "level" else number(path, field_name, value)
+        else:
+            given[key] = at_least(path, field_name, value, 0.0, strict=key in ("gear_ratio", "gear_efficiency"))
+    if given.get("gear_efficiency", 1.0) > 1:
+        raise bad_input(path, f"{where}.gear_efficiency", given["gear_efficiency"], "is above 1", "give a fraction")
+    group = GroupDescription(**{**default.__dict__, **given})
+    if group.spring_reference == "level" and group.stiffness == 0:
+        raise bad_input(path, f"{where}.spring_reference", "level", "needs a spring", "give a stiffness above zero")
+    return group
+
+
+def check_keys(
+    path: Path, where: str, table: Any, known: set[str], required: set[str] | frozenset[str] = frozenset()
+) -> None:
+    """Raises `UserError` unless `table` is a mapping with only `known` and all `required` keys."""
+    prefix = f"{where}." if where else ""
+    if not isinstance(table, Mapping):
+        raise bad_input(path, where, table, "is not a table", f"give the keys {', '.join(sorted(known))}")
+    for key in table:
+        if key not in known:
+            raise bad_input(
+                path, f"{prefix}{key}", table[key], "is an unknown key", f"known here: {', '.join(sorted(known))}"
+            )
+    for key in sorted(required):
+        if key not in table:
+            raise bad_input(path, f"{prefix}{key}", "", "is missing", "add it")
+
+
+def tables(path: Path, key: str, data: Mapping[str, Any]) -> list[Any]:
+    """The array of tables under `key`, empty if absent."""
+    value = data.get(key, [])
+    if not isinstance(value, list):
+        raise bad_input(path, key, value, "is not an array of tables", f"write [[{key}]]")
+    return value
+
+
+def text(path: Path, where: str, value: Any) -> str:
+    """Returns a non-empty string, or raises `UserError`."""
+    if not isinstance(value, str) or not value:
+        raise bad_input(path, where, value, "is not a name", "give a text in quotes")
+    return value
+
+
+def number(path: Path, where: str, value: Any) -> float:
+    """Returns a finite float, or raises `UserError`; a text or a truth value is not a number here."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise bad_input(path, where, value, "is not a number", "give a finite number")
+    return require_finite(path, where, value)
+
+
+def at_least(path: Path, where: str, value: Any, bound: float, strict: bool) -> float:
+    """Returns a finite float that is at least (or, if `strict`, above) `bound`."""
+    result = number(path, where, value)
+    if result < bound or (strict and result == bound) or math.isnan(result):
+        relation = "above" if strict else "of at least"
+        raise bad_input(path, where, value, "is out of range", f"give a number {relation} {bound:g}")
+    return result
+
+
+def numbers(path: Path, where: str, value: Any, count: int) -> tuple[float, ...]:
+    """Returns `count` finite floats."""
+    if not isinstance(value, list) or len(value) != count:
+        raise bad_input(path, where, value, f"is not a list of {count} numbers", f"give {count} numbers in brackets")
+    return tuple(number(path, where, v) for v in value)
+
+
+def one_of(path: Path, where: str, value: Any, choices: tuple[Any, ...]) -> Any:
+    """Returns `value` if it is one of `choices`."""
+    if value not in choices or isinstance(value, bool):
+        raise bad_input(path, where, value, "is not known", f"choose from {', '.join(map(str, choices))}")
+    return value

@@ -1,0 +1,180 @@
+"""Loads a converted rover by name or path and checks that its files agree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.resources import find, shipped
+from lunar_mjx.rover import description as toml
+from lunar_mjx.rover.description import GROUPS, MODES, WINDINGS
+from lunar_mjx.rover.rover import JointGroup, Loop, Rover, Wheel
+
+FORMAT = "lunar-mjx-rover/1"
+MARKER = "rover.toml"
+_MASS_TOLERANCE = 1e-9  # relative
+_CONVERT_AGAIN = "convert the URDF again"
+_TOP = {
+    "format",
+    "name",
+    "source",
+    "mjcf",
+    "mass",
+    "standing_height",
+    "chassis",
+    "chassis_points",
+    "notes",
+    "wheels",
+    "groups",
+    "loops",
+}
+_GROUP_KEYS = set(JointGroup.__dataclass_fields__) - {"name"}
+
+
+def list_rovers() -> tuple[str, ...]:
+    """Names of the rovers that ship with the package."""
+    return tuple(sorted(p.parent.name for p in shipped("models").glob(f"*/{MARKER}")))
+
+
+def load_rover(name_or_path: str | Path) -> Rover:
+    """Loads a rover.
+
+    Args:
+      name_or_path: name of a shipped rover, or the path of a folder that `convert` wrote.
+
+    Returns:
+      The rover.
+
+    Raises:
+      UserError: no such rover, or its `rover.toml` and MJCF are broken or disagree.
+    """
+    folder = find("models", name_or_path, MARKER)
+    path = folder / MARKER
+    data = toml.read_toml(path, "the rover file")
+    toml.check_keys(path, "", data, _TOP, _TOP - {"source", "notes", "loops"})
+    toml.one_of(path, "format", data["format"], (FORMAT,))
+    mjcf = require_file(folder / toml.text(path, "mjcf", data["mjcf"]), "the rover's MJCF")
+    try:
+        model = mujoco.MjSpec.from_file(str(mjcf)).compile()
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{mjcf}: MuJoCo cannot compile it ({reason}); {_CONVERT_AGAIN}.") from None
+    mass = toml.at_least(path, "mass", data["mass"], 0.0, strict=True)
+    total = float(model.body_mass.sum())
+    if abs(total - mass) > _MASS_TOLERANCE * mass:
+        raise bad_input(path, "mass", mass, f"is not the {total:.12g} kg of {mjcf.name}: mass was lost", _CONVERT_AGAIN)
+    bodies = {model.body(i).name for i in range(1, model.nbody)}
+    joints = {model.joint(i).name for i in range(model.njnt)}
+    wheels = tuple(_wheel(path, f"wheels[{i}]", w, bodies, joints) for i, w in enumerate(_list(path, "wheels", data)))
+    groups = _groups(path, data["groups"], model)
+    _check_wheels_against_groups(path, wheels, groups)
+    points = _list(path, "chassis_points", data)
+    return Rover(
+        name=toml.text(path, "name", data["name"]),
+        folder=folder,
+        mjcf=mjcf,
+        wheels=wheels,
+        groups=groups,
+        joint_limits=_limits(model),
+        chassis=_known(path, "chassis", data["chassis"], bodies, "body"),
+        chassis_points=np.array([toml.numbers(path, f"chassis_points[{i}]", p, 3) for i, p in enumerate(points)]),
+        loops=tuple(_loop(path, f"loops[{i}]", x, bodies) for i, x in enumerate(toml.tables(path, "loops", data))),
+        mass=mass,
+        standing_height=toml.number(path, "standing_height", data["standing_height"]),
+        notes=tuple(toml.text(path, "notes", n) for n in data.get("notes", [])),
+    )
+
+
+def _list(path: Path, key: str, data: Mapping[str, Any]) -> list[Any]:
+    values = toml.tables(path, key, data)
+    if not values:
+        raise bad_input(path, key, values, "is empty", _CONVERT_AGAIN)
+    return values
+
+
+def _known(path: Path, where: str, value: Any, names: set[str], what: str) -> str:
+    name = toml.text(path, where, value)
+    if name not in names:
+        raise bad_input(path, where, name, f"is not a {what} of the MJCF", f"correct the name or {_CONVERT_AGAIN}")
+    return name
+
+
+def _wheel(path: Path, where: str, table: Any, bodies: set[str], joints: set[str]) -> Wheel:
+    known = set(Wheel.__dataclass_fields__)
+    toml.check_keys(path, where, table, known, known - {"steer", "suspension"})
+    roles = {k: _known(path, f"{where}.{k}", table[k], joints, "joint") for k in ("steer", "suspension") if k in table}
+    return Wheel(
+        corner=toml.text(path, f"{where}.corner", table["corner"]),
+        body=_known(path, f"{where}.body", table["body"], bodies, "body"),
+        radius=toml.at_least(path, f"{where}.radius", table["radius"], 0.0, strict=True),
+        width=toml.at_least(path, f"{where}.width", table["width"], 0.0, strict=True),
+        drive=_known(path, f"{where}.drive", table["drive"], joints, "joint"),
+        steer=roles.get("steer"),
+        suspension=roles.get("suspension"),
+    )
+
+
+def _groups(path: Path, data: Any, model: mujoco.MjModel) -> tuple[JointGroup, ...]:
+    """Reads the groups and checks that their joints, in order, are the MJCF's actuators."""
+    toml.check_keys(path, "groups", data, set(GROUPS), {"drive"})
+    actuators = [model.actuator(i).name for i in range(model.nu)]
+    groups = []
+    for name in (g for g in GROUPS if g in data):
+        table, where = data[name], f"groups.{name}"
+        toml.check_keys(path, where, table, _GROUP_KEYS, _GROUP_KEYS)
+        groups.append(
+            JointGroup(
+                name=name,
+                joints=tuple(
+                    _known(path, f"{where}.joints", j, set(actuators), "motor") for j in _list(path, "joints", table)
+                ),
+                mode=toml.one_of(path, f"{where}.mode", table["mode"], MODES),
+                position_gain=toml.at_least(path, f"{where}.position_gain", table["position_gain"], 0.0, strict=False),
+                velocity_gain=toml.at_least(path, f"{where}.velocity_gain", table["velocity_gain"], 0.0, strict=False),
+                gear_ratio=toml.at_least(path, f"{where}.gear_ratio", table["gear_ratio"], 0.0, strict=True),
+                gear_efficiency=toml.at_least(
+                    path, f"{where}.gear_efficiency", table["gear_efficiency"], 0.0, strict=True
+                ),
+                rotor_inertia=toml.at_least(path, f"{where}.rotor_inertia", table["rotor_inertia"], 0.0, strict=False),
+                winding=toml.one_of(path, f"{where}.winding", table["winding"], WINDINGS),
+            )
+        )
+    listed = [joint for group in groups for joint in group.joints]
+    if listed != actuators:
+        motors = ", ".join(actuators)
+        raise bad_input(path, "groups joints", ", ".join(listed), f"are not the motors {motors}", _CONVERT_AGAIN)
+    return tuple(groups)
+
+
+def _check_wheels_against_groups(path: Path, wheels: tuple[Wheel, ...], groups: tuple[JointGroup, ...]) -> None:
+    driven = next(g.joints for g in groups if g.name == "drive")
+    if tuple(w.drive for w in wheels) != driven:
+        raise bad_input(path, "groups.drive.joints", ", ".join(driven), "are not the wheels' joints", _CONVERT_AGAIN)
+
+
+def _loop(path: Path, where: str, table: Any, bodies: set[str]) -> Loop:
+    known = set(Loop.__dataclass_fields__)
+    toml.check_keys(path, where, table, known, known)
+    first, second = (toml.numbers(path, f"{where}.{k}", table[k], 3) for k in ("anchor1", "anchor2"))
+    return Loop(
+        _known(path, f"{where}.body1", table["body1"], bodies, "body"),
+        _known(path, f"{where}.body2", table["body2"], bodies, "body"),
+        (first[0], first[1], first[2]),
+        (second[0], second[1], second[2]),
+    )
+
+
+def _limits(model: mujoco.MjModel) -> dict[str, tuple[float, float]]:
+    """Limits of every joint but the free one; MuJoCo keeps an unlimited joint's range as 0 0."""
+    limits = {}
+    for i in range(model.njnt):
+        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE:
+            continue
+        low, high = (float(v) for v in model.jnt_range[i])
+        limits[model.joint(i).name] = (low, high) if (low, high) != (0.0, 0.0) else (-np.inf, np.inf)
+    return limits

@@ -1,0 +1,233 @@
+"""Finds the wheels and what drives, steers and suspends each, and makes every joint's sign agree with the frames.
+
+Signs: positive drive moves the rover forward (+x), positive steer turns the wheel to the left (about +z), positive
+suspension raises the chassis (the wheel goes down relative to it).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.rover.description import Description, WheelDescription
+from lunar_mjx.rover.tree import Body, flip_axis, locate, world_poses
+from lunar_mjx.rover.urdf import Geometry, Pose, Urdf
+
+MINIMUM_WHEELS = 3
+_SAME_PLACE = 1e-3  # m; wheels closer than this along x are in one row, closer to y = 0 are in the middle
+_HINGES = ("revolute", "continuous")
+
+
+@dataclass(frozen=True)
+class WheelRole:
+    """A wheel's body, corner and joints by name, its radius and width in m, and its centre (3,) in the base frame."""
+
+    body: str
+    corner: str
+    radius: float
+    width: float
+    drive: str
+    steer: str | None
+    suspension: str | None
+    center: np.ndarray
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Wheels in order (front to rear, left before right), the bodies with mended axes, and what was assumed."""
+
+    wheels: tuple[WheelRole, ...]
+    bodies: tuple[Body, ...]
+    notes: tuple[str, ...]
+
+    def group(self, name: str) -> tuple[str, ...]:
+        """Joint names of the group 'drive', 'steer' or 'suspension', in wheel order, each once."""
+        return tuple(dict.fromkeys(j for j in (getattr(w, name) for w in self.wheels) if j is not None))
+
+
+def assign_roles(urdf: Urdf, bodies: tuple[Body, ...], description: Description) -> Roles:
+    """Takes the wheels from the description, or infers them from the tree.
+
+    Raises:
+      UserError: fewer than three wheels, or a description that names something that is not there.
+    """
+    poses = world_poses(bodies)
+    if description.wheels:
+        wheels = [_described(urdf, bodies, poses, description, w) for w in description.wheels]
+    else:
+        wheels = [_role(urdf, bodies, poses, b, WheelDescription(b.name)) for b in _candidates(bodies, poses)]
+    if len(wheels) < MINIMUM_WHEELS:
+        found = ", ".join(w.body for w in wheels) or "none"
+        raise bad_input(
+            urdf.path,
+            "wheels",
+            found,
+            f"are fewer than {MINIMUM_WHEELS}",
+            "give each wheel a continuous joint with an axis along y at zero angles and a cylinder, "
+            "or name the wheels in the description beside the URDF ([[wheels]])",
+        )
+    wheels, notes = _drop_shared(_name_corners(urdf, wheels, description), bool(description.wheels))
+    bodies, flips = _mend_signs(bodies, poses, wheels)
+    return Roles(tuple(wheels), bodies, tuple(notes + flips))
+
+
+def _world_axis(body: Body, poses: dict[str, Pose]) -> np.ndarray:
+    assert body.joint is not None
+    return poses[body.name].rotation @ body.joint.axis
+
+
+def _rim(body: Body) -> tuple[Geometry, float, float] | None:
+    """The body's largest round primitive about its joint axis, with radius and width."""
+    assert body.joint is not None
+    found = []
+    for shape in body.geometry:
+        if shape.kind == "cylinder" and abs(shape.pose.rotation[:, 2] @ body.joint.axis) > 0.98:
+            found.append((shape, shape.size[0], shape.size[1]))
+        elif shape.kind == "sphere":
+            found.append((shape, shape.size[0], shape.size[0]))
+    return max(found, key=lambda f: f[1], default=None)
+
+
+def _candidates(bodies: tuple[Body, ...], poses: dict[str, Pose]) -> list[Body]:
+    """Bodies at the end of a chain that turn about y and carry a round shape, unless they hang above the others."""
+    parents = {b.parent for b in bodies}
+    bottoms: dict[str, float] = {}
+    found = []
+    for body in bodies:
+        if body.joint is None or body.joint.kind not in _HINGES or body.name in parents:
+            continue
+        rim = _rim(body)
+        if rim is None or abs(_world_axis(body, poses)[1]) < 0.9:
+            continue
+        found.append(body)
+        bottoms[body.name] = (poses[body.name] @ rim[0].pose).position[2] - rim[1]
+    lowest = min(bottoms.values(), default=0.0)
+    return [b for b in found if bottoms[b.name] - lowest < 0.5 * _rim(b)[1]]  # type: ignore[index]
+
+
+def _described(
+    urdf: Urdf, bodies: tuple[Body, ...], poses: dict[str, Pose], description: Description, wheel: WheelDescription
+) -> WheelRole:
+    place = locate(bodies, wheel.link)
+    path = description.path or urdf.path
+    if place is None:
+        raise bad_input(path, "wheels link", wheel.link, f"is not a link of {urdf.path.name}", "correct the name")
+    body = place[0]
+    if body.joint is None or body.joint.kind not in _HINGES:
+        raise bad_input(
+            path, "wheels link", wheel.link, "does not turn on a joint", "name a link below a continuous joint"
+        )
+    names = {b.joint.name for b in bodies if b.joint is not None}
+    for role in ("steer", "suspension"):
+        joint = getattr(wheel, role)
+        if joint is not None and joint not in names:
+            raise bad_input(path, f"wheels {role}", joint, f"is not a joint of {urdf.path.name}", "correct the name")
+    if abs(_world_axis(body, poses)[1]) < 0.9:
+        raise bad_input(
+            path, "wheels link", wheel.link, "does not turn about y at zero angles", "let the rover face along x"
+        )
+    return _role(urdf, bodies, poses, body, wheel)
+
+
+def _role(
+    urdf: Urdf, bodies: tuple[Body, ...], poses: dict[str, Pose], body: Body, given: WheelDescription
+) -> WheelRole:
+    """Fills in what `given` leaves open from the wheel's shape and its ancestors."""
+    assert body.joint is not None
+    rim = _rim(body)
+    radius, width = given.radius, given.width
+    center = poses[body.name].position
+    if rim is not None:
+        radius, width = radius or rim[1], width or rim[2]
+        center = (poses[body.name] @ rim[0].pose).position
+    if radius is None or width is None:
+        raise bad_input(
+            urdf.path,
+            f"link '{body.name}' geometry",
+            "no cylinder",
+            "does not tell the wheel's radius and width",
+            "give radius and width in the description beside the URDF ([[wheels]])",
+        )
+    by_name = {b.name: b for b in bodies}
+    steer, suspension = given.steer, given.suspension
+    parent = body.parent
+    while parent is not None:
+        ancestor = by_name[parent]
+        if ancestor.joint is not None and ancestor.joint.kind in _HINGES:
+            upright = abs(_world_axis(ancestor, poses)[2])
+            # A steering joint lies below the suspension; a turning mast above it would be something else.
+            if upright > 0.9 and steer is None and suspension is None:
+                steer = ancestor.joint.name
+            elif upright < 0.1 and suspension is None:
+                suspension = ancestor.joint.name
+        parent = ancestor.parent
+    return WheelRole(
+        body.name, given.corner or "", float(radius), float(width), body.joint.name, steer, suspension, center
+    )
+
+
+def _name_corners(urdf: Urdf, wheels: list[WheelRole], description: Description) -> list[WheelRole]:
+    """Sorts front to rear and left before right, and names corners lf, rf, lr, rr (lm, rm between; c in the middle)."""
+    rows: list[list[WheelRole]] = []
+    spread = max(w.center[0] for w in wheels) - min(w.center[0] for w in wheels)
+    for wheel in sorted(wheels, key=lambda w: -w.center[0]):
+        if rows and rows[-1][0].center[0] - wheel.center[0] < max(_SAME_PLACE, 0.1 * spread):
+            rows[-1].append(wheel)
+        else:
+            rows.append([wheel])
+    middle = ["m"] if len(rows) == 3 else [f"m{i}" for i in range(1, len(rows) - 1)]
+    letters = ["f", *middle, "r"] if len(rows) > 1 else ["m"]
+    named = []
+    for letter, row in zip(letters, rows, strict=True):
+        for wheel in sorted(row, key=lambda w: -w.center[1]):
+            y = wheel.center[1]
+            side = "c" if abs(y) < _SAME_PLACE else "l" if y > 0 else "r"
+            named.append(replace(wheel, corner=wheel.corner or side + letter))
+    corners = [w.corner for w in named]
+    for corner in corners:
+        if corners.count(corner) > 1:
+            raise bad_input(
+                description.path or urdf.path,
+                "wheels corner",
+                corner,
+                "is given to two wheels",
+                "name the wheels and their corners in the description beside the URDF ([[wheels]])",
+            )
+    return named
+
+
+def _drop_shared(wheels: list[WheelRole], described: bool) -> tuple[list[WheelRole], list[str]]:
+    """Leaves a pivot that carries several wheels (a rocker, a bogie) passive, unless the description names it."""
+    pivots = [w.suspension for w in wheels]
+    shared = {p for p in pivots if p is not None and pivots.count(p) > 1}
+    if described or not shared:
+        return wheels, []
+    notes = [f"joint '{p}' carries several wheels and was left passive" for p in sorted(shared)]
+    return [replace(w, suspension=None) if w.suspension in shared else w for w in wheels], notes
+
+
+def _mend_signs(
+    bodies: tuple[Body, ...], poses: dict[str, Pose], wheels: list[WheelRole]
+) -> tuple[tuple[Body, ...], list[str]]:
+    """Reverses the axes whose positive direction is not the stated one."""
+    by_joint = {b.joint.name: b for b in bodies if b.joint is not None}
+    reverse: dict[str, str] = {}
+    for wheel in wheels:
+        if _world_axis(by_joint[wheel.drive], poses)[1] < 0:
+            reverse[wheel.drive] = "drives forward"
+        if wheel.steer is not None and _world_axis(by_joint[wheel.steer], poses)[2] < 0:
+            reverse[wheel.steer] = "steers to the left"
+        if wheel.suspension is not None:
+            body = by_joint[wheel.suspension]
+            lift = np.cross(_world_axis(body, poses), wheel.center - poses[body.name].position)[2]
+            if abs(lift) < 1e-9:
+                raise UserError(
+                    f"joint '{wheel.suspension}': turning it does not move the wheel '{wheel.body}' up or down; "
+                    "name another suspension joint in the description beside the URDF ([[wheels]])."
+                )
+            if lift > 0:
+                reverse[wheel.suspension] = "raises the chassis"
+    mended = tuple(flip_axis(b) if b.joint is not None and b.joint.name in reverse else b for b in bodies)
+    return mended, [f"joint '{j}': axis reversed so that positive {why}" for j, why in reverse.items()]
