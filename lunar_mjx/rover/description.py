@@ -63,11 +63,10 @@ class LoopDescription:
 
 
 def _default_groups() -> dict[str, GroupDescription]:
-    geared = {"gear_ratio": 1526.0, "gear_efficiency": 0.6}
     return {
         "drive": GroupDescription("velocity"),
-        "steer": GroupDescription("position", **geared),
-        "suspension": GroupDescription("position", **geared),
+        "steer": GroupDescription("position", gear_ratio=1526.0, gear_efficiency=0.6),
+        "suspension": GroupDescription("position", gear_ratio=1526.0, gear_efficiency=0.6),
     }
 
 
@@ -129,8 +128,12 @@ def read_description(path: str | Path) -> Description:
 
 def _wheel(path: Path, where: str, table: Mapping[str, Any]) -> WheelDescription:
     check_keys(path, where, table, {"link", "corner", "radius", "width", "steer", "suspension"}, {"link"})
-    lengths = {k: at_least(path, f"{where}.{k}", table[k], 0.0, strict=True) for k in ("radius", "width") if k in table}
-    names = {k: text(path, f"{where}.{k}", table[k]) for k in ("link", "corner", "steer", "suspension") if k in table}
+    lengths: dict[str, Any] = {
+        k: at_least(path, f"{where}.{k}", table[k], 0.0, strict=True) for k in ("radius", "width") if k in table
+    }
+    names: dict[str, Any] = {
+        k: text(path, f"{where}.{k}", table[k]) for k in ("link", "corner", "steer", "suspension") if k in table
+    }
     return WheelDescription(**names, **lengths)
 
 

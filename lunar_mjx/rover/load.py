@@ -1,5 +1,8 @@
 """Loads a converted rover by name or path and checks that its files agree."""
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
 from __future__ import annotations
 
 from collections.abc import Mapping

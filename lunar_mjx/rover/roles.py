@@ -12,7 +12,7 @@ import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.rover.description import Description, WheelDescription
-from lunar_mjx.rover.tree import Body, flip_axis, locate, world_poses
+from lunar_mjx.rover.tree import Body, flip_axis, locate, reframe, world_poses
 from lunar_mjx.rover.urdf import Geometry, Pose, Urdf
 
 MINIMUM_WHEELS = 3
@@ -68,8 +68,12 @@ def assign_roles(urdf: Urdf, bodies: tuple[Body, ...], description: Description)
             "give each wheel a continuous joint with an axis along y at zero angles and a cylinder, "
             "or name the wheels in the description beside the URDF ([[wheels]])",
         )
-    wheels, notes = _drop_shared(_name_corners(urdf, wheels, description), bool(description.wheels))
+    wheels = _name_corners(urdf, wheels, description)
+    notes: list[str] = []
+    if not description.wheels:
+        wheels, notes = _drop_shared(bodies, wheels)
     bodies, flips = _mend_signs(bodies, poses, wheels)
+    bodies = _align_wheels(bodies, poses, wheels)
     return Roles(tuple(wheels), bodies, tuple(notes + flips))
 
 
@@ -198,12 +202,18 @@ def _name_corners(urdf: Urdf, wheels: list[WheelRole], description: Description)
     return named
 
 
-def _drop_shared(wheels: list[WheelRole], described: bool) -> tuple[list[WheelRole], list[str]]:
-    """Leaves a pivot that carries several wheels (a rocker, a bogie) passive, unless the description names it."""
-    pivots = [w.suspension for w in wheels]
-    shared = {p for p in pivots if p is not None and pivots.count(p) > 1}
-    if described or not shared:
-        return wheels, []
+def _drop_shared(bodies: tuple[Body, ...], wheels: list[WheelRole]) -> tuple[list[WheelRole], list[str]]:
+    """Leaves a pivot that carries several wheels (a rocker, a bogie) passive."""
+    by_name = {b.name: b for b in bodies}
+    carried: dict[str, int] = {}
+    for wheel in wheels:
+        name: str | None = wheel.body
+        while name is not None:
+            joint = by_name[name].joint
+            if joint is not None:
+                carried[joint.name] = carried.get(joint.name, 0) + 1
+            name = by_name[name].parent
+    shared = {w.suspension for w in wheels if w.suspension is not None and carried[w.suspension] > 1}
     notes = [f"joint '{p}' carries several wheels and was left passive" for p in sorted(shared)]
     return [replace(w, suspension=None) if w.suspension in shared else w for w in wheels], notes
 
@@ -231,3 +241,25 @@ def _mend_signs(
                 reverse[wheel.suspension] = "raises the chassis"
     mended = tuple(flip_axis(b) if b.joint is not None and b.joint.name in reverse else b for b in bodies)
     return mended, [f"joint '{j}': axis reversed so that positive {why}" for j, why in reverse.items()]
+
+
+def _align_wheels(bodies: tuple[Body, ...], poses: dict[str, Pose], wheels: list[WheelRole]) -> tuple[Body, ...]:
+    """Gives every wheel body a frame at the rim's centre: y along the axle to the left, x forward, z up."""
+    centers = {w.body: w.center for w in wheels}
+    parents = {b.parent for b in bodies}
+    aligned = []
+    for body in bodies:
+        if body.name in centers and body.name not in parents:
+            pose = poses[body.name]
+            axle = _world_axis(body, poses)
+            forward = np.cross(axle, [0.0, 0.0, 1.0])
+            forward /= np.linalg.norm(forward)
+            turn = pose.rotation.T @ np.column_stack([forward, axle, np.cross(forward, axle)])
+            # Only along the axle: the joint's axis must go through the body's origin.
+            offset = pose.rotation.T @ (centers[body.name] - pose.position)
+            assert body.joint is not None
+            frame = Pose(body.joint.axis * (body.joint.axis @ offset), turn)
+            if np.abs(frame.position).max() > 1e-9 or np.abs(turn - np.eye(3)).max() > 1e-9:
+                body = reframe(body, frame)
+        aligned.append(body)
+    return tuple(aligned)

@@ -1,5 +1,8 @@
 """A rover as the rest of the library sees it: where its MJCF lies, and which joint does what."""
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -15,7 +18,7 @@ class Wheel:
 
     Attributes:
       corner: lf, rf, lr, rr; lm, rm for a middle row.
-      body: its body in the MJCF, with the origin on the axle.
+      body: its body in the MJCF; at zero joint angles its origin is the rim's centre, x forward, y the axle, z up.
       radius: m, without grousers.
       width: m.
       drive: joint that turns it; positive is forward.

@@ -1,5 +1,8 @@
 """What the converter works out from the compiled model: springs that hold the rover level, and stable gains."""
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
 from __future__ import annotations
 
 from dataclasses import dataclass

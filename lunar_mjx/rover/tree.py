@@ -15,7 +15,7 @@ class Body:
     """One rigid body.
 
     Attributes:
-      name: link that names it; the base carries the name of its first massive link.
+      name: link that names it; the base carries the name of its first link with mass or shape.
       parent: parent body, or None for the base.
       pose: body frame in the parent body's frame at zero joint angles.
       joint: joint that moves it, or None for the base; its axis is in the body frame.
@@ -82,6 +82,21 @@ def flip_axis(body: Body) -> Body:
     return replace(body, joint=replace(body.joint, axis=0.0 - body.joint.axis, limits=(-high, -low)))
 
 
+def reframe(body: Body, frame: Pose) -> Body:
+    """The same body described in another frame, given in the present one; only for a body without children."""
+    assert body.joint is not None
+    back = Pose(-frame.rotation.T @ frame.position, frame.rotation.T)
+    return replace(
+        body,
+        pose=body.pose @ frame,
+        joint=replace(body.joint, axis=back.rotation @ body.joint.axis),
+        com=back.apply(body.com),
+        inertia=back.rotation @ body.inertia @ frame.rotation,
+        geometry=tuple(replace(g, pose=back @ g.pose) for g in body.geometry),
+        frames={link: back @ pose for link, pose in body.frames.items()},
+    )
+
+
 def _free_root(urdf: Urdf) -> tuple[str, tuple[Joint, ...]]:
     """Drops a massless 'world' link above a floating joint: the base is free in any case."""
     floating = [j for j in urdf.joints if j.kind == "floating"]
@@ -122,8 +137,8 @@ def _fixed_frames(link: str, joints: tuple[Joint, ...]) -> dict[str, Pose]:
 
 
 def _base_frame(urdf: Urdf, root: str, frames: dict[str, Pose]) -> tuple[str, dict[str, Pose]]:
-    """Names the base after its first massive link, and moves the frame there unless that would turn it."""
-    name = next((link for link in frames if urdf.links[link].mass > 0), root)
+    """Names the base after its first link with mass or shape, and moves the frame there unless that would turn it."""
+    name = next((x for x in frames if urdf.links[x].mass > 0 or urdf.links[x].geometry), root)
     offset = frames[name]
     if not np.array_equal(offset.rotation, np.eye(3)):
         return name, frames
