@@ -1,1 +1,29 @@
 """Terrains: height fields sampled on the device, DEM readers, procedural detail, rocks and soil maps."""
+
+from lunar_mjx.terrain.craters import Craters as Craters
+from lunar_mjx.terrain.dem import Dem as Dem
+from lunar_mjx.terrain.export import export_mesh as export_mesh
+from lunar_mjx.terrain.export import to_mesh as to_mesh
+from lunar_mjx.terrain.heightfield import HeightField as HeightField
+from lunar_mjx.terrain.heightfield import gradient as gradient
+from lunar_mjx.terrain.heightfield import height as height
+from lunar_mjx.terrain.heightfield import inside as inside
+from lunar_mjx.terrain.heightfield import normal as normal
+from lunar_mjx.terrain.heightfield import sample as sample
+from lunar_mjx.terrain.heightfield import slope as slope
+from lunar_mjx.terrain.load import load_terrain as load_terrain
+from lunar_mjx.terrain.load import terrain_from_dem as terrain_from_dem
+from lunar_mjx.terrain.procedural import add_detail as add_detail
+from lunar_mjx.terrain.procedural import make_surface as make_surface
+from lunar_mjx.terrain.readers.dispatch import read_dem as read_dem
+from lunar_mjx.terrain.rock_field import RockField as RockField
+from lunar_mjx.terrain.rocks import Rocks as Rocks
+from lunar_mjx.terrain.rocks import build_rocks as build_rocks
+from lunar_mjx.terrain.rocks import nearest_rock as nearest_rock
+from lunar_mjx.terrain.roughness import Roughness as Roughness
+from lunar_mjx.terrain.soil_map import SoilMap as SoilMap
+from lunar_mjx.terrain.soil_map import rock_fraction as rock_fraction
+from lunar_mjx.terrain.terrain import Terrain as Terrain
+from lunar_mjx.terrain.terrain import flat as flat
+from lunar_mjx.terrain.terrain import inclined as inclined
+from lunar_mjx.terrain.terrain import stack as stack

@@ -1,0 +1,156 @@
+"""From a name, a path or a table to a terrain."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import ndimage
+
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.resources import find
+from lunar_mjx.terrain.config import TerrainConfig, parse_config, read_config
+from lunar_mjx.terrain.dem import Dem
+from lunar_mjx.terrain.procedural import add_detail, make_soil_patches, make_surface, rock_stream
+from lunar_mjx.terrain.readers.dispatch import SUFFIXES, read_dem
+from lunar_mjx.terrain.rock_field import place_rocks
+from lunar_mjx.terrain.terrain import Terrain, inclined
+
+CONFIG = "terrain.toml"
+_SLOPE = re.compile(r"slope:\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*deg")
+
+
+def load_terrain(
+    spec: str | Path | dict[str, Any],
+    *,
+    dem: str | Path | None = None,
+    seed: int | None = None,
+    dtype: np.dtype | type = np.float32,
+) -> Terrain:
+    """Loads a terrain.
+
+    Args:
+      spec: a shipped name ("flat", "lunar_plain", "de_gerlache_rim"), "slope:10deg", a folder with a `terrain.toml`,
+        such a file, a DEM file that says its own scale, or the tables of a `terrain.toml` as a dict.
+      dem: a DEM file that takes the place of the configuration's. Without it, the environment variable
+        `LUNAR_MJX_DEM_<NAME>` does (`LUNAR_MJX_DEM_DE_GERLACHE_RIM`).
+      seed: takes the place of the configuration's.
+      dtype: of the floating-point arrays.
+
+    Returns:
+      The terrain, its origin in the middle of the grid.
+
+    Raises:
+      UserError: the specification or a file that it names is wrong; the sentence says which, and the remedy.
+    """
+    if isinstance(spec, str) and spec.startswith("slope"):
+        return _slope(spec, dtype)
+    if isinstance(spec, dict):
+        return build_terrain(parse_config(spec, "terrain"), "terrain", Path(), dem=dem, seed=seed, dtype=dtype)
+    path = Path(spec)
+    if path.suffix.lower() in SUFFIXES:
+        return terrain_from_dem(read_dem(path), path.stem, dtype)
+    if path.suffix != ".toml":
+        path = find("terrain", spec, CONFIG) / CONFIG
+    config = read_config(path)
+    name = path.resolve().parent.name if path.name == CONFIG else path.stem
+    return build_terrain(config, name, path.parent, dem=dem, seed=seed, dtype=dtype)
+
+
+def _slope(spec: str, dtype: np.dtype | type) -> Terrain:
+    match = _SLOPE.fullmatch(spec)
+    try:
+        angle = float(match.group(1)) if match else float("nan")
+    except ValueError:
+        angle = float("nan")
+    if not abs(angle) < 90:
+        raise bad_input("terrain", "spec", spec, "is not a slope below 90 degrees", "write it as slope:10deg")
+    return inclined(np.radians(angle), dtype=dtype, name=spec)
+
+
+def load_dem(config: TerrainConfig, name: str, folder: Path, dem: str | Path | None = None, seed: int = 1) -> Dem:
+    """The ground of a configuration on the host: DEM or procedural surface, cropped, with detail."""
+    file = _dem_file(config, name, folder, dem)
+    crop = config.crop
+    if file is not None:
+        table = config.dem
+        options = {} if table is None else {
+            "cell": table.cell, "height_scale": table.height_scale, "band": table.band, "dequantise": table.dequantise
+        }  # fmt: skip
+        ground = read_dem(file, crop=crop, **options)
+    elif config.surface is not None:
+        s = config.surface
+        ground = make_surface(
+            s.width, s.height, s.cell, seed, roughness=s.roughness, craters=s.craters, center=(s.x, s.y)
+        )
+        if crop is not None:
+            ground = ground.crop(crop.x, crop.y, crop.width, crop.height)
+    else:
+        raise bad_input(name, "dem.file", "nothing", "leaves no ground", f"give dem, or set {_variable(name)}")
+    if config.detail is not None:
+        d = config.detail
+        ground = add_detail(ground, d.cell, seed, roughness=d.roughness, craters=d.craters)
+    return ground
+
+
+def build_terrain(
+    config: TerrainConfig,
+    name: str,
+    folder: Path,
+    *,
+    dem: str | Path | None = None,
+    seed: int | None = None,
+    dtype: np.dtype | type = np.float32,
+) -> Terrain:
+    """Makes the terrain of a checked configuration; relative files are looked for in `folder`. See `load_terrain`."""
+    seed = config.seed if seed is None else seed
+    if config.plane is not None:
+        p = config.plane
+        if dem is not None:
+            raise bad_input(name, "dem", dem, "does not go with a plane", "choose a terrain with a DEM")
+        return inclined(
+            np.radians(p.slope_deg), p.extent, np.radians(p.direction_deg), cell=p.cell, dtype=dtype, name=name
+        )
+    ground = load_dem(config, name, folder, dem, seed)
+    field, origin = ground.to_heightfield(dtype)
+    rocks = None
+    if config.rocks is not None:
+        west, south, east, north = ground.bounds
+        bounds = (west - origin[0], south - origin[1], east - origin[0], north - origin[1])
+
+        def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+            at = np.stack([(y - bounds[1]) / ground.cell, (x - bounds[0]) / ground.cell])
+            return ndimage.map_coordinates(ground.heights - origin[2], at, order=1, mode="nearest")
+
+        rocks = place_rocks(config.rocks, bounds, height, rock_stream(seed), dtype)
+    soil = None
+    if config.soil is not None:
+        soil = make_soil_patches(ground, config.soil.rock_fraction, config.soil.patch, seed, dtype)
+    return Terrain(field, rocks, soil, jnp.asarray(origin, dtype), name)
+
+
+def terrain_from_dem(dem: Dem, name: str = "dem", dtype: np.dtype | type = np.float32) -> Terrain:
+    """A terrain of bare ground from a DEM."""
+    field, origin = dem.to_heightfield(dtype)
+    return Terrain(field, None, None, jnp.asarray(origin, dtype), name)
+
+
+def _variable(name: str) -> str:
+    return "LUNAR_MJX_DEM_" + re.sub(r"\W", "_", name).upper()
+
+
+def _dem_file(config: TerrainConfig, name: str, folder: Path, dem: str | Path | None) -> Path | None:
+    """The DEM to read: the argument, else the environment's, else the configuration's, else none."""
+    for source, given in (("dem", dem), (_variable(name), os.environ.get(_variable(name)))):
+        if given:
+            path = Path(given)
+            if not path.is_file():
+                raise UserError(f"{path}: the DEM given by {source} is not there; check the path or its spelling.")
+            return path
+    if config.dem is not None and config.dem.file is not None:
+        return folder / config.dem.file
+    return None
