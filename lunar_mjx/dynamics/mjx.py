@@ -1,0 +1,195 @@
+"""The MJX engine: one physics step from MJX's public stages, for any rover; the reference for other engines.
+
+Contacts are off and the solver sees equality constraints only, so its problem is quadratic and one Newton iteration
+is exact. Kinematics run once per step and are fresh when the effects read them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from lunar_mjx.dynamics.ports import Forces
+from lunar_mjx.errors import UserError
+from lunar_mjx.rover import Rover
+from lunar_mjx.spatial import Frame, Vec3
+
+
+class Kinematics(NamedTuple):
+    """Poses and velocities in world coordinates, as the effects see them."""
+
+    position: Vec3
+    quaternion: Any
+    frame: Frame
+    velocity: Vec3
+    angular_velocity: Vec3
+    joint_angle: Any
+    joint_speed: Any
+    wheel_position: Vec3
+    wheel_axle: Vec3
+    wheel_velocity: Vec3
+    wheel_angular_velocity: Vec3
+
+
+Finish = Callable[[Forces], tuple[Any, Any]]
+
+
+class MjxEngine:
+    """Rigid-body dynamics of one rover on MJX: `forward` gives the kinematics and a function that finishes the step."""
+
+    name = "mjx"
+
+    def __init__(self, rover: Rover, timestep: float):
+        model = rover.compile()
+        model.opt.timestep = timestep
+        _check_options(model, rover)
+        self.mj_model = model
+        self.nq, self.nv = model.nq, model.nv
+        self.qpos0 = np.array(model.qpos0)
+        joints = [model.joint(name).id for name in rover.joints]
+        self._qadr = model.jnt_qposadr[joints]
+        self._dadr = model.jnt_dofadr[joints]
+        self._wheels = np.array([model.body(wheel.body).id for wheel in rover.wheels])
+        self._axles = np.array([model.jnt_axis[model.joint(wheel.drive).id] for wheel in rover.wheels])
+        self._chassis = model.body(rover.chassis).id
+        self._armature0 = np.array(model.dof_armature)
+        self.wheel_feet = _wheel_feet(model, self._wheels, self._chassis)
+        self._mjx = mjx.put_model(model)
+        self._data = mjx.make_data(model)
+
+    def forward(self, params: Any, qpos: Any, qvel: Any) -> tuple[Kinematics, Finish]:
+        """Kinematics at (qpos, qvel), and a function from forces to the next (qpos, qvel)."""
+        dtype = qpos.dtype
+        m = jax.tree.map(lambda a: _cast(a, dtype), self._mjx)
+        d = jax.tree.map(lambda a: _cast(a, dtype), self._data)
+        gravity = jnp.asarray(params.gravity, dtype)
+        zero = jnp.zeros_like(gravity)
+        m = m.replace(opt=m.opt.replace(gravity=jnp.stack([zero, zero, -gravity])))
+        d = d.replace(qpos=qpos, qvel=qvel)
+        d = mjx.com_vel(m, mjx.com_pos(m, mjx.kinematics(m, d)))
+
+        def finish(forces: Forces) -> tuple[Any, Any]:
+            return self._finish(params, m, d, forces)
+
+        return self._kinematics(d), finish
+
+    def _kinematics(self, d: mjx.Data) -> Kinematics:
+        chassis, wheels = self._chassis, self._wheels
+        about = d.subtree_com[chassis]
+        spin, speed = d.cvel[:, :3], d.cvel[:, 3:]
+
+        def velocity_at(body: Any, place: Any) -> Any:
+            # cvel is taken at the centre of mass of the whole tree
+            return speed[body] + jnp.cross(spin[body], place - about)
+
+        axle = jnp.einsum("wij,wj->wi", d.xmat[wheels], jnp.asarray(self._axles, d.qpos.dtype))
+        return Kinematics(
+            position=Vec3.of(d.xpos[chassis]),
+            quaternion=d.xquat[chassis],
+            frame=Frame.of_matrix(d.xmat[chassis]),
+            velocity=Vec3.of(velocity_at(chassis, d.xpos[chassis])),
+            angular_velocity=Vec3.of(spin[chassis]),
+            joint_angle=d.qpos[self._qadr],
+            joint_speed=d.qvel[self._dadr],
+            wheel_position=Vec3.of(d.xpos[wheels]),
+            wheel_axle=Vec3.of(axle),
+            wheel_velocity=Vec3.of(velocity_at(wheels, d.xpos[wheels])),
+            wheel_angular_velocity=Vec3.of(spin[wheels]),
+        )
+
+    def _finish(self, params: Any, m: mjx.Model, d: mjx.Data, forces: Forces) -> tuple[Any, Any]:
+        m = m.replace(dof_armature=self._armature(params, d.qpos.dtype))
+        d = self._carry_payload(m, d, forces)
+        d = mjx.tendon(m, mjx.camlight(m, d))
+        d = mjx.transmission(m, mjx.make_constraint(m, mjx.factor_m(m, mjx.crb(m, d))))
+        d = mjx.fwd_velocity(m, d)
+        d = self._apply(m, d, forces)
+        d = mjx.fwd_acceleration(m, mjx.fwd_actuation(m, d))
+        d = d.replace(qacc=d.qacc_smooth) if m.neq == 0 else mjx.solve(m, d)
+        d = mjx.euler(m, d)
+        return d.qpos, d.qvel
+
+    def _armature(self, params: Any, dtype: Any) -> Any:
+        """Rotor inertia times the square of the gear ratio at the actuated joints, where the model has motors."""
+        armature = jnp.asarray(self._armature0, dtype)
+        motor = params.effects.get("motor")
+        if motor is None:
+            return armature
+        reflected = motor["rotor_inertia"] * motor["gear_ratio"] ** 2 * jnp.ones(len(self._dadr), dtype)
+        return armature.at[self._dadr].set(reflected)
+
+    def _carry_payload(self, m: mjx.Model, d: mjx.Data, forces: Forces) -> mjx.Data:
+        """Adds a point mass to the chassis and shifts its centre of mass, in the spatial inertia that crb and rne read."""
+        geometry, chassis = forces.geometry, self._chassis
+        rotation = d.xmat[chassis]
+        about = d.subtree_com[chassis]
+        mass = m.body_mass[chassis]
+        com = d.xipos[chassis]
+        moved = com + rotation @ geometry.com_offset.stack()
+        payload = d.xpos[chassis] + rotation @ geometry.payload_position.stack()
+        change = (
+            _point_inertia(mass, moved - about)
+            - _point_inertia(mass, com - about)
+            + _point_inertia(geometry.payload_mass, payload - about)
+        )
+        return d.tree_replace({"_impl.cinert": d._impl.cinert.at[chassis].add(change)})
+
+    def _apply(self, m: mjx.Model, d: mjx.Data, forces: Forces) -> mjx.Data:
+        """Forces at the wheels' centres and at the chassis frame, moved to the centres of mass where xfrc_applied acts."""
+        xfrc = jnp.zeros((m.nbody, 6), d.qpos.dtype)
+        wheels, chassis = self._wheels, self._chassis
+
+        def row(body: Any, force: Any, moment: Any) -> Any:
+            moment = moment + jnp.cross(d.xpos[body] - d.xipos[body], force)
+            return jnp.concatenate([force, moment], axis=-1)
+
+        xfrc = xfrc.at[wheels].add(row(wheels, forces.wheel_force.stack(), forces.wheel_moment.stack()))
+        xfrc = xfrc.at[chassis].add(row(chassis, forces.chassis_force.stack(), forces.chassis_moment.stack()))
+        qfrc = jnp.zeros(m.nv, d.qpos.dtype).at[self._dadr].set(forces.joint_torque)
+        return d.replace(xfrc_applied=xfrc, qfrc_applied=qfrc)
+
+
+def _wheel_feet(model: mujoco.MjModel, wheels: np.ndarray, chassis: int) -> np.ndarray:
+    """Wheel centres relative to the chassis frame at zero joint angles, (wheel, 3) m."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return (data.xpos[wheels] - data.xpos[chassis]) @ data.xmat[chassis].reshape(3, 3)
+
+
+def _cast(leaf: Any, dtype: Any) -> Any:
+    if isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating):
+        return jnp.asarray(leaf, dtype)
+    return leaf
+
+
+def _point_inertia(mass: Any, r: Any) -> Any:
+    """MuJoCo's ten numbers of a point mass at `r`: Ixx Iyy Izz Ixy Ixz Iyz, mass times r, mass."""
+    x, y, z = r[0], r[1], r[2]
+    moments = jnp.stack([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
+    return mass * jnp.concatenate([moments, r, jnp.ones_like(r[:1])])
+
+
+def _check_options(model: mujoco.MjModel, rover: Rover) -> None:
+    """Refuses models for which one Newton iteration would not be exact."""
+    disabled = model.opt.disableflags
+    problems = []
+    if not disabled & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        problems.append('contacts are on (set <flag contact="disable"/>)')
+    if not disabled & mujoco.mjtDisableBit.mjDSBL_LIMIT and model.jnt_limited.any():
+        problems.append('joint limits are on (set <flag limit="disable"/>; limits are an effect)')
+    if (model.dof_frictionloss > 0).any():
+        problems.append("frictionloss is set (use a friction effect)")
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+        problems.append('the integrator is not Euler (set integrator="Euler")')
+    if problems:
+        raise UserError(f"{rover.mjcf}: the solver must see equality constraints only, but {'; '.join(problems)}.")
+    model.opt.iterations = 1
+    model.opt.ls_iterations = 1
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART

@@ -1,0 +1,144 @@
+"""The state of a simulated rover, its parameters, and what a step reports; one layout for every engine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lunar_mjx.effects.motor import REFERENCE_TEMPERATURE
+from lunar_mjx.pytree import pytree
+from lunar_mjx.spatial import Vec3
+from lunar_mjx.terrain import Terrain
+
+SYNODIC_DAY = 29.530588 * 86400.0
+"""From noon to noon on the Moon, s."""
+
+
+@pytree
+class Temperature:
+    """Temperatures as offsets from 298.15 K, each with the rounding that its last sum lost.
+
+    In float32 a value near 300 K cannot take the increments of a millisecond step; offsets with a compensated
+    (Kahan) sum can.
+    """
+
+    winding: Float[Array, "joint"]
+    winding_lost: Float[Array, "joint"]
+    housing: Float[Array, "joint"]
+    housing_lost: Float[Array, "joint"]
+
+    @property
+    def winding_kelvin(self) -> Any:
+        return self.winding + REFERENCE_TEMPERATURE
+
+    @property
+    def housing_kelvin(self) -> Any:
+        return self.housing + REFERENCE_TEMPERATURE
+
+
+def compensated_add(total: Any, lost: Any, increment: Any) -> tuple[Any, Any]:
+    """Kahan's sum: returns the new total and the rounding that it lost."""
+    increment = increment - lost
+    new = total + increment
+    return new, (new - total) - increment
+
+
+@pytree
+class State:
+    """State of one rover.
+
+    Attributes:
+      step: number of steps since reset.
+      qpos, qvel: MuJoCo's generalised positions and velocities, with the dependent joints of closed loops.
+      temperature: of every actuated joint's motor.
+      effects: state of the effects, by effect and name.
+    """
+
+    step: Any
+    qpos: Float[Array, "nq"]
+    qvel: Float[Array, "nv"]
+    temperature: Temperature
+    effects: dict[str, dict[str, Any]]
+
+
+@pytree
+class Ambient:
+    """Ambient temperature: constant, or following the Sun over a lunar day.
+
+    T_A = T_night + (T_noon - T_night) max(0, cos(2 pi (t - t_noon)/P))^(1/4): the equilibrium of a surface under the
+    Sun; constant where T_noon = T_night.
+
+    Attributes:
+      noon, night: temperatures, K. noon_time: when the Sun culminates, s. period: length of the day, s.
+    """
+
+    noon: Any
+    night: Any
+    noon_time: Any
+    period: Any
+
+    def at(self, time: Any) -> Any:
+        sun = jnp.cos(2.0 * jnp.pi * (time - self.noon_time) / self.period)
+        up = jnp.where(sun > 0.0, jnp.where(sun > 0.0, sun, 1.0) ** 0.25, 0.0)
+        return self.night + (self.noon - self.night) * up
+
+
+@pytree
+class Params:
+    """Everything that may differ between rovers of one batch.
+
+    Attributes:
+      gravity: m/s2, positive.
+      ambient: ambient temperature.
+      effects: parameters by effect and name, each a number or one per wheel or joint.
+      terrain: the ground.
+    """
+
+    gravity: Any
+    ambient: Ambient
+    effects: dict[str, dict[str, Any]]
+    terrain: Terrain
+
+
+@pytree
+class Telemetry:
+    """What a step reports, at the beginning of that step (the seed paper's III-E, with temperatures, slip, sinkage).
+
+    Attributes:
+      time: s.
+      position: of the chassis frame, world, m. quaternion: w, x, y, z, body to world. euler: roll, pitch, yaw, rad.
+      velocity, angular_velocity: of the chassis frame in world coordinates, m/s, rad/s.
+      joint_angle, joint_speed: rad, rad/s. joint_torque: of the motors at the joints, N m.
+      current: motor current, A. voltage: V. winding_temperature, housing_temperature: K.
+      joule_heat, winding_heat, housing_heat: heat made in the winding; net heat into winding and housing, W.
+      wheel_position, wheel_velocity: world, m, m/s. sinkage: m. slip: eq. 8. slip_angle: rad.
+      wheel_force, wheel_moment: of the ground on the wheel, wheel frame (forward, left, normal), N, N m.
+      on_terrain: whether each wheel is over the terrain's grid.
+    """
+
+    time: Any
+    position: Vec3
+    quaternion: Float[Array, "4"]
+    euler: Vec3
+    velocity: Vec3
+    angular_velocity: Vec3
+    joint_angle: Float[Array, "joint"]
+    joint_speed: Float[Array, "joint"]
+    joint_torque: Float[Array, "joint"]
+    current: Float[Array, "joint"]
+    voltage: Float[Array, "joint"]
+    winding_temperature: Float[Array, "joint"]
+    housing_temperature: Float[Array, "joint"]
+    joule_heat: Float[Array, "joint"]
+    winding_heat: Float[Array, "joint"]
+    housing_heat: Float[Array, "joint"]
+    wheel_position: Vec3
+    wheel_velocity: Vec3
+    sinkage: Float[Array, "wheel"]
+    slip: Float[Array, "wheel"]
+    slip_angle: Float[Array, "wheel"]
+    wheel_force: Vec3
+    wheel_moment: Vec3
+    on_terrain: Array

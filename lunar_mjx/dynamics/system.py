@@ -1,0 +1,298 @@
+"""One physics step: an engine's rigid-body dynamics with the effects at their ports, as pure functions on pytrees."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.dynamics.mjx import Kinematics, MjxEngine
+from lunar_mjx.dynamics.ports import Pipeline, apply_effects, heat_flow
+from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperature, compensated_add
+from lunar_mjx.effects.context import Context, Heat, RoverInfo
+from lunar_mjx.effects.motor import MODES, REFERENCE_TEMPERATURE, motor_current, torque_constant, winding_resistance
+from lunar_mjx.errors import UserError
+from lunar_mjx.rover import Rover
+from lunar_mjx.spatial import Vec3
+from lunar_mjx.terrain import sample
+
+if TYPE_CHECKING:
+    from lunar_mjx.model import Model
+
+ENGINES = ("auto", "mjx")
+
+
+class System:
+    """A model made ready to run: `reset` and `step` are pure, for one rover, and compose with jit, vmap and grad.
+
+    Everything that may differ between rovers is in `params`, which both take; `vmap` over it, over the state, or both.
+
+    Attributes:
+      model: what was built.
+      params: the model's parameters, as a pytree of arrays.
+      info: the rover as drawn.
+      engine: the rigid-body engine.
+      dt: time step, s.
+    """
+
+    def __init__(self, model: Model, engine: str = "auto"):
+        if engine not in ENGINES:
+            raise UserError(f"build: engine = {engine!r} does not exist; use one of {', '.join(ENGINES)}.")
+        self.model = model
+        self.dt = model.timestep
+        self.engine = MjxEngine(model.rover, model.timestep)
+        self.pipeline = Pipeline(model.effects)
+        self.info = rover_info(model)
+        self.params = default_params(model)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Actuated joints in the order of the controls."""
+        return self.model.rover.joints
+
+    def reset(
+        self, params: Params, x: Any = 0.0, y: Any = 0.0, yaw: Any = 0.0, winding_temperature: Any = None
+    ) -> State:
+        """A rover at rest on the terrain, its joints at zero, leaning with the slope under its wheels.
+
+        Args:
+          params: parameters.
+          x, y: where its chassis frame stands, m, world frame.
+          yaw: heading, rad, 0 along world x.
+          winding_temperature: of all motors, winding and housing alike, K; ambient if None.
+
+        Returns:
+          The state.
+        """
+        dtype = jnp.result_type(float)
+        qpos = jnp.asarray(self.engine.qpos0, dtype)
+        position, quaternion = self._stand(
+            params, jnp.asarray(x, dtype), jnp.asarray(y, dtype), jnp.asarray(yaw, dtype)
+        )
+        qpos = jnp.concatenate([position, quaternion, qpos[7:]])
+        joint = jnp.zeros(len(self.joint_names), dtype)
+        ambient = params.ambient.at(jnp.zeros((), dtype))
+        warm = ambient if winding_temperature is None else winding_temperature
+        offset = joint + (jnp.asarray(warm, dtype) - REFERENCE_TEMPERATURE)
+        wheel = jnp.zeros(len(self.model.rover.wheels), dtype)
+        shapes = {"joint": joint, "wheel": wheel, "rover": jnp.zeros((), dtype)}
+        effects = {
+            e.name: {name: shapes[s.axis] + s.initial for name, s in e.state.items()}
+            for e in self.model.effects
+            if e.state
+        }
+        return State(
+            step=jnp.zeros((), jnp.int32),
+            qpos=qpos,
+            qvel=jnp.zeros(self.engine.nv, dtype),
+            temperature=Temperature(offset, joint, offset, joint),
+            effects=effects,
+        )
+
+    def _stand(self, params: Params, x: Any, y: Any, yaw: Any) -> tuple[Any, Any]:
+        """Pose on the plane fitted to the terrain under the wheels, none of which lies below the surface."""
+        feet = self.engine.wheel_feet
+        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+        wheel_x, wheel_y = x + cos * feet[:, 0] - sin * feet[:, 1], y + sin * feet[:, 0] + cos * feet[:, 1]
+        height, _, _ = sample(params.terrain.field, wheel_x, wheel_y)
+        design = np.column_stack([np.ones(len(feet)), feet[:, :2]])
+        fit = jnp.asarray(np.linalg.pinv(design), height.dtype) @ height
+        pitch, roll = jnp.arctan(-fit[1]), jnp.arctan(fit[2] * jnp.cos(jnp.arctan(fit[1])))
+        above = jnp.max(height - jnp.asarray(design, height.dtype) @ fit)
+        quaternion = _quaternion(roll, pitch, yaw)
+        up = Vec3(*_rotate_z(quaternion))
+        lift = self.model.rover.standing_height
+        # the frame's origin stands above the fitted plane along its normal
+        ground = fit[0] + above
+        return jnp.stack([x + lift * up.x, y + lift * up.y, ground + lift * up.z]), quaternion
+
+    def step(self, params: Params, state: State, control: Any) -> tuple[State, Telemetry]:
+        """Advances one rover by one time step.
+
+        Args:
+          params: parameters.
+          state: state at the beginning of the step.
+          control: (joint,) target of every actuated joint, in its mode's unit (rad, rad/s, N m, A), held over the step.
+
+        Returns:
+          The state at the end of the step, and what the step saw at its beginning.
+        """
+        kinematics, finish = self.engine.forward(params, state.qpos, state.qvel)
+        ctx = self._context(params, state, kinematics)
+        forces, ctx, effects = apply_effects(self.pipeline, ctx, jnp.asarray(control, state.qpos.dtype), state.effects)
+        heat, effects, temperature = self._heat(ctx, state.temperature, effects)
+        qpos, qvel = finish(forces)
+        telemetry = _telemetry(ctx, kinematics, heat)
+        return State(state.step + 1, qpos, qvel, temperature, effects), telemetry
+
+    def rollout(self, params: Params, state: State, controls: Any, every: int = 1) -> tuple[State, Telemetry]:
+        """Drives one rover through a sequence of controls.
+
+        Args:
+          params: parameters.
+          state: initial state.
+          controls: (time, joint) controls, each held for `every` steps.
+          every: steps per control and per reported telemetry.
+
+        Returns:
+          The final state, and telemetry with a leading time axis (at the beginning of each control).
+        """
+
+        def hold(state: State, control: Any) -> tuple[State, Telemetry]:
+            new, telemetry = self.step(params, state, control)
+            if every > 1:
+                new = jax.lax.fori_loop(1, every, lambda _, s: self.step(params, s, control)[0], new)
+            return new, telemetry
+
+        return jax.lax.scan(hold, state, controls)
+
+    def _context(self, params: Params, state: State, k: Kinematics) -> Context:
+        dtype = state.qpos.dtype
+        time = state.step.astype(dtype) * jnp.asarray(self.dt, dtype)
+        return Context(
+            time=time,
+            dt=jnp.asarray(self.dt, dtype),
+            gravity=params.gravity,
+            ambient_temperature=params.ambient.at(time),
+            position=k.position,
+            frame=k.frame,
+            velocity=k.velocity,
+            angular_velocity=k.angular_velocity,
+            joint_angle=k.joint_angle,
+            joint_speed=k.joint_speed,
+            winding_temperature=state.temperature.winding_kelvin,
+            housing_temperature=state.temperature.housing_kelvin,
+            wheel_position=k.wheel_position,
+            wheel_axle=k.wheel_axle,
+            wheel_velocity=k.wheel_velocity,
+            wheel_angular_velocity=k.wheel_angular_velocity,
+            terrain=params.terrain,
+            rover=jax.tree.map(lambda a: jnp.asarray(a, dtype) if a.dtype.kind == "f" else jnp.asarray(a), self.info),
+            parameters={name: SimpleNamespace(**values) for name, values in params.effects.items()},
+        )
+
+    def _heat(self, ctx: Context, t: Temperature, effects: Any) -> tuple[Heat, Any, Temperature]:
+        """Steps the motors' temperatures: explicit Euler (eqs. 4 and 5) or Heun's second-order method."""
+        if "heat" not in self.pipeline:
+            zero, one = jnp.zeros_like(t.winding), jnp.ones_like(t.winding)
+            return Heat(zero, zero, one, one), effects, t
+        heat, effects = heat_flow(self.pipeline, ctx, effects)
+        if self.model.thermal_integrator == "heun":
+            ahead = dataclasses.replace(
+                ctx,
+                winding_temperature=ctx.winding_temperature + ctx.dt * heat.winding / heat.winding_capacity,
+                housing_temperature=ctx.housing_temperature + ctx.dt * heat.housing / heat.housing_capacity,
+            )
+            then, _ = heat_flow(self.pipeline, ahead, effects)
+            heat = dataclasses.replace(
+                heat, winding=0.5 * (heat.winding + then.winding), housing=0.5 * (heat.housing + then.housing)
+            )
+        winding = compensated_add(t.winding, t.winding_lost, ctx.dt * heat.winding / heat.winding_capacity)
+        housing = compensated_add(t.housing, t.housing_lost, ctx.dt * heat.housing / heat.housing_capacity)
+        return heat, effects, Temperature(*winding, *housing)
+
+
+def build(model: Model, engine: str = "auto") -> System:
+    """Makes a model ready to run; `engine` is "auto" or "mjx".
+
+    Raises:
+      UserError: unknown engine, or a rover that the engine cannot run exactly.
+    """
+    return System(model, engine)
+
+
+def rover_info(model: Model) -> RoverInfo:
+    """The rover as drawn, with the control modes and gains of the model."""
+    rover: Rover = model.rover
+    names = ("drive", "steer", "suspension")
+    groups = [(g, names.index(g.name)) for g in rover.groups for _ in g.joints]
+    limits = np.array([rover.joint_limits[j] for j in rover.joints], float)
+    points = np.asarray(rover.chassis_points, float)
+    return RoverInfo(
+        wheel_radius=np.array([w.radius for w in rover.wheels]),  # type: ignore[arg-type]
+        wheel_width=np.array([w.width for w in rover.wheels]),  # type: ignore[arg-type]
+        joint_group=np.array([i for _, i in groups]),  # type: ignore[arg-type]
+        joint_lower=limits[:, 0],  # type: ignore[arg-type]
+        joint_upper=limits[:, 1],  # type: ignore[arg-type]
+        mode=np.array([MODES.index(model.modes[g.name]) for g, _ in groups]),  # type: ignore[arg-type]
+        position_gain=np.array([model.gains[g.name][0] for g, _ in groups]),  # type: ignore[arg-type]
+        velocity_gain=np.array([model.gains[g.name][1] for g, _ in groups]),  # type: ignore[arg-type]
+        chassis_points=Vec3(points[:, 0], points[:, 1], points[:, 2]),
+        name=rover.name,
+    )
+
+
+def default_params(model: Model) -> Params:
+    """The model's parameters as arrays of the default float type."""
+    dtype = jnp.result_type(float)
+    terrain = jax.tree.map(
+        lambda a: jnp.asarray(a, dtype) if jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating) else jnp.asarray(a),
+        model.terrain,
+    )
+    ambient = Ambient(*(jnp.asarray(v, dtype) for v in model.ambient))
+    effects = {e.name: {k: jnp.asarray(v, dtype) for k, v in model.parameters[e.name].items()} for e in model.effects}
+    return Params(jnp.asarray(model.gravity, dtype), ambient, effects, terrain)
+
+
+def _telemetry(ctx: Context, k: Kinematics, heat: Heat) -> Telemetry:
+    contact, wheel = ctx.contact, ctx.wheel
+    assert contact is not None and wheel is not None and ctx.command is not None
+    motor = ctx.parameters.get("motor")
+    if motor is None:
+        current = voltage = joule = jnp.zeros_like(ctx.joint_angle)
+    else:
+        current = motor_current(ctx)
+        resistance = winding_resistance(motor, ctx.winding_temperature)
+        back_emf = torque_constant(motor, ctx.winding_temperature) * motor.gear_ratio * ctx.joint_speed
+        voltage, joule = current * resistance + back_emf, current**2 * resistance
+    return Telemetry(
+        time=ctx.time,
+        position=k.position,
+        quaternion=k.quaternion,
+        euler=k.frame.euler(),
+        velocity=k.velocity,
+        angular_velocity=k.angular_velocity,
+        joint_angle=k.joint_angle,
+        joint_speed=k.joint_speed,
+        joint_torque=ctx.torque,  # type: ignore[arg-type]
+        current=current,
+        voltage=voltage,
+        winding_temperature=ctx.winding_temperature,
+        housing_temperature=ctx.housing_temperature,
+        joule_heat=joule,
+        winding_heat=heat.winding,
+        housing_heat=heat.housing,
+        wheel_position=k.wheel_position,
+        wheel_velocity=k.wheel_velocity,
+        sinkage=contact.sinkage,
+        slip=contact.slip,
+        slip_angle=contact.slip_angle,
+        wheel_force=wheel.force,
+        wheel_moment=wheel.moment,
+        on_terrain=contact.inside,
+    )
+
+
+def _quaternion(roll: Any, pitch: Any, yaw: Any) -> Any:
+    """w, x, y, z of intrinsic z-y'-x'' Euler angles."""
+    cr, sr = jnp.cos(0.5 * roll), jnp.sin(0.5 * roll)
+    cp, sp = jnp.cos(0.5 * pitch), jnp.sin(0.5 * pitch)
+    cy, sy = jnp.cos(0.5 * yaw), jnp.sin(0.5 * yaw)
+    return jnp.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+def _rotate_z(q: Any) -> tuple[Any, Any, Any]:
+    """The body's up axis in the world."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)

@@ -1,0 +1,196 @@
+"""What an effect is: a small pure function at one or several ports, with named, bounded, unit-carrying parameters.
+
+A user's own effect is a Python file of about ten lines::
+
+    import jax.numpy as jnp
+    from lunar_mjx.effects import Parameter, effect
+
+    @effect("motor_torque", torque=Parameter(0.5, null=0.0, bounds=(0.0, 5.0), unit="N m",
+                                             meaning="Coulomb friction of the gear", source="datasheet"))
+    def gear_friction(ctx, p, x, torque):
+        "tau_f = tau_c sgn(omega), smoothed below 0.01 rad/s."
+        return torque - p.torque * jnp.tanh(ctx.joint_speed / 0.01)
+
+A port function takes the context, the effect's parameters `p`, its state `x` and the port's value, and returns the new
+value, or (new value, {state: new state}) where the effect owns state. It is written for one rover, elementwise over
+wheels or joints, and knows nothing of the engine that calls it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from lunar_mjx.errors import UserError, require_finite
+
+PORTS = (
+    "command",
+    "motor_torque",
+    "geometry",
+    "soil",
+    "wheel_normal",
+    "wheel_shear",
+    "body_wrench",
+    "heat",
+    "sensor",
+)
+"""The ports, in the order in which a step calls them (`sensor` acts on the finished trajectory)."""
+
+AXES = ("rover", "wheel", "joint")
+"""What a parameter or state may have one entry per; "rover" is a single number."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A physical parameter of an effect.
+
+    Attributes:
+      nominal: value used unless the model says otherwise, in `unit`.
+      null: value at which the effect vanishes; None where the effect has no null in this parameter.
+      bounds: physically admissible closed interval, in `unit`.
+      unit: SI unit (or 1); powers that depend on the sinkage exponent are written as in N/m^(n+1).
+      meaning: what it is, in a few words.
+      source: where the nominal value comes from.
+      axis: "rover" for a single number, or "wheel" or "joint" where a model may give one value each.
+    """
+
+    nominal: float
+    null: float | None
+    bounds: tuple[float, float]
+    unit: str
+    meaning: str
+    source: str
+    axis: str = "rover"
+
+    def __post_init__(self) -> None:
+        low, high = self.bounds
+        if not low <= self.nominal <= high:
+            raise UserError(
+                f"Parameter: nominal = {self.nominal} is outside the bounds {self.bounds}; widen the bounds."
+            )
+        if self.null is not None and not low <= self.null <= high:
+            raise UserError(f"Parameter: null = {self.null} is outside the bounds {self.bounds}; widen the bounds.")
+        if self.axis not in AXES:
+            raise UserError(f"Parameter: axis = {self.axis!r} is unknown; use one of {', '.join(AXES)}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class StateVariable:
+    """A state that an effect owns.
+
+    Attributes:
+      initial: value at reset.
+      unit: SI unit.
+      meaning: what it is, in a few words.
+      axis: "rover", "wheel" or "joint".
+      rate: whether the port function returns its time derivative (integrated by the step) instead of its new value.
+    """
+
+    initial: float
+    unit: str
+    meaning: str
+    axis: str = "wheel"
+    rate: bool = False
+
+
+PortFunction = Callable[..., Any]
+_EMPTY: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect:
+    """A physical effect: functions at ports, and the parameters and state that they share.
+
+    Attributes:
+      name: name in the catalogue and in `model.toml`.
+      ports: port name -> function(ctx, p, x, value).
+      parameters: parameter name -> `Parameter`.
+      state: state name -> `StateVariable`.
+      replaces: names of effects that must leave the list when this one enters it.
+      order: effects at one port run by rising order, and in list order where equal.
+      transient: the effect vanishes in steady state, so that a steady-state wheel test bed leaves it out.
+      doc: equation and source.
+    """
+
+    name: str
+    ports: Mapping[str, PortFunction]
+    parameters: Mapping[str, Parameter] = dataclasses.field(default_factory=dict)
+    state: Mapping[str, StateVariable] = dataclasses.field(default_factory=dict)
+    replaces: tuple[str, ...] = ()
+    order: int = 0
+    transient: bool = False
+    doc: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise UserError(f"effect: name = {self.name!r} is not an identifier; use letters, digits and underscores.")
+        for port in self.ports:
+            if port not in PORTS:
+                raise UserError(f"effect {self.name}: port = {port!r} does not exist; use one of {', '.join(PORTS)}.")
+        if not self.ports:
+            raise UserError(f"effect {self.name}: ports is empty; name at least one of {', '.join(PORTS)}.")
+
+    def nominal(self) -> dict[str, float]:
+        """The nominal value of every parameter."""
+        return {name: parameter.nominal for name, parameter in self.parameters.items()}
+
+    def null(self) -> dict[str, float]:
+        """The values at which the effect vanishes; parameters without a null keep their nominal value."""
+        return {k: p.nominal if p.null is None else p.null for k, p in self.parameters.items()}
+
+    def check(self, name: str, value: Any, source: str) -> float | tuple[float, ...]:
+        """Returns a parameter's value if it is a finite number (or a sequence of them) within its bounds.
+
+        Args:
+          name: parameter name.
+          value: number, or one number per wheel or joint.
+          source: file or function to name in the error.
+
+        Raises:
+          UserError: unknown parameter, not a number, not finite, or out of bounds.
+        """
+        field = f"effects.{self.name}.{name}"
+        if name not in self.parameters:
+            known = ", ".join(self.parameters) or "none"
+            raise UserError(f"{source}: {field} is unknown; the parameters of {self.name} are {known}.")
+        parameter = self.parameters[name]
+        if isinstance(value, list | tuple):
+            if parameter.axis == "rover":
+                raise UserError(f"{source}: {field} = {value} has several values; {self.name} takes one number here.")
+            return tuple(float(self.check(name, v, source)) for v in value)  # type: ignore[arg-type]
+        number = require_finite(source, field, value)
+        low, high = parameter.bounds
+        if not low <= number <= high:
+            raise UserError(
+                f"{source}: {field} = {number:g} {parameter.unit} is outside [{low:g}, {high:g}] {parameter.unit}; "
+                f"give the {parameter.meaning} within these bounds."
+            )
+        return number
+
+
+def effect(
+    port: str,
+    *,
+    state: Mapping[str, StateVariable] = _EMPTY,
+    replaces: tuple[str, ...] = (),
+    order: int = 0,
+    transient: bool = False,
+    **parameters: Parameter,
+) -> Callable[[PortFunction], Effect]:
+    """Decorator: makes an `Effect` of a function at one port; the function's docstring states equation and source."""
+
+    def build(function: PortFunction) -> Effect:
+        return Effect(
+            name=function.__name__,
+            ports={port: function},
+            parameters=parameters,
+            state=dict(state),
+            replaces=replaces,
+            order=order,
+            transient=transient,
+            doc=(function.__doc__ or "").strip(),
+        )
+
+    return build

@@ -1,0 +1,246 @@
+"""The common context that every port sees, and the values that ports hand on.
+
+Shapes are those of one rover: `wheel` arrays have one entry per wheel, `joint` arrays one per actuated joint. All is
+in SI units, temperatures in kelvin. Fields that a later part of the step fills are None before it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from jaxtyping import Array, Float
+
+from lunar_mjx.pytree import pytree, static
+from lunar_mjx.spatial import Frame, Vec3
+from lunar_mjx.terrain import Terrain
+
+
+@pytree
+class Command:
+    """Value of the port `command`.
+
+    Attributes:
+      target: commanded control in the unit of each joint's mode (rad, rad/s, N m or A).
+      current: motor current that the controller asks for, A.
+    """
+
+    target: Float[Array, "joint"]
+    current: Float[Array, "joint"]
+
+
+@pytree
+class Geometry:
+    """Value of the port `geometry`: the rover as it is, not as it was drawn.
+
+    Attributes:
+      radius, width: of the wheels, m.
+      toe: angle of each wheel about its steering axis beyond the steering angle, rad, positive to the left.
+      payload_mass: point mass carried on the chassis, kg.
+      payload_position: its place in the chassis frame, m.
+      com_offset: shift of the chassis' centre of mass, in the chassis frame, m.
+    """
+
+    radius: Float[Array, "wheel"]
+    width: Float[Array, "wheel"]
+    toe: Float[Array, "wheel"]
+    payload_mass: Any
+    payload_position: Vec3
+    com_offset: Vec3
+
+
+@pytree
+class Contact:
+    """How each wheel meets the ground.
+
+    Attributes:
+      sinkage: depth of the wheel's lowest point below the undisturbed surface, m; 0 for an airborne wheel.
+      sinkage_rate: its rate, m/s, positive when sinking.
+      slip: slip ratio of eq. 8 in the direction of travel (positive when driving faster than travelling).
+      slip_angle: between the wheel's heading and its velocity, rad, positive when the wheel moves to its left.
+      v_x, v_y: velocity of the wheel's centre along and across its heading in the ground plane, m/s.
+      rim_speed: r times the wheel's angular velocity, m/s.
+      forward, left, normal: axes of the wheel frame (heading, left, ground normal), in world coordinates.
+      inside: whether the wheel is over the terrain's grid.
+    """
+
+    sinkage: Float[Array, "wheel"]
+    sinkage_rate: Float[Array, "wheel"]
+    slip: Float[Array, "wheel"]
+    slip_angle: Float[Array, "wheel"]
+    v_x: Float[Array, "wheel"]
+    v_y: Float[Array, "wheel"]
+    rim_speed: Float[Array, "wheel"]
+    forward: Vec3
+    left: Vec3
+    normal: Vec3
+    inside: Array
+
+
+@pytree
+class Soil:
+    """Value of the port `soil`: the ground's parameters at each wheel.
+
+    Attributes:
+      k_c: cohesive modulus of sinkage, N/m^(n+1).
+      k_phi: frictional modulus of sinkage, N/m^(n+2).
+      n: sinkage exponent.
+      cohesion: Pa.
+      tan_phi: tangent of the angle of internal friction.
+      shear_modulus_x, shear_modulus_y: Janosi shear deformation moduli K_s and K_y, m.
+      rock: 1 where the wheel stands on hard rock, 0 where it stands on soil.
+    """
+
+    k_c: Float[Array, "wheel"]
+    k_phi: Float[Array, "wheel"]
+    n: Float[Array, "wheel"]
+    cohesion: Float[Array, "wheel"]
+    tan_phi: Float[Array, "wheel"]
+    shear_modulus_x: Float[Array, "wheel"]
+    shear_modulus_y: Float[Array, "wheel"]
+    rock: Float[Array, "wheel"]
+
+
+@pytree
+class Stress:
+    """Normal stress at quadrature nodes over the contact arc, one tuple entry per node."""
+
+    theta: tuple[Any, ...]
+    weight: tuple[Any, ...]
+    sigma: tuple[Any, ...]
+
+
+@pytree
+class Normal:
+    """Value of the port `wheel_normal`.
+
+    Attributes:
+      entrance, exit, theta_m: entrance angle, exit angle and angle of maximum stress, rad from the vertical.
+      sigma_m: maximum normal stress, Pa.
+      load: upward force on the wheel of the normal stress alone, N.
+      resistance: backward force of the normal stress (compaction resistance) for rolling forward, N.
+      damping: upward force that resists sinking, N.
+      stress: the stress at quadrature nodes, where an effect integrates it.
+    """
+
+    entrance: Float[Array, "wheel"]
+    exit: Float[Array, "wheel"]
+    theta_m: Float[Array, "wheel"]
+    sigma_m: Float[Array, "wheel"]
+    load: Float[Array, "wheel"]
+    resistance: Float[Array, "wheel"]
+    damping: Float[Array, "wheel"]
+    stress: Stress | None = None
+
+
+@pytree
+class WheelForce:
+    """Value of the port `wheel_shear`.
+
+    Attributes:
+      slip_x: rim speed less travel speed over the larger of the two, signed in the wheel's frame (positive pushes the
+        soil backward); equals eq. 8 when the rover moves forward.
+      slip_y: (1 - s) tan(beta) of eq. 11, signed as the lateral velocity.
+      direction: +1 when the wheel rolls forward, -1 when it rolls backward.
+      force: on the wheel's centre in the wheel frame (forward, left, ground normal), N.
+      moment: on the wheel about its centre in the wheel frame, N m.
+    """
+
+    slip_x: Float[Array, "wheel"]
+    slip_y: Float[Array, "wheel"]
+    direction: Float[Array, "wheel"]
+    force: Vec3
+    moment: Vec3
+
+
+@pytree
+class BodyWrench:
+    """Value of the port `body_wrench`.
+
+    Attributes:
+      force: on the chassis, world frame, N.
+      moment: on the chassis about the origin of its frame, world frame, N m.
+      joint_torque: extra torque at the actuated joints, N m.
+    """
+
+    force: Vec3
+    moment: Vec3
+    joint_torque: Float[Array, "joint"]
+
+
+@pytree
+class Heat:
+    """Value of the port `heat`: heat flow into the two nodes of every motor, W, and their heat capacities, J/K."""
+
+    winding: Float[Array, "joint"]
+    housing: Float[Array, "joint"]
+    winding_capacity: Float[Array, "joint"]
+    housing_capacity: Float[Array, "joint"]
+
+
+@pytree
+class RoverInfo:
+    """What never changes during a run: the rover as drawn.
+
+    Attributes:
+      wheel_radius, wheel_width: nominal, m.
+      joint_group: 0 drive, 1 steer, 2 suspension, for each actuated joint.
+      joint_lower, joint_upper: joint limits, rad; infinite where there is none.
+      mode: control mode of each joint: 0 position, 1 velocity, 2 torque, 3 current.
+      position_gain: N m/rad. velocity_gain: N m s/rad.
+      chassis_points: where the chassis can touch the ground, in its frame, m.
+    """
+
+    wheel_radius: Float[Array, "wheel"]
+    wheel_width: Float[Array, "wheel"]
+    joint_group: Array
+    joint_lower: Float[Array, "joint"]
+    joint_upper: Float[Array, "joint"]
+    mode: Array
+    position_gain: Float[Array, "joint"]
+    velocity_gain: Float[Array, "joint"]
+    chassis_points: Vec3
+    name: str = static(default="rover")
+
+
+@pytree
+class Context:
+    """What every port sees.
+
+    Attributes:
+      time: s. dt: time step, s. gravity: m/s2, positive. ambient_temperature: K.
+      position, frame, velocity, angular_velocity: of the chassis frame, in world coordinates.
+      joint_angle, joint_speed: of the actuated joints, rad, rad/s (output side of the gear).
+      winding_temperature, housing_temperature: of their motors, K.
+      wheel_position, wheel_axle, wheel_velocity, wheel_angular_velocity: of the wheels' centres, world coordinates.
+      terrain: the ground.
+      rover: the rover as drawn.
+      parameters: every effect's parameters, by effect and name.
+      command, torque, geometry, contact, soil, normal, wheel: what the ports before have settled.
+    """
+
+    time: Any
+    dt: Any
+    gravity: Any
+    ambient_temperature: Any
+    position: Vec3
+    frame: Frame
+    velocity: Vec3
+    angular_velocity: Vec3
+    joint_angle: Float[Array, "joint"]
+    joint_speed: Float[Array, "joint"]
+    winding_temperature: Float[Array, "joint"]
+    housing_temperature: Float[Array, "joint"]
+    wheel_position: Vec3
+    wheel_axle: Vec3
+    wheel_velocity: Vec3
+    wheel_angular_velocity: Vec3
+    terrain: Terrain
+    rover: RoverInfo
+    parameters: Any
+    command: Command | None = None
+    torque: Float[Array, "joint"] | None = None
+    geometry: Geometry | None = None
+    contact: Contact | None = None
+    soil: Soil | None = None
+    normal: Normal | None = None
+    wheel: WheelForce | None = None

@@ -1,0 +1,141 @@
+"""Electric motors: control electronics, torque from current, and the heat that they make.
+
+Source of the equations: the seed paper's (6), (7), (15), (16), with the gear that it leaves out (PHYSICS flaw 8).
+Motor data: maxon ECX TORQUE 22 XL with GPX 26 HP gearhead, catalogue values at 25 degC.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from lunar_mjx.effects.base import Effect, Parameter, effect
+
+REFERENCE_TEMPERATURE = 298.15
+"""T_R0 of eqs. 6 and 7, K (25 degC): where the catalogue states resistance and torque constant."""
+
+WINDINGS = {
+    12: {"resistance": 0.292, "torque_constant": 17.0e-3, "current_limit": 41.1},
+    18: {"resistance": 0.757, "torque_constant": 28.3e-3, "current_limit": 23.8},
+    24: {"resistance": 1.24, "torque_constant": 37.7e-3, "current_limit": 19.4},
+    36: {"resistance": 2.87, "torque_constant": 54.6e-3, "current_limit": 12.5},
+    48: {"resistance": 4.13, "torque_constant": 71.6e-3, "current_limit": 11.6},
+}
+"""Windings by nominal voltage, V: resistance ohm, torque constant N m/A, stall current A."""
+
+POSITION, VELOCITY, TORQUE, CURRENT = range(4)
+MODES = ("position", "velocity", "torque", "current")
+MODE_UNITS = ("rad", "rad/s", "N m", "A")
+
+_MAXON = "maxon ECX TORQUE 22 XL, 48 V winding"
+
+
+def _torque_per_ampere(motor) -> jnp.ndarray:
+    """N m at the joint per ampere at 25 degC."""
+    return motor.gear_ratio * motor.gear_efficiency * motor.torque_constant
+
+
+@effect(
+    "command",
+    order=50,
+    current_limit=Parameter(
+        11.6, None, (0.0, 1e3), "A", "largest current of the amplifier", _MAXON + ", stall current", axis="joint"
+    ),
+)
+def joint_control(ctx, p, x, command):
+    """Turns each joint's target into a motor current by the joint's control mode.
+
+    Position: PD, tau = k_p (q* - q) - k_d qdot. Velocity: P, tau = k_d (omega* - omega). Torque: tau = target, asked
+    for as the current that gives it at 25 degC (eq. 15). Current: passed on. Source: seed paper III-D.
+    """
+    motor, rover = ctx.parameters["motor"], ctx.rover
+    target, mode = command.target, rover.mode
+    position = rover.position_gain * (target - ctx.joint_angle) - rover.velocity_gain * ctx.joint_speed
+    velocity = rover.velocity_gain * (target - ctx.joint_speed)
+    torque = jnp.where(mode == POSITION, position, jnp.where(mode == VELOCITY, velocity, target))
+    current = jnp.where(mode == CURRENT, target, torque / _torque_per_ampere(motor))
+    return dataclasses.replace(command, current=jnp.clip(current, -p.current_limit, p.current_limit))
+
+
+def winding_resistance(motor, temperature):
+    """Eq. 6: R = R_0 (1 + alpha (T_R - T_R0)), ohm."""
+    return motor.resistance * (1.0 + motor.alpha * (temperature - REFERENCE_TEMPERATURE))
+
+
+def torque_constant(motor, temperature):
+    """Eq. 7: K = K_0 (1 + beta (T_R - T_R0)), N m/A."""
+    return motor.torque_constant * (1.0 + motor.beta * (temperature - REFERENCE_TEMPERATURE))
+
+
+def _motor_torque(ctx, p, x, torque):
+    hot = ctx.winding_temperature >= p.cutoff_temperature
+    produced = p.gear_ratio * p.gear_efficiency * torque_constant(p, ctx.winding_temperature) * ctx.command.current
+    return torque + jnp.where(hot, 0.0, produced)
+
+
+def motor_current(ctx):
+    """Current that flows in the winding, A: none once the cut-off has opened the circuit."""
+    cutoff = ctx.parameters["motor"].cutoff_temperature
+    return jnp.where(ctx.winding_temperature >= cutoff, 0.0, ctx.command.current)
+
+
+def _motor_heat(ctx, p, x, heat):
+    joule = motor_current(ctx) ** 2 * winding_resistance(p, ctx.winding_temperature)
+    one = jnp.ones_like(joule)
+    return dataclasses.replace(
+        heat,
+        winding=heat.winding + joule,
+        winding_capacity=p.winding_capacity * one,
+        housing_capacity=p.housing_capacity * one,
+    )
+
+
+motor = Effect(
+    name="motor",
+    ports={"motor_torque": _motor_torque, "heat": _motor_heat},
+    parameters={
+        "resistance": Parameter(4.13, None, (1e-3, 1e3), "ohm", "winding resistance at 25 degC", _MAXON, "joint"),
+        "torque_constant": Parameter(
+            71.6e-3, None, (1e-5, 10.0), "N m/A", "torque constant at 25 degC", _MAXON, "joint"
+        ),
+        "alpha": Parameter(0.0040, 0.0, (0.0, 0.02), "1/K", "temperature coefficient of the winding", "copper"),
+        "beta": Parameter(-0.0012, 0.0, (-0.02, 0.0), "1/K", "temperature coefficient of the magnet", "NdFeB"),
+        "gear_ratio": Parameter(
+            243.0,
+            None,
+            (1.0, 1e4),
+            "1",
+            "gear reduction",
+            "maxon GPX 26 HP, smallest four-stage ratio; choice",
+            "joint",
+        ),
+        "gear_efficiency": Parameter(
+            0.75, None, (0.05, 1.0), "1", "gear efficiency", "choice for a 3- or 4-stage gear", "joint"
+        ),
+        "rotor_inertia": Parameter(
+            9e-7, 0.0, (0.0, 1e-2), "kg m2", "rotor inertia", "estimate for a 22 mm motor; not in the paper", "joint"
+        ),
+        "winding_capacity": Parameter(
+            4.07,
+            None,
+            (1e-3, 1e6),
+            "J/K",
+            "heat capacity of the winding C_R",
+            "winding time constant 10 s over R_th1; choice",
+        ),
+        "housing_capacity": Parameter(
+            55.0,
+            None,
+            (1e-3, 1e6),
+            "J/K",
+            "heat capacity of the housing C_S",
+            "housing time constant 10 min over R_th2; choice",
+        ),
+        "R_th1": Parameter(2.46, None, (1e-3, 1e4), "K/W", "thermal resistance winding to housing", _MAXON),
+        "cutoff_temperature": Parameter(
+            423.15, None, (273.15, 1e4), "K", "winding temperature that cuts the torque", "seed paper: 150 degC"
+        ),
+    },
+    doc="Torque N eta K(T_R) I with K(T_R) of eq. 7, none at or above the cut-off; Joule heat I^2 R(T_R) of eqs. 1 and 6.",
+)

@@ -1,0 +1,247 @@
+"""The model: a rover, a terrain and a list of effects, with one value for every parameter."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lunar_mjx.dynamics.state import SYNODIC_DAY
+from lunar_mjx.effects import catalogue
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.effects.motor import MODES, WINDINGS
+from lunar_mjx.errors import UserError, bad_input, require_finite
+from lunar_mjx.rover import Rover, load_rover
+from lunar_mjx.terrain import Terrain, load_terrain
+
+LUNAR_GRAVITY = 1.625
+"""m/s2, the seed paper's value."""
+
+ROOM = 298.15
+THERMAL_INTEGRATORS = ("heun", "euler")
+DEFAULT_TERRAIN = "lunar_plain"
+
+Value = float | tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Model:
+    """A rover, a terrain and a list of effects.
+
+    Attributes:
+      rover: the rover. terrain: the ground. terrain_spec: name or path that it was loaded from.
+      effects: in list order. parameters: value of every parameter, by effect and name.
+      preset: name of the preset that the list started from.
+      gravity: m/s2, positive. timestep: s. thermal_integrator: "heun" or "euler".
+      ambient: noon temperature K, night temperature K, time of noon s, length of the day s; constant if both are equal.
+      modes: control mode by joint group. gains: position gain N m/rad and velocity gain N m s/rad by joint group.
+      effect_files: catalogue name or file.py:name of every effect, as written in `model.toml`.
+    """
+
+    rover: Rover
+    terrain: Terrain
+    terrain_spec: str
+    effects: tuple[Effect, ...]
+    parameters: Mapping[str, Mapping[str, Value]]
+    preset: str = "consistent"
+    gravity: float = LUNAR_GRAVITY
+    timestep: float = 0.002
+    thermal_integrator: str = "heun"
+    ambient: tuple[float, float, float, float] = (ROOM, ROOM, 0.0, SYNODIC_DAY)
+    modes: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    gains: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    effect_files: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def effect_names(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.effects)
+
+    def add(self, effect: Effect | str, source: str = "Model.add", **values: Any) -> Model:
+        """A model with one more effect, in the place of those that it replaces.
+
+        Args:
+          effect: an effect, a catalogue name, or file.py:name.
+          source: what to name in errors.
+          **values: parameter values that differ from the nominal ones.
+
+        Raises:
+          UserError: the effect is unknown or already in the list, or a value is unknown or out of bounds.
+        """
+        written = effect if isinstance(effect, str) else effect.name
+        found = catalogue.get(effect) if isinstance(effect, str) else effect
+        if found.name in self.effect_names:
+            raise bad_input(source, "effect", found.name, "is already in the model", "set its parameters instead")
+        replaced = [i for i, e in enumerate(self.effects) if e.name in found.replaces]
+        kept = [e for e in self.effects if e.name not in found.replaces]
+        kept.insert(replaced[0] if replaced else len(kept), found)
+        parameters = {k: v for k, v in self.parameters.items() if k not in found.replaces}
+        parameters[found.name] = found.nominal()
+        files = {k: v for k, v in self.effect_files.items() if k not in found.replaces}
+        model = dataclasses.replace(
+            self, effects=tuple(kept), parameters=parameters, effect_files={**files, found.name: written}
+        )
+        return model.set(found.name, source, **values)
+
+    def remove(self, name: str) -> Model:
+        """A model without the effect `name`."""
+        self._effect(name, "Model.remove")
+        return dataclasses.replace(
+            self,
+            effects=tuple(e for e in self.effects if e.name != name),
+            parameters={k: v for k, v in self.parameters.items() if k != name},
+            effect_files={k: v for k, v in self.effect_files.items() if k != name},
+        )
+
+    def set(self, name: str, source: str = "Model.set", **values: Any) -> Model:
+        """A model with other values for parameters of the effect `name`.
+
+        A value is a number, one number per wheel or joint, or for joints a mapping from joint group to number, in which
+        groups left out keep their value.
+
+        Raises:
+          UserError: unknown effect or parameter, or a value that is not finite or out of bounds.
+        """
+        effect = self._effect(name, source)
+        new = dict(self.parameters[name])
+        for key, value in values.items():
+            if isinstance(value, Mapping):
+                value = self._by_group(effect, key, value, source)
+            elif hasattr(value, "tolist"):
+                value = value.tolist()
+            checked = effect.check(key, value, source)
+            if isinstance(checked, tuple):
+                _check_length(self.rover, effect, key, checked, source)
+            new[key] = checked
+        return dataclasses.replace(self, parameters={**self.parameters, name: new})
+
+    def replace(self, **changes: Any) -> Model:
+        """A model with other attributes, checked."""
+        model = dataclasses.replace(self, **changes)
+        _check_globals(model, "Model.replace")
+        return model
+
+    def _effect(self, name: str, source: str) -> Effect:
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise bad_input(source, "effect", name, "is not in the model", f"use one of {', '.join(self.effect_names)}")
+
+    def _by_group(self, effect: Effect, key: str, value: Mapping[str, Any], source: str) -> tuple[float, ...]:
+        """One value per joint from one per joint group."""
+        field = f"effects.{effect.name}.{key}"
+        if key not in effect.parameters or effect.parameters[key].axis != "joint":
+            effect.check(key, effect.parameters[key].nominal if key in effect.parameters else 0.0, source)
+            raise bad_input(source, field, dict(value), "has a value per joint group", "give one number here")
+        groups = [g.name for g in self.rover.groups]
+        for group in value:
+            if group not in groups:
+                raise bad_input(source, f"{field}.{group}", value[group], "names no joint group of the rover",
+                                f"use one of {', '.join(groups)}")  # fmt: skip
+        present = self.parameters[effect.name][key]
+        count = len(self.rover.joints)
+        old = present if isinstance(present, tuple) else (present,) * count
+        names = [g.name for g in self.rover.groups for _ in g.joints]
+        return tuple(
+            float(effect.check(key, value[n], source)) if n in value else o  # type: ignore[arg-type]
+            for n, o in zip(names, old, strict=True)
+        )
+
+
+def _check_length(rover: Rover, effect: Effect, key: str, value: Sequence[float], source: str) -> None:
+    axis = effect.parameters[key].axis
+    wanted = len(rover.wheels) if axis == "wheel" else len(rover.joints)
+    if len(value) != wanted:
+        raise bad_input(source, f"effects.{effect.name}.{key}", list(value), f"has {len(value)} values",
+                        f"give one number, or {wanted}, one per {axis}")  # fmt: skip
+
+
+def _check_globals(model: Model, source: str | Path) -> None:
+    """Refuses model-wide settings that make no sense."""
+    if require_finite(source, "gravity_m_s2", model.gravity) < 0.0:
+        raise bad_input(source, "gravity_m_s2", model.gravity, "is negative", "give the magnitude; it points down")
+    if not 1e-5 <= require_finite(source, "timestep_s", model.timestep) <= 0.02:
+        raise bad_input(source, "timestep_s", model.timestep, "is outside [1e-5, 0.02] s", "use about 0.002 s")
+    if model.thermal_integrator not in THERMAL_INTEGRATORS:
+        raise bad_input(source, "thermal_integrator", model.thermal_integrator, "does not exist",
+                        f"use one of {', '.join(THERMAL_INTEGRATORS)}")  # fmt: skip
+    for field, kelvin in zip(("noon", "night"), model.ambient[:2], strict=True):
+        if require_finite(source, f"ambient.{field}_temperature_degC", kelvin) <= 0.0:
+            raise bad_input(source, f"ambient.{field}_temperature_degC", kelvin - 273.15, "is below absolute zero",
+                            "give degrees Celsius above -273.15")  # fmt: skip
+    if require_finite(source, "ambient.period_s", model.ambient[3]) <= 0.0:
+        raise bad_input(
+            source, "ambient.period_s", model.ambient[3], "is not positive", "give the length of the day in s"
+        )
+    for group, mode in model.modes.items():
+        if mode not in MODES:
+            raise bad_input(source, f"control.{group}.mode", mode, "does not exist", f"use one of {', '.join(MODES)}")
+    for group, gains in model.gains.items():
+        for name, gain in zip(("position_gain", "velocity_gain"), gains, strict=True):
+            if require_finite(source, f"control.{group}.{name}", gain) < 0.0:
+                raise bad_input(source, f"control.{group}.{name}", gain, "is negative", "give zero or more")
+
+
+def make_model(
+    rover: str | Path | Rover = "viper",
+    terrain: str | Path | Terrain = DEFAULT_TERRAIN,
+    preset: str = "consistent",
+    **changes: Any,
+) -> Model:
+    """A model from a preset.
+
+    Args:
+      rover: name or folder of a rover, or a rover.
+      terrain: name, file or folder of a terrain, or a terrain.
+      preset: "consistent" or "paper".
+      **changes: attributes of `Model` that differ (gravity, timestep, ambient, modes, gains, ...); `modes` and `gains`
+        may name some of the joint groups only.
+
+    Raises:
+      UserError: unknown rover, terrain, preset or attribute value.
+    """
+    if preset not in catalogue.PRESETS:
+        raise bad_input("make_model", "preset", preset, "does not exist", f"use one of {', '.join(catalogue.PRESETS)}")
+    loaded = rover if isinstance(rover, Rover) else load_rover(rover)
+    ground = terrain if isinstance(terrain, Terrain) else load_terrain(terrain)
+    effects = tuple(catalogue.CATALOGUE[name] for name in catalogue.PRESETS[preset])
+    modes = {g.name: g.mode for g in loaded.groups} | dict(changes.pop("modes", {}))
+    gains = {g.name: (g.position_gain, g.velocity_gain) for g in loaded.groups} | dict(changes.pop("gains", {}))
+    for field, given in (("modes", modes), ("gains", gains)):
+        for group in given:
+            if loaded.group(group) is None:
+                known = ", ".join(g.name for g in loaded.groups)
+                raise bad_input("make_model", f"{field}.{group}", given[group], f"names no joint group of {loaded.name}",
+                                f"use one of {known}")  # fmt: skip
+    model = Model(
+        rover=loaded,
+        terrain=ground,
+        terrain_spec=ground.name if isinstance(terrain, Terrain) else str(terrain),
+        effects=effects,
+        parameters={e.name: e.nominal() for e in effects},
+        preset=preset,
+        thermal_integrator="euler" if preset == "paper" else "heun",
+        modes=modes,
+        gains=gains,
+        effect_files={e.name: e.name for e in effects},
+    )
+    model = _rover_motors(model)
+    for name, values in catalogue.PRESET_PARAMETERS[preset].items():
+        model = model.set(name, f"preset {preset}", **values)
+    return model.replace(**changes)
+
+
+def _rover_motors(model: Model) -> Model:
+    """Motor parameters that the rover's folder states for each joint group."""
+    groups = model.rover.groups
+    windings = {g.name: WINDINGS[g.winding] for g in groups}
+    model = model.set(
+        "motor",
+        str(model.rover.folder),
+        gear_ratio={g.name: g.gear_ratio for g in groups},
+        gear_efficiency={g.name: g.gear_efficiency for g in groups},
+        rotor_inertia={g.name: g.rotor_inertia for g in groups},
+        resistance={n: w["resistance"] for n, w in windings.items()},
+        torque_constant={n: w["torque_constant"] for n, w in windings.items()},
+    )
+    return model.set("joint_control", current_limit={n: w["current_limit"] for n, w in windings.items()})
