@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from lunar_mjx.dynamics.state import SYNODIC_DAY
-from lunar_mjx.effects import catalogue
+from lunar_mjx.effects import catalogue, presets
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.motor import MODES, WINDINGS
-from lunar_mjx.errors import UserError, bad_input, require_finite
+from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.rover import Rover, load_rover
 from lunar_mjx.terrain import Terrain, load_terrain
 
@@ -200,18 +200,18 @@ def make_model(
     Raises:
       UserError: unknown rover, terrain, preset or attribute value.
     """
-    if preset not in catalogue.PRESETS:
-        raise bad_input("make_model", "preset", preset, "does not exist", f"use one of {', '.join(catalogue.PRESETS)}")
+    if preset not in presets.PRESETS:
+        raise bad_input("make_model", "preset", preset, "does not exist", f"use one of {', '.join(presets.PRESETS)}")
     loaded = rover if isinstance(rover, Rover) else load_rover(rover)
     ground = terrain if isinstance(terrain, Terrain) else load_terrain(terrain)
-    effects = tuple(catalogue.CATALOGUE[name] for name in catalogue.PRESETS[preset])
+    effects = tuple(catalogue.CATALOGUE[name] for name in presets.PRESETS[preset])
     modes = {g.name: g.mode for g in loaded.groups} | dict(changes.pop("modes", {}))
-    gains = {g.name: (g.position_gain, g.velocity_gain) for g in loaded.groups} | dict(changes.pop("gains", {}))
-    for field, given in (("modes", modes), ("gains", gains)):
+    given_gains = dict(changes.pop("gains", {}))
+    for field, given in (("modes", modes), ("gains", given_gains)):
         for group in given:
             if loaded.group(group) is None:
                 known = ", ".join(g.name for g in loaded.groups)
-                raise bad_input("make_model", f"{field}.{group}", given[group], f"names no joint group of {loaded.name}",
+                raise bad_input("make_model", f"{field}.{group}", given[group], "names no joint group of the rover",
                                 f"use one of {known}")  # fmt: skip
     model = Model(
         rover=loaded,
@@ -222,13 +222,24 @@ def make_model(
         preset=preset,
         thermal_integrator="euler" if preset == "paper" else "heun",
         modes=modes,
-        gains=gains,
         effect_files={e.name: e.name for e in effects},
     )
     model = _rover_motors(model)
-    for name, values in catalogue.PRESET_PARAMETERS[preset].items():
+    for name, values in presets.PRESET_PARAMETERS[preset].items():
         model = model.set(name, f"preset {preset}", **values)
+    model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded) | given_gains)
     return model.replace(**changes)
+
+
+def _gains_of_gear(model: Model, rover: Rover) -> dict[str, tuple[float, float]]:
+    """The rover's gains, scaled with the inertia that a preset's gear reflects, so that they stay stable."""
+    ratios = model.parameters["motor"]["gear_ratio"]
+    assert isinstance(ratios, tuple)
+    gains = {}
+    for group in rover.groups:
+        scale = (ratios[rover.joints.index(group.joints[0])] / group.gear_ratio) ** 2
+        gains[group.name] = (group.position_gain * scale, group.velocity_gain * scale)
+    return gains
 
 
 def _rover_motors(model: Model) -> Model:

@@ -121,8 +121,8 @@ def _effects(path: Path, data: Mapping[str, Any], model: Model) -> Model:
         model = _list_effects(path, data["effect_list"], model)
     for name, values in tables.items():
         if name not in model.effect_names:
-            raise bad_input(path, f"effects.{name}", dict(values) if isinstance(values, dict) else values,
-                            "is not in the list of effects", "add the name to effect_list or drop the table")  # fmt: skip
+            raise bad_input(path, f"effects.{name}", values,
+                            "is not in the list of effects", "add it to effect_list or drop the table")  # fmt: skip
         effect = next(e for e in model.effects if e.name == name)
         values = _table(path, f"effects.{name}", values)
         model = model.set(name, str(path), **{k: _value(path, effect, k, v) for k, v in values.items()})

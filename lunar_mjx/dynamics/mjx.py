@@ -4,6 +4,9 @@ Contacts are off and the solver sees equality constraints only, so its problem i
 is exact. Kinematics run once per step and are fresh when the effects read them.
 """
 
+# MuJoCo ships no type stubs for its compiled module.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -125,7 +128,7 @@ class MjxEngine:
         return armature.at[self._dadr].set(reflected)
 
     def _carry_payload(self, m: mjx.Model, d: mjx.Data, forces: Forces) -> mjx.Data:
-        """Adds a point mass to the chassis and shifts its centre of mass, in the spatial inertia that crb and rne read."""
+        """Adds a point mass to the chassis and shifts its centre of mass, in the inertia that crb and rne read."""
         geometry, chassis = forces.geometry, self._chassis
         rotation = d.xmat[chassis]
         about = d.subtree_com[chassis]
@@ -138,10 +141,11 @@ class MjxEngine:
             - _point_inertia(mass, com - about)
             + _point_inertia(geometry.payload_mass, payload - about)
         )
-        return d.tree_replace({"_impl.cinert": d._impl.cinert.at[chassis].add(change)})
+        cinert: Any = d._impl.cinert
+        return d.tree_replace({"_impl.cinert": cinert.at[chassis].add(change)})  # type: ignore[return-value]
 
     def _apply(self, m: mjx.Model, d: mjx.Data, forces: Forces) -> mjx.Data:
-        """Forces at the wheels' centres and at the chassis frame, moved to the centres of mass where xfrc_applied acts."""
+        """Forces at the wheels' centres and the chassis frame, moved to the centres of mass where xfrc_applied acts."""
         xfrc = jnp.zeros((m.nbody, 6), d.qpos.dtype)
         wheels, chassis = self._wheels, self._chassis
 

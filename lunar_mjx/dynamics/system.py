@@ -48,6 +48,8 @@ class System:
         self.pipeline = Pipeline(model.effects)
         self.info = rover_info(model)
         self.params = default_params(model)
+        steer = [model.rover.joints.index(w.steer) if w.steer else -1 for w in model.rover.wheels]
+        self._steer, self._steered = np.maximum(steer, 0), np.array(steer) >= 0
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -166,6 +168,7 @@ class System:
             joint_speed=k.joint_speed,
             winding_temperature=state.temperature.winding_kelvin,
             housing_temperature=state.temperature.housing_kelvin,
+            steering_angle=jnp.where(self._steered, k.joint_angle[self._steer], 0.0),
             wheel_position=k.wheel_position,
             wheel_axle=k.wheel_axle,
             wheel_velocity=k.wheel_velocity,

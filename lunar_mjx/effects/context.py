@@ -211,6 +211,7 @@ class Context:
       position, frame, velocity, angular_velocity: of the chassis frame, in world coordinates.
       joint_angle, joint_speed: of the actuated joints, rad, rad/s (output side of the gear).
       winding_temperature, housing_temperature: of their motors, K.
+      steering_angle: of each wheel, rad, positive to the left; 0 where it is not steered.
       wheel_position, wheel_axle, wheel_velocity, wheel_angular_velocity: of the wheels' centres, world coordinates.
       terrain: the ground.
       rover: the rover as drawn.
@@ -230,6 +231,7 @@ class Context:
     joint_speed: Float[Array, "joint"]
     winding_temperature: Float[Array, "joint"]
     housing_temperature: Float[Array, "joint"]
+    steering_angle: Float[Array, "wheel"]
     wheel_position: Vec3
     wheel_axle: Vec3
     wheel_velocity: Vec3

@@ -137,5 +137,5 @@ motor = Effect(
             423.15, None, (273.15, 1e4), "K", "winding temperature that cuts the torque", "seed paper: 150 degC"
         ),
     },
-    doc="Torque N eta K(T_R) I with K(T_R) of eq. 7, none at or above the cut-off; Joule heat I^2 R(T_R) of eqs. 1 and 6.",
+    doc="Torque N eta K(T_R) I (eqs. 7, 15, 16), none at or above the cut-off; Joule heat I^2 R(T_R) (eqs. 1, 6).",
 )

@@ -62,7 +62,7 @@ def printed_slip_angle(contact):
                       "paper's release: 1e2 to 1e5; chosen stable for a 1 kg wheel at 2 ms"),
 )  # fmt: skip
 def penalty_contact(ctx, p, x, normal):
-    """F_N = k_N z + c_N zdot on every ground (flaw 2): sinks 0.02 to 0.4 mm, where the soil's stress is next to nothing."""
+    """F_N = k_N z + c_N zdot on every ground (flaw 2): 0.02 to 0.4 mm deep, where the soil carries next to nothing."""
     contact, geometry = ctx.contact, ctx.geometry
     theta_1 = entrance_angle(contact.sinkage, geometry.radius)
     load = p.stiffness * contact.sinkage
@@ -91,7 +91,7 @@ def _mend(number, what):
     shear_radius=Parameter(1.0, None, (0.8, 1.3), "1", "shearing radius r_s over the radius r", "seed paper: r_s = r"),
 )
 def printed_shear(ctx, p, x, wheel):
-    """Eqs. 8-14 as printed. theta_s of eq. 14, which the paper does not define, is read as the wheel's steering toe.
+    """Eqs. 8-14 as printed. theta_s of eq. 14, which the paper does not define, is read as the steering angle.
 
     F_DP, F_S, M_R, M_O and M_S are applied at the wheel's centre; F_N comes from the port `wheel_normal` and holds no
     share of the shear stress. Rock carries no soil force.
@@ -117,7 +117,7 @@ def printed_shear(ctx, p, x, wheel):
     # |tan(beta)| inside and the sign outside: opposing, also where eq. 9 puts beta beyond 90 deg
     mobilised = -jnp.expm1(-jnp.minimum(r * jnp.abs(lateral) * theta_m / soil.shear_modulus_y, 50.0))
     side = -jnp.sign(contact.v_y) * r_s * b * side_strength * theta_m * mobilised
-    theta_s = (1.0 - p.mend_side) * geometry.toe
+    theta_s = (1.0 - p.mend_side) * (ctx.steering_angle + geometry.toe)
     force = Vec3(heading * drawbar, side, normal.load + normal.damping)
     moment = Vec3(
         r * side,

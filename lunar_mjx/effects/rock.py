@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -67,8 +68,8 @@ hard_ground = Effect(
 )  # fmt: skip
 
 
-def _closest_point_to_sphere(center: Vec3, wheel_center: Vec3, axle: Vec3, radius, width) -> tuple[Vec3, Vec3, object]:
-    """Point of a cylinder (a wheel) nearest to a sphere's centre, relative to the wheel's; unit vector to it; distance."""
+def _closest_point_to_sphere(center: Vec3, wheel_center: Vec3, axle: Vec3, radius, width) -> tuple[Vec3, Vec3, Any]:
+    """Point of a wheel nearest to a sphere's centre, relative to the wheel's; unit vector to that; distance."""
     gap = center - wheel_center
     axial = gap.dot(axle)
     radial = gap - axle * axial
@@ -125,7 +126,7 @@ def boulders(ctx, p, x, wheel):
     speed_scale=_SPEED,
 )
 def chassis_contact(ctx, p, x, wrench):
-    """Points of the chassis that touch terrain or boulders are pushed out, so that it neither sinks in nor falls through."""
+    """Points of the chassis that touch terrain or boulders are pushed out, so that it does not sink in."""
     arm = ctx.frame.to_world(ctx.rover.chassis_points)
     point = arm + ctx.position
     velocity = ctx.velocity + ctx.angular_velocity.cross(arm)
@@ -150,7 +151,7 @@ def chassis_contact(ctx, p, x, wrench):
     damping=Parameter(50.0, 0.0, (0.0, 1e6), "N m s/rad", "damping of the joint stops", "choice"),
 )
 def joint_limits(ctx, p, x, wrench):
-    """Joint stops as passive springs with damping beyond the limits, so that the solver sees equality constraints only."""
+    """Joint stops as passive springs with damping, so that the solver sees equality constraints only."""
     below = jnp.maximum(ctx.rover.joint_lower - ctx.joint_angle, 0.0)
     above = jnp.maximum(ctx.joint_angle - ctx.rover.joint_upper, 0.0)
     upward = jnp.where(below > 0.0, jnp.maximum(p.stiffness * below - p.damping * ctx.joint_speed, 0.0), 0.0)

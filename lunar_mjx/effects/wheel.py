@@ -153,7 +153,7 @@ def shear_state(ctx, p, x, wheel):
 
 
 def lateral_slip_speed(contact):
-    """Numerator of (1 - s) tan(beta) over V_r: v_y when driving, v_y (2 - r omega/v_x) when braking, m/s (eqs. 8-11)."""
+    """Numerator of (1 - s) tan(beta) over V_r: v_y driving, v_y (2 - r omega/v_x) braking, m/s (eqs. 8-11)."""
     braking = jnp.abs(contact.rim_speed) <= jnp.abs(contact.v_x)
     speed = jnp.where(jnp.abs(contact.v_x) > 1e-6, contact.v_x, 1.0)
     factor = jnp.where(braking, 2.0 - jnp.clip(contact.rim_speed / speed, -1.0, 1.0), 1.0)

@@ -1,0 +1,72 @@
+"""The rover as it is rather than as it was drawn (port `geometry`), and its parking brake."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from lunar_mjx.effects.base import Parameter, StateVariable, effect
+from lunar_mjx.spatial import Vec3
+
+_HERE = "the user's measurement"
+
+
+def _place(axis: str) -> Parameter:
+    return Parameter(0.0, None, (-10.0, 10.0), "m", f"{axis} of the payload in the chassis frame", _HERE)
+
+
+@effect(
+    "geometry",
+    mass=Parameter(0.0, 0.0, (0.0, 1e4), "kg", "payload mass", _HERE),
+    x=_place("x"),
+    y=_place("y"),
+    z=_place("z"),
+)
+def payload(ctx, p, x, geometry):
+    """A point mass fixed to the chassis: weight, inertia and centre of mass change with it."""
+    return dataclasses.replace(geometry, payload_mass=p.mass, payload_position=Vec3(p.x, p.y, p.z))
+
+
+def _shift(axis: str) -> Parameter:
+    return Parameter(0.0, 0.0, (-1.0, 1.0), "m", f"shift of the chassis' centre of mass along {axis}", _HERE)
+
+
+@effect("geometry", x=_shift("x"), y=_shift("y"), z=_shift("z"))
+def com_offset(ctx, p, x, geometry):
+    """The chassis' centre of mass lies elsewhere than drawn; its own inertia stays."""
+    return dataclasses.replace(geometry, com_offset=Vec3(p.x, p.y, p.z))
+
+
+@effect(
+    "geometry",
+    offset=Parameter(0.0, 0.0, (-0.05, 0.05), "m", "wheel radius beyond the nominal one", _HERE, axis="wheel"),
+)
+def wheel_radius_error(ctx, p, x, geometry):
+    """Wheels larger (caked soil) or smaller (wear) than drawn."""
+    return dataclasses.replace(geometry, radius=geometry.radius + p.offset)
+
+
+@effect(
+    "geometry",
+    angle=Parameter(0.0, 0.0, (-0.5, 0.5), "rad", "toe angle, positive to the left", _HERE, axis="wheel"),
+)
+def steering_toe(ctx, p, x, geometry):
+    """Each wheel's heading differs from its steering angle by a constant toe (misalignment)."""
+    return dataclasses.replace(geometry, toe=geometry.toe + p.angle)
+
+
+@effect(
+    "body_wrench",
+    state={"angle": StateVariable(0.0, "rad", "angle at which the brake caught the wheel", axis="joint")},
+    engaged=Parameter(1.0, 0.0, (0.0, 1.0), "1", "1: brake set; 0: released", "command"),
+    stiffness=Parameter(1e4, None, (1.0, 1e7), "N m/rad", "stiffness of the braked wheel", "choice"),
+    damping=Parameter(10.0, None, (0.0, 1e5), "N m s/rad", "damping of the braked wheel", "choice"),
+)
+def parking_brake(ctx, p, x, wrench):
+    """Holds every drive joint at the angle where the brake caught it, as a stiff damped spring; blocks the wheels."""
+    held = (ctx.rover.joint_group == 0) & (p.engaged > 0.5)
+    angle = jnp.where(held, x.angle, ctx.joint_angle)
+    hold = p.stiffness * (angle - ctx.joint_angle) - p.damping * ctx.joint_speed
+    torque = wrench.joint_torque + jnp.where(held, hold, 0.0)
+    return dataclasses.replace(wrench, joint_torque=torque), {"angle": angle}
