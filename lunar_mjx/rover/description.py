@@ -79,7 +79,7 @@ class Description:
     gravity: float = 1.625
     timestep: float = 0.002
     solref: tuple[float, ...] = (0.004, 1.0)
-    solimp: tuple[float, ...] = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+    solimp: tuple[float, ...] = (0.999, 0.999, 0.001, 0.5, 2.0)
     passive_damping: float = 0.0
     wheels: tuple[WheelDescription, ...] = ()
     loops: tuple[LoopDescription, ...] = ()

@@ -61,7 +61,10 @@ def load_rover(name_or_path: str | Path) -> Rover:
     data = toml.read_toml(path, "the rover file")
     toml.check_keys(path, "", data, _TOP, _TOP - {"source", "notes", "loops"})
     toml.one_of(path, "format", data["format"], (FORMAT,))
-    mjcf = require_file(folder / toml.text(path, "mjcf", data["mjcf"]), "the rover's MJCF")
+    file = toml.text(path, "mjcf", data["mjcf"])
+    if Path(file).name != file:
+        raise bad_input(path, "mjcf", file, "is not the name of a file beside it", _CONVERT_AGAIN)
+    mjcf = require_file(folder / file, "the rover's MJCF")
     try:
         model = mujoco.MjSpec.from_file(str(mjcf)).compile()
     except ValueError as error:
