@@ -3,7 +3,7 @@
 Small lunar craters are in equilibrium: N(>D) = 0.079 D^-2 per m^2 (Trask 1966: 10^10.9 D^-2 per 10^6 km^2, D in m),
 the exponent confirmed by Moore et al. (1980). A fresh crater is 0.196 of its diameter deep and its rim 0.036 high (Pike
 1977); metre-sized craters at Chang'E-4 are degraded to 0.061 on average (Wu et al. 2021). Depths are drawn
-log-uniformly between `shallowest` and `deepest`, whose defaults have that mean; the rim keeps Pike's share of the depth.
+log-uniformly between `shallowest` and `deepest`, whose defaults have that mean; the rim keeps Pike's share.
 """
 
 from __future__ import annotations

@@ -50,7 +50,14 @@ def to_mesh(terrain: Terrain, *, rocks: bool = True, solid: bool = False, depth:
             if radius > 0:
                 body = trimesh.creation.icosphere(subdivisions=2, radius=float(radius))
                 bodies.append(body.apply_translation(center.astype(np.float64)))
-    return trimesh.util.concatenate(bodies) if len(bodies) > 1 else bodies[0]
+    if len(bodies) == 1:
+        return bodies[0]
+    starts = np.cumsum([0] + [len(body.vertices) for body in bodies[:-1]])
+    return trimesh.Trimesh(
+        np.concatenate([body.vertices for body in bodies]),
+        np.concatenate([body.faces + start for body, start in zip(bodies, starts, strict=True)]),
+        process=False,
+    )
 
 
 def _quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:

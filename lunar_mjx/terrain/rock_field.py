@@ -63,7 +63,7 @@ class RockField:
         if self.abundance == 0:
             return np.zeros_like(np.asarray(diameter, float))
         grid, above = self._cumulative()
-        return np.interp(diameter, grid, above)
+        return np.asarray(np.interp(diameter, grid, above))
 
     def _cumulative(self) -> tuple[np.ndarray, np.ndarray]:
         q = 1.79 + 0.152 / self.abundance

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -83,8 +84,8 @@ def fractal(
     gain *= wanted / np.sqrt(squared)
     gain[k * longest < cell] = 0.0
     noise = rng.standard_normal((high, wide), dtype=dtype)
-    shaped = fft.irfft2(fft.rfft2(noise, workers=2) * gain.astype(dtype), s=(high, wide), workers=2)
-    heights = np.asarray(shaped[:rows, :cols], np.float64)
+    shaped: Any = fft.irfft2(fft.rfft2(noise, workers=2) * gain.astype(dtype), s=(high, wide), workers=2)
+    heights = shaped[:rows, :cols].astype(np.float64)
     return heights - heights.mean()
 
 

@@ -1,0 +1,103 @@
+"""Cropping, resampling, filling holes, and removing the steps of grey levels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lunar_mjx.errors import UserError
+from lunar_mjx.terrain import Dem, Roughness, read_dem
+from lunar_mjx.terrain.dem import fill_holes
+from lunar_mjx.terrain.dequantise import dequantise
+from lunar_mjx.terrain.roughness import fractal
+
+
+def ramp(rows=21, cols=31, cell=2.0):
+    y, x = np.mgrid[:rows, :cols] * cell
+    return Dem(0.1 * x - 0.05 * y, cell, x0=100.0, y0=-50.0)
+
+
+def test_crop_keeps_map_coordinates():
+    dem = ramp()
+    part = dem.crop(x=130.0, y=-30.0, width=20.0, height=12.0)
+    assert part.bounds == (120.0, -36.0, 140.0, -24.0)
+    np.testing.assert_array_equal(part.heights, dem.heights[7:14, 10:21])
+
+
+@pytest.mark.parametrize("rectangle", [(500, -30, 10, 10), (130, -30, 1000, 10), (130, -30, -5, 10), (130, -30, 1, 1)])
+def test_crop_outside_is_refused(rectangle):
+    with pytest.raises(UserError, match="crop"):
+        ramp().crop(*rectangle)
+
+
+@pytest.mark.parametrize("cell", [0.7, 1.0, 4.0, 5.0])
+def test_resampling_keeps_a_plane(cell):
+    new = ramp().resample(cell)
+    rows, cols = new.heights.shape
+    y, x = np.mgrid[:rows, :cols] * cell
+    inner = np.s_[2:-2, 2:-2] if cell > 2 else np.s_[:, :]  # the low-pass filter bends a ramp at its ends
+    np.testing.assert_allclose(new.heights[inner], (0.1 * x - 0.05 * y)[inner], atol=0.02 if cell > 2 else 1e-9)
+
+
+def test_coarse_resampling_does_not_alias():
+    x = np.arange(400) * 0.1
+    wave = np.tile(np.sin(2 * np.pi * x / 0.33), (400, 1))  # far below the new spacing
+    assert np.abs(Dem(wave, 0.1).resample(1.0).heights[3:-3, 3:-3]).max() < 0.02
+
+
+def test_holes_are_filled_and_counted():
+    heights = ramp().heights.copy()
+    expected = heights.copy()
+    heights[5:8, 5:9] = np.nan
+    heights[0, 0] = np.nan
+    filled, notes = fill_holes(heights, "x.tif")
+    np.testing.assert_allclose(filled[5:8, 5:9], expected[5:8, 5:9], atol=1e-9)
+    assert np.isfinite(filled).all() and "13 of 651" in notes[0]
+
+
+@pytest.mark.parametrize("hurst", [0.85, 0.95])
+def test_dequantising_comes_nearer_to_the_truth(hurst):
+    quantum = 0.2
+    truth = fractal(128, 128, 2.0, Roughness(hurst, 0.24, 2.0), np.random.default_rng(1))
+    data = np.round(truth / quantum) * quantum
+    result = dequantise(data, quantum)
+    assert np.abs(result - data).max() <= quantum / 2 + 1e-12
+
+    def slope_error(z):
+        return np.std(np.diff(z, axis=1) - np.diff(truth, axis=1))
+
+    assert np.std(result - truth) < 0.9 * np.std(data - truth)
+    assert slope_error(result) < 0.85 * slope_error(data)
+
+
+def test_dequantising_a_gentle_ramp_removes_the_staircase():
+    quantum = 0.2
+    y, x = np.mgrid[:64, :64] * 2.0
+    truth = 0.011 * x + 0.007 * y + 0.4 * np.sin(x / 25) * np.cos(y / 30)
+    result = dequantise(np.round(truth / quantum) * quantum, quantum)
+    assert np.std(result - truth) < 0.5 * quantum / np.sqrt(12)
+
+
+def test_apollo_15(apollo15):
+    raw = read_dem(apollo15, cell=2.0, height_scale=49.0, dequantise=False)
+    dem = read_dem(apollo15, cell=2.0, height_scale=49.0)
+    assert dem.heights.shape == (257, 257) and np.ptp(raw.heights) == pytest.approx(49.0)
+    quantum = 49.0 / 255
+    assert np.abs(dem.heights - raw.heights).max() <= quantum / 2 + 1e-9
+
+    def level(z):
+        return (np.abs(np.diff(z, axis=1)) < 1e-6).mean()
+
+    assert level(raw.heights) > 0.4 and level(dem.heights) < 0.01  # plateaus were 44 % of the ground
+    # Relief at 32 m is the data's own, to a part in a thousand.
+    far = [np.sqrt(np.mean((z[:, 16:] - z[:, :-16]) ** 2)) for z in (raw.heights, dem.heights)]
+    assert far[1] == pytest.approx(far[0], rel=2e-3)
+
+
+def test_not_a_grid_is_refused():
+    for heights in (np.zeros(5), np.zeros((1, 9)), np.full((3, 3), np.nan)):
+        with pytest.raises(UserError, match="heights"):
+            Dem(heights, 1.0)
+    for cell in (0.0, -1.0, float("nan")):
+        with pytest.raises(UserError, match="cell"):
+            Dem(np.zeros((3, 3)), cell)
