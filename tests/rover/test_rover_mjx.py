@@ -73,18 +73,23 @@ def test_steps_without_nan_in_float32(rover: Rover, drive: tuple[mujoco.MjModel,
 
 
 def test_accelerations_agree_with_native_mujoco(rover: Rover) -> None:
-    """One solve in each engine from the same moving state; float32 against float64."""
+    """One solve in each engine from the same moving state, with closed loops; float32 against float64."""
     model = rover.compile()
     native = mujoco.MjData(model)
     random = np.random.default_rng(1)
     native.qvel[:] = random.normal(size=model.nv) * 0.1
     native.ctrl[:] = random.normal(size=model.nu) * 10
+    if rover.loops:  # a parallelogram: the upper arm turns with the lower, the upright by the opposite angle
+        for wheel in rover.wheels:
+            rate = native.joint(wheel.suspension).qvel[0]
+            native.joint(f"{wheel.corner}_upper_pivot").qvel[:] = rate
+            native.joint(f"{wheel.corner}_upright_pivot").qvel[:] = -rate
     mx = mjx.put_model(model)
     start = mjx.make_data(mx).replace(qvel=jnp.array(native.qvel), ctrl=jnp.array(native.ctrl))
     ours = jax.jit(lambda d: mjx.forward(mx, d))(start)
     mujoco.mj_forward(model, native)
     scale = np.abs(native.qacc).max()
-    np.testing.assert_allclose(np.asarray(ours.qacc), native.qacc, atol=2e-4 * scale)
+    np.testing.assert_allclose(np.asarray(ours.qacc), native.qacc, atol=1e-3 * scale)
 
 
 def test_loops_stay_closed_in_float32(rover: Rover, drive: tuple[mujoco.MjModel, Any]) -> None:
