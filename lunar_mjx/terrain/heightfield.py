@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from lunar_mjx.pytree import pytree
 
 Scalar = Float[Array, "*batch"]
+Points = Float[ArrayLike, "*points"]
 
 
 @pytree
@@ -78,14 +79,14 @@ def bilinear(
     return low + t * (high - low), du, dv
 
 
-def _cells(field: HeightField, x: Array, y: Array) -> tuple[Array, Array]:
+def _cells(field: HeightField, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
     dtype = field.heights.dtype
     x, y = jnp.asarray(x, dtype), jnp.asarray(y, dtype)
     return (x - field.x0) / field.cell, (y - field.y0) / field.cell
 
 
 def sample(
-    field: HeightField, x: Float[Array, "*points"], y: Float[Array, "*points"]
+    field: HeightField, x: Points, y: Points
 ) -> tuple[Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"]]:
     """Height and slope of the ground below points.
 
@@ -104,20 +105,18 @@ def sample(
     return z, du / field.cell, dv / field.cell
 
 
-def height(field: HeightField, x: Float[Array, "*points"], y: Float[Array, "*points"]) -> Float[Array, "*points"]:
+def height(field: HeightField, x: Points, y: Points) -> Float[Array, "*points"]:
     """Height of the ground in m; arguments as for `sample`."""
     return sample(field, x, y)[0]
 
 
-def gradient(
-    field: HeightField, x: Float[Array, "*points"], y: Float[Array, "*points"]
-) -> tuple[Float[Array, "*points"], Float[Array, "*points"]]:
+def gradient(field: HeightField, x: Points, y: Points) -> tuple[Float[Array, "*points"], Float[Array, "*points"]]:
     """dz/dx and dz/dy of the ground; arguments as for `sample`."""
     return sample(field, x, y)[1:]
 
 
 def normal(
-    field: HeightField, x: Float[Array, "*points"], y: Float[Array, "*points"]
+    field: HeightField, x: Points, y: Points
 ) -> tuple[Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"]]:
     """Upward unit normal of the ground, as (nx, ny, nz); arguments as for `sample`."""
     _, dzdx, dzdy = sample(field, x, y)
@@ -125,7 +124,7 @@ def normal(
     return -dzdx * nz, -dzdy * nz, nz
 
 
-def slope(field: HeightField, x: Float[Array, "*points"], y: Float[Array, "*points"]) -> Float[Array, "*points"]:
+def slope(field: HeightField, x: Points, y: Points) -> Float[Array, "*points"]:
     """Steepest slope of the ground, rad, from 0 to pi/2; arguments as for `sample`."""
     _, dzdx, dzdy = sample(field, x, y)
     squared = dzdx * dzdx + dzdy * dzdy
@@ -134,7 +133,7 @@ def slope(field: HeightField, x: Float[Array, "*points"], y: Float[Array, "*poin
     return jnp.where(level, 0.0, jnp.arctan(jnp.sqrt(jnp.where(level, 1.0, squared))))
 
 
-def inside(field: HeightField, x: Float[Array, "*points"], y: Float[Array, "*points"]) -> Bool[Array, "*points"]:
+def inside(field: HeightField, x: Points, y: Points) -> Bool[Array, "*points"]:
     """Whether points lie on the grid, its edge included; false for NaN. Arguments as for `sample`."""
     rows, cols = field.heights.shape
     u, v = _cells(field, x, y)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from pathlib import Path
@@ -21,6 +22,7 @@ from lunar_mjx.terrain.rock_field import place_rocks
 from lunar_mjx.terrain.terrain import Terrain, inclined
 
 CONFIG = "terrain.toml"
+_LOG = logging.getLogger(__name__)
 _SLOPE = re.compile(r"slope:\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*deg")
 
 
@@ -84,6 +86,12 @@ def load_dem(config: TerrainConfig, name: str, folder: Path, dem: str | Path | N
         ground = read_dem(file, crop=crop, **options)
     elif config.surface is not None:
         s = config.surface
+        if config.dem is not None:
+            _LOG.warning(
+                "%s: no DEM is given, so the ground is a procedural stand-in; set %s to the DEM's path.",
+                name,
+                _variable(name),
+            )
         ground = make_surface(
             s.width, s.height, s.cell, seed, roughness=s.roughness, craters=s.craters, center=(s.x, s.y)
         )
@@ -130,7 +138,9 @@ def build_terrain(
     soil = None
     if config.soil is not None:
         soil = make_soil_patches(ground, config.soil.rock_fraction, config.soil.patch, seed, dtype)
-    return Terrain(field, rocks, soil, jnp.asarray(origin, dtype), name)
+    # Reports show the name: a stand-in shall not pass for the site.
+    stand_in = config.dem is not None and _dem_file(config, name, folder, dem) is None
+    return Terrain(field, rocks, soil, jnp.asarray(origin, dtype), f"{name} (stand-in)" if stand_in else name)
 
 
 def terrain_from_dem(dem: Dem, name: str = "dem", dtype: np.dtype | type = np.float32) -> Terrain:

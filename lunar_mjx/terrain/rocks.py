@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.pytree import pytree
-from lunar_mjx.terrain.heightfield import Scalar, grid_index, take
+from lunar_mjx.terrain.heightfield import Points, Scalar, grid_index, take
 
 CELL = 0.25
 """Default spacing of the look-up grid, m."""
@@ -43,7 +43,7 @@ class Rocks:
 
 
 def nearest_rock(
-    rocks: Rocks | None, x: Float[Array, "*points"], y: Float[Array, "*points"]
+    rocks: Rocks | None, x: Points, y: Points
 ) -> tuple[Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"]]:
     """The rock whose surface is nearest to each point in plan, as far as the look-up grid tells.
 

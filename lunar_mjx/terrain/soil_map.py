@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lunar_mjx.pytree import pytree
-from lunar_mjx.terrain.heightfield import Scalar, bilinear
+from lunar_mjx.terrain.heightfield import Points, Scalar, bilinear
 
 
 @pytree
@@ -26,9 +26,7 @@ class SoilMap:
     cell: Scalar
 
 
-def rock_fraction(
-    soil: SoilMap | None, x: Float[Array, "*points"], y: Float[Array, "*points"]
-) -> Float[Array, "*points"]:
+def rock_fraction(soil: SoilMap | None, x: Points, y: Points) -> Float[Array, "*points"]:
     """Fraction of hard rock at points, interpolated bilinearly; outside the grid that of the nearest edge point.
 
     Args:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lunar_mjx.terrain import HeightField, height, inside, normal, sample, slope
+from lunar_mjx.terrain import HeightField, gradient, height, inside, normal, sample, slope
 
 
 def make(seed=0, rows=9, cols=12, cell=0.5, x0=-2.0, y0=1.0, dtype=np.float64):
@@ -140,3 +140,15 @@ def test_kilometres_of_altitude_do_not_eat_millimetres():
     x, y = -37000 + 0.2 * 17 - origin[0], 15000 + 0.2 * 30 - origin[1]
     assert float(height(field, x, y)) + origin[2] == pytest.approx(heights[30, 17], abs=2e-5)
     assert origin.dtype == np.float64 and (origin == np.round(origin)).all()
+
+
+def test_shapes_are_those_of_the_annotations():
+    from beartype import BeartypeConf, beartype
+    from jaxtyping import TypeCheckError, jaxtyped
+
+    field = make(dtype=np.float32)
+    for function in (sample, height, gradient, normal, slope, inside):
+        checked = jaxtyped(function, typechecker=beartype(conf=BeartypeConf(is_pep484_tower=True)))
+        checked(field, jnp.zeros((2, 3)), jnp.ones((2, 3)))
+        with pytest.raises(TypeCheckError):
+            checked(field, jnp.zeros(3), jnp.zeros(4))

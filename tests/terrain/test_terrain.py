@@ -97,12 +97,20 @@ def site(tmp_path):
     return path
 
 
+def test_the_stand_in_says_that_it_is_one(caplog):
+    terrain = load_terrain("de_gerlache_rim")
+    assert terrain.name == "de_gerlache_rim (stand-in)" and "LUNAR_MJX_DEM_DE_GERLACHE_RIM" in caplog.text
+    assert terrain.origin[0] == pytest.approx(-37300, abs=3) and min(terrain.field.heights.shape) > 490
+    x, y = np.random.default_rng(0).uniform(-50, 50, (2, 2000))
+    assert 2 < float(np.degrees(np.median(slope(terrain.field, x, y)))) < 12  # ground that a rover can drive on
+
+
 @pytest.mark.parametrize("by", ["argument", "environment"])
 def test_the_users_dem_replaces_the_stand_in(site, by, monkeypatch):
     if by == "environment":
         monkeypatch.setenv("LUNAR_MJX_DEM_DE_GERLACHE_RIM", str(site))
     terrain = load_terrain("de_gerlache_rim", dem=site if by == "argument" else None)
-    assert terrain.origin[2] == pytest.approx(600, abs=4)
+    assert terrain.name == "de_gerlache_rim" and terrain.origin[2] == pytest.approx(600, abs=4)
     assert terrain.origin[0] == pytest.approx(-37300, abs=3) and terrain.origin[1] == pytest.approx(13300, abs=3)
     assert float(terrain.field.cell) == pytest.approx(0.2) and min(terrain.field.heights.shape) > 490
     bare = load_terrain(str(site))
