@@ -96,6 +96,8 @@ def test_geotiff(some):
     refused(lambda: read_dem(folder / "b.tif", crop=(1e6, 0, 10, 10)), "crop", "leaves the DEM")
     (folder / "broken.tif").write_bytes(b"II*\0 this is no raster")
     refused(lambda: read_dem(folder / "broken.tif"), "broken.tif", "cannot be read")
+    (folder / "trick.xml").write_text(f"<VRTDataset><SourceFilename>{folder / 'b.tif'}</SourceFilename></VRTDataset>")
+    refused(lambda: read_dem(folder / "trick.xml"), "trick.xml", "cannot be read")
     whole = tif(folder / "t.tif", np.zeros((300, 300))).read_bytes()
     (folder / "t.tif").write_bytes(whole[: len(whole) // 2])
     refused(lambda: read_dem(folder / "t.tif"), "t.tif", "cannot be read")

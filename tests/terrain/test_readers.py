@@ -65,6 +65,17 @@ def test_geotiff_without_georeference_takes_the_users_cell(tmp_path):
     assert read_dem(path, cell=2.0).cell == 2.0
 
 
+def test_pds4(tmp_path):
+    profile = {"height": 3, "width": 4, "count": 1, "dtype": "float32", "crs": POLAR}
+    words = {"LATITUDE_TYPE": "Planetocentric", "TARGET": "Moon"}  # what GDAL asks of a new label
+    transform = Affine(5, 0, -45000, 0, -5, 23000)
+    with rasterio.open(tmp_path / "a.xml", "w", driver="PDS4", transform=transform, **profile, **words) as raster:
+        raster.write(GRID.astype("float32"), 1)
+    dem = read_dem(tmp_path / "a.xml")
+    np.testing.assert_allclose(dem.heights, GRID[::-1])
+    assert (dem.cell, dem.x0, dem.y0) == (5.0, -44997.5, 22987.5)
+
+
 LABEL = """PDS_VERSION_ID            = "PDS3"
 RECORD_TYPE               = FIXED_LENGTH
 RECORD_BYTES              = {record}

@@ -23,7 +23,8 @@ def read_geotiff(path: Path, options: ReadOptions) -> Dem:
         with warnings.catch_warnings():
             # A raster without georeference is answered below, with what to do about it.
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as raster:
+            # One driver only: others that GDAL would try (VRT, WMS) let a file name further files and hosts.
+            with rasterio.open(path, driver="PDS4" if path.suffix.lower() == ".xml" else "GTiff") as raster:
                 return _read(path, raster, options)
     except (RasterioError, OSError) as error:
         reason = str(error).splitlines()[0]
