@@ -1,0 +1,218 @@
+"""Steady-state tables of single-wheel test beds: reading, averaging replicates, and the scatter between them."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from lunar_mjx.criticism.single_wheel import SLIP_DEFINITIONS, SPEED, WheelTest, wheel_test
+from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+
+QUANTITIES: Mapping[str, tuple[str, str, str]] = {
+    "drawbar_pull": ("drawbar_pull_N", "N", "drawbar pull"),
+    "side_force": ("side_force_N", "N", "side force"),
+    "driving_torque": ("driving_torque_Nm", "N m", "driving torque"),
+    "sinkage": ("sinkage_m", "m", "sinkage"),
+}
+"""What a test bed measures: quantity -> column, unit, name."""
+
+_REQUIRED = ("slip_ratio", "slip_angle_deg", "normal_load_N")
+_SPEEDS = ("rim_speed_m_s", "travel_speed_m_s")
+_COLUMNS = (*_REQUIRED, *_SPEEDS, *(column for column, _, _ in QUANTITIES.values()), "trial")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SteadyStateTable:
+    """A steady-state table: what was imposed and what was measured, one entry per point.
+
+    Attributes:
+      name: for messages and reports.
+      test: slip ratio, slip angle deg, normal load N and, where given, speeds m/s, by column.
+      measured: by quantity of `QUANTITIES`, in SI units; those that the table has.
+      replicates: number of runs behind each point.
+      sigma: scatter of one run about its point by quantity, pooled over the replicates; empty if there are none.
+      radius, width: of the wheel, m.
+      slip_definition: what the slip ratio compares the rim speed with.
+      source: who measured it, licence and citation, as the table's description says.
+    """
+
+    name: str
+    test: pd.DataFrame
+    measured: Mapping[str, np.ndarray]
+    replicates: np.ndarray
+    sigma: Mapping[str, float]
+    radius: float
+    width: float
+    slip_definition: str
+    source: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.test)
+
+    def select(self, keep: np.ndarray) -> SteadyStateTable:
+        """The points where `keep` is true."""
+        return dataclasses.replace(
+            self,
+            test=self.test[keep].reset_index(drop=True),
+            measured={k: v[keep] for k, v in self.measured.items()},
+            replicates=self.replicates[keep],
+        )
+
+    def at_angles(self, angles_deg: tuple[float, ...]) -> SteadyStateTable:
+        """The points at these slip angles, deg."""
+        angle = self.test["slip_angle_deg"].to_numpy()
+        return self.select(np.isclose(angle[:, None], np.asarray(angles_deg)[None, :], atol=0.01).any(axis=1))
+
+    def wheel_test(self) -> WheelTest:
+        """What a `WheelBed` has to impose to repeat the table.
+
+        Where both speeds are given they are used as they are, in proportion; slip then needs no definition.
+        """
+        columns = {name: self.test[name].to_numpy(float) for name in self.test}
+        angle, load = np.radians(columns["slip_angle_deg"]), columns["normal_load_N"]
+        if not all(speed in columns for speed in _SPEEDS):
+            return wheel_test(columns["slip_ratio"], angle, load, self.radius, self.width, self.slip_definition)
+        rim, travel = columns["rim_speed_m_s"], columns["travel_speed_m_s"]
+        scale = SPEED / np.maximum(rim, travel)
+        radius, width = np.full(len(self), self.radius), np.full(len(self), self.width)
+        return WheelTest(scale * rim, scale * travel, angle, load, radius, width)  # type: ignore[arg-type]
+
+
+def read_table(
+    path: str | Path,
+    radius: float,
+    width: float,
+    slip_definition: str,
+    name: str | None = None,
+    source: Mapping[str, str] | None = None,
+) -> SteadyStateTable:
+    """Reads a steady-state table from a CSV file, every row a run.
+
+    Args:
+      path: CSV with the columns slip_ratio, slip_angle_deg, normal_load_N, optionally rim_speed_m_s and
+        travel_speed_m_s, and at least one of drawbar_pull_N, side_force_N, driving_torque_Nm, sinkage_m.
+      radius, width: of the wheel, m.
+      slip_definition: "wheel_frame" (eq. 8, v_x = V cos beta) or "travel_speed" (V).
+      name: for reports; the file's name if None.
+      source: who measured it, licence, citation.
+
+    Raises:
+      UserError: the file or a column is missing, a column's unit is not the one of the schema, a cell is not a finite
+        number, a load is not positive, a slip ratio is outside [-1, 1], or a row occurs twice.
+    """
+    file = require_file(path, "the steady-state table")
+    for field, value in (("radius", radius), ("width", width)):
+        if require_finite(file, field, value) <= 0.0:
+            raise bad_input(file, field, value, "is not positive", "give the wheel's dimension in m")
+    if slip_definition not in SLIP_DEFINITIONS:
+        raise bad_input(file, "slip_definition", slip_definition, "does not exist",
+                        f"use one of {', '.join(SLIP_DEFINITIONS)}")  # fmt: skip
+    try:
+        frame = pd.read_csv(file)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise UserError(f"{file}: is not a CSV table ({error}); give comma-separated values with a header.") from error
+    _check_columns(file, frame)
+    numbers = _numbers(file, frame)
+    _check_values(file, numbers, slip_definition)
+    measured = {q: numbers[c].to_numpy() for q, (c, _, _) in QUANTITIES.items() if c in numbers}
+    test = numbers[[c for c in (*_REQUIRED, *_SPEEDS) if c in numbers]]
+    return SteadyStateTable(
+        name=name or file.stem,
+        test=test,
+        measured=measured,
+        replicates=np.ones(len(test), int),
+        sigma={},
+        radius=float(radius),
+        width=float(width),
+        slip_definition=slip_definition,
+        source=dict(source or {}),
+    )
+
+
+def _check_columns(file: Path, frame: pd.DataFrame) -> None:
+    if frame.empty:
+        raise UserError(f"{file}: holds no rows; give one row per run.")
+    # Two columns of one name reach us as "name" and "name.1".
+    twice = [c for c in frame if re.fullmatch(r"(.+)\.\d+", str(c)) and str(c).rsplit(".", 1)[0] in frame]
+    if twice:
+        raise bad_input(file, "column", str(twice[0]).rsplit(".", 1)[0], "occurs twice", "keep one of them")
+    stems = {re.sub(r"_(N|Nm|m|deg|m_s)$", "", column): column for column in _COLUMNS}
+    for column in map(str, frame.columns):
+        for stem, wanted in stems.items():
+            rest = column.removeprefix(stem + "_")
+            if column not in _COLUMNS and (
+                column == stem or (rest != column and "std" not in rest and "_" not in rest)
+            ):
+                raise bad_input(file, "column", column, "does not have the unit of the schema",
+                                f"convert it and call it {wanted}")  # fmt: skip
+    for column in _REQUIRED:
+        if column not in frame:
+            raise UserError(f"{file}: the column {column} is missing; the table needs {', '.join(_REQUIRED)}.")
+    if not any(column in frame for column, _, _ in QUANTITIES.values()):
+        wanted = ", ".join(column for column, _, _ in QUANTITIES.values())
+        raise UserError(f"{file}: nothing measured is in the table; give at least one of {wanted}.")
+
+
+def _numbers(file: Path, frame: pd.DataFrame) -> pd.DataFrame:
+    """The known columns as finite numbers; errors name the line of the file."""
+    known = [c for c in _COLUMNS if c in frame]
+    numbers = frame[known].apply(pd.to_numeric, errors="coerce")
+    for column in known:
+        bad = ~np.isfinite(numbers[column].to_numpy(float))
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise bad_input(file, f"line {row + 2}, {column}", frame[column].iloc[row], "is not a finite number",
+                            "correct the cell or leave the row out")  # fmt: skip
+    return numbers
+
+
+def _check_values(file: Path, numbers: pd.DataFrame, slip_definition: str) -> None:
+    def refuse(bad: Any, column: str, problem: str, remedy: str) -> None:
+        bad = np.asarray(bad)
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise bad_input(file, f"line {row + 2}, {column}", numbers[column].iloc[row], problem, remedy)
+
+    refuse(numbers["normal_load_N"] <= 0.0, "normal_load_N", "is not positive", "give the load on the wheel in N")
+    refuse(numbers["slip_ratio"].abs() > 1.0, "slip_ratio", "is outside [-1, 1]", "give slip as a ratio")
+    refuse(numbers["slip_angle_deg"].abs() > 90.0, "slip_angle_deg", "is beyond 90 deg", "give it in degrees")
+    speeds = [c for c in _SPEEDS if c in numbers]
+    for column in speeds:
+        refuse(numbers[column] < 0.0, column, "is negative", "give the magnitude in m/s")
+    if len(speeds) == 2:
+        refuse(numbers[speeds].max(axis=1) <= 0.0, speeds[0], "is zero, and so is the travel speed", "drop the row")
+    elif slip_definition == "wheel_frame":
+        refuse(numbers["slip_angle_deg"].abs() > 89.9, "slip_angle_deg", "has no slip in the wheel's frame",
+               "give both speeds, or slip by travel speed")  # fmt: skip
+    refuse(numbers.duplicated(), "slip_ratio", "begins a row that occurs twice", "remove the copy")
+
+
+def average(table: SteadyStateTable) -> SteadyStateTable:
+    """Averages replicates (same slip angle and rim speed, or slip ratio to 0.01) and pools their scatter.
+
+    Args:
+      table: one row per run.
+
+    Returns:
+      One row per point, sorted by slip angle and slip; `sigma` is the pooled standard deviation of single runs.
+    """
+    by = "rim_speed_m_s" if "rim_speed_m_s" in table.test else "slip_ratio"
+    group = [table.test["slip_angle_deg"].round(2), table.test[by].round(4 if by != "slip_ratio" else 2)]
+    keys = pd.MultiIndex.from_arrays(group)
+    order, labels = pd.factorize(keys, sort=True)
+    test = table.test.groupby(order).mean()
+    measured, sigma = {}, {}
+    freedom = len(table) - len(labels)
+    for quantity, values in table.measured.items():
+        means = pd.Series(values).groupby(order).mean().to_numpy()
+        measured[quantity] = means
+        if freedom > 0:
+            sigma[quantity] = float(np.sqrt(np.sum((values - means[order]) ** 2) / freedom))
+    count = np.bincount(order, weights=table.replicates).astype(int)
+    return dataclasses.replace(table, test=test, measured=measured, replicates=count, sigma=sigma)
