@@ -14,7 +14,7 @@ from lunar_mjx.dynamics.mjx import Kinematics, MjxEngine
 from lunar_mjx.dynamics.ports import Pipeline, apply_effects, heat_flow
 from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperature, compensated_add
 from lunar_mjx.effects.context import Context, Heat, RoverInfo
-from lunar_mjx.effects.motor import MODES, REFERENCE_TEMPERATURE, motor_current, torque_constant, winding_resistance
+from lunar_mjx.effects.motor import MODES, REFERENCE_TEMPERATURE, torque_constant, winding_resistance
 from lunar_mjx.errors import UserError
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Vec3
@@ -248,7 +248,7 @@ def _telemetry(ctx: Context, k: Kinematics, heat: Heat) -> Telemetry:
     if motor is None:
         current = voltage = joule = jnp.zeros_like(ctx.joint_angle)
     else:
-        current = motor_current(ctx)
+        current = ctx.command.current
         resistance = winding_resistance(motor, ctx.winding_temperature)
         back_emf = torque_constant(motor, ctx.winding_temperature) * motor.gear_ratio * ctx.joint_speed
         voltage, joule = current * resistance + back_emf, current**2 * resistance

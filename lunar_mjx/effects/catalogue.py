@@ -7,8 +7,8 @@ import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from lunar_mjx.effects import motor as motor_module
 from lunar_mjx.effects import chassis, paper, rock, soil, stress_integral, thermal, wheel
+from lunar_mjx.effects import motor as motor_module
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError, require_file
 
@@ -20,10 +20,12 @@ def _by_name(effects: Iterable[Effect]) -> dict[str, Effect]:
 CATALOGUE: Mapping[str, Effect] = _by_name(
     (
         motor_module.joint_control,
+        motor_module.thermal_cutoff,
         motor_module.motor,
         soil.soil,
         soil.surface_type,
         soil.hard_surface,
+        soil.soil_gradient,
         wheel.pressure_sinkage,
         wheel.shear_state,
         wheel.closed_form_shear,

@@ -10,7 +10,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from lunar_mjx.effects.base import Effect, Parameter, effect
+from lunar_mjx.effects.base import Effect, Parameter, StateVariable, effect
 
 REFERENCE_TEMPERATURE = 298.15
 """T_R0 of eqs. 6 and 7, K (25 degC): where the catalogue states resistance and torque constant."""
@@ -68,20 +68,36 @@ def torque_constant(motor, temperature):
     return motor.torque_constant * (1.0 + motor.beta * (temperature - REFERENCE_TEMPERATURE))
 
 
+@effect(
+    "command",
+    order=60,
+    state={"tripped": StateVariable(0.0, "1", "1 while the cut-off is open", axis="joint")},
+    temperature=Parameter(
+        423.15, None, (273.15, 1e4), "K", "winding temperature that cuts the current", "seed paper: 150 degC"
+    ),
+    hysteresis=Parameter(
+        20.0, 0.0, (0.0, 500.0), "K", "cooling below the cut-off before the current returns", "choice; paper: none"
+    ),
+)
+def thermal_cutoff(ctx, p, x, command):
+    """No current, hence no torque, from the moment a winding reaches 150 degC until it has cooled (seed paper III-C2).
+
+    Without hysteresis, as printed, the current returns at the next step and the motor chatters at the cut-off.
+    """
+    closes_at = p.temperature - p.hysteresis
+    stays = (x.tripped > 0.5) & (ctx.winding_temperature >= closes_at)
+    tripped = (ctx.winding_temperature >= p.temperature) | stays
+    current = jnp.where(tripped, 0.0, command.current)
+    return dataclasses.replace(command, current=current), {"tripped": jnp.where(tripped, 1.0, 0.0)}
+
+
 def _motor_torque(ctx, p, x, torque):
-    hot = ctx.winding_temperature >= p.cutoff_temperature
-    produced = p.gear_ratio * p.gear_efficiency * torque_constant(p, ctx.winding_temperature) * ctx.command.current
-    return torque + jnp.where(hot, 0.0, produced)
-
-
-def motor_current(ctx):
-    """Current that flows in the winding, A: none once the cut-off has opened the circuit."""
-    cutoff = ctx.parameters["motor"].cutoff_temperature
-    return jnp.where(ctx.winding_temperature >= cutoff, 0.0, ctx.command.current)
+    constant = torque_constant(p, ctx.winding_temperature)
+    return torque + p.gear_ratio * p.gear_efficiency * constant * ctx.command.current
 
 
 def _motor_heat(ctx, p, x, heat):
-    joule = motor_current(ctx) ** 2 * winding_resistance(p, ctx.winding_temperature)
+    joule = ctx.command.current**2 * winding_resistance(p, ctx.winding_temperature)
     one = jnp.ones_like(joule)
     return dataclasses.replace(
         heat,
@@ -133,9 +149,6 @@ motor = Effect(
             "housing time constant 10 min over R_th2; choice",
         ),
         "R_th1": Parameter(2.46, None, (1e-3, 1e4), "K/W", "thermal resistance winding to housing", _MAXON),
-        "cutoff_temperature": Parameter(
-            423.15, None, (273.15, 1e4), "K", "winding temperature that cuts the torque", "seed paper: 150 degC"
-        ),
     },
-    doc="Torque N eta K(T_R) I (eqs. 7, 15, 16), none at or above the cut-off; Joule heat I^2 R(T_R) (eqs. 1, 6).",
+    doc="Torque N eta K(T_R) I (eqs. 7, 15, 16); Joule heat I^2 R(T_R) (eqs. 1, 6).",
 )

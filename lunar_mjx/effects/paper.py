@@ -14,6 +14,7 @@ from lunar_mjx.effects.wheel import (
     entrance_angle,
     geometry_factors,
     grounded,
+    janosi,
     max_normal_stress,
     sin_difference,
 )
@@ -48,9 +49,10 @@ def printed_slip(contact):
 
 def printed_slip_angle(contact):
     """Eq. 9 as printed, within 89 deg of the axes where tan(beta) is finite; rad."""
-    speed = jnp.sqrt(contact.v_x**2 + contact.v_y**2)
-    cosine = jnp.where(speed > SPEED_FLOOR, contact.v_x / jnp.maximum(speed, SPEED_FLOOR), 1.0)
-    return jnp.sign(contact.v_y) * jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
+    moving = contact.v_x**2 + contact.v_y**2 > SPEED_FLOOR**2
+    # arccos(v_x/|v|) sign(v_y) is the arc tangent, whose derivative is finite where v_y = 0
+    angle = jnp.arctan2(contact.v_y, jnp.where(moving, contact.v_x, 1.0))
+    return jnp.where(moving & (contact.v_y != 0.0), angle, 0.0)
 
 
 @effect(
@@ -112,17 +114,19 @@ def printed_shear(ctx, p, x, wheel):
     shear_radius = p.mend_shear_radius * r_s + (1.0 - p.mend_shear_radius) * r
     drawbar = shear_radius * b * tau * a_factor - normal_radius * b * sigma_m * b_factor
     tangent = jnp.tan(jnp.clip(printed_slip_angle(contact), -1.553, 1.553))
-    lateral = jnp.where(p.mend_side > 0.5, wheel.slip_y, (1.0 - slip) * tangent)
-    side_strength = jnp.where(p.mend_side > 0.5, strength, tau)
+    mended_side = p.mend_side > 0.5
     # |tan(beta)| inside and the sign outside: opposing, also where eq. 9 puts beta beyond 90 deg
-    mobilised = -jnp.expm1(-jnp.minimum(r * jnp.abs(lateral) * theta_m / soil.shear_modulus_y, 50.0))
-    side = -jnp.sign(contact.v_y) * r_s * b * side_strength * theta_m * mobilised
+    lateral = r * jnp.abs((1.0 - slip) * tangent) * theta_m / soil.shear_modulus_y
+    printed_side = jnp.sign(contact.v_y) * tau * -jnp.expm1(-jnp.minimum(lateral, 50.0))
+    # mended, the sign is that of the displacement, so that a wheel that stands holds against the slope
+    own_side = strength * janosi(r * theta_m * wheel.slip_y, soil.shear_modulus_y)
+    side = -r_s * b * theta_m * jnp.where(mended_side, own_side, printed_side)
     theta_s = (1.0 - p.mend_side) * (ctx.steering_angle + geometry.toe)
     force = Vec3(heading * drawbar, side, normal.load + normal.damping)
     moment = Vec3(
         r * side,
         -heading * r_s * r_s * b * tau * theta_m,
-        jnp.sin(theta_m) * r * side - drawbar * b * theta_s / (8.0 * jnp.pi),
+        jnp.where(mended_side, heading, 1.0) * jnp.sin(theta_m) * r * side - drawbar * b * theta_s / (8.0 * jnp.pi),
     )
     return dataclasses.replace(wheel, force=wheel.force + force, moment=wheel.moment + moment)
 

@@ -11,6 +11,7 @@ from lunar_mjx.effects.soil import SOILS
 PRESETS: Mapping[str, tuple[str, ...]] = {
     "consistent": (
         "joint_control",
+        "thermal_cutoff",
         "motor",
         "soil",
         "surface_type",
@@ -28,6 +29,7 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
     ),
     "paper": (
         "joint_control",
+        "thermal_cutoff",
         "motor",
         "soil",
         "surface_type",
@@ -48,6 +50,7 @@ _PAPER_WINDING = WINDINGS[12]
 PRESET_PARAMETERS: Mapping[str, Mapping[str, Mapping[str, float | Mapping[str, float]]]] = {
     "consistent": {},
     "paper": {
+        "thermal_cutoff": {"hysteresis": 0.0},
         "joint_control": {"current_limit": _PAPER_WINDING["current_limit"]},
         "motor": {
             "resistance": _PAPER_WINDING["resistance"],
@@ -71,6 +74,7 @@ UNSAID: Mapping[str, str] = {
     "heat capacities C_R, C_S": "4.07 and 55 J/K: time constants of 10 s and 10 min over R_th1 and R_th2",
     "winding and magnet": "copper, alpha 0.0040 1/K; NdFeB, beta -0.0012 1/K",
     "ambient temperature T_A": "25 degC",
+    "after the cut-off": "the current returns as soon as the winding is below 150 degC again (no hysteresis)",
     "soil": "the paper's release: k_c 1e5, k_phi 1e3, n 1.1, c 462.3 Pa, phi 0.3889 rad, K_s = K_y = 0.015 m",
     "contact k_N, c_N": "5e4 N/m, 300 N s/m",
     "friction mu": "0.8, on rock and under the soil forces alike",

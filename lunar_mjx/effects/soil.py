@@ -76,3 +76,14 @@ def surface_type(ctx, p, x, ground):
 def hard_surface(ctx, p, x, ground):
     """Turns the whole terrain into hard rock, whatever the map says."""
     return dataclasses.replace(ground, rock=jnp.maximum(ground.rock, jnp.where(p.fraction > 0.5, 1.0, 0.0)))
+
+
+def _slope(direction: str) -> Parameter:
+    return Parameter(0.0, 0.0, (-10.0, 10.0), "1/m", f"relative growth of the moduli toward {direction}", "site survey")
+
+
+@effect("soil", order=-70, east=_slope("the east"), north=_slope("the north"))
+def soil_gradient(ctx, p, x, ground):
+    """Soil that grows stiffer in one direction: k_c and k_phi times exp(g_x x + g_y y)."""
+    factor = jnp.exp(jnp.clip(p.east * ctx.wheel_position.x + p.north * ctx.wheel_position.y, -5.0, 5.0))
+    return dataclasses.replace(ground, k_c=ground.k_c * factor, k_phi=ground.k_phi * factor)

@@ -1,0 +1,72 @@
+"""The seed paper's Fig. 3: 15 N m asked of all drive motors with blocked wheels, until the winding is too hot."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.dynamics import build
+from lunar_mjx.effects.presets import PRESET_PARAMETERS
+from lunar_mjx.model import make_model
+
+DESIRED_TORQUE = 15.0
+"""N m, the seed paper's."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HotMotor:
+    """One run of the experiment, for the motor that starts at the left front; arrays over time.
+
+    Attributes:
+      preset: physics of the run. time: s. winding, housing: temperatures, degC. torque: actual, at the joint, N m.
+      desired: N m. cutoff_time: when the winding passes 150 degC, s; NaN if it never does.
+    """
+
+    preset: str
+    time: np.ndarray
+    winding: np.ndarray
+    housing: np.ndarray
+    torque: np.ndarray
+    desired: float
+    cutoff_time: float
+
+
+def hot_motor(preset: str, duration: float = 14.0, rover: str = "luvmi_x") -> HotMotor:
+    """Runs the experiment on flat ground with the parking brake set.
+
+    Both presets get the motor that the preset `paper` states (winding, gear), so that they differ in physics only.
+
+    Args:
+      preset: "paper" or "consistent".
+      duration: s.
+      rover: name or folder of a rover.
+    """
+    model = make_model(rover, "flat", preset, modes={"drive": "torque"}).add("parking_brake")
+    model = model.set("motor", **PRESET_PARAMETERS["paper"]["motor"])
+    model = model.set("joint_control", **PRESET_PARAMETERS["paper"]["joint_control"])
+    if preset != "paper":
+        paper = make_model(rover, "flat", "paper")
+        model = model.replace(gains=paper.gains)
+    system = build(model)
+    drives = len(model.rover.wheels)
+    control = jnp.zeros(len(system.joint_names)).at[:drives].set(DESIRED_TORQUE)
+    every = 10
+    samples = round(duration / (every * model.timestep))
+    run = jax.jit(lambda p, s: system.rollout(p, s, jnp.tile(control, (samples, 1)), every=every)[1])
+    seen = jax.device_get(run(system.params, system.reset(system.params)))
+    winding = np.asarray(seen.winding_temperature)[:, 0] - 273.15
+    limit = float(np.max(np.asarray(model.parameters["thermal_cutoff"]["temperature"]))) - 273.15
+    above = np.flatnonzero(winding >= limit)
+    time = np.asarray(seen.time)
+    return HotMotor(
+        preset=preset,
+        time=time,
+        winding=winding,
+        housing=np.asarray(seen.housing_temperature)[:, 0] - 273.15,
+        torque=np.asarray(seen.joint_torque)[:, 0],
+        desired=DESIRED_TORQUE,
+        cutoff_time=float(time[above[0]]) if above.size else float("nan"),
+    )
