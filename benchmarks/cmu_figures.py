@@ -16,7 +16,7 @@ import pandas as pd
 import tomli_w
 
 from lunar_mjx.criticism.data_files import replicate_column
-from lunar_mjx.criticism.table import QUANTITIES, average, read_table
+from lunar_mjx.criticism.table import QUANTITIES, average, read_table, replicate_groups
 
 RADIUS, WIDTH = 0.0625, 0.05
 FOLDER = Path(__file__).resolve().parent.parent / "lunar_mjx" / "criticism" / "data"
@@ -38,12 +38,11 @@ def figures(path: Path) -> tuple[pd.DataFrame, dict[str, object]]:
     """The averaged table and its description."""
     runs = read_table(path, RADIUS, WIDTH, "travel_speed", "CMU smooth wheel", SOURCE)
     mean = average(runs)
-    frame = mean.test.copy()
-    angles, rims = (runs.test[c].round(4) for c in ("slip_angle_deg", "rim_speed_m_s"))
-    order = pd.MultiIndex.from_arrays([angles, rims]).factorize(sort=True)[0]
+    frame = pd.DataFrame(mean.test)
+    group = replicate_groups(runs)
     for quantity, values in mean.measured.items():
         frame[QUANTITIES[quantity][0]] = values
-        frame[replicate_column(quantity)] = pd.Series(runs.measured[quantity]).groupby(order).std(ddof=1).to_numpy()
+        frame[replicate_column(quantity)] = pd.Series(runs.measured[quantity]).groupby(group).std(ddof=1)
     frame["replicates"] = mean.replicates
     about = {
         "name": "CMU smooth wheel",

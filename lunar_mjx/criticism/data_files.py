@@ -40,13 +40,13 @@ def load_figures(name: str = "cmu_smooth_wheel") -> SteadyStateTable:
         raise UserError(f"load_figures: name = {name!r} does not ship with lunar-mjx; use one of {known}.")
     about: dict[str, Any] = tomllib.loads(toml.read_text(encoding="utf-8"))
     frame = pd.read_csv(csv)
-    measured = {q: frame[c].to_numpy() for q, (c, _, _) in QUANTITIES.items() if c in frame}
+    measured = {q: np.asarray(frame[c], float) for q, (c, _, _) in QUANTITIES.items() if c in frame}
     imposed = ["slip_ratio", "slip_angle_deg", "normal_load_N", "rim_speed_m_s", "travel_speed_m_s"]
     return SteadyStateTable(
         name=about["name"],
-        test=frame[imposed],
+        test={c: np.asarray(frame[c], float) for c in imposed},
         measured=measured,
-        replicates=frame["replicates"].to_numpy(int),
+        replicates=np.asarray(frame["replicates"], int),
         sigma={q: about["sigma"][QUANTITIES[q][0]] for q in measured},
         radius=about["wheel"]["radius_m"],
         width=about["wheel"]["width_m"],
@@ -59,4 +59,4 @@ def replicate_scatter(name: str = "cmu_smooth_wheel") -> dict[str, np.ndarray]:
     """Standard deviation between the replicates of every point of `load_figures(name)`, by quantity, SI units."""
     frame = pd.read_csv(_FOLDER / f"{name}.csv")
     columns = {q: replicate_column(q) for q in QUANTITIES}
-    return {q: frame[c].to_numpy() for q, c in columns.items() if c in frame}
+    return {q: np.asarray(frame[c], float) for q, c in columns.items() if c in frame}

@@ -135,12 +135,19 @@ def fit(
     base.merged({f.effect: {f.name: f.low} for f in free})
     with jax.enable_x64(True):
         evaluate, jacobian = _functions(base, seen, free)
-        points = qmc.Sobol(len(free), seed=seed).random(starts)
+        points = qmc.Sobol(len(free), rng=np.random.default_rng(seed)).random(starts)
         solutions = []
         for i, start in enumerate(points):
             # The middle of the range keeps starts away from its edges, where an exponent of 2.5 carries no load.
             x0 = 0.1 + 0.8 * start
-            solutions.append(optimize.least_squares(evaluate, x0, jacobian, bounds=(0.0, 1.0), x_scale=0.1))
+            found = optimize.least_squares(
+                evaluate,
+                x0,
+                jac=jacobian,
+                bounds=(0.0, 1.0),
+                x_scale=0.1,  # pyright: ignore[reportArgumentType]
+            )
+            solutions.append(found)
             if progress is not None:
                 progress(i + 1)
     solutions.sort(key=lambda s: s.cost)

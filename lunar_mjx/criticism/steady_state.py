@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from lunar_mjx.criticism.single_wheel import WheelBed
-from lunar_mjx.criticism.table import QUANTITIES, SteadyStateTable
+from lunar_mjx.criticism.table import QUANTITIES, SteadyStateTable, at_angles
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError
 
@@ -54,8 +54,7 @@ class Comparison:
 
     def score(self, angles_deg: tuple[float, ...]) -> float:
         """Root mean square residual over all quantities at some slip angles, in sigma."""
-        angle = self.table.test["slip_angle_deg"].to_numpy()
-        keep = np.isclose(angle[:, None], np.asarray(angles_deg)[None, :], atol=0.01).any(axis=1)
+        keep = at_angles(self.table.test["slip_angle_deg"], angles_deg)
         return _rms(np.concatenate([r[keep] for r in self.residual.values()]))
 
     def to_dict(self) -> dict[str, Any]:
@@ -137,5 +136,5 @@ def _rms(values: np.ndarray) -> float:
 
 def _worst(table: SteadyStateTable, quantity: str, predicted: np.ndarray, residual: np.ndarray) -> Worst:
     i = int(np.argmax(np.abs(residual)))
-    slip, angle = (float(table.test[c].iloc[i]) for c in ("slip_ratio", "slip_angle_deg"))
+    slip, angle = (float(table.test[c][i]) for c in ("slip_ratio", "slip_angle_deg"))
     return Worst(slip, angle, float(table.measured[quantity][i]), float(predicted[i]), float(residual[i]))

@@ -6,7 +6,6 @@ import dataclasses
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -43,7 +42,7 @@ class SteadyStateTable:
     """
 
     name: str
-    test: pd.DataFrame
+    test: Mapping[str, np.ndarray]
     measured: Mapping[str, np.ndarray]
     replicates: np.ndarray
     sigma: Mapping[str, float]
@@ -53,28 +52,27 @@ class SteadyStateTable:
     source: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.test)
+        return len(self.replicates)
 
     def select(self, keep: np.ndarray) -> SteadyStateTable:
         """The points where `keep` is true."""
         return dataclasses.replace(
             self,
-            test=self.test[keep].reset_index(drop=True),
+            test={k: v[keep] for k, v in self.test.items()},
             measured={k: v[keep] for k, v in self.measured.items()},
             replicates=self.replicates[keep],
         )
 
     def at_angles(self, angles_deg: tuple[float, ...]) -> SteadyStateTable:
         """The points at these slip angles, deg."""
-        angle = self.test["slip_angle_deg"].to_numpy()
-        return self.select(np.isclose(angle[:, None], np.asarray(angles_deg)[None, :], atol=0.01).any(axis=1))
+        return self.select(at_angles(self.test["slip_angle_deg"], angles_deg))
 
     def wheel_test(self) -> WheelTest:
         """What a `WheelBed` has to impose to repeat the table.
 
         Where both speeds are given they are used as they are, in proportion; slip then needs no definition.
         """
-        columns = {name: self.test[name].to_numpy(float) for name in self.test}
+        columns = self.test
         angle, load = np.radians(columns["slip_angle_deg"]), columns["normal_load_N"]
         if not all(speed in columns for speed in _SPEEDS):
             return wheel_test(columns["slip_ratio"], angle, load, self.radius, self.width, self.slip_definition)
@@ -82,6 +80,12 @@ class SteadyStateTable:
         scale = SPEED / np.maximum(rim, travel)
         radius, width = np.full(len(self), self.radius), np.full(len(self), self.width)
         return WheelTest(scale * rim, scale * travel, angle, load, radius, width)  # type: ignore[arg-type]
+
+
+def at_angles(slip_angle_deg: np.ndarray, wanted_deg: tuple[float, ...]) -> np.ndarray:
+    """Which points lie at one of the wanted slip angles, to 0.01 deg."""
+    near = np.abs(slip_angle_deg[:, None] - np.asarray(wanted_deg)[None, :]) < 0.01
+    return np.any(near, axis=1)
 
 
 def read_table(
@@ -120,13 +124,13 @@ def read_table(
     _check_columns(file, frame)
     numbers = _numbers(file, frame)
     _check_values(file, numbers, slip_definition)
-    measured = {q: numbers[c].to_numpy() for q, (c, _, _) in QUANTITIES.items() if c in numbers}
-    test = numbers[[c for c in (*_REQUIRED, *_SPEEDS) if c in numbers]]
+    measured = {q: numbers[c] for q, (c, _, _) in QUANTITIES.items() if c in numbers}
+    test = {c: numbers[c] for c in (*_REQUIRED, *_SPEEDS) if c in numbers}
     return SteadyStateTable(
         name=name or file.stem,
         test=test,
         measured=measured,
-        replicates=np.ones(len(test), int),
+        replicates=np.ones(len(frame), int),
         sigma={},
         radius=float(radius),
         width=float(width),
@@ -159,42 +163,58 @@ def _check_columns(file: Path, frame: pd.DataFrame) -> None:
         raise UserError(f"{file}: nothing measured is in the table; give at least one of {wanted}.")
 
 
-def _numbers(file: Path, frame: pd.DataFrame) -> pd.DataFrame:
+def _numbers(file: Path, frame: pd.DataFrame) -> dict[str, np.ndarray]:
     """The known columns as finite numbers; errors name the line of the file."""
-    known = [c for c in _COLUMNS if c in frame]
-    numbers = frame[known].apply(pd.to_numeric, errors="coerce")
-    for column in known:
-        bad = ~np.isfinite(numbers[column].to_numpy(float))
+    numbers = {}
+    for column in (c for c in _COLUMNS if c in frame):
+        values = np.asarray(pd.to_numeric(frame[column], errors="coerce"), float)
+        bad = ~np.isfinite(values)
         if bad.any():
             row = int(np.argmax(bad))
-            raise bad_input(file, f"line {row + 2}, {column}", frame[column].iloc[row], "is not a finite number",
+            raise bad_input(file, f"line {row + 2}, {column}", frame[column].to_list()[row], "is not a finite number",
                             "correct the cell or leave the row out")  # fmt: skip
+        numbers[column] = values
     return numbers
 
 
-def _check_values(file: Path, numbers: pd.DataFrame, slip_definition: str) -> None:
-    def refuse(bad: Any, column: str, problem: str, remedy: str) -> None:
-        bad = np.asarray(bad)
+def _check_values(file: Path, numbers: Mapping[str, np.ndarray], slip_definition: str) -> None:
+    def refuse(bad: np.ndarray, column: str, problem: str, remedy: str) -> None:
         if bad.any():
             row = int(np.argmax(bad))
-            raise bad_input(file, f"line {row + 2}, {column}", numbers[column].iloc[row], problem, remedy)
+            raise bad_input(file, f"line {row + 2}, {column}", float(numbers[column][row]), problem, remedy)
 
     refuse(numbers["normal_load_N"] <= 0.0, "normal_load_N", "is not positive", "give the load on the wheel in N")
-    refuse(numbers["slip_ratio"].abs() > 1.0, "slip_ratio", "is outside [-1, 1]", "give slip as a ratio")
-    refuse(numbers["slip_angle_deg"].abs() > 90.0, "slip_angle_deg", "is beyond 90 deg", "give it in degrees")
+    refuse(np.abs(numbers["slip_ratio"]) > 1.0, "slip_ratio", "is outside [-1, 1]", "give slip as a ratio")
+    refuse(np.abs(numbers["slip_angle_deg"]) > 90.0, "slip_angle_deg", "is beyond 90 deg", "give it in degrees")
     speeds = [c for c in _SPEEDS if c in numbers]
     for column in speeds:
         refuse(numbers[column] < 0.0, column, "is negative", "give the magnitude in m/s")
     if len(speeds) == 2:
-        refuse(numbers[speeds].max(axis=1) <= 0.0, speeds[0], "is zero, and so is the travel speed", "drop the row")
+        still = np.maximum(numbers[speeds[0]], numbers[speeds[1]]) <= 0.0
+        refuse(still, speeds[0], "is zero, and so is the travel speed", "drop the row")
     elif slip_definition == "wheel_frame":
-        refuse(numbers["slip_angle_deg"].abs() > 89.9, "slip_angle_deg", "has no slip in the wheel's frame",
+        refuse(np.abs(numbers["slip_angle_deg"]) > 89.9, "slip_angle_deg", "has no slip in the wheel's frame",
                "give both speeds, or slip by travel speed")  # fmt: skip
-    refuse(numbers.duplicated(), "slip_ratio", "begins a row that occurs twice", "remove the copy")
+    rows = np.column_stack(list(numbers.values()))
+    first = np.unique(rows, axis=0, return_index=True)[1]
+    copied = ~np.isin(np.arange(len(rows)), first)
+    refuse(copied, "slip_ratio", "begins a row that occurs twice", "remove the copy")
+
+
+def replicate_groups(table: SteadyStateTable) -> np.ndarray:
+    """Which point each run belongs to: same slip angle, and same rim speed (or slip ratio to 0.01).
+
+    Returns:
+      Group number of each row, counted by rising slip angle and then rim speed or slip.
+    """
+    rim = table.test.get("rim_speed_m_s")
+    second = np.round(table.test["slip_ratio"], 2) if rim is None else np.round(rim, 4)
+    keys = np.column_stack([np.round(table.test["slip_angle_deg"], 2), second])
+    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def average(table: SteadyStateTable) -> SteadyStateTable:
-    """Averages replicates (same slip angle and rim speed, or slip ratio to 0.01) and pools their scatter.
+    """Averages replicates and pools their scatter.
 
     Args:
       table: one row per run.
@@ -202,17 +222,18 @@ def average(table: SteadyStateTable) -> SteadyStateTable:
     Returns:
       One row per point, sorted by slip angle and slip; `sigma` is the pooled standard deviation of single runs.
     """
-    by = "rim_speed_m_s" if "rim_speed_m_s" in table.test else "slip_ratio"
-    group = [table.test["slip_angle_deg"].round(2), table.test[by].round(4 if by != "slip_ratio" else 2)]
-    keys = pd.MultiIndex.from_arrays(group)
-    order, labels = pd.factorize(keys, sort=True)
-    test = table.test.groupby(order).mean()
-    measured, sigma = {}, {}
-    freedom = len(table) - len(labels)
-    for quantity, values in table.measured.items():
-        means = pd.Series(values).groupby(order).mean().to_numpy()
-        measured[quantity] = means
-        if freedom > 0:
-            sigma[quantity] = float(np.sqrt(np.sum((values - means[order]) ** 2) / freedom))
-    count = np.bincount(order, weights=table.replicates).astype(int)
-    return dataclasses.replace(table, test=test, measured=measured, replicates=count, sigma=sigma)
+    group = replicate_groups(table)
+    count = np.bincount(group)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.bincount(group, weights=values) / count
+
+    measured = {q: mean(v) for q, v in table.measured.items()}
+    freedom = len(table) - len(count)
+    sigma = {}
+    if freedom > 0:
+        for q, values in table.measured.items():
+            sigma[q] = float(np.sqrt(np.sum((values - measured[q][group]) ** 2) / freedom))
+    test = {k: mean(v) for k, v in table.test.items()}
+    runs = np.bincount(group, weights=table.replicates).astype(int)
+    return dataclasses.replace(table, test=test, measured=measured, replicates=runs, sigma=sigma)
