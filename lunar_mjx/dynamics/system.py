@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lunar_mjx.dynamics.heat import step_heat
 from lunar_mjx.dynamics.mjx import Kinematics, MjxEngine
-from lunar_mjx.dynamics.ports import Pipeline, apply_effects, heat_flow
-from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperature, compensated_add
+from lunar_mjx.dynamics.ports import Pipeline, apply_effects
+from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperature
 from lunar_mjx.effects.context import Context, Heat, RoverInfo
 from lunar_mjx.effects.motor import MODES, REFERENCE_TEMPERATURE, torque_constant, winding_resistance
 from lunar_mjx.errors import UserError
@@ -126,7 +126,9 @@ class System:
         kinematics, finish = self.engine.forward(params, state.qpos, state.qvel)
         ctx = self._context(params, state, kinematics)
         forces, ctx, effects = apply_effects(self.pipeline, ctx, jnp.asarray(control, state.qpos.dtype), state.effects)
-        heat, effects, temperature = self._heat(ctx, state.temperature, effects)
+        heat, effects, temperature = step_heat(
+            self.pipeline, self.model.thermal_integrator, ctx, state.temperature, effects
+        )
         qpos, qvel = finish(forces)
         telemetry = _telemetry(ctx, kinematics, heat)
         return State(state.step + 1, qpos, qvel, temperature, effects), telemetry
@@ -177,26 +179,6 @@ class System:
             rover=jax.tree.map(lambda a: jnp.asarray(a, dtype) if a.dtype.kind == "f" else jnp.asarray(a), self.info),
             parameters={name: SimpleNamespace(**values) for name, values in params.effects.items()},
         )
-
-    def _heat(self, ctx: Context, t: Temperature, effects: Any) -> tuple[Heat, Any, Temperature]:
-        """Steps the motors' temperatures: explicit Euler (eqs. 4 and 5) or Heun's second-order method."""
-        if "heat" not in self.pipeline:
-            zero, one = jnp.zeros_like(t.winding), jnp.ones_like(t.winding)
-            return Heat(zero, zero, one, one), effects, t
-        heat, effects = heat_flow(self.pipeline, ctx, effects)
-        if self.model.thermal_integrator == "heun":
-            ahead = dataclasses.replace(
-                ctx,
-                winding_temperature=ctx.winding_temperature + ctx.dt * heat.winding / heat.winding_capacity,
-                housing_temperature=ctx.housing_temperature + ctx.dt * heat.housing / heat.housing_capacity,
-            )
-            then, _ = heat_flow(self.pipeline, ahead, effects)
-            heat = dataclasses.replace(
-                heat, winding=0.5 * (heat.winding + then.winding), housing=0.5 * (heat.housing + then.housing)
-            )
-        winding = compensated_add(t.winding, t.winding_lost, ctx.dt * heat.winding / heat.winding_capacity)
-        housing = compensated_add(t.housing, t.housing_lost, ctx.dt * heat.housing / heat.housing_capacity)
-        return heat, effects, Temperature(*winding, *housing)
 
 
 def build(model: Model, engine: str = "auto") -> System:
