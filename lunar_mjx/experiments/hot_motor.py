@@ -22,7 +22,7 @@ class HotMotor:
 
     Attributes:
       preset: physics of the run. time: s. winding, housing: temperatures, degC. torque: actual, at the joint, N m.
-      desired: N m. cutoff_time: when the winding passes 150 degC, s; NaN if it never does.
+      desired: N m. cutoff_time: when the torque drops to zero, s; NaN if it never does.
     """
 
     preset: str
@@ -58,8 +58,7 @@ def hot_motor(preset: str, duration: float = 14.0, rover: str = "luvmi_x") -> Ho
     run = jax.jit(lambda p, s: system.rollout(p, s, jnp.tile(control, (samples, 1)), every=every)[1])
     seen = jax.device_get(run(system.params, system.reset(system.params)))
     winding = np.asarray(seen.winding_temperature)[:, 0] - 273.15
-    limit = float(np.max(np.asarray(model.parameters["thermal_cutoff"]["temperature"]))) - 273.15
-    above = np.flatnonzero(winding >= limit)
+    off = np.flatnonzero(np.asarray(seen.joint_torque)[:, 0] == 0.0)
     time = np.asarray(seen.time)
     return HotMotor(
         preset=preset,
@@ -68,5 +67,5 @@ def hot_motor(preset: str, duration: float = 14.0, rover: str = "luvmi_x") -> Ho
         housing=np.asarray(seen.housing_temperature)[:, 0] - 273.15,
         torque=np.asarray(seen.joint_torque)[:, 0],
         desired=DESIRED_TORQUE,
-        cutoff_time=float(time[above[0]]) if above.size else float("nan"),
+        cutoff_time=float(time[off[0]]) if off.size else float("nan"),
     )

@@ -20,7 +20,8 @@ class SlopeRun:
 
     Attributes:
       slope_deg: inclination. speed: up the slope, m/s. rim_speed: mean of the wheels', m/s.
-      slip: 1 - speed/rim speed, of the whole rover. wheel_slip: (wheel,) mean slip ratio. sinkage: (wheel,) mean, m. torque: (wheel,) mean, N m.
+      slip: 1 - speed/rim speed, of the whole rover. wheel_slip: (wheel,) mean slip ratio.
+      sinkage: (wheel,) mean, m. torque: (wheel,) mean, N m.
     """
 
     slope_deg: float
