@@ -99,6 +99,14 @@ def pressure_sinkage(ctx, p, x, normal):
     )
 
 
+def mean_decay(q):
+    """(1 - exp(-q))/q, by its series where the quotient and its derivative would lose digits."""
+    small = q < 1e-2
+    safe = jnp.where(small, 1.0, q)
+    series = 1.0 - q / 2.0 * (1.0 - q / 3.0 * (1.0 - q / 4.0 * (1.0 - q / 5.0 * (1.0 - q / 6.0))))
+    return jnp.where(small, series, -jnp.expm1(-safe) / safe)
+
+
 def contact_length(ctx, normal):
     """Length of soil sheared between the entrance and the angle of maximum stress, m."""
     return ctx.geometry.radius * sin_difference(normal.entrance, normal.theta_m)
@@ -131,18 +139,15 @@ def shear_state(ctx, p, x, wheel):
     length = jnp.maximum(contact_length(ctx, ctx.normal), 1e-3 * ctx.geometry.radius)
     length = jnp.where(rock, p.rock_length, length)
     roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
-    turnover = jnp.abs(roll) * ctx.dt / length
-    # (1 - exp(-q))/q without 0/0 at standstill
-    safe = jnp.maximum(turnover, 1e-6)
-    kept, gained = jnp.exp(-turnover), -jnp.expm1(-safe) / safe * (ctx.dt / length)
+    # share of the way to the steady value, over the time that it would take at the first rate
+    gained = mean_decay(jnp.abs(roll) * ctx.dt / length) / length
+    held = jnp.exp(-jnp.abs(roll) * p.damping_time / length)
     lifted = airborne(contact)
 
     def advance(value, speed):
-        new = jnp.where(lifted, 0.0, kept * value + gained * speed)
-        rate = (new - value) / ctx.dt
-        return new, jnp.where(
-            lifted, 0.0, new + p.damping_time * rate * jnp.exp(-jnp.abs(roll) * p.damping_time / length)
-        )
+        rate = gained * (speed - jnp.abs(roll) * value)
+        new = value + ctx.dt * rate
+        return jnp.where(lifted, 0.0, new), jnp.where(lifted, 0.0, new + p.damping_time * rate * held)
 
     slip_x, loaded_x = advance(x.slip_x, contact.rim_speed - contact.v_x)
     slip_y, loaded_y = advance(x.slip_y, lateral_slip_speed(contact))

@@ -149,7 +149,7 @@ def heat_effects(preset: str) -> tuple[str, ...]:
 
 
 def balance(preset: str, rule: Any, ambient: float, integrator: str) -> tuple[Array, Array, Array, Array]:
-    """Heat in (Joule), stored, out (to the surroundings), and from winding to housing, J, from the temperatures alone."""
+    """Joule heat, heat stored, heat to the surroundings, and winding to housing, J, from the temperatures alone."""
     steps, dt, current = 60_000, 0.01, 0.8
     start = 290.0
     names = heat_effects(preset)
@@ -175,9 +175,7 @@ def balance(preset: str, rule: Any, ambient: float, integrator: str) -> tuple[Ar
 def test_heat_in_is_heat_stored_and_heat_out(ambient: float) -> None:
     """`consistent`, 10 minutes at 0.8 A: conservation of energy to 1e-6 of the heat that went in."""
     heat, stored, out, passed = balance("consistent", lambda y, dt: np.trapezoid(y, dx=dt), ambient, "heun")
-    print(
-        f"consistent at {ambient} K: in {heat:.1f} J, stored {stored:.1f}, out {out:.1f}, error {heat - stored - out:.1e}"
-    )
+    print(f"at {ambient} K: in {heat:.1f} J, stored {stored:.1f}, out {out:.1f}, error {heat - stored - out:.1e}")
     assert abs(heat - stored - out) < 1e-6 * heat
     assert passed > 0.1 * heat
 

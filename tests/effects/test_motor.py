@@ -1,4 +1,4 @@
-"""Motors: control modes, torque constant and resistance over temperature, cut-off, current limit (eqs. 6, 7, 15, 16)."""
+"""Motors: control modes, torque and resistance over temperature, cut-off, current limit (eqs. 6, 7, 15, 16)."""
 
 from __future__ import annotations
 
