@@ -92,10 +92,11 @@ def load_file(path: str | Path) -> dict[str, Effect]:
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-    except UserError:
-        raise
-    except Exception as error:
-        raise UserError(f"{path}: does not run: {type(error).__name__}: {error}; mend the file.") from error
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    except (Exception, SystemExit) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{path}: does not run: {type(error).__name__}: {reason}; mend the file.") from error
     found = _by_name(v for v in vars(module).values() if isinstance(v, Effect))
     if not found:
         raise UserError(f"{path}: defines no effect; decorate a function with lunar_mjx.effects.effect(port, ...).")
