@@ -9,38 +9,19 @@ is exact. Kinematics run once per step and are fresh when the effects read them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
+from lunar_mjx._quiet import mjx
+from lunar_mjx.dynamics.kinematics import Finish, Kinematics, wheel_feet
 from lunar_mjx.dynamics.ports import Forces
 from lunar_mjx.errors import UserError
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Frame, Vec3
-
-
-class Kinematics(NamedTuple):
-    """Poses and velocities in world coordinates, as the effects see them."""
-
-    position: Vec3
-    quaternion: Any
-    frame: Frame
-    velocity: Vec3
-    angular_velocity: Vec3
-    joint_angle: Any
-    joint_speed: Any
-    wheel_position: Vec3
-    wheel_axle: Vec3
-    wheel_velocity: Vec3
-    wheel_angular_velocity: Vec3
-
-
-Finish = Callable[[Forces], tuple[Any, Any]]
 
 
 class MjxEngine:
@@ -62,7 +43,7 @@ class MjxEngine:
         self._axles = np.array([model.jnt_axis[model.joint(wheel.drive).id] for wheel in rover.wheels])
         self._chassis = model.body(rover.chassis).id
         self._armature0 = np.array(model.dof_armature)
-        self.wheel_feet = _wheel_feet(model, self._wheels, self._chassis)
+        self.wheel_feet = wheel_feet(model, self._wheels, self._chassis)
         self._mjx = mjx.put_model(model)
         self._data = mjx.make_data(model)
 
@@ -157,13 +138,6 @@ class MjxEngine:
         xfrc = xfrc.at[chassis].add(row(chassis, forces.chassis_force.stack(), forces.chassis_moment.stack()))
         qfrc = jnp.zeros(m.nv, d.qpos.dtype).at[self._dadr].set(forces.joint_torque)
         return d.replace(xfrc_applied=xfrc, qfrc_applied=qfrc)
-
-
-def _wheel_feet(model: mujoco.MjModel, wheels: np.ndarray, chassis: int) -> np.ndarray:
-    """Wheel centres relative to the chassis frame at zero joint angles, (wheel, 3) m."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    return (data.xpos[wheels] - data.xpos[chassis]) @ data.xmat[chassis].reshape(3, 3)
 
 
 def _cast(leaf: Any, dtype: Any) -> Any:

@@ -1,0 +1,41 @@
+"""What every engine tells the effects, and how it is asked to end a step."""
+
+# MuJoCo ships no type stubs for its compiled module.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from lunar_mjx.dynamics.ports import Forces
+from lunar_mjx.spatial import Frame, Vec3
+
+
+class Kinematics(NamedTuple):
+    """Poses and velocities in world coordinates, as the effects see them."""
+
+    position: Vec3
+    quaternion: Any
+    frame: Frame
+    velocity: Vec3
+    angular_velocity: Vec3
+    joint_angle: Any
+    joint_speed: Any
+    wheel_position: Vec3
+    wheel_axle: Vec3
+    wheel_velocity: Vec3
+    wheel_angular_velocity: Vec3
+
+
+Finish = Callable[[Forces], tuple[Any, Any]]
+
+
+def wheel_feet(model: mujoco.MjModel, wheels: np.ndarray, chassis: int) -> np.ndarray:
+    """Wheel centres relative to the chassis frame at zero joint angles, (wheel, 3) m."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return (data.xpos[wheels] - data.xpos[chassis]) @ data.xmat[chassis].reshape(3, 3)
