@@ -143,9 +143,9 @@ def fit(
             found = optimize.least_squares(
                 evaluate,
                 x0,
-                jac=jacobian,
+                jac=jacobian,  # pyright: ignore[reportArgumentType]
                 bounds=(0.0, 1.0),
-                x_scale=0.1,  # pyright: ignore[reportArgumentType]
+                x_scale=0.1,
             )
             solutions.append(found)
             if progress is not None:

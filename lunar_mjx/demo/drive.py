@@ -1,0 +1,203 @@
+"""Drives a batch of rovers over the shipped terrain and records what they do."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from lunar_mjx.dynamics import State, System, Telemetry, build
+from lunar_mjx.effects.motor import VELOCITY
+from lunar_mjx.model import make_model
+from lunar_mjx.terrain import Terrain, sample
+
+RIM_SPEEDS = {"viper": (0.12, 0.25), "luvmi_x": (0.08, 0.15)}
+"""Least and largest commanded rim speed of a rover, m/s; VIPER's top speed is about 0.2 m/s."""
+_OTHER_SPEEDS = (0.08, 0.15)
+
+RECORDS_PER_SECOND = 10
+_CHUNK_SECONDS = 1.0
+_STEERING_AMPLITUDE = (0.08, 0.25)
+_STEERING_PERIOD = (12.0, 30.0)
+_SPIN_UP = 1.0
+"""Seconds over which the wheels come up to speed."""
+_STEEPEST = np.tan(np.radians(10.0))
+_CLEARANCE = 1.5
+"""Distance from rocks at which a rover may start, beyond the rock's radius, m."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drive:
+    """A recorded batch drive of one kind of rover; arrays are (time, rover) or (time, rover, wheel), SI units.
+
+    Attributes:
+      rover: name. mass: kg. joints, wheels: names.
+      time: (time,) s.
+      x, y, z, roll, pitch, yaw: of the chassis frame, m, rad.
+      slip, sinkage: of every wheel, eq. 8 and m. rolling: whether the wheel rolls fast enough for slip to mean
+        something.
+      winding_degC: hottest winding of every rover.
+      power: electrical power into all motors, W.
+      energy: (rover,) J. distance: (rover,) length of the path in the plane, m.
+      command_speed: (rover,) commanded rim speed, m/s.
+    """
+
+    rover: str
+    mass: float
+    wheels: tuple[str, ...]
+    time: Float[np.ndarray, "time"]
+    x: Float[np.ndarray, "time rover"]
+    y: Float[np.ndarray, "time rover"]
+    z: Float[np.ndarray, "time rover"]
+    roll: Float[np.ndarray, "time rover"]
+    pitch: Float[np.ndarray, "time rover"]
+    yaw: Float[np.ndarray, "time rover"]
+    slip: Float[np.ndarray, "time rover wheel"]
+    rolling: Any
+    sinkage: Float[np.ndarray, "time rover wheel"]
+    winding_degC: Float[np.ndarray, "time rover"]
+    power: Float[np.ndarray, "time rover"]
+    energy: Float[np.ndarray, "rover"]
+    distance: Float[np.ndarray, "rover"]
+    command_speed: Float[np.ndarray, "rover"]
+
+    @property
+    def mean_slip(self) -> Float[np.ndarray, "time rover"]:
+        """Mean over the rolling wheels; not a number where none rolls."""
+        count = self.rolling.sum(axis=-1)
+        total = np.where(self.rolling, self.slip, 0.0).sum(axis=-1)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def drive(
+    rover: str,
+    count: int,
+    seconds: float,
+    seed: int,
+    terrain: Terrain,
+    progress: Callable[[float], None] | None = None,
+) -> Drive:
+    """Drives `count` rovers of one kind from different places, headings and commands.
+
+    Args:
+      rover: name of a rover.
+      count: number of rovers.
+      seconds: of simulated time.
+      seed: of starts and commands.
+      terrain: the ground.
+      progress: called with the share done, 0 to 1.
+
+    Raises:
+      UserError: unknown rover.
+    """
+    model = make_model(rover, terrain)
+    system = build(model)
+    rng = np.random.default_rng(seed)
+    starts = _starts(terrain, count, rng)
+    hold = round(1.0 / RECORDS_PER_SECOND / system.dt)
+    controls, speed = _controls(system, count, seconds, rng)
+    state = jax.jit(jax.vmap(system.reset, in_axes=(None, 0, 0, 0)))(system.params, *map(jnp.asarray, starts))
+
+    @jax.jit
+    def run(params: Any, state: State, controls: Any) -> tuple[State, Telemetry]:
+        state, telemetry = jax.vmap(lambda s, c: system.rollout(params, s, c, hold))(state, controls)
+        # Without weak types the state comes back as it went in, and the next chunk needs no second compilation.
+        return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), state), telemetry
+
+    records: list[Telemetry] = []
+    chunk = max(1, round(_CHUNK_SECONDS * RECORDS_PER_SECOND))
+    for first in range(0, controls.shape[1], chunk):
+        part = controls[:, first : first + chunk]
+        state, telemetry = run(system.params, state, jnp.asarray(part))
+        records.append(jax.device_get(telemetry))
+        if progress is not None:
+            progress(min(1.0, (first + chunk) / controls.shape[1]))
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *records)
+    return _record(system, joined, speed)
+
+
+def _starts(terrain: Terrain, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y and yaw of every rover: a jittered grid about the origin, clear of rocks and of steep ground."""
+    rows = int(np.ceil(np.sqrt(count)))
+    spacing = 8.0
+    cells = [((i - (rows - 1) / 2) * spacing, (j - (rows - 1) / 2) * spacing) for j in range(rows) for i in range(rows)]
+    places = []
+    for cx, cy in cells[:count]:
+        for _ in range(200):
+            x, y = np.array([cx, cy]) + rng.uniform(-2.5, 2.5, 2)
+            if _good(terrain, x, y):
+                break
+        places.append((x, y))
+    x, y = np.array(places).T
+    return x, y, rng.uniform(-np.pi, np.pi, count)
+
+
+def _good(terrain: Terrain, x: float, y: float) -> bool:
+    near = np.stack(np.meshgrid(x + np.linspace(-1, 1, 5), y + np.linspace(-1, 1, 5)))
+    _, slope_x, slope_y = sample(terrain.field, jnp.asarray(near[0]), jnp.asarray(near[1]))
+    if float(jnp.max(jnp.hypot(slope_x, slope_y))) > _STEEPEST:
+        return False
+    if terrain.rocks is None:
+        return True
+    centers, radii = np.asarray(terrain.rocks.centers), np.asarray(terrain.rocks.radii)
+    apart = np.hypot(centers[:, 0] - x, centers[:, 1] - y)
+    return bool(np.all(apart > radii + _CLEARANCE))
+
+
+def _controls(
+    system: System, count: int, seconds: float, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "rover time joint"], Float[np.ndarray, "rover"]]:
+    """Constant rim speed after a ramp, and front and rear wheels that steer against each other in a slow wave."""
+    rover = system.model.rover
+    steps = max(1, round(seconds * RECORDS_PER_SECOND))
+    time = np.arange(steps) / RECORDS_PER_SECOND
+    speed = rng.uniform(*RIM_SPEEDS.get(rover.name, _OTHER_SPEEDS), count)
+    amplitude, period = rng.uniform(*_STEERING_AMPLITUDE, count), rng.uniform(*_STEERING_PERIOD, count)
+    phase = rng.uniform(0.0, 2.0 * np.pi, count)
+    ramp = np.minimum(time / _SPIN_UP, 1.0)
+    wave = amplitude[:, None] * np.sin(2.0 * np.pi * time[None, :] / period[:, None] + phase[:, None]) * ramp
+    controls = np.zeros((count, steps, len(system.joint_names)))
+    for wheel in rover.wheels:
+        rate = speed[:, None] / wheel.radius * ramp
+        at = system.joint_names.index(wheel.drive)
+        assert int(system.info.mode[at]) == VELOCITY
+        controls[:, :, at] = rate
+        if wheel.steer is not None:
+            controls[:, :, system.joint_names.index(wheel.steer)] = wave if wheel.corner.endswith("f") else -wave
+    return controls, speed
+
+
+def _record(system: System, t: Telemetry, speed: np.ndarray) -> Drive:
+    """From telemetry with axes (rover, time, ...) to a `Drive` with axes (time, rover, ...)."""
+
+    def turned(value: Any) -> np.ndarray:
+        return np.swapaxes(np.asarray(value, float), 0, 1)
+
+    x, y = turned(t.position.x), turned(t.position.y)
+    rim = turned(t.joint_speed)[..., : len(system.model.rover.wheels)] * np.asarray(system.info.wheel_radius)
+    power = turned(t.voltage * t.current).sum(axis=-1)
+    return Drive(
+        rover=system.model.rover.name,
+        mass=system.model.rover.mass,
+        wheels=tuple(w.corner for w in system.model.rover.wheels),
+        time=np.asarray(t.time[0], float),
+        x=x,
+        y=y,
+        z=turned(t.position.z),
+        roll=turned(t.euler.x),
+        pitch=turned(t.euler.y),
+        yaw=turned(t.euler.z),
+        slip=turned(t.slip),
+        rolling=np.abs(rim) > 0.02,
+        sinkage=turned(t.sinkage),
+        winding_degC=turned(t.winding_temperature).max(axis=-1) - 273.15,
+        power=power,
+        energy=power.sum(axis=0) / RECORDS_PER_SECOND,
+        distance=np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)).sum(axis=0),
+        command_speed=speed,
+    )

@@ -1,0 +1,177 @@
+"""The figures of the demonstration."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+from PIL import Image
+from plotly.subplots import make_subplots
+
+from lunar_mjx.criticism import SteadyStateTable, replicate_scatter
+from lunar_mjx.demo.drive import Drive
+from lunar_mjx.demo.wheel import Case, dense_curve
+from lunar_mjx.report.style import BLUE, INK, MEASURED, SERIES, VERMILION, Series, faded, finish
+from lunar_mjx.terrain import Terrain
+
+ROVERS = {"viper": ("VIPER", BLUE), "luvmi_x": ("LUVMI-X", VERMILION)}
+_MARGIN = 5.0
+_SUN = (np.radians(315.0), np.radians(20.0))
+"""Azimuth (clockwise from north) and elevation of the light that shades the relief."""
+
+CASE_STYLE: dict[str, Series] = {
+    "paper": SERIES[0],
+    "consistent": SERIES[1],
+    "paper, refitted": SERIES[4],
+    "consistent, refitted": SERIES[2],
+}
+WHEEL_ROWS = (
+    ("drawbar_pull", "drawbar pull, N", 1.0),
+    ("side_force", "side force, N", 1.0),
+    ("sinkage", "sinkage, mm", 1e3),
+)
+
+
+def paths_figure(drives: Sequence[Drive], terrain: Terrain) -> go.Figure:
+    """The rovers' paths on the shaded relief of the ground that they cover."""
+    figure = go.Figure()
+    xs, ys = (np.concatenate([getattr(d, k).ravel() for d in drives]) for k in ("x", "y"))
+    image, box = _relief(terrain, (xs.min(), xs.max()), (ys.min(), ys.max()))
+    west, east, south, north = box
+    figure.add_layout_image(source=image, xref="x", yref="y", x=west, y=north, sizex=east - west,
+                            sizey=north - south, sizing="stretch", layer="below")  # fmt: skip
+    _add_rocks(figure, terrain, box)
+    for d in drives:
+        name, colour = ROVERS.get(d.rover, (d.rover, INK))
+        for i in range(d.x.shape[1]):
+            figure.add_scatter(
+                x=d.x[::5, i].round(3), y=d.y[::5, i].round(3), mode="lines", name=name, legendgroup=name,
+                showlegend=i == 0, line={"color": colour, "width": 3}, hovertemplate=f"{name} {i + 1}<extra></extra>",
+            )  # fmt: skip
+        figure.add_scatter(
+            x=d.x[0].round(3), y=d.y[0].round(3), mode="markers", name=f"start of {name}", hoverinfo="skip",
+            marker={"symbol": "circle" if d.rover == "viper" else "square", "size": 8, "color": "white",
+                    "line": {"color": colour, "width": 2}},
+        )  # fmt: skip
+    finish(figure, 820)
+    figure.update_xaxes(title_text="east, m", range=[west, east], constrain="domain", showgrid=False)
+    figure.update_yaxes(
+        title_text="north, m", range=[south, north], scaleanchor="x", constrain="domain", showgrid=False
+    )
+    return figure
+
+
+def _relief(
+    terrain: Terrain, x: tuple[float, float], y: tuple[float, float]
+) -> tuple[str, tuple[float, float, float, float]]:
+    """Shaded relief as a PNG data URI, and its west, east, south and north, m."""
+    field = terrain.field
+    heights, cell = np.asarray(field.heights, float), float(field.cell)
+    x0, y0 = float(field.x0), float(field.y0)
+    rows, columns = heights.shape
+    i0, i1 = (int(np.clip((v - x0) / cell, 0, columns - 1)) for v in (x[0] - _MARGIN, x[1] + _MARGIN))
+    j0, j1 = (int(np.clip((v - y0) / cell, 0, rows - 1)) for v in (y[0] - _MARGIN, y[1] + _MARGIN))
+    step = max(1, round(max(i1 - i0, j1 - j0) / 700))
+    part = heights[j0 : j1 + 1 : step, i0 : i1 + 1 : step]
+    slope_y, slope_x = np.gradient(part, cell * step)
+    azimuth, elevation = _SUN
+    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    light = (-slope_x * sun[0] - slope_y * sun[1] + sun[2]) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
+    grey = np.clip(150 + 240 * (light - np.sin(elevation)), 60, 235).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(grey[::-1]).save(file, "PNG", optimize=True)
+    uri = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
+    half = 0.5 * cell * step
+    height, width = part.shape
+    west, south = x0 + i0 * cell - half, y0 + j0 * cell - half
+    return uri, (west, west + width * cell * step, south, south + height * cell * step)
+
+
+def _add_rocks(figure: go.Figure, terrain: Terrain, box: tuple[float, float, float, float]) -> None:
+    if terrain.rocks is None:
+        return
+    centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
+    shapes = []
+    for (x, y, _), r in zip(centers, radii, strict=True):
+        if r > 0.0 and box[0] < x < box[1] and box[2] < y < box[3]:
+            shapes.append({"type": "circle", "x0": x - r, "x1": x + r, "y0": y - r, "y1": y + r, "line": {"width": 0.5},
+                           "fillcolor": "#3a3a3a"})  # fmt: skip
+    figure.update_layout(shapes=shapes)
+    if shapes:
+        figure.add_scatter(x=[None], y=[None], mode="markers", name="rock", marker={"color": "#3a3a3a", "size": 9})
+
+
+def history_figure(drives: Sequence[Drive], individuals: int = 3) -> go.Figure:
+    """Slip, sinkage and winding temperature over time: median and range over the batch, and a few individuals."""
+    rows = ("mean slip of the wheels", "deepest wheel's sinkage, mm", "hottest winding, °C")
+    figure = make_subplots(
+        rows=3, cols=len(drives), shared_xaxes=True, vertical_spacing=0.05, horizontal_spacing=0.08,
+        column_titles=[ROVERS.get(d.rover, (d.rover, INK))[0] for d in drives],
+    )  # fmt: skip
+    for column, d in enumerate(drives, 1):
+        colour = ROVERS.get(d.rover, (d.rover, INK))[1]
+        for row, values in enumerate((d.mean_slip, 1e3 * d.sinkage.max(axis=-1), d.winding_degC), 1):
+            _band(figure, d.time, values, colour, row, column, individuals, legend=row == 1 and column == 1)
+    finish(figure, 760, margin={"l": 70, "r": 16, "t": 90, "b": 52})
+    figure.update_layout(legend={"y": 1.06})
+    for row, title in enumerate(rows, 1):
+        figure.update_yaxes(title_text=title, row=row, col=1)
+    figure.update_xaxes(title_text="time, s", row=3)
+    return figure
+
+
+def _band(figure, time, values, colour, row, column, individuals, legend) -> None:
+    """One panel. Slip is not a number until the wheels roll; the band then starts later."""
+    known = np.isfinite(values).any(axis=1)
+    time, values = time[known].round(3), values[known]
+    low, middle, high = (f(values, axis=1).round(4) for f in (np.nanmin, np.nanmedian, np.nanmax))
+    place = {"row": row, "col": column}
+    figure.add_scatter(x=time, y=high, mode="lines", line={"width": 0}, showlegend=False, hoverinfo="skip", **place)
+    figure.add_scatter(x=time, y=low, mode="lines", line={"width": 0}, fill="tonexty", fillcolor=faded(colour, 0.2),
+                       name="range over the batch", showlegend=legend, hoverinfo="skip", **place)  # fmt: skip
+    for i in range(min(individuals, values.shape[1])):
+        figure.add_scatter(x=time, y=values[:, i].round(4), mode="lines", name="single rovers",
+                           showlegend=legend and i == 0, legendgroup="single",
+                           line={"color": faded(colour, 0.65), "width": 1, "dash": ("solid", "dot", "dash")[i % 3]},
+                           hovertemplate=f"rover {i + 1}: %{{y}}<extra></extra>", **place)  # fmt: skip
+    figure.add_scatter(x=time, y=middle, mode="lines", name="median", line={"color": INK, "width": 2.5},
+                       showlegend=legend, hovertemplate="median: %{y}<extra></extra>", **place)  # fmt: skip
+
+
+def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequence[float], beds: Sequence) -> go.Figure:
+    """Drawbar pull, side force and sinkage over slip, a column per slip angle; error bars are the replicates' scatter."""
+    rows = [row for row in WHEEL_ROWS if row[0] in table.measured]
+    scatter = replicate_scatter()
+    figure = make_subplots(
+        rows=len(rows), cols=len(angles), shared_xaxes=True, shared_yaxes=True, vertical_spacing=0.035,
+        horizontal_spacing=0.012, column_titles=[f"{a:g}°" for a in angles],
+    )  # fmt: skip
+    for column, angle in enumerate(angles, 1):
+        here = np.abs(table.test["slip_angle_deg"] - angle) < 0.01
+        curves = [dense_curve(bed, table, angle) for bed in beds]
+        for row, (quantity, _, scale) in enumerate(rows, 1):
+            place, legend = {"row": row, "col": column}, row == 1 and column == 1
+            for case, curve in zip(cases, curves, strict=True):
+                style = CASE_STYLE.get(case.name, SERIES[3])
+                figure.add_scatter(
+                    x=curve["slip_ratio"].round(3), y=(scale * curve[quantity]).round(3), mode="lines", name=case.name,
+                    line={"color": style.colour, "dash": style.dash, "width": 2}, showlegend=legend,
+                    legendgroup=case.name, hovertemplate=f"{case.name}: %{{y}}<extra></extra>", **place,
+                )  # fmt: skip
+            figure.add_scatter(
+                x=table.test["slip_ratio"][here].round(3), y=(scale * table.measured[quantity][here]).round(3),
+                error_y={"type": "data", "array": (scale * scatter[quantity][here]).round(3), "thickness": 1.2, "width": 3},
+                mode="markers", name="measured (mean and scatter of 3 runs)", showlegend=legend, legendgroup="measured",
+                marker={"color": MEASURED.colour, "size": 6, "symbol": MEASURED.symbol},
+                hovertemplate="measured: %{y}<extra></extra>", **place,
+            )  # fmt: skip
+    finish(figure, 820, margin={"l": 66, "r": 12, "t": 96, "b": 52})
+    figure.update_layout(legend={"y": 1.06})
+    for row, (_, title, _) in enumerate(rows, 1):
+        figure.update_yaxes(title_text=title, row=row, col=1)
+    figure.update_xaxes(dtick=0.5, range=[-1.08, 1.0])
+    figure.update_xaxes(title_text="slip ratio", row=len(rows))
+    return figure

@@ -1,0 +1,194 @@
+"""What the demonstration's page says, in words and tables."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from importlib import metadata
+
+import numpy as np
+
+from lunar_mjx import __version__
+from lunar_mjx.criticism import SteadyStateTable
+from lunar_mjx.criticism.fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, held_out_rms
+from lunar_mjx.criticism.steady_state import as_bed
+from lunar_mjx.criticism.table import QUANTITIES
+from lunar_mjx.demo.drive import Drive
+from lunar_mjx.demo.figures import ROVERS, history_figure, paths_figure, wheel_figure
+from lunar_mjx.demo.wheel import Case
+from lunar_mjx.report.page import Facts, Figure, Section, Table, Text
+from lunar_mjx.terrain import Terrain
+
+_UPSET = 60.0
+"""Roll or pitch beyond which a rover counts as rolled over, deg."""
+
+
+def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
+    """What was found, a sentence each."""
+    count = sum(d.x.shape[1] for d in drives)
+    bad = sum(int((~np.isfinite(d.x)).any(axis=0).sum()) for d in drives)
+    upset = sum(
+        int((np.degrees(np.maximum(np.abs(d.roll), np.abs(d.pitch))).max(axis=0) > _UPSET).sum()) for d in drives
+    )
+    drove = ", ".join(
+        f"{d.x.shape[1]} {_name(d)}s {np.median(d.distance):.1f} m at {100 * np.nanmedian(d.mean_slip):.0f} % slip and "
+        f"{1e3 * np.median(d.sinkage):.0f} mm sinkage (medians)" for d in drives
+    )  # fmt: skip
+    named = {c.name: c for c in cases}
+    plain, paper, fitted = named["consistent"], named["paper"], named["consistent, refitted"]
+    assert fitted.fit is not None
+    quantity = max(QUANTITIES.keys() & fitted.comparison.rms.keys(), key=lambda q: held_out_rms(fitted.comparison, q))
+    return [
+        f"{count} rovers drove {drives[0].time[-1]:.0f} s on true-scale terrain: {drove}. "
+        f"{bad or 'None'} failed numerically, {upset or 'none'} rolled over.",
+        f"With nominal soils, the wheel of {paper.name} misses the measurements by {paper.comparison.overall:.0f} times the "
+        f"scatter of single runs, that of {plain.name} by {plain.comparison.overall:.0f} times.",
+        f"Refitting the soil of {plain.name} at {_angles(FIT_ANGLES)} leaves {fitted.fit.held_out:.1f} times the scatter at "
+        f"slip angles that the fit did not see ({fitted.fit.inside:.1f} inside the fitted range, {fitted.fit.beyond:.1f} "
+        f"beyond it), most of it in the {QUANTITIES[quantity][2]}: physics is missing, not only parameters.",
+    ]
+
+
+def _name(d: Drive) -> str:
+    return ROVERS.get(d.rover, (d.rover, ""))[0]
+
+
+def _angles(angles: Sequence[float]) -> str:
+    return ", ".join(f"{a:g}" for a in angles) + " deg"
+
+
+def driving_section(drives: Sequence[Drive], terrain: Terrain) -> Section:
+    """Paths, histories and a table of the batch."""
+    rows = []
+    for d in drives:
+        slip = np.nanmean(d.mean_slip, axis=0) if np.isfinite(d.mean_slip).all(axis=0).all() else _mean_slip(d)
+        for label, pick in (("median", np.nanmedian), ("least", np.nanmin), ("most", np.nanmax)):
+            rows.append([
+                f"{_name(d)}, {d.mass:.0f} kg, {label}", f"{pick(d.command_speed):.2f}", f"{pick(d.distance):.2f}",
+                f"{pick(slip):.2f}", f"{1e3 * pick(d.sinkage.mean(axis=(0, 2))):.1f}",
+                f"{1e3 * pick(d.sinkage.max(axis=(0, 2))):.1f}", f"{pick(d.winding_degC.max(axis=0)):.1f}",
+                f"{pick(d.energy) / 1e3:.2f}", f"{np.degrees(pick(np.abs(d.roll).max(axis=0))):.1f}",
+            ])  # fmt: skip
+    header = ["rover", "commanded rim speed, m/s", "distance, m", "mean slip", "mean sinkage, mm", "largest sinkage, mm",
+              "hottest winding, °C", "electrical energy, kJ", "largest roll, deg"]  # fmt: skip
+    about = (
+        f"All rovers share the model preset consistent and the soil of the Lunar Sourcebook, and differ in place, heading, "
+        f"speed and steering. The ground is the shipped terrain {terrain.name} at true scale; no two rovers meet. Motors "
+        "start at 25 °C."
+    )
+    return Section(
+        "Rovers on the Moon",
+        [
+            Text([about]),
+            Figure(paths_figure(drives, terrain),
+                   "Paths on the shaded relief, lit from the north-west at 20 deg; dark discs are rocks."),  # fmt: skip
+            Figure(history_figure(drives), "Slip by eq. 8 in the wheel's frame, mean over the wheels that turn; sinkage of "
+                   "the deepest wheel; temperature of the hottest of the twelve motors. Peaks are craters and rocks."),
+            Table("What the batch did: over the rovers of each kind, column by column", header, rows,
+                  "Sinkage is measured from the undisturbed ground. Energy counts voltage times current of all motors."),
+        ],
+    )  # fmt: skip
+
+
+def _mean_slip(d: Drive) -> np.ndarray:
+    known = np.isfinite(d.mean_slip)
+    total = np.where(known, d.mean_slip, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+
+
+def wheel_section(cases: Sequence[Case]) -> Section:
+    """The wheel against the test bed: panels, errors, where they are worst, and the fitted values."""
+    table = cases[0].comparison.table
+    angles = sorted({round(float(a), 2) for a in table.test["slip_angle_deg"]})
+    beds = [case.fit.bed if case.fit else as_bed(case.name) for case in cases]
+    caption = (
+        "Columns are slip angles; slip compares the rim speed with the travel speed. Each curve follows the measured load "
+        f"from point to point. Fitted at {_angles(FIT_ANGLES)}; held out at {_angles(INSIDE_ANGLES + BEYOND_ANGLES)}; "
+        f"{_angles(APART_ANGLES)} set apart, because the wheel sinks to its axle there."
+    )
+    sigma = ", ".join(f"{QUANTITIES[q][2]} {_scatter(q, s)}" for q, s in table.sigma.items())
+    return Section(
+        "The wheel against measurements",
+        [
+            Text([f"The same wheel-soil functions that drive the rovers above, in the test bed of {table.name}: imposed slip, "
+                  f"slip angle and load. Errors are in units of the scatter of single runs about their mean: {sigma}."]),
+            Figure(wheel_figure(cases, table, angles, beds), caption),
+            _error_table(cases),
+            _worst_table(cases),
+            _fit_table(cases),
+        ],
+    )  # fmt: skip
+
+
+def _scatter(quantity: str, sigma: float) -> str:
+    unit = QUANTITIES[quantity][1]
+    return f"{1e3 * sigma:.2f} mm" if unit == "m" else f"{sigma:.2f} {unit}"
+
+
+def _error_table(cases: Sequence[Case]) -> Table:
+    quantities = list(cases[0].comparison.rms)
+    rows = []
+    for case in cases:
+        c = case.comparison
+        rows.append([case.name, case.soil, *(f"{c.rms[q]:.1f}" for q in quantities), f"{c.overall:.1f}",
+                     *(f"{v:.1f}" for v in case.scores().values())])  # fmt: skip
+    header = ["model", "soil", *(QUANTITIES[q][2] for q in quantities), "all", f"fitted ({_angles(FIT_ANGLES)})",
+              f"held out inside ({_angles(INSIDE_ANGLES)})", f"beyond ({_angles(BEYOND_ANGLES)})",
+              f"apart ({_angles(APART_ANGLES)})"]  # fmt: skip
+    note = (
+        "A model as good as a repeated run would score about 1. Nominal soils are never fitted to these measurements."
+    )
+    return Table("Root mean square error, in scatter of single runs", header, rows, note)
+
+
+def _worst_table(cases: Sequence[Case]) -> Table:
+    rows = []
+    for case in cases:
+        for quantity, w in case.comparison.worst.items():
+            _, unit, name = QUANTITIES[quantity]
+            scale, shown = (1e3, "mm") if unit == "m" else (1.0, unit)
+            rows.append([case.name, name, f"{w.slip_ratio:.2f}", f"{w.slip_angle_deg:g}",
+                         f"{scale * w.measured:.1f} {shown}", f"{scale * w.predicted:.1f} {shown}", f"{w.residual:+.0f}"])  # fmt: skip
+    header = ["model", "quantity", "slip ratio", "slip angle, deg", "measured", "model", "error, scatter"]
+    return Table("Where each model is worst", header, rows)
+
+
+def _fit_table(cases: Sequence[Case]) -> Table:
+    rows = []
+    for case in cases:
+        if case.fit is None:
+            continue
+        for effect, values in case.fit.values.items():
+            for name, value in values.items():
+                edge = "at the edge of its range" if f"{effect}.{name}" in case.fit.at_bound else ""
+                unit = next(e.parameters[name].unit for e in case.fit.bed.effects if e.name == effect)
+                rows.append([case.name, f"{effect}.{name}", f"{value:.4g}", unit, edge])
+    starts = "; ".join(f"{c.name}: {c.fit.agreeing} of {len(c.fit.starts)}" for c in cases if c.fit)
+    note = (
+        "k_c and k_phi act only through k_c/b + k_phi on one wheel width: k_c is held at 0 and k_phi stands for that sum. "
+        f"Starts that agree with the best: {starts}. Values are those that these equations need, not the sand's own."
+    )
+    return Table("Refitted values", ["model", "parameter", "value", "unit", ""], rows, note)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what made the report."""
+    packages = ("jax", "mujoco", "mujoco-mjx", "numpy", "scipy")
+    return {"lunar-mjx": __version__, "python": platform.python_version(), **{p: metadata.version(p) for p in packages}}
+
+
+def provenance_section(table: SteadyStateTable, terrain: str, seed: int) -> Section:
+    """Where everything came from."""
+    pairs = [
+        ("Measurements", table.source.get("citation", "")),
+        ("Measured by", table.source.get("who", "")),
+        ("Licence of the measurements", table.source.get("licence", "")),
+        ("Wheel", f"smooth, radius {1e3 * table.radius:g} mm, width {1e3 * table.width:g} mm (the radius is given as 58 mm "
+         "in another publication of the group)"),
+        ("Points", f"{len(table)}, each the mean of {int(table.replicates.min())} or more runs"),
+        ("Slip definition", "rim speed against travel speed in the table; the model is given both speeds and forms the slip "
+         "of the wheel's frame (eq. 8) itself"),
+        ("Drive", f"preset consistent, terrain {terrain}, time step 2 ms, float32, seed {seed}"),
+        ("Versions", ", ".join(f"{k} {v}" for k, v in versions().items())),
+    ]  # fmt: skip
+    return Section("Where this comes from", [Facts(pairs)])

@@ -1,0 +1,53 @@
+"""Progress of a long command: a bar with the time left on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Reporter = Callable[[str, float], None]
+"""Takes what is being done, and the share of the whole that is done, 0 to 1."""
+
+_LINE_EVERY = 5.0
+"""Seconds between plain lines."""
+
+
+def silent(what: str, done: float) -> None:
+    """A reporter that shows nothing."""
+
+
+@contextmanager
+def console_progress(console: Console | None = None) -> Iterator[Reporter]:
+    """A reporter to standard error: a bar on a terminal, else a line at most every five seconds and at each stage."""
+    console = console or Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines(console)
+        return
+    columns = (TextColumn("{task.description:32}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
+               TextColumn("left"), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("starting", total=1.0)
+
+        def report(what: str, done: float) -> None:
+            bar.update(task, description=what, completed=done)
+
+        yield report
+
+
+def _lines(console: Console) -> Reporter:
+    start, last, stage = time.monotonic(), -_LINE_EVERY, ""
+
+    def report(what: str, done: float) -> None:
+        nonlocal last, stage
+        now = time.monotonic() - start
+        if what == stage and now - last < _LINE_EVERY:
+            return
+        last, stage = now, what
+        left = f", about {now * (1.0 - done) / done:.0f} s left" if done > 0.02 else ""
+        console.print(f"{100 * done:3.0f} %  {what} ({now:.0f} s{left})", highlight=False, markup=False)
+
+    return report
