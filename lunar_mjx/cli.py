@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
+from typer.core import TyperGroup
 
 from lunar_mjx import __version__
 from lunar_mjx.errors import EXIT_STATUS, UserError, bad_input
 
+INTERRUPTED = 130
+
+
+class _Interrupted(BaseException):
+    """Control-C, kept from Typer, which would exit without a word."""
+
+
+class _Commands(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise _Interrupted from None
+
+
 app = typer.Typer(
     name="lunar-mjx",
+    cls=_Commands,
     help="Lunar rovers on MuJoCo MJX: simulate thousands, hold the model against measurements.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -58,10 +74,18 @@ def select_device(device: str) -> None:
         )  # fmt: skip
 
 
+def check_folder(out: Path) -> None:
+    """Refuses, before any work is done, an output folder that is a file or lies in one."""
+    for path in (out, *out.parents):
+        if path.exists():
+            if not path.is_dir():
+                raise bad_input("lunar-mjx", "--out", str(out), f"is not a folder: {path} is a file", "name a folder")
+            return
+
+
 def make_folder(out: Path) -> Path:
-    """Makes the output folder; refuses a path that is a file."""
-    if out.exists() and not out.is_dir():
-        raise bad_input("lunar-mjx", "--out", str(out), "is a file", "name a folder")
+    """Makes the output folder."""
+    check_folder(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -71,9 +95,17 @@ def make_folder(out: Path) -> Path:
     return out
 
 
+def check_finite(**options: float) -> None:
+    """Refuses numbers such as nan and inf, which the command line takes for numbers."""
+    for name, value in options.items():
+        if not math.isfinite(value):
+            raise bad_input("lunar-mjx", f"--{name.replace('_', '-')}", value, "is not finite", "give a finite number")
+
+
 @app.command()
 def demo(out: OutOption = Path("runs/demo"), device: DeviceOption = "auto") -> None:
     """Drive VIPERs and LUVMI-Xs over lunar terrain, and hold the wheel model against a measured wheel."""
+    check_folder(out)
     select_device(device)
     from lunar_mjx.demo import run_demo
 
@@ -91,14 +123,14 @@ def convert(
     name: Annotated[str | None, typer.Option(help="Name of the rover; the URDF's if left out.")] = None,
 ) -> None:
     """Convert a URDF (and the loop closures that it cannot express) into an MJCF rover folder."""
+    check_folder(out)
     from lunar_mjx.rover import convert as convert_urdf
 
     rover = convert_urdf(urdf, out, description, name)
-    console = Console()
-    console.print(f"{rover.name}: {rover.mass:g} kg, {len(rover.wheels)} wheels, {len(rover.joints)} motors, "
-                  f"{len(rover.loops)} loops", highlight=False)  # fmt: skip
+    print(f"{rover.name}: {rover.mass:g} kg, {len(rover.wheels)} wheels, {len(rover.joints)} motors, "
+          f"{len(rover.loops)} loops")  # fmt: skip
     for note in rover.notes:
-        console.print(f"note: {note}", highlight=False)
+        print(f"note: {note}")
     print(rover.mjcf)
 
 
@@ -109,6 +141,9 @@ def simulate(
     rover: RoverOption = "viper",
     terrain: TerrainOption = "lunar_plain",
     preset: PresetOption = "consistent",
+    effects: Annotated[
+        list[str] | None, typer.Option(help="Effect to add: catalogue name, my_effects.py or my_effects.py:name.")
+    ] = None,
     commands: Annotated[Path | None, typer.Option(help="CSV of commands; overrides --drive and --steer.")] = None,
     drive: Annotated[float, typer.Option(help="Command of every drive joint, in its mode's unit.")] = 0.4,
     steer: Annotated[float, typer.Option(help="Command of every front steering joint, rad.")] = 0.0,
@@ -119,22 +154,21 @@ def simulate(
     device: DeviceOption = "auto",
 ) -> None:
     """Drive one rover and write its telemetry as a table of log channels."""
+    check_folder(out)
+    check_finite(drive=drive, steer=steer, duration=duration, x=x, y=y, yaw_deg=yaw_deg)
     select_device(device)
-    import math
-
     from lunar_mjx.model import make_model
     from lunar_mjx.model_file import load_model, save_model
     from lunar_mjx.simulate import channels, constant_commands, front_steering, read_commands
     from lunar_mjx.simulate import simulate as run
 
     built = load_model(model) if model else make_model(rover, terrain, preset)
+    for effect in effects or []:
+        built = built.add(effect, "--effects")
     if commands:
         wanted = read_commands(commands, built)
     else:
         wanted = front_steering(built, constant_commands(built, duration, drive=drive), steer)
-    for name, value in (("--x", x), ("--y", y), ("--yaw-deg", yaw_deg)):
-        if not math.isfinite(value):
-            raise bad_input("simulate", name, value, "is not finite", "give a finite number")
     system, seen = run(built, wanted, x, y, math.radians(yaw_deg))
     folder = make_folder(out)
     table = channels(system, seen, wanted)
@@ -154,14 +188,15 @@ def preset(
     save: Annotated[Path | None, typer.Option(help="Write the preset as a model.toml.")] = None,
 ) -> None:
     """Print a preset: its effects with every value and source, and for `paper` what it leaves unsaid or undefined."""
-    from lunar_mjx.describe import print_preset
+    from lunar_mjx.describe import make_console, print_preset
     from lunar_mjx.model import make_model
     from lunar_mjx.model_file import save_model
 
     model = make_model(rover, "flat", name)
-    print_preset(model, Console())
-    if save:
-        print(save_model(model, save))
+    written = save_model(model, save) if save else None
+    print_preset(model, make_console())
+    if written:
+        print(written)
 
 
 @app.command()
@@ -171,6 +206,7 @@ def figures(
     device: DeviceOption = "auto",
 ) -> None:
     """Run the paper's Figs. 3 and 5 and the slope check in both presets, and plot them."""
+    check_folder(out)
     select_device(device)
     from lunar_mjx.figures import FIGURES, make_figures
 
@@ -182,48 +218,64 @@ def figures(
         print(path)
 
 
-@terrain_app.command("info")
-def terrain_info(
-    spec: Annotated[str, typer.Argument(help="Shipped terrain, slope:10deg, DEM file or terrain.toml.")],
-) -> None:
-    """Print a terrain's extent, heights, slopes and rocks."""
-    from lunar_mjx.describe import print_terrain
+SpecArgument = Annotated[str, typer.Argument(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")]
+DemOption = Annotated[Path | None, typer.Option(help="DEM file that takes the place of the configuration's.")]
+SeedOption = Annotated[int | None, typer.Option(min=0, help="Seed that takes the place of the configuration's.")]
+
+
+def open_terrain(spec: str, dem: Path | None, seed: int | None) -> Any:
+    """Loads a terrain; refuses a DEM or seed for one that takes none."""
     from lunar_mjx.terrain import load_terrain
 
-    print_terrain(load_terrain(spec), Console())
+    if spec.startswith("slope") or Path(spec).suffix not in ("", ".toml"):
+        for option, value in (("--dem", dem), ("--seed", seed)):
+            if value is not None:
+                raise bad_input("lunar-mjx", option, value, f"does not go with {spec}", "name a configured terrain")
+    return load_terrain(spec, dem=dem, seed=seed)
+
+
+@terrain_app.command("info")
+def terrain_info(spec: SpecArgument, dem: DemOption = None, seed: SeedOption = None) -> None:
+    """Print a terrain's extent, heights, slopes and rocks."""
+    from lunar_mjx.describe import make_console, print_terrain
+
+    print_terrain(open_terrain(spec, dem, seed), make_console())
 
 
 @terrain_app.command("export")
 def terrain_export(
-    spec: Annotated[str, typer.Argument(help="Shipped terrain, slope:10deg, DEM file or terrain.toml.")],
-    path: Annotated[Path, typer.Argument(help="Mesh file: .stl, .obj, .ply or .glb.")],
+    spec: SpecArgument,
+    path: Annotated[Path, typer.Argument(help="Mesh file: .stl, .obj or .ply.")],
+    dem: DemOption = None,
+    seed: SeedOption = None,
 ) -> None:
     """Write a terrain with its rocks as a triangle mesh."""
-    from lunar_mjx.terrain import export_mesh, load_terrain
+    from lunar_mjx.terrain import export_mesh
 
-    print(export_mesh(load_terrain(spec), path))
+    print(export_mesh(open_terrain(spec, dem, seed), path))
 
 
 @effect_app.command("list")
 def effect_list() -> None:
     """List the catalogue of effects."""
+    from lunar_mjx.describe import make_console, make_table
     from lunar_mjx.effects.catalogue import CATALOGUE
     from lunar_mjx.effects.presets import PRESETS
 
-    table = Table("effect", "ports", *PRESETS, "what", box=None)
+    table = make_table("effect", "ports", *PRESETS, "what")
     for effect in CATALOGUE.values():
         marks = ["x" if effect.name in names else "" for names in PRESETS.values()]
         table.add_row(effect.name, ", ".join(effect.ports), *marks, effect.doc.split("\n")[0])
-    Console().print(table)
+    make_console().print(table)
 
 
 @effect_app.command("show")
 def effect_show(name: Annotated[str, typer.Argument(help="Catalogue name, or my_effects.py:name.")]) -> None:
     """Print an effect's equation, parameters, bounds and sources."""
-    from lunar_mjx.describe import print_effect
+    from lunar_mjx.describe import make_console, print_effect
     from lunar_mjx.effects.catalogue import get
 
-    print_effect(get(name), Console())
+    print_effect(get(name), make_console())
 
 
 @app.command()
@@ -238,11 +290,18 @@ def main() -> None:
     try:
         app()
     except UserError as error:
-        print(f"lunar-mjx: {error}", file=sys.stderr)
-        sys.exit(EXIT_STATUS)
-    except KeyboardInterrupt:
-        print("lunar-mjx: interrupted", file=sys.stderr)
-        sys.exit(130)
+        _fail(str(error), EXIT_STATUS)
+    except OSError as error:  # unreadable, unwritable, disk full
+        if error.filename is None:
+            raise
+        _fail(f"{error.filename}: {error.strerror or error}; check the path and its permissions.", EXIT_STATUS)
+    except (_Interrupted, KeyboardInterrupt):
+        _fail("interrupted", INTERRUPTED)
+
+
+def _fail(sentence: str, status: int) -> None:
+    print(f"lunar-mjx: {' '.join(sentence.splitlines())}", file=sys.stderr)
+    sys.exit(status)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from lunar_mjx.effects import catalogue, presets
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.motor import MODES, WINDINGS
 from lunar_mjx.errors import bad_input, require_finite
+from lunar_mjx.resources import shipped
 from lunar_mjx.rover import Rover, load_rover
 from lunar_mjx.terrain import Terrain, load_terrain
 
@@ -19,6 +20,10 @@ LUNAR_GRAVITY = 1.625
 """m/s2, the seed paper's value."""
 
 ROOM = 298.15
+ZERO_CELSIUS = 273.15
+GAINS = ("position_gain_Nm_rad", "velocity_gain_Nms_rad")
+"""Names in `model.toml` of a joint group's two gains."""
+
 THERMAL_INTEGRATORS = ("heun", "euler")
 DEFAULT_TERRAIN = "lunar_plain"
 
@@ -30,13 +35,14 @@ class Model:
     """A rover, a terrain and a list of effects.
 
     Attributes:
-      rover: the rover. terrain: the ground. terrain_spec: name or path that it was loaded from.
+      rover: the rover. terrain: the ground. terrain_spec: name or absolute path that it was loaded from; empty for a
+        terrain made in Python.
       effects: in list order. parameters: value of every parameter, by effect and name.
       preset: name of the preset that the list started from.
       gravity: m/s2, positive. timestep: s. thermal_integrator: "heun" or "euler".
       ambient: noon temperature K, night temperature K, time of noon s, length of the day s; constant if both are equal.
       modes: control mode by joint group. gains: position gain N m/rad and velocity gain N m s/rad by joint group.
-      effect_files: catalogue name or file.py:name of every effect, as written in `model.toml`.
+      effect_files: catalogue name or /absolute/file.py:name of every effect.
     """
 
     rover: Rover
@@ -57,7 +63,7 @@ class Model:
     def effect_names(self) -> tuple[str, ...]:
         return tuple(e.name for e in self.effects)
 
-    def add(self, effect: Effect | str, source: str = "Model.add", **values: Any) -> Model:
+    def add(self, effect: Effect | str, source: str = "Model.add", /, **values: Any) -> Model:
         """A model with one more effect, in the place of those that it replaces.
 
         Args:
@@ -66,12 +72,17 @@ class Model:
           **values: parameter values that differ from the nominal ones.
 
         Raises:
-          UserError: the effect is unknown or already in the list, or a value is unknown or out of bounds.
+          UserError: the effect is unknown, already in the list or replaced by one in it, or a value is unknown or out
+            of bounds.
         """
-        written = effect if isinstance(effect, str) else effect.name
-        found = catalogue.get(effect) if isinstance(effect, str) else effect
+        written = settled_effect(effect) if isinstance(effect, str) else effect.name
+        found = catalogue.get(written) if isinstance(effect, str) else effect
         if found.name in self.effect_names:
             raise bad_input(source, "effect", found.name, "is already in the model", "set its parameters instead")
+        for other in self.effects:
+            if found.name in other.replaces and other.name not in found.replaces:
+                raise bad_input(source, "effect", found.name, f"is replaced by {other.name}, which is in the model",
+                                f"remove {other.name} first")  # fmt: skip
         replaced = [i for i, e in enumerate(self.effects) if e.name in found.replaces]
         kept = [e for e in self.effects if e.name not in found.replaces]
         kept.insert(replaced[0] if replaced else len(kept), found)
@@ -93,7 +104,7 @@ class Model:
             effect_files={k: v for k, v in self.effect_files.items() if k != name},
         )
 
-    def set(self, name: str, source: str = "Model.set", **values: Any) -> Model:
+    def set(self, name: str, source: str = "Model.set", /, **values: Any) -> Model:
         """A model with other values for parameters of the effect `name`.
 
         A value is a number, one number per wheel or joint, or for joints a mapping from joint group to number, in which
@@ -109,6 +120,7 @@ class Model:
                 value = self._by_group(effect, key, value, source)
             elif hasattr(value, "tolist"):
                 value = value.tolist()
+            _check_flat(effect, key, value, source)
             checked = effect.check(key, value, source)
             if isinstance(checked, tuple):
                 _check_length(self.rover, effect, key, checked, source)
@@ -116,9 +128,13 @@ class Model:
         return dataclasses.replace(self, parameters={**self.parameters, name: new})
 
     def replace(self, **changes: Any) -> Model:
-        """A model with other attributes, checked."""
+        """A model with other attributes, checked.
+
+        Raises:
+          UserError: an attribute's value makes no sense.
+        """
         model = dataclasses.replace(self, **changes)
-        _check_globals(model, "Model.replace")
+        check_settings(model, "Model.replace")
         return model
 
     def _effect(self, name: str, source: str) -> Effect:
@@ -139,9 +155,11 @@ class Model:
                 raise bad_input(source, f"{field}.{group}", value[group], "names no joint group of the rover",
                                 f"use one of {', '.join(groups)}")  # fmt: skip
         present = self.parameters[effect.name][key]
-        count = len(self.rover.joints)
-        old = present if isinstance(present, tuple) else (present,) * count
         names = [g.name for g in self.rover.groups for _ in g.joints]
+        old = present if isinstance(present, tuple) else (present,) * len(names)
+        for group, number in value.items():
+            if isinstance(number, list | tuple | Mapping):
+                raise bad_input(source, f"{field}.{group}", number, "is not a number", "give one number per group")
         return tuple(
             float(effect.check(key, value[n], source)) if n in value else o  # type: ignore[arg-type]
             for n, o in zip(names, old, strict=True)
@@ -156,8 +174,33 @@ def _check_length(rover: Rover, effect: Effect, key: str, value: Sequence[float]
                         f"give one number, or {wanted}, one per {axis}")  # fmt: skip
 
 
-def _check_globals(model: Model, source: str | Path) -> None:
-    """Refuses model-wide settings that make no sense."""
+def _check_flat(effect: Effect, key: str, value: Any, source: str) -> None:
+    if isinstance(value, list | tuple) and any(isinstance(v, list | tuple | Mapping) for v in value):
+        raise bad_input(source, f"effects.{effect.name}.{key}", value, "is nested", "give a flat list of numbers")
+
+
+READS_MOTOR = ("joint_control", "winding_conduction", "rotor_stator_path")
+"""Effects that read the parameters of the effect `motor`."""
+
+
+def check_effects(model: Model, source: str | Path) -> None:
+    """Refuses a list of effects that cannot run.
+
+    Raises:
+      UserError: an effect needs another one that is not in the list.
+    """
+    needy = [name for name in READS_MOTOR if name in model.effect_names]
+    if needy and "motor" not in model.effect_names:
+        raise bad_input(source, "effect_list", ", ".join(model.effect_names), f"lacks motor, which {needy[0]} reads",
+                        f"add motor or take out {', '.join(needy)}")  # fmt: skip
+
+
+def check_settings(model: Model, source: str | Path) -> None:
+    """Refuses model-wide settings that make no sense.
+
+    Raises:
+      UserError: the sentence names the field as it is called in `model.toml`.
+    """
     if require_finite(source, "gravity_m_s2", model.gravity) < 0.0:
         raise bad_input(source, "gravity_m_s2", model.gravity, "is negative", "give the magnitude; it points down")
     if not 1e-5 <= require_finite(source, "timestep_s", model.timestep) <= 0.02:
@@ -165,21 +208,64 @@ def _check_globals(model: Model, source: str | Path) -> None:
     if model.thermal_integrator not in THERMAL_INTEGRATORS:
         raise bad_input(source, "thermal_integrator", model.thermal_integrator, "does not exist",
                         f"use one of {', '.join(THERMAL_INTEGRATORS)}")  # fmt: skip
-    for field, kelvin in zip(("noon", "night"), model.ambient[:2], strict=True):
-        if require_finite(source, f"ambient.{field}_temperature_degC", kelvin) <= 0.0:
-            raise bad_input(source, f"ambient.{field}_temperature_degC", kelvin - 273.15, "is below absolute zero",
-                            "give degrees Celsius above -273.15")  # fmt: skip
-    if require_finite(source, "ambient.period_s", model.ambient[3]) <= 0.0:
-        raise bad_input(
-            source, "ambient.period_s", model.ambient[3], "is not positive", "give the length of the day in s"
-        )
+    _check_ambient(model.ambient, source)
     for group, mode in model.modes.items():
+        _check_group(model.rover, f"control.{group}.mode", group, mode, source)
         if mode not in MODES:
             raise bad_input(source, f"control.{group}.mode", mode, "does not exist", f"use one of {', '.join(MODES)}")
     for group, gains in model.gains.items():
-        for name, gain in zip(("position_gain", "velocity_gain"), gains, strict=True):
+        _check_group(model.rover, f"control.{group}", group, gains, source)
+        if len(gains) != len(GAINS):
+            raise bad_input(source, f"control.{group}", gains, "are not two gains", f"give {' and '.join(GAINS)}")
+        for name, gain in zip(GAINS, gains, strict=True):
             if require_finite(source, f"control.{group}.{name}", gain) < 0.0:
                 raise bad_input(source, f"control.{group}.{name}", gain, "is negative", "give zero or more")
+
+
+def _check_group(rover: Rover, field: str, group: str, value: Any, source: str | Path) -> None:
+    if rover.group(group) is None:
+        raise bad_input(source, field, value, "names no joint group of the rover",
+                        f"use one of {', '.join(g.name for g in rover.groups)}")  # fmt: skip
+
+
+def _check_ambient(ambient: Sequence[float], source: str | Path) -> None:
+    if len(ambient) != 4:
+        raise bad_input(source, "ambient", ambient, "is not four numbers",
+                        "give noon and night temperature in K, time of noon and length of the day in s")  # fmt: skip
+    noon, night, noon_time, period = ambient
+    for field, kelvin in (("noon", noon), ("night", night)):
+        if require_finite(source, f"ambient.{field}_temperature_degC", kelvin) <= 0.0:
+            raise bad_input(source, f"ambient.{field}_temperature_degC", round(kelvin - ZERO_CELSIUS, 6),
+                            "is not above absolute zero", "give degrees Celsius above -273.15")  # fmt: skip
+    require_finite(source, "ambient.noon_time_s", noon_time)
+    if require_finite(source, "ambient.period_s", period) <= 0.0:
+        raise bad_input(source, "ambient.period_s", period, "is not positive", "give the length of the day in s")
+
+
+def settled(kind: str, spec: str | Path, marker: str) -> str:
+    """A rover's or terrain's spec that means the same from every folder.
+
+    Args:
+      kind: "models" or "terrain".
+      spec: name of a shipped one, path, or anything else (such as slope:10deg).
+      marker: file that a folder of this kind holds.
+
+    Returns:
+      A shipped one's name, else the absolute path where there is such a file or folder, else `spec` itself.
+    """
+    path = Path(spec)
+    if not path.is_file() and not (path / marker).is_file():
+        return str(spec)
+    full = path.resolve()
+    return full.name if full.is_dir() and full.parent == shipped(kind).resolve() else str(full)
+
+
+def settled_effect(spec: str) -> str:
+    """An effect's spec that means the same from every folder: catalogue name, or /absolute/file.py:name."""
+    if ".py" not in spec:
+        return spec
+    file, colon, member = spec.partition(":")
+    return f"{Path(file).resolve()}{colon}{member}"
 
 
 def make_model(
@@ -203,20 +289,13 @@ def make_model(
     if preset not in presets.PRESETS:
         raise bad_input("make_model", "preset", preset, "does not exist", f"use one of {', '.join(presets.PRESETS)}")
     loaded = rover if isinstance(rover, Rover) else load_rover(rover)
-    ground = terrain if isinstance(terrain, Terrain) else load_terrain(terrain)
     effects = tuple(catalogue.CATALOGUE[name] for name in presets.PRESETS[preset])
     modes = {g.name: g.mode for g in loaded.groups} | dict(changes.pop("modes", {}))
     given_gains = dict(changes.pop("gains", {}))
-    for field, given in (("modes", modes), ("gains", given_gains)):
-        for group in given:
-            if loaded.group(group) is None:
-                known = ", ".join(g.name for g in loaded.groups)
-                raise bad_input("make_model", f"{field}.{group}", given[group], "names no joint group of the rover",
-                                f"use one of {known}")  # fmt: skip
     model = Model(
         rover=loaded,
-        terrain=ground,
-        terrain_spec=ground.name if isinstance(terrain, Terrain) else str(terrain),
+        terrain=terrain if isinstance(terrain, Terrain) else load_terrain(terrain),
+        terrain_spec="" if isinstance(terrain, Terrain) else settled("terrain", terrain, "terrain.toml"),
         effects=effects,
         parameters={e.name: e.nominal() for e in effects},
         preset=preset,
@@ -224,25 +303,34 @@ def make_model(
         modes=modes,
         effect_files={e.name: e.name for e in effects},
     )
-    model = _rover_motors(model)
-    for name, values in presets.PRESET_PARAMETERS[preset].items():
-        model = model.set(name, f"preset {preset}", **values)
+    model = preset_values(rover_motors(model))
     model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded) | given_gains)
     return model.replace(**changes)
 
 
+def preset_values(model: Model) -> Model:
+    """The values in which the model's preset departs from the nominal ones."""
+    for name, values in presets.PRESET_PARAMETERS[model.preset].items():
+        model = model.set(name, f"preset {model.preset}", **values)
+    return model
+
+
 def _gains_of_gear(model: Model, rover: Rover) -> dict[str, tuple[float, float]]:
-    """The rover's gains, scaled with the inertia that a preset's gear reflects, so that they stay stable."""
+    """The gains of the rover, scaled with the inertia at the joint, which a preset's gear changes."""
     ratios = model.parameters["motor"]["gear_ratio"]
     assert isinstance(ratios, tuple)
+    compiled = rover.compile()
     gains = {}
     for group in rover.groups:
-        scale = (ratios[rover.joints.index(group.joints[0])] / group.gear_ratio) ** 2
+        ratio = ratios[rover.joints.index(group.joints[0])]
+        inertia = float(compiled.dof_M0[compiled.joint(group.joints[0]).dofadr[0]])
+        reflected = group.rotor_inertia * (ratio**2 - group.gear_ratio**2)
+        scale = (inertia + reflected) / inertia
         gains[group.name] = (group.position_gain * scale, group.velocity_gain * scale)
     return gains
 
 
-def _rover_motors(model: Model) -> Model:
+def rover_motors(model: Model) -> Model:
     """Motor parameters that the rover's folder states for each joint group."""
     groups = model.rover.groups
     windings = {g.name: WINDINGS[g.winding] for g in groups}

@@ -4,30 +4,46 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tomli_w
 
 from lunar_mjx.dynamics.state import SYNODIC_DAY
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect, Parameter
+from lunar_mjx.effects.presets import PRESETS
 from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
-from lunar_mjx.model import LUNAR_GRAVITY, Model, make_model
+from lunar_mjx.model import (
+    GAINS,
+    LUNAR_GRAVITY,
+    ZERO_CELSIUS,
+    Model,
+    check_effects,
+    check_settings,
+    make_model,
+    settled,
+)
 from lunar_mjx.resources import shipped
+from lunar_mjx.rover import load_rover
+from lunar_mjx.terrain import load_terrain
 from lunar_mjx.units import to_unit
 
 FORMAT = "lunar-mjx-model/1"
-ZERO_CELSIUS = 273.15
+_MARKERS = {"models": "rover.toml", "terrain": "terrain.toml"}
 _TOP = ("format", "rover", "terrain", "preset", "gravity_m_s2", "timestep_s", "thermal_integrator", "effect_list",
         "ambient", "control", "effects")  # fmt: skip
 _AMBIENT = ("temperature_degC", "noon_temperature_degC", "night_temperature_degC", "noon_time_s", "period_s")
-_CONTROL = ("mode", "position_gain_Nm_rad", "velocity_gain_Nms_rad")
+_CONTROL = ("mode", *GAINS)
+
+T = TypeVar("T")
 
 
 def load_model(path: str | Path) -> Model:
     """Reads a model from a `model.toml`.
+
+    Shipped names mean what ships; other relative paths count from the file's folder.
 
     Raises:
       UserError: one sentence naming the file, the field, the value and the remedy.
@@ -38,61 +54,81 @@ def load_model(path: str | Path) -> Model:
     if data.get("format") != FORMAT:
         raise bad_input(path, "format", data.get("format"), "is not known", f'write format = "{FORMAT}"')
     for key in ("rover", "terrain"):
-        if not isinstance(data.get(key), str):
+        if not isinstance(data.get(key), str) or not data[key]:
             raise bad_input(path, key, data.get(key), "is not a name", f"name a {key} or the path of one")
-    control = _table(path, "control", data.get("control", {}))
-    modes, gains = {}, {}
-    for group, entry in control.items():
-        _known(path, f"control.{group}", _table(path, f"control.{group}", entry), _CONTROL)
-        modes[group] = entry.get("mode")
+    preset = _text(path, "preset", data.get("preset", "consistent"))
+    if preset not in PRESETS:
+        raise bad_input(path, "preset", preset, "does not exist", f"use one of {', '.join(PRESETS)}")
+    terrain = _near(path, "terrain", data["terrain"])
     model = make_model(
-        _beside(path, data["rover"]),
-        _beside(path, data["terrain"]),
-        _text(path, "preset", data.get("preset", "consistent")),
-        timestep=_number(path, "timestep_s", data.get("timestep_s", 0.002)),
-        gravity=_number(path, "gravity_m_s2", data.get("gravity_m_s2", LUNAR_GRAVITY)),
+        _named(path, "rover", data["rover"], load_rover, _near(path, "models", data["rover"])),
+        _named(path, "terrain", data["terrain"], load_terrain, terrain),
+        preset,
     )
-    for group, entry in control.items():
-        if group not in model.modes:
-            raise bad_input(path, f"control.{group}", dict(entry), "names no joint group of the rover",
-                            f"use one of {', '.join(model.modes)}")  # fmt: skip
-        modes[group] = _text(path, f"control.{group}.mode", entry.get("mode", model.modes[group]))
-        gains[group] = tuple(
-            _number(path, f"control.{group}.{key}", entry.get(key, old))
-            for key, old in zip(_CONTROL[1:], model.gains[group], strict=True)
-        )
-    model = model.replace(
+    ambient = _ambient(path, _table(path, "ambient", data.get("ambient", {})), model.ambient)
+    modes, gains = _control(path, _table(path, "control", data.get("control", {})), model)
+    model = dataclasses.replace(
+        model,
+        terrain_spec=settled("terrain", terrain, _MARKERS["terrain"]),
+        gravity=_number(path, "gravity_m_s2", data.get("gravity_m_s2", LUNAR_GRAVITY)),
+        timestep=_number(path, "timestep_s", data.get("timestep_s", model.timestep)),
+        thermal_integrator=_text(path, "thermal_integrator", data.get("thermal_integrator", model.thermal_integrator)),
+        ambient=ambient,
         modes={**model.modes, **modes},
         gains={**model.gains, **gains},
-        ambient=_ambient(path, _table(path, "ambient", data.get("ambient", {})), model.ambient),
-        thermal_integrator=_text(path, "thermal_integrator", data.get("thermal_integrator", model.thermal_integrator)),
-        terrain_spec=data["terrain"],
     )
-    return _effects(path, data, model)
+    check_settings(model, path)
+    model = _effects(path, data, model)
+    check_effects(model, path)
+    return model
 
 
 def save_model(model: Model, path: str | Path) -> Path:
-    """Writes a model to a `model.toml` that `load_model` reads back to the same model; returns the path."""
+    """Writes a model to a `model.toml` that `load_model` reads back to the same model; returns the path.
+
+    Paths of the user's own rover, terrain and effects are written relative to the file's folder if they lie in it.
+
+    Raises:
+      UserError: the terrain or an effect was made in Python, where no file can name it, or the file cannot be written.
+    """
     path = Path(path)
-    noon, night, noon_time, period = model.ambient
-    if noon == night:
+    text = tomli_w.dumps(_record(model, path))
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}); name a file in a folder that exists.") from None
+    return path
+
+
+def _record(model: Model, path: Path) -> dict[str, Any]:
+    """The contents of the file at `path`."""
+    if not model.terrain_spec:
+        raise bad_input(path, "terrain", model.terrain.name, "was made in Python and no file names it",
+                        "make the model with a terrain's name or path")  # fmt: skip
+    for effect in model.effects:
+        spec = model.effect_files[effect.name]
+        if ".py" not in spec and catalogue.CATALOGUE.get(spec) is not effect:
+            raise bad_input(path, "effect_list", effect.name, "was made in Python and no file names it",
+                            f"put it into a file and add it as my_effects.py:{effect.name}")  # fmt: skip
+    noon, night, noon_time, period = (float(v) for v in model.ambient)
+    if noon == night and (noon_time, period) == (0.0, SYNODIC_DAY):
         ambient: dict[str, float] = {"temperature_degC": _celsius(noon)}
     else:
         ambient = {"noon_temperature_degC": _celsius(noon), "night_temperature_degC": _celsius(night),
                    "noon_time_s": noon_time, "period_s": period}  # fmt: skip
-    folder = model.rover.folder
-    data = {
+    folder = path.parent.resolve()
+    return {
         "format": FORMAT,
-        "rover": folder.name if folder.parent == shipped("models") else str(folder),
-        "terrain": model.terrain_spec,
+        "rover": _spelled(settled("models", model.rover.folder, _MARKERS["models"]), folder),
+        "terrain": _spelled(model.terrain_spec, folder),
         "preset": model.preset,
         "gravity_m_s2": float(model.gravity),
         "timestep_s": float(model.timestep),
         "thermal_integrator": model.thermal_integrator,
-        "effect_list": [model.effect_files[e.name] for e in model.effects],
+        "effect_list": [_spelled(model.effect_files[e.name], folder) for e in model.effects],
         "ambient": ambient,
         "control": {
-            group: {"mode": mode, _CONTROL[1]: float(model.gains[group][0]), _CONTROL[2]: float(model.gains[group][1])}
+            group: {"mode": mode} | dict(zip(GAINS, (float(g) for g in model.gains[group]), strict=True))
             for group, mode in model.modes.items()
         },
         "effects": {
@@ -101,17 +137,40 @@ def save_model(model: Model, path: str | Path) -> Path:
             if e.parameters
         },
     }
-    path.write_text(tomli_w.dumps(data))
-    return path
+
+
+def _spelled(spec: str, folder: Path) -> str:
+    """An absolute path within `folder` as ./relative; anything else as it is."""
+    path = Path(spec)
+    return f"./{path.relative_to(folder).as_posix()}" if path.is_absolute() and path.is_relative_to(folder) else spec
 
 
 def _celsius(kelvin: float) -> float:
-    return round(float(kelvin) - ZERO_CELSIUS, 9)
+    """Degrees Celsius that become the same kelvin again, short where they can be."""
+    short = round(kelvin - ZERO_CELSIUS, 9)
+    return short if short + ZERO_CELSIUS == kelvin else kelvin - ZERO_CELSIUS
 
 
 def _written(parameter: Parameter, value: Any) -> Any:
     plain = list(value) if isinstance(value, tuple) else float(value)
     return plain if parameter.unit == "1" else {"value": plain, "unit": parameter.unit}
+
+
+def _control(path: Path, table: Mapping[str, Any], model: Model) -> tuple[dict[str, str], dict[str, tuple[float, ...]]]:
+    """Modes and gains of the joint groups that the file names."""
+    modes, gains = {}, {}
+    for group, entry in table.items():
+        field = f"control.{group}"
+        if group not in model.modes:
+            raise bad_input(path, field, entry, "names no joint group of the rover",
+                            f"use one of {', '.join(model.modes)}")  # fmt: skip
+        _known(path, field, _table(path, field, entry), _CONTROL)
+        modes[group] = _text(path, f"{field}.mode", entry.get("mode", model.modes[group]))
+        gains[group] = tuple(
+            _number(path, f"{field}.{key}", entry.get(key, old))
+            for key, old in zip(GAINS, model.gains[group], strict=True)
+        )
+    return modes, gains
 
 
 def _effects(path: Path, data: Mapping[str, Any], model: Model) -> Model:
@@ -134,12 +193,13 @@ def _list_effects(path: Path, names: Any, model: Model) -> Model:
         raise bad_input(path, "effect_list", names, "is not a list of names", "list effects as strings")
     parameters, effects, files = {}, [], {}
     for name in names:
-        effect = catalogue.get(_beside(path, name))
+        near = _near_effect(path, name)
+        effect = _named(path, "effect_list", name, catalogue.get, near)
         if effect.name in parameters:
             raise bad_input(path, "effect_list", effect.name, "stands there twice", "name every effect once")
         effects.append(effect)
         parameters[effect.name] = model.parameters.get(effect.name, effect.nominal())
-        files[effect.name] = name
+        files[effect.name] = near
     for effect in effects:
         for other in effect.replaces:
             if other in parameters:
@@ -149,16 +209,21 @@ def _list_effects(path: Path, names: Any, model: Model) -> Model:
 
 def _value(path: Path, effect: Effect, key: str, value: Any) -> Any:
     """A parameter's value in its SI unit: a number, a list, a table per joint group, or any of these with a unit."""
-    if key not in effect.parameters or not isinstance(value, dict) or "value" not in value:
-        return value
-    field = f"effects.{effect.name}.{key}"
-    _known(path, field, value, ("value", "unit"))
-    unit = _text(path, f"{field}.unit", value.get("unit", effect.parameters[key].unit))
+    if key not in effect.parameters:
+        return 0.0  # refused by name where it is set
+    field, parameter = f"effects.{effect.name}.{key}", effect.parameters[key]
+    unit, inner = parameter.unit, value
+    if isinstance(value, dict) and ("value" in value or "unit" in value):
+        _known(path, field, value, ("value", "unit"))
+        if "value" not in value:
+            raise bad_input(path, f"{field}.value", None, "is missing", "give the number beside its unit")
+        inner, unit = value["value"], _text(path, f"{field}.unit", value.get("unit", unit))
 
     def convert(number: Any) -> float:
-        return to_unit(_number(path, field, number), unit, effect.parameters[key].unit, path, field)
+        # a temperature whose bounds reach down to 0 K is a difference of temperatures
+        difference = parameter.unit == "K" and parameter.bounds[0] <= 0.0
+        return to_unit(_number(path, field, number), unit, parameter.unit, path, field, difference=difference)
 
-    inner = value["value"]
     if isinstance(inner, list):
         return [convert(n) for n in inner]
     if isinstance(inner, dict):
@@ -168,21 +233,27 @@ def _value(path: Path, effect: Effect, key: str, value: Any) -> Any:
 
 def _ambient(path: Path, table: Mapping[str, Any], default: tuple[float, ...]) -> tuple[float, float, float, float]:
     _known(path, "ambient", table, _AMBIENT)
-    constant = "temperature_degC" in table
-    if constant and len(table) > 1:
-        raise bad_input(path, "ambient.temperature_degC", table["temperature_degC"], "is given beside a lunar day",
-                        "give either temperature_degC or noon and night temperatures")  # fmt: skip
-    if constant:
-        kelvin = _number(path, "ambient.temperature_degC", table["temperature_degC"]) + ZERO_CELSIUS
-        return kelvin, kelvin, 0.0, SYNODIC_DAY
     if not table:
         return default[0], default[1], default[2], default[3]
+
+    def kelvin(key: str) -> float:
+        celsius = _number(path, f"ambient.{key}", table[key])
+        if celsius <= -ZERO_CELSIUS:
+            raise bad_input(path, f"ambient.{key}", celsius, "is not above absolute zero",
+                            "give degrees Celsius above -273.15")  # fmt: skip
+        return celsius + ZERO_CELSIUS
+
+    if "temperature_degC" in table:
+        if len(table) > 1:
+            raise bad_input(path, "ambient.temperature_degC", table["temperature_degC"], "is given beside a lunar day",
+                            "give either temperature_degC or noon and night temperatures")  # fmt: skip
+        return kelvin("temperature_degC"), kelvin("temperature_degC"), 0.0, SYNODIC_DAY
     for key in ("noon_temperature_degC", "night_temperature_degC"):
         if key not in table:
             raise bad_input(path, f"ambient.{key}", None, "is missing", "give both noon and night temperatures")
     return (
-        _number(path, "ambient.noon_temperature_degC", table["noon_temperature_degC"]) + ZERO_CELSIUS,
-        _number(path, "ambient.night_temperature_degC", table["night_temperature_degC"]) + ZERO_CELSIUS,
+        kelvin("noon_temperature_degC"),
+        kelvin("night_temperature_degC"),
         _number(path, "ambient.noon_time_s", table.get("noon_time_s", 0.0)),
         _number(path, "ambient.period_s", table.get("period_s", SYNODIC_DAY)),
     )
@@ -190,18 +261,36 @@ def _ambient(path: Path, table: Mapping[str, Any], default: tuple[float, ...]) -
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise UserError(f"{path}: is not valid TOML ({error}); mend that line.") from None
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except UnicodeDecodeError:
         raise UserError(f"{path}: is not a text file; give a model.toml.") from None
+    except RecursionError:
+        raise UserError(f"{path}: is not valid TOML (nested too deeply); mend the file.") from None
+    except ValueError as error:  # tomllib.TOMLDecodeError, and numbers of thousands of digits
+        raise UserError(f"{path}: is not valid TOML ({error}); mend that line.") from None
 
 
-def _beside(path: Path, name: str) -> str:
-    """A relative path counts from the file that names it; anything else stays a name."""
-    file, colon, member = name.partition(":") if ".py" in name else (name, "", "")
-    near = path.parent / file
-    return f"{near}{colon}{member}" if file and near.exists() and not Path(file).is_absolute() else name
+def _named(path: Path, field: str, value: str, load: Callable[[str], T], spec: str) -> T:
+    """Loads what a field of the file names, and says so where that fails."""
+    try:
+        return load(spec)
+    except UserError as error:
+        raise UserError(f"{path}: {field} = {value!r} cannot be loaded: {error}") from error
+
+
+def _near(path: Path, kind: str, name: str) -> str:
+    """The shipped rover or terrain called `name`, else a relative path counted from the file; else `name`."""
+    if name == Path(name).name and (shipped(kind) / name / _MARKERS[kind]).is_file():
+        return str(shipped(kind) / name)
+    near = path.parent.resolve() / name
+    return str(near) if near.is_file() or (near / _MARKERS[kind]).is_file() else name
+
+
+def _near_effect(path: Path, name: str) -> str:
+    if ".py" not in name:
+        return name
+    file, colon, member = name.partition(":")
+    return f"{path.parent.resolve() / file}{colon}{member}"
 
 
 def _table(path: Path, field: str, value: Any) -> Mapping[str, Any]:
@@ -220,7 +309,10 @@ def _known(path: Path, field: str, table: Mapping[str, Any], known: tuple[str, .
 def _number(path: Path, field: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise bad_input(path, field, value, "is not a number", "give a number")
-    return require_finite(path, field, value)
+    try:
+        return require_finite(path, field, value)
+    except OverflowError:
+        raise bad_input(path, field, value, "is too large", "give a number below 1e308") from None
 
 
 def _text(path: Path, field: str, value: Any) -> str:

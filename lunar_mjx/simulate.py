@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import traceback
+import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +15,17 @@ import pandas as pd
 
 from lunar_mjx.dynamics import System, Telemetry, build
 from lunar_mjx.effects.motor import MODES
-from lunar_mjx.errors import UserError, bad_input, require_file
-from lunar_mjx.model import Model
+from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+from lunar_mjx.model import ZERO_CELSIUS, Model, check_effects
+from lunar_mjx.rover import Rover
 
-COMMAND_UNITS = dict(zip(MODES, ("angle_rad", "speed_rad_s", "torque_Nm", "current_A"), strict=True))
+COMMAND_UNITS: dict[str, str] = dict(zip(MODES, ("angle_rad", "speed_rad_s", "torque_Nm", "current_A"), strict=True))
 """Ending of a command channel's name by control mode."""
+
+INTERVAL = 0.05
+"""About the time between commands, and between rows of telemetry, s."""
+
+MOST_COMMANDS = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,21 +36,41 @@ class Commands:
     interval: float
 
 
+def joint_channels(rover: Rover) -> list[str]:
+    """Corner and kind of every actuated joint in the order of the controls: `lf_drive`, `lf_steer`, `lf_sus`, ...
+
+    A joint that belongs to no single wheel goes by its own name.
+    """
+    names = {}
+    for wheel in rover.wheels:
+        for joint, kind in ((wheel.drive, "drive"), (wheel.steer, "steer"), (wheel.suspension, "sus")):
+            if joint is not None:
+                names[joint] = joint if joint in names else f"{wheel.corner}_{kind}"
+    return [names.get(joint, joint) for joint in rover.joints]
+
+
 def command_channels(model: Model) -> list[str]:
     """Names of the command channels in the order of the controls, such as `command_lf_drive_speed_rad_s`."""
-    return [
-        f"command_{joint}_{COMMAND_UNITS[model.modes[group.name]]}"
-        for group in model.rover.groups
-        for joint in group.joints
-    ]
+    modes = [model.modes[group.name] for group in model.rover.groups for _ in group.joints]
+    channels = zip(joint_channels(model.rover), modes, strict=True)
+    return [f"command_{channel}_{COMMAND_UNITS[mode]}" for channel, mode in channels]
 
 
-def constant_commands(model: Model, duration: float, interval: float = 0.05, **groups: float) -> Commands:
+def constant_commands(model: Model, duration: float, interval: float | None = None, **groups: float) -> Commands:
     """The same command for every joint of a group (`drive`, `steer`, `suspension`), zero for groups left out.
 
+    Args:
+      model: whose joints are commanded.
+      duration: s.
+      interval: time from one command to the next, s; by default the whole number of time steps nearest to 0.05 s.
+      **groups: command by joint group, in the unit of its mode.
+
     Raises:
-      UserError: a group that the rover lacks, a value that is not finite, or a duration below one interval.
+      UserError: a group that the rover lacks, a value that is not finite, or a duration of less than one command or of
+        too many.
     """
+    if interval is None:
+        interval = max(1, round(INTERVAL / model.timestep)) * model.timestep
     value = []
     for name, number in groups.items():
         if model.rover.group(name) is None:
@@ -51,8 +80,13 @@ def constant_commands(model: Model, duration: float, interval: float = 0.05, **g
             raise bad_input("command", name, number, "is not finite", "give a finite number")
     for group in model.rover.groups:
         value += [groups.get(group.name, 0.0)] * len(group.joints)
-    if not np.isfinite(duration) or duration < interval:
-        raise bad_input("command", "duration", duration, f"is below {interval} s", "give a longer time in s")
+    if not np.isfinite(duration):
+        raise bad_input("command", "duration", duration, "is not finite", "give a time in s")
+    if duration < interval:
+        raise bad_input("command", "duration", duration, f"is below {interval:g} s", "give a longer time in s")
+    if duration > MOST_COMMANDS * interval:
+        raise bad_input("command", "duration", duration, f"is above {MOST_COMMANDS * interval:g} s",
+                        "drive in several parts")  # fmt: skip
     return Commands(np.tile(np.array(value, float), (round(duration / interval), 1)), interval)
 
 
@@ -64,8 +98,10 @@ def read_commands(path: str | Path, model: Model) -> Commands:
     """
     path = require_file(path, "the command file")
     try:
-        table = pd.read_csv(path)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # rows longer than the header
+            table = pd.read_csv(path, index_col=False)
+    except (pd.errors.ParserError, pd.errors.ParserWarning, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: is not a CSV table ({error}); write time_s and one column per joint.") from None
     names = ["time_s", *command_channels(model)]
     for name in names:
@@ -74,16 +110,16 @@ def read_commands(path: str | Path, model: Model) -> Commands:
     for name in table.columns:
         if name not in names:
             raise bad_input(path, "column", name, "is unknown", f"use {', '.join(names[:3])}, ...")
-        numbers = pd.to_numeric(table[name], errors="coerce").to_numpy(float)
+        numbers = np.asarray(pd.to_numeric(table[name].astype(str), errors="coerce"), float)
         wrong = np.flatnonzero(~np.isfinite(numbers))
         if wrong.size:
             row = int(wrong[0])
-            raise bad_input(f"{path}, row {row + 2}", name, table[name].iloc[row], "is not a finite number",
+            raise bad_input(f"{path}, line {row + 2}", name, table[name].iloc[row], "is not a finite number",
                             "give a number in the unit of the column's name")  # fmt: skip
     time = table["time_s"].to_numpy(float)
     steps = np.diff(time)
     if time.size < 2 or (steps <= 0).any():
-        raise bad_input(path, "time_s", list(time[:3]), "does not rise", "sort the rows by time; give two at least")
+        raise bad_input(path, "time_s", time[:3].tolist(), "does not rise", "sort the rows by time; give two at least")
     if np.ptp(steps) > 1e-3 * steps.mean():
         raise bad_input(path, "time_s", f"{steps.min():g} to {steps.max():g} s apart", "is uneven",
                         "resample the commands to a constant rate")  # fmt: skip
@@ -96,9 +132,11 @@ def simulate(
     """Drives one rover; the telemetry has one entry per command (at its beginning), as NumPy arrays.
 
     Raises:
-      UserError: commands of another number of joints or not finite, an interval below the time step, or a simulation
-        that diverged.
+      UserError: commands of another number of joints or not finite, an interval that is no whole number of time steps,
+        a start off the terrain, an effect that does not run, or a simulation that diverged.
     """
+    check_effects(model, "simulate")
+    _check_start(model, x, y, yaw)
     system = build(model, engine)
     joints = len(system.joint_names)
     if commands.values.ndim != 2 or commands.values.shape[1] != joints:
@@ -108,25 +146,64 @@ def simulate(
         raise bad_input(f"simulate, command {row}", system.joint_names[column], commands.values[row, column],
                         "is not finite", "give a finite number")  # fmt: skip
     every = round(commands.interval / model.timestep)
-    if every < 1:
-        raise bad_input("simulate", "interval", commands.interval, f"is below the time step of {model.timestep} s",
-                        "give commands less often or a smaller timestep_s")  # fmt: skip
-    run = jax.jit(lambda p, s, c: system.rollout(p, s, c, every=every))
+    if every < 1 or abs(every * model.timestep - commands.interval) > 1e-3 * commands.interval:
+        raise bad_input("simulate", "interval", f"{commands.interval:g} s",
+                        f"is no whole number of time steps of {model.timestep:g} s",
+                        f"set timestep_s = {commands.interval / max(every, 1):.6g}, or resample the commands"
+                        )  # fmt: skip
     start = system.reset(system.params, x, y, yaw)
-    telemetry = jax.device_get(run(system.params, start, jnp.asarray(commands.values))[1])
-    broken = np.flatnonzero(~np.isfinite(telemetry.quaternion).all(axis=1))
-    if broken.size:
-        raise bad_input("simulate", "time", f"{telemetry.time[broken[0]]:g} s", "is where the simulation diverged",
+    run = jax.jit(lambda p, s, c: system.rollout(p, s, c, every=every))
+    try:
+        compiled = run.lower(system.params, start, jnp.asarray(commands.values)).compile()
+    except Exception as error:
+        _blame_user_effect(model, error)
+        raise
+    telemetry = jax.device_get(compiled(system.params, start, jnp.asarray(commands.values))[1])
+    finite = np.ones(len(commands.values), bool)
+    for leaf in jax.tree.leaves(telemetry):
+        finite &= np.isfinite(leaf.reshape(len(finite), -1)).all(axis=1)
+    if not finite.all():
+        when = float(telemetry.time[np.argmin(finite)])
+        raise bad_input("simulate", "time", f"{when:g} s", "is where the simulation diverged",
                         "use a smaller timestep_s, softer gains or smaller commands")  # fmt: skip
     return system, telemetry
+
+
+def _check_start(model: Model, x: float, y: float, yaw: float) -> None:
+    for name, value in (("x", x), ("y", y), ("yaw", yaw)):
+        require_finite("simulate", name, value)
+    field = model.terrain.field
+    rows, cols = field.heights.shape[-2:]
+    for name, value, low, count in (("x", x, field.x0, cols), ("y", y, field.y0, rows)):
+        low, high = float(low), float(low + (count - 1) * field.cell)
+        if not low <= value <= high:
+            raise bad_input("simulate", name, value, f"is off the terrain {model.terrain.name}",
+                            f"start within {low:g} .. {high:g} m")  # fmt: skip
+
+
+def _blame_user_effect(model: Model, error: Exception) -> None:
+    """Raises a `UserError` if the step cannot be traced because of an effect from the user's own file."""
+    files = {spec.partition(":")[0]: name for name, spec in model.effect_files.items() if ".py" in spec}
+    message = f"{type(error).__name__}: {error}"
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if frame.filename in files:
+            raise UserError(
+                f"{frame.filename}, line {frame.lineno}: the effect does not run ({message}); mend that line."
+            ) from error
+    if files:
+        raise UserError(
+            f"{next(iter(files))}: the model does not run with the effect {next(iter(files.values()))} ({message}); "
+            "return the port's value, with a dict of new state where the effect owns state."
+        ) from error
 
 
 def channels(system: System, seen: Telemetry, commands: Commands) -> pd.DataFrame:
     """Telemetry as a table of log channels (time_s first; units in the names; temperatures in degrees Celsius)."""
     corners = [w.corner for w in system.model.rover.wheels]
-    data: dict[str, np.ndarray] = {"time_s": np.asarray(seen.time, float)}
+    data: dict[str, Any] = {"time_s": np.asarray(seen.time, float)}
     for axis in "xyz":
         data[f"position_{axis}_m"] = getattr(seen.position, axis)
+    for axis in "xyz":
         data[f"world_velocity_{axis}_m_s"] = getattr(seen.velocity, axis)
     for i, part in enumerate("wxyz"):
         data[f"quaternion_{part}"] = seen.quaternion[:, i]
@@ -138,12 +215,12 @@ def channels(system: System, seen: Telemetry, commands: Commands) -> pd.DataFram
         "motor_{}_torque_Nm": seen.joint_torque,
         "motor_{}_current_A": seen.current,
         "motor_{}_voltage_V": seen.voltage,
-        "winding_{}_temperature_degC": seen.winding_temperature - 273.15,
-        "housing_{}_temperature_degC": seen.housing_temperature - 273.15,
+        "winding_{}_temperature_degC": np.asarray(seen.winding_temperature, float) - ZERO_CELSIUS,
+        "housing_{}_temperature_degC": np.asarray(seen.housing_temperature, float) - ZERO_CELSIUS,
     }
     for pattern, values in per_joint.items():
-        for i, joint in enumerate(system.joint_names):
-            data[pattern.format(joint)] = values[:, i]
+        for i, channel in enumerate(joint_channels(system.model.rover)):
+            data[pattern.format(channel)] = values[:, i]
     per_wheel = {
         "wheel_{}_sinkage_m": seen.sinkage,
         "wheel_{}_slip_ratio": seen.slip,
@@ -170,6 +247,9 @@ def front_steering(model: Model, commands: Commands, angle: float) -> Commands:
     if angle and not fronts:
         raise bad_input("command", "steer", angle, "needs steered front wheels, which the rover lacks", "leave it at 0")
     values = commands.values.copy()
+    if angle and model.modes["steer"] != "position":
+        raise bad_input("command", "steer", angle, f"is an angle, but the mode of steer is {model.modes['steer']}",
+                        "set control.steer.mode to position, or give the commands as a table")  # fmt: skip
     for name in fronts:
         values[:, model.rover.joints.index(name)] = angle
     return Commands(values, commands.interval)
