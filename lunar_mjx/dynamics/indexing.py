@@ -1,4 +1,4 @@
-"""Picking and placing entries at addresses that are known when the step is traced: slices, never gathers or scatters."""
+"""Picks and places entries at addresses known when the step is traced: slices, never gathers or scatters."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ axes and offsets are constant. The derivation is in docs/structured_engine.md.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -230,7 +231,6 @@ class StructuredEngine:
 
 def _cast_group(group: LegGroup, dtype: Any) -> LegGroup:
     """The same group with its arrays in the state's type; floats stay, and fold into the code."""
-    import dataclasses
 
     def cast(tree: Any) -> Any:
         return jax.tree.map(lambda a: jnp.asarray(a, dtype) if isinstance(a, np.ndarray) else a, tree)
@@ -275,12 +275,10 @@ def _forward(group: LegGroup, n: LegGroup, base: Motion, qpos: Any, qvel: Any) -
     angle = [mul(link.numbers.sign, select(qpos, link.qpos)) for link in n.links]
     speed = [mul(link.numbers.sign, select(qvel, link.dof)) for link in n.links]
     gain, drift = _close_loop(n, angle, speed)
+    ground = LinkState(ZERO, IDENTITY, STILL, base, STILL)
     links: list[LinkState] = []
     for k, link in enumerate(n.links):
-        if link.parent == CHASSIS:
-            up = LinkState(ZERO, IDENTITY, STILL, base, STILL)
-        else:
-            up = links[link.parent]
+        up = ground if link.parent == CHASSIS else links[link.parent]
         origin = up.origin + up.frame.apply(link.numbers.origin)
         mount = up.frame.then(link.numbers.turn)
         axis = mount[link.axis]

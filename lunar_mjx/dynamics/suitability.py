@@ -26,7 +26,7 @@ _IGNORABLE = sum(
         "ISLAND",
         "CLAMPCTRL",
         "AUTORESET",
-    )  # fmt: skip
+    )
 )
 """Disable flags that change nothing where there is no contact, limit, friction loss, sensor or soft constraint."""
 
