@@ -184,14 +184,13 @@ def _physical(f: Free, unit: Any, numpy: Any) -> Any:
 
 def _functions(bed: WheelBed, table: SteadyStateTable, free: Sequence[Free]) -> tuple[Callable, Callable]:
     """Residual vector in sigma and its Jacobian, as NumPy functions of the places in [0, 1]."""
-    test = jax.tree.map(jnp.asarray, table.wheel_test())
+    test = table.wheel_test()
 
     def vector(place: Any) -> Any:
         values = {e: dict(v) for e, v in bed.parameters.items()}
         for i, f in enumerate(free):
             values[f.effect][f.name] = _physical(f, place[i], jnp)
-        scaled, _ = residuals(bed, values, table, test)
-        return jnp.concatenate(list(scaled.values()))
+        return jnp.concatenate(list(residuals(bed(values, test), table).values()))
 
     run, slope = jax.jit(vector), jax.jit(jax.jacfwd(vector))
     return (lambda x: np.asarray(run(x))), (lambda x: np.asarray(slope(x)))

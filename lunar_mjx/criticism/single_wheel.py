@@ -6,6 +6,7 @@ marked `transient` are left out, because a test bed reports the steady state.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
@@ -164,6 +165,7 @@ class WheelBed:
             )
         self.gravity = gravity
         self._pipeline = Pipeline(self.effects)
+        self._compiled = jax.jit(self.__call__)
 
     @classmethod
     def of_preset(cls, preset: str) -> WheelBed:
@@ -193,8 +195,19 @@ class WheelBed:
         return WheelBed([*kept, added], {**self.parameters, added.name: values}, self.gravity)
 
     def with_values(self, values: Parameters) -> WheelBed:
-        """The bed with other parameter values, by effect and name."""
-        return WheelBed(self.effects, self.merged(values), self.gravity)
+        """The bed with other parameter values, by effect and name; what was compiled is shared."""
+        bed = copy.copy(self)
+        bed.parameters = self.merged(values)
+        return bed
+
+    def run(self, test: WheelTest) -> WheelResult:
+        """Runs the test with the bed's own parameters, compiled once for each number of points, in float64.
+
+        Returns:
+          The results as NumPy arrays.
+        """
+        with jax.enable_x64(True):
+            return jax.device_get(self._compiled(self.parameters, test))
 
     def merged(self, values: Parameters) -> dict[str, dict[str, Any]]:
         """The bed's parameters with `values` in place of some."""

@@ -6,10 +6,9 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
 import numpy as np
 
-from lunar_mjx.criticism.single_wheel import WheelBed
+from lunar_mjx.criticism.single_wheel import WheelBed, WheelResult
 from lunar_mjx.criticism.table import QUANTITIES, SteadyStateTable, at_angles
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError
@@ -84,11 +83,9 @@ def as_bed(model: WheelBed | Model | str | Sequence[Effect | str]) -> WheelBed:
     return WheelBed(model) if isinstance(model, Sequence) else WheelBed.of_model(model)
 
 
-def residuals(bed: WheelBed, parameters: Any, table: SteadyStateTable, test: Any) -> tuple[dict[str, Any], Any]:
-    """Residuals in sigma by quantity, and the bed's result; pure in `parameters`."""
-    result = bed(parameters, test)
-    scaled = {q: (getattr(result, q) - v) / table.sigma[q] for q, v in table.measured.items()}
-    return scaled, result
+def residuals(result: WheelResult, table: SteadyStateTable) -> dict[str, Any]:
+    """Residuals (model less measurement) in sigma, by quantity."""
+    return {q: (getattr(result, q) - v) / table.sigma[q] for q, v in table.measured.items()}
 
 
 def compare(
@@ -113,11 +110,9 @@ def compare(
             "replicates, or give sigma."
         )
     bed = as_bed(model)
-    with jax.enable_x64(True):
-        scaled, result = jax.jit(lambda p, t: residuals(bed, p, table, t))(bed.parameters, table.wheel_test())
-        residual = {q: np.asarray(r) for q, r in scaled.items()}
-        predicted = {q: np.asarray(getattr(result, q)) for q in table.measured}
-        reached = np.asarray(result.reached)
+    result = bed.run(table.wheel_test())
+    residual = residuals(result, table)
+    predicted = {q: np.asarray(getattr(result, q)) for q in table.measured}
     return Comparison(
         name=name or (model if isinstance(model, str) else "model"),
         table=table,
@@ -126,7 +121,7 @@ def compare(
         rms={q: _rms(r) for q, r in residual.items()},
         overall=_rms(np.concatenate(list(residual.values()))),
         worst={q: _worst(table, q, predicted[q], r) for q, r in residual.items()},
-        unreached=int((~reached).sum()),
+        unreached=int((~np.asarray(result.reached)).sum()),
     )
 
 

@@ -22,11 +22,12 @@ _OTHER_SPEEDS = (0.08, 0.15)
 
 RECORDS_PER_SECOND = 10
 _CHUNK_SECONDS = 1.0
-_STEERING_AMPLITUDE = (0.08, 0.25)
-_STEERING_PERIOD = (12.0, 30.0)
+_STEERING_AMPLITUDE = (0.15, 0.4)
+_STEERING_PERIOD = (20.0, 60.0)
 _SPIN_UP = 1.0
 """Seconds over which the wheels come up to speed."""
 _STEEPEST = np.tan(np.radians(10.0))
+_SPACING = 8.0
 _CLEARANCE = 1.5
 """Distance from rocks at which a rover may start, beyond the rock's radius, m."""
 
@@ -41,7 +42,7 @@ class Drive:
       x, y, z, roll, pitch, yaw: of the chassis frame, m, rad.
       slip, sinkage: of every wheel, eq. 8 and m. rolling: whether the wheel rolls fast enough for slip to mean
         something.
-      winding_degC: hottest winding of every rover.
+      winding_degC: hottest winding of every rover. hottest: (rover,) the joint whose winding became hottest.
       power: electrical power into all motors, W.
       energy: (rover,) J. distance: (rover,) length of the path in the plane, m.
       command_speed: (rover,) commanded rim speed, m/s.
@@ -61,6 +62,7 @@ class Drive:
     rolling: Any
     sinkage: Float[np.ndarray, "time rover wheel"]
     winding_degC: Float[np.ndarray, "time rover"]
+    hottest: tuple[str, ...]
     power: Float[np.ndarray, "time rover"]
     energy: Float[np.ndarray, "rover"]
     distance: Float[np.ndarray, "rover"]
@@ -73,6 +75,14 @@ class Drive:
         total = np.where(self.rolling, self.slip, 0.0).sum(axis=-1)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
+    @property
+    def rover_slip(self) -> Float[np.ndarray, "rover"]:
+        """Mean over time of `mean_slip`; not a number for a rover whose wheels never rolled."""
+        slip = self.mean_slip
+        known = np.isfinite(slip)
+        count = known.sum(axis=0)
+        return np.where(count > 0, np.where(known, slip, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
+
 
 def drive(
     rover: str,
@@ -81,6 +91,7 @@ def drive(
     seed: int,
     terrain: Terrain,
     progress: Callable[[float], None] | None = None,
+    shift: float = 0.0,
 ) -> Drive:
     """Drives `count` rovers of one kind from different places, headings and commands.
 
@@ -91,21 +102,24 @@ def drive(
       seed: of starts and commands.
       terrain: the ground.
       progress: called with the share done, 0 to 1.
+      shift: of the grid of starts, as a share of its spacing, so that several drives share the ground.
 
     Raises:
       UserError: unknown rover.
     """
     model = make_model(rover, terrain)
     system = build(model)
-    rng = np.random.default_rng(seed)
-    starts = _starts(terrain, count, rng)
+    rng = np.random.default_rng([seed, *rover.encode()])
+    starts = _starts(terrain, count, rng, shift * _SPACING)
     hold = round(1.0 / RECORDS_PER_SECOND / system.dt)
     controls, speed = _controls(system, count, seconds, rng)
     state = jax.jit(jax.vmap(system.reset, in_axes=(None, 0, 0, 0)))(system.params, *map(jnp.asarray, starts))
 
     @jax.jit
     def run(params: Any, state: State, controls: Any) -> tuple[State, Telemetry]:
-        state, telemetry = jax.vmap(lambda s, c: system.rollout(params, s, c, hold))(state, controls)
+        held = jnp.repeat(controls, hold, axis=1)
+        state, telemetry = jax.vmap(lambda s, c: system.rollout(params, s, c))(state, held)
+        telemetry = jax.tree.map(lambda a: a[:, ::hold], telemetry)
         # Without weak types the state comes back as it went in, and the next chunk needs no second compilation.
         return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), state), telemetry
 
@@ -121,15 +135,17 @@ def drive(
     return _record(system, joined, speed)
 
 
-def _starts(terrain: Terrain, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _starts(
+    terrain: Terrain, count: int, rng: np.random.Generator, shift: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x, y and yaw of every rover: a jittered grid about the origin, clear of rocks and of steep ground."""
     rows = int(np.ceil(np.sqrt(count)))
-    spacing = 8.0
-    cells = [((i - (rows - 1) / 2) * spacing, (j - (rows - 1) / 2) * spacing) for j in range(rows) for i in range(rows)]
+    line = (np.arange(rows) - (rows - 1) / 2) * _SPACING + shift
+    cells = [(cx, cy) for cy in line for cx in line]
     places = []
     for cx, cy in cells[:count]:
         for _ in range(200):
-            x, y = np.array([cx, cy]) + rng.uniform(-2.5, 2.5, 2)
+            x, y = np.array([cx, cy]) + rng.uniform(-2.0, 2.0, 2)
             if _good(terrain, x, y):
                 break
         places.append((x, y))
@@ -168,7 +184,9 @@ def _controls(
         assert int(system.info.mode[at]) == VELOCITY
         controls[:, :, at] = rate
         if wheel.steer is not None:
-            controls[:, :, system.joint_names.index(wheel.steer)] = wave if wheel.corner.endswith("f") else -wave
+            at = system.joint_names.index(wheel.steer)
+            low, high = 0.9 * np.array(rover.joint_limits[wheel.steer])
+            controls[:, :, at] = np.clip(wave if wheel.corner.endswith("f") else -wave, low, high)
     return controls, speed
 
 
@@ -180,6 +198,7 @@ def _record(system: System, t: Telemetry, speed: np.ndarray) -> Drive:
 
     x, y = turned(t.position.x), turned(t.position.y)
     rim = turned(t.joint_speed)[..., : len(system.model.rover.wheels)] * np.asarray(system.info.wheel_radius)
+    winding = turned(t.winding_temperature)
     power = turned(t.voltage * t.current).sum(axis=-1)
     return Drive(
         rover=system.model.rover.name,
@@ -195,7 +214,8 @@ def _record(system: System, t: Telemetry, speed: np.ndarray) -> Drive:
         slip=turned(t.slip),
         rolling=np.abs(rim) > 0.02,
         sinkage=turned(t.sinkage),
-        winding_degC=turned(t.winding_temperature).max(axis=-1) - 273.15,
+        winding_degC=winding.max(axis=-1) - 273.15,
+        hottest=tuple(system.joint_names[i] for i in winding.max(axis=0).argmax(axis=-1)),
         power=power,
         energy=power.sum(axis=0) / RECORDS_PER_SECOND,
         distance=np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)).sum(axis=0),

@@ -13,7 +13,7 @@ from plotly.subplots import make_subplots
 
 from lunar_mjx.criticism import SteadyStateTable, replicate_scatter
 from lunar_mjx.demo.drive import Drive
-from lunar_mjx.demo.wheel import Case, dense_curve
+from lunar_mjx.demo.wheel import Case, dense_curves
 from lunar_mjx.report.style import BLUE, INK, MEASURED, SERIES, VERMILION, Series, faded, finish
 from lunar_mjx.terrain import Terrain
 
@@ -142,28 +142,30 @@ def _band(figure, time, values, colour, row, column, individuals, legend) -> Non
 
 
 def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequence[float], beds: Sequence) -> go.Figure:
-    """Drawbar pull, side force and sinkage over slip, a column per slip angle; error bars are the replicates' scatter."""
+    """Drawbar pull, side force and sinkage over slip, a column per slip angle; error bars: replicates."""
     rows = [row for row in WHEEL_ROWS if row[0] in table.measured]
     scatter = replicate_scatter()
+    curves = [dense_curves(bed, table, angles) for bed in beds]
     figure = make_subplots(
         rows=len(rows), cols=len(angles), shared_xaxes=True, shared_yaxes=True, vertical_spacing=0.035,
         horizontal_spacing=0.012, column_titles=[f"{a:g}°" for a in angles],
     )  # fmt: skip
     for column, angle in enumerate(angles, 1):
         here = np.abs(table.test["slip_angle_deg"] - angle) < 0.01
-        curves = [dense_curve(bed, table, angle) for bed in beds]
         for row, (quantity, _, scale) in enumerate(rows, 1):
             place, legend = {"row": row, "col": column}, row == 1 and column == 1
             for case, curve in zip(cases, curves, strict=True):
                 style = CASE_STYLE.get(case.name, SERIES[3])
                 figure.add_scatter(
-                    x=curve["slip_ratio"].round(3), y=(scale * curve[quantity]).round(3), mode="lines", name=case.name,
+                    x=curve["slip_ratio"].round(3), y=(scale * curve[quantity][column - 1]).round(3), mode="lines",
+                    name=case.name,
                     line={"color": style.colour, "dash": style.dash, "width": 2}, showlegend=legend,
                     legendgroup=case.name, hovertemplate=f"{case.name}: %{{y}}<extra></extra>", **place,
                 )  # fmt: skip
             figure.add_scatter(
                 x=table.test["slip_ratio"][here].round(3), y=(scale * table.measured[quantity][here]).round(3),
-                error_y={"type": "data", "array": (scale * scatter[quantity][here]).round(3), "thickness": 1.2, "width": 3},
+                error_y={"type": "data", "array": (scale * scatter[quantity][here]).round(3), "thickness": 1.2,
+                         "width": 3},
                 mode="markers", name="measured (mean and scatter of 3 runs)", showlegend=legend, legendgroup="measured",
                 marker={"color": MEASURED.colour, "size": 6, "symbol": MEASURED.symbol},
                 hovertemplate="measured: %{y}<extra></extra>", **place,
@@ -172,6 +174,11 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
     figure.update_layout(legend={"y": 1.06})
     for row, (_, title, _) in enumerate(rows, 1):
         figure.update_yaxes(title_text=title, row=row, col=1)
+    for row, (quantity, _, scale) in enumerate(rows, 1):
+        drawn = np.concatenate([c[quantity].ravel() for c in curves] + [table.measured[quantity]]) * scale
+        low, high = float(drawn.min()), float(drawn.max())
+        edge = 0.06 * (high - low)
+        figure.update_yaxes(range=[low - edge, high + edge], row=row)
     figure.update_xaxes(dtick=0.5, range=[-1.08, 1.0])
     figure.update_xaxes(title_text="slip ratio", row=len(rows))
     return figure

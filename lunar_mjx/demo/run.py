@@ -60,12 +60,11 @@ def run_demo(
         report("making the terrain", 0.0)
         terrain = load_terrain(DEFAULT_TERRAIN)
         drives, done = [], 0.02
-        for name, share in _SHARES.items():
+        for i, (name, share) in enumerate(_SHARES.items()):
             what = f"driving {rovers} {ROVERS[name][0]}s"
             report(f"{what} (compiling)", done)
-            drives.append(
-                drive(name, rovers, seconds, seed, terrain, _part(report, what, done + 0.7 * share, 0.3 * share))
-            )
+            tell = _part(report, what, done + 0.7 * share, 0.3 * share)
+            drives.append(drive(name, rovers, seconds, seed, terrain, tell, shift=0.5 * i))
             done += share
         cases = wheel_cases(starts, seed, _part(report, "wheel against test bed", done, 0.95 - done))
         report("writing the page", 0.95)
@@ -104,19 +103,17 @@ def summary(d: Drive) -> dict[str, Any]:
     def numbers(values: np.ndarray) -> list[float | None]:
         return [round(float(v), 6) if np.isfinite(v) else None for v in values]
 
-    slip = d.mean_slip
-    known = np.isfinite(slip)
-    mean_slip = np.where(known, slip, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return {
         "rover": d.rover,
         "mass_kg": d.mass,
         "simulated_s": float(d.time[-1]),
         "command_rim_speed_m_s": numbers(d.command_speed),
         "distance_m": numbers(d.distance),
-        "mean_slip": numbers(np.where(known.any(axis=0), mean_slip, np.nan)),
+        "mean_slip": numbers(d.rover_slip),
         "mean_sinkage_m": numbers(d.sinkage.mean(axis=(0, 2))),
         "max_sinkage_m": numbers(d.sinkage.max(axis=(0, 2))),
         "max_winding_temperature_degC": numbers(d.winding_degC.max(axis=0)),
+        "hottest_motor": list(d.hottest),
         "electrical_energy_J": numbers(d.energy),
         "max_roll_deg": numbers(np.degrees(np.abs(d.roll).max(axis=0))),
         "max_pitch_deg": numbers(np.degrees(np.abs(d.pitch).max(axis=0))),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import metadata
 
 import numpy as np
@@ -31,7 +32,7 @@ def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
         int((np.degrees(np.maximum(np.abs(d.roll), np.abs(d.pitch))).max(axis=0) > _UPSET).sum()) for d in drives
     )
     drove = ", ".join(
-        f"{d.x.shape[1]} {_name(d)}s {np.median(d.distance):.1f} m at {100 * np.nanmedian(d.mean_slip):.0f} % slip and "
+        f"{d.x.shape[1]} {_name(d)}s {np.median(d.distance):.1f} m at {100 * of_finite(np.median, d.mean_slip):.0f} % slip and "
         f"{1e3 * np.median(d.sinkage):.0f} mm sinkage (medians)" for d in drives
     )  # fmt: skip
     named = {c.name: c for c in cases}
@@ -41,12 +42,19 @@ def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
     return [
         f"{count} rovers drove {drives[0].time[-1]:.0f} s on true-scale terrain: {drove}. "
         f"{bad or 'None'} failed numerically, {upset or 'none'} rolled over.",
-        f"With nominal soils, the wheel of {paper.name} misses the measurements by {paper.comparison.overall:.0f} times the "
-        f"scatter of single runs, that of {plain.name} by {plain.comparison.overall:.0f} times.",
-        f"Refitting the soil of {plain.name} at {_angles(FIT_ANGLES)} leaves {fitted.fit.held_out:.1f} times the scatter at "
-        f"slip angles that the fit did not see ({fitted.fit.inside:.1f} inside the fitted range, {fitted.fit.beyond:.1f} "
-        f"beyond it), most of it in the {QUANTITIES[quantity][2]}: physics is missing, not only parameters.",
+        f"With nominal soils, the wheel of {paper.name} misses the measurements by {paper.comparison.overall:.0f} "
+        f"times the scatter of single runs, that of {plain.name} by {plain.comparison.overall:.0f} times.",
+        f"Refitting the soil of {plain.name} at {_angles(FIT_ANGLES)} leaves {fitted.fit.held_out:.1f} times the "
+        f"scatter at slip angles that the fit did not see ({fitted.fit.inside:.1f} inside the fitted range, "
+        f"{fitted.fit.beyond:.1f} beyond it), most of it in the {QUANTITIES[quantity][2]}: physics is missing, not "
+        "only parameters.",
     ]
+
+
+def of_finite(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+    """The statistic of the finite values; not a number where there is none."""
+    finite = values[np.isfinite(values)]
+    return float(statistic(finite)) if finite.size else float("nan")
 
 
 def _name(d: Drive) -> str:
@@ -61,39 +69,36 @@ def driving_section(drives: Sequence[Drive], terrain: Terrain) -> Section:
     """Paths, histories and a table of the batch."""
     rows = []
     for d in drives:
-        slip = np.nanmean(d.mean_slip, axis=0) if np.isfinite(d.mean_slip).all(axis=0).all() else _mean_slip(d)
-        for label, pick in (("median", np.nanmedian), ("least", np.nanmin), ("most", np.nanmax)):
+        slip = d.rover_slip
+        for label, statistic in (("median", np.median), ("least", np.min), ("most", np.max)):
+            pick = functools.partial(of_finite, statistic)
             rows.append([
                 f"{_name(d)}, {d.mass:.0f} kg, {label}", f"{pick(d.command_speed):.2f}", f"{pick(d.distance):.2f}",
                 f"{pick(slip):.2f}", f"{1e3 * pick(d.sinkage.mean(axis=(0, 2))):.1f}",
                 f"{1e3 * pick(d.sinkage.max(axis=(0, 2))):.1f}", f"{pick(d.winding_degC.max(axis=0)):.1f}",
                 f"{pick(d.energy) / 1e3:.2f}", f"{np.degrees(pick(np.abs(d.roll).max(axis=0))):.1f}",
             ])  # fmt: skip
-    header = ["rover", "commanded rim speed, m/s", "distance, m", "mean slip", "mean sinkage, mm", "largest sinkage, mm",
-              "hottest winding, °C", "electrical energy, kJ", "largest roll, deg"]  # fmt: skip
+    header = ["rover", "commanded rim speed, m/s", "distance, m", "mean slip", "mean sinkage, mm",
+              "largest sinkage, mm", "hottest winding, °C", "electrical energy, kJ", "largest roll, deg"]  # fmt: skip
     about = (
-        f"All rovers share the model preset consistent and the soil of the Lunar Sourcebook, and differ in place, heading, "
-        f"speed and steering. The ground is the shipped terrain {terrain.name} at true scale; no two rovers meet. Motors "
-        "start at 25 °C."
+        "All rovers share the model preset consistent and the soil of the Lunar Sourcebook, and differ in place, "
+        f"heading, speed and steering. The ground is the shipped terrain {terrain.name} at true scale. Each rover "
+        "drives alone: rovers do not see each other. Motors start at 25 °C."
     )
-    return Section(
-        "Rovers on the Moon",
-        [
-            Text([about]),
-            Figure(paths_figure(drives, terrain),
-                   "Paths on the shaded relief, lit from the north-west at 20 deg; dark discs are rocks."),  # fmt: skip
-            Figure(history_figure(drives), "Slip by eq. 8 in the wheel's frame, mean over the wheels that turn; sinkage of "
-                   "the deepest wheel; temperature of the hottest of the twelve motors. Peaks are craters and rocks."),
-            Table("What the batch did: over the rovers of each kind, column by column", header, rows,
-                  "Sinkage is measured from the undisturbed ground. Energy counts voltage times current of all motors."),
-        ],
-    )  # fmt: skip
-
-
-def _mean_slip(d: Drive) -> np.ndarray:
-    known = np.isfinite(d.mean_slip)
-    total = np.where(known, d.mean_slip, 0.0).sum(axis=0)
-    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+    paths = "Paths on the shaded relief, lit from the north-west at 20 deg; dark discs are rocks."
+    history = (
+        "Slip by eq. 8 in the wheel's frame, mean over the wheels that turn; sinkage of the deepest wheel; temperature "
+        "of the hottest of the twelve motors. Peaks are craters and rocks."
+    )
+    note = "Sinkage is measured from the undisturbed ground. Energy counts voltage times current of all motors."
+    title = "What the batch did: median, least and most over the rovers of each kind, column by column"
+    blocks = [
+        Text([about]),
+        Figure(paths_figure(drives, terrain), paths),
+        Figure(history_figure(drives), history),
+        Table(title, header, rows, note),
+    ]
+    return Section("Rovers on the Moon", blocks)
 
 
 def wheel_section(cases: Sequence[Case]) -> Section:
@@ -102,22 +107,19 @@ def wheel_section(cases: Sequence[Case]) -> Section:
     angles = sorted({round(float(a), 2) for a in table.test["slip_angle_deg"]})
     beds = [case.fit.bed if case.fit else as_bed(case.name) for case in cases]
     caption = (
-        "Columns are slip angles; slip compares the rim speed with the travel speed. Each curve follows the measured load "
-        f"from point to point. Fitted at {_angles(FIT_ANGLES)}; held out at {_angles(INSIDE_ANGLES + BEYOND_ANGLES)}; "
-        f"{_angles(APART_ANGLES)} set apart, because the wheel sinks to its axle there."
+        "Columns are slip angles; slip compares the rim speed with the travel speed. Each curve follows the measured "
+        f"load from point to point. Fitted at {_angles(FIT_ANGLES)}; held out at "
+        f"{_angles(INSIDE_ANGLES + BEYOND_ANGLES)}; {_angles(APART_ANGLES)} set apart, because the wheel sinks to its "
+        "axle there. Soils: " + "; ".join(f"{case.name}: {case.soil}" for case in cases) + "."
     )
     sigma = ", ".join(f"{QUANTITIES[q][2]} {_scatter(q, s)}" for q, s in table.sigma.items())
-    return Section(
-        "The wheel against measurements",
-        [
-            Text([f"The same wheel-soil functions that drive the rovers above, in the test bed of {table.name}: imposed slip, "
-                  f"slip angle and load. Errors are in units of the scatter of single runs about their mean: {sigma}."]),
-            Figure(wheel_figure(cases, table, angles, beds), caption),
-            _error_table(cases),
-            _worst_table(cases),
-            _fit_table(cases),
-        ],
-    )  # fmt: skip
+    about = (
+        f"The same wheel-soil functions that drive the rovers above, in the test bed of the {table.name}: imposed "
+        f"slip, slip angle and load. Errors are in units of the scatter of single runs about their mean: {sigma}."
+    )
+    figure = Figure(wheel_figure(cases, table, angles, beds), caption)
+    blocks = [Text([about]), figure, _error_table(cases), _worst_table(cases), _fit_table(cases)]
+    return Section("The wheel against measurements", blocks)
 
 
 def _scatter(quantity: str, sigma: float) -> str:
@@ -147,8 +149,9 @@ def _worst_table(cases: Sequence[Case]) -> Table:
         for quantity, w in case.comparison.worst.items():
             _, unit, name = QUANTITIES[quantity]
             scale, shown = (1e3, "mm") if unit == "m" else (1.0, unit)
-            rows.append([case.name, name, f"{w.slip_ratio:.2f}", f"{w.slip_angle_deg:g}",
-                         f"{scale * w.measured:.1f} {shown}", f"{scale * w.predicted:.1f} {shown}", f"{w.residual:+.0f}"])  # fmt: skip
+            there = (f"{scale * v:.1f} {shown}" for v in (w.measured, w.predicted))
+            place = (f"{w.slip_ratio:.2f}", f"{w.slip_angle_deg:g}")
+            rows.append([case.name, name, *place, *there, f"{w.residual:+.0f}"])
     header = ["model", "quantity", "slip ratio", "slip angle, deg", "measured", "model", "error, scatter"]
     return Table("Where each model is worst", header, rows)
 
@@ -165,7 +168,8 @@ def _fit_table(cases: Sequence[Case]) -> Table:
                 rows.append([case.name, f"{effect}.{name}", f"{value:.4g}", unit, edge])
     starts = "; ".join(f"{c.name}: {c.fit.agreeing} of {len(c.fit.starts)}" for c in cases if c.fit)
     note = (
-        "k_c and k_phi act only through k_c/b + k_phi on one wheel width: k_c is held at 0 and k_phi stands for that sum. "
+        "k_c and k_phi act only through k_c/b + k_phi on one wheel width: k_c is held at 0, and k_phi is that "
+        "sum: six of the seven soil parameters are left. "
         f"Starts that agree with the best: {starts}. Values are those that these equations need, not the sand's own."
     )
     return Table("Refitted values", ["model", "parameter", "value", "unit", ""], rows, note)
@@ -183,11 +187,11 @@ def provenance_section(table: SteadyStateTable, terrain: str, seed: int) -> Sect
         ("Measurements", table.source.get("citation", "")),
         ("Measured by", table.source.get("who", "")),
         ("Licence of the measurements", table.source.get("licence", "")),
-        ("Wheel", f"smooth, radius {1e3 * table.radius:g} mm, width {1e3 * table.width:g} mm (the radius is given as 58 mm "
-         "in another publication of the group)"),
+        ("Wheel", f"smooth, radius {1e3 * table.radius:g} mm, width {1e3 * table.width:g} mm (the radius is given "
+         "as 58 mm in another publication of the group)"),
         ("Points", f"{len(table)}, each the mean of {int(table.replicates.min())} or more runs"),
-        ("Slip definition", "rim speed against travel speed in the table; the model is given both speeds and forms the slip "
-         "of the wheel's frame (eq. 8) itself"),
+        ("Slip definition", "rim speed against travel speed in the table; the model is given both speeds and forms "
+         "the slip of the wheel's frame (eq. 8) itself"),
         ("Drive", f"preset consistent, terrain {terrain}, time step 2 ms, float32, seed {seed}"),
         ("Versions", ", ".join(f"{k} {v}" for k, v in versions().items())),
     ]  # fmt: skip

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from lunar_mjx.criticism import Comparison, SteadyStateTable, WheelBed, WheelFit, compare, fit, load_figures
 from lunar_mjx.criticism.fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
+from lunar_mjx.criticism.single_wheel import wheel_test
 
 
 class Case(NamedTuple):
@@ -35,6 +37,8 @@ class Case(NamedTuple):
         return {"name": self.name, "soil": self.soil, "scores_sigma": self.scores(), "fit": fitted,
                 "comparison": self.comparison.to_dict()}  # fmt: skip
 
+
+_CURVE_POINTS = 61
 
 PAPER_SOIL = "nominal: the paper's release"
 LUNAR_SOIL = "nominal: Lunar Sourcebook"
@@ -66,21 +70,19 @@ def wheel_cases(starts: int = 8, seed: int = 0, progress: Callable[[float], None
     return cases
 
 
-def dense_curve(bed: WheelBed, table: SteadyStateTable, angle_deg: float, points: int = 61) -> dict[str, np.ndarray]:
-    """A model's curve over slip at one slip angle, at the mean load of the measurements there.
+def dense_curves(bed: WheelBed, table: SteadyStateTable, angles_deg: Sequence[float]) -> dict[str, np.ndarray]:
+    """A model's curves over slip, (angle, slip), at loads interpolated between the measured points of each angle.
 
     Returns:
-      slip_ratio by travel speed, drawbar_pull N, side_force N, sinkage m.
+      slip_ratio (slip,) by travel speed; drawbar_pull N, side_force N, sinkage m, each (angle, slip).
     """
-    import jax
-
-    from lunar_mjx.criticism.single_wheel import wheel_test
-
-    here = table.at_angles((angle_deg,))
-    slip = np.linspace(-1.0, 0.92, points)
-    # The load differs from point to point; between points it is interpolated, so that the curve meets each.
-    load = np.interp(slip, here.test["slip_ratio"], here.test["normal_load_N"])
+    slip = np.linspace(-1.0, 0.92, _CURVE_POINTS)
+    loads = []
+    for angle in angles_deg:
+        here = table.at_angles((angle,)).test
+        loads.append(np.interp(slip, here["slip_ratio"], here["normal_load_N"]))
     with jax.enable_x64(True):
-        test = wheel_test(slip, np.radians(angle_deg), load, table.radius, table.width, "travel_speed")
-        result = jax.jit(bed.__call__)(bed.parameters, test)
+        angles = np.radians(np.asarray(angles_deg))[:, None]
+        test = wheel_test(slip[None, :], angles, np.stack(loads), table.radius, table.width, "travel_speed")
+    result = bed.run(test)
     return {"slip_ratio": slip, **{q: np.asarray(getattr(result, q)) for q in table.measured}}
