@@ -146,9 +146,7 @@ def _spelled(spec: str, folder: Path) -> str:
 
 
 def _celsius(kelvin: float) -> float:
-    """Degrees Celsius that become the same kelvin again, short where they can be."""
-    short = round(kelvin - ZERO_CELSIUS, 9)
-    return short if short + ZERO_CELSIUS == kelvin else kelvin - ZERO_CELSIUS
+    return round(kelvin - ZERO_CELSIUS, 9)
 
 
 def _written(parameter: Parameter, value: Any) -> Any:
@@ -241,7 +239,7 @@ def _ambient(path: Path, table: Mapping[str, Any], default: tuple[float, ...]) -
         if celsius <= -ZERO_CELSIUS:
             raise bad_input(path, f"ambient.{key}", celsius, "is not above absolute zero",
                             "give degrees Celsius above -273.15")  # fmt: skip
-        return celsius + ZERO_CELSIUS
+        return round(celsius + ZERO_CELSIUS, 9)  # so that what was saved, rounded likewise, is the same again
 
     if "temperature_degC" in table:
         if len(table) > 1:

@@ -104,7 +104,7 @@ def test_a_loaded_model_runs_to_the_same_numbers(tmp_path: Path) -> None:
     for a, b in zip(*(jax.tree.leaves(r) for r in results), strict=True):
         np.testing.assert_array_equal(a, b)
     torque = np.asarray(results[0][1].joint_torque)
-    bare = run(build(model.set("my_friction", torque=0.0), "mjx").params, state, control)[1].joint_torque
+    bare = run(build(model.set("my_friction", torque=[0.0] * 12), "mjx").params, state, control)[1].joint_torque
     friction = [0.1 + 0.2] * 4 + [0.5] * 8
     np.testing.assert_allclose(bare - torque, friction, rtol=1e-3, err_msg="the user's effect acts")
 

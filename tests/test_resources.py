@@ -28,7 +28,7 @@ def test_unknown_name_lists_what_ships(name: str, tmp_path: Path, monkeypatch: p
 
 
 def test_a_folder_without_the_marker_is_not_found(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds rover.toml"):
+    with pytest.raises(UserError, match=r"holds rover\.toml"):
         resources.find("models", tmp_path, "rover.toml")
 
 
