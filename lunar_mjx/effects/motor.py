@@ -76,13 +76,13 @@ def torque_constant(motor, temperature):
         423.15, None, (273.15, 1e4), "K", "winding temperature that cuts the current", "seed paper: 150 degC"
     ),
     hysteresis=Parameter(
-        20.0, 0.0, (0.0, 500.0), "K", "cooling below the cut-off before the current returns", "choice; paper: none"
+        20.0, 0.0, (0.0, 500.0), "K", "cooling below the cut-off before the current returns", "choice"
     ),
 )
 def thermal_cutoff(ctx, p, x, command):
     """No current, hence no torque, from the moment a winding reaches 150 degC until it has cooled (seed paper III-C2).
 
-    Without hysteresis, as printed, the current returns at the next step and the motor chatters at the cut-off.
+    Without hysteresis the current returns at the next step and the motor chatters at the cut-off.
     """
     closes_at = p.temperature - p.hysteresis
     stays = (x.tripped > 0.5) & (ctx.winding_temperature >= closes_at)

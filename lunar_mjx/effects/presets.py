@@ -50,7 +50,7 @@ _PAPER_WINDING = WINDINGS[12]
 PRESET_PARAMETERS: Mapping[str, Mapping[str, Mapping[str, float | Mapping[str, float]]]] = {
     "consistent": {},
     "paper": {
-        "thermal_cutoff": {"hysteresis": 0.0},
+        "thermal_cutoff": {"hysteresis": 500.0},
         "joint_control": {"current_limit": _PAPER_WINDING["current_limit"]},
         "motor": {
             "resistance": _PAPER_WINDING["resistance"],
@@ -70,11 +70,11 @@ UNSAID: Mapping[str, str] = {
     "drive gear": "62:1, the smallest three-stage ratio of the GPX 26 HP, efficiency 0.8 "
     "(15 N m reach 150 degC only below about 80 / efficiency)",
     "steering and suspension gear": "as the rover's folder says",
-    "drive gains": "the rover's, times the square of the ratio of the gears, like the inertia that they act on",
+    "drive gains": "the rover's, in proportion to the inertia at the joint, which the gear changes",
     "heat capacities C_R, C_S": "4.07 and 55 J/K: time constants of 10 s and 10 min over R_th1 and R_th2",
     "winding and magnet": "copper, alpha 0.0040 1/K; NdFeB, beta -0.0012 1/K",
     "ambient temperature T_A": "25 degC",
-    "after the cut-off": "the current returns as soon as the winding is below 150 degC again (no hysteresis)",
+    "after the cut-off": "the current stays off: the paper says that the torque drops to zero, not that it returns",
     "soil": "the paper's release: k_c 1e5, k_phi 1e3, n 1.1, c 462.3 Pa, phi 0.3889 rad, K_s = K_y = 0.015 m",
     "contact k_N, c_N": "5e4 N/m, 300 N s/m",
     "friction mu": "0.8, on rock and under the soil forces alike",

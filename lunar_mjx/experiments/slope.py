@@ -36,8 +36,8 @@ class SlopeRun:
 def slope_runs(
     slopes_deg: Sequence[float],
     model: Model | None = None,
-    rim_speed: float = 0.1,
-    duration: float = 20.0,
+    rim_speed: float = 0.2,
+    duration: float = 15.0,
     average: float = 5.0,
 ) -> list[SlopeRun]:
     """Drives up each slope at a commanded rim speed and averages the end of the run.

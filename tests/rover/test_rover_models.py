@@ -241,7 +241,7 @@ def test_explicit_gains_are_stable(rover: Rover) -> None:
             dof = model.joint(joint).dofadr[0]
             unit[0, dof] = 1
             mujoco.mj_solveM(model, data, response, unit)
-            assert group.velocity_gain * dt * response[0, dof] < 0.6
+            assert group.velocity_gain * dt * response[0, dof] < 0.9
             assert group.position_gain * dt**2 * response[0, dof] < 0.2
 
 
