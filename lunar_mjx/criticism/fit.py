@@ -54,8 +54,8 @@ BEYOND_ANGLES = (75.0,)
 """Held out, beyond every fitted slip angle. 90 deg is set apart: the sinkage there reaches the wheel's radius."""
 APART_ANGLES = (90.0,)
 
-_AGREE = 1e-3
-"""Starts agree with the best where their root mean square residual is within this fraction of it."""
+_AGREE, _EXACT = 1e-3, 1e-6
+"""Starts agree with the best where their root mean square residual exceeds it by at most this share, or sigma."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ def fit(
         beyond=whole.score(BEYOND_ANGLES),
         apart=whole.score(APART_ANGLES),
         starts=rms,
-        agreeing=sum(r <= rms[0] * (1.0 + _AGREE) for r in rms),
+        agreeing=sum(r <= rms[0] * (1.0 + _AGREE) + _EXACT for r in rms),
         at_bound=tuple(f"{f.effect}.{f.name}" for f, u in zip(free, best, strict=True) if u < 1e-4 or u > 1 - 1e-4),
     )
 

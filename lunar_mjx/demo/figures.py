@@ -106,7 +106,7 @@ def _add_rocks(figure: go.Figure, terrain: Terrain, box: tuple[float, float, flo
 
 def history_figure(drives: Sequence[Drive], individuals: int = 3) -> go.Figure:
     """Slip, sinkage and winding temperature over time: median and range over the batch, and a few individuals."""
-    rows = ("mean slip of the wheels", "deepest wheel's sinkage, mm", "hottest winding, °C")
+    rows = ("mean slip", "deepest sinkage, mm", "hottest winding, °C")
     figure = make_subplots(
         rows=3, cols=len(drives), shared_xaxes=True, vertical_spacing=0.05, horizontal_spacing=0.08,
         column_titles=[ROVERS.get(d.rover, (d.rover, INK))[0] for d in drives],

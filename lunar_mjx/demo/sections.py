@@ -31,10 +31,7 @@ def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
     upset = sum(
         int((np.degrees(np.maximum(np.abs(d.roll), np.abs(d.pitch))).max(axis=0) > _UPSET).sum()) for d in drives
     )
-    drove = ", ".join(
-        f"{d.x.shape[1]} {_name(d)}s {np.median(d.distance):.1f} m at {100 * of_finite(np.median, d.mean_slip):.0f} % slip and "
-        f"{1e3 * np.median(d.sinkage):.0f} mm sinkage (medians)" for d in drives
-    )  # fmt: skip
+    drove = ", ".join(_drove(d) for d in drives)
     named = {c.name: c for c in cases}
     plain, paper, fitted = named["consistent"], named["paper"], named["consistent, refitted"]
     assert fitted.fit is not None
@@ -42,13 +39,22 @@ def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
     return [
         f"{count} rovers drove {drives[0].time[-1]:.0f} s on true-scale terrain: {drove}. "
         f"{bad or 'None'} failed numerically, {upset or 'none'} rolled over.",
-        f"With nominal soils, the wheel of {paper.name} misses the measurements by {paper.comparison.overall:.0f} "
-        f"times the scatter of single runs, that of {plain.name} by {plain.comparison.overall:.0f} times.",
+        f"With nominal soils, the wheel of the preset {paper.name} misses the measurements by "
+        f"{paper.comparison.overall:.0f} times the scatter of single runs, that of {plain.name} by "
+        f"{plain.comparison.overall:.0f} times.",
         f"Refitting the soil of {plain.name} at {_angles(FIT_ANGLES)} leaves {fitted.fit.held_out:.1f} times the "
         f"scatter at slip angles that the fit did not see ({fitted.fit.inside:.1f} inside the fitted range, "
         f"{fitted.fit.beyond:.1f} beyond it), most of it in the {QUANTITIES[quantity][2]}: physics is missing, not "
         "only parameters.",
     ]
+
+
+def _drove(d: Drive) -> str:
+    slip = 100 * of_finite(np.median, d.mean_slip)
+    return (
+        f"{d.x.shape[1]} {_name(d)}s {np.median(d.distance):.1f} m at {slip:.0f} % slip and "
+        f"{1e3 * np.median(d.sinkage):.0f} mm sinkage (medians)"
+    )
 
 
 def of_finite(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> float:
@@ -140,7 +146,7 @@ def _error_table(cases: Sequence[Case]) -> Table:
     note = (
         "A model as good as a repeated run would score about 1. Nominal soils are never fitted to these measurements."
     )
-    return Table("Root mean square error, in scatter of single runs", header, rows, note)
+    return Table("Root mean square error, in scatter of single runs", header, rows, note, texts=2)
 
 
 def _worst_table(cases: Sequence[Case]) -> Table:
@@ -153,7 +159,7 @@ def _worst_table(cases: Sequence[Case]) -> Table:
             place = (f"{w.slip_ratio:.2f}", f"{w.slip_angle_deg:g}")
             rows.append([case.name, name, *place, *there, f"{w.residual:+.0f}"])
     header = ["model", "quantity", "slip ratio", "slip angle, deg", "measured", "model", "error, scatter"]
-    return Table("Where each model is worst", header, rows)
+    return Table("Where each model is worst", header, rows, texts=2)
 
 
 def _fit_table(cases: Sequence[Case]) -> Table:
@@ -172,7 +178,7 @@ def _fit_table(cases: Sequence[Case]) -> Table:
         "sum: six of the seven soil parameters are left. "
         f"Starts that agree with the best: {starts}. Values are those that these equations need, not the sand's own."
     )
-    return Table("Refitted values", ["model", "parameter", "value", "unit", ""], rows, note)
+    return Table("Refitted values", ["model", "parameter", "value", "unit", ""], rows, note, texts=2)
 
 
 def versions() -> dict[str, str]:

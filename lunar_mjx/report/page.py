@@ -22,12 +22,13 @@ class Figure(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table; numbers are given as text, in the digits to show."""
+    """A table; numbers are given as text, in the digits to show. The first `texts` columns hold words."""
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
+    texts: int = 1
 
 
 class Text(NamedTuple):
