@@ -288,7 +288,7 @@ def main() -> None:
     """Entry point of the command."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
-        app()
+        app(prog_name="lunar-mjx")
     except UserError as error:
         _fail(str(error), EXIT_STATUS)
     except OSError as error:  # unreadable, unwritable, disk full

@@ -159,14 +159,19 @@ def simulate(
         _blame_user_effect(model, error)
         raise
     telemetry = jax.device_get(compiled(system.params, start, jnp.asarray(commands.values))[1])
-    finite = np.ones(len(commands.values), bool)
+    check_finite(telemetry)
+    return system, telemetry
+
+
+def check_finite(telemetry: Telemetry) -> None:
+    """Raises `UserError` if a simulation diverged, and says when."""
+    finite = np.ones(len(telemetry.time), bool)
     for leaf in jax.tree.leaves(telemetry):
         finite &= np.isfinite(leaf.reshape(len(finite), -1)).all(axis=1)
     if not finite.all():
         when = float(telemetry.time[np.argmin(finite)])
         raise bad_input("simulate", "time", f"{when:g} s", "is where the simulation diverged",
                         "use a smaller timestep_s, softer gains or smaller commands")  # fmt: skip
-    return system, telemetry
 
 
 def _check_start(model: Model, x: float, y: float, yaw: float) -> None:
