@@ -6,6 +6,7 @@ one wide instruction (or one group of GPU threads) serves many of them. A rollou
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
+from lunar_mjx.dynamics.batch_last import batch_last
 from lunar_mjx.dynamics.state import Params, State, Telemetry
 from lunar_mjx.errors import UserError
 
@@ -31,8 +33,8 @@ def step_batch(
 ) -> tuple[State, Telemetry]:
     """One step of many rovers; see `System.step_batch`."""
 
-    def step(params: Params, axes: Axes, state: State, control: Any) -> Any:
-        return jax.vmap(system.step, in_axes=(axes, -1, -1), out_axes=-1)(params, state, control)
+    def step(params: Params, axes: list[int | None], state: State, control: Any) -> Any:
+        return batch_last(system.step, (axes, -1, -1))(params, state, control)
 
     return _in_chunks(step, params, params_axes, (state, control), chunk)
 
@@ -51,8 +53,13 @@ def rollout_batch(
     keep = report or (lambda telemetry: telemetry)
     controls = jnp.asarray(controls)
 
-    def drive(params: Params, axes: Axes, state: State, *own: Any) -> Any:
-        run = jax.vmap(system.step, in_axes=(axes, -1, -1 if own else None), out_axes=-1)
+    def drive(params: Params, axes: list[int | None], state: State, *own: Any) -> Any:
+        run = batch_last(system.step, (axes, -1, -1 if own else None))
+        engine = system.engine
+
+        def recast(change: Callable[..., Any], state: State) -> State:
+            qpos, qvel = batch_last(change, (-1, -1))(state.qpos, state.qvel)
+            return dataclasses.replace(state, qpos=qpos, qvel=qvel)
 
         def hold(now: State, control: Any) -> tuple[State, Any]:
             new, telemetry = run(params, now, control)
@@ -60,7 +67,8 @@ def rollout_batch(
                 new = jax.lax.fori_loop(1, every, lambda _, s: run(params, s, control)[0], new)
             return new, keep(telemetry)
 
-        return jax.lax.scan(hold, state, own[0] if own else controls)
+        end, kept = jax.lax.scan(hold, recast(engine.split, state), own[0] if own else controls)
+        return recast(engine.join, end), kept
 
     return _in_chunks(drive, params, params_axes, (state, controls) if controls.ndim == 3 else (state,), chunk)
 
@@ -73,13 +81,12 @@ def _in_chunks(function: Callable[..., Any], params: Params, axes: Axes, varying
     per_rover = jax.tree.leaves(jax.tree.broadcast(flags, params))
     _check(leaves, per_rover, varying, batch)
     inner = [_inner_axis(leaf) if own else None for leaf, own in zip(leaves, per_rover, strict=True)]
-    inner_axes = jax.tree.unflatten(treedef, inner)
 
     def block(args: tuple[list[Any], Any]) -> Any:
         own, varying = args
         moved = iter(own)
         filled = [leaf if a is None else jnp.moveaxis(next(moved), 0, a) for leaf, a in zip(leaves, inner, strict=True)]
-        out = function(jax.tree.unflatten(treedef, filled), inner_axes, *_last(varying))
+        out = function(jax.tree.unflatten(treedef, filled), inner, *_last(varying))
         return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), out)
 
     args = ([leaf for leaf, own in zip(leaves, per_rover, strict=True) if own], varying)

@@ -63,6 +63,14 @@ class MjxEngine:
 
         return self._kinematics(d), finish
 
+    def split(self, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+        """The coordinates as a loop over time carries them: unchanged."""
+        return qpos, qvel
+
+    def join(self, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+        """The inverse of `split`."""
+        return qpos, qvel
+
     def _kinematics(self, d: mjx.Data) -> Kinematics:
         chassis, wheels = self._chassis, self._wheels
         about = d.subtree_com[chassis]

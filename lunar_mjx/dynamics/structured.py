@@ -43,10 +43,37 @@ from lunar_mjx.dynamics.spatial_algebra import (
 )
 from lunar_mjx.dynamics.suitability import check_model
 from lunar_mjx.dynamics.topology import CHASSIS, LegGroup, Structure, read_structure
+from lunar_mjx.pytree import pytree
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Frame, Vec3
 
 STILL = Motion(ZERO, ZERO)
+
+
+@pytree
+class Pieces:
+    """Positions or velocities as separate components, so that a loop over time carries no array to cut up.
+
+    Attributes:
+      base: of the free joint, numbers. joints: independent joints by group and link, each of shape (leg,).
+    """
+
+    base: tuple[Any, ...]
+    joints: tuple[tuple[Any, ...], ...]
+
+    @property
+    def dtype(self) -> Any:
+        return self.base[0].dtype
+
+
+class Base(NamedTuple):
+    """The chassis: pose and velocity in the world, and its spatial velocity in its own frame."""
+
+    position: Vector
+    quaternion: list[Any]
+    frame: Rotation
+    velocity: Vector
+    motion: Motion
 
 
 class LinkState(NamedTuple):
@@ -111,39 +138,69 @@ class StructuredEngine:
         self.wheel_feet = wheel_feet(model, wheels, chassis)
         self._joints = len(joints)
 
-    def forward(self, params: Any, qpos: Float[Array, "nq"], qvel: Float[Array, "nv"]) -> tuple[Kinematics, Finish]:
+    def forward(self, params: Any, qpos: Any, qvel: Any) -> tuple[Kinematics, Finish]:
         """Kinematics at (qpos, qvel), and a function from forces to the next (qpos, qvel).
 
         The dependent joints of loops are computed from the independent ones; their entries in `qpos` and `qvel` are
         not read.
+
+        Args:
+          params: gravity, and the motors' rotor inertia where there are motors.
+          qpos, qvel: MuJoCo's coordinates of shapes (nq,) and (nv,), or both as `split` gives them.
         """
-        dtype = qpos.dtype
-        numbers = [_cast_group(group, dtype) for group in self.structure.groups]
-        p, v = self.structure.free_qpos, self.structure.free_dof
-        position = Vector(*(qpos[p + i] for i in range(3)))
-        quaternion = normalized([qpos[p + 3 + i] for i in range(4)])
+        whole = not isinstance(qpos, Pieces)
+        if whole:
+            qpos, qvel = self.split(qpos, qvel)
+        numbers = [_cast_group(group, qpos.dtype) for group in self.structure.groups]
+        position, velocity = Vector(*qpos.base[:3]), Vector(*qvel.base[:3])
+        quaternion = normalized(list(qpos.base[3:]))
         frame = rotation(quaternion)
-        velocity = Vector(*(qvel[v + i] for i in range(3)))
-        base = Motion(Vector(*(qvel[v + 3 + i] for i in range(3))), frame.undo(velocity))
+        base = Base(position, quaternion, frame, velocity, Motion(Vector(*qvel.base[3:]), frame.undo(velocity)))
         legs = [
-            _forward(group, n, base, qpos, qvel) for group, n in zip(self.structure.groups, numbers, strict=True)
-        ]  # fmt: skip
-        kinematics = self._kinematics(numbers, legs, position, quaternion, frame, base, velocity)
+            _forward(n, base.motion, angle, speed)
+            for n, angle, speed in zip(numbers, qpos.joints, qvel.joints, strict=True)
+        ]
 
         def finish(forces: Forces) -> tuple[Any, Any]:
-            return self._finish(params, numbers, legs, position, quaternion, frame, base, velocity, forces)
+            new = self._finish(params, numbers, legs, base, forces)
+            return self.join(*new) if whole else new
 
-        return kinematics, finish
+        return self._kinematics(numbers, legs, base), finish
+
+    def split(self, qpos: Float[Array, "nq"], qvel: Float[Array, "nv"]) -> tuple[Pieces, Pieces]:
+        """The coordinates as the pieces that the engine computes with; dependent joints are left out."""
+        p, v = self.structure.free_qpos, self.structure.free_dof
+        groups = self.structure.groups
+        return (
+            Pieces(
+                tuple(qpos[p + i] for i in range(7)),
+                tuple(tuple(select(qpos, g.links[k].qpos) for k in g.free) for g in groups),
+            ),
+            Pieces(
+                tuple(qvel[v + i] for i in range(6)),
+                tuple(tuple(select(qvel, g.links[k].dof) for k in g.free) for g in groups),
+            ),
+        )
+
+    def join(self, qpos: Pieces, qvel: Pieces) -> tuple[Float[Array, "nq"], Float[Array, "nv"]]:
+        """MuJoCo's coordinates from the pieces, with the dependent joints of loops."""
+        positions, speeds = [jnp.stack(qpos.base)], [jnp.stack(qvel.base)]
+        at_q, at_v = [self.structure.free_qpos + np.arange(7)], [self.structure.free_dof + np.arange(6)]
+        for group, q, w in zip(self.structure.groups, qpos.joints, qvel.joints, strict=True):
+            n = _cast_group(group, qpos.dtype)
+            angle, speed, _, _ = _joints(n, q, w)
+            for k, link in enumerate(n.links):
+                positions.append(_over_legs(mul(link.numbers.sign, angle[k]), n.count))
+                speeds.append(_over_legs(mul(link.numbers.sign, speed[k]), n.count))
+                at_q.append(link.qpos)
+                at_v.append(link.dof)
+        return assemble(positions, at_q), assemble(speeds, at_v)
 
     def _kinematics(
         self,
         numbers: list[LegGroup],
         legs: list[LegState],
-        position: Vector,
-        quaternion: list[Any],
-        frame: Rotation,
-        base: Motion,
-        velocity: Vector,
+        base: Base,
     ) -> Kinematics:
         angles, speeds, drives = [], [], []
         for group, leg in zip(numbers, legs, strict=True):
@@ -160,73 +217,56 @@ class StructuredEngine:
                 moving = link.velocity.linear + link.velocity.angular.cross(at)
                 vectors = at, link.frame.apply(slot.numbers.axle), moving, link.velocity.angular
                 for into, vector in zip((places, axles, travels, spins), vectors, strict=True):
-                    into.append([_over_legs(c, group.count) for c in frame.apply(vector)])
+                    into.append([_over_legs(c, group.count) for c in base.frame.apply(vector)])
                 order.append(slot.index)
 
         def of_wheels(pieces: list[list[Any]]) -> Vec3:
             return Vec3(*(assemble([piece[i] for piece in pieces], order) for i in range(3)))
 
+        place = Vec3(*base.position)
         return Kinematics(
-            position=Vec3(*position),
-            quaternion=jnp.stack(quaternion),
-            frame=Frame(*(Vec3(*column) for column in frame)),
-            velocity=Vec3(*velocity),
-            angular_velocity=Vec3(*frame.apply(base.angular)),
+            position=place,
+            quaternion=jnp.stack(base.quaternion),
+            frame=Frame(*(Vec3(*column) for column in base.frame)),
+            velocity=Vec3(*base.velocity),
+            angular_velocity=Vec3(*base.frame.apply(base.motion.angular)),
             joint_angle=assemble(angles, drives),
             joint_speed=assemble(speeds, drives),
-            wheel_position=of_wheels(places) + Vec3(*position),
+            wheel_position=of_wheels(places) + place,
             wheel_axle=of_wheels(axles),
             wheel_velocity=of_wheels(travels),
             wheel_angular_velocity=of_wheels(spins),
         )
 
     def _finish(
-        self,
-        params: Any,
-        numbers: list[LegGroup],
-        legs: list[LegState],
-        position: Vector,
-        quaternion: list[Any],
-        frame: Rotation,
-        base: Motion,
-        velocity: Vector,
-        forces: Forces,
-    ) -> tuple[Any, Any]:
+        self, params: Any, numbers: list[LegGroup], legs: list[LegState], base: Base, forces: Forces
+    ) -> tuple[Pieces, Pieces]:
+        """Accelerations from the forces, and a step of semi-implicit Euler."""
         dtype, dt = forces.joint_torque.dtype, self.timestep
+        frame, motion = base.frame, base.motion
         up = frame.undo(Vector(0.0, 0.0, jnp.asarray(params.gravity, dtype)))
         armature = _reflected_inertia(params, self._joints, dtype)
         blocks = [
             _leg_block(group, leg, up, forces, frame, armature, dt) for group, leg in zip(numbers, legs, strict=True)
         ]
         chassis = _chassis_inertia(self.structure.base, forces)
-        falling = Motion(ZERO, up)
-        force = chassis.apply(falling) + base.cross_force(chassis.apply(base)) - Force(
-            frame.undo(Vector(*forces.chassis_moment)), frame.undo(Vector(*forces.chassis_force))
-        )  # fmt: skip
+        applied = Force(frame.undo(Vector(*forces.chassis_moment)), frame.undo(Vector(*forces.chassis_force)))
+        force = chassis.apply(Motion(ZERO, up)) + motion.cross_force(chassis.apply(motion)) - applied
         acceleration, rates = _solve(chassis, force, blocks)
         # the classical acceleration of the chassis frame's origin
-        linear = acceleration.linear + base.angular.cross(base.linear)
-        new_velocity = velocity + frame.apply(linear) * dt
-        new_spin = base.angular + acceleration.angular * dt
-        new_position = position + new_velocity * dt
-        new_quaternion = integrate(quaternion, new_spin, dt)
-        return self._pack(numbers, legs, rates, [*new_position, *new_quaternion], [*new_velocity, *new_spin])
-
-    def _pack(
-        self, numbers: list[LegGroup], legs: list[LegState], rates: list[list[Any]], pose: list[Any], twist: list[Any]
-    ) -> tuple[Any, Any]:
-        """The new joints by semi-implicit Euler, in MuJoCo's layout."""
-        positions, speeds = [jnp.stack(pose)], [jnp.stack(twist)]
-        at_q = [self.structure.free_qpos + np.arange(7)]
-        at_v = [self.structure.free_dof + np.arange(6)]
-        for group, leg, rate in zip(numbers, legs, rates, strict=True):
-            angle, speed = _advance(group, leg, rate, self.timestep)
-            for link, q, w in zip(group.links, angle, speed, strict=True):
-                positions.append(_over_legs(mul(link.numbers.sign, q), group.count))
-                speeds.append(_over_legs(mul(link.numbers.sign, w), group.count))
-                at_q.append(link.qpos)
-                at_v.append(link.dof)
-        return assemble(positions, at_q), assemble(speeds, at_v)
+        linear = acceleration.linear + motion.angular.cross(motion.linear)
+        velocity = base.velocity + frame.apply(linear) * dt
+        spin = motion.angular + acceleration.angular * dt
+        position = base.position + velocity * dt
+        quaternion = integrate(base.quaternion, spin, dt)
+        angles, speeds = [], []
+        for n, leg, rate in zip(numbers, legs, rates, strict=True):
+            signs = [n.links[k].numbers.sign for k in n.free]
+            speed = [leg.speed[k] + dt * r for k, r in zip(n.free, rate, strict=True)]
+            angle = [leg.angle[k] + dt * w for k, w in zip(n.free, speed, strict=True)]
+            speeds.append(tuple(mul(s, w) for s, w in zip(signs, speed, strict=True)))
+            angles.append(tuple(mul(s, q) for s, q in zip(signs, angle, strict=True)))
+        return Pieces((*position, *quaternion), tuple(angles)), Pieces((*velocity, *spin), tuple(speeds))
 
 
 def _cast_group(group: LegGroup, dtype: Any) -> LegGroup:
@@ -255,26 +295,25 @@ def _sum_over_legs(value: Any, count: int) -> Any:
     return count * value if jnp.ndim(value) == 0 else jnp.sum(value)
 
 
-def _close_loop(group: LegGroup, angle: list[Any], speed: list[Any]) -> tuple[list[Any], list[Any]]:
-    """Sets the dependent joints; returns the gains and drifts of all joints."""
-    gain: list[Any] = [1.0] * len(group.links)
-    drift: list[Any] = [0.0] * len(group.links)
-    loop = group.loop
-    if loop is None:
-        return gain, drift
-    driver = loop.independent
-    angles = loop.angles(loop.numbers, angle[driver])
-    gains, drifts = loop.rates(loop.numbers, angle[driver], speed[driver])
-    for k, q, g, b in zip(loop.dependent, angles, gains, drifts, strict=True):
-        angle[k], speed[k], gain[k], drift[k] = q, mul(g, speed[driver]), g, b
-    return gain, drift
+def _joints(n: LegGroup, qpos: tuple[Any, ...], qvel: tuple[Any, ...]) -> tuple[list[Any], ...]:
+    """Angles and speeds of all joints in the links' own sense, with their gains and drifts (see `LegState`)."""
+    count, loop = len(n.links), n.loop
+    angle, speed = [0.0] * count, [0.0] * count
+    gain, drift = [1.0] * count, [0.0] * count
+    for k, q, w in zip(n.free, qpos, qvel, strict=True):
+        angle[k], speed[k] = mul(n.links[k].numbers.sign, q), mul(n.links[k].numbers.sign, w)
+    if loop is not None:
+        driver = loop.independent
+        angles = loop.angles(loop.numbers, angle[driver])
+        gains, drifts = loop.rates(loop.numbers, angle[driver], speed[driver])
+        for k, q, g, b in zip(loop.dependent, angles, gains, drifts, strict=True):
+            angle[k], speed[k], gain[k], drift[k] = q, mul(g, speed[driver]), g, b
+    return angle, speed, gain, drift
 
 
-def _forward(group: LegGroup, n: LegGroup, base: Motion, qpos: Any, qvel: Any) -> LegState:
+def _forward(n: LegGroup, base: Motion, qpos: tuple[Any, ...], qvel: tuple[Any, ...]) -> LegState:
     """Poses, velocities and bias accelerations from the chassis outward (Featherstone 2008, table 5.1)."""
-    angle = [mul(link.numbers.sign, select(qpos, link.qpos)) for link in n.links]
-    speed = [mul(link.numbers.sign, select(qvel, link.dof)) for link in n.links]
-    gain, drift = _close_loop(n, angle, speed)
+    angle, speed, gain, drift = _joints(n, qpos, qvel)
     ground = LinkState(ZERO, IDENTITY, STILL, base, STILL)
     links: list[LinkState] = []
     for k, link in enumerate(n.links):
@@ -285,9 +324,14 @@ def _forward(group: LegGroup, n: LegGroup, base: Motion, qpos: Any, qvel: Any) -
         subspace = Motion(axis, origin.cross(axis))
         velocity = up.velocity + subspace * speed[k]
         bias = up.bias + velocity.cross(subspace) * speed[k] + subspace * drift[k]
-        frame = mount.turn(link.axis, jnp.cos(angle[k]), jnp.sin(angle[k]))
-        links.append(LinkState(origin, frame, subspace, velocity, bias))
+        cos, sin = once(jnp.cos(angle[k]), jnp.sin(angle[k]))
+        links.append(LinkState(origin, mount.turn(link.axis, cos, sin), subspace, velocity, bias))
     return LegState(angle, speed, gain, drift, links)
+
+
+def once(*values: Any) -> tuple[Any, ...]:
+    """The same values, which XLA computes once and stores instead of again in every kernel that reads them."""
+    return jax.lax.optimization_barrier(values)
 
 
 def _reflected_inertia(params: Any, joints: int, dtype: Any) -> Any:
@@ -385,7 +429,7 @@ def _project(n: LegGroup, leg: LegState, block: LegBlock) -> LegBlock:
     loop = n.loop
     if loop is None:
         return block
-    free = [k for k in range(len(n.links)) if k not in loop.dependent]
+    free = n.free
     moved = {k: [(k, 1.0)] for k in free}
     moved[loop.independent] += [(k, leg.gain[k]) for k in loop.dependent]
 
@@ -446,15 +490,3 @@ def _matrix(inertia: Inertia) -> list[list[Any]]:
     top = [moments[r] + cross[r] for r in range(3)]
     bottom = [[cross[c][r] for c in range(3)] + [m if c == r else 0.0 for c in range(3)] for r in range(3)]
     return top + bottom
-
-
-def _advance(n: LegGroup, leg: LegState, rates: list[Any], dt: float) -> tuple[list[Any], list[Any]]:
-    """Semi-implicit Euler of the independent joints; the dependent ones follow exactly."""
-    dependent = n.loop.dependent if n.loop else ()
-    free = [k for k in range(len(n.links)) if k not in dependent]
-    angle, speed = list(leg.angle), list(leg.speed)
-    for k, rate in zip(free, rates, strict=True):
-        speed[k] = speed[k] + dt * rate
-        angle[k] = angle[k] + dt * speed[k]
-    _close_loop(n, angle, speed)
-    return angle, speed

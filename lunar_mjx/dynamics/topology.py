@@ -83,6 +83,12 @@ class LegGroup:
     wheels: tuple[WheelSlot, ...]
     loop: FourBar | None
 
+    @property
+    def free(self) -> list[int]:
+        """The independent joints."""
+        dependent = self.loop.dependent if self.loop else ()
+        return [k for k in range(len(self.links)) if k not in dependent]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Structure:
