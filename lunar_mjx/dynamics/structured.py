@@ -50,12 +50,22 @@ from lunar_mjx.spatial import Frame, Vec3
 STILL = Motion(ZERO, ZERO)
 
 
+class Turn(NamedTuple):
+    """A joint's angle, rad, with its cosine and sine: carried along, so that no kernel computes them again."""
+
+    angle: Any
+    cos: Any
+    sin: Any
+
+
 @pytree
 class Pieces:
     """Positions or velocities as separate components, so that a loop over time carries no array to cut up.
 
     Attributes:
-      base: of the free joint, numbers. joints: independent joints by group and link, each of shape (leg,).
+      base: of the free joint, numbers.
+      joints: by group: for positions the turn of every link, for velocities the speeds of the independent joints, in
+        the links' own sense, each of shape (leg,).
     """
 
     base: tuple[Any, ...]
@@ -171,15 +181,16 @@ class StructuredEngine:
         """The coordinates as the pieces that the engine computes with; dependent joints are left out."""
         p, v = self.structure.free_qpos, self.structure.free_dof
         groups = self.structure.groups
+        numbers = [_cast_group(g, qpos.dtype) for g in groups]
+        turns = tuple(
+            _turns(n, [mul(n.links[k].numbers.sign, select(qpos, n.links[k].qpos)) for k in n.free]) for n in numbers
+        )
+        speeds = tuple(
+            tuple(mul(n.links[k].numbers.sign, select(qvel, n.links[k].dof)) for k in n.free) for n in numbers
+        )
         return (
-            Pieces(
-                tuple(qpos[p + i] for i in range(7)),
-                tuple(tuple(select(qpos, g.links[k].qpos) for k in g.free) for g in groups),
-            ),
-            Pieces(
-                tuple(qvel[v + i] for i in range(6)),
-                tuple(tuple(select(qvel, g.links[k].dof) for k in g.free) for g in groups),
-            ),
+            Pieces(tuple(qpos[p + i] for i in range(7)), turns),
+            Pieces(tuple(qvel[v + i] for i in range(6)), speeds),
         )
 
     def join(self, qpos: Pieces, qvel: Pieces) -> tuple[Float[Array, "nq"], Float[Array, "nv"]]:
@@ -188,9 +199,9 @@ class StructuredEngine:
         at_q, at_v = [self.structure.free_qpos + np.arange(7)], [self.structure.free_dof + np.arange(6)]
         for group, q, w in zip(self.structure.groups, qpos.joints, qvel.joints, strict=True):
             n = _cast_group(group, qpos.dtype)
-            angle, speed, _, _ = _joints(n, q, w)
+            speed, _, _ = _speeds(n, q, w)
             for k, link in enumerate(n.links):
-                positions.append(_over_legs(mul(link.numbers.sign, angle[k]), n.count))
+                positions.append(_over_legs(mul(link.numbers.sign, q[k].angle), n.count))
                 speeds.append(_over_legs(mul(link.numbers.sign, speed[k]), n.count))
                 at_q.append(link.qpos)
                 at_v.append(link.dof)
@@ -261,11 +272,10 @@ class StructuredEngine:
         quaternion = integrate(base.quaternion, spin, dt)
         angles, speeds = [], []
         for n, leg, rate in zip(numbers, legs, rates, strict=True):
-            signs = [n.links[k].numbers.sign for k in n.free]
             speed = [leg.speed[k] + dt * r for k, r in zip(n.free, rate, strict=True)]
             angle = [leg.angle[k] + dt * w for k, w in zip(n.free, speed, strict=True)]
-            speeds.append(tuple(mul(s, w) for s, w in zip(signs, speed, strict=True)))
-            angles.append(tuple(mul(s, q) for s, q in zip(signs, angle, strict=True)))
+            speeds.append(tuple(speed))
+            angles.append(_turns(n, angle))
         return Pieces((*position, *quaternion), tuple(angles)), Pieces((*velocity, *spin), tuple(speeds))
 
 
@@ -295,25 +305,35 @@ def _sum_over_legs(value: Any, count: int) -> Any:
     return count * value if jnp.ndim(value) == 0 else jnp.sum(value)
 
 
-def _joints(n: LegGroup, qpos: tuple[Any, ...], qvel: tuple[Any, ...]) -> tuple[list[Any], ...]:
-    """Angles and speeds of all joints in the links' own sense, with their gains and drifts (see `LegState`)."""
+def _turns(n: LegGroup, free: list[Any]) -> tuple[Turn, ...]:
+    """All joints' angles with their cosines and sines, from the independent angles."""
+    angle: list[Any] = [0.0] * len(n.links)
+    for k, q in zip(n.free, free, strict=True):
+        angle[k] = q
+    loop = n.loop
+    if loop is not None:
+        for k, q in zip(loop.dependent, loop.angles(loop.numbers, angle[loop.independent]), strict=True):
+            angle[k] = q
+    return tuple(Turn(q, *once(jnp.cos(q), jnp.sin(q))) for q in angle)
+
+
+def _speeds(n: LegGroup, turns: tuple[Turn, ...], free: tuple[Any, ...]) -> tuple[list[Any], list[Any], list[Any]]:
+    """Speeds of all joints, with their gains and drifts (see `LegState`)."""
     count, loop = len(n.links), n.loop
-    angle, speed = [0.0] * count, [0.0] * count
-    gain, drift = [1.0] * count, [0.0] * count
-    for k, q, w in zip(n.free, qpos, qvel, strict=True):
-        angle[k], speed[k] = mul(n.links[k].numbers.sign, q), mul(n.links[k].numbers.sign, w)
+    speed, gain, drift = [0.0] * count, [1.0] * count, [0.0] * count
+    for k, w in zip(n.free, free, strict=True):
+        speed[k] = w
     if loop is not None:
         driver = loop.independent
-        angles = loop.angles(loop.numbers, angle[driver])
-        gains, drifts = loop.rates(loop.numbers, angle[driver], speed[driver])
-        for k, q, g, b in zip(loop.dependent, angles, gains, drifts, strict=True):
-            angle[k], speed[k], gain[k], drift[k] = q, mul(g, speed[driver]), g, b
-    return angle, speed, gain, drift
+        gains, drifts = loop.rates(loop.numbers, turns[driver].angle, speed[driver])
+        for k, g, b in zip(loop.dependent, gains, drifts, strict=True):
+            speed[k], gain[k], drift[k] = mul(g, speed[driver]), g, b
+    return speed, gain, drift
 
 
-def _forward(n: LegGroup, base: Motion, qpos: tuple[Any, ...], qvel: tuple[Any, ...]) -> LegState:
+def _forward(n: LegGroup, base: Motion, turns: tuple[Turn, ...], free: tuple[Any, ...]) -> LegState:
     """Poses, velocities and bias accelerations from the chassis outward (Featherstone 2008, table 5.1)."""
-    angle, speed, gain, drift = _joints(n, qpos, qvel)
+    speed, gain, drift = _speeds(n, turns, free)
     ground = LinkState(ZERO, IDENTITY, STILL, base, STILL)
     links: list[LinkState] = []
     for k, link in enumerate(n.links):
@@ -324,9 +344,9 @@ def _forward(n: LegGroup, base: Motion, qpos: tuple[Any, ...], qvel: tuple[Any, 
         subspace = Motion(axis, origin.cross(axis))
         velocity = up.velocity + subspace * speed[k]
         bias = up.bias + velocity.cross(subspace) * speed[k] + subspace * drift[k]
-        cos, sin = once(jnp.cos(angle[k]), jnp.sin(angle[k]))
-        links.append(LinkState(origin, mount.turn(link.axis, cos, sin), subspace, velocity, bias))
-    return LegState(angle, speed, gain, drift, links)
+        frame = mount.turn(link.axis, turns[k].cos, turns[k].sin)
+        links.append(LinkState(origin, frame, subspace, velocity, bias))
+    return LegState([turn.angle for turn in turns], speed, gain, drift, links)
 
 
 def once(*values: Any) -> tuple[Any, ...]:
