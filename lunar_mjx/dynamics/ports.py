@@ -75,12 +75,11 @@ class Pipeline:
             value, update = result
             new = {}
             for name, old in own.items():
-                if name not in update:
-                    new[name] = old
-                elif effect.state[name].rate:
-                    new[name] = old + ctx.dt * update[name]
-                else:
-                    new[name] = update[name]
+                value_now = update.get(name, old)
+                if name in update and effect.state[name].rate:
+                    value_now = old + ctx.dt * update[name]
+                # A weakly typed new state would compile the next call of the step anew.
+                new[name] = jnp.asarray(value_now, old.dtype)
             state = {**state, effect.name: new}
         return value, state
 

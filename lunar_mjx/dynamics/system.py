@@ -147,7 +147,8 @@ class System:
         def hold(state: State, control: Any) -> tuple[State, Telemetry]:
             new, telemetry = self.step(params, state, control)
             if every > 1:
-                new = jax.lax.fori_loop(1, every, lambda _, s: self.step(params, s, control)[0], new)
+                # Begun anew from the old state, so that the step above is only its telemetry: half the compilation.
+                new = jax.lax.fori_loop(0, every, lambda _, s: self.step(params, s, control)[0], state)
             return new, telemetry
 
         return jax.lax.scan(hold, state, controls)

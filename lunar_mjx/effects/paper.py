@@ -26,8 +26,9 @@ SPEED_FLOOR = 0.02
 REGULARISATIONS = {
     "eq. 8, slip ratio": f"denominators r omega and v_x kept at least {SPEED_FLOOR} m/s from zero; s within [-1, 1]",
     "eq. 9, slip angle": "0 where the wheel stands still; |beta| at most 89 deg, so that tan(beta) stays finite",
-    "tau_m": "exponent -j/K_s at most 3, because j as printed can be negative, where exp(-j/K_s) grows without bound",
-    "eq. 11, F_S": "opposes the lateral velocity; the paper gives no sign",
+    "tau_m": "exponent -j/K_s at most 3, because j as printed can be negative, where exp(-j/K_s) grows without bound; "
+    "odd in j where mend_j = 1",
+    "eq. 11, F_S": "opposes the lateral velocity, with |tau_m|; the paper gives no sign",
     "friction at standstill": "mu F_N tanh(|v|/v_e): the printed mu F_N has no direction at rest",
     "A and B at theta_m = 0": "half-angle form with sinkage of at least 1e-9 r",
     "F_N": "never pulls: k_N z + c_N zdot at least zero",
@@ -109,7 +110,8 @@ def printed_shear(ctx, p, x, wheel):
     j = r_s * (theta_1 - theta_m) - lever * (1.0 - slip) * arc
     strength = jnp.where(soil.rock > 0.5, 0.0, grounded(contact, soil.cohesion + normal.sigma_m * soil.tan_phi))
     sigma_m = jnp.where(soil.rock > 0.5, 0.0, normal.sigma_m)
-    tau = -strength * jnp.expm1(jnp.minimum(-j / soil.shear_modulus_x, 3.0))
+    printed_share = -jnp.expm1(jnp.minimum(-j / soil.shear_modulus_x, 3.0))
+    tau = strength * jnp.where(p.mend_j > 0.5, janosi(j, soil.shear_modulus_x), printed_share)
     normal_radius = p.mend_shear_radius * r + (1.0 - p.mend_shear_radius) * r_s
     shear_radius = p.mend_shear_radius * r_s + (1.0 - p.mend_shear_radius) * r
     drawbar = shear_radius * b * tau * a_factor - normal_radius * b * sigma_m * b_factor
@@ -117,7 +119,7 @@ def printed_shear(ctx, p, x, wheel):
     mended_side = p.mend_side > 0.5
     # |tan(beta)| inside and the sign outside: opposing, also where eq. 9 puts beta beyond 90 deg
     lateral = r * jnp.abs((1.0 - slip) * tangent) * theta_m / soil.shear_modulus_y
-    printed_side = jnp.sign(contact.v_y) * tau * -jnp.expm1(-jnp.minimum(lateral, 50.0))
+    printed_side = jnp.sign(contact.v_y) * jnp.abs(tau) * -jnp.expm1(-jnp.minimum(lateral, 50.0))
     # mended, the sign is that of the displacement, so that a wheel that stands holds against the slope
     own_side = strength * janosi(r * theta_m * wheel.slip_y, soil.shear_modulus_y)
     side = -r_s * b * theta_m * jnp.where(mended_side, own_side, printed_side)

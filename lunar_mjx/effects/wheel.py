@@ -18,6 +18,10 @@ _MAX_SINKAGE_RATIO = 1.5
 """The contact arc is followed up to an entrance angle of 120 deg; a wheel buried deeper keeps the force of that arc."""
 
 
+STANDSTILL_SPEED = 1e-3
+"""m/s; below it a wheel counts as standing, and eq. 11's factor for braking, a ratio of speeds, has no meaning."""
+
+
 def entrance_angle(sinkage, radius):
     """theta_1 = arccos((r - z)/r), written as 2 arcsin sqrt(z/2r), which keeps its digits at small sinkage; rad."""
     ratio = jnp.clip(sinkage / radius, _MIN_SINKAGE, _MAX_SINKAGE_RATIO)
@@ -160,8 +164,9 @@ def shear_state(ctx, p, x, wheel):
 def lateral_slip_speed(contact):
     """Numerator of (1 - s) tan(beta) over V_r: v_y driving, v_y (2 - r omega/v_x) braking, m/s (eqs. 8-11)."""
     braking = jnp.abs(contact.rim_speed) <= jnp.abs(contact.v_x)
-    speed = jnp.where(jnp.abs(contact.v_x) > 1e-6, contact.v_x, 1.0)
-    factor = jnp.where(braking, 2.0 - jnp.clip(contact.rim_speed / speed, -1.0, 1.0), 1.0)
+    rolling = jnp.abs(contact.v_x) > STANDSTILL_SPEED
+    speed = jnp.where(rolling, contact.v_x, 1.0)
+    factor = jnp.where(braking & rolling, 2.0 - jnp.clip(contact.rim_speed / speed, -1.0, 1.0), 1.0)
     return contact.v_y * factor
 
 

