@@ -14,6 +14,7 @@ phi_3 = phi_1 and phi_2 = -phi_1.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
@@ -175,7 +176,7 @@ def _freudenstein(known: Plane, link: Plane, length: Plane, branch: Any) -> Any:
 
 
 def read_fourbar(
-    links: list[Link], count: int, pinned: tuple[int, int], anchors: list[tuple[np.ndarray, np.ndarray]], name: str
+    links: list[Link], count: int, pinned: tuple[int, int], anchors: Sequence[tuple[np.ndarray, ...]], name: str
 ) -> FourBar:
     """Reads a loop that a pin closes between two links of a leg.
 
@@ -272,7 +273,7 @@ def _branch(loop: FourBar, legs: list[_Measured], name: str) -> LoopNumbers:
     for leg in legs:
         errors = []
         for sign in (1.0, -1.0):
-            vectors = {k: tuple(float(c) for c in getattr(leg, k)) for k in "defb"}
+            vectors: Any = {k: tuple(float(c) for c in getattr(leg, k)) for k in "defb"}
             phi = loop._solve(LoopNumbers(leg.senses, **vectors, branch=sign), np.float64(0.0))
             errors.append(max(abs(float(p)) for p in phi))
         if abs(errors[0] - errors[1]) < 1e-2:

@@ -354,10 +354,10 @@ def _body(masses: list[list[tuple[float, np.ndarray, np.ndarray]]], aligns: list
 
 
 def _fuse(masses: list[tuple[float, np.ndarray, np.ndarray]]) -> tuple[float, np.ndarray, np.ndarray]:
-    mass = sum(m for m, _, _ in masses)
+    mass = float(sum(m for m, _, _ in masses))
     if mass == 0.0:
         return 0.0, np.zeros(3), np.zeros((3, 3))
-    com = sum(m * c for m, c, _ in masses) / mass
+    com = np.sum([m * c for m, c, _ in masses], axis=0) / mass
     moments = np.zeros((3, 3))
     for m, c, i in masses:
         r = c - com
