@@ -21,7 +21,7 @@ def _rover(folder: Path, name: str, legs: str, tail: str, corners: list[str], jo
     path.write_text(_HEAD.format(name=name) + legs + "</body></worldbody>" + tail + "</mujoco>")
     wheels = tuple(Wheel(c, f"{c}_wheel", 0.2, 0.1, f"{c}_drive", None, None) for c in corners)
     group = JointGroup("drive", joints, "torque", 0.0, 0.0, 1.0, 1.0, 0.0, 48)
-    limits = {j: (-np.inf, np.inf) for j in joints}
+    limits = dict.fromkeys(joints, (-np.inf, np.inf))
     return Rover(
         name, Path(folder), path, wheels, (group,), limits, "chassis", np.zeros((1, 3)), (), 0.0, 0.0
     )  # fmt: skip
@@ -43,7 +43,8 @@ def spider(folder: Path, legs: int, links: int = 4, seed: int = 0) -> Rover:
             quat = rng.normal(size=4)
             text += f"""<body name="{name}" pos="{_vector(rng.normal(size=3) * 0.3)}" quat="{_vector(quat)}">
 <joint name="{joint}" axis="{_vector(rng.normal(size=3))}" pos="{_vector(rng.normal(size=3) * 0.05)}"
- damping="{rng.uniform(0, 3)}" stiffness="{rng.uniform(0, 50)}" springref="{rng.normal() * 0.3}" armature="{rng.uniform(0.01, 0.3)}"/>
+ damping="{rng.uniform(0, 3)}" stiffness="{rng.uniform(0, 50)}" springref="{rng.normal() * 0.3}"
+ armature="{rng.uniform(0.01, 0.3)}"/>
 <inertial pos="{_vector(rng.normal(size=3) * 0.1)}" mass="{rng.uniform(0.5, 3)}" quat="{_vector(rng.normal(size=4))}"
  diaginertia="{_vector(rng.uniform(0.02, 0.03, 3))}"/>
 <body pos="{_vector(rng.normal(size=3) * 0.1)}"><inertial pos="0 0 0" mass="0.3" diaginertia=".01 .01 .01"/></body>
@@ -59,7 +60,8 @@ def mixed(folder: Path) -> Rover:
     text, corners = "", ["lf", "rf", "lm", "rm", "lr", "rr"]
     for i, c in enumerate(corners):
         x, y = (0.6, 0.0, -0.6)[i // 2], 0.4 if i % 2 == 0 else -0.4
-        arm = f"""<body pos="{x} {y} 0"><joint name="{c}_arm" axis="0 {1 if y > 0 else -1} 0" damping="5" stiffness="100"/>
+        arm = f"""<body pos="{x} {y} 0"><joint name="{c}_arm" axis="0 {1 if y > 0 else -1} 0"
+ damping="5" stiffness="100"/>
 <inertial pos="0.1 0 0" mass="2" diaginertia=".01 .02 .02"/>"""
         knuckle = f"""<body pos="0.2 0 -0.1"><joint name="{c}_steer" axis="0 0 1" armature="0.1"/>
 <inertial pos="0 0.02 0" mass="1" diaginertia=".01 .01 .01"/>"""
@@ -83,11 +85,13 @@ def fourbar(folder: Path, driven: str = "lower", solref: float = 0.004, damping:
         text += f"""<body name="{c}_lower" pos="{x} {0.2 * side} -0.06">
 <joint name="{c}_lower" axis="{axis}" stiffness="80" springref="0.1" damping="{damping}" armature="0.2"/>
 <inertial pos="0 {0.16 * side} 0.01" mass="4" diaginertia=".05 .01 .05"/>
-<body name="{c}_upright" pos="0 {0.32 * side} 0.01"><joint name="{c}_coupler" axis="1 0 0" damping="{damping / 4}" armature="0.02"/>
+<body name="{c}_upright" pos="0 {0.32 * side} 0.01"><joint name="{c}_coupler" axis="1 0 0"
+ damping="{damping / 4}" armature="0.02"/>
 <inertial pos="0 0.01 0.05" mass="2" diaginertia=".01 .01 .004"/>
 <body name="{c}_wheel" pos="0 {0.1 * side} -0.05"><joint name="{c}_drive" axis="0 1 0" armature="0.05"/>
 <inertial pos="0 0 0" mass="6" diaginertia=".1 .2 .1"/></body></body></body>
-<body name="{c}_upper" pos="{x} {0.22 * side} 0.05"><joint name="{c}_upper" axis="{axis}" stiffness="20" armature="0.03"/>
+<body name="{c}_upper" pos="{x} {0.22 * side} 0.05"><joint name="{c}_upper" axis="{axis}"
+ stiffness="20" armature="0.03"/>
 <inertial pos="0 {0.12 * side} 0" mass="1.5" diaginertia=".02 .002 .02"/></body>"""
         tail += (
             f'<connect body1="{c}_upright" body2="{c}_upper" anchor="0 {-0.03 * side} 0.14" '
