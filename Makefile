@@ -14,7 +14,7 @@ demo: $(VENV)/run.stamp
 	$(BIN)/lunar-mjx demo -o runs/demo
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .
