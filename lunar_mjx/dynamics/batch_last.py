@@ -102,34 +102,31 @@ def _apply(eqn: Any, operands: list[_Value]) -> list[_Value]:
         inner = eqn.params[_INLINE[name]]
         return _run(inner.jaxpr, inner.consts, operands)
     if all(o.axis is None for o in operands):
-        out = _alone(eqn, [o.array for o in operands])
+        out = _bind(eqn, [o.array for o in operands])
         return [_Value(x, None) for x in out]
     if name == "optimization_barrier":
         out = _bind(eqn, [o.array for o in operands])
         return [_Value(x, o.axis) for x, o in zip(out, operands, strict=True)]
+    if name == "reshape" and operands[0].axis == 0:
+        x = operands[0].array
+        return [_Value(jnp.reshape(x, (x.shape[0], *eqn.params["new_sizes"])), 0)]
     rule = _elementwise if name in _ELEMENTWISE else _RULES.get(name)
     if rule is not None and all(o.axis in (None, -1) for o in operands):
         done = rule(eqn, operands)
         if done is not None:
             return [_Value(done, -1)]
-    out = jax.vmap(lambda *x: _alone(eqn, x), in_axes=tuple(o.axis for o in operands), out_axes=-1)(
+    out = jax.vmap(lambda *x: _bind(eqn, x), in_axes=tuple(o.axis for o in operands), out_axes=-1)(
         *(o.array for o in operands)
     )
     return [_Value(x, -1) for x in out]
 
 
 def _bind(eqn: Any, arrays: Any) -> list[Any]:
-    out = eqn.primitive.bind(*arrays, **eqn.params)
+    """Binds an equation's primitive again, with whatever functions it holds (loops, custom derivatives)."""
+    bound = eqn.primitive.get_bind_params(eqn.params)
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)
+    out = eqn.primitive.bind(*functions, *arrays, **params)
     return list(out) if eqn.primitive.multiple_results else [out]
-
-
-def _alone(eqn: Any, arrays: Any) -> list[Any]:
-    """Evaluates one equation, with whatever functions it holds (loops, custom derivatives)."""
-    free = [v for v in eqn.invars if not isinstance(v, core.Literal)]
-    given = [a for v, a in zip(eqn.invars, arrays, strict=True) if not isinstance(v, core.Literal)]
-    names = dict(zip(free, given, strict=True))
-    jaxpr = core.Jaxpr((), list(names), eqn.outvars, [eqn])
-    return core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, ()))(*names.values())
 
 
 def _elementwise(eqn: Any, operands: list[_Value]) -> Any:

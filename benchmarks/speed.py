@@ -1,0 +1,220 @@
+"""Rover-steps per second of every engine, gated by parity in the same run; JSON, table and roofline numbers.
+
+    python benchmarks/speed.py --rovers luvmi_x,viper --batches 4096,32768,65536,131072 --out benchmarks/speed_gpu.json
+    python benchmarks/speed.py --rovers luvmi_x --batches 1,512,2048 --threads 2 --out benchmarks/speed_cpu.json
+
+Rows: the structured engine with all effects of the preset `consistent`, with the stress integral, with one map per
+rover, and without effects; MJX with all effects; bare `mjx.step`; native MuJoCo's batched stepper on the CPU.
+A row counts only where `parity` is true: one step of both engines from the same states, in the same process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from lunar_mjx.dynamics import Params, System, build
+from lunar_mjx.model import Model, make_model
+
+TOLERANCE = 2e-3
+"""Largest difference of the velocities after one float32 step, relative to the largest velocity change."""
+
+
+def control(model: Model) -> np.ndarray:
+    """Drive at 1 rad/s with the wheels straight."""
+    return np.array([1.0 if g.name == "drive" else 0.0 for g in model.rover.groups for _ in g.joints], np.float32)
+
+
+def starts(system: System, batch: int) -> Any:
+    spread = jnp.linspace(-5.0, 5.0, batch)
+    return jax.jit(jax.vmap(lambda x, y: system.reset(system.params, x, y)))(spread, 0.6 * spread)
+
+
+def parity(model: Model, batch: int = 64) -> float:
+    """Difference of one step, structured against MJX, from states that have driven for 0.5 s."""
+    ours, theirs = build(model, "structured"), build(model, "mjx")
+    state = starts(ours, batch)
+    controls = jnp.broadcast_to(control(model), (250, len(control(model))))
+    state, _ = jax.jit(lambda s: ours.rollout_batch(ours.params, s, controls, report=lambda t: None))(state)
+    held = jnp.broadcast_to(controls[0], (batch, controls.shape[1]))
+    new = [jax.jit(lambda s, e=e: e.step_batch(e.params, s, held)[0])(state).qvel for e in (ours, theirs)]
+    change = jnp.maximum(jnp.abs(new[1] - state.qvel).max(), 1e-3)
+    return float(jnp.abs(new[0] - new[1]).max() / change)
+
+
+def timed(function: Any, state: Any, steps: int, batch: int, repeats: int = 3) -> dict[str, Any]:
+    """Compiles, warms up, and times `function(state) -> state` of `steps` steps."""
+    begin = time.perf_counter()
+    lowered = jax.jit(function).lower(state)
+    traced = time.perf_counter() - begin
+    compiled = lowered.compile()
+    compile_s = time.perf_counter() - begin - traced
+    text, cost = compiled.as_text() or "", compiled.cost_analysis() or {}
+    new = jax.block_until_ready(compiled(state))
+    best = cpu = float("inf")
+    for _ in range(repeats):
+        wall, process = time.perf_counter(), time.process_time()
+        new = jax.block_until_ready(compiled(new))
+        best, cpu = min(best, time.perf_counter() - wall), min(cpu, time.process_time() - process)
+    return {
+        "steps_per_s": batch * steps / best,
+        "us_per_batch_step": best / steps * 1e6,
+        "process_cpu_ns_per_step": cpu / steps / batch * 1e9,
+        "trace_s": traced,
+        "compile_s": compile_s,
+        "kernels_in_loop": kernels_in_loop(text),
+        # XLA's analysis counts the body of the loop over time once
+        "bytes_per_step": cost.get("bytes accessed", 0.0) / batch,
+        "flop_per_step": cost.get("flops", 0.0) / batch,
+        "finite": bool(jnp.isfinite(jax.tree.leaves(new)[1]).all()),
+    }
+
+
+def kernels_in_loop(text: str) -> int:
+    """Fusions, copies and library calls of the largest computation that is no fusion: the loop's body."""
+    counts, name = {}, ""
+    for line in text.splitlines():
+        if line and not line.startswith(" ") and line.endswith("{"):
+            name = line.split(" ", 1)[0]
+        elif "fused" not in name:
+            counts[name] = counts.get(name, 0) + any(f" {op}(" in line for op in ("fusion", "copy", "custom-call"))
+    return max(counts.values(), default=0)
+
+
+def rollout(system: System, steps: int, chunk: int | None, params: Params | None = None, axes: Any = None) -> Any:
+    held = jnp.broadcast_to(control(system.model), (steps, len(control(system.model))))
+
+    def run(state: Any) -> Any:
+        used = system.params if params is None else params
+        return system.rollout_batch(used, state, held, report=lambda t: None, params_axes=axes, chunk=chunk)[0]
+
+    return run
+
+
+def per_rover_maps(system: System, batch: int, nodes: int = 128) -> Params:
+    """A small map for every rover, each a shifted cut of the model's own."""
+    field = system.params.terrain.field
+    rows = np.asarray(field.heights)
+    cut = np.stack([np.roll(rows[:nodes, :nodes], i % nodes, axis=0) for i in range(min(batch, 64))])
+    heights = jnp.asarray(cut)[jnp.arange(batch) % len(cut)]
+    ground = dataclasses.replace(
+        system.params.terrain, field=dataclasses.replace(field, heights=heights), rocks=None, soil=None
+    )
+    return dataclasses.replace(system.params, terrain=ground)
+
+
+def bare_mjx(model: Model, steps: int, batch: int) -> dict[str, Any]:
+    native = model.rover.compile()
+    m = mjx.put_model(native)
+    data = jax.vmap(lambda _: mjx.make_data(m))(jnp.arange(batch))
+
+    def run(data: Any) -> Any:
+        step = jax.vmap(lambda d: mjx.step(m, d))
+        return jax.lax.scan(lambda d, _: (step(d), None), data, None, length=steps)[0]
+
+    return timed(run, data, steps, batch)
+
+
+def native_batch(model: Model, threads: int, batch: int, steps: int = 200) -> dict[str, Any]:
+    """Native MuJoCo without effects on `threads` threads (float64)."""
+    from mujoco import rollout as native_rollout
+
+    native = model.rover.compile()
+    data = [mujoco.MjData(native) for _ in range(threads)]
+    size = mujoco.mj_stateSize(native, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    state = np.zeros((batch, size))
+    mujoco.mj_getState(native, data[0], state[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    state[:] = state[0]
+    best = float("inf")
+    with native_rollout.Rollout(nthread=threads) as runner:
+        for _ in range(3):
+            begin = time.perf_counter()
+            runner.rollout([native] * batch, data, state, nstep=steps)
+            best = min(best, time.perf_counter() - begin)
+    return {"steps_per_s": batch * steps / best, "threads": threads}
+
+
+def rows_of(rover: str, options: argparse.Namespace) -> list[dict[str, Any]]:
+    model = make_model(rover)
+    gap = parity(model)
+    rows: list[dict[str, Any]] = []
+
+    def add(engine: str, batch: int, result: dict[str, Any]) -> None:
+        counted = {"parity": gap < TOLERANCE, "parity_gap": gap} if engine.startswith("structured") else {}
+        rows.append({"rover": rover, "engine": engine, "batch": batch, **counted, **result})
+        print(f"{rover:8s} {engine:28s} {batch:8d} {result['steps_per_s']:14,.0f} steps/s  " + ", ".join(
+            f"{k} {v:.3g}" for k, v in result.items() if k in ("compile_s", "kernels_in_loop", "bytes_per_step",
+                                                               "flop_per_step", "process_cpu_ns_per_step")
+        ), flush=True)  # fmt: skip
+
+    full, bare = build(model, "structured"), model
+    integral = build(model.add("stress_integral"), "structured")
+    for effect in model.effect_names:
+        bare = bare.remove(effect)
+    for batch in options.batches:
+        chunk = options.chunk or None
+        state = starts(full, batch)
+        add("structured", batch, timed(rollout(full, options.steps, chunk), state, options.steps, batch))
+        if batch == options.batches[-1] or batch == options.main:
+            own = starts(integral, batch)
+            add("structured, stress integral", batch,
+                timed(rollout(integral, options.steps, chunk), own, options.steps, batch))  # fmt: skip
+            naked = build(bare, "structured")
+            add("structured, no effects", batch,
+                timed(rollout(naked, options.steps, chunk), starts(naked, batch), options.steps, batch))  # fmt: skip
+        if batch == options.main:
+            maps = per_rover_maps(full, batch)
+            run = rollout(full, options.steps, chunk, maps, _terrain_axes(maps))
+            add("structured, map per rover", batch, timed(run, state, options.steps, batch))
+            if not options.skip_mjx:
+                slow = build(model, "mjx")
+                add("mjx", batch, timed(rollout(slow, options.mjx_steps, None), state, options.mjx_steps, batch))
+                add("bare mjx.step", batch, bare_mjx(model, options.mjx_steps, batch))
+    if options.threads:
+        add("native rollout, no effects", 512, native_batch(model, options.threads, 512))
+    return rows
+
+
+def _terrain_axes(params: Params) -> Params:
+    """Per-rover heights; everything else shared."""
+    none = jax.tree.map(lambda _: None, params)
+    field = dataclasses.replace(none.terrain.field, heights=0)
+    return dataclasses.replace(none, terrain=dataclasses.replace(none.terrain, field=field))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    numbers = lambda text: [int(n) for n in text.split(",")]  # noqa: E731
+    parser.add_argument("--rovers", default="luvmi_x,viper")
+    parser.add_argument("--batches", type=numbers, default=[1024, 4096])
+    parser.add_argument("--main", type=int, default=0, help="batch at which every engine is compared")
+    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--mjx-steps", type=int, default=10)
+    parser.add_argument("--chunk", type=int, default=0, help="rovers per chunk; 0: the library's choice")
+    parser.add_argument("--threads", type=int, default=0, help="threads of native MuJoCo; 0: leave it out")
+    parser.add_argument("--skip-mjx", action="store_true")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for rover in options.rovers.split(","):
+        rows += rows_of(rover, options)
+        if options.out:
+            device = jax.devices()[0]
+            about = {"device": device.device_kind, "jax": jax.__version__, "mujoco": mujoco.__version__,
+                     "cpu": platform.processor(), "steps": options.steps, "chunk": options.chunk}  # fmt: skip
+            options.out.write_text(json.dumps({"about": about, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
