@@ -21,7 +21,7 @@ from lunar_mjx.errors import UserError
 if TYPE_CHECKING:
     from lunar_mjx.dynamics.system import System
 
-CHUNK = {"cpu": 1024, "gpu": 32768}
+CHUNK = {"cpu": 1024, "gpu": 65536}
 """Rovers per chunk by platform (benchmarks/speed.py): the state of a chunk stays in the L2 cache."""
 
 Axes = Any
@@ -90,7 +90,7 @@ def _in_chunks(function: Callable[..., Any], params: Params, axes: Axes, varying
         return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), out)
 
     args = ([leaf for leaf, own in zip(leaves, per_rover, strict=True) if own], varying)
-    size = chunk or CHUNK.get(jax.default_backend(), 32768)
+    size = chunk or CHUNK.get(jax.default_backend(), 65536)
     if batch <= size:
         return block(args)
     count = math.ceil(batch / size)
