@@ -98,8 +98,10 @@ class Reference:
         mujoco.mj_forward(m, d)
         mass = np.zeros((m.nv, m.nv))
         mujoco.mj_fullM(m, d, mass)
+        # damping is implicit in the engine's step
+        mass += self.engine.timestep * np.diag(m.dof_damping)
         pushed = np.zeros(m.nv)
-        mujoco.mj_xfrcAccumulate(m, d, pushed) if hasattr(mujoco, "mj_xfrcAccumulate") else self._accumulate(pushed)
+        self._accumulate(pushed)
         free = d.qfrc_passive + d.qfrc_applied + pushed - d.qfrc_bias
         matrix = np.block([[mass, jac.T], [jac, np.zeros((len(jac), len(jac)))]])
         return np.linalg.lstsq(matrix, np.r_[free, -rate @ qvel], rcond=1e-12)[0][: m.nv]
