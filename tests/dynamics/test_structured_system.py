@@ -100,6 +100,7 @@ def test_batches_refuse_axes_that_differ():
         system.step_batch(system.params, state, jnp.zeros((2, len(system.joint_names))))
 
 
+@pytest.mark.slow
 def test_derivatives_agree_with_finite_differences():
     """Forward and reverse mode through 20 steps on smooth ground, in float64."""
     with jax.enable_x64(True):
@@ -125,6 +126,7 @@ def test_derivatives_agree_with_finite_differences():
     assert abs(forward - central) < 1e-6 * max(abs(forward), 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rover", ["viper", "luvmi_x"])
 def test_gradients_are_finite_in_float32(rover):
     system = build(make_model(rover))
