@@ -35,7 +35,7 @@ def bad_input(source: str | Path, field: str, value: Any, problem: str, remedy: 
     return UserError(f"{source}: {field} = {shown} {problem}; {remedy}.")
 
 
-def require_finite(source: str | Path, field: str, value: float) -> float:
+def require_finite(source: str | Path, field: str, value: Any) -> float:
     """Returns `value` as a float, or raises `UserError` if it is not a finite number."""
     try:
         number = float(value)

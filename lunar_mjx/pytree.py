@@ -6,8 +6,12 @@ import dataclasses
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 
 T = TypeVar("T")
+
+AnyArray = jax.Array | np.ndarray
+"""On the device or on the host: what pytrees hold that are made by hand, or fetched with `jax.device_get`."""
 
 
 def static(**kwargs: Any) -> Any:

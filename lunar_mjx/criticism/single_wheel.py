@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from lunar_mjx.dynamics.ports import Pipeline, nominal_geometry, wheel_contact, wheel_ports
 from lunar_mjx.effects import catalogue, presets
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.context import Context, RoverInfo
 from lunar_mjx.errors import UserError, bad_input
-from lunar_mjx.pytree import pytree
+from lunar_mjx.pytree import AnyArray, pytree
 from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import Terrain, flat
 
@@ -61,12 +61,12 @@ class WheelTest:
       radius, width: of the wheel, m.
     """
 
-    rim_speed: Float[Array, "*point"]
-    travel_speed: Float[Array, "*point"]
-    slip_angle: Float[Array, "*point"]
-    normal_load: Float[Array, "*point"]
-    radius: Float[Array, "*point"]
-    width: Float[Array, "*point"]
+    rim_speed: Float[AnyArray, "*point"]
+    travel_speed: Float[AnyArray, "*point"]
+    slip_angle: Float[AnyArray, "*point"]
+    normal_load: Float[AnyArray, "*point"]
+    radius: Float[AnyArray, "*point"]
+    width: Float[AnyArray, "*point"]
 
 
 @pytree
@@ -83,12 +83,12 @@ class WheelResult:
       reached: whether some sinkage up to 1.5 radii carries the load; elsewhere the result is that of 1.5 radii.
     """
 
-    drawbar_pull: Float[Array, "*point"]
-    side_force: Float[Array, "*point"]
-    driving_torque: Float[Array, "*point"]
-    sinkage: Float[Array, "*point"]
-    vertical_force: Float[Array, "*point"]
-    reached: Bool[Array, "*point"]
+    drawbar_pull: Float[AnyArray, "*point"]
+    side_force: Float[AnyArray, "*point"]
+    driving_torque: Float[AnyArray, "*point"]
+    sinkage: Float[AnyArray, "*point"]
+    vertical_force: Float[AnyArray, "*point"]
+    reached: Bool[AnyArray, "*point"]
 
 
 class _Loads(NamedTuple):

@@ -88,7 +88,7 @@ def nominal_geometry(rover: RoverInfo) -> Geometry:
     zero = jnp.zeros_like(rover.wheel_radius)
     nil = jnp.zeros_like(rover.wheel_radius[..., 0])
     none = Vec3(nil, nil, nil)
-    return Geometry(rover.wheel_radius, rover.wheel_width, zero, nil, none, none)
+    return Geometry(jnp.asarray(rover.wheel_radius), jnp.asarray(rover.wheel_width), zero, nil, none, none)
 
 
 def wheel_contact(ctx: Context) -> Contact:

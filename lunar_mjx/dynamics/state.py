@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lunar_mjx.effects.motor import REFERENCE_TEMPERATURE
-from lunar_mjx.pytree import pytree
+from lunar_mjx.pytree import AnyArray, pytree
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import Terrain
 
@@ -24,10 +24,10 @@ class Temperature:
     (Kahan) sum can.
     """
 
-    winding: Float[Array, "joint"]
-    winding_lost: Float[Array, "joint"]
-    housing: Float[Array, "joint"]
-    housing_lost: Float[Array, "joint"]
+    winding: Float[Array, "*batch joint"]
+    winding_lost: Float[Array, "*batch joint"]
+    housing: Float[Array, "*batch joint"]
+    housing_lost: Float[Array, "*batch joint"]
 
     @property
     def winding_kelvin(self) -> Any:
@@ -57,8 +57,8 @@ class State:
     """
 
     step: Any
-    qpos: Float[Array, "nq"]
-    qvel: Float[Array, "nv"]
+    qpos: Float[Array, "*batch nq"]
+    qvel: Float[Array, "*batch nv"]
     temperature: Temperature
     effects: dict[str, dict[str, Any]]
 
@@ -120,25 +120,25 @@ class Telemetry:
 
     time: Any
     position: Vec3
-    quaternion: Float[Array, "4"]
+    quaternion: Float[AnyArray, "*batch 4"]
     euler: Vec3
     velocity: Vec3
     angular_velocity: Vec3
-    joint_angle: Float[Array, "joint"]
-    joint_speed: Float[Array, "joint"]
-    joint_torque: Float[Array, "joint"]
-    current: Float[Array, "joint"]
-    voltage: Float[Array, "joint"]
-    winding_temperature: Float[Array, "joint"]
-    housing_temperature: Float[Array, "joint"]
-    joule_heat: Float[Array, "joint"]
-    winding_heat: Float[Array, "joint"]
-    housing_heat: Float[Array, "joint"]
+    joint_angle: Float[AnyArray, "*batch joint"]
+    joint_speed: Float[AnyArray, "*batch joint"]
+    joint_torque: Float[AnyArray, "*batch joint"]
+    current: Float[AnyArray, "*batch joint"]
+    voltage: Float[AnyArray, "*batch joint"]
+    winding_temperature: Float[AnyArray, "*batch joint"]
+    housing_temperature: Float[AnyArray, "*batch joint"]
+    joule_heat: Float[AnyArray, "*batch joint"]
+    winding_heat: Float[AnyArray, "*batch joint"]
+    housing_heat: Float[AnyArray, "*batch joint"]
     wheel_position: Vec3
     wheel_velocity: Vec3
-    sinkage: Float[Array, "wheel"]
-    slip: Float[Array, "wheel"]
-    slip_angle: Float[Array, "wheel"]
+    sinkage: Float[AnyArray, "*batch wheel"]
+    slip: Float[AnyArray, "*batch wheel"]
+    slip_angle: Float[AnyArray, "*batch wheel"]
     wheel_force: Vec3
     wheel_moment: Vec3
-    on_terrain: Array
+    on_terrain: AnyArray

@@ -243,14 +243,14 @@ def rover_info(model: Model) -> RoverInfo:
     limits = np.array([rover.joint_limits[j] for j in rover.joints], float)
     points = np.asarray(rover.chassis_points, float)
     return RoverInfo(
-        wheel_radius=np.array([w.radius for w in rover.wheels]),  # type: ignore[arg-type]
-        wheel_width=np.array([w.width for w in rover.wheels]),  # type: ignore[arg-type]
-        joint_group=np.array([i for _, i in groups]),  # type: ignore[arg-type]
-        joint_lower=limits[:, 0],  # type: ignore[arg-type]
-        joint_upper=limits[:, 1],  # type: ignore[arg-type]
-        mode=np.array([MODES.index(model.modes[g.name]) for g, _ in groups]),  # type: ignore[arg-type]
-        position_gain=np.array([model.gains[g.name][0] for g, _ in groups]),  # type: ignore[arg-type]
-        velocity_gain=np.array([model.gains[g.name][1] for g, _ in groups]),  # type: ignore[arg-type]
+        wheel_radius=np.array([w.radius for w in rover.wheels]),
+        wheel_width=np.array([w.width for w in rover.wheels]),
+        joint_group=np.array([i for _, i in groups]),
+        joint_lower=limits[:, 0],
+        joint_upper=limits[:, 1],
+        mode=np.array([MODES.index(model.modes[g.name]) for g, _ in groups]),
+        position_gain=np.array([model.gains[g.name][0] for g, _ in groups]),
+        velocity_gain=np.array([model.gains[g.name][1] for g, _ in groups]),
         chassis_points=Vec3(points[:, 0], points[:, 1], points[:, 2]),
         name=rover.name,
     )

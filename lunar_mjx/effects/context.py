@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from lunar_mjx.pytree import pytree, static
+from lunar_mjx.pytree import AnyArray, pytree, static
 from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import Terrain
 
@@ -190,14 +190,14 @@ class RoverInfo:
       chassis_points: where the chassis can touch the ground, in its frame, m.
     """
 
-    wheel_radius: Float[Array, "wheel"]
-    wheel_width: Float[Array, "wheel"]
-    joint_group: Array
-    joint_lower: Float[Array, "joint"]
-    joint_upper: Float[Array, "joint"]
-    mode: Array
-    position_gain: Float[Array, "joint"]
-    velocity_gain: Float[Array, "joint"]
+    wheel_radius: Float[AnyArray, "wheel"]
+    wheel_width: Float[AnyArray, "wheel"]
+    joint_group: Int[AnyArray, "joint"]
+    joint_lower: Float[AnyArray, "joint"]
+    joint_upper: Float[AnyArray, "joint"]
+    mode: Int[AnyArray, "joint"]
+    position_gain: Float[AnyArray, "joint"]
+    velocity_gain: Float[AnyArray, "joint"]
     chassis_points: Vec3
     name: str = static(default="rover")
 
