@@ -125,7 +125,7 @@ def _build(cls: type, table: Any, source: str, where: str) -> Any:
             raise bad_input(source, f"{prefix}{key}", value, "is not a known key", f"use one of {', '.join(fields)}")
     for name, field in fields.items():
         if name not in table and field.default is dataclasses.MISSING:
-            raise bad_input(source, f"{prefix}{name}", "nothing", "is missing", "add it")
+            raise bad_input(source, f"{prefix}{name}", None, "is missing", "add it")
     values = {key: _convert(hints[key], value, source, f"{prefix}{key}") for key, value in table.items()}
     try:
         return cls(**values)

@@ -98,7 +98,7 @@ def load_dem(config: TerrainConfig, name: str, folder: Path, dem: str | Path | N
         if crop is not None:
             ground = ground.crop(crop.x, crop.y, crop.width, crop.height)
     else:
-        raise bad_input(name, "dem.file", "nothing", "leaves no ground", f"give dem, or set {_variable(name)}")
+        raise bad_input(name, "dem.file", None, "leaves no ground", f"give dem, or set {_variable(name)}")
     if config.detail is not None:
         d = config.detail
         ground = add_detail(ground, d.cell, seed, roughness=d.roughness, craters=d.craters)

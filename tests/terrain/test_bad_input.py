@@ -171,7 +171,7 @@ def test_npy(some):
     [
         ("ncols 2\nnrows 2\ncellsize 1\n1 2 3\n", ["3 numbers", "2 x 2"]),
         ("ncols 2\nnrows 2\ncellsize 0\n1 2 3 4\n", ["cellsize = 0.0"]),
-        ("ncols 2\nnrows 2\n1 2 3 4\n", ["cellsize", "nothing"]),
+        ("ncols 2\nnrows 2\n1 2 3 4\n", ["cellsize", "None"]),
         ("ncols 2\nnrows 2\ndx 1\ndy 2\n1 2 3 4\n", ["dx, dy", "not equal"]),
         ("ncols two\nnrows 2\ncellsize 1\n1 2 3 4\n", ["ncols", "two"]),
         ("nrows 2\ncellsize 1\n1 2 3 4\n", ["ncols", "whole number"]),

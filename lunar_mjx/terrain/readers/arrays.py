@@ -8,13 +8,13 @@ import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size
-from lunar_mjx.terrain.readers.options import ReadOptions
+from lunar_mjx.terrain.readers.options import WHERE, ReadOptions
 
 
 def read_npy(path: Path, options: ReadOptions) -> Dem:
     """Reads a two-dimensional array of heights in m; as in all readers, its first row is the north. See `read_dem`."""
     if options.cell is None:
-        raise bad_input(path, "cell", "nothing", "leaves the array without a scale", "give cell, the spacing in m")
+        raise bad_input(path, "cell", None, "leaves the array without a scale", f"{WHERE}, the spacing in m")
     cell = require_cell(str(path), "cell", options.cell)
     try:
         data = np.load(path, allow_pickle=False)
@@ -83,7 +83,7 @@ def _asc_cell(path: Path, header: dict[str, float]) -> float:
         return require_cell(str(path), "cellsize", header["cellsize"])
     dx, dy = header.get("dx"), header.get("dy")
     if dx is None or dy is None:
-        raise bad_input(path, "cellsize", "nothing", "is not in the header", "repair the header")
+        raise bad_input(path, "cellsize", None, "is not in the header", "repair the header")
     if abs(dx - dy) > 1e-6 * abs(dx):
         raise bad_input(path, "dx, dy", f"{dx:g}, {dy:g}", "are not equal", "resample it to square cells")
     return require_cell(str(path), "dx", dx)

@@ -12,7 +12,7 @@ from rasterio.windows import Window as PixelWindow
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size
-from lunar_mjx.terrain.readers.options import ReadOptions, Window
+from lunar_mjx.terrain.readers.options import WHERE, ReadOptions, Window
 
 _SQUARE = 1e-4  # relative difference of pixel width and height that counts as square
 
@@ -62,13 +62,7 @@ def _grid(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> t
     transform, crs = raster.transform, raster.crs
     if crs is None and transform.is_identity:
         if options.cell is None:
-            raise bad_input(
-                path,
-                "georeference",
-                "none",
-                "leaves the pixel's size unknown",
-                "give cell = <m> or a georeferenced file",
-            )
+            raise bad_input(path, "cell", None, "is missing, and the file has no georeference", f"{WHERE}, in m")
         cell = require_cell(str(path), "cell", options.cell)
         return 0.0, raster.height * cell, cell
     if crs is not None and crs.is_geographic:

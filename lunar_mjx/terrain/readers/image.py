@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 from lunar_mjx.errors import UserError, bad_input, require_finite
 from lunar_mjx.terrain.dem import Dem, require_cell, require_size
 from lunar_mjx.terrain.dequantise import dequantise
-from lunar_mjx.terrain.readers.options import ReadOptions
+from lunar_mjx.terrain.readers.options import WHERE, ReadOptions
 
 _WHITE = {"L": 255, "I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I": 65535}
 
@@ -23,7 +23,7 @@ def read_image(path: Path, options: ReadOptions) -> Dem:
         ("cell", options.cell, "the pixel's size in m"),
     ):
         if value is None:
-            raise bad_input(path, field, "nothing", "leaves the image without a scale", f"give {field}, {meaning}")
+            raise bad_input(path, field, None, "leaves the image without a scale", f"{WHERE}, {meaning}")
     scale = require_finite(path, "height_scale", options.height_scale)  # pyright: ignore[reportArgumentType]
     if scale <= 0:
         raise bad_input(path, "height_scale", scale, "is not positive", "give the height of white above black in m")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+WHERE = "give it under [dem] of a terrain.toml, or to read_dem"
+"""Remedy for what a file does not say; a path alone, as on the command line, cannot say it."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Window:
@@ -20,7 +23,7 @@ class ReadOptions:
     """Options of `read_dem`.
 
     Attributes:
-      cell: spacing of the grid, m; for formats that do not say it (PNG, npy), or to overrule none other.
+      cell: spacing of the grid, m; for files that do not say it themselves (PNG, npy, a raster without georeference).
       height_scale: height of full white above black, m; for images of 8 or 16 bits.
       dequantise: removes the steps of an image's few grey levels.
       band: which band of a GeoTIFF, from 1.

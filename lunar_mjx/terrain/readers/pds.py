@@ -60,7 +60,7 @@ def _find(path: Path) -> tuple[Path, Path, Label]:
         name = re.search(r'"?([^"(),\s]+\.[A-Za-z]+)"?', label.get("^IMAGE", ""))
         image = _beside(path, [name.group(1)] if name else [path.stem + s for s in (".IMG", ".img")])
         if image is None:
-            raise bad_input(path, "^IMAGE", label.get("^IMAGE", "nothing"), "is not beside the label", "put it there")
+            raise bad_input(path, "^IMAGE", label.get("^IMAGE"), "is not beside the label", "put it there")
         return image, path, label
     with path.open("rb") as file:
         attached = file.read(64).lstrip().startswith((b"PDS_VERSION_ID", b"ODL_VERSION_ID", b"CCSD"))
@@ -91,7 +91,7 @@ def _parse(path: Path) -> Label:
             key, value = pair.groups()
             label.setdefault(key, value.split("/*")[0].strip().strip('"'))
     if "LINES" not in label:
-        raise bad_input(path, "LINES", "nothing", "is not in the label", "give the PDS3 label of an image")
+        raise bad_input(path, "LINES", None, "is not in the label", "give the PDS3 label of an image")
     return label
 
 
@@ -150,7 +150,7 @@ def _missing(data: np.ndarray, path: Path, label: Label) -> np.ndarray:
 def _cell(path: Path, label: Label, options: ReadOptions) -> float:
     if "MAP_SCALE" not in label:
         if options.cell is None:
-            raise bad_input(path, "MAP_SCALE", "nothing", "is not in the label", "give cell = <m>")
+            raise bad_input(path, "MAP_SCALE", None, "is not in the label", "give cell = <m>")
         return require_cell(str(path), "cell", options.cell)
     value = _number(path, label, "MAP_SCALE")
     unit = re.search(r"<\s*([A-Za-z]+)\s*/\s*PIX", label["MAP_SCALE"], re.IGNORECASE)
@@ -183,7 +183,7 @@ def _number(path: Path, label: Label, key: str, default: float | None = None) ->
         return default
     match = re.match(r"[-+]?(\d+\.?\d*|\.\d+)([EeDd][-+]?\d+)?", label.get(key, ""))
     if match is None:
-        raise bad_input(path, key, label.get(key, "nothing"), "is not a number", "repair the label")
+        raise bad_input(path, key, label.get(key), "is not a number", "repair the label")
     return float(match.group(0).upper().replace("D", "E"))
 
 
