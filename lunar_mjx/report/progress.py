@@ -16,10 +16,6 @@ _LINE_EVERY = 5.0
 """Seconds between plain lines."""
 
 
-def silent(what: str, done: float) -> None:
-    """A reporter that shows nothing."""
-
-
 @contextmanager
 def console_progress(console: Console | None = None) -> Iterator[Reporter]:
     """A reporter to standard error: a bar on a terminal, else a line at most every five seconds and at each stage."""
