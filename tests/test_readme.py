@@ -1,0 +1,44 @@
+"""What the README shows runs as it stands there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lunar_mjx.effects.catalogue import get
+from lunar_mjx.model import make_model
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+FIRST_STEPS, OWN_EFFECT = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+COMMANDS = [shlex.split(c, comments=True)[1:] for c in re.findall(r"^    (lunar-mjx .*)$", README, re.MULTILINE)]
+
+
+@pytest.mark.slow
+def test_first_steps(capsys: pytest.CaptureFixture[str]) -> None:
+    shown: dict[str, object] = {}
+    exec(compile(FIRST_STEPS, "README.md", "exec"), shown)
+    seen = shown["seen"]
+    assert np.isfinite(np.asarray(seen.slip)).all()  # type: ignore[attr-defined]
+    assert float(capsys.readouterr().out.split()[0]) > 1.0, "10 s at 0.8 rad/s on wheels of 0.25 m"
+
+
+def test_own_effect(tmp_path: Path) -> None:
+    file = tmp_path / "my_effects.py"
+    file.write_text(OWN_EFFECT, encoding="utf-8")
+    model = make_model("viper", "flat").add(get(f"{file}:gear_friction"), torque=0.2)
+    assert model.parameters["gear_friction"]["torque"] == 0.2
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_options_exist(command: list[str], run) -> None:
+    """Each command's own help names the options that the README gives it."""
+    names = [c for i, c in enumerate(command) if c.isalpha() and all(n.isalpha() for n in command[:i])]
+    while run(*names, "--help").status:
+        names.pop()
+    text = run(*names, "--help").out
+    for option in (c for c in command if c.startswith("-")):
+        assert option in text, option
