@@ -54,7 +54,10 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
     roles = assign_roles(source, bodies, told)
     loops = place_loops(source, roles.bodies, told)
     height, height_notes = _standing_height(roles)
-    spec = build_spec(name, roles, loops, told, height)
+    try:
+        spec = build_spec(name, roles, loops, told, height)
+    except ValueError as error:
+        raise _uncompilable(source, error) from None
     model = _compile(source, spec)
     level_springs(spec, model, roles, told)
     model = _compile(source, spec)
@@ -99,9 +102,12 @@ def _compile(urdf: Urdf, spec: mujoco.MjSpec) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise UserError(
-            f"{urdf.path}: MuJoCo cannot compile the converted model ({' '.join(str(error).split())}); mend the URDF."
-        ) from None
+        raise _uncompilable(urdf, error) from None
+
+
+def _uncompilable(urdf: Urdf, error: ValueError) -> UserError:
+    reason = " ".join(str(error).split())
+    return UserError(f"{urdf.path}: MuJoCo cannot compile the converted model ({reason}); mend the URDF.")
 
 
 def _standing_height(roles: Roles) -> tuple[float, list[str]]:
@@ -183,7 +189,7 @@ def _record(
         "standing_height": height,
         "chassis": base.name,
         "chassis_points": [[round(float(v), 6) + 0.0 for v in p] for p in points],
-        "notes": [*urdf.notes, *roles.notes, *notes, *point_notes],
+        "notes": [*urdf.notes, *roles.notes, *_passive_notes(roles, loops), *notes, *point_notes],
         "groups": groups,
         "wheels": wheels,
         "loops": [
@@ -196,6 +202,24 @@ def _record(
             for x in loops
         ],
     }
+
+
+def _passive_notes(roles: Roles, loops: tuple[PlacedLoop, ...]) -> list[str]:
+    """A sentence for each joint that nothing moves or stops, but for those of closed loops and those noted already."""
+    parents = {b.name: b.parent for b in roles.bodies}
+    guided: set[str | None] = {body for loop in loops for body in (loop.body1, loop.body2)}
+    for name in list(guided):
+        while name is not None:
+            guided.add(name)
+            name = parents[name]
+    moved = {joint for group in GROUPS for joint in roles.group(group)}
+    told = " ".join(roles.notes)
+    free = [b.joint.name for b in roles.bodies if b.joint is not None and b.name not in guided]
+    return [
+        f"joint '{joint}' drives, steers or suspends no wheel: it has no motor and moves freely beyond its limits"
+        for joint in free
+        if joint not in moved and f"'{joint}'" not in told
+    ]
 
 
 def _chassis_points(base: Body, roles: Roles) -> tuple[np.ndarray, list[str]]:

@@ -114,6 +114,11 @@ def read_urdf(path: str | Path) -> Urdf:
         raise UserError(f"{path}: the URDF is not well-formed XML ({error}); mend the file at that place.") from None
     if robot.tag != "robot":
         raise bad_input(path, "root element", robot.tag, "is not <robot>", "give a URDF (expand xacro files first)")
+    for element in robot.iter():
+        if isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag.split("}")[0]:
+            tag = f"xacro:{element.tag.split('}')[1]}"
+            raise bad_input(path, "element", tag, "was not expanded, and its parts would be lost",
+                            "expand the file first: xacro in.xacro > out.urdf")  # fmt: skip
     reader = _Reader(path)
     colours = {m.get("name", ""): reader.colour(m) for m in robot.findall("material") if m.find("color") is not None}
     links = [reader.link(element, colours) for element in robot.findall("link")]
@@ -170,9 +175,13 @@ class _Reader:
         if material is not None:
             known = colours.get(material.get("name", ""), rgba)
             rgba = self.colour(material) if material.find("color") is not None else known
-        # A collision shape is the simpler and mechanically meaningful one; a visual shape stands in for none.
-        shapes = element.findall("collision") or element.findall("visual")
-        geometry = tuple(g for g in (self.geometry(s, where, rgba) for s in shapes) if g is not None)
+        # A collision shape is the simpler and mechanically meaningful one; a visual shape stands in where no collision
+        # is a primitive.
+        geometry: tuple[Geometry, ...] = ()
+        for tag in ("collision", "visual"):
+            if not geometry:
+                shapes = (self.geometry(s, where, rgba) for s in element.findall(tag))
+                geometry = tuple(g for g in shapes if g is not None)
         inertial = element.find("inertial")
         if inertial is None:
             return Link(name, 0.0, np.zeros(3), np.zeros((3, 3)), geometry)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -134,3 +135,25 @@ def test_world_link_above_a_floating_base_is_dropped(data: Path, tmp_path: Path)
     rover = convert(urdf, tmp_path / "out")
     assert rover.compile().nv == 10
     assert rover.mass == pytest.approx(57.298)
+
+
+def test_a_visual_cylinder_stands_in_for_a_collision_mesh(data: Path, tmp_path: Path) -> None:
+    mesh = '<collision><geometry><mesh filename="package://x/wheel.stl"/></geometry></collision>'
+    text = re.sub(r"<(/?)collision>", r"<\1visual>", (data / "steered.urdf").read_text())
+    urdf = tmp_path / "mesh.urdf"
+    urdf.write_text(text.replace("</link>", f"{mesh}</link>"))
+    rover = convert(urdf, tmp_path / "out")
+    assert {(w.radius, w.width) for w in rover.wheels} == {(0.12, 0.09)}
+
+
+def test_a_joint_without_a_role_is_named(data: Path, tmp_path: Path) -> None:
+    mast = (
+        '<link name="mast"><inertial><mass value="1"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/>'
+        '</inertial></link><joint name="pan" type="revolute"><parent link="Body"/><child link="mast"/>'
+        '<axis xyz="0 0 1"/><limit lower="-1" upper="1"/></joint>'
+    )
+    urdf = tmp_path / "mast.urdf"
+    urdf.write_text((data / "steered.urdf").read_text().replace("</robot>", f"{mast}</robot>"))
+    rover = convert(urdf, tmp_path / "out")
+    assert [n for n in rover.notes if "'pan'" in n and "no motor" in n]
+    assert not [n for n in convert(data / "steered.urdf", tmp_path / "plain").notes if "no motor" in n]

@@ -60,6 +60,12 @@ URDF_MISTAKES = {
     "axis of two numbers": ('<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>', ["FrontLeftArmJoint", "2 numbers"]),
     "origin not finite": ('xyz="0.15 0.25 -0.05"', 'xyz="0.15 nan -0.05"', ["FrontLeftArmJoint", "not finite"]),
     "negative radius": (CYLINDER, CYLINDER.replace("0.12", "-0.12"), ["FrontLeftWheel", "cylinder", "not positive"]),
+    "xacro left over": (
+        '<robot name="steered">',
+        '<robot name="steered" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm side="left"/>',
+        ["xacro:arm", "not expanded"],
+    ),
+    "joint called free": ('name="FrontLeftArmJoint"', 'name="free"', ["repeated name 'free'"]),
     "bad robot name": ('<robot name="steered">', '<robot name="../steered">', ["name", "cannot name a file"]),
 }
 EVERY_OCCURRENCE = {"not a robot", "no wheels"}
