@@ -13,6 +13,8 @@ from lunar_mjx.terrain.heightfield import HeightField
 
 MOST_NODATA = 0.5
 """A DEM that misses more than this share of its heights is refused."""
+HIGHEST = 1e7
+"""m; radii of the Moon (1.7e6 m) pass for heights, marks of nodata such as -3.4e38 do not."""
 MOST_CELLS = 50_000_000
 """A grid of more nodes than this is refused before memory runs out."""
 
@@ -47,6 +49,10 @@ class Dem:
             raise bad_input(
                 self.source, "heights", f"shape {heights.shape}", "is not a grid of at least 2 x 2", "give more heights"
             )
+        if (np.abs(heights) > HIGHEST).any():
+            worst = heights.flat[np.nanargmax(np.abs(heights))]
+            raise bad_input(self.source, "heights", f"{worst:g} m", "is no height but a mark of nodata, or not in m",
+                            "declare it as nodata in the file, or correct the scale")  # fmt: skip
         if not np.isfinite(heights).all():
             count = int((~np.isfinite(heights)).sum())
             raise bad_input(
@@ -120,8 +126,12 @@ class Dem:
         heights = self.heights
         ratio = cell / self.cell
         if ratio > 1:
-            # A Gaussian of half the new spacing leaves 1 % of a wave at the new Nyquist limit's double.
-            heights = ndimage.gaussian_filter(heights, 0.5 * np.sqrt(ratio**2 - 1), mode="nearest")
+            # A Gaussian of half the new spacing leaves 1 % of a wave at the new Nyquist limit's double. The odd
+            # reflection at the edges keeps a slope straight there.
+            sigma = 0.5 * np.sqrt(ratio**2 - 1)
+            rim = int(4 * sigma + 0.5)
+            padded = np.pad(heights, rim, mode="reflect", reflect_type="odd")
+            heights = ndimage.gaussian_filter(padded, sigma)[rim : rim + heights.shape[0], rim : rim + heights.shape[1]]
         note = f"resampled from {self.cell:g} m to {cell:g} m"
         return dataclasses.replace(
             self, heights=spline(heights, rows, cols, ratio), cell=float(cell), notes=(*self.notes, note)
