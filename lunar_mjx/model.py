@@ -125,14 +125,29 @@ class Model:
             if isinstance(checked, tuple):
                 _check_length(self.rover, effect, key, checked, source)
             new[key] = checked
-        return dataclasses.replace(self, parameters={**self.parameters, name: new})
+        model = dataclasses.replace(self, parameters={**self.parameters, name: new})
+        if name == "soil" and {"k_c", "k_phi"} <= new.keys():
+            _check_soil(model, source)
+        return model
 
     def replace(self, **changes: Any) -> Model:
         """A model with other attributes, checked.
 
+        `modes` and `gains` may name some of the joint groups only. `terrain` may be a name or path, as in `make_model`.
+
         Raises:
-          UserError: an attribute's value makes no sense.
+          UserError: an attribute does not exist, or its value makes no sense.
         """
+        known = [f.name for f in dataclasses.fields(self)]
+        for key in changes:
+            if key not in known:
+                raise bad_input("Model.replace", key, changes[key], "is unknown", f"use one of {', '.join(known)}")
+        for key in ("modes", "gains"):
+            if key in changes:
+                changes[key] = {**getattr(self, key), **changes[key]}
+        if "terrain" in changes:
+            # the name of the old ground must not be saved for the new one
+            changes = {**_ground(changes.pop("terrain")), **changes}
         model = dataclasses.replace(self, **changes)
         check_settings(model, "Model.replace")
         return model
@@ -177,6 +192,17 @@ def _check_length(rover: Rover, effect: Effect, key: str, value: Sequence[float]
 def _check_flat(effect: Effect, key: str, value: Any, source: str) -> None:
     if isinstance(value, list | tuple) and any(isinstance(v, list | tuple | Mapping) for v in value):
         raise bad_input(source, f"effects.{effect.name}.{key}", value, "is nested", "give a flat list of numbers")
+
+
+def _check_soil(model: Model, source: str) -> None:
+    """Refuses a soil that would pull a wheel of the rover down: k_c/b + k_phi must be positive for every width b."""
+    k_c, k_phi = (float(model.parameters["soil"][key]) for key in ("k_c", "k_phi"))  # type: ignore[arg-type]
+    width = min(wheel.width for wheel in model.rover.wheels)
+    if k_c / width + k_phi <= 0.0:
+        raise bad_input(source, "effects.soil.k_c", k_c,
+                        f"makes the soil's stiffness k_c/b + k_phi = {k_c / width + k_phi:g} under a wheel {width:g} m "
+                        "wide, which is not positive",
+                        "give a larger k_c or k_phi, or a rover with wider wheels")  # fmt: skip
 
 
 READS_MOTOR = ("joint_control", "winding_conduction", "rotor_stator_path")
@@ -229,7 +255,7 @@ def _check_group(rover: Rover, field: str, group: str, value: Any, source: str |
 
 
 def _check_ambient(ambient: Sequence[float], source: str | Path) -> None:
-    if len(ambient) != 4:
+    if not hasattr(ambient, "__len__") or len(ambient) != 4:
         raise bad_input(source, "ambient", ambient, "is not four numbers",
                         "give noon and night temperature in K, time of noon and length of the day in s")  # fmt: skip
     noon, night, noon_time, period = ambient
@@ -270,7 +296,7 @@ def settled_effect(spec: str) -> str:
 
 def make_model(
     rover: str | Path | Rover = "viper",
-    terrain: str | Path | Terrain = DEFAULT_TERRAIN,
+    terrain: str | Path | dict[str, Any] | Terrain = DEFAULT_TERRAIN,
     preset: str = "consistent",
     **changes: Any,
 ) -> Model:
@@ -278,7 +304,7 @@ def make_model(
 
     Args:
       rover: name or folder of a rover, or a rover.
-      terrain: name, file or folder of a terrain, or a terrain.
+      terrain: name, file or folder of a terrain, the tables of a `terrain.toml` as a dict, or a terrain.
       preset: "consistent" or "paper".
       **changes: attributes of `Model` that differ (gravity, timestep, ambient, modes, gains, ...); `modes` and `gains`
         may name some of the joint groups only.
@@ -294,8 +320,7 @@ def make_model(
     given_gains = dict(changes.pop("gains", {}))
     model = Model(
         rover=loaded,
-        terrain=terrain if isinstance(terrain, Terrain) else load_terrain(terrain),
-        terrain_spec="" if isinstance(terrain, Terrain) else settled("terrain", terrain, "terrain.toml"),
+        **_ground(terrain),
         effects=effects,
         parameters={e.name: e.nominal() for e in effects},
         preset=preset,
@@ -306,6 +331,14 @@ def make_model(
     model = preset_values(rover_motors(model))
     model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded) | given_gains)
     return model.replace(**changes)
+
+
+def _ground(terrain: str | Path | dict[str, Any] | Terrain) -> dict[str, Any]:
+    """The attributes `terrain` and `terrain_spec` of a model; a terrain made in Python has no name to save."""
+    if isinstance(terrain, Terrain):
+        return {"terrain": terrain, "terrain_spec": ""}
+    spec = "" if isinstance(terrain, dict) else settled("terrain", terrain, "terrain.toml")
+    return {"terrain": load_terrain(terrain), "terrain_spec": spec}
 
 
 def preset_values(model: Model) -> Model:

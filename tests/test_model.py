@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lunar_mjx.dynamics import build
 from lunar_mjx.effects.base import Parameter, effect
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.presets import PRESET_PARAMETERS, PRESETS
@@ -176,6 +177,13 @@ REFUSED: dict[str, tuple[Change, list[str]]] = {
     "unknown rover": (lambda m: make_model("moonbuggy", m.terrain), ["moonbuggy", "luvmi_x, viper"]),
     "unknown terrain": (lambda m: make_model(m.rover, "sea"), ["sea", "lunar_plain"]),
     "gains of no group": (lambda m: make_model(m.rover, m.terrain, gains={"arm": (1, 1)}), ["control.arm"]),
+    "unknown attribute": (lambda m: m.replace(weight=1.0), ["Model.replace", "weight", "unknown", "gravity"]),
+    "ambient is one number": (lambda m: m.replace(ambient=300.0), ["ambient = 300.0", "four numbers"]),
+    "soil that pulls": (
+        lambda m: m.set("soil", k_c=-1.1e5, k_phi=1.2e6),
+        ["effects.soil.k_c = -110000.0", "-175000", "0.08 m", "not positive"],
+    ),
+    "soil without stiffness": (lambda m: m.set("soil", k_c=0.0, k_phi=0.0), ["effects.soil.k_c = 0.0", "not positive"]),
     "no motor": (lambda m: check_effects(m.remove("motor"), "here"), ["here", "lacks motor", "joint_control"]),
 }
 
@@ -199,3 +207,22 @@ def test_an_effect_list_without_any_reader_of_the_motor_is_fine(model: Model) ->
 
 def test_a_terrain_made_in_python_has_no_spec() -> None:
     assert make_model("luvmi_x", flat()).terrain_spec == ""
+    assert make_model("luvmi_x", {"plane": {"slope_deg": 3.0}}).terrain_spec == ""
+
+
+def test_replace_keeps_the_modes_and_gains_of_other_groups(model: Model) -> None:
+    changed = model.replace(modes={"drive": "torque"}, gains={"drive": (0.0, 5.0)})
+    assert changed.modes == {**model.modes, "drive": "torque"}
+    assert changed.gains == {**model.gains, "drive": (0.0, 5.0)}
+    build(changed)
+
+
+def test_replace_takes_a_terrain_and_its_name_together(model: Model) -> None:
+    assert model.replace(terrain="slope:5deg").terrain_spec == "slope:5deg"
+    assert model.replace(terrain="slope:5deg").terrain.name == "slope:5deg"
+    assert model.replace(terrain=flat()).terrain_spec == "", "save_model must not write the old terrain's name"
+
+
+def test_a_soil_of_negative_cohesive_modulus_is_fine_under_wide_wheels() -> None:
+    soil = {"k_c": -1.1e5, "k_phi": 2.22e6, "n": 1.2}  # GRC-1, stiff where b > 0.0495 m
+    assert make_model("luvmi_x", flat()).set("soil", **soil).parameters["soil"]["k_c"] == -1.1e5
