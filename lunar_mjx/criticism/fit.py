@@ -104,6 +104,35 @@ def held_out_rms(comparison: Comparison, quantity: str) -> float:
     return one.score(INSIDE_ANGLES + BEYOND_ANGLES)
 
 
+def _solve(
+    bed: WheelBed,
+    table: SteadyStateTable,
+    free: Sequence[Free],
+    starts: int,
+    seed: int,
+    progress: Callable[[int], None] | None,
+) -> list[Any]:
+    """Least squares from every start; arguments as for `fit`. Best first."""
+    with jax.enable_x64(True):
+        evaluate, jacobian = _functions(bed, table, free)
+        points = qmc.Sobol(len(free), rng=np.random.default_rng(seed)).random(starts)
+        solutions = []
+        for i, start in enumerate(points):
+            # The middle of the range keeps starts away from its edges, where an exponent of 2.5 carries no load.
+            x0 = 0.1 + 0.8 * start
+            found = optimize.least_squares(
+                evaluate,
+                x0,
+                jac=jacobian,  # pyright: ignore[reportArgumentType]
+                bounds=(0.0, 1.0),
+                x_scale=0.1,
+            )
+            solutions.append(found)
+            if progress is not None:
+                progress(i + 1)
+    return sorted(solutions, key=lambda s: s.cost)
+
+
 def fit(
     bed: WheelBed,
     table: SteadyStateTable,
@@ -133,24 +162,7 @@ def fit(
     fixed = {e: dict(v) for e, v in FIXED.items() if e in bed.parameters}
     base = bed.with_values(fixed)
     base.merged({f.effect: {f.name: f.low} for f in free})
-    with jax.enable_x64(True):
-        evaluate, jacobian = _functions(base, seen, free)
-        points = qmc.Sobol(len(free), rng=np.random.default_rng(seed)).random(starts)
-        solutions = []
-        for i, start in enumerate(points):
-            # The middle of the range keeps starts away from its edges, where an exponent of 2.5 carries no load.
-            x0 = 0.1 + 0.8 * start
-            found = optimize.least_squares(
-                evaluate,
-                x0,
-                jac=jacobian,  # pyright: ignore[reportArgumentType]
-                bounds=(0.0, 1.0),
-                x_scale=0.1,
-            )
-            solutions.append(found)
-            if progress is not None:
-                progress(i + 1)
-    solutions.sort(key=lambda s: s.cost)
+    solutions = _solve(base, seen, free, starts, seed, progress)
     rms = tuple(float(np.sqrt(2.0 * s.cost / len(s.fun))) for s in solutions)
     best = solutions[0].x
     values: dict[str, dict[str, float]] = {}
