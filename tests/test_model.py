@@ -184,6 +184,7 @@ REFUSED: dict[str, tuple[Change, list[str]]] = {
         ["effects.soil.k_c = -110000.0", "-175000", "0.08 m", "not positive"],
     ),
     "soil without stiffness": (lambda m: m.set("soil", k_c=0.0, k_phi=0.0), ["effects.soil.k_c = 0.0", "not positive"]),
+    "build without motor": (lambda m: build(m.remove("motor")), ["build", "lacks motor", "joint_control"]),
     "no motor": (lambda m: check_effects(m.remove("motor"), "here"), ["here", "lacks motor", "joint_control"]),
 }
 

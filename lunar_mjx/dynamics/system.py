@@ -230,8 +230,11 @@ def build(model: Model, engine: str = "auto") -> System:
     """Makes a model ready to run; `engine` is "auto" (the fastest that fits), "structured" or "mjx".
 
     Raises:
-      UserError: unknown engine, or a rover that the engine cannot run exactly.
+      UserError: unknown engine, a rover that the engine cannot run exactly, or an effect whose motor is missing.
     """
+    from lunar_mjx.model import check_effects  # which imports this package
+
+    check_effects(model, "build")
     return System(model, engine)
 
 
