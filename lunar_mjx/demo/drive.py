@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lunar_mjx.dynamics import State, System, Telemetry, build
+from lunar_mjx.dynamics import System, Telemetry, build
 from lunar_mjx.effects.motor import VELOCITY
 from lunar_mjx.model import make_model
 from lunar_mjx.terrain import Terrain, sample
@@ -115,14 +115,7 @@ def drive(
     controls, speed = _controls(system, count, seconds, rng)
     state = jax.jit(jax.vmap(system.reset, in_axes=(None, 0, 0, 0)))(system.params, *map(jnp.asarray, starts))
 
-    @jax.jit
-    def run(params: Any, state: State, controls: Any) -> tuple[State, Telemetry]:
-        held = jnp.repeat(controls, hold, axis=1)
-        state, telemetry = jax.vmap(lambda s, c: system.rollout(params, s, c))(state, held)
-        telemetry = jax.tree.map(lambda a: a[:, ::hold], telemetry)
-        # Without weak types the state comes back as it went in, and the next chunk needs no second compilation.
-        return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), state), telemetry
-
+    run = jax.jit(lambda params, state, controls: system.rollout_batch(params, state, controls, hold))
     records: list[Telemetry] = []
     chunk = max(1, round(_CHUNK_SECONDS * RECORDS_PER_SECOND))
     for first in range(0, controls.shape[1], chunk):

@@ -22,7 +22,7 @@ from lunar_mjx.report.progress import Reporter, console_progress
 from lunar_mjx.terrain import load_terrain
 
 TITLE = "lunar-mjx: a batch of rovers on the Moon, and the wheel model against measurements"
-_SHARES = {"viper": 0.45, "luvmi_x": 0.3}
+_SHARES = {"viper": 0.45, "luvmi_x": 0.35}
 """Measured share of each rover's drive in the whole, compilation included; the wheel takes the rest."""
 
 
@@ -63,7 +63,7 @@ def run_demo(
         for i, (name, share) in enumerate(_SHARES.items()):
             what = f"driving {rovers} {ROVERS[name][0]}s"
             report(f"{what} (compiling)", done)
-            tell = _part(report, what, done + 0.7 * share, 0.3 * share)
+            tell = _part(report, what, done + 0.85 * share, 0.15 * share)
             drives.append(drive(name, rovers, seconds, seed, terrain, tell, shift=0.5 * i))
             done += share
         cases = wheel_cases(starts, seed, _part(report, "wheel against test bed", done, 0.95 - done))
