@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +138,7 @@ class Model:
         Raises:
           UserError: an attribute does not exist, or its value makes no sense.
         """
+        given = set(changes.get("gains", {}))
         known = [f.name for f in dataclasses.fields(self)]
         for key in changes:
             if key not in known:
@@ -150,7 +151,7 @@ class Model:
             changes = {**_ground(changes.pop("terrain")), **changes}
         model = dataclasses.replace(self, **changes)
         check_settings(model, "Model.replace")
-        return model
+        return with_position_gains(model, given)
 
     def _effect(self, name: str, source: str) -> Effect:
         for effect in self.effects:
@@ -219,6 +220,23 @@ def check_effects(model: Model, source: str | Path) -> None:
     if needy and "motor" not in model.effect_names:
         raise bad_input(source, "effect_list", ", ".join(model.effect_names), f"lacks motor, which {needy[0]} reads",
                         f"add motor or take out {', '.join(needy)}")  # fmt: skip
+
+
+_POSITION_RATE = 20.0
+"""1/s; a wheel that gets its position loop from its velocity loop nears its target at about this rate."""
+
+
+def with_position_gains(model: Model, given: Collection[str]) -> Model:
+    """Gives groups in position mode that have no position gain one in proportion to their velocity gain.
+
+    A group made for velocity control has none and would stand still whatever the target. Groups in `given` keep theirs.
+    """
+    gains = {
+        group: (_POSITION_RATE * gain[1], gain[1])
+        for group, gain in model.gains.items()
+        if model.modes.get(group) == "position" and gain[0] == 0.0 and group not in given
+    }
+    return dataclasses.replace(model, gains={**model.gains, **gains}) if gains else model
 
 
 def check_settings(model: Model, source: str | Path) -> None:
@@ -329,8 +347,8 @@ def make_model(
         effect_files={e.name: e.name for e in effects},
     )
     model = preset_values(rover_motors(model))
-    model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded) | given_gains)
-    return model.replace(**changes)
+    model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded))
+    return model.replace(**changes, gains=given_gains)
 
 
 def _ground(terrain: str | Path | dict[str, Any] | Terrain) -> dict[str, Any]:

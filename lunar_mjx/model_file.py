@@ -24,6 +24,7 @@ from lunar_mjx.model import (
     check_settings,
     make_model,
     settled,
+    with_position_gains,
 )
 from lunar_mjx.resources import shipped
 from lunar_mjx.rover import load_rover
@@ -78,6 +79,7 @@ def load_model(path: str | Path) -> Model:
         gains={**model.gains, **gains},
     )
     check_settings(model, path)
+    model = with_position_gains(model, [g for g, entry in data.get("control", {}).items() if GAINS[0] in entry])
     model = _effects(path, data, model)
     check_effects(model, path)
     return model

@@ -227,3 +227,13 @@ def test_replace_takes_a_terrain_and_its_name_together(model: Model) -> None:
 def test_a_soil_of_negative_cohesive_modulus_is_fine_under_wide_wheels() -> None:
     soil = {"k_c": -1.1e5, "k_phi": 2.22e6, "n": 1.2}  # GRC-1, stiff where b > 0.0495 m
     assert make_model("luvmi_x", flat()).set("soil", **soil).parameters["soil"]["k_c"] == -1.1e5
+
+
+def test_wheels_in_position_mode_get_a_gain_that_moves_them(model: Model) -> None:
+    velocity = model.gains["drive"][1]
+    assert model.gains["drive"][0] == 0.0
+    assert model.replace(modes={"drive": "position"}).gains["drive"] == (20.0 * velocity, velocity)
+    assert make_model("luvmi_x", flat(), modes={"drive": "position"}).gains["drive"] == (20.0 * velocity, velocity)
+    assert model.replace(modes={"drive": "position"}, gains={"drive": (0.0, 5.0)}).gains["drive"] == (0.0, 5.0)
+    made = make_model("luvmi_x", flat(), modes={"drive": "position"}, gains={"drive": (0.0, 5.0)})
+    assert made.gains["drive"] == (0.0, 5.0)
