@@ -39,3 +39,23 @@ def wheel_feet(model: mujoco.MjModel, wheels: np.ndarray, chassis: int) -> np.nd
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return (data.xpos[wheels] - data.xpos[chassis]) @ data.xmat[chassis].reshape(3, 3)
+
+
+def chassis_boxes(model: mujoco.MjModel, chassis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bounding boxes of the chassis' shapes along the axes of its frame.
+
+    Args:
+      model: compiled model.
+      chassis: id of the base body.
+
+    Returns:
+      Centres and half sides, each (box, 3), m; no boxes where the chassis has no shape.
+    """
+    centers, halves = [], []
+    for geom in np.flatnonzero(model.geom_bodyid == chassis):
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        rotation = rotation.reshape(3, 3)
+        centers.append(model.geom_pos[geom] + rotation @ model.geom_aabb[geom, :3])
+        halves.append(np.abs(rotation) @ model.geom_aabb[geom, 3:])
+    return np.reshape(centers, (-1, 3)), np.reshape(halves, (-1, 3))

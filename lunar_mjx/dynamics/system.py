@@ -14,7 +14,7 @@ from lunar_mjx.dynamics import batch
 from lunar_mjx.dynamics.engines import make_engine
 from lunar_mjx.dynamics.heat import step_heat
 from lunar_mjx.dynamics.indexing import select
-from lunar_mjx.dynamics.kinematics import Kinematics
+from lunar_mjx.dynamics.kinematics import Kinematics, chassis_boxes
 from lunar_mjx.dynamics.ports import Pipeline, apply_effects
 from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperature
 from lunar_mjx.effects.context import Context, Heat, RoverInfo
@@ -245,6 +245,8 @@ def rover_info(model: Model) -> RoverInfo:
     groups = [(g, names.index(g.name)) for g in rover.groups for _ in g.joints]
     limits = np.array([rover.joint_limits[j] for j in rover.joints], float)
     points = np.asarray(rover.chassis_points, float)
+    compiled = rover.compile()
+    center, half = chassis_boxes(compiled, compiled.body(rover.chassis).id)
     return RoverInfo(
         wheel_radius=np.array([w.radius for w in rover.wheels]),
         wheel_width=np.array([w.width for w in rover.wheels]),
@@ -254,7 +256,9 @@ def rover_info(model: Model) -> RoverInfo:
         mode=np.array([MODES.index(model.modes[g.name]) for g, _ in groups]),
         position_gain=np.array([model.gains[g.name][0] for g, _ in groups]),
         velocity_gain=np.array([model.gains[g.name][1] for g, _ in groups]),
-        chassis_points=Vec3(points[:, 0], points[:, 1], points[:, 2]),
+        chassis_points=Vec3(*points.T),
+        box_center=Vec3(*center.T) if len(center) else None,
+        box_half=Vec3(*half.T) if len(half) else None,
         name=rover.name,
     )
 

@@ -188,6 +188,7 @@ class RoverInfo:
       mode: control mode of each joint: 0 position, 1 velocity, 2 torque, 3 current.
       position_gain: N m/rad. velocity_gain: N m s/rad.
       chassis_points: where the chassis can touch the ground, in its frame, m.
+      box_center, box_half: centres and half sides of the chassis' boxes, along the axes of its frame, m.
     """
 
     wheel_radius: Float[AnyArray, "wheel"]
@@ -199,6 +200,8 @@ class RoverInfo:
     position_gain: Float[AnyArray, "joint"]
     velocity_gain: Float[AnyArray, "joint"]
     chassis_points: Vec3
+    box_center: Vec3 | None = None
+    box_half: Vec3 | None = None
     name: str = static(default="rover")
 
 

@@ -118,6 +118,36 @@ def boulders(ctx, p, x, wheel):
     )
 
 
+_QUADRANTS = ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5))
+"""Where each box of the chassis looks for boulders, in half lengths from its centre."""
+
+
+def _boulders_under_chassis(ctx, p) -> list[tuple[Vec3, Vec3]]:
+    """Force on the chassis, N, and its arm from the chassis frame, m, per quadrant: sphere against box, world frame."""
+    center, half = ctx.rover.box_center, ctx.rover.box_half
+    rocks = []
+    for fore, side in _QUADRANTS:
+        probe = ctx.frame.to_world(Vec3(center.x + fore * half.x, center.y + side * half.y, center.z)) + ctx.position
+        rocks.append(nearest_rock(ctx.terrain.rocks, probe.x, probe.y))
+    out = []
+    for x, y, z, radius in rocks:
+        # quadrants that found the same boulder share its push
+        share = 1.0 / sum(jnp.where((x == other[0]) & (y == other[1]), 1.0, 0.0) for other in rocks)
+        gap = ctx.frame.from_world(Vec3(x, y, z) - ctx.position) - center
+        nearest = Vec3(*(jnp.clip(g, -h, h) for g, h in zip(gap, half, strict=True)))
+        apart = gap - nearest
+        distance = apart.norm(1e-9)
+        inside = distance < 1e-6
+        down = Vec3(jnp.zeros_like(distance), jnp.zeros_like(distance), -jnp.ones_like(distance))
+        toward = ctx.frame.to_world(down.where(inside, apart * (1.0 / distance)))
+        arm = ctx.frame.to_world(nearest + center)
+        velocity = ctx.velocity + ctx.angular_velocity.cross(arm)
+        depth = jnp.where(radius > 0.0, radius - jnp.where(inside, 0.0, distance), -1.0)
+        load = share * _penalty(depth, velocity.dot(toward), p.stiffness, p.damping)
+        out.append((toward * -load + _sliding_friction(velocity, toward, p.mu, load, p.speed_scale), arm))
+    return out
+
+
 @effect(
     "body_wrench",
     stiffness=Parameter(5e4, None, (1e2, 1e8), "N/m", "contact stiffness of the chassis", "choice"),
@@ -126,7 +156,7 @@ def boulders(ctx, p, x, wheel):
     speed_scale=_SPEED,
 )
 def chassis_contact(ctx, p, x, wrench):
-    """Points of the chassis that touch terrain or boulders are pushed out, so that it does not sink in."""
+    """Points of the chassis that touch the ground and boulders that touch its boxes push it out."""
     arm = ctx.frame.to_world(ctx.rover.chassis_points)
     point = arm + ctx.position
     velocity = ctx.velocity + ctx.angular_velocity.cross(arm)
@@ -134,15 +164,11 @@ def chassis_contact(ctx, p, x, wrench):
     normal = Vec3(-slope_x, -slope_y, jnp.ones_like(slope_x)).unit()
     load = _penalty((height - point.z) * normal.z, -velocity.dot(normal), p.stiffness, p.damping)
     force = normal * load + _sliding_friction(velocity, normal, p.mu, load, p.speed_scale)
-    if ctx.terrain.rocks is not None:
-        cx, cy, cz, rock_radius = nearest_rock(ctx.terrain.rocks, point.x, point.y)
-        apart = point - Vec3(cx, cy, cz)
-        distance = apart.norm(1e-9)
-        away = apart * (1.0 / distance)
-        depth = jnp.where(rock_radius > 0.0, rock_radius - distance, -1.0)
-        push = _penalty(depth, -velocity.dot(away), p.stiffness, p.damping)
-        force = force + away * push + _sliding_friction(velocity, away, p.mu, push, p.speed_scale)
-    return dataclasses.replace(wrench, force=wrench.force + force.sum(), moment=wrench.moment + arm.cross(force).sum())
+    total, moment = force.sum(), arm.cross(force).sum()
+    if ctx.terrain.rocks is not None and ctx.rover.box_center is not None:
+        for push, where in _boulders_under_chassis(ctx, p):
+            total, moment = total + push.sum(), moment + where.cross(push).sum()
+    return dataclasses.replace(wrench, force=wrench.force + total, moment=wrench.moment + moment)
 
 
 @effect(

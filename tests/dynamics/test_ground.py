@@ -16,13 +16,15 @@ from lunar_mjx.terrain import SoilMap, build_rocks, flat
 
 EVERY = 50
 BOULDER_X, BOULDER_RADIUS = 1.0, 0.4
+LOW_RADIUS, LOW_LINE = 0.15, -12.0  # passes between the wheels, but not under the belly
 
 
 @pytest.fixture(scope="module")
 def drives():
-    """A LUVMI-X on ground with a boulder ahead whose northern half is rock, run along three lines."""
+    """A LUVMI-X on ground with two boulders ahead whose northern part is rock, run along four lines."""
     ground = flat(40.0)
-    rocks = build_rocks(np.array([[BOULDER_X, 0.0, 0.1]]), np.array([BOULDER_RADIUS]), (-20.0, -20.0, 20.0, 20.0))
+    centers = np.array([[BOULDER_X, 0.0, 0.1], [BOULDER_X, LOW_LINE, 0.0]])
+    rocks = build_rocks(centers, np.array([BOULDER_RADIUS, LOW_RADIUS]), (-20.0, -20.0, 20.0, 20.0))
     rock = np.zeros((41, 41), np.float32)
     rock[24:] = 1.0  # y from 4 m on
     soil = SoilMap(jnp.asarray(rock), jnp.asarray(-20.0), jnp.asarray(-20.0), jnp.asarray(1.0))
@@ -32,8 +34,8 @@ def drives():
     def run(y):
         return system.rollout(system.params, system.reset(system.params, 0.0, y), control, EVERY)[1]
 
-    # head-on, on soft soil far from the boulder, and on rock
-    return jax.device_get(jax.jit(jax.vmap(run))(jnp.array([0.0, -6.0, 8.0])))
+    # head-on, on soft soil far from the boulders, on rock, and at the low boulder
+    return jax.device_get(jax.jit(jax.vmap(run))(jnp.array([0.0, -6.0, 8.0, LOW_LINE])))
 
 
 def test_a_boulder_stops_or_lifts_the_rover(drives) -> None:
@@ -46,6 +48,15 @@ def test_a_boulder_stops_or_lifts_the_rover(drives) -> None:
     free, stopped = drives.position.x[1, -1], drives.position.x[0, -1]
     assert free > 0.7
     assert stopped < free - 0.1 or drives.position.z[0].max() > drives.position.z[1].max() + 0.05
+
+
+def test_a_boulder_between_the_wheels_does_not_pass_through_the_chassis(drives) -> None:
+    """A boulder higher than the belly stops the chassis at its front face, though no wheel touches it."""
+    x, belly = np.asarray(drives.position.x[3]), 0.115
+    # the hull reaches 0.35 m ahead of the frame and meets the sphere at the height of the belly
+    meets = BOULDER_X - np.sqrt(LOW_RADIUS**2 - belly**2) - 0.35
+    assert x.max() == pytest.approx(meets, abs=0.05)
+    assert abs(x[-1] - x[-20]) < 0.01
 
 
 def test_rock_carries_without_sinkage_and_slip(drives) -> None:
