@@ -268,8 +268,13 @@ def test_interrupted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: object) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
+    # A process started in the background inherits a SIGINT that is ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(cli, "select_device", interrupt)
-    assert run("simulate", "--rover", "luvmi_x") == (130, "", "lunar-mjx: interrupted\n")
+    try:
+        assert run("simulate", "--rover", "luvmi_x") == (130, "", "lunar-mjx: interrupted\n")
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_full_disk_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
