@@ -1,0 +1,12 @@
+"""Measurement logs: reading, checking, writing, templates, and logs recorded from the simulator."""
+
+from lunar_mjx.criticism.log.apply import commands as commands
+from lunar_mjx.criticism.log.apply import log_model as log_model
+from lunar_mjx.criticism.log.findings import Finding as Finding
+from lunar_mjx.criticism.log.log import Imu as Imu
+from lunar_mjx.criticism.log.log import Log as Log
+from lunar_mjx.criticism.log.log import LogTable as LogTable
+from lunar_mjx.criticism.log.log import Noise as Noise
+from lunar_mjx.criticism.log.log import SteadyLog as SteadyLog
+from lunar_mjx.criticism.log.read import read_campaign as read_campaign
+from lunar_mjx.criticism.log.read import read_log as read_log

@@ -1,0 +1,93 @@
+"""A table of a TOML file whose values are taken by name and kind; every mistake names the file and the field."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+
+
+@dataclasses.dataclass(frozen=True)
+class Fields:
+    """A table and where it stands: `path` the file, `prefix` such as "tables.drive"."""
+
+    path: Path
+    values: Mapping[str, Any]
+    prefix: str = ""
+
+    @classmethod
+    def read(cls, path: Path, what: str = "the file") -> Fields:
+        """The whole of a TOML file.
+
+        Raises:
+          UserError: the file is missing or is not TOML.
+        """
+        require_file(path, what)
+        try:
+            return cls(path, tomllib.loads(path.read_text(encoding="utf-8")))
+        except UnicodeDecodeError:
+            raise UserError(f"{path}: is not a text file; give a TOML file.") from None
+        except RecursionError:
+            raise UserError(f"{path}: is not valid TOML (nested too deeply); mend the file.") from None
+        except ValueError as error:
+            raise UserError(f"{path}: is not valid TOML ({error}); mend that line.") from None
+
+    def field(self, key: str) -> str:
+        """Full name of a key."""
+        return f"{self.prefix}.{key}" if self.prefix else key
+
+    def known(self, keys: Sequence[str]) -> None:
+        """Refuses keys that are not in `keys`."""
+        for key, value in self.values.items():
+            if key not in keys:
+                raise bad_input(self.path, self.field(key), value, "is an unknown key", f"use one of {', '.join(keys)}")
+
+    def table(self, key: str) -> Fields:
+        """A table within; empty if it is not there."""
+        value = self.values.get(key, {})
+        if not isinstance(value, Mapping):
+            raise bad_input(self.path, self.field(key), value, "is not a table", f"write it as [{self.field(key)}]")
+        return Fields(self.path, value, self.field(key))
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """A text, which must be there if there is no default."""
+        value = self.values.get(key, default)
+        if not isinstance(value, str) or (default is None and not value):
+            raise bad_input(self.path, self.field(key), value, "is not a text", "give a name in quotes")
+        return value
+
+    def choice(self, key: str, choices: Sequence[str]) -> str | None:
+        """One of `choices`, or None if it is not there."""
+        if key not in self.values:
+            return None
+        value = self.text(key)
+        if value not in choices:
+            raise bad_input(self.path, self.field(key), value, "does not exist", f"use one of {', '.join(choices)}")
+        return value
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """A finite number, which must be there if there is no default."""
+        return self._finite(self.field(key), self.values.get(key, default))
+
+    def positive(self, key: str, default: float | None = None) -> float:
+        """A positive finite number."""
+        value = self.number(key, default)
+        if value <= 0.0:
+            raise bad_input(self.path, self.field(key), value, "is not positive", "give a positive number")
+        return value
+
+    def vector(self, key: str, count: int, default: Sequence[float] | None = None) -> tuple[float, ...]:
+        """A list of `count` finite numbers."""
+        value = self.values.get(key, default)
+        if not isinstance(value, list | tuple) or len(value) != count:
+            raise bad_input(self.path, self.field(key), value, f"is not a list of {count} numbers", "write [a, b, ...]")
+        return tuple(self._finite(self.field(key), v) for v in value)
+
+    def _finite(self, field: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise bad_input(self.path, field, value, "is not a number", "give a number")
+        return require_finite(self.path, field, value)
