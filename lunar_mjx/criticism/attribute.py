@@ -1,0 +1,341 @@
+"""Which effect is missing: noise first, a certified fit, scores, refits, held-out manoeuvres, and then a verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.criticism.fitting import Fit, Progress, fit, silent
+from lunar_mjx.criticism.held_out import NoiseTest, errors, gain, noise_test
+from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
+from lunar_mjx.criticism.verdict import Diagnosis, EffectEvidence, Verdict
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How a diagnosis is made.
+
+    Attributes:
+      alpha: family-wise error rate of the score tests.
+      share: of the excess over the noise; a candidate that explains more of it is refitted whatever its score, because
+        the other missing effects of a model that fails badly drown every score. Held-out manoeuvres judge it.
+      chi2: least drop of chi-square by an effect that is named.
+      gain_se: held-out gain in standard errors that an effect must earn.
+      refits: effects refitted at each level. beam: models carried from level to level. most: effects named at most.
+      confounded: |cos| from which two effects count as near relatives.
+      same: differences of chi-square below which two effects explain the data alike.
+      explained: share of the excess over the noise that the effects named must explain where they do not reach it.
+      starts: of the baseline fit. draws: of the bootstrap. seed: of both.
+    """
+
+    alpha: float = 0.01
+    share: float = 0.05
+    chi2: float = 25.0
+    gain_se: float = 2.0
+    refits: int = 4
+    beam: int = 2
+    most: int = 4
+    confounded: float = 0.9
+    same: float = 12.0
+    explained: float = 0.995
+    starts: int = 4
+    draws: int = 2000
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Candidate:
+    """A refitted set of effects.
+
+    Attributes:
+      effects: names, in the order of adding. fit: the refit. noise: whether it reaches the noise.
+      gain, gain_se: held-out gain over the parent set and its standard error.
+    """
+
+    effects: tuple[str, ...]
+    fit: Fit
+    noise: NoiseTest
+    gain: float
+    gain_se: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Search:
+    """Everything that a diagnosis looked at.
+
+    Attributes:
+      base: the baseline fit. scores: of every candidate at the base. cosines: between them.
+      tried: every refitted set. chosen: the set that is named (the base's if empty). rivals: sets that explain the
+        data alike.
+    """
+
+    base: Candidate
+    scores: tuple[Score, ...]
+    cosines: Mapping[str, Mapping[str, float]]
+    tried: tuple[Candidate, ...]
+    chosen: Candidate
+    rivals: tuple[Candidate, ...]
+
+
+def search(problem: Problem, settings: Settings = Settings(), progress: Progress = silent) -> Search:
+    """Fits the baseline, scores every candidate, refits the best and adds effects while they earn it."""
+    base_fit = fit(problem, problem.free(), starts=settings.starts, seed=settings.seed, progress=progress)
+    base = Candidate((), base_fit, noise_test(problem, base_fit), 0.0, 0.0)
+    if base_fit.problems:
+        return Search(base, (), {}, (), base, ())
+    progress("scoring", 0.0)
+    scores = _scores(problem, base, settings)
+    angles = cosines([s for s in scores if s.length >= SEPARABLE])
+    tried: dict[frozenset[str], Candidate] = {frozenset(): base}
+    beam, best = [base], base
+    for level in range(settings.most):
+        grown = []
+        for number, parent in enumerate(beam):
+            progress(f"refitting with {level + 1} effect{'s' if level else ''}", number / len(beam))
+            found = scores if not parent.effects else _scores(problem, parent, settings)
+            near = angles if not parent.effects else cosines([s for s in found if s.length >= SEPARABLE])
+            grown += _grow(problem, parent, found, near, settings, tried)
+        grown = [c for c in grown if _earned(c, settings)]
+        if not grown:
+            break
+        grown.sort(key=lambda c: c.fit.chi2)
+        if _better(grown[0], best, settings):
+            best = grown[0]
+        if any(c.noise.passes for c in grown):
+            best = next(c for c in grown if c.noise.passes)
+            break
+        beam = grown[: settings.beam]
+    best = _pruned(problem, best, settings, tried)
+    rivals = [c for c in tried.values() if c is not best and _alike(c, best, settings)]
+    return Search(base, tuple(scores), angles, tuple(tried.values()), best, tuple(rivals))
+
+
+def _scores(problem: Problem, at: Candidate, settings: Settings) -> list[Score]:
+    names = [e for e in problem.candidates if e not in at.effects]
+    return score(problem, at.fit, signatures(problem, at.fit, names), settings.draws, settings.seed)
+
+
+def significant(s: Score, settings: Settings) -> bool:
+    """Whether a score alone would name the effect."""
+    return s.length >= SEPARABLE and s.p <= settings.alpha and s.chi2 >= settings.chi2
+
+
+def worth_refitting(s: Score, parent: Candidate, settings: Settings) -> bool:
+    """Whether a score, or the share of the excess that it explains, earns a refit."""
+    fitted = parent.fit.residual[parent.fit.fitted]
+    excess = float(fitted @ fitted) - len(fitted)
+    large = not parent.noise.passes and s.chi2 > settings.share * excess
+    return significant(s, settings) or (large and s.length >= SEPARABLE and s.chi2 >= settings.chi2)
+
+
+def _grow(
+    problem: Problem,
+    parent: Candidate,
+    scores: Sequence[Score],
+    near: Mapping[str, Mapping[str, float]],
+    settings: Settings,
+    tried: dict[frozenset[str], Candidate],
+) -> list[Candidate]:
+    """Refits the parent with each of the best-scored effects, and with their near relatives."""
+    good = [s for s in scores if worth_refitting(s, parent, settings)]
+    if not good:
+        return []
+    chosen = [s for s in good[: settings.refits]]
+    for s in good[settings.refits :]:
+        if near.get(good[0].effect, {}).get(s.effect, 0.0) >= settings.confounded and len(chosen) < 2 * settings.refits:
+            chosen.append(s)
+    grown = []
+    for s in chosen:
+        effects = (*parent.effects, s.effect)
+        if frozenset(effects) in tried:
+            continue
+        candidate = _refit(problem, parent, effects, s)
+        tried[frozenset(effects)] = candidate
+        grown.append(candidate)
+    return grown
+
+
+def _refit(problem: Problem, parent: Candidate, effects: tuple[str, ...], scored: Score | None) -> Candidate:
+    """Refits from the parent with the new effect at its linear estimate, and from half of it where that fails."""
+    free = problem.free(effects)
+    found = None
+    for share in (1.0, 0.3) if scored is not None else (0.0,):
+        start = parent.fit.u.copy()
+        if scored is not None:
+            places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
+            start[places] += share * np.clip(scored.amount, -3.0, 3.0)
+        trial = fit(problem, free, start, starts=1, certify=False)
+        if found is None or trial.chi2 < found.chi2:
+            found = trial
+        if found.chi2 < parent.fit.chi2 and (problem.cheap_jacobian is False or share != 1.0):
+            break
+    assert found is not None
+    value, se = gain(problem, parent.fit, found)
+    return Candidate(effects, found, noise_test(problem, found), value, se)
+
+
+def _earned(c: Candidate, settings: Settings) -> bool:
+    """Whether the last effect added pays on manoeuvres left out."""
+    return bool(np.isfinite(c.fit.chi2) and c.gain > 0.5 * settings.chi2 and c.gain > settings.gain_se * c.gain_se)
+
+
+def _better(c: Candidate, best: Candidate, settings: Settings) -> bool:
+    return c.fit.chi2 < best.fit.chi2 - settings.chi2 * max(1, len(c.effects) - len(best.effects))
+
+
+def _alike(c: Candidate, best: Candidate, settings: Settings) -> bool:
+    """Whether another set of as many effects, or fewer, explains the data as well as the best."""
+    if not best.effects or not c.effects or len(c.effects) > len(best.effects) or not np.isfinite(c.fit.chi2):
+        return False
+    return c.fit.chi2 - best.fit.chi2 < settings.same
+
+
+def _pruned(problem: Problem, best: Candidate, settings: Settings, tried: dict[frozenset[str], Candidate]) -> Candidate:
+    """Drops effects that are not significant given the others."""
+    while len(best.effects) > 1:
+        for effect in best.effects:
+            rest = tuple(e for e in best.effects if e != effect)
+            if frozenset(rest) not in tried:
+                start = best.fit.u.copy()
+                start[problem.candidates[effect]] = 0.0
+                refitted = fit(problem, problem.free(rest), start, starts=1, certify=False)
+                tried[frozenset(rest)] = Candidate(rest, refitted, noise_test(problem, refitted), np.nan, np.nan)
+            without = tried[frozenset(rest)]
+            value, se = gain(problem, without.fit, best.fit)
+            small = without.fit.chi2 - best.fit.chi2 < settings.chi2 or value < settings.gain_se * se
+            if small or (without.noise.passes and not best.noise.passes):
+                best = without
+                break
+        else:
+            break
+    return best
+
+
+def excess_explained(search_: Search, problem: Problem) -> float:
+    """Share of the squared error beyond the noise that the chosen effects explain, over fitted and select splits."""
+    keep = problem.observations.in_split("fit", "select")
+    before = float(np.sum(search_.base.fit.residual[keep] ** 2)) - keep.sum()
+    after = float(np.sum(search_.chosen.fit.residual[keep] ** 2)) - keep.sum()
+    return 1.0 if before <= 0.0 else 1.0 - max(after, 0.0) / before
+
+
+def diagnose(problem: Problem, settings: Settings = Settings(), progress: Progress = silent) -> tuple[Diagnosis, Search]:
+    """The verdict on a model and its measurements, with the evidence.
+
+    Args:
+      problem: model, candidates and measurements; the measurements must have passed the gate (`log.check`).
+      settings: thresholds and effort.
+      progress: told what is being done.
+
+    Returns:
+      The diagnosis, and everything that it rests on.
+    """
+    found = search(problem, settings, progress)
+    base, chosen = found.base, found.chosen
+    details: dict[str, Any] = {
+        "certificate": {
+            "chi2": base.fit.chi2, "gradient": base.fit.gradient, "starts": list(base.fit.starts),
+            "at_bound": list(base.fit.at_bound), "problems": list(base.fit.problems), **base.fit.extra,
+        },
+        "noise_test_before": dataclasses.asdict(base.noise),
+        "noise_test_after": dataclasses.asdict(chosen.noise),
+        "seed": settings.seed, "alpha": settings.alpha,
+        "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
+    }  # fmt: skip
+    if base.fit.problems:
+        reason = "; ".join(base.fit.problems)
+        sentence = f"The baseline fit has no certificate ({reason}), so nothing is said about physics."
+        return Diagnosis(Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details), found
+    evidence = _evidence(problem, found, settings)
+    undecidable = tuple(e.effect for e in evidence if e.status == "not tested")
+    explained = excess_explained(found, problem)
+    details["excess_explained"] = explained
+    verdict, effects, sentence = _verdict(found, explained, settings)
+    diagnosis = Diagnosis(
+        verdict=verdict, effects=effects, sentence=sentence, evidence=evidence,
+        error_before=errors(problem, base.fit), error_after=errors(problem, chosen.fit),
+        isolability=found.cosines, undecidable=undecidable, details=details,
+    )  # fmt: skip
+    return diagnosis, found
+
+
+def _verdict(found: Search, explained: float, settings: Settings) -> tuple[Verdict, tuple[str, ...], str]:
+    base, chosen = found.base, found.chosen
+    enough = chosen.noise.passes or explained >= settings.explained
+    if not chosen.effects:
+        if base.noise.passes:
+            return Verdict.NOISE_ONLY, (), "Nothing significant is missing: the residual is at the noise."
+        worst = f"{base.noise.worst}, {base.noise.channels[base.noise.worst]:.2f} sigma"
+        return Verdict.UNKNOWN, (), (
+            f"The residual is beyond the noise (worst: {worst}) and no catalogue effect explains it."
+        )
+    names = ", ".join(chosen.effects)
+    if not enough:
+        return Verdict.UNKNOWN, chosen.effects, (
+            f"Something is missing that no catalogue effect brings to the noise; {names} helps, from "
+            f"{base.noise.rms:.2f} to {chosen.noise.rms:.2f} sigma."
+        )
+    members = list(dict.fromkeys([*chosen.effects, *(e for c in found.rivals for e in c.effects)]))
+    if len(members) > len(chosen.effects):
+        common = set(chosen.effects).intersection(*(set(c.effects) for c in found.rivals))
+        if len(chosen.effects) == 1 or not common:
+            return Verdict.KNOWN_CLASS, tuple(members), (
+                f"One of {', '.join(members)} is missing; these logs cannot tell which."
+            )
+        return Verdict.MULTIPLE, tuple(chosen.effects), (
+            f"{names} are missing; {', '.join(m for m in members if m not in common)} cannot be told apart here."
+        )
+    if len(chosen.effects) == 1:
+        return Verdict.KNOWN, chosen.effects, (
+            f"{names} is missing: consistent with these logs, and better than every listed alternative."
+        )
+    return Verdict.MULTIPLE, chosen.effects, f"{names} are missing, each significant given the others."
+
+
+def _evidence(problem: Problem, found: Search, settings: Settings) -> tuple[EffectEvidence, ...]:
+    singles = {c.effects[0]: c for c in found.tried if len(c.effects) == 1}
+    rivals = {e for c in found.rivals for e in c.effects}
+    rows = []
+    for s in found.scores:
+        own = found.chosen if s.effect in found.chosen.effects else singles.get(s.effect)
+        values, std = parameters(problem, own.fit, s.effect) if own else ({}, {})
+        others = {e: v for e, v in found.cosines.get(s.effect, {}).items() if e != s.effect}
+        nearest = max(others.items(), key=lambda item: item[1]) if others else ("", 0.0)
+        status, reason = _status(s, found, rivals, settings)
+        scored = singles.get(s.effect)
+        rows.append(EffectEvidence(
+            effect=s.effect, separable_sigma=s.length, separable_share=s.share, chi2=s.chi2, z=s.z, p=s.p,
+            held_out_gain=scored.gain if scored else float("nan"),
+            held_out_se=scored.gain_se if scored else float("nan"),
+            values=values, std=std, nearest=nearest, status=status, reason=reason,
+        ))  # fmt: skip
+    order = {name: i for i, name in enumerate(found.chosen.effects)}
+    return tuple(sorted(rows, key=lambda e: (order.get(e.effect, len(order)), -e.chi2)))
+
+
+def _status(s: Score, found: Search, rivals: set[str], settings: Settings) -> tuple[str, str]:
+    if s.effect in found.chosen.effects:
+        return "accepted", "earns its place on manoeuvres left out"
+    if s.effect in rivals:
+        return "confounded", "explains these logs as well as an accepted effect"
+    if s.length < SEPARABLE:
+        return "not tested", f"leaves {s.length:.2g} sigma after a refit of the baseline; at least {SEPARABLE:g} needed"
+    if significant(s, settings):
+        return "rejected", "explains less than an accepted effect, or nothing beyond it"
+    return "not significant", f"z = {s.z:.1f}, family-wise p = {s.p:.2g}"
+
+
+def parameters(problem: Problem, fitted: Fit, effect: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Fitted values and standard deviations of an effect's coordinates, SI units."""
+    covariance = fitted.covariance(problem)
+    values, std = {}, {}
+    for k, i in enumerate(fitted.free):
+        c = problem.coordinates[i]
+        if c.effect == effect:
+            values[c.name] = float(c.value(fitted.u[i]))
+            std[c.name] = c.std(fitted.u[i], float(np.sqrt(max(covariance[k, k], 0.0))))
+    return values, std

@@ -1,0 +1,118 @@
+"""What a fit may move: every parameter as a scaled coordinate with a prior, at zero where the model stands."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.effects.base import Effect, Parameter
+
+WIDE = 10.0
+"""Prior standard deviation, in scales, of a coordinate that the data alone should settle."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinate:
+    """One parameter on a scale of its own: value = start exp(scale u) where `log`, else start + scale u.
+
+    Attributes:
+      effect, name: whose parameter it is; nuisances such as a log's initial pose have the effect "initial".
+      start: value at u = 0, SI units. scale: change per unit of u (relative where `log`).
+      low, high: bounds of the value.
+      log: whether the logarithm moves.
+      prior: standard deviation of u; infinite for none.
+      physical: whether resting on a bound is physics (such as zero friction) and not a failed fit.
+      unit: of the value.
+      log_index: the log that a nuisance belongs to, or -1.
+      amplitude: whether the value has a null at which its effect vanishes.
+    """
+
+    effect: str
+    name: str
+    start: float
+    scale: float
+    low: float
+    high: float
+    log: bool = False
+    prior: float = WIDE
+    physical: bool = False
+    unit: str = "1"
+    log_index: int = -1
+    amplitude: bool = False
+
+    @property
+    def key(self) -> str:
+        """Effect and name in one word, with the log for a nuisance."""
+        return f"{self.effect}.{self.name}" + (f"[{self.log_index}]" if self.log_index >= 0 else "")
+
+    def value(self, u: Any) -> Any:
+        """The value at a coordinate."""
+        return self.start * np.exp(self.scale * np.asarray(u)) if self.log else self.start + self.scale * np.asarray(u)
+
+    def std(self, u: float, std_u: float) -> float:
+        """Standard deviation of the value, from that of the coordinate, to first order."""
+        return abs(float(self.value(u)) * self.scale * std_u) if self.log else abs(self.scale * std_u)
+
+    def bounds(self) -> tuple[float, float]:
+        """Bounds of the coordinate."""
+        if self.log:
+            low = -np.inf if self.low <= 0.0 else math.log(self.low / self.start) / self.scale
+            return low, math.log(self.high / self.start) / self.scale
+        return tuple(sorted(((self.low - self.start) / self.scale, (self.high - self.start) / self.scale)))  # type: ignore[return-value]
+
+
+def of_candidate(effect: Effect, values: Mapping[str, float] | None = None) -> tuple[Coordinate, ...]:
+    """Coordinates of an effect that is not in the model yet, from its null.
+
+    Parameters with a null are amplitudes: they start there, on the scale of the nominal value, and only the data and
+    the bounds hold them. Parameters without one are shapes: they start at the nominal value and keep a prior of a
+    third of it, because they mean nothing while the amplitudes are zero.
+    """
+    found = []
+    for name, p in effect.parameters.items():
+        start = (values or {}).get(name)
+        if p.null is not None:
+            found.append(_amplitude(effect.name, name, p))
+        elif p.nominal > 0.0 and p.bounds[0] >= 0.0:
+            found.append(Coordinate(effect.name, name, start or p.nominal, 0.3, *p.bounds, log=True, prior=1.0,
+                                    unit=p.unit))  # fmt: skip
+    return tuple(found)
+
+
+def _amplitude(effect: str, name: str, p: Parameter) -> Coordinate:
+    assert p.null is not None
+    low, high = p.bounds
+    # An effect whose nominal value is its null (the user's measurement) still needs a size to be tried at.
+    size = abs(p.nominal - p.null) or 0.1 * min(abs(high - p.null) or math.inf, abs(p.null - low) or math.inf)
+    if not math.isfinite(size):
+        size = 1.0
+    one_sided = p.null in (low, high)
+    return Coordinate(effect, name, p.null, size, low, high, physical=one_sided, unit=p.unit, amplitude=True)
+
+
+def default_coordinate(effect: Effect, name: str, value: float, relative: float, prior: float) -> Coordinate:
+    """A baseline parameter: its logarithm where it is positive by nature, else itself.
+
+    Args:
+      effect: whose parameter it is.
+      name: of the parameter.
+      value: where the model stands.
+      relative: scale as a share of the value.
+      prior: standard deviation in scales.
+    """
+    p = effect.parameters[name]
+    low, high = p.bounds
+    if low >= 0.0 and value > 0.0:
+        return Coordinate(effect.name, name, value, relative, low, high, True, prior, unit=p.unit)
+    scale = relative * (abs(value) or 0.1 * (high - low))
+    physical = p.null is not None and p.null in (low, high)
+    return Coordinate(effect.name, name, value, scale, low, high, False, prior, physical, p.unit)
+
+
+def indices(coordinates: Sequence[Coordinate], effects: Sequence[str]) -> np.ndarray:
+    """Places of the coordinates of some effects."""
+    return np.array([i for i, c in enumerate(coordinates) if c.effect in effects], int)

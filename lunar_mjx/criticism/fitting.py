@@ -1,0 +1,288 @@
+"""Fits that earn a certificate: Levenberg-Marquardt from many starts on whitened residuals, with priors and bounds.
+
+A fit that has not converged leaves structure in the residual, which then looks like missing physics; so nothing is
+said about physics without a certificate (small gradient, starts that agree, no bound that is not physics).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from scipy.stats import qmc
+
+from lunar_mjx.criticism.problem import Problem
+
+AGREEING = 3
+"""Starts that must end at the same chi-square."""
+SAME_CHI2 = 1.0
+"""Chi-squares that differ by less are the same fit."""
+SMALL_GRADIENT = 0.1
+"""Largest drop of chi-square that one more Gauss-Newton step may still promise."""
+
+_DAMPINGS = np.array([1e-4, 1e-2, 1.0, 1e2])
+_ITERATIONS = 40
+_EDGE = 1e-6
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the share that is done, 0 to 1."""
+
+
+def silent(what: str, share: float) -> None:
+    """A `Progress` that shows nothing."""
+    del what, share
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted model.
+
+    Attributes:
+      u: (coordinates,) where every coordinate stands. free: places of those that moved.
+      chi2: over the fitted observations and the priors.
+      residual: (n,) whitened residual of all observations (measured less predicted), in sigma.
+      jacobian: (n, free) whitened sensitivities.
+      fitted: (n,) which observations were fitted.
+      gradient: drop of chi-square that one more step promises. starts: chi-square that each start ended with.
+      at_bound: names of parameters at a bound that is not physics. extra: other figures of the certificate.
+      problems: why there is no certificate; empty where there is.
+    """
+
+    u: np.ndarray
+    free: np.ndarray
+    chi2: float
+    residual: np.ndarray
+    jacobian: np.ndarray
+    fitted: np.ndarray
+    gradient: float
+    starts: tuple[float, ...] = ()
+    at_bound: tuple[str, ...] = ()
+    extra: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+
+    def covariance(self, problem: Problem) -> np.ndarray:
+        """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
+        j = self.jacobian[self.fitted]
+        _, scale = problem.prior_rows(self.u, self.free)
+        return np.linalg.pinv(j.T @ j + np.diag(scale**2), hermitian=True)
+
+    def rms(self, keep: np.ndarray) -> float:
+        """Root mean square residual of some observations, in sigma."""
+        return float(np.sqrt(np.mean(self.residual[keep] ** 2))) if keep.any() else float("nan")
+
+
+def whitened_residuals(problem: Problem, u: np.ndarray) -> np.ndarray:
+    """(k, n) measured less predicted, whitened, at (k, coordinates); not finite where a prediction is not."""
+    difference = problem.observations.value[None] - problem.predict(u)
+    return problem.observations.whiten(difference.T).T
+
+
+class _Objective:
+    """Chi-square of the fitted observations with the priors, and its quadratic model, over the free coordinates."""
+
+    def __init__(self, problem: Problem, free: np.ndarray, fitted: np.ndarray):
+        self.problem, self.free, self.fitted = problem, free, fitted
+        self.low, self.high = problem.bounds(free)
+
+    def residuals(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residuals (k, n), and chi-square (k,), infinite where a prediction is not finite."""
+        r = whitened_residuals(self.problem, u)
+        prior = np.array([np.sum(self.problem.prior_rows(row, self.free)[0] ** 2) for row in u])
+        with np.errstate(over="ignore", invalid="ignore"):
+            chi2 = np.sum(r[:, self.fitted] ** 2, axis=1) + prior
+        return r, np.where(np.isfinite(chi2), chi2, np.inf)
+
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        j = self.problem.observations.whiten(self.problem.jacobian(u, self.free))
+        return np.where(np.isfinite(j), j, 0.0)
+
+    def quadratic(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Half the downhill gradient and the Gauss-Newton Hessian."""
+        prior, scale = self.problem.prior_rows(u, self.free)
+        j = j[self.fitted]
+        return j.T @ r[self.fitted] - scale * prior, j.T @ j + np.diag(scale**2)
+
+    def held(self, at: np.ndarray, downhill: np.ndarray) -> np.ndarray:
+        """Coordinates at a bound that the gradient pushes against."""
+        return ((at <= self.low + _EDGE) & (downhill < 0.0)) | ((at >= self.high - _EDGE) & (downhill > 0.0))
+
+    def steps(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray, dampings: np.ndarray) -> np.ndarray:
+        """(dampings, coordinates) damped Gauss-Newton steps, cut at the bounds."""
+        at = u[self.free]
+        move = ~self.held(at, downhill)
+        out = np.repeat(u[None], len(dampings), axis=0)
+        if not move.any():
+            return out
+        inner = hessian[np.ix_(move, move)]
+        for i, damping in enumerate(dampings):
+            step = np.linalg.lstsq(inner + damping * np.diag(np.diag(inner) + 1e-12), downhill[move], rcond=None)[0]
+            new = at.copy()
+            new[move] = at[move] + step
+            out[i, self.free] = np.clip(new, self.low, self.high)
+        return out
+
+    def promise(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> float:
+        """Drop of chi-square that a full Gauss-Newton step over the unheld coordinates promises."""
+        move = ~self.held(u[self.free], downhill)
+        if not move.any():
+            return 0.0
+        inner = hessian[np.ix_(move, move)]
+        return float(downhill[move] @ np.linalg.lstsq(inner, downhill[move], rcond=None)[0])
+
+
+@dataclasses.dataclass
+class _Descent:
+    u: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+    chi2: float
+    promise: float
+
+
+def _descend(goal: _Objective, start: np.ndarray, iterations: int = _ITERATIONS) -> _Descent:
+    """Levenberg-Marquardt from one start, all dampings of an iteration in one batch."""
+    u = start.copy()
+    u[goal.free] = np.clip(u[goal.free], goal.low, goal.high)
+    r, chi2 = goal.residuals(u[None])
+    r, best, damping = r[0], float(chi2[0]), 1e-2
+    j = goal.jacobian(u) if np.isfinite(best) else np.zeros((len(r), len(goal.free)))
+    promise = np.inf
+    for _ in range(iterations):
+        if not np.isfinite(best):
+            break
+        downhill, hessian = goal.quadratic(u, r, j)
+        promise = goal.promise(u, downhill, hessian)
+        if promise < 0.01 * SMALL_GRADIENT:
+            break
+        trials = goal.steps(u, downhill, hessian, damping * _DAMPINGS)
+        residuals, chi2 = goal.residuals(trials)
+        k = int(np.argmin(chi2))
+        if not chi2[k] < best:
+            if damping > 1e8:
+                break
+            damping *= 1e3
+            continue
+        u, r, best = trials[k], residuals[k], float(chi2[k])
+        damping = float(np.clip(damping * _DAMPINGS[k], 1e-9, 1e6))
+        j = goal.jacobian(u)
+    if np.isfinite(best):
+        promise = goal.promise(u, *goal.quadratic(u, r, j))
+    return _Descent(u, r, j, best, promise)
+
+
+def _chase(goal: _Objective, best: _Descent, starts: np.ndarray, rounds: int = 12) -> list[float]:
+    """Chi-square that other starts reach with the best start's Jacobian, all starts in one batch.
+
+    The fixed Jacobian (chord method) converges linearly to the same optimum where there is one.
+    """
+    u = starts.copy()
+    residual, chi2 = goal.residuals(u)
+    share = np.ones(len(u))
+    for _ in range(rounds):
+        if np.all(chi2 < best.chi2 + 0.1 * SAME_CHI2):
+            break
+        trial = u.copy()
+        for i in range(len(u)):
+            if np.isfinite(chi2[i]):
+                downhill, hessian = goal.quadratic(u[i], residual[i], best.jacobian)
+                full = goal.steps(u[i], downhill, hessian, np.array([1e-6]))[0]
+                trial[i] = u[i] + share[i] * (full - u[i])
+            else:
+                trial[i] = 0.5 * (u[i] + best.u)
+        new_residual, new_chi2 = goal.residuals(trial)
+        better = new_chi2 < chi2
+        share = np.where(better, np.minimum(1.0, 2.0 * share), 0.4 * share)
+        u[better], residual[better], chi2 = trial[better], new_residual[better], np.minimum(chi2, new_chi2)
+    return [float(c) for c in chi2]
+
+
+def fit(
+    problem: Problem,
+    free: np.ndarray,
+    start: np.ndarray | None = None,
+    starts: int = 4,
+    seed: int = 0,
+    spread: float = 1.5,
+    splits: Sequence[str] = ("fit",),
+    certify: bool = True,
+    progress: Progress = silent,
+) -> Fit:
+    """Fits coordinates to the observations of some splits.
+
+    Args:
+      problem: model and measurements.
+      free: places of the coordinates that move.
+      start: (coordinates,) first start; the model as given if None.
+      starts: number of starts in all.
+      seed: of the Sobol sequence of the other starts.
+      spread: half width of the starts' box, in scales (or in the prior's standard deviations, where smaller).
+      splits: which observations are fitted.
+      certify: whether to ask the problem for its own part of the certificate, too.
+      progress: told of every start.
+
+    Returns:
+      The best fit, with its certificate.
+    """
+    fitted = problem.observations.in_split(*splits)
+    goal = _Objective(problem, free, fitted)
+    origin = problem.origin() if start is None else np.asarray(start, float)
+    progress("fitting", 0.0)
+    found = [_descend(goal, origin)]
+    others = _other_starts(problem, free, origin if not problem.cheap_jacobian else problem.origin(), starts - 1, seed,
+                           spread, goal)  # fmt: skip
+    ends: list[float] = []
+    if problem.cheap_jacobian:
+        for i, other in enumerate(others):
+            progress("fitting", (i + 1) / max(starts, 1))
+            found.append(_descend(goal, other))
+    elif len(others):
+        near = found[0].u[None] + 0.3 * (others - origin[None])
+        near[:, free] = np.clip(near[:, free], goal.low, goal.high)
+        ends = _chase(goal, found[0], near)
+    found.sort(key=lambda d: d.chi2)
+    best = found[0]
+    chi2s = tuple(sorted([d.chi2 for d in found] + ends))
+    edge = _at_bound(problem, goal, best)
+    extra = dict(problem.certificate(best.u, free)) if certify and np.isfinite(best.chi2) else {}
+    agreeing = sum(c <= best.chi2 + SAME_CHI2 for c in chi2s)
+    problems = _faults(best, agreeing, starts, edge, extra)
+    return Fit(
+        u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual, jacobian=best.jacobian,
+        fitted=fitted, gradient=best.promise, starts=chi2s, at_bound=edge, extra=extra, problems=problems,
+    )  # fmt: skip
+
+
+def _faults(best: _Descent, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float]) -> tuple[str, ...]:
+    problems = []
+    if not np.isfinite(best.chi2):
+        return ("every start diverged",)
+    if best.promise > SMALL_GRADIENT:
+        problems.append(f"the gradient still promises a drop of chi-square of {best.promise:.2g}")
+    if starts >= AGREEING and agreeing < AGREEING:
+        problems.append(f"only {agreeing} of {starts} starts agree")
+    if edge:
+        problems.append(f"{', '.join(edge)} ended at a bound")
+    if extra.get("half_step_chi2", 0.0) > 1.0:
+        problems.append(f"halving the time step changes chi-square by {extra['half_step_chi2']:.2g}")
+    return tuple(problems)
+
+
+def _other_starts(
+    problem: Problem, free: np.ndarray, origin: np.ndarray, number: int, seed: int, spread: float, goal: _Objective
+) -> np.ndarray:
+    if number <= 0:
+        return np.zeros((0, len(origin)))
+    size = 1 << max(0, (number - 1).bit_length())
+    cube = qmc.Sobol(len(free), rng=np.random.default_rng(seed)).random(size)[:number]
+    width = np.array([spread * min(1.0, problem.coordinates[i].prior) for i in free])
+    out = np.repeat(origin[None], number, axis=0)
+    out[:, free] = np.clip(origin[free] + (2.0 * cube - 1.0) * width, goal.low, goal.high)
+    return out
+
+
+def _at_bound(problem: Problem, goal: _Objective, best: _Descent) -> tuple[str, ...]:
+    at = best.u[goal.free]
+    edge = (at <= goal.low + _EDGE) | (at >= goal.high - _EDGE)
+    return tuple(problem.coordinates[i].key for i, e in zip(goal.free, edge, strict=True)
+                 if e and not problem.coordinates[i].physical)  # fmt: skip

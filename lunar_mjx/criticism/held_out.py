@@ -1,0 +1,127 @@
+"""Judging fits on manoeuvres that they never saw, and whether a residual is at the noise."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from lunar_mjx.criticism.fitting import Fit
+from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.score import blocks
+
+AT_NOISE = 1.03
+"""Root mean square residual in sigma up to which a model counts as being at the noise, beyond sampling error."""
+CHANNEL_AT_NOISE = 1.05
+"""The same for the worst single channel."""
+_SAMPLING = 3.5
+_PIECES = 4
+"""Pieces of a log that are left out in turn where there are too few manoeuvres."""
+
+
+def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
+    """(n,) whitened residual of every observation with its own manoeuvre left out of the fit, NaN where set apart.
+
+    For fitted manoeuvres by one Gauss-Newton step from the fit without them; those not fitted as they are.
+    """
+    out = np.where(problem.observations.in_split("select", "test") | fit.fitted, fit.residual, np.nan)
+    _, scale = problem.prior_rows(fit.u, fit.free)
+    j = fit.jacobian[fit.fitted]
+    hessian = j.T @ j + np.diag(scale**2)
+    for part in _left_out(problem, fit):
+        jb, rb = fit.jacobian[part], fit.residual[part]
+        rest = hessian - jb.T @ jb
+        # A direction that only this manoeuvre knows stays where the fit put it.
+        values, vectors = np.linalg.eigh(0.5 * (rest + rest.T))
+        live = values > 1e-8 * max(float(values.max()), 1e-30)
+        step = (vectors[:, live] / values[live]) @ (vectors[:, live].T @ (jb.T @ rb))
+        out[part] = rb + jb @ step
+    return out
+
+
+def _left_out(problem: Problem, fit: Fit) -> list[np.ndarray]:
+    observations = problem.observations
+    parts = [np.flatnonzero(fit.fitted & (observations.unit == u)) for u in np.unique(observations.unit[fit.fitted])]
+    if len(parts) >= 3:
+        return parts
+    number = blocks(observations, fit.residual, fit.fitted)
+    pieces = min(_PIECES * len(parts), number.max() + 1)
+    group = np.where(number >= 0, number * pieces // (number.max() + 1), -1)
+    return [np.flatnonzero(group == g) for g in range(pieces)]
+
+
+def gain(problem: Problem, before: Fit, after: Fit, splits: tuple[str, ...] = ("fit", "select")) -> tuple[float, float]:
+    """Gain of the expected log density on manoeuvres left out, and its standard error over blocks.
+
+    Returns:
+      Sum over observations of half the drop of the squared predictive residual; its standard error.
+    """
+    keep = problem.observations.in_split(*splits)
+    old, new = predictive_residual(problem, before), predictive_residual(problem, after)
+    difference = np.where(keep, 0.5 * (old**2 - new**2), 0.0)
+    difference = np.where(np.isfinite(difference), difference, 0.0)
+    block = blocks(problem.observations, after.residual, keep)
+    per = np.bincount(block[block >= 0], weights=difference[block >= 0])
+    if len(per) < 2:
+        return float(per.sum()), float("inf")
+    return float(per.sum()), float(np.sqrt(len(per) * per.var(ddof=1)))
+
+
+@dataclasses.dataclass(frozen=True)
+class NoiseTest:
+    """Whether a residual is at the noise.
+
+    Attributes:
+      rms: over all kept observations, in sigma, corrected for the fitted parameters. limit: the most that passes.
+      channels: root mean square by channel. worst: the channel that passes least; its rms over its limit.
+      passes: whether all limits hold.
+    """
+
+    rms: float
+    limit: float
+    channels: Mapping[str, float]
+    worst: str
+    worst_ratio: float
+    passes: bool
+
+
+def noise_test(problem: Problem, fit: Fit, splits: tuple[str, ...] = ("fit", "select")) -> NoiseTest:
+    """Compares the residual of some splits with the noise, overall and channel by channel."""
+    observations = problem.observations
+    keep = observations.in_split(*splits)
+    n = int(keep.sum())
+    fitted_share = float((keep & fit.fitted).sum()) / max(n, 1)
+    freedom = max(n - fitted_share * len(fit.free), 0.25 * n, 1.0)
+    squares = np.where(keep, fit.residual**2, 0.0)
+    rms = float(np.sqrt(squares.sum() / freedom))
+    limit = AT_NOISE + _SAMPLING * np.sqrt(0.5 / max(n, 1))
+    channels: dict[str, list[float]] = {}
+    for s in observations.series:
+        part = slice(s.start, s.stop)
+        entry = channels.setdefault(s.channel, [0.0, 0.0])
+        entry[0] += float(squares[part].sum())
+        entry[1] += float(keep[part].sum())
+    by_channel, worst, ratio = {}, "", 0.0
+    for channel, (total, count) in channels.items():
+        if count < 1:
+            continue
+        value = float(np.sqrt(total / count * n / freedom))
+        by_channel[channel] = value
+        share = value / (CHANNEL_AT_NOISE + _SAMPLING * np.sqrt(0.5 / count))
+        if share > ratio:
+            worst, ratio = channel, share
+    return NoiseTest(rms, float(limit), by_channel, worst, float(ratio), bool(rms <= limit and ratio <= 1.0))
+
+
+def errors(problem: Problem, fit: Fit) -> dict[str, float]:
+    """Root mean square residual in sigma by split, where the split holds observations."""
+    found = {}
+    for split in ("fit", "select", "test", "apart"):
+        keep = problem.observations.in_split(split)
+        if keep.any():
+            found[split] = fit.rms(keep)
+    held = problem.observations.in_split("select", "test")
+    if held.any():
+        found["held_out"] = fit.rms(held)
+    return found

@@ -1,0 +1,113 @@
+"""Measurements as one vector, with their noise: series by log and channel, whitened by an Ornstein-Uhlenbeck model."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """One channel of one log (or one quantity at one group of points of a table).
+
+    Attributes:
+      log: number of the log. channel: name.
+      start, stop: place in the vector of observations.
+      time: s, one per observation; None where the observations are independent points.
+      white: standard deviation of the white noise, in the channel's unit, one number or one per observation.
+      coloured: standard deviation of the correlated noise, same unit.
+      correlation_time: of the correlated noise, s.
+    """
+
+    log: int
+    channel: str
+    start: int
+    stop: int
+    time: np.ndarray | None
+    white: np.ndarray | float
+    coloured: float = 0.0
+    correlation_time: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Observations:
+    """All measurements of a campaign.
+
+    Attributes:
+      value: (n,) measured values, each in its channel's unit; no gaps.
+      series: what they are, in order and without holes.
+      logs: names of the logs. split: "fit", "select" or "test" of every log.
+      unit: (n,) number of the manoeuvre (or of the group of points) that is left out together.
+      place: (n, k) covariates of table points (slip ratio, slip angle, load), or None.
+    """
+
+    value: np.ndarray
+    series: tuple[Series, ...]
+    logs: tuple[str, ...]
+    split: tuple[str, ...]
+    unit: np.ndarray
+    unit_split: tuple[str, ...]
+    unit_names: tuple[str, ...]
+    place: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def in_split(self, *splits: str) -> np.ndarray:
+        """(n,) which observations belong to one of the splits."""
+        wanted = np.array([s in splits for s in self.unit_split])
+        return wanted[self.unit]
+
+    def sigma(self) -> np.ndarray:
+        """(n,) standard deviation of every observation's noise, white and coloured together."""
+        out = np.empty(len(self))
+        for s in self.series:
+            out[s.start : s.stop] = np.sqrt(np.square(s.white) + s.coloured**2)
+        return out
+
+    def whiten(self, columns: np.ndarray) -> np.ndarray:
+        """Columns with the noise's covariance divided out: unit white noise stays.
+
+        Args:
+          columns: (n,) or (n, k), in the channels' units; 0 marks nothing.
+
+        Returns:
+          The same shape, in sigma: innovations of each series over their standard deviation.
+        """
+        flat = columns.reshape(len(self), -1)
+        out = np.empty_like(flat, dtype=float)
+        batches: dict[tuple[int, bytes], list[Series]] = {}
+        for s in self.series:
+            part = slice(s.start, s.stop)
+            if s.time is None or s.coloured <= 0.0 or s.correlation_time <= 0.0:
+                out[part] = flat[part] / np.sqrt(np.square(s.white) + s.coloured**2).reshape(-1, 1)
+            else:
+                batches.setdefault((s.stop - s.start, np.asarray(s.time).tobytes()), []).append(s)
+        for group in batches.values():
+            _innovations(group, flat, out)
+        return out.reshape(columns.shape)
+
+
+def _innovations(group: Sequence[Series], flat: np.ndarray, out: np.ndarray) -> None:
+    """Kalman filter of a white noise plus an Ornstein-Uhlenbeck process, for series that share their times."""
+    time = np.asarray(group[0].time)
+    data = np.stack([flat[s.start : s.stop] for s in group], axis=1)  # (time, series, column)
+    result = np.empty_like(data, dtype=float)
+    white = np.stack([np.broadcast_to(np.square(s.white), time.shape) for s in group], axis=1)
+    power = np.array([s.coloured**2 for s in group])
+    tau = np.array([s.correlation_time for s in group])
+    mean, variance = np.zeros_like(data[0], dtype=float), power.copy()
+    for i in range(len(time)):
+        if i:
+            decay = np.exp(-(time[i] - time[i - 1]) / tau)
+            mean, variance = decay[:, None] * mean, decay**2 * variance + power * (1.0 - decay**2)
+        total = variance + white[i]
+        innovation = data[i] - mean
+        result[i] = innovation / np.sqrt(total)[:, None]
+        gain = variance / total
+        mean = mean + gain[:, None] * innovation
+        variance = (1.0 - gain) * variance
+    for j, s in enumerate(group):
+        out[s.start : s.stop] = result[:, j]

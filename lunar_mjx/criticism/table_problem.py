@@ -1,0 +1,237 @@
+"""Steady-state tables of single-wheel test beds as a problem: exact derivatives through the wheel bed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.criticism.coordinates import WIDE, Coordinate, of_candidate
+from lunar_mjx.criticism.observations import Observations, Series
+from lunar_mjx.criticism.problem import NotTested, Problem
+from lunar_mjx.criticism.single_wheel import PORTS, WheelBed, WheelTest
+from lunar_mjx.criticism.table import QUANTITIES, SteadyStateTable, average
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.errors import UserError
+
+if TYPE_CHECKING:
+    from lunar_mjx.criticism.log import SteadyLog
+
+APART_DEG = 89.0
+"""From this slip angle on a point is set apart: the wheel's frame has no slip ratio there."""
+
+BASELINE: Mapping[str, Mapping[str, tuple[float, float, float, float]]] = {
+    "soil": {
+        "k_phi": (0.3, WIDE, 1e4, 1e9),
+        "n": (0.1, WIDE, 0.3, 2.5),
+        "cohesion": (0.5, WIDE, 0.0, 2e4),
+        "friction_angle": (0.1, WIDE, 0.05, 0.9),
+        "shear_modulus_x": (0.3, WIDE, 1e-4, 0.5),
+        "shear_modulus_y": (0.3, WIDE, 1e-4, 0.5),
+    },
+    "penalty_contact": {"stiffness": (0.3, WIDE, 1e2, 1e7)},
+    "engine_friction": {"mu": (0.3, WIDE, 0.0, 2.0)},
+}
+"""What a refit of a wheel model moves: scale as a share of the value, prior in scales, bounds. k_c acts on one wheel
+width only through k_c/b + k_phi and is held."""
+
+
+def points(log: SteadyLog) -> tuple[SteadyStateTable, dict[str, np.ndarray]]:
+    """A table with replicates averaged, and the standard deviation of each averaged point by quantity.
+
+    The noise is the scatter of the replicates where there are any, else what the log states.
+
+    Raises:
+      UserError: neither is there.
+    """
+    table = average(log.table)
+    noise = {}
+    for quantity in table.measured:
+        column = QUANTITIES[quantity][0]
+        sigma = table.sigma.get(quantity, 0.0)
+        if not sigma > 0.0:
+            stated = log.noise.get(column)
+            if stated is None:
+                raise UserError(
+                    f"{log.folder}: nothing tells the noise of {column}; give replicates, or state "
+                    f"[noise.{column}] std in log.toml."
+                )
+            sigma = stated.std
+        noise[quantity] = sigma / np.sqrt(table.replicates)
+    return table, noise
+
+
+def default_units(table: SteadyStateTable) -> tuple[np.ndarray, list[str]]:
+    """Groups of points that are left out together: slip angles, else loads, else slip ratios.
+
+    Returns:
+      Group number of each point, and names of the groups.
+    """
+    for column, decimals, unit in (("slip_angle_deg", 0, "deg"), ("normal_load_N", 0, "N"), ("slip_ratio", 2, "")):
+        keys, group = np.unique(np.round(table.test[column], decimals), return_inverse=True)
+        if len(keys) >= 3 or column == "slip_ratio":
+            return group.reshape(-1), [f"{column.rsplit('_', 1)[0]} {k:g} {unit}".strip() for k in keys]
+    raise AssertionError
+
+
+def default_splits(number: int, apart: Sequence[bool]) -> list[str]:
+    """Every other group is held out, and of eight or more every fourth is kept for the test."""
+    out = []
+    for i in range(number):
+        held = "select" if number < 8 or i % 4 == 1 else "test"
+        out.append("apart" if apart[i] else "fit" if i % 2 == 0 or number < 3 else held)
+    return out
+
+
+class TableProblem(Problem):
+    """Steady-state tables against a wheel bed."""
+
+    def __init__(
+        self,
+        logs: Sequence[SteadyLog],
+        bed: WheelBed,
+        candidates: Mapping[str, Effect],
+        splits: Mapping[str, str] | None = None,
+        baseline: Mapping[str, Mapping[str, tuple[float, float, float, float]]] = BASELINE,
+        values: Mapping[str, Mapping[str, float]] | None = None,
+        extra_sigma: Mapping[str, float] | None = None,
+    ):
+        """Makes the problem.
+
+        Args:
+          logs: tables of one slip definition or several.
+          bed: the model's wheel.
+          candidates: effects that may be missing, by name.
+          splits: split of a group of points by its name, in place of the default.
+          baseline: what a refit may move, by effect and parameter.
+          values: start of candidates' shape parameters.
+          extra_sigma: a model's own known discrepancy by quantity, SI units, added to the noise.
+        """
+        self.logs = tuple(logs)
+        usable, refused = _usable(bed, candidates)
+        self.effects, self.not_tested = usable, refused
+        union = bed
+        for effect in usable.values():
+            union = union.with_effect(effect, **effect.null())
+        self.bed, self._union = bed, union
+        self.coordinates, self.baseline, self.candidates = _coordinates(bed, usable, baseline, values or {})
+        self.observations, tests = _observations(self.logs, splits or {}, extra_sigma or {})
+        self._groups = [(test, tuple(q)) for test, q in tests]
+        self._run = jax.jit(jax.vmap(self._vector))
+        self._slope = jax.jit(jax.jacfwd(self._vector))
+
+    def values(self, u: np.ndarray) -> dict[str, dict[str, float]]:
+        """Parameter values at a place, by effect and name, of the coordinates alone."""
+        out: dict[str, dict[str, float]] = {}
+        for c, place in zip(self.coordinates, u, strict=True):
+            out.setdefault(c.effect, {})[c.name] = float(c.value(place))
+        return out
+
+    def _vector(self, u: Any) -> Any:
+        values = {e: dict(v) for e, v in self._union.parameters.items()}
+        for i, c in enumerate(self.coordinates):
+            values[c.effect][c.name] = c.start * jnp.exp(c.scale * u[i]) if c.log else c.start + c.scale * u[i]
+        parts = []
+        for test, quantities in self._groups:
+            result = self._union(values, test)
+            parts += [getattr(result, q) for q in quantities]
+        return jnp.concatenate(parts)
+
+    def predict(self, u: np.ndarray) -> np.ndarray:
+        with jax.enable_x64(True):
+            # One row at a time: every number of rows would be another program.
+            return np.concatenate([np.asarray(self._run(jnp.asarray(row[None], float))) for row in np.atleast_2d(u)])
+
+    def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
+        with jax.enable_x64(True):
+            return np.asarray(self._slope(jnp.asarray(u, float)))[:, which]
+
+
+def _usable(bed: WheelBed, candidates: Mapping[str, Effect]) -> tuple[dict[str, Effect], tuple[NotTested, ...]]:
+    """Candidates that a steady-state bed can hold beside the model's own effects."""
+    present = {e.name for e in bed.effects}
+    usable, refused = {}, []
+    for name, effect in candidates.items():
+        if name in present:
+            continue
+        if effect.transient or not any(port in PORTS for port in effect.ports):
+            refused.append(NotTested(name, "does not act on a wheel in steady state"))
+        elif present & set(effect.replaces):
+            refused.append(NotTested(name, f"would replace {', '.join(sorted(present & set(effect.replaces)))}"))
+        elif all(p.null is None for p in effect.parameters.values()):
+            refused.append(NotTested(name, "has no null value"))
+        else:
+            usable[name] = effect
+    return usable, tuple(refused)
+
+
+def _coordinates(
+    bed: WheelBed,
+    usable: Mapping[str, Effect],
+    baseline: Mapping[str, Mapping[str, tuple[float, float, float, float]]],
+    values: Mapping[str, Mapping[str, float]],
+) -> tuple[tuple[Coordinate, ...], np.ndarray, dict[str, np.ndarray]]:
+    found: list[Coordinate] = []
+    for effect in bed.effects:
+        for name, (relative, prior, low, high) in baseline.get(effect.name, {}).items():
+            p, at = effect.parameters[name], float(bed.parameters[effect.name][name])
+            if low > 0.0:
+                at = min(max(at, low), high)
+                found.append(Coordinate(effect.name, name, at, relative, low, high, True, prior, unit=p.unit))
+            else:
+                scale = relative * (at or 0.1 * min(high, 1e4))
+                found.append(Coordinate(effect.name, name, at, scale, low, high, False, prior, True, p.unit))
+        # Effects added earlier are refitted with the rest.
+        if effect.name not in baseline and all(p.null is not None for p in effect.parameters.values()):
+            for name, p in effect.parameters.items():
+                at = float(bed.parameters[effect.name][name])
+                scale = abs(at) or abs(p.nominal) or 1.0
+                physical = p.null in p.bounds
+                found.append(Coordinate(effect.name, name, at, 0.3 * scale, *p.bounds, False, WIDE, physical, p.unit))
+    count, places = len(found), {}
+    for name, effect in usable.items():
+        mine = of_candidate(effect, values.get(name))
+        places[name] = np.arange(len(found), len(found) + len(mine))
+        found += mine
+    return tuple(found), np.arange(count), places
+
+
+def _observations(
+    logs: Sequence[SteadyLog], splits: Mapping[str, str], extra_sigma: Mapping[str, float]
+) -> tuple[Observations, list[tuple[WheelTest, list[str]]]]:
+    value, series, unit, place, unit_names, unit_split, tests = [], [], [], [], [], [], []
+    at = 0
+    for number, log in enumerate(logs):
+        table, noise = points(log)
+        group, names = default_units(table)
+        apart = [bool(np.all(np.abs(table.test["slip_angle_deg"][group == g]) > APART_DEG)) for g in range(len(names))]
+        default = default_splits(len(names), apart)
+        chosen = [log.split or splits.get(name, default[i]) for i, name in enumerate(names)]
+        covariates = np.column_stack([table.test[c] for c in ("slip_ratio", "slip_angle_deg", "normal_load_N")])
+        for quantity, measured in table.measured.items():
+            n = len(measured)
+            white = np.sqrt(noise[quantity] ** 2 + extra_sigma.get(quantity, 0.0) ** 2)
+            series.append(Series(number, QUANTITIES[quantity][0], at, at + n, None, white))
+            value.append(measured)
+            unit.append(group + len(unit_names))
+            place.append(covariates)
+            at += n
+        prefix = f"{log.name}: " if len(logs) > 1 else ""
+        unit_names += [prefix + name for name in names]
+        unit_split += chosen
+        with jax.enable_x64(True):
+            tests.append((table.wheel_test(), list(table.measured)))
+    observations = Observations(
+        value=np.concatenate(value),
+        series=tuple(series),
+        logs=tuple(log.name for log in logs),
+        split=tuple(log.split or "fit" for log in logs),
+        unit=np.concatenate(unit),
+        unit_split=tuple(unit_split),
+        unit_names=tuple(unit_names),
+        place=np.concatenate(place),
+    )
+    return observations, tests

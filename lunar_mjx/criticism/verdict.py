@@ -1,0 +1,107 @@
+"""The answer of a diagnosis: one of eight verdicts, which is also the exit status of `why` and `improve`."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Mapping
+from typing import Any
+
+
+class Verdict(enum.Enum):
+    """What the logs say about the model; `exit_status` is the exit status of the command."""
+
+    NOISE_ONLY = ("NOISE_ONLY", 0)
+    """Nothing significant is missing, and the global test passes."""
+    BAD_DATA = ("BAD_DATA", 10)
+    """The log itself cannot be used; nothing is said about physics."""
+    BAD_FIT = ("BAD_FIT", 11)
+    """The baseline fit has no certificate of convergence; nothing is said about physics."""
+    KNOWN = ("KNOWN", 20)
+    """One catalogue effect explains the error, separably."""
+    KNOWN_CLASS = ("KNOWN_CLASS", 21)
+    """One of several effects that these logs cannot tell apart."""
+    MULTIPLE = ("MULTIPLE", 22)
+    """Several effects, each significant given the others."""
+    UNKNOWN = ("UNKNOWN", 30)
+    """Something is missing at a port, and no catalogue effect brings the held-out error to the noise."""
+    UNDECIDABLE = ("UNDECIDABLE", 31)
+    """The effect asked about leaves no separable signal in these logs."""
+
+    def __init__(self, label: str, exit_status: int):
+        self.label = label
+        self.exit_status = exit_status
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectEvidence:
+    """What the logs say for and against one effect.
+
+    Attributes:
+      effect: its name.
+      separable_sigma: length of the effect's signature at its nominal size, after refitting of the baseline has been
+        projected out, in sigma; below 5 the effect is not tested.
+      separable_share: share of the signature's length that a refit of the baseline leaves.
+      chi2: reduction of chi-square by the best amount of the effect, in linear approximation.
+      z: robust significance of its score in sigma (block variance), p: family-wise p value by multiplier bootstrap.
+      held_out_gain, held_out_se: gain of the expected log density on manoeuvres left out, and its standard error; NaN
+        where the effect was not refitted.
+      values: fitted parameters by name; std: their standard deviations.
+      nearest: the effect with the most similar projected signature, and |cos| between the two.
+      status: "accepted", "rejected", "confounded", "not tested" or "not significant".
+      reason: in a few words.
+    """
+
+    effect: str
+    separable_sigma: float
+    separable_share: float
+    chi2: float = 0.0
+    z: float = 0.0
+    p: float = 1.0
+    held_out_gain: float = float("nan")
+    held_out_se: float = float("nan")
+    values: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    std: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    nearest: tuple[str, float] = ("", 0.0)
+    status: str = "not significant"
+    reason: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """Verdict and evidence; plain data that `to_dict` makes ready for JSON.
+
+    Attributes:
+      verdict: the answer.
+      effects: the effects named by it, strongest first; for UNKNOWN those that help without sufficing.
+      port: where something unknown acts, for UNKNOWN.
+      sentence: the verdict in one sentence.
+      evidence: of every effect, strongest first.
+      ports: evidence by port: gain of log evidence of an unknown input there.
+      error_before, error_after: root mean square residual in sigma on fitted and on held-out manoeuvres, before and
+        with the effects named.
+      isolability: |cos| between projected signatures, by pairs of effects.
+      undecidable: effects that leave no separable signal in these logs.
+      details: certificate of the fit, seeds, splits and whatever else a report shows.
+    """
+
+    verdict: Verdict
+    effects: tuple[str, ...]
+    sentence: str
+    evidence: tuple[EffectEvidence, ...] = ()
+    port: str | None = None
+    ports: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    error_before: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    error_after: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    isolability: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
+    undecidable: tuple[str, ...] = ()
+    details: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Numbers, names and lists only."""
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        plain["verdict"] = self.verdict.label
+        plain["exit_status"] = self.verdict.exit_status
+        plain["effects"] = list(self.effects)
+        plain["evidence"] = [dataclasses.asdict(e) for e in self.evidence]
+        return plain
