@@ -214,12 +214,8 @@ def check_effects(model: Model, source: str | Path) -> None:
     """Refuses a list of effects that cannot run.
 
     Raises:
-      UserError: an effect needs another one that is not in the list, or acts at the port `sensor`, which no step calls.
+      UserError: an effect needs another one that is not in the list.
     """
-    for effect in model.effects:
-        if "sensor" in effect.ports:
-            raise bad_input(source, "effect", effect.name, "acts at the port sensor, which is not run yet",
-                            "apply it to the telemetry yourself")  # fmt: skip
     needy = [name for name in READS_MOTOR if name in model.effect_names]
     if needy and "motor" not in model.effect_names:
         raise bad_input(source, "effect_list", ", ".join(model.effect_names), f"lacks motor, which {needy[0]} reads",

@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 
 from lunar_mjx.dynamics import System, Telemetry, build
+from lunar_mjx.dynamics.signals import joint_channels, measure
 from lunar_mjx.effects.motor import MODES
 from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
-from lunar_mjx.model import ZERO_CELSIUS, Model, check_effects
-from lunar_mjx.rover import Rover
+from lunar_mjx.model import Model, check_effects
 
 COMMAND_UNITS: dict[str, str] = dict(zip(MODES, ("angle_rad", "speed_rad_s", "torque_Nm", "current_A"), strict=True))
 """Ending of a command channel's name by control mode."""
@@ -34,19 +34,6 @@ class Commands:
 
     values: np.ndarray
     interval: float
-
-
-def joint_channels(rover: Rover) -> list[str]:
-    """Corner and kind of every actuated joint in the order of the controls: `lf_drive`, `lf_steer`, `lf_sus`, ...
-
-    A joint that belongs to no single wheel goes by its own name.
-    """
-    names = {}
-    for wheel in rover.wheels:
-        for joint, kind in ((wheel.drive, "drive"), (wheel.steer, "steer"), (wheel.suspension, "sus")):
-            if joint is not None:
-                names[joint] = joint if joint in names else f"{wheel.corner}_{kind}"
-    return [names.get(joint, joint) for joint in rover.joints]
 
 
 def command_channels(model: Model) -> list[str]:
@@ -203,38 +190,21 @@ def _blame_user_effect(model: Model, error: Exception) -> None:
 
 
 def channels(system: System, seen: Telemetry, commands: Commands) -> pd.DataFrame:
-    """Telemetry as a table of log channels (time_s first; units in the names; temperatures in degrees Celsius)."""
-    corners = [w.corner for w in system.model.rover.wheels]
-    data: dict[str, Any] = {"time_s": np.asarray(seen.time, float)}
-    for axis in "xyz":
-        data[f"position_{axis}_m"] = getattr(seen.position, axis)
-    for axis in "xyz":
-        data[f"world_velocity_{axis}_m_s"] = getattr(seen.velocity, axis)
-    for i, part in enumerate("wxyz"):
-        data[f"quaternion_{part}"] = seen.quaternion[:, i]
-    for name, part in zip(("roll", "pitch", "yaw"), seen.euler, strict=True):
-        data[f"{name}_deg"] = np.rad2deg(part)
-    per_joint = {
-        "joint_{}_angle_rad": seen.joint_angle,
-        "joint_{}_speed_rad_s": seen.joint_speed,
-        "motor_{}_torque_Nm": seen.joint_torque,
-        "motor_{}_current_A": seen.current,
-        "motor_{}_voltage_V": seen.voltage,
-        "winding_{}_temperature_degC": np.asarray(seen.winding_temperature, float) - ZERO_CELSIUS,
-        "housing_{}_temperature_degC": np.asarray(seen.housing_temperature, float) - ZERO_CELSIUS,
-    }
-    for pattern, values in per_joint.items():
-        for i, channel in enumerate(joint_channels(system.model.rover)):
-            data[pattern.format(channel)] = values[:, i]
-    per_wheel = {
-        "wheel_{}_sinkage_m": seen.sinkage,
-        "wheel_{}_slip_ratio": seen.slip,
-        **{f"wheel_{{}}_force_{a}_N": getattr(seen.wheel_force, a) for a in "xyz"},
-        **{f"wheel_{{}}_moment_{a}_Nm": getattr(seen.wheel_moment, a) for a in "xyz"},
-    }
-    for pattern, values in per_wheel.items():
-        for i, corner in enumerate(corners):
-            data[pattern.format(corner)] = values[:, i]
+    """Telemetry as a table of log channels, as the model's sensors measure them.
+
+    Args:
+      system: what drove, with the effects at the port `sensor`.
+      seen: telemetry of one rover, one entry per command.
+      commands: what was commanded.
+
+    Returns:
+      `time_s` first, then measured channels and commands; units in the names, temperatures in degrees Celsius.
+    """
+    with jax.enable_x64(True):
+        exact = jax.tree.map(lambda a: a.astype(float) if np.issubdtype(a.dtype, np.floating) else a, seen)
+        signals = measure(system, exact)
+        data: dict[str, Any] = {"time_s": np.asarray(signals.time)}
+        data |= {name: np.asarray(values) for name, values in signals.channels.items()}
     for name, values in zip(command_channels(system.model), commands.values.T, strict=True):
         data[name] = values
     return pd.DataFrame(data)

@@ -30,14 +30,15 @@ KINDS = ("drive", "steer", "sus")
 CORNERS = ("lf", "rf", "lr", "rr")
 SCHEMA = [
     "time_s",
-    r"(position|world_velocity)_[xyz]_m(_s)?",
+    r"(position|world_velocity|body_velocity)_[xyz]_m(_s)?",
+    r"(gyro_[xyz]_rad_s|accelerometer_[xyz]_m_s2)",
     "quaternion_[wxyz]",
     "(roll|pitch|yaw)_deg",
     "joint_{j}_angle_rad",
     "joint_{j}_speed_rad_s",
     "motor_{j}_(current_A|voltage_V|torque_Nm)",
     "(winding|housing)_{j}_temperature_degC",
-    "wheel_{c}_(sinkage_m|slip_ratio)",
+    "wheel_{c}_(sinkage_m|slip_ratio|slip_angle_deg)",
     "wheel_{c}_(force_[xyz]_N|moment_[xyz]_Nm)",
     "command_{j}_(current_A|torque_Nm|speed_rad_s|angle_rad)",
 ]

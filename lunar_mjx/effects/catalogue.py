@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from lunar_mjx.effects import chassis, paper, rock, soil, stress_integral, thermal, wheel
+from lunar_mjx.effects import chassis, paper, rock, sensors, soil, stress_integral, thermal, wheel
 from lunar_mjx.effects import motor as motor_module
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError, require_file
@@ -47,6 +47,15 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         thermal.housing_convection,
         thermal.housing_conduction,
         thermal.housing_radiation,
+        sensors.clock_offset,
+        sensors.clock_drift,
+        sensors.channel_scale,
+        sensors.encoder_quantisation,
+        sensors.odometry_drift,
+        sensors.imu_bias,
+        sensors.thermistor_lag,
+        sensors.harness_resistance,
+        sensors.cross_talk,
     )
 )
 """Every effect that ships, by name."""

@@ -45,7 +45,7 @@ REMAINS = {
 VANISHING = sorted(
     name
     for name, e in CATALOGUE.items()
-    if name not in REMAINS and any(p.null is not None for p in e.parameters.values())
+    if name not in REMAINS and set(e.ports) != {"sensor"} and any(p.null is not None for p in e.parameters.values())
 )
 
 
