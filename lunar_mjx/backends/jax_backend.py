@@ -1,0 +1,115 @@
+"""The JAX engines (structured and MJX) behind the same interface, in float64 or float32.
+
+For work with many rovers use `lunar_mjx.dynamics.System` and its batched functions: this adapter moves every state
+between the host and the device.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.backends.base import Backend, BackendState, Observation, observation, whole_steps
+from lunar_mjx.dynamics import State, System, Telemetry, build
+from lunar_mjx.dynamics.state import Temperature
+from lunar_mjx.effects.motor import REFERENCE_TEMPERATURE
+from lunar_mjx.errors import bad_input
+from lunar_mjx.model import Model
+from lunar_mjx.simulate import Commands
+from lunar_mjx.terrain import Terrain
+
+PRECISIONS = ("float64", "float32")
+
+
+class JaxBackend(Backend):
+    """A JAX engine.
+
+    Args:
+      model: the model.
+      engine: "structured", "mjx" or "auto".
+      rovers: how many at once.
+      precision: "float64" or "float32".
+
+    Raises:
+      UserError: unknown engine or precision, or a rover that the engine cannot run.
+    """
+
+    def __init__(self, model: Model, engine: str = "auto", rovers: int = 1, precision: str = "float64") -> None:
+        if precision not in PRECISIONS:
+            raise bad_input("backend", "precision", precision, "does not exist", f"use one of {', '.join(PRECISIONS)}")
+        self.model, self.rovers, self.precision = model, rovers, precision
+        with self._precision():
+            self.system: System = build(model, engine)
+            self.params = self.system.params
+            self._reset = jax.jit(jax.vmap(self.system.reset, in_axes=(None, 0, 0, 0, None)))
+            self._advance = jax.jit(self.system.step_batch)
+            self._rollout = jax.jit(self.system.rollout_batch, static_argnames="every")
+        self.name = self.system.engine.name if precision == "float64" else f"{self.system.engine.name}, float32"
+        self._seen: Telemetry | None = None
+        self.reset()
+
+    @contextlib.contextmanager
+    def _precision(self) -> Iterator[None]:
+        with jax.enable_x64(self.precision == "float64"):
+            yield
+
+    def set_terrain(self, terrain: Terrain) -> None:
+        """Takes another ground; one of the same grids compiles nothing anew."""
+        with self._precision():
+            dtype = jnp.result_type(float)
+            floating = jax.tree.map(
+                lambda a: jnp.asarray(a, dtype if jnp.issubdtype(np.asarray(a).dtype, np.floating) else None), terrain
+            )
+            self.params = type(self.params)(self.params.gravity, self.params.ambient, self.params.effects, floating)
+
+    def reset(self, x: Any = 0.0, y: Any = 0.0, yaw: Any = 0.0, winding_temperature: Any = None) -> BackendState:
+        with self._precision():
+            place = [jnp.broadcast_to(jnp.asarray(v, float), (self.rovers,)) for v in (x, y, yaw)]
+            self._state = self._reset(self.params, *place, winding_temperature)
+        return self.state()
+
+    def step(self, control: Any) -> None:
+        with self._precision():
+            held = jnp.asarray(self.controls(control), float)
+            self._state, self._seen = self._advance(self.params, self._state, held)
+
+    def run(self, commands: Commands) -> Telemetry:
+        every = whole_steps(commands, self.model.timestep)
+        with self._precision():
+            values = jnp.asarray(commands.values, float)
+            if values.ndim == 2:
+                values = jnp.broadcast_to(values, (self.rovers, *values.shape))
+            self._state, seen = self._rollout(self.params, self._state, values, every=every)
+            return jax.tree.map(np.asarray, seen)
+
+    def state(self) -> BackendState:
+        s = self._state
+        kelvin = [np.array(a, float) + REFERENCE_TEMPERATURE for a in (s.temperature.winding, s.temperature.housing)]
+        effects = {e: {k: np.array(v, float) for k, v in own.items()} for e, own in s.effects.items()}
+        return BackendState(int(np.asarray(s.step).flat[0]), np.array(s.qpos, float), np.array(s.qvel, float),
+                            *kelvin, effects)  # fmt: skip
+
+    def set_state(self, state: BackendState) -> None:
+        with self._precision():
+            offsets = [jnp.asarray(k - REFERENCE_TEMPERATURE, float)
+                       for k in (state.winding_temperature, state.housing_temperature)]  # fmt: skip
+            zero = jnp.zeros_like(offsets[0])
+            effects = {e: {k: jnp.asarray(state.effects[e][k], float) for k in own}
+                       for e, own in self._state.effects.items()}  # fmt: skip
+            self._state = State(
+                step=jnp.full((self.rovers,), state.step, jnp.int32),
+                qpos=jnp.asarray(state.qpos, float),
+                qvel=jnp.asarray(state.qvel, float),
+                temperature=Temperature(offsets[0], zero, offsets[1], zero),
+                effects=effects,
+            )
+
+    def observe(self) -> Observation:
+        if self._seen is None:
+            raise bad_input(self.name, "observe", "nothing", "was seen before the first step", "call step first")
+        return {k: v.astype(float) if v.dtype.kind == "f" else v for k, v in observation(self._seen).items()}

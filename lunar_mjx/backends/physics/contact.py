@@ -1,0 +1,82 @@
+"""How the wheels meet the ground: wheel frames, sinkage, slip (eqs. 8 and 9)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lunar_mjx.backends.physics.context import Context, Values
+from lunar_mjx.backends.physics.vectors import cross, dot
+
+SLOW = 2e-3
+"""m/s; smallest denominator of the slip ratio."""
+
+STANDING = 1e-3
+"""m/s; below it a braking wheel counts as standing."""
+
+
+def wheel_contact(
+    c: Context, height: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray, inside: np.ndarray
+) -> Values:
+    """Contact with the plane that touches the ground below each wheel's centre.
+
+    Args:
+      c: poses and velocities, and the geometry.
+      height, slope_x, slope_y, inside: of the ground below the wheels, (rover, wheel).
+    """
+    radius, toe = c.geometry["radius"], c.geometry["toe"]
+    up = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+    normal = np.empty(c.wheel_position.shape)
+    normal[..., 0], normal[..., 1], normal[..., 2] = -slope_x * up, -slope_y * up, up
+    lean = dot(c.wheel_axle, normal)
+    level = np.sqrt(np.maximum(1.0 - lean * lean, 1e-6))  # cosine of the wheel's camber against the ground
+    sinkage = np.maximum(radius * level - (c.wheel_position[..., 2] - height) * up, 0.0)
+    forward = cross(c.wheel_axle, normal)
+    forward /= np.sqrt(np.maximum(dot(forward, forward), 1e-12))[..., None]
+    left = cross(normal, forward)
+    if toe.any():
+        cos, sin = np.cos(toe)[..., None], np.sin(toe)[..., None]
+        forward, left = forward * cos + left * sin, left * cos - forward * sin
+    v_x, v_y = dot(c.wheel_velocity, forward), dot(c.wheel_velocity, left)
+    rim = radius * dot(c.wheel_angular_velocity, c.wheel_axle)
+    fastest = faster(rim, v_x)
+    speed = np.maximum(np.abs(fastest), SLOW)
+    heading = 1.0 - 2.0 * (fastest < 0.0)
+    return {
+        "sinkage": sinkage,
+        "sinkage_rate": -dot(c.wheel_velocity, normal),
+        "slip": heading * (rim - v_x) / speed,
+        "slip_angle": np.arctan2(v_y, np.maximum(np.abs(v_x), SLOW)),
+        "v_x": v_x,
+        "v_y": v_y,
+        "rim_speed": rim,
+        "forward": forward,
+        "left": left,
+        "normal": normal,
+        "inside": inside,
+    }
+
+
+def faster(rim: np.ndarray, travel: np.ndarray) -> np.ndarray:
+    """Of rim and travel speed the one of larger magnitude, m/s: the denominator of eq. 8."""
+    return np.where(np.abs(rim) > np.abs(travel), rim, travel)
+
+
+def side_speed(contact: Values) -> np.ndarray:
+    """Numerator of (1 - s) tan(beta): v_y when driving, v_y (2 - r omega/v_x) when braking, m/s (eqs. 8, 9, 11)."""
+    rim, v_x, v_y = contact["rim_speed"], contact["v_x"], contact["v_y"]
+    braking = (np.abs(rim) <= np.abs(v_x)) & (np.abs(v_x) > STANDING)
+    if not braking.any():
+        return v_y
+    ratio = np.divide(rim, v_x, out=np.ones_like(rim), where=braking)
+    return v_y * (2.0 - np.minimum(np.maximum(ratio, -1.0), 1.0))
+
+
+def momentary_slip(contact: Values) -> Values:
+    """Slip without memory of the soil: rim less travel speed over the larger, eq. 11's factor, and the direction."""
+    fastest = faster(contact["rim_speed"], contact["v_x"])
+    speed = np.maximum(np.abs(fastest), SLOW)
+    return {
+        "slip_x": (contact["rim_speed"] - contact["v_x"]) / speed,
+        "slip_y": side_speed(contact) / speed,
+        "direction": np.minimum(np.maximum(fastest / SLOW, -1.0), 1.0),
+    }

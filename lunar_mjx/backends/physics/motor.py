@@ -1,0 +1,69 @@
+"""Motors: control in four modes, cut-off, torque from current (eqs. 6, 7, 15, 16), and their heat (eqs. 1-5)."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from lunar_mjx.backends.physics.context import Context, Values
+
+REFERENCE = 298.15
+"""K; where the catalogue states resistance and torque constant."""
+
+STEFAN_BOLTZMANN = 5.670374419e-8
+
+
+def controller(c: Context, p: SimpleNamespace) -> np.ndarray:
+    """Motor current asked for, A: PD in position mode, P in velocity mode, else the target; within the limit."""
+    numbers, motor = c.numbers, c.numbers.effects["motor"]
+    error = np.where(numbers.mode == 0, c.target - c.joint_angle, 0.0)
+    speed = c.joint_speed - np.where(numbers.mode == 1, c.target, 0.0)
+    torque = numbers.position_gain * error - numbers.velocity_gain * speed
+    torque = np.where(numbers.mode < 2, torque, c.target)
+    current = torque / (motor.gear_ratio * motor.gear_efficiency * motor.torque_constant)
+    current = np.where(numbers.mode == 3, c.target, current)
+    return np.minimum(np.maximum(current, -p.current_limit), p.current_limit)
+
+
+def cut_off(c: Context, p: SimpleNamespace, state: Values) -> Values:
+    """No current from the moment a winding reaches the limit until it has cooled by the hysteresis."""
+    hot = c.winding_temperature >= p.temperature
+    open_ = hot | ((state["tripped"] > 0.5) & (c.winding_temperature >= p.temperature - p.hysteresis))
+    if open_.any():
+        c.current = np.where(open_, 0.0, c.current)
+    return {"tripped": open_.astype(float)}
+
+
+def winding(motor: SimpleNamespace, temperature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R = R_0 (1 + alpha dT), ohm, and K = K_0 (1 + beta dT), N m/A (eqs. 6, 7)."""
+    rise = temperature - REFERENCE
+    return motor.resistance * (1.0 + motor.alpha * rise), motor.torque_constant * (1.0 + motor.beta * rise)
+
+
+def heat_flow(c: Context, winding_K: np.ndarray, housing_K: np.ndarray) -> Values:
+    """Net heat into winding and housing, W, and their capacities, J/K, at given temperatures."""
+    effects = c.numbers.effects
+    zero = np.zeros_like(winding_K)
+    into_winding, into_housing = zero, zero
+    capacity_w, capacity_h = zero + 1.0, zero + 1.0
+    for name in c.numbers.order:
+        p = effects[name]
+        if name == "motor":
+            resistance = p.resistance * (1.0 + p.alpha * (winding_K - REFERENCE))
+            into_winding = into_winding + c.current * c.current * resistance * c.resistance_factor
+            capacity_w, capacity_h = zero + p.winding_capacity, zero + p.housing_capacity
+        elif name == "winding_conduction":
+            into_winding = into_winding - (winding_K - housing_K) / effects["motor"].R_th1
+        elif name == "rotor_stator_path":
+            into_housing = into_housing + p.share * (winding_K - housing_K) / effects["motor"].R_th1
+        elif name == "housing_convection":
+            into_housing = into_housing - (housing_K - c.ambient_temperature) / p.R_th2
+        elif name == "housing_conduction":
+            into_housing = into_housing - p.conductance * (housing_K - c.ambient_temperature)
+        elif name == "housing_radiation":
+            squared = housing_K * housing_K
+            lost = squared * squared - c.ambient_temperature**4
+            into_housing = into_housing - p.emissivity * STEFAN_BOLTZMANN * p.area * lost
+    return {"winding": into_winding, "housing": into_housing,
+            "winding_capacity": capacity_w, "housing_capacity": capacity_h}  # fmt: skip

@@ -1,0 +1,193 @@
+"""Wheel on soft soil (eqs. 10-14 mended): pressure-sinkage, the memory of the sheared soil, closed form and integral.
+
+Sources: Wong & Reece 1967, Janosi & Hanamoto 1961, Ding et al. 2011, Ishigami et al. 2007, Bernard & Clover 1995.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from lunar_mjx.backends.physics.contact import faster, side_speed
+from lunar_mjx.backends.physics.context import Context, Values
+
+SHALLOW, DEEP = 1e-9, 1.5
+"""Sinkage over radius is followed within these bounds (up to an entrance angle of 120 deg)."""
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+
+
+def uniform_soil(p: SimpleNamespace | None, like: np.ndarray) -> Values:
+    """The same soil under every wheel (effect `soil`); without that effect a soil that bears next to nothing."""
+    given = {} if p is None else vars(p) | {"tan_phi": np.tan(p.friction_angle)}
+    bare = {"k_c": 0.0, "k_phi": 1.0, "n": 1.0, "cohesion": 0.0, "tan_phi": 0.0, "shear_modulus_x": 1.0,
+            "shear_modulus_y": 1.0, "rock": 0.0}  # fmt: skip
+    return {name: np.zeros_like(like) + given.get(name, value) for name, value in bare.items()}
+
+
+def local_soil(c: Context, uniform: Values, names: tuple[str, ...]) -> Values:
+    """The ground at each wheel: the uniform soil, then `surface_type`, `hard_surface` and `soil_gradient`."""
+    soil, place = dict(uniform), c.wheel_position
+    for name in names:
+        p = c.numbers.effects[name]
+        if name == "surface_type" and c.ground.hard is not None:
+            soil["rock"] = (c.ground.hard.value(place[..., 0], place[..., 1])[0] > 0.5).astype(float)
+        elif name == "hard_surface" and p.fraction > 0.5:
+            soil["rock"] = np.ones_like(soil["rock"])
+        elif name == "soil_gradient":
+            growth = np.exp(np.clip(p.east * place[..., 0] + p.north * place[..., 1], -5.0, 5.0))
+            soil["k_c"], soil["k_phi"] = soil["k_c"] * growth, soil["k_phi"] * growth
+    return soil
+
+
+def entrance(sinkage: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """theta_1, at which the rim enters the soil: cos theta_1 = 1 - z/r; rad."""
+    ratio = np.minimum(np.maximum(sinkage / radius, SHALLOW), DEEP)
+    return 2.0 * np.arctan2(np.sqrt(ratio), np.sqrt(2.0 - ratio))
+
+
+def peak_stress(soil: Values, width: np.ndarray, radius: np.ndarray, cos_m: np.ndarray, cos_1: np.ndarray):
+    """sigma_m = (k_c/b + k_phi) [r (cos theta_m - cos theta_1)]^n, Pa."""
+    depth = np.maximum(radius * (cos_m - cos_1), SHALLOW * radius)
+    return (soil["k_c"] / width + soil["k_phi"]) * depth ** soil["n"]
+
+
+def arc_factors(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A = 2 cos(t)(1 - cos t)/t and B = 2 sin(t)(1 - cos t)/t of eq. 10."""
+    half = np.sin(0.5 * theta)
+    common = 4.0 * half * half / theta
+    return np.cos(theta) * common, np.sin(theta) * common
+
+
+def mobilised(displacement: np.ndarray, modulus: np.ndarray) -> np.ndarray:
+    """Share of the shear strength that a displacement mobilises: sgn(j)(1 - exp(-|j|/K)) (Janosi & Hanamoto)."""
+    return np.copysign(np.expm1(-np.abs(displacement) / modulus), displacement)
+
+
+def area_damping(c: Context, coefficient: float, theta_1: np.ndarray, load: np.ndarray) -> np.ndarray:
+    """c' b r sin(theta_1) zdot, never pulling below zero the sum with the load; N."""
+    area = c.geometry["width"] * c.geometry["radius"] * np.sin(np.minimum(theta_1, 0.5 * np.pi))
+    return np.maximum(coefficient * area * c.contact["sinkage_rate"], -load)
+
+
+def pressure_sinkage(c: Context, p: SimpleNamespace) -> None:
+    """W = r b sigma_m A between theta_2 = 0, theta_m = theta_1/2 and theta_1; resistance r b sigma_m B."""
+    r, b = c.geometry["radius"], c.geometry["width"]
+    touching = c.contact["sinkage"] > 0.0
+    theta_1 = entrance(c.contact["sinkage"], r)
+    theta_m = 0.5 * theta_1
+    sigma = peak_stress(c.soil, b, r, np.cos(theta_m), np.cos(theta_1)) * touching
+    a_factor, b_factor = arc_factors(theta_m)
+    per_stress = r * b * sigma
+    load = per_stress * a_factor
+    c.normal.update(entrance=theta_1, theta_m=theta_m, sigma_m=sigma, load=load, resistance=per_stress * b_factor,
+                    damping=area_damping(c, p.damping, theta_1, load) * touching)  # fmt: skip
+
+
+def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
+    """L dk/dt = v_slip - V_r k, L the contact length and V_r the larger of |r omega| and |v_x|, exact over a step.
+
+    The force takes k plus `damping_time` times its mean rate, faded by exp(-V_r damping_time/L) when rolling.
+    """
+    contact, r = c.contact, c.geometry["radius"]
+    theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
+    length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), 1e-3 * r)
+    length = np.where(c.soil["rock"] > 0.5, p.rock_length, length)
+    roll = faster(contact["rim_speed"], contact["v_x"])
+    speed = np.abs(roll)
+    share = speed / length
+    touching = contact["sinkage"] > 0.0
+    turned = np.maximum(share * c.dt, 1e-200)
+    gain = -np.expm1(-turned) / turned / length
+    damped = p.damping_time * np.exp(-share * p.damping_time)
+
+    def advance(value: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rate = gain * (source - speed * value)
+        new = value + c.dt * rate
+        return new * touching, (new + damped * rate) * touching
+
+    slip_x, pushed_x = advance(state["slip_x"], contact["rim_speed"] - contact["v_x"])
+    slip_y, pushed_y = advance(state["slip_y"], side_speed(contact))
+    direction = np.minimum(np.maximum(advance(state["direction"], roll)[0], -1.0), 1.0)
+    c.slip.update(slip_x=pushed_x, slip_y=pushed_y, direction=direction)
+    return {"slip_x": slip_x, "slip_y": slip_y, "direction": direction}
+
+
+def closed_form_shear(c: Context, p: SimpleNamespace) -> None:
+    """tau at theta_m from j = r_s[(theta_1 - theta_m) - (1 - s)(sin theta_1 - sin theta_m)], applied over the arc.
+
+    F_x = r_s b tau A - r b sigma_m B; F_y = -r b tau_y theta_m; F_z = load + damping + r_s b tau B; M_x = r F_y;
+    M_y = -r_s^2 b tau theta_m; M_z = r sin(theta_m) F_y, with the arc leaning in the direction of rolling.
+    """
+    normal, soil, slip = c.normal, c.soil, c.slip
+    r, b = c.geometry["radius"], c.geometry["width"]
+    r_s = p.shear_radius * r
+    theta_1, theta_m, way = normal["entrance"], normal["theta_m"], slip["direction"]
+    a_factor, b_factor = arc_factors(theta_m)
+    sin_m = np.sin(theta_m)
+    chord = np.sin(theta_1) - sin_m
+    strength = (soil["cohesion"] + normal["sigma_m"] * soil["tan_phi"]) * (c.contact["sinkage"] > 0.0)
+    j = r_s * (way * (theta_1 - theta_m - chord) + slip["slip_x"] * chord)
+    tau = strength * mobilised(j, soil["shear_modulus_x"])
+    tau_y = strength * mobilised(r * theta_m * slip["slip_y"], soil["shear_modulus_y"])
+    pull = r_s * b * tau
+    side = -r * b * theta_m * tau_y
+    force, moment = c.wheel["force"], c.wheel["moment"]
+    force[..., 0] += pull * a_factor - way * normal["resistance"]
+    force[..., 1] += side
+    force[..., 2] += normal["load"] + normal["damping"] + way * pull * b_factor
+    moment[..., 0] += r * side
+    moment[..., 1] -= r_s * pull * theta_m
+    moment[..., 2] += way * r * sin_m * side
+
+
+def integral_normal(c: Context, p: SimpleNamespace) -> None:
+    """Wong-Reece stress integrated over the arc: load and resistance; the stress at nodes stays in `stress`."""
+    r, b, soil = c.geometry["radius"], c.geometry["width"], c.soil
+    touching = c.contact["sinkage"] > 0.0
+    theta_1 = entrance(c.contact["sinkage"], r)
+    theta_m = 0.5 * theta_1
+    share = 0.5 * (1.0 + _NODES)
+    rear = theta_m[..., None] * share
+    front = theta_m[..., None] * (1.0 + share)
+    # behind theta_m the stress mirrors the front in proportion: with theta_2 = 0 the mirror of t is theta_1 - t
+    mirror = np.concatenate([theta_1[..., None] - rear, front], axis=-1)
+    theta = np.concatenate([rear, front], axis=-1)
+    weight = np.concatenate([_WEIGHTS, _WEIGHTS]) * (0.5 * theta_m[..., None])
+    depth = np.maximum(r[..., None] * (np.cos(mirror) - np.cos(theta_1)[..., None]), 1e-12 * r[..., None])
+    sigma = (soil["k_c"] / b + soil["k_phi"])[..., None] * depth ** soil["n"][..., None] * touching[..., None]
+    load = r * b * np.sum(weight * sigma * np.cos(theta), axis=-1)
+    c.normal.update(
+        entrance=theta_1,
+        theta_m=theta_m,
+        sigma_m=peak_stress(soil, b, r, np.cos(theta_m), np.cos(theta_1)) * touching,
+        load=load,
+        resistance=r * b * np.sum(weight * sigma * np.sin(theta), axis=-1),
+        damping=area_damping(c, p.damping, theta_1, load) * touching,
+        stress=np.stack([theta, weight, sigma]),
+    )
+
+
+def integral_shear(c: Context, p: SimpleNamespace) -> None:
+    """Shear stress tau(theta) = (c + sigma tan phi)(1 - exp(-j(theta)/K)) integrated over the arc."""
+    normal, soil, slip = c.normal, c.soil, c.slip
+    r, b = c.geometry["radius"], c.geometry["width"]
+    r_s = p.shear_radius * r
+    theta, weight, sigma = normal["stress"]
+    theta_1, way = normal["entrance"][..., None], slip["direction"]
+    chord = np.sin(theta_1) - np.sin(theta)
+    touching = (c.contact["sinkage"] > 0.0)[..., None]
+    strength = weight * (soil["cohesion"][..., None] + sigma * soil["tan_phi"][..., None]) * touching
+    j = r_s[..., None] * (way[..., None] * (theta_1 - theta - chord) + slip["slip_x"][..., None] * chord)
+    tau = strength * mobilised(j, soil["shear_modulus_x"][..., None])
+    across = (r * slip["slip_y"])[..., None] * (theta_1 - theta)
+    tau_y = strength * mobilised(across, soil["shear_modulus_y"][..., None])
+    cos, sin = np.cos(theta), np.sin(theta)
+    force, moment = c.wheel["force"], c.wheel["moment"]
+    force[..., 0] += r_s * b * np.sum(tau * cos, -1) - way * normal["resistance"]
+    force[..., 1] -= r * b * np.sum(tau_y, -1)
+    force[..., 2] += normal["load"] + normal["damping"] + way * r_s * b * np.sum(tau * sin, -1)
+    moment[..., 0] -= r * r * b * np.sum(tau_y * cos, -1)
+    moment[..., 1] -= r_s * r_s * b * np.sum(tau, -1)
+    moment[..., 2] -= way * r * r * b * np.sum(tau_y * sin, -1)
