@@ -81,9 +81,7 @@ def _log_folders(path: Path) -> list[Path]:
         return [path.parent if path.is_file() and path.name == LOG_FILE else path]
     found = sorted(p.parent for p in path.glob(f"*/{LOG_FILE}")) if path.is_dir() else []
     if not found:
-        raise UserError(
-            f"{path}: neither it nor a folder in it holds {LOG_FILE}; name a log or a campaign."
-        )
+        raise UserError(f"{path}: neither it nor a folder in it holds {LOG_FILE}; name a log or a campaign.")
     return found
 
 

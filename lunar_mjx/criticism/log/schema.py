@@ -87,6 +87,7 @@ CHANNELS: tuple[Channel, ...] = (
     _channel("winding_{c}_{j}_temperature", "degC", "temperature", -250.0, 300.0, _HEAT),
     _channel("housing_{c}_{j}_temperature", "degC", "temperature", -250.0, 300.0, _HEAT),
     _channel("wheel_{c}_sinkage", "m", "wheel", -0.2, 1.0, "a wheel that sinks by a metre is buried"),
+    _channel("wheel_{c}_slip_angle", "deg", "wheel", -180.0, 180.0, "an angle of the wheel's velocity"),
     _channel("wheel_{c}_slip", "ratio", "wheel", -5.0, 5.0, "eq. 8 stays within [-2, 2]; the rest is noise"),
     _channel("wheel_{c}_force_{x}", "N", "force", -1e5, 1e5, "more than any rover weighs"),
     _channel("wheel_{c}_moment_{x}", "Nm", "force", -1e4, 1e4, "more than any rover's wheel bears"),

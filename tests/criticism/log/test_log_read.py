@@ -55,7 +55,7 @@ def test_units_convert(column: str, name: str, given: float, wanted: float) -> N
 
 
 @pytest.mark.parametrize("column", ["position_x_degC", "position_x", "accelerometer_z_g", "quaternion_w_deg",
-                                    "motor_lf_drive_current_rad", "wheel_lf_slip_angle_deg"])  # fmt: skip
+                                    "motor_lf_drive_current_rad", "wheel_lf_slip_angle_m"])  # fmt: skip
 def test_units_that_do_not_convert_are_a_problem_and_no_channel(column: str, tmp_path: Path) -> None:
     log = make_log(tmp_path / "a")
     path = tmp_path / "a" / "drive.csv"
