@@ -1,0 +1,144 @@
+"""What differs from rover to rover: any parameter of any effect, gravity, ambient and starting temperature."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lunar_mjx.dynamics import Params
+from lunar_mjx.errors import bad_input, require_finite
+from lunar_mjx.model import Model
+
+SCALES = ("uniform", "log")
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """One parameter drawn anew for every episode.
+
+    Attributes:
+      parameter: `effect.parameter`, `gravity` (m/s2), `ambient` (K, constant over the episode) or
+        `winding_temperature` (K, of all motors at the start), in SI units.
+      low, high: bounds of the draw.
+      scale: "uniform" or "log".
+      relative: bounds are factors of the model's own value.
+    """
+
+    parameter: str
+    low: float
+    high: float
+    scale: str = "uniform"
+    relative: bool = False
+
+    def __post_init__(self) -> None:
+        where = f"randomise.{self.parameter}"
+        for field in ("low", "high"):
+            require_finite(where, field, getattr(self, field))
+        if self.low > self.high:
+            raise bad_input(where, "low", self.low, f"is above high = {self.high}", "swap the two")
+        if self.scale not in SCALES:
+            raise bad_input(where, "scale", self.scale, "does not exist", f"use one of {', '.join(SCALES)}")
+        if self.scale == "log" and self.low <= 0.0:
+            raise bad_input(where, "low", self.low, "is not positive on a log scale", "give bounds above zero")
+
+
+def check_ranges(model: Model, ranges: Sequence[Range], source: str = "navigation") -> None:
+    """Refuses ranges that the model has no parameter for, or that leave a parameter's bounds.
+
+    Raises:
+      UserError: names the range.
+    """
+    seen = set()
+    for r in ranges:
+        if r.parameter in seen:
+            raise bad_input(source, "randomise", r.parameter, "stands there twice", "give each parameter one range")
+        seen.add(r.parameter)
+        if r.parameter in ("gravity", "ambient", "winding_temperature"):
+            if r.low <= 0.0:
+                raise bad_input(source, f"randomise.{r.parameter}", r.low, "is not positive", "give a positive value")
+            continue
+        effect, _, name = r.parameter.partition(".")
+        found = next((e for e in model.effects if e.name == effect), None)
+        if found is None or name not in found.parameters:
+            known = ", ".join(f"{e.name}.{k}" for e in model.effects for k in e.parameters)
+            raise bad_input(source, "randomise", r.parameter, "is no parameter of the model", f"use one of {known}")
+        value = np.asarray(model.parameters[effect][name], float)
+        for bound in (r.low, r.high):
+            for number in np.ravel(value * bound if r.relative else bound):
+                found.check(name, float(number), f"{source}, randomise")
+
+
+def draw(
+    ranges: Sequence[Range], params: Params, bounds: Float[Array, "range 2"], keys: Float[Array, "env 2"]
+) -> dict[str, Any]:
+    """Draws every range for every environment.
+
+    Args:
+      ranges: what to draw. bounds: low and high of each, as arrays, so that other bounds need no new compilation.
+      params: the model's own values.
+      keys: raw random keys, one per environment.
+
+    Returns:
+      Values by parameter with the leading axis `env`; relative draws are multiplied out.
+    """
+    if not ranges:
+        return {}
+    share = jax.vmap(lambda k: jax.random.uniform(k, (len(ranges),)))(keys)
+    drawn = {}
+    for i, r in enumerate(ranges):
+        low, high = bounds[i, 0], bounds[i, 1]
+        if r.scale == "log":
+            value = jnp.exp(jnp.log(low) + share[:, i] * (jnp.log(high) - jnp.log(low)))
+        else:
+            value = low + share[:, i] * (high - low)
+        if r.relative:
+            own = _own(params, r.parameter)
+            value = value.reshape(-1, *([1] * own.ndim)) * own
+        drawn[r.parameter] = value
+    return drawn
+
+
+def _own(params: Params, parameter: str) -> Any:
+    if parameter == "gravity":
+        return jnp.asarray(params.gravity)
+    if parameter in ("ambient", "winding_temperature"):
+        return jnp.asarray(params.ambient.noon)
+    effect, _, name = parameter.partition(".")
+    return params.effects[effect][name]
+
+
+def apply(params: Params, drawn: dict[str, Any]) -> tuple[Params, Any]:
+    """Puts the drawn values into the parameters.
+
+    Returns:
+      The parameters, and their axes as `System.step_batch` wants them: None if nothing differs between rovers.
+    """
+    if not drawn:
+        return params, None
+    effects = {e: dict(values) for e, values in params.effects.items()}
+    axes: dict[str, dict[str, Any]] = {e: dict.fromkeys(values) for e, values in params.effects.items()}
+    gravity, gravity_axis, ambient, ambient_axis = params.gravity, None, params.ambient, None
+    for parameter, value in drawn.items():
+        if parameter == "gravity":
+            gravity, gravity_axis = value, 0
+        elif parameter == "ambient":
+            ambient = dataclasses.replace(
+                params.ambient,
+                noon=value,
+                night=value,
+                noon_time=jnp.broadcast_to(params.ambient.noon_time, value.shape),
+                period=jnp.broadcast_to(params.ambient.period, value.shape),
+            )
+            ambient_axis = 0
+        elif parameter != "winding_temperature":
+            effect, _, name = parameter.partition(".")
+            effects[effect][name] = value
+            axes[effect][name] = 0
+    new = dataclasses.replace(params, gravity=gravity, ambient=ambient, effects=effects)
+    return new, Params(gravity_axis, ambient_axis, axes, None)  # type: ignore[arg-type]
