@@ -155,9 +155,10 @@ def whole_steps(commands: Commands, timestep: float) -> int:
     """Time steps for which each command is held."""
     every = round(commands.interval / timestep)
     if every < 1 or abs(every * timestep - commands.interval) > 1e-3 * commands.interval:
+        better = commands.interval / max(every, 1)
         raise bad_input("run", "interval", f"{commands.interval:g} s",
                         f"is no whole number of time steps of {timestep:g} s",
-                        f"set timestep_s = {commands.interval / max(every, 1):.6g}, or resample the commands")  # fmt: skip
+                        f"set timestep_s = {better:.6g}, or resample the commands")  # fmt: skip
     return every
 
 

@@ -7,6 +7,7 @@ between the host and the device.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.backends.base import Backend, BackendState, Observation, observation, whole_steps
-from lunar_mjx.dynamics import State, System, Telemetry, build
+from lunar_mjx.dynamics import Params, State, System, Telemetry, build
 from lunar_mjx.dynamics.state import Temperature
 from lunar_mjx.effects.motor import REFERENCE_TEMPERATURE
 from lunar_mjx.errors import bad_input
@@ -24,6 +25,8 @@ from lunar_mjx.simulate import Commands
 from lunar_mjx.terrain import Terrain
 
 PRECISIONS = ("float64", "float32")
+
+_EACH_TERRAIN: Any = Params(gravity=None, ambient=None, effects=None, terrain=0)  # type: ignore[arg-type]
 
 
 class JaxBackend(Backend):
@@ -46,10 +49,10 @@ class JaxBackend(Backend):
         with self._precision():
             self.system: System = build(model, engine)
             self.params = self.system.params
-            self._reset = jax.jit(jax.vmap(self.system.reset, in_axes=(None, 0, 0, 0, None)))
-            self._advance = jax.jit(self.system.step_batch)
-            self._rollout = jax.jit(self.system.rollout_batch, static_argnames="every")
+            self._advance = jax.jit(self.system.step_batch, static_argnames="params_axes")
+            self._rollout = jax.jit(self.system.rollout_batch, static_argnames=("every", "params_axes"))
         self.name = self.system.engine.name if precision == "float64" else f"{self.system.engine.name}, float32"
+        self._axes: Params | None = None
         self._seen: Telemetry | None = None
         self.reset()
 
@@ -58,25 +61,31 @@ class JaxBackend(Backend):
         with jax.enable_x64(self.precision == "float64"):
             yield
 
-    def set_terrain(self, terrain: Terrain) -> None:
-        """Takes another ground; one of the same grids compiles nothing anew."""
+    def set_terrain(self, terrain: Terrain, each: bool = False) -> None:
+        """Takes another ground; one of the same grids compiles nothing anew.
+
+        Args:
+          terrain: the ground, or with `each` a stack of one per rover.
+          each: whether `terrain` has a leading axis of rovers.
+        """
         with self._precision():
-            dtype = jnp.result_type(float)
             floating = jax.tree.map(
-                lambda a: jnp.asarray(a, dtype if jnp.issubdtype(np.asarray(a).dtype, np.floating) else None), terrain
+                lambda a: jnp.asarray(a, float if np.asarray(a).dtype.kind == "f" else None), terrain
             )
-            self.params = type(self.params)(self.params.gravity, self.params.ambient, self.params.effects, floating)
+            self.params = dataclasses.replace(self.params, terrain=floating)
+            self._axes = _EACH_TERRAIN if each else None
 
     def reset(self, x: Any = 0.0, y: Any = 0.0, yaw: Any = 0.0, winding_temperature: Any = None) -> BackendState:
         with self._precision():
             place = [jnp.broadcast_to(jnp.asarray(v, float), (self.rovers,)) for v in (x, y, yaw)]
-            self._state = self._reset(self.params, *place, winding_temperature)
+            reset = jax.vmap(self.system.reset, in_axes=(self._axes, 0, 0, 0, None))
+            self._state = reset(self.params, *place, winding_temperature)
         return self.state()
 
     def step(self, control: Any) -> None:
         with self._precision():
             held = jnp.asarray(self.controls(control), float)
-            self._state, self._seen = self._advance(self.params, self._state, held)
+            self._state, self._seen = self._advance(self.params, self._state, held, params_axes=self._axes)
 
     def run(self, commands: Commands) -> Telemetry:
         every = whole_steps(commands, self.model.timestep)
@@ -84,7 +93,7 @@ class JaxBackend(Backend):
             values = jnp.asarray(commands.values, float)
             if values.ndim == 2:
                 values = jnp.broadcast_to(values, (self.rovers, *values.shape))
-            self._state, seen = self._rollout(self.params, self._state, values, every=every)
+            self._state, seen = self._rollout(self.params, self._state, values, every=every, params_axes=self._axes)
             return jax.tree.map(np.asarray, seen)
 
     def state(self) -> BackendState:

@@ -1,0 +1,298 @@
+"""Do the engines agree? Three levels: one state stage by stage, single steps along a drive, and open-loop drives.
+
+The reference is native MuJoCo with forces in NumPy. Level 1 and 2 start every engine from states that the reference
+recorded, so that nothing drifts; level 3 lets them drive for themselves, with the reference itself started from
+coordinates rounded to float32 as the noise floor.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax
+import numpy as np
+
+from lunar_mjx.backends.base import STAGES, Backend, BackendState, Observation, observation, telemetry
+from lunar_mjx.backends.hooks import Hook
+from lunar_mjx.backends.jax_backend import JaxBackend
+from lunar_mjx.backends.native import NativeBackend
+from lunar_mjx.backends.parity_cases import QUANTITIES, Case, Tolerance
+from lunar_mjx.dynamics.state import Telemetry
+from lunar_mjx.model import Model
+from lunar_mjx.simulate import Commands
+from lunar_mjx.terrain import stack
+
+STEP_QUANTITIES = ("position", "orientation", "joint_angle", "velocity", "joint_speed", "winding_temperature",
+                   "housing_temperature", "shear_state")  # fmt: skip
+"""What level 2 compares after one step."""
+
+DRIVE_QUANTITIES = ("position", "orientation", "joint_angle", "sinkage", "slip", "joint_torque",
+                    "winding_temperature", "housing_temperature")  # fmt: skip
+"""What level 3 compares along a drive."""
+
+FLOOR_FACTOR = 10.0
+"""A drive may depart from the reference by its tolerance and this many times the noise floor."""
+
+
+@dataclasses.dataclass
+class Samples:
+    """States along the reference's drive on one ground, the control of each, and what followed."""
+
+    state: BackendState
+    control: np.ndarray
+    stages: Observation
+    after: Observation
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """One comparison of two engines.
+
+    Attributes:
+      level: 1, 2 or 3. stage: of the step (level 1), "step" or "drive". quantity: compared.
+      error: largest |a - b|/(atol + rtol |a|). difference: largest |a - b|. size: largest |a|.
+      where: the entry of the largest error, such as a wheel's corner. floor: largest difference of the noise floor.
+    """
+
+    case: str
+    level: int
+    stage: str
+    quantity: str
+    error: float
+    difference: float
+    size: float
+    where: str
+    floor: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        return bool(self.error <= 1.0)
+
+
+class Runner:
+    """An engine that evaluates states and drives, one backend per ground."""
+
+    def __init__(self, name: str, make: Callable[[Model, int], Backend], model: Model, batched: bool = True) -> None:
+        self.name, self.make, self.model, self.batched = name, make, model, batched
+
+    def step_from(self, case: Case, samples: Samples) -> tuple[Observation, Observation]:
+        """Stages of the step from every sample, and the state after it."""
+        rovers = len(samples.control) if self.batched else 1
+        backend = self.make(self.model.replace(terrain=case.terrain), rovers)
+        pieces = [_evaluate(backend, s, c) for s, c in (_rows(samples, i, rovers) for i in
+                                                        range(0, len(samples.control), rovers))]  # fmt: skip
+        seen, after = ({k: np.concatenate([p[i][k] for p in pieces]) for k in pieces[0][i]} for i in (0, 1))
+        return seen, after
+
+    def drive(self, case: Case, commands: Commands) -> Telemetry:
+        backend = self.make(self.model.replace(terrain=case.terrain), 1)
+        backend.reset()
+        return backend.run(commands)
+
+
+class JaxRunner(Runner):
+    """A JAX engine: compiled once for samples and once for drives, for all grounds."""
+
+    def __init__(self, engine: str, model: Model, precision: str = "float64") -> None:
+        self.engine, self.model, self.precision = engine, model, precision
+        self.name = engine if precision == "float64" else f"{engine}, {precision}"
+        self._backends: dict[int, JaxBackend] = {}
+
+    def _backend(self, rovers: int, case: Case) -> JaxBackend:
+        if rovers not in self._backends:
+            model = self.model.replace(terrain=case.terrain)
+            self._backends[rovers] = JaxBackend(model, self.engine, rovers, self.precision)
+        backend = self._backends[rovers]
+        backend.set_terrain(case.terrain)
+        return backend
+
+    def step_from(self, case: Case, samples: Samples) -> tuple[Observation, Observation]:
+        return _evaluate(self._backend(len(samples.control), case), samples.state, samples.control)
+
+    def drives(self, cases: list[Case], commands: Commands) -> list[Telemetry]:
+        """Drives on all grounds at once."""
+        backend = self._backends.get(-1)
+        if backend is None:
+            model = self.model.replace(terrain=cases[0].terrain)
+            backend = self._backends[-1] = JaxBackend(model, self.engine, len(cases), self.precision)
+        # the name is part of the compiled structure
+        backend.set_terrain(stack([dataclasses.replace(c.terrain, name="parity") for c in cases]), each=True)
+        backend.reset()
+        seen = backend.run(commands)
+        return [jax.tree.map(lambda a, i=i: a[i : i + 1], seen) for i in range(len(cases))]
+
+
+def native_runner(model: Model, hooks: Iterable[Hook] = (), name: str = "native") -> Runner:
+    """The reference, or with hooks a reference with planted faults."""
+    return Runner(name, lambda m, n: NativeBackend(m, hooks, n), model)
+
+
+def _rows(samples: Samples, start: int, count: int) -> tuple[BackendState, np.ndarray]:
+    cut = slice(start, start + count)
+    s = samples.state
+    effects = {e: {k: v[cut] for k, v in own.items()} for e, own in s.effects.items()}
+    state = BackendState(s.step, s.qpos[cut], s.qvel[cut], s.winding_temperature[cut], s.housing_temperature[cut],
+                         effects)  # fmt: skip
+    return state, samples.control[cut]
+
+
+def _evaluate(backend: Backend, state: BackendState, control: np.ndarray) -> tuple[Observation, Observation]:
+    backend.set_state(state)
+    backend.step(control)
+    seen, new = backend.observe(), backend.state()
+    seen["acceleration"] = (new.qvel - state.qvel) / backend.model.timestep
+    return seen, coordinates(backend.model, new)
+
+
+def coordinates(model: Model, state: BackendState) -> Observation:
+    """A state as the quantities of level 2."""
+    shear = state.effects.get("shear_state", {})
+    return {
+        "position": state.qpos[:, :3],
+        "orientation": state.qpos[:, 3:7],
+        "joint_angle": state.qpos[:, 7:],
+        "velocity": state.qvel[:, :6],
+        "joint_speed": state.qvel[:, 6:],
+        "winding_temperature": state.winding_temperature,
+        "housing_temperature": state.housing_temperature,
+        "shear_state": np.concatenate([v for _, v in sorted(shear.items())] or [np.zeros((len(state.qpos), 1))], -1),
+    }
+
+
+def record(model: Model, case: Case, commands: Commands, count: int) -> tuple[Samples, Telemetry, Telemetry]:
+    """Drives the reference over one ground.
+
+    Args:
+      model: the model. case: the ground. commands: the drive. count: how many states to keep along it.
+
+    Returns:
+      Samples, telemetry of the reference, and telemetry of the reference started from float32 coordinates.
+    """
+    backend = NativeBackend(model.replace(terrain=case.terrain), rovers=2)
+    state = backend.reset()
+    state.qpos[1] = _rounded(state.qpos[1])
+    backend.set_state(state)
+    kept = np.unique(np.linspace(0, len(commands.values) - 1, count).astype(int))
+    states: list[BackendState] = []
+    seen: list[Observation] = []
+    every = round(commands.interval / model.timestep)
+    for k, control in enumerate(commands.values):
+        if k in kept:
+            states.append(backend.state())
+        for i in range(every):
+            backend.step(backend.controls(control))
+            if i == 0:
+                seen.append(backend.observe())
+    both = telemetry(seen)
+    joined = _join(states)
+    probe = NativeBackend(model.replace(terrain=case.terrain), rovers=len(kept))
+    stages, after = _evaluate(probe, joined, commands.values[kept])
+    runs = [jax.tree.map(lambda a, i=i: a[i : i + 1], both) for i in (0, 1)]
+    return Samples(joined, commands.values[kept], stages, after), runs[0], runs[1]
+
+
+def _rounded(qpos: np.ndarray) -> np.ndarray:
+    """Coordinates as float32 holds them, moved by one more unit in the last place where they are exact."""
+    single = qpos.astype(np.float32)
+    return np.where(single == qpos, np.nextafter(single, np.float32(np.inf)), single).astype(float)
+
+
+def _join(states: list[BackendState]) -> BackendState:
+    """The first rover of several states as the rovers of one state."""
+
+    def rows(get: Callable[[BackendState], np.ndarray]) -> np.ndarray:
+        return np.stack([get(s)[0] for s in states])
+
+    effects = {e: {k: rows(lambda s, e=e, k=k: s.effects[e][k]) for k in own} for e, own in states[0].effects.items()}
+    return BackendState(0, rows(lambda s: s.qpos), rows(lambda s: s.qvel), rows(lambda s: s.winding_temperature),
+                        rows(lambda s: s.housing_temperature), effects)  # fmt: skip
+
+
+def compare(
+    a: np.ndarray, b: np.ndarray, quantity: str, tolerance: Tolerance, model: Model, floor: np.ndarray | None = None
+) -> tuple[float, float, str, float]:
+    """Largest normalised error, largest difference, where, and the largest difference of the noise floor."""
+    if quantity == "orientation":
+        a, b = np.atleast_2d(a), np.atleast_2d(b)
+        b = b * np.where(np.sum(a * b, -1, keepdims=True) < 0.0, -1.0, 1.0)
+        difference, size = 2.0 * np.linalg.norm(a - b, axis=-1), 0.0
+    else:
+        difference, size = np.abs(a - b), np.abs(a)
+    allowed = tolerance.absolute + tolerance.relative * size + np.zeros_like(difference)
+    if floor is not None:
+        allowed = allowed + FLOOR_FACTOR * floor
+    error = np.where(np.isfinite(difference), difference / allowed, np.inf)
+    at = np.unravel_index(int(np.argmax(error)), error.shape)
+    return float(error[at]), float(difference[at]), _where(model, quantity, a.shape, at), float(np.max(size))
+
+
+def _where(model: Model, quantity: str, shape: tuple[int, ...], at: Any) -> str:
+    """The wheel or joint of an entry."""
+    rover = model.rover
+    if len(at) < 2:
+        return ""
+    axes = "xyz"
+    if quantity.startswith("wheel_"):
+        return f"{rover.wheels[at[1]].corner} {axes[at[2]]}"
+    if quantity in ("sinkage", "slip", "slip_angle"):
+        return rover.wheels[at[1]].corner
+    if shape[1] == len(rover.joints):
+        return rover.joints[at[1]]
+    return f"{at[1]}"
+
+
+def judge(
+    case: Case, samples: Samples, other: tuple[Observation, Observation], tolerance: dict[str, Tolerance], model: Model
+) -> list[Result]:
+    """Levels 1 and 2: another engine's stages and steps against the reference's, from the same states."""
+    out = []
+    stages = [(1, stage, q, samples.stages, other[0]) for stage, names in STAGES.items() for q in names]
+    steps = [(2, "step", q, samples.after, other[1]) for q in STEP_QUANTITIES]
+    for level, stage, quantity, a, b in stages + steps:
+        error, difference, where, size = compare(a[quantity], b[quantity], quantity, tolerance[quantity], model)
+        out.append(Result(case.name, level, stage, quantity, error, difference, size, where))
+    return out
+
+
+def judge_drive(
+    case: Case, reference: Telemetry, noise: Telemetry, other: Telemetry, tolerance: dict[str, Tolerance], model: Model
+) -> list[Result]:
+    """Level 3: an open-loop drive against the reference's, with the noise floor of float32 coordinates."""
+    a, n, b = (traces(t) for t in (reference, noise, other))
+    out = []
+    for quantity in DRIVE_QUANTITIES:
+        # the floor so far: what has been perturbed stays perturbed
+        apart = gap(a[quantity], n[quantity], quantity)
+        floor = np.maximum.accumulate(apart, axis=0)
+        error, difference, where, size = compare(a[quantity], b[quantity], quantity, tolerance[quantity], model, floor)
+        out.append(Result(case.name, 3, "drive", quantity, error, difference, size, where, float(np.max(apart))))
+    return out
+
+
+def gap(a: np.ndarray, b: np.ndarray, quantity: str) -> np.ndarray:
+    """|a - b|, or the angle between two orientations."""
+    if quantity != "orientation":
+        return np.abs(a - b)
+    return 2.0 * np.linalg.norm(a - b * np.where(np.sum(a * b, -1, keepdims=True) < 0.0, -1.0, 1.0), axis=-1)
+
+
+def traces(seen: Telemetry) -> Observation:
+    """A run's telemetry (one rover) as arrays with a leading time axis."""
+    values = observation(seen)
+    out = {k: v[0].astype(float) for k, v in values.items()}
+    return {**out, "orientation": out["quaternion"]}
+
+
+def tolerances(relative: float, drive: bool = False) -> dict[str, Tolerance]:
+    """Tolerance of every quantity: relative, and absolute in proportion to the quantity's typical size."""
+    grown = 10.0 if drive else 1.0
+    return {k: Tolerance(grown * relative * size, grown * relative) for k, (_, size) in QUANTITIES.items()}
+
+
+def first_failure(results: Iterable[Result]) -> Result | None:
+    """The first stage of level 1 that failed, in the order of the step: where the engines part."""
+    order = {stage: i for i, stage in enumerate(STAGES)}
+    failed = [r for r in results if r.level == 1 and not r.passed]
+    return min(failed, key=lambda r: (order[r.stage], -r.error), default=None)
