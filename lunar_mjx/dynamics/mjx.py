@@ -52,9 +52,7 @@ class MjxEngine:
         dtype = qpos.dtype
         m = jax.tree.map(lambda a: _cast(a, dtype), self._mjx)
         d = jax.tree.map(lambda a: _cast(a, dtype), self._data)
-        gravity = jnp.asarray(params.gravity, dtype)
-        zero = jnp.zeros_like(gravity)
-        m = m.replace(opt=m.opt.replace(gravity=jnp.stack([zero, zero, -gravity])))
+        m = _with_gravity(m, jnp.asarray(params.gravity, dtype))
         d = d.replace(qpos=qpos, qvel=qvel)
         d = mjx.com_vel(m, mjx.com_pos(m, mjx.kinematics(m, d)))
 
@@ -97,6 +95,8 @@ class MjxEngine:
 
     def _finish(self, params: Any, m: mjx.Model, d: mjx.Data, forces: Forces) -> tuple[Any, Any]:
         m = m.replace(dof_armature=self._armature(params, d.qpos.dtype))
+        if forces.geometry.gravity is not None:
+            m = _with_gravity(m, jnp.asarray(forces.geometry.gravity, d.qpos.dtype))
         d = self._carry_payload(m, d, forces)
         d = mjx.tendon(m, mjx.camlight(m, d))
         d = mjx.transmission(m, mjx.make_constraint(m, mjx.factor_m(m, mjx.crb(m, d))))
@@ -146,6 +146,11 @@ class MjxEngine:
         xfrc = xfrc.at[chassis].add(row(chassis, forces.chassis_force.stack(), forces.chassis_moment.stack()))
         qfrc = jnp.zeros(m.nv, d.qpos.dtype).at[self._dadr].set(forces.joint_torque)
         return d.replace(xfrc_applied=xfrc, qfrc_applied=qfrc)
+
+
+def _with_gravity(m: mjx.Model, gravity: Any) -> mjx.Model:
+    zero = jnp.zeros_like(gravity)
+    return m.replace(opt=m.opt.replace(gravity=jnp.stack([zero, zero, -gravity])))
 
 
 def _cast(leaf: Any, dtype: Any) -> Any:

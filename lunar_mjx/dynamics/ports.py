@@ -174,6 +174,8 @@ def apply_effects(
     ctx = dataclasses.replace(ctx, torque=torque)
     geometry, state = pipeline.run("geometry", ctx, state, nominal_geometry(ctx.rover))
     ctx = dataclasses.replace(ctx, geometry=geometry)
+    if geometry.gravity is not None:
+        ctx = dataclasses.replace(ctx, gravity=geometry.gravity)
     ctx = dataclasses.replace(ctx, contact=wheel_contact(ctx))
     ctx, state = wheel_ports(pipeline, ctx, state)
     zero = jnp.zeros_like(ctx.position.x)

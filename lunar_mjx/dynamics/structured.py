@@ -211,7 +211,8 @@ class StructuredEngine:
         """Accelerations from the forces, and a step of semi-implicit Euler."""
         dtype, dt = forces.joint_torque.dtype, self.timestep
         frame, motion = base.frame, base.motion
-        up = frame.undo(Vector(0.0, 0.0, jnp.asarray(params.gravity, dtype)))
+        gravity = params.gravity if forces.geometry.gravity is None else forces.geometry.gravity
+        up = frame.undo(Vector(0.0, 0.0, jnp.asarray(gravity, dtype)))
         armature = _reflected_inertia(params, self._joints, dtype)
         blocks = [
             leg_block(group, leg, up, forces, frame, armature, dt) for group, leg in zip(numbers, legs, strict=True)

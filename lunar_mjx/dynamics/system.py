@@ -82,7 +82,7 @@ class System:
         wheel = jnp.zeros(len(self.model.rover.wheels), dtype)
         shapes = {"joint": joint, "wheel": wheel, "rover": jnp.zeros((), dtype)}
         effects = {
-            e.name: {name: shapes[s.axis] + s.initial for name, s in e.state.items()}
+            e.name: {name: s.reset(shapes[s.axis]) for name, s in e.state.items()}
             for e in self.model.effects
             if e.state
         }

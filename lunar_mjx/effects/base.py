@@ -23,6 +23,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+import jax.numpy as jnp
+
 from lunar_mjx.errors import UserError, require_finite
 
 PORTS = (
@@ -86,6 +88,7 @@ class StateVariable:
       meaning: what it is, in a few words.
       axis: "rover", "wheel" or "joint".
       rate: whether the port function returns its time derivative (integrated by the step) instead of its new value.
+      slots: length of a leading axis beside that, for a memory of fixed size; 0 for none.
     """
 
     initial: float
@@ -93,6 +96,12 @@ class StateVariable:
     meaning: str
     axis: str = "wheel"
     rate: bool = False
+    slots: int = 0
+
+    def reset(self, like: Any) -> Any:
+        """The state at reset; `like` is an array of zeros over its axis."""
+        like = jnp.broadcast_to(like, (self.slots, *like.shape)) if self.slots else like
+        return like + self.initial
 
 
 PortFunction = Callable[..., Any]
@@ -110,7 +119,8 @@ class Effect:
       state: state name -> `StateVariable`.
       replaces: names of effects that must leave the list when this one enters it.
       order: effects at one port run by rising order, and in list order where equal.
-      transient: the effect vanishes in steady state, so that a steady-state wheel test bed leaves it out.
+      transient: the effect vanishes on a wheel in steady state, or needs its history or its place, so that a
+        steady-state wheel test bed leaves it out.
       doc: equation and source.
     """
 

@@ -38,6 +38,7 @@ class Geometry:
       payload_mass: point mass carried on the chassis, kg.
       payload_position: its place in the chassis frame, m.
       com_offset: shift of the chassis' centre of mass, in the chassis frame, m.
+      gravity: true gravity, m/s2; None where it is as stated.
     """
 
     radius: Float[Array, "wheel"]
@@ -46,6 +47,7 @@ class Geometry:
     payload_mass: Any
     payload_position: Vec3
     com_offset: Vec3
+    gravity: Any = None
 
 
 @pytree
@@ -88,6 +90,7 @@ class Soil:
       tan_phi: tangent of the angle of internal friction.
       shear_modulus_x, shear_modulus_y: Janosi shear deformation moduli K_s and K_y, m.
       rock: 1 where the wheel stands on hard rock, 0 where it stands on soil.
+      rut: depth of the surface that the wheel meets below the undisturbed one, m; None where nothing has passed.
     """
 
     k_c: Float[Array, "wheel"]
@@ -98,6 +101,16 @@ class Soil:
     shear_modulus_x: Float[Array, "wheel"]
     shear_modulus_y: Float[Array, "wheel"]
     rock: Float[Array, "wheel"]
+    rut: Any = None
+
+
+@pytree
+class Arc:
+    """Integrals of the linearised stress over the contact arc, in units of its maximum: of cos, of sin, and of 1."""
+
+    cos: Float[Array, "wheel"]
+    sin: Float[Array, "wheel"]
+    one: Float[Array, "wheel"]
 
 
 @pytree
@@ -120,6 +133,7 @@ class Normal:
       resistance: backward force of the normal stress (compaction resistance) for rolling forward, N.
       damping: upward force that resists sinking, N.
       stress: the stress at quadrature nodes, where an effect integrates it.
+      arc: integrals of the linearised stress where it does not run from 0 over theta_1/2 to theta_1.
     """
 
     entrance: Float[Array, "wheel"]
@@ -130,6 +144,7 @@ class Normal:
     resistance: Float[Array, "wheel"]
     damping: Float[Array, "wheel"]
     stress: Stress | None = None
+    arc: Arc | None = None
 
 
 @pytree
@@ -143,6 +158,9 @@ class WheelForce:
       direction: +1 when the wheel rolls forward, -1 when it rolls backward.
       force: on the wheel's centre in the wheel frame (forward, left, ground normal), N.
       moment: on the wheel about its centre in the wheel frame, N m.
+      circle: share of the shear stress that both directions have in common (friction circle); None for none.
+      lug: how far the shearing surface lies beyond the radius of shear, m; None for not at all.
+      grip: factor of the shear stress; None for 1.
     """
 
     slip_x: Float[Array, "wheel"]
@@ -150,6 +168,9 @@ class WheelForce:
     direction: Float[Array, "wheel"]
     force: Vec3
     moment: Vec3
+    circle: Any = None
+    lug: Any = None
+    grip: Any = None
 
 
 @pytree

@@ -11,12 +11,14 @@ from lunar_mjx.effects.base import Effect, Parameter
 from lunar_mjx.effects.context import Stress
 from lunar_mjx.effects.wheel import (
     _DAMPING,
+    contact_with_soil,
     cos_difference,
     entrance_angle,
     grounded,
-    janosi,
     max_normal_stress,
     normal_damping_force,
+    shear_stress,
+    shearing_radius,
     sin_difference,
 )
 from lunar_mjx.spatial import Vec3
@@ -27,11 +29,9 @@ NODES_PER_SIDE = 6
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(NODES_PER_SIDE)
 
 
-def _normal(ctx, p, x, normal):
-    contact, geometry = ctx.contact, ctx.geometry
-    r, b = geometry.radius, geometry.width
-    theta_1 = entrance_angle(contact.sinkage, r)
-    theta_m, theta_2 = 0.5 * theta_1, jnp.zeros_like(theta_1)
+def integrate(ctx, contact, theta_1, theta_m, theta_2):
+    """Load and resistance of the normal stress, N, and the stress at the nodes, for the angles given in rad."""
+    r, b = ctx.geometry.radius, ctx.geometry.width
     modulus = ctx.soil.k_c / b + ctx.soil.k_phi
     theta, weight, sigma = [], [], []
     for node, w in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
@@ -47,31 +47,39 @@ def _normal(ctx, p, x, normal):
     area = r * b
     load = area * sum(w * s * jnp.cos(t) for t, w, s in zip(theta, weight, sigma, strict=True))
     resistance = area * sum(w * s * jnp.sin(t) for t, w, s in zip(theta, weight, sigma, strict=True))
+    return load, resistance, Stress(theta=tuple(theta), weight=tuple(weight), sigma=tuple(sigma))
+
+
+def _normal(ctx, p, x, normal):
+    contact, geometry = contact_with_soil(ctx), ctx.geometry
+    theta_1 = entrance_angle(contact.sinkage, geometry.radius)
+    theta_m, theta_2 = 0.5 * theta_1, jnp.zeros_like(theta_1)
+    load, resistance, stress = integrate(ctx, contact, theta_1, theta_m, theta_2)
     damping = jnp.maximum(normal_damping_force(ctx, p.damping, theta_1), -load)
+    sigma_m = max_normal_stress(ctx.soil, geometry.width, geometry.radius, theta_m, theta_1)
     return dataclasses.replace(
         normal,
         entrance=theta_1,
         exit=theta_2,
         theta_m=theta_m,
-        sigma_m=grounded(contact, max_normal_stress(ctx.soil, b, r, theta_m, theta_1)),
+        sigma_m=grounded(contact, sigma_m),
         load=load,
         resistance=resistance,
         damping=grounded(contact, damping),
-        stress=Stress(theta=tuple(theta), weight=tuple(weight), sigma=tuple(sigma)),
+        stress=stress,
     )
 
 
 def _shear(ctx, p, x, wheel):
     geometry, normal, soil = ctx.geometry, ctx.normal, ctx.soil
-    r, b, r_s = geometry.radius, geometry.width, p.shear_radius * geometry.radius
+    r, b, r_s = geometry.radius, geometry.width, shearing_radius(p, geometry, wheel)
     theta_1, stress = normal.entrance, normal.stress
     along = lift = turn = across = roll = yaw = 0.0
     for theta, weight, sigma in zip(stress.theta, stress.weight, stress.sigma, strict=True):
         arc = sin_difference(theta_1, theta)
         strength = grounded(ctx.contact, soil.cohesion + sigma * soil.tan_phi)
         j_x = r_s * (wheel.direction * ((theta_1 - theta) - arc) + wheel.slip_x * arc)
-        tau = weight * strength * janosi(j_x, soil.shear_modulus_x)
-        tau_y = weight * strength * janosi(r * (theta_1 - theta) * wheel.slip_y, soil.shear_modulus_y)
+        tau, tau_y = shear_stress(wheel, soil, weight * strength, j_x, r * (theta_1 - theta) * wheel.slip_y)
         cos, sin = jnp.cos(theta), jnp.sin(theta)
         along, lift, turn = along + tau * cos, lift + tau * sin, turn + tau
         across, roll, yaw = across + tau_y, roll + tau_y * cos, yaw + tau_y * sin

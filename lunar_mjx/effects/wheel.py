@@ -14,6 +14,7 @@ from lunar_mjx.effects.base import Parameter, StateVariable, effect
 from lunar_mjx.spatial import Vec3
 
 _MIN_SINKAGE = 1e-9
+_TINY = 1e-24
 _MAX_SINKAGE_RATIO = 1.5
 """The contact arc is followed up to an entrance angle of 120 deg; a wheel buried deeper keeps the force of that arc."""
 
@@ -62,6 +63,13 @@ def airborne(contact):
     return contact.sinkage <= 0.0
 
 
+def contact_with_soil(ctx):
+    """The contact with its sinkage below the surface that the wheel meets: the bottom of a rut where one is."""
+    if ctx.soil.rut is None:
+        return ctx.contact
+    return dataclasses.replace(ctx.contact, sinkage=jnp.maximum(ctx.contact.sinkage - ctx.soil.rut, 0.0))
+
+
 def grounded(contact, value):
     """`value` under a wheel that touches the ground, 0 under an airborne one."""
     return jnp.where(airborne(contact), 0.0, value)
@@ -84,7 +92,7 @@ def pressure_sinkage(ctx, p, x, normal):
 
     Linearised Wong-Reece stress between theta_2 = 0, theta_m = theta_1/2 and theta_1 (Ding et al. 2011); mends flaw 2.
     """
-    contact, geometry = ctx.contact, ctx.geometry
+    contact, geometry = contact_with_soil(ctx), ctx.geometry
     theta_1 = entrance_angle(contact.sinkage, geometry.radius)
     theta_m = 0.5 * theta_1
     sigma_m = max_normal_stress(ctx.soil, geometry.width, geometry.radius, theta_m, theta_1)
@@ -170,6 +178,28 @@ def lateral_slip_speed(contact):
     return contact.v_y * factor
 
 
+def shear_stress(wheel, soil, strength, j_x, j_y):
+    """Shear stress along and across the wheel after the displacements j_x and j_y, Pa (Janosi & Hanamoto 1961).
+
+    Each direction has the whole strength to itself, unless `wheel.circle` says that they share it.
+    """
+    if wheel.grip is not None:
+        strength = strength * wheel.grip
+    tau_x = strength * janosi(j_x, soil.shear_modulus_x)
+    tau_y = strength * janosi(j_y, soil.shear_modulus_y)
+    if wheel.circle is None:
+        return tau_x, tau_y
+    q_x, q_y = j_x / soil.shear_modulus_x, j_y / soil.shear_modulus_y
+    common = strength * mean_decay(jnp.sqrt(q_x * q_x + q_y * q_y + _TINY))
+    return tau_x + wheel.circle * (common * q_x - tau_x), tau_y + wheel.circle * (common * q_y - tau_y)
+
+
+def shearing_radius(p, geometry, wheel):
+    """r_s, m: the radius, its factor, and what grousers add."""
+    radius = p.shear_radius * geometry.radius
+    return radius if wheel.lug is None else radius + wheel.lug
+
+
 @effect(
     "wheel_shear",
     shear_radius=Parameter(1.0, None, (0.8, 1.3), "1", "shearing radius r_s over the radius r", "seed paper: r_s = r"),
@@ -184,19 +214,21 @@ def closed_form_shear(ctx, p, x, wheel):
     whose second term needs an undefined theta_s and is left out: flaw 6).
     """
     geometry, normal, soil = ctx.geometry, ctx.normal, ctx.soil
-    r, b, r_s = geometry.radius, geometry.width, p.shear_radius * geometry.radius
+    r, b, r_s = geometry.radius, geometry.width, shearing_radius(p, geometry, wheel)
     theta_1, theta_m = normal.entrance, normal.theta_m
-    a_factor, b_factor = geometry_factors(theta_m)
+    if normal.arc is None:
+        (a_factor, b_factor), whole, front = geometry_factors(theta_m), theta_m, theta_m
+    else:
+        a_factor, b_factor, whole, front = normal.arc.cos, normal.arc.sin, normal.arc.one, theta_1 - theta_m
     arc = sin_difference(theta_1, theta_m)
     strength = grounded(ctx.contact, soil.cohesion + normal.sigma_m * soil.tan_phi)
     j_x = r_s * (wheel.direction * ((theta_1 - theta_m) - arc) + wheel.slip_x * arc)
-    tau = strength * janosi(j_x, soil.shear_modulus_x)
-    tau_y = strength * janosi(r * theta_m * wheel.slip_y, soil.shear_modulus_y)
-    side = -r * b * theta_m * tau_y
+    tau, tau_y = shear_stress(wheel, soil, strength, j_x, r * front * wheel.slip_y)
+    side = -r * b * whole * tau_y
     force = Vec3(
         r_s * b * tau * a_factor - wheel.direction * normal.resistance,
         side,
         normal.load + normal.damping + wheel.direction * r_s * b * tau * b_factor,
     )
-    moment = Vec3(r * side, -r_s * r_s * b * theta_m * tau, wheel.direction * r * jnp.sin(theta_m) * side)
+    moment = Vec3(r * side, -r_s * r_s * b * whole * tau, wheel.direction * r * jnp.sin(theta_m) * side)
     return dataclasses.replace(wheel, force=wheel.force + force, moment=wheel.moment + moment)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from types import SimpleNamespace
 from typing import Any
@@ -31,8 +32,7 @@ def _step(dt: Any, v_x: Any, v_y: Any, rim: Any, sinkage: Any, rock: Any, state:
     contact = Contact(sinkage, zero, zero, zero, v_x, v_y, rim, nil, nil, nil, zero == 0)
     normal = initial_normal(v_x)
     normal = functools.partial(type(normal), THETA_1 + zero, zero, THETA_1 / 2 + zero)(zero, zero, zero, zero)
-    soil = initial_soil(v_x)
-    soil = type(soil)(*(getattr(soil, f) for f in list(soil.__dataclass_fields__)[:-1]), rock)
+    soil = dataclasses.replace(initial_soil(v_x), rock=rock)
     ctx = bare_context(
         dt=dt, contact=contact, normal=normal, soil=soil, geometry=nominal_geometry(rover_info(RADIUS + zero, zero))
     )
