@@ -1,0 +1,89 @@
+"""Soil that has been driven over: ruts and their compacted bottom, remembered at a fixed number of places."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from lunar_mjx.effects.base import Parameter, StateVariable, effect
+
+PLACES = 64
+"""Places that every wheel remembers; with the nominal spacing a track of 6.4 m."""
+
+_FRESH = 3
+"""Its own latest places, which lie under or just behind it, are no earlier pass for a wheel."""
+_NOWHERE = 1e6
+"""Where places lie that have not been visited yet, m from the origin."""
+_FAINT = 0.05
+"""Nearness, 1 on the place itself, at which the rut is half as deep as in the middle of the track."""
+
+
+def rut_under(ctx, p, x):
+    """What earlier passes left under each wheel.
+
+    Args:
+      ctx: wheel positions. p: spacing. x: places (place, wheel) with x, y and depth, m.
+
+    Returns:
+      Depth that earlier passes pressed the soil to, m, and how fully the wheel stands in a track (0 to 1), per wheel.
+    """
+    here_x, here_y = ctx.wheel_position.x[None, None, :], ctx.wheel_position.y[None, None, :]
+    squared = (x.place_x[:, :, None] - here_x) ** 2 + (x.place_y[:, :, None] - here_y) ** 2
+    near = jnp.maximum(1.0 - squared / (4.0 * p.spacing**2), 0.0)
+    near = near * near
+    places, wheels = x.depth.shape
+    own = jnp.eye(wheels, dtype=bool)[None] & (jnp.arange(places) < _FRESH)[:, None, None]
+    near = jnp.where(own, 0.0, near)
+    total = jnp.sum(near, axis=(0, 1))
+    return jnp.sum(near * x.depth[:, :, None], axis=(0, 1)) / (total + _FAINT), total / (total + _FAINT)
+
+
+def _remember(ctx, ground, p, x):
+    """Drops a place where the wheel is `spacing` away from its last one, and forgets the oldest."""
+    here, depth = ctx.wheel_position, ctx.contact.sinkage
+    gone = (here.x - x.place_x[0]) ** 2 + (here.y - x.place_y[0]) ** 2
+    drop = (gone > p.spacing**2) & (depth > 0.0) & (ground.rock < 0.5)
+
+    def push(old, new):
+        return jnp.where(drop, jnp.concatenate([new[None], old[:-1]]), old)
+
+    return {
+        "place_x": push(x.place_x, here.x),
+        "place_y": push(x.place_y, here.y),
+        "depth": push(x.depth, depth),
+    }
+
+
+def _place(axis: str) -> StateVariable:
+    return StateVariable(_NOWHERE, "m", f"{axis} of the places that the wheel has visited", slots=PLACES)
+
+
+@effect(
+    "soil",
+    order=20,
+    transient=True,
+    state={
+        "place_x": _place("x"),
+        "place_y": _place("y"),
+        "depth": StateVariable(0.0, "m", "sinkage of the wheel at those places", slots=PLACES),
+    },
+    plastic=Parameter(0.8, 0.0, (0.0, 0.95), "1", "share of the sinkage that remains when the wheel has passed",
+                      "choice: k_0 + A_u z_u of dry sand (Wong 2008, ch. 4) unloads almost vertically"),
+    spacing=Parameter(0.1, None, (0.02, 2.0), "m", "distance between remembered places",
+                      "choice: half a wheel's width, a track then being twice that to either side"),
+)  # fmt: skip
+def multipass(ctx, p, x, ground):
+    """Wheels that come later (the rear ones, or the same on another pass) roll in ruts of compacted soil.
+
+    A pass to depth z_u leaves a rut of depth e z_u; p = p_u - (k_0 + A_u z_u)(z_u - z) of Wong 2008 from there to z_u,
+    with k_0 + A_u z_u = p_u/((1 - e) z_u), is approximated by the soil's own law from the bottom of the rut, made
+    stiffer by (1 - e)^-n so that it meets p_u = k z_u^n at z_u again. Each wheel remembers the last 64 places (their
+    position and depth), and finds those of all wheels but the latest three of its own.
+    """
+    depth, inside = rut_under(ctx, p, x)
+    firm = 1.0 + inside * (jnp.power(1.0 - p.plastic, -ground.n) - 1.0)
+    rut = p.plastic * depth
+    rut = rut if ground.rut is None else jnp.maximum(rut, ground.rut)
+    soil = dataclasses.replace(ground, k_c=ground.k_c * firm, k_phi=ground.k_phi * firm, rut=rut)
+    return soil, _remember(ctx, ground, p, x)
