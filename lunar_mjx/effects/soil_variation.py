@@ -1,0 +1,131 @@
+"""Soil that varies with gravity, slope and place (port `soil`)."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.effects.base import Effect, Parameter, effect
+
+_EXPONENT = (-2.0, 2.0)
+
+
+@effect(
+    "soil",
+    order=-55,
+    stiffness=Parameter(1.0, 0.0, _EXPONENT, "1", "exponent of gravity in k_phi",
+                        "Reece 1965: gamma b k_phi; sinkage of one mass is the same at any g (Kobayashi et al. 2010)"),
+    cohesion=Parameter(0.5, 0.0, _EXPONENT, "1", "exponent of gravity in cohesion and k_c",
+                       "choice; soil that settled in less gravity is looser"),
+    reference=Parameter(9.80665, None, (0.1, 100.0), "m/s2", "gravity in which the soil's parameters were measured",
+                        "standard gravity of the Earth"),
+)  # fmt: skip
+def gravity_soil(ctx, p, x, ground):
+    """k_phi (g/g_ref)^a, and k_c and c times (g/g_ref)^b: gravity changes the soil, not only the weight upon it.
+
+    The frictional modulus of dry soil stands for gamma k'_phi with gamma = rho g (Reece 1965), whence a = 1: the same
+    mass sinks as deep in any gravity, and slips more in low gravity (Kobayashi et al. 2010; Wong & Kobayashi 2012).
+    """
+    ratio = jnp.maximum(ctx.gravity / p.reference, 1e-6)
+    firm, sticky = ratio**p.stiffness, ratio**p.cohesion
+    return dataclasses.replace(
+        ground, k_phi=ground.k_phi * firm, k_c=ground.k_c * sticky, cohesion=ground.cohesion * sticky
+    )
+
+
+@effect(
+    "soil",
+    order=-60,
+    stiffness=Parameter(0.5, 0.0, (-5.0, 5.0), "1", "loss of stiffness at the angle of repose, as a logarithm",
+                        "choice: 40 % less at repose"),
+    friction=Parameter(0.1, 0.0, (-5.0, 5.0), "1", "loss of friction at the angle of repose, as a logarithm",
+                       "choice: 10 % less at repose"),
+)  # fmt: skip
+def slope_stiffness(ctx, p, x, ground):
+    """k exp(-a m) and tan phi exp(-b m) with m = (tan alpha/tan phi)^2, the share of strength that the slope takes.
+
+    Soil near its angle of repose (alpha = phi, m = 1) has no shear strength left to bear a wheel, so that stiffness and
+    effective friction fall with the slope; even in the slope, hence smooth on flat ground. The form is a choice: the
+    literature gives bearing capacity factors on slopes (Meyerhof 1957), which fall likewise.
+    """
+    up = ctx.contact.normal
+    grade = (up.x * up.x + up.y * up.y) / (up.z * up.z)
+    taken = grade / jnp.maximum(ground.tan_phi, 0.05) ** 2
+    soft = jnp.exp(-p.stiffness * jnp.minimum(taken, 2.0))
+    return dataclasses.replace(
+        ground,
+        k_c=ground.k_c * soft,
+        k_phi=ground.k_phi * soft,
+        tan_phi=ground.tan_phi * jnp.exp(-p.friction * jnp.minimum(taken, 2.0)),
+    )
+
+
+PATCHES = 8
+"""Number of places at which `soil_patches` lets the soil differ."""
+
+
+def _patch_parameters() -> dict[str, Parameter]:
+    parameters = {}
+    for i in range(PATCHES):
+        # Nominal: one soft patch 3 m ahead of the origin.
+        parameters[f"amplitude_{i}"] = Parameter(
+            -0.7 if i == 2 else 0.0, 0.0, (-4.0, 4.0), "1", f"logarithm of the soil's stiffness factor at place {i}",
+            "choice: half as stiff at place 2")  # fmt: skip
+    for i in range(PATCHES):
+        where = f"of place {i}; see `places_along` for those of a track"
+        parameters[f"x_{i}"] = Parameter(1.5 * i, None, (-1e6, 1e6), "m", "x " + where, "choice: every 1.5 m along x")
+        parameters[f"y_{i}"] = Parameter(0.0, None, (-1e6, 1e6), "m", "y " + where, "choice: along x")
+    parameters["width"] = Parameter(1.0, None, (0.01, 1e4), "m", "standard deviation of a patch", "choice")
+    parameters["cohesive"] = Parameter(
+        0.5, None, (-2.0, 2.0), "1", "exponent by which cohesion follows the stiffness", "choice")  # fmt: skip
+    return parameters
+
+
+def _soil_patches(ctx, p: SimpleNamespace, x, ground):
+    place, values = ctx.wheel_position, vars(p)
+    total = jnp.zeros_like(ground.k_phi)
+    for i in range(PATCHES):
+        squared = (place.x - values[f"x_{i}"]) ** 2 + (place.y - values[f"y_{i}"]) ** 2
+        total = total + values[f"amplitude_{i}"] * jnp.exp(-0.5 * squared / p.width**2)
+    total = jnp.clip(total, -5.0, 5.0)
+    firm = jnp.exp(total)
+    return dataclasses.replace(
+        ground,
+        k_c=ground.k_c * firm,
+        k_phi=ground.k_phi * firm,
+        cohesion=ground.cohesion * jnp.exp(p.cohesive * total),
+    )
+
+
+soil_patches = Effect(
+    name="soil_patches",
+    ports={"soil": _soil_patches},
+    parameters=_patch_parameters(),
+    order=-65,
+    transient=True,
+    doc="""k exp(f) and c exp(q f) with f(x, y) = sum of a_i exp(-|x - x_i|^2/(2 w^2)): a smooth field of soil patches.
+
+    Radial basis functions at eight fixed places (a Gaussian random field of length w, seen at the places; Rasmussen &
+    Williams 2006, ch. 2); `places_along` puts them along the track of a log, where alone they can be told.""",
+)
+
+
+def places_along(x: np.ndarray, y: np.ndarray) -> dict[str, float]:
+    """Parameters of `soil_patches` that put its places evenly along a driven track.
+
+    Args:
+      x, y: (time,) positions of the rover in the order of driving, m.
+
+    Returns:
+      x_0 .. y_7 at equal distances along the track from its first to its last point, and a width of two thirds of the
+      distance between them, at least 0.05 m.
+    """
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    gone = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    at = np.linspace(0.0, gone[-1], PATCHES)
+    out = {f"x_{i}": float(np.interp(s, gone, x)) for i, s in enumerate(at)}
+    out |= {f"y_{i}": float(np.interp(s, gone, y)) for i, s in enumerate(at)}
+    return out | {"width": max(2.0 / 3.0 * float(gone[-1]) / (PATCHES - 1), 0.05)}
