@@ -57,6 +57,34 @@ def steering_toe(ctx, p, x, geometry):
 
 
 @effect(
+    "geometry",
+    transient=True,
+    state={"distance": StateVariable(0.0, "m", "distance rolled by the rim since reset", rate=True)},
+    wear=Parameter(1e-4, 0.0, (-1e-2, 1e-2), "1", "radius lost per distance rolled; negative where soil cakes",
+                   "choice: caking and packing, 0.1 mm per m; abrasion alone is a thousand times slower"),
+)  # fmt: skip
+def wheel_wear(ctx, p, x, geometry):
+    """r(d) = r_0 - w d with d the distance rolled: wheels that wear, or grow as soil cakes on them (Archard 1953)."""
+    rolled = geometry.radius * jnp.abs(ctx.wheel_angular_velocity.dot(ctx.wheel_axle))
+    worn = jnp.maximum(geometry.radius - p.wear * x.distance, 0.5 * geometry.radius)
+    return dataclasses.replace(geometry, radius=worn), {"distance": rolled}
+
+
+@effect(
+    "geometry",
+    relative=Parameter(0.02, 0.0, (-0.5, 0.5), "1", "gravity beyond the stated one, relative to it",
+                       "choice: order of an accelerometer's scale error"),
+)  # fmt: skip
+def gravity_error(ctx, p, x, geometry):
+    """g (1 + epsilon) on every body of the rover, and in the weight of the soil that it pushes.
+
+    Stands for an error in the stated value, or of the slope's reference to first order (Newton's second law).
+    """
+    stated = ctx.gravity if geometry.gravity is None else geometry.gravity
+    return dataclasses.replace(geometry, gravity=stated * (1.0 + p.relative))
+
+
+@effect(
     "body_wrench",
     state={"angle": StateVariable(0.0, "rad", "angle at which the brake caught the wheel", axis="joint")},
     engaged=Parameter(1.0, 0.0, (0.0, 1.0), "1", "1: brake set; 0: released", "command"),
@@ -72,3 +100,30 @@ def parking_brake(ctx, p, x, wrench):
     hold = p.stiffness * (angle - ctx.joint_angle) - p.damping * ctx.joint_speed
     torque = wrench.joint_torque + jnp.where(held, hold, 0.0)
     return dataclasses.replace(wrench, joint_torque=torque), {"angle": angle}
+
+
+def _hitch(axis: str) -> Parameter:
+    return Parameter(0.0, None, (-10.0, 10.0), "m", f"{axis} of the hitch in the chassis frame", _HERE)
+
+
+def _pull(axis: str, nominal: float) -> Parameter:
+    return Parameter(
+        nominal, 0.0, (-1e5, 1e5), "N", f"pull on the chassis along world {axis}", "choice: a drawbar test at a few kg"
+    )
+
+
+@effect(
+    "body_wrench",
+    force_x=_pull("x", -50.0),
+    force_y=_pull("y", 0.0),
+    force_z=_pull("z", 0.0),
+    x=_hitch("x"),
+    y=_hitch("y"),
+    z=_hitch("z"),
+)
+def tether(ctx, p, x, wrench):
+    """A constant force F at the hitch, moment r x F: a long tether for drawbar tests (d'Alembert's equivalence)."""
+    nil = jnp.zeros_like(ctx.position.x)
+    force = Vec3(p.force_x + nil, p.force_y + nil, p.force_z + nil)
+    arm = ctx.frame.to_world(Vec3(p.x, p.y, p.z))
+    return dataclasses.replace(wrench, force=wrench.force + force, moment=wrench.moment + arm.cross(force))
