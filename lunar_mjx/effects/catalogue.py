@@ -7,7 +7,24 @@ import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from lunar_mjx.effects import chassis, paper, rock, sensors, soil, stress_integral, thermal, wheel
+from lunar_mjx.effects import (
+    bulldozing,
+    chassis,
+    contact_angles,
+    friction_circle,
+    grousers,
+    multipass,
+    paper,
+    rock,
+    sensors,
+    slip_sinkage,
+    soil,
+    soil_variation,
+    stress_integral,
+    suspension,
+    thermal,
+    wheel,
+)
 from lunar_mjx.effects import motor as motor_module
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError, require_file
@@ -42,6 +59,24 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         chassis.wheel_radius_error,
         chassis.steering_toe,
         chassis.parking_brake,
+        chassis.wheel_wear,
+        chassis.gravity_error,
+        chassis.tether,
+        slip_sinkage.slip_sinkage,
+        slip_sinkage.angle_sinkage,
+        soil_variation.gravity_soil,
+        soil_variation.slope_stiffness,
+        soil_variation.soil_patches,
+        multipass.multipass,
+        contact_angles.exit_angle,
+        contact_angles.dynamic_sinkage,
+        friction_circle.friction_circle,
+        grousers.grousers,
+        grousers.grouser_pulsation,
+        bulldozing.bulldozing,
+        bulldozing.rolling_resistance,
+        suspension.suspension_friction,
+        suspension.dust_charging,
         thermal.winding_conduction,
         thermal.rotor_stator_path,
         thermal.housing_convection,
