@@ -206,7 +206,17 @@ def _check_soil(model: Model, source: str) -> None:
                         "give a larger k_c or k_phi, or a rover with wider wheels")  # fmt: skip
 
 
-READS_MOTOR = ("joint_control", "winding_conduction", "rotor_stator_path")
+READS_MOTOR = (
+    "joint_control",
+    "winding_conduction",
+    "rotor_stator_path",
+    "iron_loss",
+    "gear_friction_heat",
+    "magnet_nonlinearity",
+    "directional_gear_efficiency",
+    "backlash",
+    "voltage_saturation",
+)
 """Effects that read the parameters of the effect `motor`."""
 
 

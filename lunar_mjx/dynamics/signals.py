@@ -72,7 +72,7 @@ def observe(
     Returns:
       Channels of shape (time,) or (batch, time), named as in a log.
     """
-    gravity = jnp.asarray(system.params.gravity if params is None else params.gravity)
+    gravity = _felt_gravity(system.model.effects, system.params if params is None else params)
     gravity = gravity[..., None] if gravity.ndim else gravity
     corners = [w.corner for w in system.model.rover.wheels]
     seen = telemetry
@@ -123,6 +123,14 @@ def _entries(out: dict[str, Any], values: dict[str, Any], names: Sequence[str]) 
 def _body_frame(quaternion: Float[AnyArray, "*batch time 4"]) -> Frame:
     columns = rotation([quaternion[..., i] for i in range(4)])
     return Frame(*(Vec3(c.x, c.y, c.z) for c in columns))
+
+
+def _felt_gravity(effects: Sequence[Effect], params: Params) -> Any:
+    """Gravity after the effects at the port `geometry` that change it, m/s2."""
+    gravity = jnp.asarray(params.gravity)
+    if any(e.name == "gravity_error" for e in effects):
+        gravity = gravity * (1.0 + params.effects["gravity_error"]["relative"])
+    return gravity
 
 
 def _specific_force(seen: Telemetry, body: Frame, gravity: Any, lever: Sequence[float] | None) -> Vec3:

@@ -18,7 +18,7 @@ from lunar_mjx.dynamics.kinematics import Kinematics, chassis_boxes
 from lunar_mjx.dynamics.ports import Pipeline, apply_effects
 from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperature
 from lunar_mjx.effects.context import Context, Heat, RoverInfo
-from lunar_mjx.effects.motor import MODES, REFERENCE_TEMPERATURE, torque_constant, winding_resistance
+from lunar_mjx.effects.motor import MODES, REFERENCE_TEMPERATURE, constant_at, winding_resistance
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import sample
@@ -284,7 +284,7 @@ def _telemetry(ctx: Context, k: Kinematics, heat: Heat) -> Telemetry:
     else:
         current = ctx.command.current
         resistance = winding_resistance(motor, ctx.winding_temperature)
-        back_emf = torque_constant(motor, ctx.winding_temperature) * motor.gear_ratio * ctx.joint_speed
+        back_emf = constant_at(ctx.parameters, ctx.winding_temperature) * motor.gear_ratio * ctx.joint_speed
         voltage, joule = current * resistance + back_emf, current**2 * resistance
     return Telemetry(
         time=ctx.time,

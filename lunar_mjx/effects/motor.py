@@ -31,7 +31,7 @@ MODE_UNITS = ("rad", "rad/s", "N m", "A")
 _MAXON = "maxon ECX TORQUE 22 XL, 48 V winding"
 
 
-def _torque_per_ampere(motor) -> jnp.ndarray:
+def torque_per_ampere(motor) -> jnp.ndarray:
     """N m at the joint per ampere at 25 degC."""
     return motor.gear_ratio * motor.gear_efficiency * motor.torque_constant
 
@@ -54,7 +54,7 @@ def joint_control(ctx, p, x, command):
     position = rover.position_gain * (target - ctx.joint_angle) - rover.velocity_gain * ctx.joint_speed
     velocity = rover.velocity_gain * (target - ctx.joint_speed)
     torque = jnp.where(mode == POSITION, position, jnp.where(mode == VELOCITY, velocity, target))
-    current = jnp.where(mode == CURRENT, target, torque / _torque_per_ampere(motor))
+    current = jnp.where(mode == CURRENT, target, torque / torque_per_ampere(motor))
     return dataclasses.replace(command, current=jnp.clip(current, -p.current_limit, p.current_limit))
 
 
@@ -105,6 +105,34 @@ def _motor_heat(ctx, p, x, heat):
         winding_capacity=p.winding_capacity * one,
         housing_capacity=p.housing_capacity * one,
     )
+
+
+@effect(
+    "motor_torque",
+    order=1,
+    beta_2=Parameter(
+        -2e-6, 0.0, (-1.2e-5, 1.2e-5), "1/K2", "quadratic temperature coefficient of the magnet",
+        "choice: NdFeB loses 2 % more than linearly at 125 degC",
+    ),
+)  # fmt: skip
+def magnet_nonlinearity(ctx, p, x, torque):
+    """K = K_0 (1 + beta dT + beta_2 dT^2), dT = T_R - 25 degC, in torque and back-EMF.
+
+    Reversible: lasting demagnetisation is left out.
+    """
+    parameters = ctx.parameters["motor"]
+    return torque + torque_per_ampere(parameters) * _quadratic(p, ctx.winding_temperature) * ctx.command.current
+
+
+def _quadratic(p, temperature):
+    return p.beta_2 * (temperature - REFERENCE_TEMPERATURE) ** 2
+
+
+def constant_at(parameters, temperature):
+    """The torque constant K at a winding temperature, N m/A, with magnet_nonlinearity where it is in the list."""
+    motor, magnet = parameters["motor"], parameters.get("magnet_nonlinearity")
+    linear = torque_constant(motor, temperature)
+    return linear if magnet is None else linear + motor.torque_constant * _quadratic(magnet, temperature)
 
 
 motor = Effect(
