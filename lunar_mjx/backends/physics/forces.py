@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -178,6 +179,10 @@ class ForceModel:
             function(c, p)
         if "shear" in hooks:
             c.wheel = hooks.call("shear", c, c.wheel)
+
+    def shear_functions(self) -> tuple[tuple[Callable, Any], ...]:
+        """The model's effects on the wheel force, in order, with their parameters."""
+        return self._shear
 
     def wheel_world(self, c: Context) -> tuple[np.ndarray, np.ndarray]:
         """Force and moment on the wheels in world coordinates, (rover, wheel, 3)."""
