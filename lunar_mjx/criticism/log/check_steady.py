@@ -1,0 +1,172 @@
+"""Checks of steady-state tables: copied rows, replicates against the stated noise, the sign of what a wheel does."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from lunar_mjx.criticism.log.check_noise import FACTOR
+from lunar_mjx.criticism.log.check_values import CHANCE
+from lunar_mjx.criticism.log.findings import WARNING, Finding
+from lunar_mjx.criticism.log.log import SteadyLog
+from lunar_mjx.criticism.log.schema import STEADY_CHANNELS
+from lunar_mjx.criticism.table import QUANTITIES, replicate_groups
+
+
+def check_steady(log: SteadyLog) -> list[Finding]:
+    """Findings beyond what reading found."""
+    if len(log.table) == 0:
+        return [Finding(log.name, "", None, "", "dropout", "holds no usable row; see the other findings, or fill it")]
+    found = _copies(log) + _ranges(log) + _signs(log)
+    return found + (_replicates(log) if not found else [])
+
+
+def _finding(
+    log: SteadyLog, row: int | None, column: str, kind: str, message: str, severity: str = "bad_data"
+) -> Finding:
+    number = int(log.rows[row]) if row is not None and len(log.rows) else row
+    return Finding(log.name, "", number, column, kind, message, severity)
+
+
+def _columns(log: SteadyLog) -> dict[str, np.ndarray]:
+    return {**log.table.test, **{QUANTITIES[q][0]: v for q, v in log.table.measured.items()}}
+
+
+def _copies(log: SteadyLog) -> list[Finding]:
+    """Rows whose measured values all occur again: no bed measures the same to the last digit twice."""
+    measured = np.column_stack(list(log.table.measured.values()))
+    if measured.shape[1] < 2:  # one quantity with few digits repeats by chance
+        measured = np.column_stack([measured, *log.table.test.values()])
+    _, first, count = np.unique(measured, axis=0, return_index=True, return_counts=True)
+    trivial = np.all(measured[first] == 0.0, axis=1)
+    if not ((count > 1) & ~trivial).any():
+        return []
+    original = int(first[np.argmax((count > 1) & ~trivial)])
+    copy = int(np.flatnonzero((measured == measured[original]).all(axis=1))[1])
+    line = int(log.rows[original]) + 2 if len(log.rows) else original + 2
+    return [_finding(log, copy, "", "copy", f"holds the same measurements as line {line}; remove the copy")]
+
+
+def _ranges(log: SteadyLog) -> list[Finding]:
+    found = []
+    for column, values in _columns(log).items():
+        _, low, high = STEADY_CHANNELS[column]
+        beyond = (values < low) | (values > high)
+        if beyond.any():
+            row = int(np.argmax(beyond))
+            found.append(
+                _finding(
+                    log, row, column, "range", f"is {values[row]:.5g}, outside [{low:g}, {high:g}]; check its unit"
+                )
+            )
+    load = log.table.test["normal_load_N"]
+    for quantity in ("drawbar_pull", "side_force"):
+        values = log.table.measured.get(quantity)
+        if values is not None and np.median(np.abs(values)) > 3.0 * np.median(load):
+            found.append(
+                _finding(
+                    log,
+                    None,
+                    QUANTITIES[quantity][0],
+                    "unit",
+                    f"is {np.median(np.abs(values)):.3g} N "
+                    "at the "
+                    f"median under a load of {np.median(load):.3g} N: no soil bears that; check both "
+                    "units",
+                )
+            )
+    sinkage = log.table.measured.get("sinkage")
+    if sinkage is not None and np.median(sinkage) > 2.0 * log.table.radius:
+        found.append(
+            _finding(
+                log,
+                None,
+                "sinkage_m",
+                "unit",
+                f"is {np.median(sinkage):.3g} m at the median, more than the wheel's diameter; check its unit",
+            )
+        )
+    return found
+
+
+def _signs(log: SteadyLog) -> list[Finding]:
+    """Pull and torque grow with slip; a wheel sinks downwards; both by rank over the whole table."""
+    found = []
+    slip = log.table.test["slip_ratio"]
+    for quantity in ("drawbar_pull", "driving_torque"):
+        values = log.table.measured.get(quantity)
+        if values is None or len(values) < 8 or np.ptp(slip) < 0.3:
+            continue
+        rank = float(stats.spearmanr(slip, values).statistic)
+        noise = log.table.sigma.get(quantity, 0.0)
+        if rank < -0.7 and np.ptp(values) > 10.0 * noise:
+            found.append(
+                _finding(
+                    log,
+                    None,
+                    QUANTITIES[quantity][0],
+                    "frame",
+                    "falls with slip (rank correlation "
+                    f"{rank:.2f})"
+                    ": its sign, or that of the slip ratio, is reversed; a driving wheel pulls forward",
+                )
+            )
+    sinkage = log.table.measured.get("sinkage")
+    if sinkage is not None and np.median(sinkage) < -5.0 * log.table.sigma.get("sinkage", 1e-4):
+        found.append(
+            _finding(
+                log,
+                None,
+                "sinkage_m",
+                "frame",
+                f"is {np.median(sinkage):.3g} m at the median; sinkage counts downwards",
+            )
+        )
+    return found
+
+
+def _replicates(log: SteadyLog) -> list[Finding]:
+    """The scatter of replicates against the stated noise, pooled over the points, by chi-square."""
+    group = replicate_groups(log.table)
+    count = np.bincount(group)
+    freedom = int((count - 1).sum())
+    found: list[Finding] = []
+    if freedom < 3:
+        return found
+    for quantity, values in log.table.measured.items():
+        column = QUANTITIES[quantity][0]
+        row_std = log.row_std.get(column)
+        stated = row_std if row_std is not None else np.full(len(values), log.table.sigma.get(quantity, np.nan))
+        if not np.isfinite(stated).all() or not (stated > 0.0).all():
+            continue
+        mean = np.bincount(group, weights=values) / count
+        residual = (values - mean[group]) / stated
+        # a correction for unequal stated noise within a group would change this by less than the factor allows
+        statistic = float(residual @ residual)
+        ratio = float(np.sqrt(statistic / freedom))
+        high, low = stats.chi2.sf(statistic, freedom) < CHANCE, stats.chi2.cdf(statistic, freedom) < CHANCE
+        if (ratio > FACTOR and high) or (ratio < 1.0 / FACTOR and low):
+            worst = int(np.argmax(np.abs(residual))) if ratio > 1.0 else None
+            found.append(
+                _finding(
+                    log,
+                    worst,
+                    column,
+                    "noise",
+                    f"its replicates scatter {ratio:.3g} times as much as "
+                    "the "
+                    f"stated noise ({freedom} degrees of freedom); state what the replicates show",
+                )
+            )
+        elif high and ratio > 1.3:
+            found.append(
+                _finding(
+                    log,
+                    None,
+                    column,
+                    "noise",
+                    f"its replicates scatter {ratio:.3g} times as much as the stated noise",
+                    WARNING,
+                )
+            )
+    return found
