@@ -72,7 +72,7 @@ class NavigationConfig:
     place_seed: int = 0
     steepest: float = np.radians(20.0)
     randomise: tuple[Range, ...] = ()
-    kalman: KalmanConfig = KalmanConfig()
+    kalman: KalmanConfig = dataclasses.field(default_factory=KalmanConfig)
     divergence: str = "stop"
 
     def __post_init__(self) -> None:

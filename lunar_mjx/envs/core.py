@@ -26,8 +26,8 @@ class State:
       terminated: the task ended: nothing follows, no value is left.
       truncated: the episode was cut off although the task goes on: the value of `final_obs` still counts.
       final_obs, final_privileged: the true successors, before any reset.
-      metrics: numbers of the step for logs, by name; `episode_return`, `episode_length` and `success` hold those of
-        the episode that ended, and mean something only where `done`.
+      metrics: numbers for logs, by name: `episode_return`, `episode_length`, `success` and others of the episode, which
+        mean something only where `done`; and, where the name begins with `reward_`, parts of the step's reward.
       info: what scripted agents and viewers read.
       inner: the environment's own state.
     """

@@ -146,7 +146,13 @@ class NavigationEnv:
         view = self._view(inner)
         obs, privileged = self._observe(params, inner, view)
         zero, no = jnp.zeros(keys.shape[0], obs.dtype), jnp.zeros(keys.shape[0], bool)
-        names = ("episode_return", "episode_length", "success", *ENDS[1:], *self.config.weights)
+        names = (
+            "episode_return",
+            "episode_length",
+            "success",
+            *ENDS[1:],
+            *(f"reward_{n}" for n in self.config.weights),
+        )
         metrics = dict.fromkeys(names, zero)
         return State(obs, privileged, zero, no, no, obs, privileged, metrics, self._info(view), inner)
 
@@ -176,7 +182,7 @@ class NavigationEnv:
             "episode_length": inner.steps.astype(reward.dtype),
             "success": success.astype(reward.dtype),
             **{name: ends[name].astype(reward.dtype) for name in ENDS[1:]},
-            **terms,
+            **{f"reward_{name}": value for name, value in terms.items()},
         }
         final_obs, final_privileged = self._observe(params, inner, view)
         if c.divergence == "reset":

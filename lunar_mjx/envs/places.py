@@ -1,4 +1,4 @@
-"""Where rovers start and where they are sent: pairs of places on a terrain, drawn once on the host and checked there."""
+"""Where rovers start and where they are sent: pairs of places on a terrain, drawn and checked once on the host."""
 
 from __future__ import annotations
 

@@ -1,0 +1,121 @@
+"""How often an agent succeeds: one episode per environment, with the interval that the number of episodes allows."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.envs.core import Environment, split_keys
+from lunar_mjx.envs.scripted import Agent
+
+_PIECE = 50
+_Z = 1.959963984540054
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """Result of an evaluation.
+
+    Attributes:
+      episodes: how many. success: share that reached the goal. low, high: its 95 % Wilson interval.
+      episode_return: mean; return_deviation: standard deviation. episode_time: mean, s.
+      ends: share of every way in which episodes ended, those cut off as `time`.
+    """
+
+    episodes: int
+    success: float
+    low: float
+    high: float
+    episode_return: float
+    return_deviation: float
+    episode_time: float
+    ends: dict[str, float]
+
+    def record(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return dataclasses.asdict(self)
+
+
+def wilson(successes: float, count: int) -> tuple[float, float]:
+    """95 % interval of a share (Wilson 1927)."""
+    share, z2 = successes / count, _Z * _Z
+    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
+    half = _Z / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+class Evaluator:
+    """Scores agents in an environment; compiled once for all parameters and states of an agent.
+
+    Args:
+      env: the environment.
+      agent: function of (agent's parameters, state, key) to actions.
+      episodes: scored, one per environment: the first of each, so that short episodes do not count twice.
+    """
+
+    def __init__(self, env: Environment, agent: Any, episodes: int):
+        self.env, self.episodes = env, episodes
+        self._reset = jax.jit(lambda params, key: env.reset(params, split_keys(key, episodes)))
+
+        def piece(params: Any, agent_params: Any, carry: Any, key: Any) -> Any:
+            def step(carry: Any, key: Any) -> Any:
+                state, over, result = carry
+                state = env.step(params, state, agent(agent_params, state, key))
+                first = state.done & ~over
+                seen = {k: v for k, v in state.metrics.items() if not k.startswith("reward_")}
+                result = jax.tree.map(lambda old, new: jnp.where(first, new, old), result, seen)
+                return (state, over | state.done, result), None
+
+            return jax.lax.scan(step, carry, jax.random.split(key, _PIECE))[0]
+
+        self._piece = jax.jit(piece)
+
+    def __call__(self, env_params: Any, agent_params: Any, seed: int) -> Score:
+        """Plays the episodes.
+
+        Args:
+          env_params: of the environment: other terrain, places and ranges than in training.
+          agent_params: of the agent.
+          seed: of places, soils and random agents.
+        """
+        key_reset, key = jax.random.split(jax.random.PRNGKey(seed))
+        state = self._reset(env_params, key_reset)
+        zero = jnp.zeros(self.episodes)
+        seen = {k: zero for k in state.metrics if not k.startswith("reward_")}
+        carry = (state, jnp.zeros(self.episodes, bool), seen)
+        for i in range(math.ceil(self.env.episode_steps / _PIECE)):
+            carry = self._piece(env_params, agent_params, carry, jax.random.fold_in(key, i))
+            if bool(carry[1].all()):
+                break
+        result = jax.device_get(carry[2])
+        return _score(result, self.env.control_interval)
+
+
+def _score(result: dict[str, np.ndarray], interval: float) -> Score:
+    success, returns = result["success"], result["episode_return"]
+    count = len(success)
+    low, high = wilson(float(success.sum()), count)
+    ends = {k: float(v.mean()) for k, v in result.items() if k not in ("episode_return", "episode_length", "success")}
+    return Score(
+        episodes=count,
+        success=float(success.mean()),
+        low=low,
+        high=high,
+        episode_return=float(returns.mean()),
+        return_deviation=float(returns.std()),
+        episode_time=float(result["episode_length"].mean()) * interval,
+        ends={"success": float(success.mean()), **ends,
+              "time": max(0.0, 1.0 - float(success.mean()) - sum(ends.values()))},
+    )  # fmt: skip
+
+
+def evaluate(env: Environment, agent: Agent, episodes: int, seed: int, env_params: Any = None) -> Score:
+    """Scores an agent that has no parameters, such as those of `make_agent`."""
+    return Evaluator(env, lambda _, state, key: agent(state, key), episodes)(
+        env.params if env_params is None else env_params, (), seed
+    )

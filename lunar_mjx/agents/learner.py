@@ -1,0 +1,281 @@
+"""One epoch of off-policy training as a pure function: act, store, learn, many times over, on one or many devices.
+
+The whole state of a training is one pytree. Every device runs its own share of the environments and of each batch;
+parameters are the same everywhere, because gradients and observation statistics are averaged over the mesh.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as Spec
+
+from lunar_mjx._quiet import without_warp_notices
+from lunar_mjx.agents import guard
+from lunar_mjx.agents.ddpg import DDPG, DDPGConfig
+from lunar_mjx.agents.replay import Batch, ReplayBuffer, ReplayState, Transition
+from lunar_mjx.agents.td3 import TD3, TD3Config
+from lunar_mjx.envs.core import Environment, State
+from lunar_mjx.errors import bad_input
+from lunar_mjx.pytree import pytree
+
+with without_warp_notices():
+    from brax.training.acme import running_statistics
+
+AXIS = "device"
+EPISODE = ("episode_return", "episode_length", "success")
+"""Metrics that every environment gives for episodes that ended."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """How an agent is trained; the algorithm's own settings are in `algorithm`.
+
+    Attributes:
+      algorithm: `TD3Config` or `DDPGConfig`, which also chooses the algorithm.
+      envs: environments, over all devices.
+      batch: transitions per update, over all devices.
+      updates: updates per step of all environments.
+      buffer_steps: steps kept per environment.
+      random_steps: steps of each environment with random actions before the policy acts and learns.
+      noise: least and greatest deviation of the exploration noise, spread evenly over the environments (PQL's mixed
+        exploration); equal for one deviation.
+      normalise: normalise observations by their running mean and deviation.
+      epoch_steps: steps of each environment per jitted epoch.
+      episodes: report every episode that ends, for curves by episode; only for few environments.
+    """
+
+    algorithm: TD3Config | DDPGConfig
+    envs: int = 1
+    batch: int = 256
+    updates: int = 1
+    buffer_steps: int = 1_000_000
+    random_steps: int = 100
+    noise: tuple[float, float] = (0.3, 0.3)
+    normalise: bool = False
+    epoch_steps: int = 1000
+    episodes: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("envs", "batch", "updates", "buffer_steps", "epoch_steps"):
+            if getattr(self, name) < 1:
+                raise bad_input("TrainConfig", name, getattr(self, name), "is below 1", "give at least 1")
+        if not 0.0 <= self.noise[0] <= self.noise[1]:
+            raise bad_input("TrainConfig", "noise", self.noise, "is no range of deviations", "give (least, greatest)")
+        if self.random_steps < self.algorithm.n_step:
+            raise bad_input("TrainConfig", "random_steps", self.random_steps,
+                            f"is below n_step = {self.algorithm.n_step}", "raise it")  # fmt: skip
+
+
+@pytree
+class TrainState:
+    """Everything that a training needs to go on; `iterations` counts steps of every environment.
+
+    Of one copy on every device: agent, statistics, iterations. Of one share on every device: the rest.
+    """
+
+    agent: Any
+    statistics: Any
+    iterations: Any
+    env: State
+    buffer: ReplayState
+    noise: Any
+    key: Any
+    guard: guard.Guard
+
+
+class Learner:
+    """Training of one algorithm in one environment over a mesh of devices.
+
+    Args:
+      env: the environment.
+      config: how to train.
+      mesh: devices along the axis `AXIS`; all devices of all processes if None.
+
+    Raises:
+      UserError: environments or batch that do not divide among the devices.
+    """
+
+    def __init__(self, env: Environment, config: TrainConfig, mesh: Mesh | None = None):
+        self.env, self.config = env, config
+        self.mesh = mesh or jax.make_mesh((jax.device_count(),), (AXIS,))
+        self.devices = self.mesh.size
+        for name in ("envs", "batch"):
+            if getattr(config, name) % self.devices:
+                raise bad_input("TrainConfig", name, getattr(config, name),
+                                f"does not divide among {self.devices} devices", "give a multiple")  # fmt: skip
+        algorithm = config.algorithm
+        kind = TD3 if isinstance(algorithm, TD3Config) else DDPG
+        self.agent = kind(algorithm, env.observation_size, env.privileged_size, env.action_size)  # type: ignore[arg-type]
+        self.buffer = ReplayBuffer(config.buffer_steps, algorithm.n_step, algorithm.gamma)
+        shared, own = Spec(), Spec(AXIS)
+        self.specs = TrainState(shared, shared, shared, own, ReplayState(own, shared, shared), own, own, own)  # type: ignore[arg-type]
+        self._init = self._over_devices(self._init_share, (shared,), self.specs)
+        reports = (shared, own) if config.episodes else (shared, shared)
+        self._epoch = self._over_devices(self._epoch_share, (shared, self.specs), (self.specs, reports), donate=(1,))
+
+    def _over_devices(self, function: Any, ins: Any, outs: Any, donate: tuple[int, ...] = ()) -> Any:
+        mapped = jax.shard_map(function, mesh=self.mesh, in_specs=ins, out_specs=outs, check_vma=False)
+        return jax.jit(mapped, donate_argnums=donate)
+
+    def init(self, seed: int) -> TrainState:
+        """The state before the first step."""
+        return self._init(jax.random.PRNGKey(seed))
+
+    def epoch(self, env_params: Any, state: TrainState) -> tuple[TrainState, Any]:
+        """Runs `epoch_steps` steps of every environment, and their updates; `state` is used up.
+
+        Returns:
+          The state after, and a pair: numbers of the epoch by name, and per step and environment (or nothing) whether
+          an episode ended, its return, length and success.
+        """
+        return self._epoch(env_params, state)
+
+    def shardings(self, state: Any) -> Any:
+        """Where every leaf of a state like `state` lives."""
+        prefix = jax.tree.map(lambda s: NamedSharding(self.mesh, s), self.specs, is_leaf=lambda s: isinstance(s, Spec))
+        return jax.tree.broadcast(prefix, state, is_leaf=lambda s: isinstance(s, NamedSharding))
+
+    def abstract(self) -> TrainState:
+        """Shapes, types and shardings of a state, without making one."""
+        shapes = jax.eval_shape(self._init, jax.random.PRNGKey(0))
+        return jax.tree.map(
+            lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), shapes, self.shardings(shapes)
+        )
+
+    def policy(self, state: TrainState) -> tuple[Any, Any]:
+        """What acting needs: the actor's parameters, and mean and deviation of observations (or None)."""
+        statistics = state.statistics
+        return state.agent.actor, (statistics.mean["obs"], statistics.std["obs"]) if self.config.normalise else None
+
+    # What runs on every device, over its share of the environments.
+
+    def _init_share(self, key: Any) -> TrainState:
+        c, mine = self.config, self.config.envs // self.devices
+        key_agent, key_env, key_run = jax.random.split(key, 3)
+        rank = jax.lax.axis_index(AXIS)
+        env = self.env.reset(self.env.params, jax.random.split(jax.random.fold_in(key_env, rank), mine))
+        action = jnp.zeros((mine, self.env.action_size), env.obs.dtype)
+        example = _transition(env, action, env)
+        widths = {"obs": env.obs[0], "privileged": env.privileged[0]}
+        return TrainState(
+            agent=self.agent.init(key_agent),
+            statistics=jax.tree.map(jnp.asarray, running_statistics.init_state(widths)),
+            iterations=jnp.zeros((), jnp.int32),
+            env=env,
+            buffer=self.buffer.init(example),
+            noise=jnp.linspace(c.noise[0], c.noise[1], mine),
+            key=jax.random.fold_in(key_run, rank)[None],
+            guard=guard.start(env, action),
+        )
+
+    def _epoch_share(self, params: Any, state: TrainState) -> tuple[TrainState, Any]:
+        def iteration(state: TrainState, _: Any) -> tuple[TrainState, Any]:
+            state, seen = self._collect(params, state)
+            state, losses = self._learn(state)
+            return state, (seen, losses)
+
+        state, (seen, losses) = jax.lax.scan(iteration, state, length=self.config.epoch_steps)
+        numbers = self._summary(state, seen, losses)
+        if not self.config.episodes:
+            return state, (numbers, {})
+        return state, (numbers, {name: seen[name].T for name in (*EPISODE, "done")})
+
+    def _collect(self, params: Any, state: TrainState) -> tuple[TrainState, Any]:
+        """One step of every environment, stored."""
+        c = self.config
+        key, key_noise = jax.random.split(state.key[0])
+        obs = self._normalised(state.statistics, state.env.obs, "obs")
+        noise = jax.random.normal(key_noise, (obs.shape[0], self.env.action_size), obs.dtype)
+        action = jnp.clip(self.agent.act(state.agent.actor, obs) + state.noise[:, None] * noise, -1.0, 1.0)
+        blind = jax.random.uniform(jax.random.fold_in(key_noise, 1), action.shape, action.dtype, -1.0, 1.0)
+        action = jnp.where(state.iterations < c.random_steps, blind, action)
+        env = self.env.step(params, state.env, action)
+        statistics = state.statistics
+        if c.normalise:
+            statistics = running_statistics.update(
+                statistics, {"obs": env.final_obs, "privileged": env.final_privileged}, pmap_axis_name=AXIS
+            )
+        new = dataclasses.replace(
+            state,
+            env=env,
+            statistics=statistics,
+            buffer=self.buffer.insert(state.buffer, _transition(state.env, action, env)),
+            key=key[None],
+            iterations=state.iterations + 1,
+            guard=guard.watch(state.guard, state.env, action, env, state.iterations),
+        )
+        return new, self._seen(env)
+
+    def _seen(self, env: State) -> dict[str, Any]:
+        """Of a step, what the reports need: sums over episodes that ended, means over steps for `reward_` terms."""
+        ended = {k: jnp.sum(jnp.where(env.done, v, 0.0)) for k, v in env.metrics.items() if not k.startswith("reward_")}
+        means = {k: jnp.mean(v) for k, v in env.metrics.items() if k.startswith("reward_")}
+        seen = {"ended": ended, "count": jnp.sum(env.done), "means": {**means, "reward": jnp.mean(env.reward)}}
+        if self.config.episodes:
+            seen |= {name: env.metrics[name] for name in EPISODE} | {"done": env.done}
+        return seen
+
+    def _learn(self, state: TrainState) -> tuple[TrainState, dict[str, Any]]:
+        """The updates that follow a step."""
+        c = self.config
+
+        def once(carry: Any, _: Any) -> Any:
+            agent, key = carry
+            key, key_sample, key_update = jax.random.split(key, 3)
+            batch = self.buffer.sample(state.buffer, key_sample, c.batch // self.devices)
+            agent, losses = self.agent.update(agent, self._normalised_batch(state.statistics, batch), key_update, AXIS)
+            return (agent, key), losses
+
+        def learn(agent: Any) -> Any:
+            (agent, _), losses = jax.lax.scan(once, (agent, jax.random.fold_in(state.key[0], 1)), length=c.updates)
+            return agent, jax.tree.map(jnp.mean, losses)
+
+        def wait(agent: Any) -> Any:
+            return agent, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(learn, agent)[1])
+
+        agent, losses = jax.lax.cond(state.iterations >= c.random_steps, learn, wait, state.agent)
+        return dataclasses.replace(state, agent=agent), losses
+
+    def _normalised(self, statistics: Any, values: Any, name: str) -> Any:
+        if not self.config.normalise:
+            return values
+        return normalised(values, statistics.mean[name], statistics.std[name])
+
+    def _normalised_batch(self, statistics: Any, batch: Batch) -> Batch:
+        return dataclasses.replace(
+            batch,
+            obs=self._normalised(statistics, batch.obs, "obs"),
+            privileged=self._normalised(statistics, batch.privileged, "privileged"),
+            next_obs=self._normalised(statistics, batch.next_obs, "obs"),
+            next_privileged=self._normalised(statistics, batch.next_privileged, "privileged"),
+        )
+
+    def _summary(self, state: TrainState, seen: Any, losses: Any) -> dict[str, Any]:
+        """Numbers of an epoch, the same on every device; means of ended episodes are nan where none ended."""
+        ended, count = jax.lax.psum(jax.tree.map(jnp.sum, (seen["ended"], seen["count"])), AXIS)
+        numbers = {k: jnp.where(count > 0, v / jnp.maximum(count, 1), jnp.nan) for k, v in ended.items()}
+        rest = jax.tree.map(jnp.mean, {**seen["means"], **losses})
+        return {
+            **numbers,
+            **jax.lax.pmean(rest, AXIS),
+            "episodes": count,
+            "tripped": jax.lax.pmax(state.guard.tripped[0].astype(jnp.int32), AXIS),
+            "broken": guard.broken(state.agent).astype(jnp.int32),
+        }
+
+
+def normalised(values: Any, mean: Any, deviation: Any) -> Any:
+    """Observations in deviations from the mean, within 10 of them."""
+    return jnp.clip((values - mean) / deviation, -10.0, 10.0)
+
+
+def _transition(before: State, action: Any, after: State) -> Transition:
+    return Transition(
+        before.obs, before.privileged, action, after.reward, after.terminated, after.truncated, after.final_obs,
+        after.final_privileged,
+    )  # fmt: skip

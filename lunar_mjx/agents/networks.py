@@ -1,0 +1,79 @@
+"""Actor and critics: brax's multi-layer perceptrons, several critics as one batch of parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from lunar_mjx._quiet import without_warp_notices
+from lunar_mjx.errors import bad_input
+
+with without_warp_notices():
+    from brax.training import networks as brax_networks
+
+ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
+    "relu": jax.nn.relu, "elu": jax.nn.elu, "swish": jax.nn.swish, "tanh": jnp.tanh
+}  # fmt: skip
+
+Network = brax_networks.FeedForwardNetwork
+"""`init(key) -> params` and `apply(params, ...)`."""
+
+_TORCH = jax.nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
+"""PyTorch's default for linear layers, U(-1/sqrt(fan_in), 1/sqrt(fan_in)), which SB3 keeps."""
+
+
+def _mlp(sizes: Sequence[int], activation: str, layer_norm: bool) -> Any:
+    if activation not in ACTIVATIONS:
+        raise bad_input("networks", "activation", activation, "does not exist", f"use one of {', '.join(ACTIVATIONS)}")
+    return brax_networks.MLP(
+        layer_sizes=tuple(sizes), activation=ACTIVATIONS[activation], kernel_init=_TORCH, layer_norm=layer_norm
+    )
+
+
+def make_actor(
+    obs: int, actions: int, layers: Sequence[int], activation: str = "relu", layer_norm: bool = False,
+    last_scale: float = 1.0,
+) -> Network:  # fmt: skip
+    """A deterministic policy: `apply(params, obs) -> action` in [-1, 1].
+
+    Args:
+      obs, actions: widths.
+      layers: widths of the hidden layers.
+      activation: name in `ACTIVATIONS`.
+      layer_norm: normalise each hidden layer.
+      last_scale: of the last layer's weights at the start; a small one makes the first actions near zero.
+    """
+    module = _mlp((*layers, actions), activation, layer_norm)
+
+    def init(key: Any) -> Any:
+        params = module.init(key, jnp.zeros((1, obs)))
+        last = f"hidden_{len(layers)}"
+        inner = params["params"]
+        return {"params": {**inner, last: jax.tree.map(lambda a: last_scale * a, inner[last])}}
+
+    return Network(init=init, apply=lambda params, x: jnp.tanh(module.apply(params, x)))
+
+
+def make_critics(
+    obs: int, actions: int, layers: Sequence[int], count: int = 2, outputs: int = 1, activation: str = "relu",
+    layer_norm: bool = False,
+) -> Network:  # fmt: skip
+    """Several critics: `apply(params, obs, action) -> (critic, batch, outputs)`; params lead with the axis `critic`."""
+    module = _mlp((*layers, outputs), activation, layer_norm)
+
+    def init(key: Any) -> Any:
+        one = jnp.zeros((1, obs + actions))
+        return jax.vmap(lambda k: module.init(k, one))(jax.random.split(key, count))
+
+    def apply(params: Any, x: Any, action: Any) -> Any:
+        return jax.vmap(module.apply, in_axes=(0, None))(params, jnp.concatenate([x, action], axis=-1))
+
+    return Network(init=init, apply=apply)
+
+
+def first_critic(params: Any) -> Any:
+    """The parameters of the first critic alone, still with the leading axis."""
+    return jax.tree.map(lambda a: a[:1], params)

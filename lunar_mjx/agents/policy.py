@@ -1,0 +1,96 @@
+"""A trained policy as one small file: weights, observation statistics, and how its environment is made."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.agents.learner import Learner, normalised
+from lunar_mjx.agents.networks import make_actor
+from lunar_mjx.errors import UserError, bad_input, require_file
+
+FORMAT = "lunar-mjx-policy/1"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """A deterministic policy.
+
+    Attributes:
+      params: of the actor. mean, deviation: of the observations; None if they are not normalised.
+      network: `obs`, `actions`, `layers`, `activation`, `layer_norm` of the actor.
+      environment: name and options that make the environment that it was trained in.
+      notes: what trained it, with what result.
+    """
+
+    params: Any
+    mean: np.ndarray | None
+    deviation: np.ndarray | None
+    network: dict[str, Any]
+    environment: dict[str, Any]
+    notes: dict[str, Any]
+
+    def act(self, obs: Any) -> Any:
+        """Actions in [-1, 1], (env, action), for observations (env, obs)."""
+        if self.mean is not None:
+            obs = normalised(obs, jnp.asarray(self.mean), jnp.asarray(self.deviation))
+        return make_actor(**self.network).apply(self.params, obs)
+
+
+def policy_of(learner: Learner, state: Any, environment: dict[str, Any], notes: dict[str, Any]) -> Policy:
+    """The policy of a training's state."""
+    params, statistics = jax.device_get(learner.policy(state))
+    config = learner.config.algorithm
+    network = {
+        "obs": learner.env.observation_size,
+        "actions": learner.env.action_size,
+        "layers": list(config.actor_layers),
+        "activation": config.activation,
+        "layer_norm": config.layer_norm,
+    }
+    mean, deviation = statistics if statistics is not None else (None, None)
+    return Policy(params, mean, deviation, network, environment, notes)
+
+
+def save_policy(policy: Policy, path: Path) -> Path:
+    """Writes a policy as an .npz file without pickles; returns the path."""
+    leaves = {f"params{jax.tree_util.keystr(p)}": np.asarray(a) for p, a in
+              jax.tree_util.tree_leaves_with_path(policy.params)}  # fmt: skip
+    if policy.mean is not None:
+        leaves |= {"mean": np.asarray(policy.mean), "deviation": np.asarray(policy.deviation)}
+    record = {"format": FORMAT, "network": policy.network, "environment": policy.environment, "notes": policy.notes}
+    np.savez_compressed(path, record=np.array(json.dumps(record)), **leaves)
+    return path
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Reads a policy that `save_policy` wrote.
+
+    Raises:
+      UserError: the file is missing or holds no policy.
+    """
+    path = require_file(path, "the policy")
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            record = json.loads(str(data["record"]))
+            arrays = {name: data[name] for name in data.files if name != "record"}
+    except (ValueError, KeyError, OSError) as error:
+        raise UserError(f"{path}: is no policy ({error}); give an .npz that `lunar-mjx train` wrote.") from None
+    if record.get("format") != FORMAT:
+        raise bad_input(path, "format", record.get("format"), "is not known", f"give a file of format {FORMAT}")
+    network = record["network"]
+    shapes = jax.eval_shape(make_actor(**network).init, jax.random.PRNGKey(0))
+    leaves = []
+    for place, leaf in jax.tree_util.tree_leaves_with_path(shapes):
+        name = f"params{jax.tree_util.keystr(place)}"
+        if name not in arrays or arrays[name].shape != leaf.shape:
+            raise UserError(f"{path}: the weights {name} do not fit its network; write the policy anew.")
+        leaves.append(jnp.asarray(arrays[name], jnp.float32))
+    params = jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+    return Policy(params, arrays.get("mean"), arrays.get("deviation"), network, record["environment"], record["notes"])

@@ -1,0 +1,215 @@
+"""The loop around the epochs: progress, records, checkpoints, guard, time limit, and the policy at the end."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from lunar_mjx.agents import guard
+from lunar_mjx.agents.checkpoint import Checkpoints
+from lunar_mjx.agents.learner import EPISODE, Learner, TrainState
+from lunar_mjx.agents.policy import Policy, policy_of, save_policy
+from lunar_mjx.agents.record import Progress, Record
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """How long a training runs and what it leaves behind.
+
+    Attributes:
+      steps: environment steps, over all environments.
+      seed: of everything random.
+      time_limit: s of wall time of this process after which it saves and stops, to be resumed; none if None.
+      checkpoint_every: s between checkpoints; also one at the end; none at all if infinite.
+      resume: go on from the folder's newest checkpoint, if it has one.
+      quiet: print no progress.
+    """
+
+    steps: int
+    seed: int = 0
+    time_limit: float | None = None
+    checkpoint_every: float = 300.0
+    resume: bool = True
+    quiet: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Result:
+    """What a training came to.
+
+    Attributes:
+      learner, state: from which more can be read.
+      policy: the trained policy.
+      rows: numbers of every epoch. episodes: return, length, success and step of every episode, where recorded.
+      finished: False if the time limit came first.
+    """
+
+    learner: Learner
+    state: TrainState
+    policy: Policy
+    rows: list[dict[str, Any]]
+    episodes: dict[str, list[float]]
+    finished: bool
+
+
+Callback = Callable[[Learner, TrainState, dict[str, Any]], dict[str, Any] | None]
+"""Called after every epoch with the row of numbers; may return more numbers for it, among them `stop` to end there."""
+
+
+def train(
+    learner: Learner,
+    run: RunConfig,
+    folder: Path | None = None,
+    environment: dict[str, Any] | None = None,
+    callback: Callback | None = None,
+) -> Result:
+    """Trains until the steps are done or the time is up.
+
+    Args:
+      learner: environment, algorithm and devices.
+      run: how long.
+      folder: for checkpoints, `progress.csv`, TensorBoard events and `policy.npz`; nothing is written if None.
+      environment: name and options of the environment, kept in the policy.
+      callback: called after every epoch.
+
+    Raises:
+      DivergenceError: a value was not finite; the sentence names the environment and the file for replay.
+      UserError: the folder's checkpoint belongs to other settings.
+    """
+    loop = _Loop(learner, run, folder, environment or {})
+    try:
+        return loop.run(callback)
+    finally:
+        loop.close()
+
+
+class _Loop:
+    def __init__(self, learner: Learner, run: RunConfig, folder: Path | None, environment: dict[str, Any]):
+        self.learner, self.config, self.folder, self.environment = learner, run, folder, environment
+        self.per_epoch = learner.config.envs * learner.config.epoch_steps
+        self.checkpoints = Checkpoints(folder / "checkpoints") if folder else None
+        self.episodes: dict[str, list[float]] = {name: [] for name in (*EPISODE, "step")}
+        self.epochs, self.elapsed, rows = 0, 0.0, []
+        latest = self.checkpoints.latest() if self.checkpoints and run.resume else None
+        if latest is not None and self.checkpoints is not None:
+            self.state, notes = self.checkpoints.restore(latest, learner.abstract())
+            self.epochs, self.elapsed, rows = notes["epochs"], notes["elapsed"], notes["rows"]
+            self.episodes = notes["episodes"]
+        else:
+            self.state = learner.init(run.seed)
+        self.lead = jax.process_index() == 0
+        self.record = Record(folder, rows) if folder and self.lead else None
+        self.rows: list[dict[str, Any]] = self.record.rows if self.record else list(rows)
+        self.progress = Progress(run.steps, run.time_limit, run.quiet or not self.lead)
+
+    def run(self, callback: Callback | None) -> Result:
+        c, total = self.config, max(1, math.ceil(self.config.steps / self.per_epoch))
+        begin = saved = time.monotonic()
+        before, stop = self.elapsed, False
+        while self.epochs < total and not stop:
+            tick = time.monotonic()
+            row = self._epoch()
+            self.elapsed = before + time.monotonic() - begin
+            row |= {"elapsed_s": self.elapsed, "steps_per_s": self.per_epoch / (time.monotonic() - tick)}
+            extra = callback(self.learner, self.state, row) if callback else None
+            stop = bool((extra or {}).pop("stop", False)) if extra else False
+            row |= extra or {}
+            self._keep(row)
+            self.progress.show(row, final=self.epochs >= total)
+            now = time.monotonic()
+            late = c.time_limit is not None and now - begin >= c.time_limit
+            last = self.epochs >= total or late or stop
+            if self.checkpoints and math.isfinite(c.checkpoint_every) and (last or now - saved >= c.checkpoint_every):
+                self._save()
+                saved = time.monotonic()
+            if late:
+                break
+        return self._result(self.epochs >= total or stop)
+
+    def _epoch(self) -> dict[str, Any]:
+        self.state, (numbers, episodes) = self.learner.epoch(self.learner.env.params, self.state)
+        row = {k: float(v) for k, v in jax.device_get(numbers).items()}
+        first = self.epochs * self.per_epoch
+        self.epochs += 1
+        if row.pop("tripped") or row.pop("broken", 0.0):
+            self._diverged()
+        self._episodes(episodes, first)
+        return {"steps": self.epochs * self.per_epoch, **row}
+
+    def _episodes(self, episodes: Any, first: int) -> None:
+        if not episodes or jax.process_count() > 1:
+            return
+        found = jax.device_get(episodes)
+        env, step = np.nonzero(found["done"])
+        order = np.lexsort((env, step))
+        env, step = env[order], step[order]
+        for name in EPISODE:
+            self.episodes[name] += found[name][env, step].astype(float).tolist()
+        self.episodes["step"] += (first + (step + 1) * self.learner.config.envs).tolist()
+
+    def _keep(self, row: dict[str, Any]) -> None:
+        if self.record:
+            self.record.add(row)
+        else:
+            self.rows.append(row)
+
+    def _save(self) -> None:
+        assert self.checkpoints is not None
+        notes = {"epochs": self.epochs, "elapsed": self.elapsed, "rows": self.rows, "episodes": self.episodes}
+        self.checkpoints.save(self.epochs, self.state, _plain(notes))
+
+    def _diverged(self) -> None:
+        envs = self.learner.config.envs // self.learner.devices
+        seen = jax.device_get(self.state.guard)
+        if not np.any(seen.tripped):
+            raise guard.DivergenceError(
+                "train: the agent's parameters are not finite although all environments are; "
+                "lower the learning rates or the reward scale."
+            )
+        if not self.folder:
+            number = int(np.argmax(seen.tripped)) * envs + int(seen.env[np.argmax(seen.tripped)])
+            raise guard.DivergenceError(f"train: environment {number} gave a value that is not finite; "
+                                        "train into a folder to keep its state.")  # fmt: skip
+        path = self.folder / "not_finite.npz"
+        number, when = guard.dump(seen, path, envs)
+        raise guard.DivergenceError(
+            f"train: environment {number} gave a value that is not finite in step {when}; its state before that step "
+            f"is in {path}: take the step again with lunar_mjx.agents.guard.replay, and mend the model or time step."
+        )
+
+    def _result(self, finished: bool) -> Result:
+        notes = {
+            "algorithm": type(self.learner.agent).__name__,
+            "train": _plain(dataclasses.asdict(self.learner.config)),
+            "seed": self.config.seed,
+            "steps": self.epochs * self.per_epoch,
+            "elapsed_s": self.elapsed,
+        }
+        policy = policy_of(self.learner, self.state, self.environment, notes)
+        if self.folder and self.lead:
+            save_policy(policy, self.folder / "policy.npz")
+        return Result(self.learner, self.state, policy, self.rows, self.episodes, finished)
+
+    def close(self) -> None:
+        if self.record:
+            self.record.close()
+        if self.checkpoints:
+            self.checkpoints.close()
+
+
+def _plain(value: Any) -> Any:
+    """As JSON holds it: not-a-numbers become None."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
