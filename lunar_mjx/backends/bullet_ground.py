@@ -45,7 +45,7 @@ class BulletGround:
         for wheel in wheels:
             p.setCollisionFilterGroupMask(body, wheel, _WHEELS, _TERRAIN, **self._id)
             # frictions multiply, and stiffnesses act in series: the wheel must not add its own
-            p.changeDynamics(body, wheel, lateralFriction=1.0, restitution=0.0, **self._id)
+            p.changeDynamics(body, wheel, lateralFriction=1.0, restitution=0.0, collisionMargin=0.0, **self._id)
         self._bears = np.zeros(len(wheels), bool)
         self.bear(wheels, self._bears, force=True)
 

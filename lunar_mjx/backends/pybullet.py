@@ -243,7 +243,11 @@ class _World:
         self._base_at, self._base_turn = np.array(base[3]), _matrix(base[4])
 
     def _pin(self, loop: Any) -> tuple[int, int, np.ndarray, np.ndarray]:
-        """A point-to-point constraint; its anchors are given from the links' centres of mass."""
+        """A point-to-point constraint, whose anchors Bullet takes from the links' centres of mass.
+
+        Returns:
+          The two links and the anchors in the links' frames, where Bullet's Jacobians take them from.
+        """
         p = self._p
         links = [self.link_of[body] for body in (loop.body1, loop.body2)]
         anchors = []
@@ -253,7 +257,7 @@ class _World:
         constraint = p.createConstraint(self._body, links[0], self._body, links[1], p.JOINT_POINT2POINT, [0, 0, 0],
                                         anchors[0].tolist(), anchors[1].tolist(), **self._id)  # fmt: skip
         p.changeConstraint(constraint, maxForce=1e9, **self._id)
-        return links[0], links[1], anchors[0], anchors[1]
+        return links[0], links[1], np.array(loop.anchor1), np.array(loop.anchor2)
 
     def place(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         p = self._p

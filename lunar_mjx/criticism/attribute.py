@@ -144,7 +144,7 @@ def _grow(
     good = [s for s in scores if worth_refitting(s, parent, settings)]
     if not good:
         return []
-    chosen = [s for s in good[: settings.refits]]
+    chosen = list(good[: settings.refits])
     for s in good[settings.refits :]:
         if near.get(good[0].effect, {}).get(s.effect, 0.0) >= settings.confounded and len(chosen) < 2 * settings.refits:
             chosen.append(s)
@@ -223,7 +223,9 @@ def excess_explained(search_: Search, problem: Problem) -> float:
     return 1.0 if before <= 0.0 else 1.0 - max(after, 0.0) / before
 
 
-def diagnose(problem: Problem, settings: Settings = Settings(), progress: Progress = silent) -> tuple[Diagnosis, Search]:
+def diagnose(
+    problem: Problem, settings: Settings = Settings(), progress: Progress = silent
+) -> tuple[Diagnosis, Search]:
     """The verdict on a model and its measurements, with the evidence.
 
     Args:
@@ -270,28 +272,40 @@ def _verdict(found: Search, explained: float, settings: Settings) -> tuple[Verdi
         if base.noise.passes:
             return Verdict.NOISE_ONLY, (), "Nothing significant is missing: the residual is at the noise."
         worst = f"{base.noise.worst}, {base.noise.channels[base.noise.worst]:.2f} sigma"
-        return Verdict.UNKNOWN, (), (
-            f"The residual is beyond the noise (worst: {worst}) and no catalogue effect explains it."
+        return (
+            Verdict.UNKNOWN,
+            (),
+            (f"The residual is beyond the noise (worst: {worst}) and no catalogue effect explains it."),
         )
     names = ", ".join(chosen.effects)
     if not enough:
-        return Verdict.UNKNOWN, chosen.effects, (
-            f"Something is missing that no catalogue effect brings to the noise; {names} helps, from "
-            f"{base.noise.rms:.2f} to {chosen.noise.rms:.2f} sigma."
+        return (
+            Verdict.UNKNOWN,
+            chosen.effects,
+            (
+                f"Something is missing that no catalogue effect brings to the noise; {names} helps, from "
+                f"{base.noise.rms:.2f} to {chosen.noise.rms:.2f} sigma."
+            ),
         )
     members = list(dict.fromkeys([*chosen.effects, *(e for c in found.rivals for e in c.effects)]))
     if len(members) > len(chosen.effects):
         common = set(chosen.effects).intersection(*(set(c.effects) for c in found.rivals))
         if len(chosen.effects) == 1 or not common:
-            return Verdict.KNOWN_CLASS, tuple(members), (
-                f"One of {', '.join(members)} is missing; these logs cannot tell which."
+            return (
+                Verdict.KNOWN_CLASS,
+                tuple(members),
+                (f"One of {', '.join(members)} is missing; these logs cannot tell which."),
             )
-        return Verdict.MULTIPLE, tuple(chosen.effects), (
-            f"{names} are missing; {', '.join(m for m in members if m not in common)} cannot be told apart here."
+        return (
+            Verdict.MULTIPLE,
+            tuple(chosen.effects),
+            (f"{names} are missing; {', '.join(m for m in members if m not in common)} cannot be told apart here."),
         )
     if len(chosen.effects) == 1:
-        return Verdict.KNOWN, chosen.effects, (
-            f"{names} is missing: consistent with these logs, and better than every listed alternative."
+        return (
+            Verdict.KNOWN,
+            chosen.effects,
+            (f"{names} is missing: consistent with these logs, and better than every listed alternative."),
         )
     return Verdict.MULTIPLE, chosen.effects, f"{names} are missing, each significant given the others."
 

@@ -253,7 +253,9 @@ def fit(
     )  # fmt: skip
 
 
-def _faults(best: _Descent, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float]) -> tuple[str, ...]:
+def _faults(
+    best: _Descent, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float]
+) -> tuple[str, ...]:
     problems = []
     if not np.isfinite(best.chi2):
         return ("every start diverged",)

@@ -158,9 +158,7 @@ def signatures(problem: Problem, fit: Fit, names: list[str]) -> dict[str, np.nda
     return out
 
 
-def score(
-    problem: Problem, fit: Fit, found: Mapping[str, np.ndarray], draws: int = 2000, seed: int = 0
-) -> list[Score]:
+def score(problem: Problem, fit: Fit, found: Mapping[str, np.ndarray], draws: int = 2000, seed: int = 0) -> list[Score]:
     """Scores every candidate on the fitted observations.
 
     Args:
@@ -251,6 +249,4 @@ def cosines(scores: list[Score]) -> dict[str, dict[str, float]]:
         if live.any():
             u, w, _ = np.linalg.svd(s.signature[:, live] / size[live], full_matrices=False)
             bases[s.effect] = u[:, w > 1e-6 * w.max()]
-    return {
-        a: {b: float(np.linalg.norm(bases[a].T @ bases[b], 2)) if a != b else 1.0 for b in bases} for a in bases
-    }
+    return {a: {b: float(np.linalg.norm(bases[a].T @ bases[b], 2)) if a != b else 1.0 for b in bases} for a in bases}

@@ -259,6 +259,7 @@ def rover_info(model: Model) -> RoverInfo:
         chassis_points=Vec3(*points.T),
         box_center=Vec3(*center.T) if len(center) else None,
         box_half=Vec3(*half.T) if len(half) else None,
+        joint_inertia=1.0 / compiled.dof_invweight0[[compiled.joint(j).dofadr[0] for j in rover.joints]],
         name=rover.name,
     )
 

@@ -209,6 +209,7 @@ class RoverInfo:
       mode: control mode of each joint: 0 position, 1 velocity, 2 torque, 3 current.
       position_gain: N m/rad. velocity_gain: N m s/rad.
       chassis_points: where the chassis can touch the ground, in its frame, m.
+      joint_inertia: torque per acceleration of each joint of the rover as drawn, kg m2; None where unknown.
       box_center, box_half: centres and half sides of the chassis' boxes, along the axes of its frame, m.
     """
 
@@ -223,6 +224,7 @@ class RoverInfo:
     chassis_points: Vec3
     box_center: Vec3 | None = None
     box_half: Vec3 | None = None
+    joint_inertia: Float[AnyArray, "joint"] | None = None
     name: str = static(default="rover")
 
 

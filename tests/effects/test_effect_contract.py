@@ -153,7 +153,7 @@ def act(names: tuple[str, ...], world: Terrain, values: Mapping[str, Any], s: Ma
         parameters=parameters(pipeline.effects, values),
     )
     size = {"wheel": jnp.zeros(WHEELS), "joint": jnp.zeros(JOINTS), "rover": zero}
-    memory = {e.name: {k: size[v.axis] + v.initial for k, v in e.state.items()} for e in pipeline.effects if e.state}
+    memory = {e.name: {k: v.reset(size[v.axis]) for k, v in e.state.items()} for e in pipeline.effects if e.state}
     if "shear_state" in memory:
         memory["shear_state"] = dict(zip(("slip_x", "slip_y", "direction"), s["slip"], strict=True))
     forces, ctx, memory = apply_effects(pipeline, ctx, s["target"], memory)
