@@ -17,9 +17,11 @@ from lunar_mjx.criticism.problem import Problem
 AGREEING = 3
 """Starts that must end at the same chi-square."""
 SAME_CHI2 = 1.0
-"""Chi-squares that differ by less are the same fit."""
-SMALL_GRADIENT = 0.1
-"""Largest drop of chi-square that one more Gauss-Newton step may still promise."""
+"""Chi-squares that differ by less, or by less than a ten-thousandth, are the same fit."""
+SMALL_GRADIENT = 0.5
+"""Largest drop of chi-square that one more Gauss-Newton step may still promise: under a sigma in all directions."""
+HALF_STEP = 25.0
+"""Largest change of chi-square by halving the time step: below what would name an effect."""
 
 _DAMPINGS = np.array([1e-4, 1e-2, 1.0, 1e2])
 _ITERATIONS = 40
@@ -153,7 +155,7 @@ def _descend(goal: _Objective, start: np.ndarray, iterations: int = _ITERATIONS)
             break
         downhill, hessian = goal.quadratic(u, r, j)
         promise = goal.promise(u, downhill, hessian)
-        if promise < 0.01 * SMALL_GRADIENT:
+        if promise < 0.2 * SMALL_GRADIENT:
             break
         trials = goal.steps(u, downhill, hessian, damping * _DAMPINGS)
         residuals, chi2 = goal.residuals(trials)
@@ -171,7 +173,32 @@ def _descend(goal: _Objective, start: np.ndarray, iterations: int = _ITERATIONS)
     return _Descent(u, r, j, best, promise)
 
 
-def _chase(goal: _Objective, best: _Descent, starts: np.ndarray, rounds: int = 12) -> list[float]:
+def _same(chi2: float) -> float:
+    return max(SAME_CHI2, 1e-4 * chi2)
+
+
+def _with_own_nuisances(goal: _Objective, best: _Descent) -> _Descent:
+    """Fits the starts of logs that are held out to these logs themselves; what all logs share stays where it is."""
+    problem = goal.problem
+    held = {n for n, split in enumerate(problem.observations.split) if split != "fit"}
+    own = np.array([problem.coordinates[i].log_index in held for i in goal.free])
+    if not own.any() or not np.isfinite(best.chi2):
+        return best
+    rows = ~goal.fitted
+    prior, scale = problem.prior_rows(best.u, goal.free)
+    j = best.jacobian[rows][:, own]
+    r = best.residual[rows]
+    if not np.isfinite(r).all():
+        return best
+    u = best.u.copy()
+    at = goal.free[own]
+    step = np.linalg.lstsq(j.T @ j + np.diag(scale[own] ** 2), j.T @ r - scale[own] * prior[own], rcond=None)[0]
+    u[at] = np.clip(u[at] + step, goal.low[own], goal.high[own])
+    residual = goal.residuals(u[None])[0][0]
+    return dataclasses.replace(best, u=u, residual=residual) if np.isfinite(residual).all() else best
+
+
+def _chase(goal: _Objective, best: _Descent, starts: np.ndarray, rounds: int = 8) -> list[float]:
     """Chi-square that other starts reach with the best start's Jacobian, all starts in one batch.
 
     The fixed Jacobian (chord method) converges linearly to the same optimum where there is one.
@@ -180,7 +207,7 @@ def _chase(goal: _Objective, best: _Descent, starts: np.ndarray, rounds: int = 1
     residual, chi2 = goal.residuals(u)
     share = np.ones(len(u))
     for _ in range(rounds):
-        if np.all(chi2 < best.chi2 + 0.1 * SAME_CHI2):
+        if np.all(chi2 < best.chi2 + 0.5 * _same(best.chi2)):
             break
         trial = u.copy()
         for i in range(len(u)):
@@ -241,11 +268,11 @@ def fit(
         near[:, free] = np.clip(near[:, free], goal.low, goal.high)
         ends = _chase(goal, found[0], near)
     found.sort(key=lambda d: d.chi2)
-    best = found[0]
+    best = _with_own_nuisances(goal, found[0])
     chi2s = tuple(sorted([d.chi2 for d in found] + ends))
     edge = _at_bound(problem, goal, best)
     extra = dict(problem.certificate(best.u, free)) if certify and np.isfinite(best.chi2) else {}
-    agreeing = sum(c <= best.chi2 + SAME_CHI2 for c in chi2s)
+    agreeing = sum(c <= best.chi2 + _same(best.chi2) for c in chi2s)
     problems = _faults(best, agreeing, starts, edge, extra)
     return Fit(
         u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual, jacobian=best.jacobian,
@@ -265,7 +292,7 @@ def _faults(
         problems.append(f"only {agreeing} of {starts} starts agree")
     if edge:
         problems.append(f"{', '.join(edge)} ended at a bound")
-    if extra.get("half_step_chi2", 0.0) > 1.0:
+    if extra.get("half_step_chi2", 0.0) > HALF_STEP:
         problems.append(f"halving the time step changes chi-square by {extra['half_step_chi2']:.2g}")
     return tuple(problems)
 

@@ -1,0 +1,250 @@
+"""Drive logs of whole rovers as a problem: every hypothesis is one more rover in the batch.
+
+Rows of parameters times logs are simulated together, in float64; derivatives are difference quotients between rovers of
+one batch, so that a Jacobian costs no program of its own (`jacfwd` through the step takes minutes to compile on a CPU).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
+from lunar_mjx.criticism.drive_noise import channel_noise
+from lunar_mjx.criticism.drive_runs import Bench, LogRun
+from lunar_mjx.criticism.fitting import Progress, silent
+from lunar_mjx.criticism.observations import Observations, Series
+from lunar_mjx.criticism.problem import NotTested, Problem
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.effects.presets import PRESETS
+from lunar_mjx.model import Model
+
+if TYPE_CHECKING:
+    from lunar_mjx.criticism.log import Log
+
+STEP = 1e-4
+"""Difference quotient's step in scales: truncation and rounding both stay below 1e-4 of the derivative."""
+
+BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "soil": {
+        "k_phi": (0.3, 2.0), "n": (0.1, 2.0), "cohesion": (0.3, 2.0), "friction_angle": (0.1, 2.0),
+        "shear_modulus_x": (0.3, 2.0), "shear_modulus_y": (0.3, 2.0),
+    },
+    "penalty_contact": {"stiffness": (0.3, 2.0)},
+    "motor": {
+        "resistance": (0.05, 2.0), "torque_constant": (0.05, 2.0), "gear_efficiency": (0.1, 1.0),
+        "winding_capacity": (0.2, 2.0), "housing_capacity": (0.2, 2.0), "R_th1": (0.2, 2.0),
+    },
+    "housing_convection": {"R_th2": (0.3, 2.0)},
+    "housing_conduction": {"conductance": (0.3, 2.0)},
+}  # fmt: skip
+"""What a refit moves, by effect and parameter: scale as a share of the value, and prior standard deviation in scales:
+how well soil and motor are known before a drive."""
+
+NOT_MISSING = frozenset(
+    {"parking_brake", "payload", "tether", "hard_surface", "surface_type", "soil_gradient", "boulders"}
+)
+"""Effects that describe an arrangement of the test, which its user knows, and are never candidates by themselves."""
+
+
+class DriveProblem(Problem):
+    """Drive logs against a model."""
+
+    cheap_jacobian = False
+
+    def __init__(
+        self,
+        logs: Sequence[Log],
+        model: Model,
+        candidates: Mapping[str, Effect],
+        splits: Mapping[str, str] | None = None,
+        baseline: Mapping[str, Mapping[str, tuple[float, float]]] = BASELINE,
+        channels: Sequence[str] | None = None,
+        chunk: int | None = None,
+        engine: str = "auto",
+        progress: Progress = silent,
+    ):
+        """Makes the problem.
+
+        Args:
+          logs: of one rover, checked.
+          model: the model as it is.
+          candidates: effects that may be missing, by name.
+          splits: split of a log by its name, in place of the default.
+          baseline: what a refit may move: scale and prior by effect and parameter.
+          channels: to compare; all that are measured and modelled if None.
+          chunk: rovers simulated at once.
+          engine: of the dynamics.
+          progress: told of every chunk.
+        """
+        self.logs, self.model = tuple(logs), model
+        self.effects, self.not_tested = _usable(model, candidates)
+        union = model
+        for effect in self.effects.values():
+            union = union.add(effect, "criticism", **effect.null())
+        self.progress = progress
+        self.bench = Bench(union, self.logs, chunk, engine)
+        found = _baseline_coordinates(model, baseline)
+        count = len(found)
+        for number, run in enumerate(self.bench.runs):
+            found += _nuisances(number, run)
+        self.baseline = np.arange(len(found))
+        self._nuisance = np.arange(count, len(found))
+        self.candidates = {}
+        for name, effect in self.effects.items():
+            mine = of_candidate(effect)
+            self.candidates[name] = np.arange(len(found), len(found) + len(mine))
+            found += mine
+        self.coordinates = tuple(found)
+        self.observations = _observations(self.bench, self.logs, splits or {}, channels)
+
+    def predict(self, u: np.ndarray) -> np.ndarray:
+        rows = np.atleast_2d(u)
+        values = self._values(rows)
+        out = np.empty((len(rows), len(self.observations)))
+        for number in range(len(self.logs)):
+            out[:, self._of_log(number)] = np.nan
+        jobs = [(number, k) for number in range(len(self.logs)) for k in range(len(rows))]
+        for number, k, sampled in self.bench.run(jobs, values, self.observations, self.progress):
+            out[k, self._of_log(number)] = sampled
+        return out
+
+    def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """As in `Problem`; nuisances of different logs are perturbed together, since a log feels only its own."""
+        which = np.asarray(which)
+        own = [i for i in which if self.coordinates[i].log_index >= 0]
+        shared = [int(i) for i in which if self.coordinates[i].log_index < 0]
+        kinds = sorted({self.coordinates[i].name for i in own})
+        rows = np.repeat(u[None], 1 + len(shared) + len(kinds), axis=0)
+        steps = np.empty(len(shared))
+        for k, i in enumerate(shared):
+            high = self.coordinates[i].bounds()[1]
+            steps[k] = STEP if u[i] + STEP <= high else -STEP
+            rows[1 + k, i] += steps[k]
+        for k, kind in enumerate(kinds):
+            same = [i for i in own if self.coordinates[i].name == kind]
+            rows[1 + len(shared) + k, same] += STEP
+        values = self.predict(rows)
+        difference = values[1:] - values[:1]
+        out = np.zeros((len(self.observations), len(which)))
+        for column, i in enumerate(which):
+            c = self.coordinates[i]
+            if c.log_index < 0:
+                k = shared.index(int(i))
+                out[:, column] = difference[k] / steps[k]
+            else:
+                part = self._of_log(c.log_index)
+                out[part, column] = difference[len(shared) + kinds.index(c.name), part] / STEP
+        return out
+
+    def _of_log(self, number: int) -> slice:
+        mine = [s for s in self.observations.series if s.log == number]
+        return slice(mine[0].start, mine[-1].stop) if mine else slice(0, 0)
+
+    def _values(self, rows: np.ndarray) -> dict[tuple[str, str, int], np.ndarray]:
+        """(rows,) value or factor of every coordinate, by effect, name and log."""
+        return {
+            (c.effect, c.name, c.log_index): np.asarray(c.value(rows[:, i])) for i, c in enumerate(self.coordinates)
+        }
+
+    def certificate(self, u: np.ndarray, free: np.ndarray) -> Mapping[str, float]:
+        del free
+        halved = self.bench.halved()
+        values = self._values(u[None])
+        fine = np.empty(len(self.observations))
+        for number, _, sampled in halved.run(
+            [(n, 0) for n in range(len(self.logs))], values, self.observations, silent
+        ):
+            fine[self._of_log(number)] = sampled
+        keep = self.observations.in_split("fit")
+        measured = self.observations.value
+        coarse = self.predict(u[None])[0]
+        chi2 = [np.sum(self.observations.whiten(measured - p)[keep] ** 2) for p in (coarse, fine)]
+        return {"half_step_chi2": float(abs(chi2[0] - chi2[1]))}
+
+
+def _usable(model: Model, candidates: Mapping[str, Effect]) -> tuple[dict[str, Effect], tuple[NotTested, ...]]:
+    present = set(model.effect_names)
+    usable, refused = {}, []
+    for name, effect in candidates.items():
+        if name in present:
+            continue
+        if name in NOT_MISSING:
+            refused.append(NotTested(name, "describes the arrangement of a test, which its user knows"))
+        elif present & set(effect.replaces):
+            refused.append(NotTested(name, f"would replace {', '.join(sorted(present & set(effect.replaces)))}"))
+        elif all(p.null is None for p in effect.parameters.values()):
+            refused.append(NotTested(name, "has no null value"))
+        else:
+            usable[name] = effect
+    return usable, tuple(refused)
+
+
+def _baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[Coordinate]:
+    """Baseline parameters; one that differs between wheels or joints moves by a common factor."""
+    found = []
+    for effect in model.effects:
+        for name, (relative, prior) in baseline.get(effect.name, {}).items():
+            value = np.atleast_1d(np.asarray(model.parameters[effect.name][name], float))
+            p = effect.parameters[name]
+            if np.all(value > 0.0):
+                low, high = max(p.bounds[0] / value.min(), 1e-3), min(p.bounds[1] / value.max(), 1e3)
+                found.append(Coordinate(effect.name, name, 1.0, relative, low, high, True, prior, unit="1"))
+        # Effects beyond the preset were added to explain measurements; they are refitted with the rest.
+        if effect.name not in PRESETS.get(model.preset, ()) and effect.name not in NOT_MISSING:
+            for name, p in effect.parameters.items():
+                value = np.asarray(model.parameters[effect.name][name], float)
+                if p.null is not None and value.ndim == 0:
+                    found.append(default_coordinate(effect, name, float(value), 0.3, 10.0))
+    return found
+
+
+def _nuisances(number: int, run: LogRun) -> list[Coordinate]:
+    """What nobody knows exactly about the start of a log: pose in the plane and temperature."""
+    wide = {"x": (0.01, 1.0), "y": (0.01, 1.0), "yaw": (0.01, 0.6), "temperature": (1.0, 100.0)}
+    return [
+        Coordinate("initial", name, run.start[name], wide[name][0], run.start[name] - wide[name][1],
+                   run.start[name] + wide[name][1], prior=10.0, log_index=number)
+        for name in run.unknown
+    ]  # fmt: skip
+
+
+def default_splits(logs: Sequence[Log]) -> list[str]:
+    """Splits of logs that state none: with four or more every fourth is held out, the first of these for selection."""
+    out = []
+    for i, log in enumerate(logs):
+        held = "select" if i % 8 == 3 else "test"
+        out.append(log.split or (held if len(logs) >= 4 and i % 4 == 3 else "fit"))
+    return out
+
+
+def _observations(
+    bench: Bench, logs: Sequence[Log], splits: Mapping[str, str], channels: Sequence[str] | None
+) -> Observations:
+    value, series, unit, at = [], [], [], 0
+    default = default_splits(logs)
+    for number, (log, run) in enumerate(zip(logs, bench.runs, strict=True)):
+        for channel in bench.channels(number):
+            if channels is not None and channel not in channels:
+                continue
+            found = log.channel(channel)
+            if found is None:
+                continue
+            time, measured = found
+            inside = (time >= run.begin - 1e-9) & (time <= run.end + 1e-9)
+            time, measured = time[inside], measured[inside]
+            if len(time) < 2:
+                continue
+            white, coloured, tau = channel_noise(log, channel)
+            series.append(Series(number, channel, at, at + len(time), time, white, coloured, tau))
+            value.append(measured)
+            unit.append(np.full(len(time), number))
+            at += len(time)
+    names = tuple(log.name for log in logs)
+    split = tuple(splits.get(n, d) for n, d in zip(names, default, strict=True))
+    return Observations(
+        value=np.concatenate(value), series=tuple(series), logs=names, split=split,
+        unit=np.concatenate(unit), unit_split=split, unit_names=names,
+    )  # fmt: skip

@@ -1,0 +1,299 @@
+"""Simulating many hypotheses of many logs at once: rows of parameters times logs, in chunks of one size."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.criticism.fitting import Progress
+from lunar_mjx.criticism.observations import Observations
+from lunar_mjx.dynamics import System, build
+from lunar_mjx.dynamics.signals import measure
+from lunar_mjx.dynamics.state import Params
+from lunar_mjx.dynamics.system import default_params
+from lunar_mjx.effects.channels import EULER
+from lunar_mjx.errors import UserError
+from lunar_mjx.model import ZERO_CELSIUS, Model
+
+if TYPE_CHECKING:
+    from lunar_mjx.criticism.log import Log
+
+SETTLE = 1.0
+"""Time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
+CHUNK = {"cpu": 64, "gpu": 4096}
+_FINEST = 0.01
+"""Shortest interval of telemetry, s."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LogRun:
+    """A log made ready to simulate.
+
+    Attributes:
+      model: the union model under the log's conditions.
+      commands: (time, joint). every: time steps per command.
+      begin, end: common time of the first command and of the last telemetry, s.
+      start: x, y m, yaw rad, temperature K. unknown: which of these a fit must find.
+      imu_position: m.
+    """
+
+    model: Model
+    commands: np.ndarray
+    every: int
+    begin: float
+    end: float
+    start: Mapping[str, float]
+    unknown: tuple[str, ...]
+    imu_position: tuple[float, float, float]
+
+
+class Bench:
+    """All logs of a campaign, grouped by what one program can run."""
+
+    def __init__(self, model: Model, logs: Sequence[Log], chunk: int | None, engine: str):
+        self.logs, self.model, self.engine = tuple(logs), model, engine
+        self.chunk = chunk or CHUNK.get(jax.default_backend(), 64)
+        self.runs = [log_run(log, model) for log in logs]
+        with jax.enable_x64(True):
+            self._params = [_nameless(default_params(run.model)) for run in self.runs]
+        self._programs: dict[Any, _Program] = {}
+
+    def halved(self) -> Bench:
+        """The same with half the time step."""
+        other = Bench.__new__(Bench)
+        other.logs, other.engine, other.chunk = self.logs, self.engine, min(self.chunk, 8 * ((len(self.runs) + 7) // 8))
+        other.model = self.model.replace(timestep=0.5 * self.model.timestep)
+        other.runs = [
+            dataclasses.replace(r, model=r.model.replace(timestep=0.5 * r.model.timestep), every=2 * r.every)
+            for r in self.runs
+        ]
+        other._params, other._programs = self._params, {}
+        return other
+
+    def channels(self, number: int) -> list[str]:
+        """Channels of a log that the model gives, in a fixed order."""
+        known = _modelled(self.runs[number].model)
+        return [c for c in self.logs[number].channel_names if c in known and not c.startswith("quaternion")]
+
+    def _program(self, number: int) -> _Program:
+        run = self.runs[number]
+        wanted = tuple(sorted({c for n in range(len(self.runs)) for c in self.channels(n)}))
+        shapes = tuple((a.shape, str(a.dtype)) for a in jax.tree.leaves(self._params[number].terrain))
+        key = (tuple(sorted(run.model.modes.items())), tuple(sorted(run.model.gains.items())), shapes, run.every,
+               run.imu_position)  # fmt: skip
+        if key not in self._programs:
+            self._programs[key] = _Program(run.model, run.every, wanted, run.imu_position, self.engine)
+        return self._programs[key]
+
+    def run(
+        self,
+        jobs: Sequence[tuple[int, int]],
+        values: Mapping[tuple[str, str, int], np.ndarray],
+        observations: Observations,
+        progress: Progress,
+    ) -> Iterator[tuple[int, int, np.ndarray]]:
+        """Simulates jobs (log, row) and yields (log, row, samples of the log's observations)."""
+        groups: dict[Any, list[tuple[int, int]]] = {}
+        for job in jobs:
+            program = self._program(job[0])
+            length = _bucket(len(self.runs[job[0]].commands))
+            groups.setdefault((id(program), length), []).append(job)
+        done = 0
+        for (_, length), mine in groups.items():
+            program = self._program(mine[0][0])
+            size = self.chunk if len(mine) > 8 else 8
+            for at in range(0, len(mine), size):
+                part = mine[at : at + size]
+                padded = part + [part[-1]] * (size - len(part))
+                signals = program(self, padded, values, length)
+                for i, (number, row) in enumerate(part):
+                    yield number, row, self._sample(number, {c: v[i] for c, v in signals.items()}, observations)
+                done += len(part)
+                progress("simulating", done / len(jobs))
+
+    def _sample(self, number: int, signals: Mapping[str, np.ndarray], observations: Observations) -> np.ndarray:
+        run = self.runs[number]
+        step = run.every * run.model.timestep
+        parts = []
+        for s in observations.series:
+            if s.log != number:
+                continue
+            values = signals[s.channel]
+            assert s.time is not None
+            place = (s.time - run.begin) / step
+            low = np.clip(np.floor(place).astype(int), 0, len(values) - 2)
+            share = place - low
+            if s.channel in EULER:
+                values = np.rad2deg(np.unwrap(np.deg2rad(values)))
+            sampled = values[low] * (1.0 - share) + values[low + 1] * share
+            if s.channel in EULER:
+                measured = observations.value[s.start : s.stop]
+                sampled = measured + (sampled - measured + 180.0) % 360.0 - 180.0
+            parts.append(sampled)
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _nameless(params: Params) -> Params:
+    """Parameters whose terrain has no name, which would make programs of their own."""
+    return jax.tree.map(np.asarray, dataclasses.replace(params, terrain=dataclasses.replace(params.terrain, name="")))
+
+
+def _bucket(length: int) -> int:
+    """Lengths are rounded up to one of few, so that logs of about the same length share a program."""
+    size = 64
+    while size < length:
+        size = int(size * 1.25 / 16 + 1) * 16
+    return size
+
+
+class _Program:
+    """One compiled simulation of a chunk of rovers, from rest to the measured channels."""
+
+    def __init__(
+        self, model: Model, every: int, channels: tuple[str, ...], imu: tuple[float, float, float], engine: str
+    ):
+        self.model, self.every, self.channels, self.imu = model, every, channels, imu
+        with jax.enable_x64(True):
+            self.system: System = build(model, engine)
+        self._run = jax.jit(self._simulate, static_argnames=())
+
+    def _simulate(self, params: Params, start: Mapping[str, Any], commands: Any) -> dict[str, Any]:
+        system = self.system
+        state = jax.vmap(lambda p, s: system.reset(p, s["x"], s["y"], s["yaw"], s["temperature"]))(params, start)
+        axes = jax.tree.map(lambda _: 0, params)
+        still = jnp.zeros((1, commands.shape[-1]), commands.dtype)
+        warm, _ = system.rollout_batch(
+            params, state, still, round(SETTLE / system.dt), axes, report=lambda t: t.time, chunk=len(commands)
+        )
+        # The clock and the heat begin with the log.
+        state = dataclasses.replace(warm, step=state.step, temperature=state.temperature)
+        _, seen = system.rollout_batch(params, state, commands, self.every, axes, chunk=len(commands))
+
+        def channels(params: Params, seen: Any) -> dict[str, Any]:
+            found = measure(system, seen, params, self.imu if any(self.imu) else None).channels
+            return {c: found[c] for c in self.channels}
+
+        return jax.vmap(channels)(params, seen)
+
+    def __call__(
+        self,
+        bench: Bench,
+        jobs: Sequence[tuple[int, int]],
+        values: Mapping[tuple[str, str, int], np.ndarray],
+        length: int,
+    ) -> dict[str, np.ndarray]:
+        rows = [_row(bench, number, k, values) for number, k in jobs]
+        stacked = jax.tree.map(lambda *a: np.stack(a), *[r[0] for r in rows])
+        start = {name: np.array([r[1][name] for r in rows]) for name in ("x", "y", "yaw", "temperature")}
+        commands = np.stack([_padded(bench.runs[number].commands, length) for number, _ in jobs])
+        with jax.enable_x64(True):
+            return {c: np.asarray(v) for c, v in self._run(stacked, start, commands).items()}
+
+
+def _padded(commands: np.ndarray, length: int) -> np.ndarray:
+    return np.concatenate([commands, np.repeat(commands[-1:], length - len(commands), axis=0)])
+
+
+def _row(
+    bench: Bench, number: int, k: int, values: Mapping[tuple[str, str, int], np.ndarray]
+) -> tuple[Params, dict[str, float]]:
+    """Parameters and start of one rover: the log's conditions with one row of coordinates put in."""
+    base, start = bench._params[number], dict(bench.runs[number].start)
+    effects = {e: {n: np.asarray(v, float) for n, v in p.items()} for e, p in base.effects.items()}
+    for (effect, name, log), column in values.items():
+        value = float(column[k])
+        if effect == "initial":
+            if log == number:
+                start[name] = value
+        elif _is_factor(bench, effect, name):
+            effects[effect][name] = effects[effect][name] * value
+        else:
+            effects[effect][name] = np.full_like(effects[effect][name], value)
+    return dataclasses.replace(base, effects=effects), start
+
+
+@functools.cache
+def _factor_table() -> Mapping[str, Any]:
+    from lunar_mjx.criticism.drive_problem import BASELINE
+
+    return BASELINE
+
+
+def _is_factor(bench: Bench, effect: str, name: str) -> bool:
+    """Baseline parameters move by a factor common to all wheels or joints; candidates by their value."""
+    del bench
+    return name in _factor_table().get(effect, {})
+
+
+def _modelled(model: Model) -> frozenset[str]:
+    from lunar_mjx.dynamics.signals import joint_channels
+
+    joints, corners = joint_channels(model.rover), [w.corner for w in model.rover.wheels]
+    names = [f"position_{a}_m" for a in "xyz"]
+    names += [f"{f}_velocity_{a}_m_s" for f in ("world", "body") for a in "xyz"]
+    names += [*EULER, *(f"gyro_{a}_rad_s" for a in "xyz"), *(f"accelerometer_{a}_m_s2" for a in "xyz")]
+    for j in joints:
+        names += [f"joint_{j}_angle_rad", f"joint_{j}_speed_rad_s", f"motor_{j}_torque_Nm", f"motor_{j}_current_A"]
+        names += [f"motor_{j}_voltage_V", f"winding_{j}_temperature_degC", f"housing_{j}_temperature_degC"]
+    for c in corners:
+        names += [f"wheel_{c}_sinkage_m", f"wheel_{c}_slip_ratio"]
+        names += [f"wheel_{c}_force_{a}_N" for a in "xyz"] + [f"wheel_{c}_moment_{a}_Nm" for a in "xyz"]
+    return frozenset(names)
+
+
+def log_run(log: Log, model: Model) -> LogRun:
+    """A log made ready: its model, its commands on whole time steps, and where the rover stands at first.
+
+    Raises:
+      UserError: the log is shorter than two samples, or is of another rover.
+    """
+    from lunar_mjx.criticism.log import commands as log_commands
+    from lunar_mjx.criticism.log import log_model
+
+    own = log_model(log, model)
+    given, begin = log_commands(log, own)
+    every = round(given.interval / own.timestep)
+    values = given.values
+    finest = max(_FINEST, min(float(np.median(np.diff(t.time_s))) for t in log.tables.values() if len(t) > 2))
+    split = next((k for k in range(1, every + 1) if every % k == 0 and given.interval / k <= 1.01 * finest), 1)
+    values, every = np.repeat(values, split, axis=0), every // split
+    if len(values) < 3:
+        raise UserError(f"{log.folder}: is too short to simulate ({len(values)} commands); record a longer drive.")
+    end = begin + (len(values) - 1) * every * own.timestep
+    start, unknown = _start(log, own)
+    return LogRun(own, values, every, begin, end, start, unknown, tuple(log.imu.position_m))  # type: ignore[arg-type]
+
+
+def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Pose and temperature at the first samples, and which of them are measured with noise and so must be fitted."""
+    start = {"x": 0.0, "y": 0.0, "yaw": 0.0, "temperature": float(model.ambient[0])}
+    unknown = []
+
+    def first(channel: str) -> float | None:
+        found = log.channel(channel)
+        return None if found is None or not len(found[1]) else float(np.mean(found[1][:5]))
+
+    stated = log.initial.get("position_m")
+    for i, axis in enumerate("xy"):
+        value = first(f"position_{axis}_m")
+        if stated is not None:
+            start[axis] = float(stated[i])
+        if value is not None:
+            start[axis] = value
+            unknown.append(axis)
+    yaw = first("yaw_deg")
+    if yaw is not None:
+        start["yaw"] = float(np.deg2rad(yaw))
+        unknown.append("yaw")
+    temperatures = [first(c) for c in log.channel_names if c.endswith("_temperature_degC")]
+    known = [t for t in temperatures if t is not None]
+    if known:
+        start["temperature"] = float(np.mean(known)) + ZERO_CELSIUS
+        unknown.append("temperature")
+    return start, tuple(unknown)
