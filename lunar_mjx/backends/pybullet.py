@@ -195,7 +195,8 @@ class _World:
         self._id = {"physicsClientId": self._client}
         with _quiet():
             self._body = p.loadURDF(str(urdf_of(model.rover)), useFixedBase=False,
-                                    flags=p.URDF_USE_INERTIA_FROM_FILE, **self._id)  # fmt: skip
+                                    flags=p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_IMPLICIT_CYLINDER,
+                                    **self._id)  # fmt: skip
         p.setGravity(0.0, 0.0, -model.gravity, **self._id)
         p.setTimeStep(model.timestep, **self._id)
         p.setPhysicsEngineParameter(numSolverIterations=200, solverResidualThreshold=0.0, erp=0.8, **self._id)
