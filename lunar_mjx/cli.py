@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from lunar_mjx import __version__
+from lunar_mjx.commands import train as train_commands
 from lunar_mjx.errors import EXIT_STATUS, UserError, bad_input
 
 INTERRUPTED = 130
@@ -276,6 +277,9 @@ def effect_show(name: Annotated[str, typer.Argument(help="Catalogue name, or my_
     from lunar_mjx.effects.catalogue import get
 
     print_effect(get(name), make_console())
+
+
+train_commands.register(app)
 
 
 @app.command()

@@ -47,6 +47,7 @@ class TrainConfig:
       normalise: normalise observations by their running mean and deviation.
       epoch_steps: steps of each environment per jitted epoch.
       episodes: report every episode that ends, for curves by episode; only for few environments.
+      precision: of matrix products: "highest" is float32; "default" lets recent GPUs round to TF32.
     """
 
     algorithm: TD3Config | DDPGConfig
@@ -59,11 +60,14 @@ class TrainConfig:
     normalise: bool = False
     epoch_steps: int = 1000
     episodes: bool = True
+    precision: str = "highest"
 
     def __post_init__(self) -> None:
         for name in ("envs", "batch", "updates", "buffer_steps", "epoch_steps"):
             if getattr(self, name) < 1:
                 raise bad_input("TrainConfig", name, getattr(self, name), "is below 1", "give at least 1")
+        if self.precision not in ("highest", "high", "default"):
+            raise bad_input("TrainConfig", "precision", self.precision, "does not exist", "use highest or default")
         if not 0.0 <= self.noise[0] <= self.noise[1]:
             raise bad_input("TrainConfig", "noise", self.noise, "is no range of deviations", "give (least, greatest)")
         if self.random_steps < self.algorithm.n_step:
@@ -124,7 +128,8 @@ class Learner:
 
     def init(self, seed: int) -> TrainState:
         """The state before the first step."""
-        return self._init(jax.random.PRNGKey(seed))
+        with jax.default_matmul_precision(self.config.precision):
+            return self._init(jax.random.PRNGKey(seed))
 
     def epoch(self, env_params: Any, state: TrainState) -> tuple[TrainState, Any]:
         """Runs `epoch_steps` steps of every environment, and their updates; `state` is used up.
@@ -133,7 +138,8 @@ class Learner:
           The state after, and a pair: numbers of the epoch by name, and per step and environment (or nothing) whether
           an episode ended, its return, length and success.
         """
-        return self._epoch(env_params, state)
+        with jax.default_matmul_precision(self.config.precision):
+            return self._epoch(env_params, state)
 
     def shardings(self, state: Any) -> Any:
         """Where every leaf of a state like `state` lives."""

@@ -47,7 +47,8 @@ class Result:
     Attributes:
       learner, state: from which more can be read.
       policy: the trained policy.
-      rows: numbers of every epoch. episodes: return, length, success and step of every episode, where recorded.
+      rows: numbers of every epoch; `elapsed_s` in them counts compilation but not the callback.
+      episodes: return, length, success and step of every episode, where recorded.
       finished: False if the time limit came first.
     """
 
@@ -112,13 +113,15 @@ class _Loop:
     def run(self, callback: Callback | None) -> Result:
         c, total = self.config, max(1, math.ceil(self.config.steps / self.per_epoch))
         begin = saved = time.monotonic()
-        before, stop = self.elapsed, False
+        before, stop, outside = self.elapsed, False, 0.0
         while self.epochs < total and not stop:
             tick = time.monotonic()
             row = self._epoch()
-            self.elapsed = before + time.monotonic() - begin
-            row |= {"elapsed_s": self.elapsed, "steps_per_s": self.per_epoch / (time.monotonic() - tick)}
+            tock = time.monotonic()
+            self.elapsed = before + tock - begin - outside
+            row |= {"elapsed_s": self.elapsed, "steps_per_s": self.per_epoch / (tock - tick)}
             extra = callback(self.learner, self.state, row) if callback else None
+            outside += time.monotonic() - tock
             stop = bool((extra or {}).pop("stop", False)) if extra else False
             row |= extra or {}
             self._keep(row)
@@ -163,7 +166,7 @@ class _Loop:
     def _save(self) -> None:
         assert self.checkpoints is not None
         notes = {"epochs": self.epochs, "elapsed": self.elapsed, "rows": self.rows, "episodes": self.episodes}
-        self.checkpoints.save(self.epochs, self.state, _plain(notes))
+        self.checkpoints.save(self.epochs, self.state, plain(notes))
 
     def _diverged(self) -> None:
         envs = self.learner.config.envs // self.learner.devices
@@ -187,7 +190,7 @@ class _Loop:
     def _result(self, finished: bool) -> Result:
         notes = {
             "algorithm": type(self.learner.agent).__name__,
-            "train": _plain(dataclasses.asdict(self.learner.config)),
+            "train": plain(dataclasses.asdict(self.learner.config)),
             "seed": self.config.seed,
             "steps": self.epochs * self.per_epoch,
             "elapsed_s": self.elapsed,
@@ -204,12 +207,12 @@ class _Loop:
             self.checkpoints.close()
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """As JSON holds it: not-a-numbers become None."""
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -1,0 +1,84 @@
+"""Learning curves: by environment step and wall time, and by episode on the axes of the paper's Fig. 6."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_BAND = 20
+"""Episodes in the moving mean of curves by episode."""
+
+
+def _figure(columns: int, width: float = 5.0, height: float = 3.6) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(columns * width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(1, columns, squeeze=False)[0]
+
+
+def moving_mean(values: Sequence[float], width: int = _BAND) -> np.ndarray:
+    """Mean over the last `width` values, fewer at the beginning."""
+    values = np.asarray(values, float)
+    total = np.cumsum(np.insert(values, 0, 0.0))
+    last = np.arange(1, len(values) + 1)
+    first = np.maximum(last - width, 0)
+    return (total[last] - total[first]) / (last - first)
+
+
+def mean_interval(curves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean over seeds (first axis) and its 95 % interval by Student's t; no width for one seed."""
+    from scipy import stats
+
+    mean, count = curves.mean(axis=0), len(curves)
+    if count < 2:
+        return mean, mean, mean
+    half = stats.t.ppf(0.975, count - 1) * curves.std(axis=0, ddof=1) / np.sqrt(count)
+    return mean, mean - half, mean + half
+
+
+def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str = "") -> Path:
+    """Return and success over environment steps, and success on unseen ground over wall time; a line per record."""
+    figure, (first, second, third) = _figure(3)
+    for record in records:
+        rows = [r for r in record["rows"] if r.get("episode_return") is not None]
+        steps, label = [r["steps"] for r in rows], f"seed {record['seed']}"
+        first.plot(steps, [r["episode_return"] for r in rows], lw=1, label=label)
+        second.plot(steps, [100 * r["success"] for r in rows], lw=1)
+        third.plot([s["elapsed_s"] for s in record["unseen"]], [100 * s["success"] for s in record["unseen"]], "o-",
+                   ms=3, lw=1)  # fmt: skip
+    first.set(xlabel="environment steps", ylabel="return of ended episodes", title=title)
+    second.set(xlabel="environment steps", ylabel="success in training, %", ylim=(-3, 103))
+    third.set(xlabel="wall time of training, s", ylabel="success on unseen ground, %", ylim=(-3, 103))
+    third.axhline(95, color="0.7", lw=0.8, ls="--")
+    first.legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path, most: int | None = None) -> Path:
+    """Average return per episode over episodes, as the paper's Fig. 6: mean over seeds with its interval.
+
+    Args:
+      groups: by algorithm, records of its seeds.
+      path: of the picture.
+      most: episodes to show; as many as every seed has if None.
+    """
+    figure, (axes,) = _figure(1, 6.0)
+    styles = ["-", "--", "-.", ":"]
+    for i, (name, records) in enumerate(groups.items()):
+        curves = [moving_mean(r["episodes"]["episode_return"]) for r in records]
+        count = min(len(c) for c in curves) if most is None else most
+        curves = [np.pad(c[:count], (0, max(0, count - len(c))), constant_values=np.nan) for c in curves]
+        mean, low, high = mean_interval(np.stack(curves))
+        axes.plot(np.arange(1, count + 1), mean, styles[i % 4], label=name)
+        if len(curves) > 1:
+            axes.fill_between(np.arange(1, count + 1), low, high, alpha=0.2)
+    axes.set(xlabel="episode", ylabel=f"average return per episode (mean of {_BAND})")
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=120)
+    return path

@@ -1,0 +1,171 @@
+"""One episode of an agent, looked at closely: its path, its commands and a video."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from PIL import Image
+
+from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.envs import NavigationEnv, make, make_agent, split_keys
+from lunar_mjx.envs.render import Camera, TopView
+from lunar_mjx.envs.scripted import AGENTS, Agent
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.resources import shipped
+
+VIEWS = ("auto", "camera", "top")
+_FRAMES = 300
+"""Most frames of a video."""
+
+
+def shipped_policy(rover: str) -> Path | None:
+    """The trained policy that ships with a rover, or None."""
+    path = shipped("models") / rover / "policy.npz"
+    return path if path.is_file() else None
+
+
+def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = None) -> tuple[Any, Agent, dict]:
+    """An agent with the environment that it was made for.
+
+    Args:
+      name: path of a policy, name of a rover that ships one, or `zero`, `random`, `scripted`.
+      task: of agents without a policy.
+      options: of the environment that differ from the policy's.
+
+    Returns:
+      The environment, the agent, and the options of the unseen ground that it is to be scored on.
+
+    Raises:
+      UserError: no such agent.
+    """
+    options = options or {}
+    if name in AGENTS:
+        env = make("navigation", **{"task": task, **options})
+        unseen = {"terrain": "world:heldout", "ranges": "unseen"} if task == "large" else {}
+        return env, make_agent(name, env), unseen
+    path = Path(name) if name.endswith(".npz") else shipped_policy(name)
+    if path is None:
+        raise bad_input("agent", "agent", name, "is no rover with a trained policy",
+                        f"give a policy.npz, or one of {', '.join(AGENTS)}")  # fmt: skip
+    policy = load_policy(path)
+    made_in = policy.environment
+    arguments = {k: tuple(v) if isinstance(v, list) else v for k, v in made_in["options"].items()}
+    env = make(made_in["name"], **{**arguments, **options})
+    if env.observation_size != policy.network["obs"] or env.action_size != policy.network["actions"]:
+        raise bad_input(path, "observations", policy.network["obs"],
+                        f"do not fit the environment's {env.observation_size}",
+                        "change no observations or actions")  # fmt: skip
+    return env, lambda state, key: policy.act(state.obs), dict(made_in.get("unseen", {}))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode; arrays lead with time.
+
+    Attributes:
+      env, params: where. qpos, yaw, position, action, reward: at every step. goal: m. end: how it ended.
+    """
+
+    env: NavigationEnv
+    params: Any
+    qpos: np.ndarray
+    yaw: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray
+    goal: np.ndarray
+    end: str
+
+    @property
+    def sentence(self) -> str:
+        length = float(np.hypot(*np.diff(self.qpos[:, :2], axis=0).T).sum())
+        time = len(self.reward) * self.env.control_interval
+        return f"{self.end} after {time:.1f} s and {length:.1f} m, return {self.reward.sum():.1f}"
+
+    def write(self, folder: Path, view: str = "auto") -> list[Path]:
+        """Writes the table of the drive, a picture of the path and an animated WebP; returns their paths.
+
+        Raises:
+          UserError: unknown view, or `camera` without OpenGL.
+        """
+        if view not in VIEWS:
+            raise bad_input("play", "view", view, "does not exist", f"use one of {', '.join(VIEWS)}")
+        frames, still = self._frames(view)
+        table = np.column_stack([np.arange(len(self.reward)) * self.env.control_interval, self.qpos[:-1, :3],
+                                 self.yaw[:-1], self.reward, self.action])  # fmt: skip
+        names = ["time_s", "position_x_m", "position_y_m", "position_z_m", "yaw_rad", "reward",
+                 *(f"action_{n}" for n in self.env.actions.names)]  # fmt: skip
+        csv, picture, video = (folder / n for n in ("episode.csv", "path.png", "episode.webp"))
+        np.savetxt(csv, table, delimiter=",", header=",".join(names), comments="", fmt="%.6g")
+        Image.fromarray(still).save(picture)
+        stride = max(1, len(self.reward) // _FRAMES)
+        images = [Image.fromarray(f) for f in frames]
+        images[0].save(video, save_all=True, append_images=images[1:], loop=0, quality=75,
+                       duration=max(20, round(1000 * stride * self.env.control_interval / 4)))  # fmt: skip
+        note = {"end": self.end, "goal_m": self.goal.tolist(), "speed_up": 4}
+        (folder / "episode.json").write_text(json.dumps(note) + "\n", encoding="utf-8")
+        return [csv, picture, video]
+
+    def _frames(self, view: str) -> tuple[list[np.ndarray], np.ndarray]:
+        terrain, rover = self.params.system.terrain, self.env.model.rover
+        places = np.vstack([self.qpos[:, :2], self.goal[None]])
+        radius, size = self.env.config.goal_radius, 5.0 * self.env.model.rover.standing_height
+        top = TopView(terrain, places)
+        steps = range(0, len(self.qpos), max(1, len(self.reward) // _FRAMES))
+
+        def drawn(i: int) -> np.ndarray:
+            return top.frame(self.qpos[i], float(self.yaw[i]), self.goal, radius, self.qpos[: i + 1, :2], size)
+
+        still = drawn(len(self.qpos) - 1)
+        if view != "top":
+            try:
+                camera = Camera(rover, terrain, places)
+            except UserError:
+                if view == "camera":
+                    raise
+            else:
+                ground = float(self.qpos[0, 2]) - rover.standing_height
+                frames = [camera.frame(self.qpos[i], float(self.yaw[i]), self.goal, ground) for i in steps]
+                camera.close()
+                return frames, still
+        return [drawn(i) for i in steps], still
+
+
+def play_episode(env: Any, params: Any, agent: Agent, seed: int = 0) -> Episode:
+    """Drives one rover for one episode.
+
+    Raises:
+      UserError: an environment without a rover.
+    """
+    if not isinstance(env, NavigationEnv):
+        raise UserError("play: the environment has no rover; give the navigation task.")
+    step = jax.jit(lambda params, state, key: _acted(env, agent, params, state, key))
+    state = jax.jit(lambda params, key: env.reset(params, split_keys(key, 1)))(params, jax.random.PRNGKey(seed))
+    goal = np.asarray(state.inner.goal[0])
+    qpos, actions, rewards, end = [np.asarray(state.inner.physics.qpos[0])], [], [], "time is up"
+    for i in range(env.episode_steps):
+        action, state = step(params, state, jax.random.fold_in(jax.random.PRNGKey(seed + 1), i))
+        actions.append(np.asarray(action[0]))
+        rewards.append(float(state.reward[0]))
+        if bool(state.done[0]):
+            flags = {k: float(v[0]) for k, v in state.metrics.items() if not k.startswith("reward_")}
+            names = {"success": "goal reached", "rolled_over": "rolled over", "stuck": "stuck",
+                     "off_terrain": "left the terrain", "diverged": "diverged"}  # fmt: skip
+            end = next((text for k, text in names.items() if flags[k] > 0), end)
+            # the pose after the last step is gone with the reset: the picture ends one step before
+            qpos.append(qpos[-1])
+            break
+        qpos.append(np.asarray(state.inner.physics.qpos[0]))
+    table = np.stack(qpos)
+    w, x, y, z = table[:, 3:7].T
+    yaw = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+    return Episode(env, params, table, yaw, np.stack(actions), np.array(rewards), goal, end)
+
+
+def _acted(env: Any, agent: Agent, params: Any, state: Any, key: Any) -> Any:
+    action = agent(state, key)
+    return action, env.step(params, state, action)

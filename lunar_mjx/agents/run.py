@@ -1,0 +1,154 @@
+"""One training from its name to its curve, policy and scores; what the command and the scripts in `train/` share."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from lunar_mjx.agents.configs import Training
+from lunar_mjx.agents.curves import plot_episodes, plot_progress
+from lunar_mjx.agents.evaluate import Evaluator, Score
+from lunar_mjx.agents.learner import Learner, TrainState, normalised
+from lunar_mjx.agents.policy import Policy, policy_of, save_policy
+from lunar_mjx.agents.train import Result, RunConfig, plain, train
+from lunar_mjx.envs import NavigationEnv, make
+from lunar_mjx.envs.config import UNSEEN_SOIL
+
+
+def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
+    """The environment's parameters for an evaluation: other terrain, soil and places than in training.
+
+    Args:
+      env: of the training. options: `terrain`, and `ranges` = "unseen" for the held-out soil.
+    """
+    if not isinstance(env, NavigationEnv):
+        return env.params
+    from lunar_mjx.envs.worlds import PREFIX, world
+
+    model, terrain = env.model, options.get("terrain")
+    if terrain is not None:
+        ground = world(terrain.removeprefix(PREFIX)) if terrain.startswith(PREFIX) else terrain
+        model = model.replace(terrain=ground)
+    unseen = {r.parameter: r for r in UNSEEN_SOIL}
+    ranges = None
+    if options.get("ranges") == "unseen":
+        ranges = tuple(unseen.get(r.parameter, r) for r in env.config.randomise)
+    return env.place(model, ranges, seed=env.config.place_seed + 7919)
+
+
+class Scorer:
+    """Scores a training's policy on unseen ground every so often; stops it at a wanted success rate.
+
+    Args:
+      env: the environment. unseen: see `unseen_params`.
+      episodes: per evaluation. every: s of training between evaluations.
+      target: success rate at which the training stops; never if None.
+      folder: the policy with the best score is kept there as `best_policy.npz`.
+    """
+
+    def __init__(self, env: Any, unseen: Mapping[str, Any], episodes: int, every: float, target: float | None,
+                 folder: Path | None, environment: dict[str, Any]):  # fmt: skip
+        self.params = unseen_params(env, unseen)
+        self.every, self.target, self.folder, self.environment = every, target, folder, environment
+        self.scores: list[dict[str, Any]] = []
+        self._next, self._best, self._evaluator = every, -1.0, None
+        self._env, self._episodes = env, episodes
+
+    def __call__(self, learner: Learner, state: TrainState, row: dict[str, Any]) -> dict[str, Any] | None:
+        if row["elapsed_s"] < self._next:
+            return None
+        score = self.score(learner, state)
+        self._next = row["elapsed_s"] + self.every
+        self.scores.append({"steps": row["steps"], "elapsed_s": row["elapsed_s"], **score.record()})
+        if score.success > self._best and self.folder is not None:
+            self._best = score.success
+            notes = {"score": score.record(), "steps": row["steps"], "elapsed_s": row["elapsed_s"]}
+            save_policy(policy_of(learner, state, self.environment, notes), self.folder / "best_policy.npz")
+        stop = self.target is not None and score.success >= self.target
+        return {"unseen_success": score.success, "unseen_return": score.episode_return, "stop": stop}
+
+    def score(self, learner: Learner, state: TrainState, seed: int = 12345) -> Score:
+        """Scores the policy of a state."""
+        if self._evaluator is None:
+            actor = learner.agent
+
+            def agent(params: Any, state: Any, key: Any) -> Any:
+                weights, statistics = params
+                obs = state.obs if statistics is None else normalised(state.obs, *statistics)
+                return actor.act(weights, obs)
+
+            self._evaluator = Evaluator(self._env, agent, self._episodes)
+        params = jax.device_put(jax.device_get(learner.policy(state)))
+        return self._evaluator(self.params, params, seed)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Report:
+    """What `run_training` came to.
+
+    Attributes:
+      result: of the training. score: of its policy on unseen ground. record: what `curve.json` holds.
+    """
+
+    result: Result
+    score: Score
+    record: dict[str, Any]
+
+
+def run_training(
+    name: str,
+    training: Training,
+    run: RunConfig,
+    folder: Path,
+    eval_every: float = 15.0,
+    eval_episodes: int = 512,
+    target: float | None = None,
+) -> Report:
+    """Trains, scores on unseen ground, and writes policy, curve and scores into a folder.
+
+    Files: `progress.csv`, `events/` (TensorBoard), `checkpoints/`, `policy.npz`, `best_policy.npz` (best on unseen
+    ground during training), `curve.json`, `curve.png`.
+
+    Args:
+      name: of the training, for titles.
+      training: what to train. run: how long.
+      eval_every: s of training between scores. eval_episodes: of each.
+      target: success rate on unseen ground at which to stop.
+    """
+    begin = time.monotonic()
+    env = make(training.environment, **training.options)
+    environment = {"name": training.environment, "options": plain(dict(training.options)),
+                   "unseen": dict(training.unseen)}  # fmt: skip
+    learner = Learner(env, training.train)
+    scorer = Scorer(env, training.unseen, eval_episodes, eval_every, target, folder, environment)
+    result = train(learner, run, folder, environment, scorer)
+    score = scorer.score(learner, result.state, seed=54321)
+    record = {
+        "training": name,
+        "environment": environment,
+        "train": plain(dataclasses.asdict(training.train)),
+        "seed": run.seed,
+        "device": f"{jax.device_count()} x {jax.devices()[0].device_kind}",
+        "finished": result.finished,
+        "wall_s": time.monotonic() - begin,
+        "rows": plain(result.rows),
+        "episodes": plain(result.episodes),
+        "unseen": plain(scorer.scores),
+        "final": plain(score.record()),
+    }
+    (folder / "curve.json").write_text(json.dumps(record), encoding="utf-8")
+    plot_progress([record], folder / "curve.png", name)
+    if result.episodes["step"]:
+        plot_episodes({name: [record]}, folder / "episodes.png")
+    return Report(result, score, record)
+
+
+def agent_of(policy: Policy) -> Any:
+    """The policy as an agent of `Evaluator`, which takes no parameters."""
+    return lambda _, state, key: policy.act(state.obs)

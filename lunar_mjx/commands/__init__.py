@@ -1,0 +1,1 @@
+"""The commands of `lunar-mjx`, a module for each topic."""

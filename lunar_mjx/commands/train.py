@@ -1,0 +1,167 @@
+"""`lunar-mjx train`, `evaluate` and `play`: reinforcement learning from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lunar_mjx.errors import bad_input
+
+DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+SetOption = Annotated[list[str] | None, typer.Option("--set", help="name=value: a field of the training's settings.")]
+EnvSetOption = Annotated[
+    list[str] | None, typer.Option("--env", help="name=value: an option of the environment, as JSON or text.")
+]
+
+
+def _pairs(option: str, texts: list[str] | None) -> dict[str, str]:
+    pairs = {}
+    for text in texts or []:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise bad_input("lunar-mjx", option, text, "is not name=value", f"write {option} name=value")
+        pairs[name] = value
+    return pairs
+
+
+def env_options(texts: list[str] | None) -> dict[str, Any]:
+    """Options of an environment from `name=value` texts; a value is JSON where it reads as JSON, else text."""
+    options: dict[str, Any] = {}
+    for name, text in _pairs("--env", texts).items():
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text
+        options[name] = tuple(value) if isinstance(value, list) else value
+    return options
+
+
+def train(
+    training: Annotated[str, typer.Argument(help="Name of a training; see --list.")] = "large-td3",
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to resume from.")] = Path(
+        "runs/train"
+    ),
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; the training's own if left out.")] = None,
+    time_limit: Annotated[float | None, typer.Option(help="s after which it saves and stops, to be resumed.")] = None,
+    target: Annotated[float | None, typer.Option(help="Success rate on unseen ground at which it stops.")] = None,
+    environment: Annotated[
+        str | None, typer.Option(help="Environment instead: a name, or my_env.py:make_env, run as your own code.")
+    ] = None,
+    settings: SetOption = None,
+    env: EnvSetOption = None,
+    eval_every: Annotated[float, typer.Option(help="s of training between evaluations.")] = 30.0,
+    eval_episodes: Annotated[int, typer.Option(min=1)] = 256,
+    checkpoint_every: Annotated[float, typer.Option(help="s between checkpoints.")] = 300.0,
+    restart: Annotated[bool, typer.Option(help="Begin anew although the folder has a checkpoint.")] = False,
+    quiet: Annotated[bool, typer.Option(help="No progress.")] = False,
+    list_: Annotated[bool, typer.Option("--list", help="List the trainings and stop.")] = False,
+    device: DeviceOption = "auto",
+) -> None:
+    """Train a policy; resumes from the folder's newest checkpoint."""
+    from lunar_mjx.cli import check_finite, check_folder, make_folder, select_device
+
+    check_folder(out)
+    limits = {"time_limit": time_limit, "target": target, "eval_every": eval_every}
+    check_finite(**{k: v for k, v in limits.items() if v is not None})
+    select_device(device)
+    import dataclasses
+
+    from lunar_mjx.agents.configs import TRAININGS, get_training, override
+
+    if list_:
+        for name, known in TRAININGS.items():
+            print(f"{name:12} {known.note}")
+        return
+    chosen = override(get_training(training), **_pairs("--set", settings))
+    options = env_options(env)
+    if environment is not None:
+        chosen = dataclasses.replace(chosen, environment=environment, options=options, unseen={})
+    elif options:
+        chosen = dataclasses.replace(chosen, options={**chosen.options, **options})
+    from lunar_mjx.agents.run import run_training
+    from lunar_mjx.agents.train import RunConfig
+
+    run = RunConfig(steps or chosen.steps, seed, time_limit, checkpoint_every, not restart, quiet)
+    report = run_training(training, chosen, run, make_folder(out), eval_every, eval_episodes, target)
+    score = report.score
+    print(f"success on unseen ground {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of "
+          f"{score.episodes} episodes, return {score.episode_return:.1f}")  # fmt: skip
+    if not report.result.finished:
+        print("time limit reached; the same command resumes")
+    print(out / "policy.npz")
+
+
+AgentArgument = Annotated[str, typer.Argument(help="policy.npz, a shipped policy's rover, or zero, random, scripted.")]
+TaskOption = Annotated[str, typer.Option(help="Task for agents without a policy: paper, consistent or large.")]
+
+
+def evaluate(
+    agent: AgentArgument,
+    episodes: Annotated[int, typer.Option(min=1)] = 256,
+    seed: Annotated[int, typer.Option(min=0)] = 54321,
+    task: TaskOption = "large",
+    terrain: Annotated[str | None, typer.Option(help="Terrain; the policy's unseen one if left out.")] = None,
+    seen: Annotated[bool, typer.Option(help="On the ground and soil of the training instead.")] = False,
+    env: EnvSetOption = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="JSON file to write.")] = None,
+    device: DeviceOption = "auto",
+) -> None:
+    """Score an agent: success rate with its 95 % interval, on unseen ground, goals and soil."""
+    from lunar_mjx.cli import select_device
+
+    select_device(device)
+    from lunar_mjx.agents.evaluate import Evaluator
+    from lunar_mjx.agents.play import open_agent
+    from lunar_mjx.agents.run import unseen_params
+
+    made, act, unseen = open_agent(agent, task, env_options(env))
+    if terrain is not None:
+        unseen = {**unseen, "terrain": terrain}
+    params = made.params if seen and terrain is None else unseen_params(made, {} if seen else unseen)
+    score = Evaluator(made, lambda _, state, key: act(state, key), episodes)(params, (), seed)
+    print(f"success {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of {score.episodes} "
+          f"episodes, return {score.episode_return:.1f} +- {score.return_deviation:.1f}, "
+          f"{score.episode_time:.1f} s an episode")  # fmt: skip
+    print(", ".join(f"{name} {100 * share:.1f} %" for name, share in score.ends.items()))
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps({"agent": agent, **score.record()}, indent=1) + "\n", encoding="utf-8")
+        print(out)
+
+
+def play(
+    agent: AgentArgument = "luvmi_x",
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("runs/play"),
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    task: TaskOption = "large",
+    terrain: Annotated[str | None, typer.Option(help="Terrain; the policy's unseen one if left out.")] = None,
+    view: Annotated[str, typer.Option(help="camera (needs OpenGL), top, or auto: camera where it works.")] = "auto",
+    env: EnvSetOption = None,
+    device: DeviceOption = "auto",
+) -> None:
+    """Drive one episode and write a video of it."""
+    from lunar_mjx.cli import check_folder, make_folder, select_device
+
+    check_folder(out)
+    select_device(device)
+    from lunar_mjx.agents.play import open_agent, play_episode
+    from lunar_mjx.agents.run import unseen_params
+
+    made, act, unseen = open_agent(agent, task, env_options(env))
+    if terrain is not None:
+        unseen = {**unseen, "terrain": terrain}
+    episode = play_episode(made, unseen_params(made, unseen), act, seed)
+    print(episode.sentence)
+    for path in episode.write(make_folder(out), view):
+        print(path)
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the commands to the application."""
+    app.command()(train)
+    app.command()(evaluate)
+    app.command()(play)
