@@ -18,7 +18,7 @@ from lunar_mjx.backends.base import STAGES, Backend, BackendState, Observation, 
 from lunar_mjx.backends.hooks import Hook
 from lunar_mjx.backends.jax_backend import JaxBackend
 from lunar_mjx.backends.native import NativeBackend
-from lunar_mjx.backends.parity_cases import QUANTITIES, Case, Tolerance
+from lunar_mjx.backends.parity_cases import LOOP_RATE, QUANTITIES, RATES, RELATIVE, Case, Tolerance
 from lunar_mjx.dynamics.state import Telemetry
 from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands
@@ -285,10 +285,18 @@ def traces(seen: Telemetry) -> Observation:
     return {**out, "orientation": out["quaternion"]}
 
 
-def tolerances(relative: float, drive: bool = False) -> dict[str, Tolerance]:
-    """Tolerance of every quantity: relative, and absolute in proportion to the quantity's typical size."""
+def tolerances(kind: str, drive: bool = False) -> dict[str, Tolerance]:
+    """Tolerance of every quantity: relative, and absolute in proportion to the quantity's typical size.
+
+    Args:
+      kind: key of `RELATIVE`. drive: whether whole drives are compared, which gather ten times as much.
+    """
     grown = 10.0 if drive else 1.0
-    return {k: Tolerance(grown * relative * size, grown * relative) for k, (_, size) in QUANTITIES.items()}
+    out = {}
+    for quantity, (_, size) in QUANTITIES.items():
+        relative = LOOP_RATE if kind == "soft loop" and quantity in RATES else grown * RELATIVE[kind]
+        out[quantity] = Tolerance(relative * size, relative)
+    return out
 
 
 def first_failure(results: Iterable[Result]) -> Result | None:
