@@ -99,8 +99,8 @@ def _interval(tables: list[Any], timestep: float) -> float:
 def log_model(log: Log, base: Model) -> Model:
     """The base model under the log's conditions: gravity, terrain, changes of the rover, ambient, control modes.
 
-    Sun angles go to every effect of the model that has the parameters `sun_azimuth` and `sun_elevation`. An ambient
-    temperature that is a channel gives its mean.
+    A canned manoeuvre brings the arrangement of its test. The Sun's angles go to every effect of the model that has the
+    parameters `sun_azimuth` and `sun_elevation`. An ambient temperature that is a channel gives its mean.
 
     Raises:
       UserError: the log is of another rover, or states what the model cannot take.
@@ -119,7 +119,14 @@ def log_model(log: Log, base: Model) -> Model:
     if any(log.terrain_origin_m):
         x, y = log.terrain_origin_m
         model = model.replace(terrain=moved(model.terrain, -x, -y), terrain_spec="")
-    return _sun(log, _changed_rover(log, model))
+    return _arranged(log, _sun(log, _changed_rover(log, model)))
+
+
+def _arranged(log: Log, model: Model) -> Model:
+    """The arrangement of a canned manoeuvre (a stand, a brake), which its log names."""
+    from lunar_mjx.manoeuvres import MANOEUVRES, load_manoeuvre, with_arrangement  # which reads files as this package
+
+    return with_arrangement(load_manoeuvre(log.manoeuvre), model) if log.manoeuvre in MANOEUVRES else model
 
 
 def environment_value(log: Log, key: str) -> float | None:

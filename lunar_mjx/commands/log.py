@@ -1,0 +1,183 @@
+"""`lunar-mjx log`: template, check, recording from the simulator, and sealed answers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lunar_mjx.errors import UserError, bad_input
+
+BAD_DATA_STATUS = 10
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command `log` to the application."""
+    log_app = typer.Typer(help="Measurement logs: make, check, simulate, unseal.", no_args_is_help=True)
+    log_app.command("new")(new)
+    log_app.command("check")(check)
+    log_app.command("simulate")(simulate)
+    log_app.command("unseal")(unseal)
+    log_app.command("manoeuvres")(manoeuvres)
+    app.add_typer(log_app, name="log")
+
+
+def new(
+    folder: Annotated[Path, typer.Argument(help="Folder to make; must not exist or be empty.")],
+    rover: Annotated[str, typer.Option(help="Name of a shipped rover, or folder of one.")] = "viper",
+    manoeuvre: Annotated[str, typer.Option(help="Canned manoeuvre or free text.")] = "speed_staircase",
+    steady: Annotated[bool, typer.Option(help="For a single-wheel test bed.")] = False,
+) -> None:
+    """Write a commented template of a log: fill in its tables, then check it."""
+    from lunar_mjx.criticism.log import new_log
+
+    print(new_log(folder, rover, manoeuvre, steady))
+
+
+def check(
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or folders of logs.")],
+    slowest: Annotated[
+        list[str] | None, typer.Option(help="Effect that will be asked about and its time constant, as name=600 (s).")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print findings as JSON.")] = False,
+) -> None:
+    """Check logs before anything else uses them; exit status 10 where data are unusable."""
+    from lunar_mjx.criticism.log import check as check_logs
+    from lunar_mjx.criticism.log import read_campaign
+    from lunar_mjx.criticism.log.findings import is_bad
+
+    read = read_campaign(logs)
+    found = check_logs(read, _numbers("--slowest", slowest))
+    if as_json:
+        print(json.dumps({"logs": [log.name for log in read], "bad_data": is_bad(found),
+                          "findings": [f.to_dict() for f in found]}, indent=2))  # fmt: skip
+    else:
+        _print_findings(read, found)
+    if is_bad(found):
+        raise typer.Exit(BAD_DATA_STATUS)
+
+
+def _print_findings(logs: list[Any], found: list[Any]) -> None:
+    from rich.markup import escape
+
+    from lunar_mjx.criticism.log import SteadyLog
+    from lunar_mjx.describe import make_console, make_table
+
+    console = make_console()
+    for log in logs:
+        mine = [f for f in found if f.log == log.name]
+        if isinstance(log, SteadyLog):
+            what = f"{len(log.table)} points"
+        else:
+            what = ", ".join(f"{t.name} {len(t)} rows x {len(t.channels)}" for t in log.tables.values())
+        bad = sum(f.severity == "bad_data" for f in mine)
+        console.print(f"{escape(log.name)} ({what}): {f'BAD_DATA, {bad} findings' if bad else 'fit to be used'}")
+        if not mine:
+            continue
+        table = make_table("", "table", "line", "column", "kind", "finding")
+        for f in mine:
+            mark = "BAD" if f.severity == "bad_data" else "note"
+            line = "" if f.line is None else str(f.line)
+            table.add_row(mark, escape(f.table), line, escape(f.column), f.kind, escape(f.message))
+        console.print(table)
+
+
+def simulate(
+    out: Annotated[Path, typer.Argument(help="Folder of the log; the answer goes to OUT.answer.toml.")],
+    rover: Annotated[str, typer.Option(help="Name of a shipped rover, or folder of one.")] = "viper",
+    manoeuvre: Annotated[str, typer.Option(help="Canned manoeuvre, or TOML file of one.")] = "speed_staircase",
+    effect: Annotated[
+        list[str] | None, typer.Option(help="Hidden effect, as NAME or NAME:parameter=value,parameter=value.")
+    ] = None,
+    effects: Annotated[
+        list[str] | None, typer.Option(help="Hidden effect from your own file, as my_effects.py:name.")
+    ] = None,
+    preset: Annotated[str, typer.Option(help="consistent or paper.")] = "consistent",
+    model: Annotated[Path | None, typer.Option(help="model.toml; overrides --rover and --preset.")] = None,
+    terrain: Annotated[str | None, typer.Option(help="In place of the manoeuvre's terrain.")] = None,
+    gravity: Annotated[float | None, typer.Option(help="m/s2")] = None,
+    noise: Annotated[str, typer.Option(help="datasheet, none or scale:5.")] = "datasheet",
+    coloured: Annotated[bool, typer.Option(help="Autoregressive noise instead of white.")] = False,
+    quantise: Annotated[bool, typer.Option(help="Round to the instruments' steps.")] = False,
+    dropouts: Annotated[float, typer.Option(help="Share of samples lost.")] = 0.0,
+    bias: Annotated[list[str] | None, typer.Option(help="Constant added to a channel, as gyro_z_rad_s=0.01.")] = None,
+    forces: Annotated[bool, typer.Option(help="With force and torque sensors.")] = False,
+    seconds: Annotated[float | None, typer.Option(help="Length of the drive; the manoeuvre's own if left out.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the noise; drawn if left out.")] = None,
+    split: Annotated[str | None, typer.Option(help="fit, select or test.")] = None,
+    seal: Annotated[bool, typer.Option(help="Commit to the answer, so that it can be shown later.")] = False,
+) -> None:
+    """Record a log from the simulator, with any hidden effect and any noise."""
+    from lunar_mjx.criticism.log import Recording, simulate_log
+    from lunar_mjx.criticism.log.instruments import parse_noise
+    from lunar_mjx.criticism.log.seal import answer_path
+    from lunar_mjx.model_file import load_model
+
+    recording = Recording(parse_noise(noise), coloured, quantise=quantise, dropouts=dropouts,
+                          bias=_numbers("--bias", bias), forces=forces)  # fmt: skip
+    hidden = [_effect(text) for text in effect or []] + [(text, {}) for text in effects or []]
+    folder = simulate_log(
+        out, rover, manoeuvre, hidden, preset=preset, model=load_model(model) if model else None, terrain=terrain,
+        gravity_m_s2=gravity, recording=recording, seconds=seconds, seed=seed, seal=seal, split=split,
+    )  # fmt: skip
+    print(folder)
+    print(f"answer (keep it): {answer_path(out)}" if seal else f"answer: {answer_path(out)}")
+
+
+def _effect(text: str) -> tuple[str, dict[str, float]]:
+    """NAME:parameter=value,... as a name and its values."""
+    name, _, rest = text.partition(":")
+    return name, _numbers("--effect", rest.split(",") if rest else [])
+
+
+def _numbers(option: str, pairs: list[str] | None) -> dict[str, float]:
+    values = {}
+    for pair in pairs or []:
+        name, equals, number = pair.partition("=")
+        try:
+            values[name.strip()] = float(number)
+        except ValueError:
+            equals = ""
+        if not equals or not name.strip():
+            raise bad_input("lunar-mjx log", option, pair, "is not name=number", "write it as in stiffness=0.5")
+    return values
+
+
+def unseal(
+    answer: Annotated[Path, typer.Argument(help="OUT.answer.toml that the sender kept.")],
+    log: Annotated[Path, typer.Argument(help="The sealed log.")],
+    verdict: Annotated[Path | None, typer.Option(help="The colleague's verdict.json, or its folder.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Open the answer to a sealed log, and compare it with a verdict."""
+    from lunar_mjx.criticism.log import unseal as open_answer
+
+    result = open_answer(answer, log, verdict)
+    if as_json:
+        print(json.dumps(result, indent=2))
+        return
+    print(f"the answer is the one that {log} was sealed with, and its tables are unchanged")
+    for hidden in result["effects"]:
+        values = ", ".join(f"{k} = {v}" for k, v in hidden["parameters"].items())
+        print(f"{'hidden' if hidden['added'] else 'changed'}: {hidden['name']}{f' ({values})' if values else ''}")
+    if not result["effects"]:
+        print("hidden: nothing")
+    if verdict is not None:
+        print(f"verdict: {result['verdict']} {', '.join(result['named'])}".rstrip())
+        print(f"score: {result['score']}")
+
+
+def manoeuvres() -> None:
+    """List the canned manoeuvres: what each is and which effects it tells apart."""
+    from lunar_mjx.describe import make_console, make_table
+    from lunar_mjx.manoeuvres import MANOEUVRES, load_manoeuvre
+
+    table = make_table("manoeuvre", "s", "what", "tells apart")
+    for name in MANOEUVRES:
+        plan = load_manoeuvre(name)
+        table.add_row(name, f"{plan.duration_s:g}", plan.description, ", ".join(plan.separates))
+    if not MANOEUVRES:
+        raise UserError("manoeuvres: none ships with this installation; reinstall the package.")
+    make_console().print(table)

@@ -1,0 +1,245 @@
+"""A manoeuvre: segments of commands in rover-independent terms, where it starts, and how the test is arranged."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.criticism.log.fields import Fields
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.manoeuvres.stand import stand
+from lunar_mjx.model import Model
+from lunar_mjx.rover import Rover, Wheel
+from lunar_mjx.simulate import INTERVAL, Commands
+
+FORMAT = "lunar-mjx-manoeuvre/1"
+_FOLDER = Path(__file__).resolve().parent
+MANOEUVRES: tuple[str, ...] = tuple(sorted(p.stem for p in _FOLDER.glob("*.toml")))
+"""Names of the canned manoeuvres."""
+
+ARRANGEMENTS = ("stand", "parking_brake", "tether", "hard_surface")
+"""Effects that a test may be arranged with; its user knows of them, and so does every model of its log."""
+
+_TOP = ("format", "description", "separates", "terrain", "start", "environment", "payload_share", "modes",
+        "arrangement", "segment")  # fmt: skip
+_SIDES = ("front", "rear", "left", "right")
+_QUANTITIES = {"speed_m_s": "velocity", "current_A": "current"}
+_SEGMENT = ("duration_s", "ramp_s", *_QUANTITIES, "steer_deg", "suspension_deg", "note")
+SPIN = "spin"
+
+Sided = float | Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Segment:
+    """A stretch of constant commands.
+
+    Attributes:
+      duration_s: s. ramp_s: time over which the commands change from those before in a straight line.
+      drive: rim speed m/s or motor current A of the drive joints; steer: rad, or "spin" for the wheels' angles of a
+        turn on the spot; suspension: rad. One number, or by front, rear, left, right; sides add up.
+    """
+
+    duration_s: float
+    ramp_s: float
+    drive: Sided
+    steer: Sided | str
+    suspension: Sided
+
+
+@dataclasses.dataclass(frozen=True)
+class Manoeuvre:
+    """A manoeuvre that any rover with driven wheels can run.
+
+    Attributes:
+      name: of its file. description, separates: what it is and which effects it tells apart.
+      terrain: as in a log. start: x m, y m, yaw rad. environment: as in a log.
+      payload_share: payload as a share of the rover's mass.
+      drive_mode: velocity (commands are rim speeds) or current.
+      arrangement: parameters of the effects of `ARRANGEMENTS` that the test is arranged with.
+      segments: in order.
+    """
+
+    name: str
+    description: str
+    separates: tuple[str, ...]
+    terrain: str
+    start: tuple[float, float, float]
+    environment: Mapping[str, float]
+    payload_share: float
+    drive_mode: str
+    arrangement: Mapping[str, Mapping[str, float]]
+    segments: tuple[Segment, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """At scale 1, s."""
+        return sum(s.duration_s for s in self.segments)
+
+
+@functools.cache
+def load_manoeuvre(name: str | Path) -> Manoeuvre:
+    """A canned manoeuvre by name, or one from a TOML file of the same layout.
+
+    Raises:
+      UserError: there is none, or a key or value of its file is wrong.
+    """
+    path = _FOLDER / f"{name}.toml" if str(name) in MANOEUVRES else Path(name)
+    if path.suffix != ".toml":
+        raise bad_input("manoeuvre", "name", str(name), "is neither canned nor a TOML file",
+                        f"use one of {', '.join(MANOEUVRES)}")  # fmt: skip
+    top = Fields.read(path, "the manoeuvre")
+    top.known(_TOP)
+    if top.text("format", "") != FORMAT:
+        raise bad_input(path, "format", top.values.get("format"), "is not known", f'write format = "{FORMAT}"')
+    start, environment = top.table("start"), top.table("environment")
+    start.known(("x_m", "y_m", "yaw_deg"))
+    segments = top.values.get("segment")
+    if not isinstance(segments, list) or not segments:
+        raise UserError(f"{path}: holds no [[segment]]; give at least one with duration_s.")
+    arranged = top.table("arrangement")
+    arranged.known(ARRANGEMENTS)
+    mode = top.table("modes").choice("drive", ("velocity", "current")) or "velocity"
+    parts = [Fields(path, s, f"segment {i + 1}") for i, s in enumerate(segments)]
+    return Manoeuvre(
+        name=path.stem,
+        description=top.text("description", ""),
+        separates=tuple(map(str, top.values.get("separates", ()))),
+        terrain=top.text("terrain", "flat"),
+        start=(start.number("x_m", 0.0), start.number("y_m", 0.0), float(np.radians(start.number("yaw_deg", 0.0)))),
+        environment={k: environment.number(k) for k in environment.values},
+        payload_share=top.number("payload_share", 0.0),
+        drive_mode=mode,
+        arrangement={k: {n: arranged.table(k).number(n) for n in arranged.table(k).values} for k in arranged.values},
+        segments=tuple(_segment(p, mode) for p in parts),
+    )
+
+
+def _segment(fields: Fields, mode: str) -> Segment:
+    fields.known(_SEGMENT)
+    for quantity, meant in _QUANTITIES.items():
+        if quantity in fields.values and meant != mode:
+            raise bad_input(fields.path, fields.field(quantity), fields.values[quantity], f"goes with modes.drive = "
+                            f'"{meant}"', "set that mode, or use the other quantity")  # fmt: skip
+    duration = fields.positive("duration_s")
+    ramp = fields.number("ramp_s", 0.0)
+    if not 0.0 <= ramp <= duration:
+        raise bad_input(fields.path, fields.field("ramp_s"), ramp, "is not within the segment", "give 0 to duration_s")
+    drive = _sided(fields, next((q for q, m in _QUANTITIES.items() if m == mode), "speed_m_s"))
+    steer = SPIN if fields.values.get("steer_deg") == SPIN else _radians(_sided(fields, "steer_deg"))
+    return Segment(duration, ramp, drive, steer, _radians(_sided(fields, "suspension_deg")))
+
+
+def _sided(fields: Fields, key: str) -> Sided:
+    value = fields.values.get(key, 0.0)
+    if not isinstance(value, Mapping):
+        return fields.number(key, 0.0)
+    sides = fields.table(key)
+    sides.known(_SIDES)
+    return {side: sides.number(side) for side in sides.values}
+
+
+def _radians(value: Sided) -> Sided:
+    return (
+        {k: float(np.radians(v)) for k, v in value.items()} if isinstance(value, Mapping) else float(np.radians(value))
+    )
+
+
+def _of_wheel(value: Sided, wheel: Wheel) -> float:
+    if not isinstance(value, Mapping):
+        return float(value)
+    sides = ("left" if wheel.corner[0] == "l" else "right", {"f": "front", "r": "rear"}.get(wheel.corner[1], ""))
+    return sum(value.get(side, 0.0) for side in sides)
+
+
+def with_arrangement(manoeuvre: Manoeuvre, model: Model) -> Model:
+    """The model with the effects of the test's arrangement: a stand, a brake, a tether, hard ground."""
+    for name, values in manoeuvre.arrangement.items():
+        effect: Any = stand if name == "stand" else name
+        if name in model.effect_names:
+            model = model.set(name, manoeuvre.name, **values)
+        else:
+            model = model.add(effect, manoeuvre.name, **values)
+    return model
+
+
+def commands(manoeuvre: Manoeuvre, model: Model, scale: float = 1.0) -> Commands:
+    """The manoeuvre as commands for a model whose drive joints are in the manoeuvre's mode.
+
+    Args:
+      manoeuvre: what to drive.
+      model: of any rover; its control mode of `drive` must be the manoeuvre's.
+      scale: factor on all durations; speeds stay, so that a short version covers less ground.
+
+    Returns:
+      One row per whole number of time steps nearest to 0.05 s.
+
+    Raises:
+      UserError: a scale that is not positive, a manoeuvre shorter than one command, or another mode.
+    """
+    if not 0.0 < scale <= 1e3:
+        raise bad_input("manoeuvre", "scale", scale, "is not a factor on durations", "give a positive number")
+    if model.modes["drive"] != manoeuvre.drive_mode:
+        raise bad_input(manoeuvre.name, "mode", model.modes["drive"], "is not that of its drive commands",
+                        f'set control.drive.mode = "{manoeuvre.drive_mode}"')  # fmt: skip
+    interval = max(1, round(INTERVAL / model.timestep)) * model.timestep
+    count = round(scale * manoeuvre.duration_s / interval)
+    if count < 2:
+        raise bad_input(
+            "manoeuvre", "scale", scale, f"leaves {scale * manoeuvre.duration_s:g} s", "give a larger scale"
+        )
+    targets = [_targets(s, model) for s in manoeuvre.segments]
+    ends = scale * np.cumsum([s.duration_s for s in manoeuvre.segments])
+    out = np.empty((count, len(model.rover.joints)))
+    for row in range(count):
+        time = row * interval
+        i = min(int(np.searchsorted(ends, time + 1e-9, side="right")), len(ends) - 1)
+        ramp = scale * manoeuvre.segments[i].ramp_s
+        into = time - (ends[i - 1] if i else 0.0)
+        share = 1.0 if into >= ramp else into / ramp
+        before = targets[i - 1] if i else np.zeros_like(targets[0])
+        out[row] = targets[i] if share == 1.0 else before + share * (targets[i] - before)
+    return Commands(out, interval)
+
+
+def _targets(segment: Segment, model: Model) -> np.ndarray:
+    """(joint,) commands of a segment, within the joints' limits."""
+    rover = model.rover
+    places = wheel_places(rover) if segment.steer == SPIN else {}
+    out = dict.fromkeys(rover.joints, 0.0)
+    for wheel in rover.wheels:
+        drive = _of_wheel(segment.drive, wheel)
+        if model.modes["drive"] == "velocity":
+            drive /= wheel.radius
+        steer = 0.0
+        if segment.steer != SPIN:
+            steer = _of_wheel(segment.steer, wheel)  # type: ignore[arg-type]
+        elif wheel.steer is not None:
+            x, y = places[wheel.corner]
+            # the tangent of a circle about the middle, taken within +-90 deg: left wheels then run backwards
+            steer = float(np.arctan2(-x, y) if y > 0.0 else np.arctan2(x, -y))
+        if segment.steer == SPIN and wheel.corner[0] == "l":
+            drive = -drive
+        out[wheel.drive] = drive
+        for joint, value in ((wheel.steer, steer), (wheel.suspension, _of_wheel(segment.suspension, wheel))):
+            if joint is not None:
+                low, high = rover.joint_limits[joint]
+                out[joint] = float(np.clip(value, low, high))
+    return np.array([out[j] for j in rover.joints])
+
+
+@functools.cache
+def wheel_places(rover: Rover) -> Mapping[str, tuple[float, float]]:
+    """x, y of every wheel in the chassis frame at zero joint angles, m, by corner."""
+    import mujoco
+
+    model = rover.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    base = data.body(rover.chassis).xpos
+    return {w.corner: tuple(map(float, (data.body(w.body).xpos - base)[:2])) for w in rover.wheels}  # type: ignore[misc]
