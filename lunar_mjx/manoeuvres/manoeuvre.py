@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.log.fields import Fields
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.manoeuvres.stand import stand
 from lunar_mjx.model import Model
 from lunar_mjx.rover import Rover, Wheel
 from lunar_mjx.simulate import INTERVAL, Commands
+from lunar_mjx.toml_fields import Fields
 
 FORMAT = "lunar-mjx-manoeuvre/1"
 _FOLDER = Path(__file__).resolve().parent

@@ -7,13 +7,13 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from lunar_mjx.criticism.log.fields import Fields
 from lunar_mjx.criticism.log.findings import Finding
 from lunar_mjx.criticism.log.log import Imu, Log, LogTable, Noise, SteadyLog
 from lunar_mjx.criticism.log.read_steady import read_steady
 from lunar_mjx.criticism.log.read_table import read_log_table
 from lunar_mjx.criticism.log.schema import FORMAT, NOISE_SOURCES, SPLITS, parse_column
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.toml_fields import Fields
 
 LOG_FILE = "log.toml"
 ENVIRONMENT = ("ambient_temperature_degC", "sun_azimuth_deg", "sun_elevation_deg")

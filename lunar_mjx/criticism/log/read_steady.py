@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lunar_mjx.criticism.log.fields import Fields
 from lunar_mjx.criticism.log.findings import WARNING, Finding
 from lunar_mjx.criticism.log.log import Noise, SteadyLog
 from lunar_mjx.criticism.log.read_table import numbers, read_frame
@@ -16,6 +15,7 @@ from lunar_mjx.criticism.log.schema import SPLITS, STEADY_CHANNELS, conversion
 from lunar_mjx.criticism.single_wheel import SLIP_DEFINITIONS
 from lunar_mjx.criticism.table import QUANTITIES, SteadyStateTable
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.toml_fields import Fields
 
 TOP = ("format", "kind", "file", "tables", "wheel", "slip_definition", "noise", "split", "gravity_m_s2", "source",
        "manoeuvre", "commitment")  # fmt: skip

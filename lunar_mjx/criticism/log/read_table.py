@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.criticism.log.fields import Fields
 from lunar_mjx.criticism.log.findings import WARNING, Finding
 from lunar_mjx.criticism.log.log import LogTable
 from lunar_mjx.criticism.log.schema import parse_column
 from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.toml_fields import Fields
 
 TIME = "time_s"
 GAPS = ("", "nan", "na", "n/a", "null", "none", "-")

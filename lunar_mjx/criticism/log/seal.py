@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 import tomli_w
 
-from lunar_mjx.criticism.log.fields import Fields
 from lunar_mjx.criticism.log.log import Log
 from lunar_mjx.criticism.log.read import LOG_FILE, read_log
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.toml_fields import Fields
 
 FORMAT = "lunar-mjx-answer/1"
 PREFIX = "sha256:"
