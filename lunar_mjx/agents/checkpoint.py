@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from lunar_mjx.errors import UserError
@@ -60,7 +61,10 @@ class Checkpoints:
                 f"{self.folder}: the checkpoint does not fit these settings ({reason}); "
                 "train with the settings that made it, or into another folder."
             ) from error
-        leaves = [found["state"][name] for name in _flat(like)]
+        leaves = [
+            found["state"][jax.tree_util.keystr(path)] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype)
+            for path, leaf in jax.tree_util.tree_leaves_with_path(like)
+        ]
         return jax.tree.unflatten(jax.tree.structure(like), leaves), found["notes"]
 
     def close(self) -> None:
@@ -68,5 +72,6 @@ class Checkpoints:
 
 
 def _flat(tree: Any) -> dict[str, Any]:
-    """Leaves by path, so that the layout on disk does not depend on the classes of the tree."""
-    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+    """Leaves by path, so that the layout on disk does not depend on the classes of the tree, but for empty ones."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves if leaf.size}

@@ -17,20 +17,21 @@ EnvSetOption = Annotated[
 ]
 
 
-def _pairs(option: str, texts: list[str] | None) -> dict[str, str]:
-    pairs = {}
+def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
+    """Name and value of `name=value` texts."""
+    found = {}
     for text in texts or []:
         name, equals, value = text.partition("=")
         if not equals or not name:
             raise bad_input("lunar-mjx", option, text, "is not name=value", f"write {option} name=value")
-        pairs[name] = value
-    return pairs
+        found[name] = value
+    return found
 
 
 def env_options(texts: list[str] | None) -> dict[str, Any]:
     """Options of an environment from `name=value` texts; a value is JSON where it reads as JSON, else text."""
     options: dict[str, Any] = {}
-    for name, text in _pairs("--env", texts).items():
+    for name, text in pairs("--env", texts).items():
         try:
             value = json.loads(text)
         except ValueError:
@@ -76,7 +77,7 @@ def train(
         for name, known in TRAININGS.items():
             print(f"{name:12} {known.note}")
         return
-    chosen = override(get_training(training), **_pairs("--set", settings))
+    chosen = override(get_training(training), **pairs("--set", settings))
     options = env_options(env)
     if environment is not None:
         chosen = dataclasses.replace(chosen, environment=environment, options=options, unseen={})

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -111,7 +112,9 @@ class Camera:
         model = _scene(rover, jax.device_get(terrain), np.asarray(places, float))
         self._model, self._data = model, mujoco.MjData(model)
         try:
-            self._renderer = mujoco.Renderer(model, height, width)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of windowing libraries that find no display
+                self._renderer = mujoco.Renderer(model, height, width)
         except Exception as error:
             raise UserError(
                 f"render: MuJoCo finds no OpenGL ({type(error).__name__}); set MUJOCO_GL=egl or osmesa on a machine "
