@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from lunar_mjx.backends.log_channels import log_channels
 from lunar_mjx.dynamics.state import Telemetry
 from lunar_mjx.errors import bad_input
 from lunar_mjx.model import Model
-from lunar_mjx.simulate import Commands, channels
+from lunar_mjx.simulate import Commands
 from lunar_mjx.spatial import Vec3
 
 Observation = dict[str, np.ndarray]
@@ -134,21 +134,13 @@ class Backend(abc.ABC):
     def _check_finite(self, seen: Observation) -> None:
         fine = np.isfinite(seen["position"]).all() and np.isfinite(seen["velocity"]).all()
         if not (fine and np.isfinite(seen["joint_speed"]).all()):
-            raise bad_input(self.name, "time", f"{seen['time'].flat[0]:g} s", "is where the simulation diverged",
+            when = round(float(seen["time"].flat[0]), 6)
+            raise bad_input(self.name, "time, s", when, "is where the simulation diverged",
                             "use a smaller timestep_s, softer gains or smaller commands")  # fmt: skip
 
     def channels(self, seen: Telemetry, commands: Commands, rover: int = 0) -> pd.DataFrame:
         """One rover's telemetry as log channels (units in the names, temperatures in degrees Celsius)."""
-        own = dataclasses.replace(seen, **{f.name: pick(getattr(seen, f.name), rover)
-                                           for f in dataclasses.fields(seen)})  # fmt: skip
-        values = commands.values if commands.values.ndim == 2 else commands.values[rover]
-        of: Any = SimpleNamespace(model=self.model)
-        return channels(of, own, Commands(values, commands.interval))
-
-
-def pick(value: Any, rover: int) -> Any:
-    """One rover's part of an array, or of a vector's components."""
-    return Vec3(*(v[rover] for v in value)) if isinstance(value, Vec3) else value[rover]
+        return log_channels(self.model, seen, commands, rover)
 
 
 def whole_steps(commands: Commands, timestep: float) -> int:

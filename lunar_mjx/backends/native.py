@@ -128,6 +128,8 @@ def native_model(model: Model) -> mujoco.MjModel:
     # the problem is quadratic: one Newton iteration is exact, and starting it warm changes nothing
     m.opt.solver, m.opt.iterations, m.opt.ls_iterations = mujoco.mjtSolver.mjSOL_NEWTON, 1, 1
     m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    # a run that diverges must be told, not begun anew
+    m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     chassis = m.body(model.rover.chassis).id
     m.body_sameframe[chassis] = 0  # its centre of mass may move
     if "motor" in model.effect_names:

@@ -18,7 +18,7 @@ from lunar_mjx.backends.base import STAGES, Backend, BackendState, Observation, 
 from lunar_mjx.backends.hooks import Hook
 from lunar_mjx.backends.jax_backend import JaxBackend
 from lunar_mjx.backends.native import NativeBackend
-from lunar_mjx.backends.parity_cases import LOOP_RATE, QUANTITIES, RATES, RELATIVE, Case, Tolerance
+from lunar_mjx.backends.parity_cases import EXCEPTIONS, QUANTITIES, RELATIVE, Case, Tolerance
 from lunar_mjx.dynamics.state import Telemetry
 from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands
@@ -294,7 +294,7 @@ def tolerances(kind: str, drive: bool = False) -> dict[str, Tolerance]:
     grown = 10.0 if drive else 1.0
     out = {}
     for quantity, (_, size) in QUANTITIES.items():
-        relative = LOOP_RATE if kind == "soft loop" and quantity in RATES else grown * RELATIVE[kind]
+        relative = grown * EXCEPTIONS.get(kind, {}).get(quantity, RELATIVE[kind])
         out[quantity] = Tolerance(relative * size, relative)
     return out
 

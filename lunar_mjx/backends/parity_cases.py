@@ -137,8 +137,10 @@ RELATIVE = {"float64": 1e-9, "pybullet": 5e-6, "float32": 5e-4, "soft loop": 2e-
 """Relative tolerance by what separates two engines: float64 rounding through the equations; PyBullet, which keeps joint
 axes and frames to about 1e-8; float32; MuJoCo's compliant loop constraint against a loop that is closed exactly."""
 
-LOOP_RATE = 0.1
-"""Relative tolerance of accelerations, and of speeds after a step, between compliant and exact loops: the constraint
-brings back within a few time steps what the loop has opened."""
-
-RATES = ("acceleration", "velocity", "joint_speed")
+EXCEPTIONS: dict[str, dict[str, float]] = {
+    # the constraint brings back within a few time steps what the loop has opened
+    "soft loop": {"acceleration": 0.1, "velocity": 0.1, "joint_speed": 0.1},
+    # a height of some metres in float32 is off by 2e-7 m: 0.05 N on rock of 2e5 N/m
+    "float32": {"wheel_force": 5e-3, "wheel_moment": 5e-3, "acceleration": 1e-2, "slip": 2e-3},
+}
+"""Quantities with another relative tolerance."""

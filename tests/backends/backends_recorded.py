@@ -1,0 +1,30 @@
+"""A rover's model, grounds and recorded drive, for the comparisons."""
+
+from __future__ import annotations
+
+from lunar_mjx.backends import parity
+from lunar_mjx.backends.parity_cases import cases, drive
+from lunar_mjx.model import make_model
+
+DURATION, SAMPLES = 4.0, 6
+
+
+class Recorded:
+    """A model, its grounds, and the reference's drive on each."""
+
+    def __init__(self, rover: str, preset: str, duration: float = DURATION, grounds=None):
+        self.model = make_model(rover, "flat", preset)
+        self.cases = cases(self.model.rover, grounds)
+        self.commands = drive(self.model, duration)
+        self.of = {c.name: parity.record(self.model, c, self.commands, SAMPLES) for c in self.cases}
+
+    def judge(self, runner: parity.Runner, kind: str) -> list[parity.Result]:
+        """Levels 1 and 2 on all grounds."""
+        wanted = parity.tolerances(kind)
+        return [
+            result
+            for case in self.cases
+            for result in parity.judge(
+                case, self.of[case.name][0], runner.step_from(case, self.of[case.name][0]), wanted, self.model
+            )
+        ]

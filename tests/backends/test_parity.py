@@ -1,0 +1,123 @@
+"""The engines agree, and the comparison catches planted faults and names the stage."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from backends_faults import FAULTS
+
+from lunar_mjx.backends import parity
+from lunar_mjx.backends.parity_page import verdict, write_parity_page
+from lunar_mjx.backends.parity_study import kind_of, make_runner, run_study
+from lunar_mjx.errors import UserError
+from lunar_mjx.model import make_model
+
+
+def _failed(results):
+    return [f"{r.case} {r.stage} {r.quantity} {r.where}: {r.error:.3g}" for r in results if not r.passed]
+
+
+def test_structured_engine_agrees_with_native(luvmi, structured):
+    """Float64, from the same states: every stage and the state after one step."""
+    results = luvmi.judge(structured, "float64")
+    assert len(results) == 3 * 20
+    assert not _failed(results)
+
+
+def test_the_drive_moves_every_stage(luvmi):
+    """A comparison of rovers that stand still would prove nothing."""
+    samples = luvmi.of["slope, hard"][0]
+    assert samples.state.qpos[-1, 0] > 0.1
+    least = {"wheel_velocity": 0.05, "slip": 0.01, "slip_angle": 1e-3, "sinkage": 1e-4, "wheel_force": 10.0,
+             "wheel_moment": 0.1, "joint_torque": 1.0, "winding_heat": 0.01, "acceleration": 1.0}  # fmt: skip
+    for name, value in least.items():
+        assert np.abs(samples.stages[name]).max() > value, name
+    assert np.abs(luvmi.of["flat, soft"][0].stages["housing_heat"]).max() > 1e-3
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_planted_faults_fail_at_level_1_and_name_the_stage(fault, luvmi, structured):
+    """The fault is in the reference: the JAX engine that is compiled already must tell."""
+    hook, stages, where = FAULTS[fault]
+    case = luvmi.cases[0]
+    samples = luvmi.of[case.name][0]
+    wrong = parity.native_runner(luvmi.model, [hook]).step_from(case, samples)
+    faulty = parity.Samples(samples.state, samples.control, *wrong)
+    right = structured.step_from(case, samples)
+    results = parity.judge(case, faulty, right, parity.tolerances("float64"), luvmi.model)
+    first = parity.first_failure(results)
+    assert first is not None and first.stage == stages[0]
+    assert {r.stage for r in results if r.level == 1 and not r.passed} == set(stages)
+    assert all(r.where.endswith(where) for r in results if r.stage == stages[0] and not r.passed)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_told_at_the_loosest_tolerance_too(fault, luvmi):
+    hook, stages, _ = FAULTS[fault]
+    case = luvmi.cases[0]
+    samples = luvmi.of[case.name][0]
+    wrong = parity.native_runner(luvmi.model, [hook]).step_from(case, samples)
+    for kind in ("float32", "soft loop", "pybullet"):
+        first = parity.first_failure(parity.judge(case, samples, wrong, parity.tolerances(kind), luvmi.model))
+        assert first is not None and first.stage in stages, kind
+
+
+def test_a_drive_stays_within_tolerance_and_noise(luvmi):
+    """The reference against itself, started from float32 coordinates: told by a drive only beyond the floor."""
+    case = luvmi.cases[0]
+    _, run, noise = luvmi.of[case.name]
+    wanted = parity.tolerances("float64", drive=True)
+    same = parity.judge_drive(case, run, noise, run, wanted, luvmi.model)
+    assert all(r.error == 0.0 and r.floor > 0.0 for r in same if r.quantity in ("position", "sinkage", "slip"))
+    assert not _failed(parity.judge_drive(case, run, noise, noise, wanted, luvmi.model))
+    hook = FAULTS["wheel radius"][0]
+    wrong = parity.native_runner(luvmi.model, [hook]).drive(case, luvmi.commands)
+    assert "position" in {r.quantity for r in parity.judge_drive(case, run, noise, wrong, wanted, luvmi.model)
+                          if not r.passed}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["consistent", "paper"])
+@pytest.mark.parametrize("engine", ["structured", "mjx", "structured:float32"])
+def test_drives_agree(engine, preset):
+    study = run_study("luvmi_x", preset, [engine], 5.0, 8)
+    assert [p.failed for p in study.pairs] == [[]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["structured", "mjx"])
+def test_viper_agrees(engine):
+    study = run_study("viper", "consistent", [engine], 4.0, 6, grounds=("flat, soft", "slope, hard"))
+    assert [p.failed for p in study.pairs] == [[]]
+
+
+def test_page_says_where_engines_part(tmp_path, luvmi, monkeypatch):
+    from lunar_mjx.backends import parity_study
+
+    hook = FAULTS["lateral force"][0]
+    monkeypatch.setattr(parity_study, "make_runner",
+                        lambda engine, model: parity.native_runner(model, [hook], "faulty"))  # fmt: skip
+    study = parity_study.run_study("luvmi_x", "consistent", ["structured"], 1.0, 4, grounds=("slope, soft",))
+    assert "first in the stage soil wrench (wheel_force, " in verdict(study, study.pairs[0])
+    page = write_parity_page(tmp_path / "parity.html", [study])
+    assert "first in the stage soil wrench" in page.read_text()
+    numbers = json.loads((tmp_path / "parity.json").read_text())
+    assert len(numbers[0]["results"]) == 28 and not all(r["passed"] for r in numbers[0]["results"])
+
+
+def test_kinds_of_tolerance(luvmi):
+    assert kind_of(("native", "structured"), luvmi.model) == "float64"
+    assert kind_of(("native", "structured, float32"), luvmi.model) == "float32"
+    assert kind_of(("native", "pybullet"), luvmi.model) == "pybullet"
+    viper = make_model("viper", "flat")
+    assert kind_of(("native", "structured"), viper) == kind_of(("structured", "mjx"), viper) == "soft loop"
+    assert kind_of(("native", "mjx"), viper) == "float64"
+
+
+def test_refuses_unknown_engines_and_grounds(luvmi):
+    with pytest.raises(UserError, match="engine = 'ode' does not exist; use some of structured"):
+        make_runner("ode", luvmi.model)
+    with pytest.raises(UserError, match="ground = 'lava' does not exist; use some of flat, soft"):
+        run_study("luvmi_x", "consistent", [], 1.0, 2, grounds=("lava",))
