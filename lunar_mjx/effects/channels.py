@@ -111,12 +111,14 @@ def unwrapped(channel: str, signals: Signals) -> Any:
     Returns:
       (..., time), equal to the channel at the first sample.
     """
-    values = jnp.asarray(signals.channels[channel])
+    sign = quaternion_signs(signals) if channel in QUATERNION else 1.0
+    return _smooth(channel, jnp.asarray(signals.channels[channel]), sign)
+
+
+def _smooth(channel: str, values: Any, sign: Any) -> Any:
     if channel in EULER:
         return jnp.unwrap(values, period=360.0)
-    if channel in QUATERNION:
-        return values * quaternion_signs(signals)
-    return values
+    return values * sign if channel in QUATERNION else values
 
 
 def quaternion_signs(signals: Signals) -> Any:
@@ -184,16 +186,35 @@ def shift_smoothly(time: Any, values: Any, at: Any) -> Any:
     return jnp.where(at < t0, y0 + (at - t0) * m0, jnp.where(at > t1, y1 + (at - t1) * m1, inside))
 
 
-def shifted(signals: Signals, channel: str, offset: Any) -> Any:
-    """A channel at times earlier by `offset` (s, one number or one per sample); (..., time), wrapped as before."""
-    smooth = unwrapped(channel, signals)
-    old = jnp.asarray(signals.channels[channel])
-    moved = shift_smoothly(signals.time, smooth, jnp.asarray(signals.time) - offset)
-    if channel in QUATERNION:
-        return quaternion_signs(signals) * moved
-    if channel in EULER:
-        return wrapped_degrees(old + (moved - smooth))
-    return moved
+def shifted(signals: Signals, offset_of: dict[str, Any]) -> Signals:
+    """Signals whose channels of each family are those of earlier times; angles wrap and quaternions flip as before.
+
+    Args:
+      signals: of one trajectory or a batch.
+      offset_of: how much earlier, s, by family: one number, or one per sample.
+
+    Returns:
+      Signals at the same times.
+    """
+    names = [name for name in signals.channels if family(name) in offset_of]
+    if not names:
+        return signals
+    whole = set(QUATERNION) <= signals.channels.keys()
+    sign = quaternion_signs(signals) if whole else 1.0
+    time = jnp.asarray(signals.time)
+    old = {name: jnp.asarray(signals.channels[name]) for name in names}
+    smooth = jnp.stack([_smooth(name, value, sign) for name, value in old.items()], axis=-2)
+    late = [jnp.broadcast_to(jnp.asarray(offset_of[family(name)]), time.shape) for name in names]  # type: ignore[index]
+    at = time[..., None, :] - jnp.stack(late, axis=-2)
+    moved = shift_smoothly(time if time.ndim == 1 else time[..., None, :], smooth, at)
+    change = moved - smooth
+    out = {}
+    for i, (name, value) in enumerate(old.items()):
+        if name in EULER:
+            out[name] = wrapped_degrees(value + change[..., i, :])
+        else:
+            out[name] = moved[..., i, :] * (sign if name in QUATERNION else 1.0)
+    return signals.with_channels(out)
 
 
 def lag(time: Any, values: Any, constant: Any) -> Any:

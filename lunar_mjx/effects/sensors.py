@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Parameter, effect
-from lunar_mjx.effects.channels import FAMILIES, QUATERNION, Signals, family, lag, shifted
+from lunar_mjx.effects.channels import FAMILIES, QUATERNION, Signals, lag, shifted
 
 _GRAVITY_MEMS = "choice: MEMS accelerometer, 2 mg"
 
@@ -22,11 +22,6 @@ def _entry(value: Any, index: int) -> Any:
     """The value of one joint, from one number for all or one per joint."""
     value = jnp.asarray(value)
     return value[index] if value.ndim else value
-
-
-def _shift_families(signals: Signals, offset_of: dict[str, Any]) -> Signals:
-    moved = {name: shifted(signals, name, offset_of[family(name)]) for name in signals.channels if family(name)}  # type: ignore[index]
-    return signals.with_channels(moved)
 
 
 def _offset(name: str) -> Parameter:
@@ -42,7 +37,7 @@ def clock_offset(ctx, p, x, signals):
     voltages, torques, bus), temperature, wheel (sinkage, slip, forces). Before the first sample the channel goes on
     straight. Source: mujoco.sysid treats a delay as a parameter of the measurement.
     """
-    return _shift_families(signals, {name: getattr(p, name) for name in FAMILIES})
+    return shifted(signals, {name: getattr(p, name) for name in FAMILIES})
 
 
 def _rate(name: str) -> Parameter:
@@ -54,7 +49,7 @@ def _rate(name: str) -> Parameter:
 def clock_drift(ctx, p, x, signals):
     """Each family's clock drifts: y_m(t) = y(t - eps (t - t_0)) with t_0 the first sample; families as clock_offset."""
     since = ctx.time - ctx.time[..., :1]
-    return _shift_families(signals, {name: getattr(p, name) * since for name in FAMILIES})
+    return shifted(signals, {name: getattr(p, name) * since for name in FAMILIES})
 
 
 _SCALED = {
@@ -244,9 +239,11 @@ def thermistor_lag(ctx, p, x, signals):
     """tau dT_m/dt = T + dT - T_m, from equilibrium at the first sample; exact for T straight between the samples."""
     changed = {}
     for node in ("winding", "housing"):
-        for name in _matching(signals, rf"{node}_.*_temperature_degC"):
-            late = lag(signals.time, signals.channels[name], getattr(p, node))
-            changed[name] = late + p.self_heating
+        names = _matching(signals, rf"{node}_.*_temperature_degC")
+        if names:
+            values = jnp.stack([jnp.asarray(signals.channels[name]) for name in names], axis=-2)
+            late = lag(jnp.asarray(signals.time)[..., None, :], values, getattr(p, node)) + p.self_heating
+            changed.update({name: late[..., i, :] for i, name in enumerate(names)})
     return signals.with_channels(changed)
 
 
