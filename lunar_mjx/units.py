@@ -91,3 +91,26 @@ def to_unit(value: float, unit: str, wanted: str, source: str | Path, field: str
     if not math.isfinite(converted):
         raise bad_input(source, field, shown, f"is not finite in {wanted}", "give a smaller number")
     return converted
+
+
+@functools.cache
+def si_dimensions(unit: str) -> tuple[tuple[str, int], ...]:
+    """Base dimensions of a coherent SI unit with their powers, an angle being a pure number.
+
+    Args:
+      unit: such as "N m/rad"; without powers that depend on the sinkage exponent.
+
+    Returns:
+      Pairs such as ("[length]", 2), sorted by name; empty for a pure number.
+
+    Raises:
+      ValueError: not a unit, or not the SI unit of its dimension (such as mm, deg or degC).
+    """
+    try:
+        quantity = _registry().Quantity(1.0, _expression(unit)).to_base_units()
+    except Exception as error:  # Pint raises its own errors, and some of Python's parser
+        raise ValueError(f"{unit!r} is not a unit") from error
+    if not math.isclose(quantity.magnitude, 1.0, rel_tol=1e-12):
+        raise ValueError(f"{unit!r} is not the SI unit, which is {quantity.units:~}")
+    powers = {name: round(power) for name, power in quantity.dimensionality.items()}
+    return tuple(sorted((name, power) for name, power in powers.items() if name != "[plane_angle]"))

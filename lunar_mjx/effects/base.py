@@ -5,11 +5,15 @@ A user's own effect is a Python file of about ten lines::
     import jax.numpy as jnp
     from lunar_mjx.effects import Parameter, effect
 
-    @effect("motor_torque", torque=Parameter(0.5, null=0.0, bounds=(0.0, 5.0), unit="N m",
-                                             meaning="Coulomb friction of the gear", source="datasheet"))
+    @effect("motor_torque",
+            torque=Parameter(0.5, 0.0, (0.0, 5.0), "N m", "Coulomb friction of the gear", "datasheet"),
+            speed=Parameter(0.01, None, (1e-4, 1.0), "rad/s", "speed of full friction", "choice"))
     def gear_friction(ctx, p, x, torque):
-        "tau_f = tau_c sgn(omega), smoothed below 0.01 rad/s."
-        return torque - p.torque * jnp.tanh(ctx.joint_speed / 0.01)
+        "tau_f = tau_c tanh(omega/omega_0): Coulomb friction, smoothed."
+        return torque - p.torque * jnp.tanh(ctx.joint_speed / p.speed)
+
+`lunar-mjx effect test my_effects.py` checks what every effect promises: that it vanishes at its null values, has finite
+derivatives, holds in any base units (a bare 0.01 in place of `p.speed` would not), and costs little.
 
 A port function takes the context, the effect's parameters `p`, its state `x` and the port's value, and returns the new
 value, or (new value, {state: new state}) where the effect owns state. It is written for one rover, elementwise over
