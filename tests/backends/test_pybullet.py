@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import dataclasses
 import importlib.util
 
 import numpy as np
@@ -134,8 +135,6 @@ def test_refuses_what_it_cannot(tmp_path):
         PyBulletBackend(model.add("payload", mass=3.0))
     with pytest.raises(UserError, match="pybullet: contact = 'magic' does not exist; use one of numpy, engine"):
         PyBulletBackend(model, contact="magic")
-    import dataclasses
-
     (tmp_path / "rover.toml").write_text((model.rover.folder / "rover.toml").read_text())
-    with pytest.raises(UserError, match="luvmi_x.urdf' is not there, and PyBullet loads URDF only"):
+    with pytest.raises(UserError, match=r"luvmi_x\.urdf' is not there, and PyBullet loads URDF only"):
         urdf_of(dataclasses.replace(model.rover, folder=tmp_path))

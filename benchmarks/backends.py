@@ -1,0 +1,255 @@
+"""Every backend side by side in one run: rover-steps per second, compile time and memory against the batch size.
+
+    python benchmarks/backends.py --batches 1,16,256 --out benchmarks/backends_cpu.json              # CPU
+    python benchmarks/backends.py --cpu-rows 0 --batches 4096,32768,65536 --out benchmarks/backends_h200.json
+    python benchmarks/backends.py --cpu-rows 0 --engines structured,mjx --devices 4 --batches 262144 ...
+
+Rows with effects run the preset `consistent` on `lunar_plain`, thermal network included:
+  pybullet                 Bullet with forces in NumPy, in one process and in one per core
+  native, NumPy effects    native MuJoCo (C, float64) with forces in NumPy, in one process and in one per core
+  mjx, structured          the JAX engines, float32
+Rows without, as floors:
+  native, bare             `mujoco.rollout` of the same rover, on one thread and on all
+  mjx, bare                `mjx.step` of the same rover
+  mjx, spheres             `mjx.step` with a sphere per wheel on a height field, the usual terrain in MJX
+The load of the machine before the run is kept in the JSON: rows of a busy machine are lower bounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import platform
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from speed import control, native_batch, rollout, starts
+
+from lunar_mjx._quiet import mjx
+from lunar_mjx.backends import NativeBackend
+from lunar_mjx.dynamics import build
+from lunar_mjx.errors import UserError
+from lunar_mjx.model import Model, make_model
+
+ENGINES = ("pybullet", "native", "structured", "mjx", "bare", "spheres")
+
+
+def time_jax(function: Callable[[Any], Any], state: Any, steps: int, batch: int, repeats: int = 3) -> dict[str, Any]:
+    """Compiles `function(state) -> state` of `steps` steps, and times the best of some calls."""
+    begin = time.perf_counter()
+    compiled = jax.jit(function).lower(state).compile()
+    compile_s = time.perf_counter() - begin
+    memory = compiled.memory_analysis()
+    new = jax.block_until_ready(compiled(state))
+    best = float("inf")
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        new = jax.block_until_ready(compiled(new))
+        best = min(best, time.perf_counter() - begin)
+    used = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes if memory else None
+    return {
+        "steps_per_s": batch * steps / best,
+        "compile_s": compile_s,
+        "memory_MB": used and used / 1e6,
+        "finite": all(bool(jnp.isfinite(a).all()) for a in jax.tree.leaves(new)),
+    }
+
+
+def sharded(function: Callable[[Any], Any], devices: int) -> Callable[[Any], Any]:
+    """`function` with the batch split over devices."""
+    if devices == 1:
+        return function
+    mesh = jax.make_mesh((devices,), ("batch",))
+    split = jax.sharding.PartitionSpec("batch")
+    return jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+
+
+def spheres(model: Model, steps: int, batch: int) -> dict[str, Any]:
+    """MJX with a sphere for every wheel on a height field, and solver iterations that converge (4, line search 8)."""
+    spec = model.rover.spec()
+    field = model.terrain.field
+    heights = np.asarray(field.heights)[:128, :128]
+    low, high = float(heights.min()), float(heights.max())
+    half = 0.5 * (len(heights) - 1) * float(field.cell)
+    spec.add_hfield(name="ground", nrow=len(heights), ncol=len(heights), size=[half, half, max(high - low, 1e-3), 1.0],
+                    userdata=((heights - low) / max(high - low, 1e-3)).ravel())  # fmt: skip
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", contype=1, conaffinity=1)
+    for wheel in model.rover.wheels:
+        spec.body(wheel.body).add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[wheel.radius, 0, 0], contype=1,
+                                       conaffinity=1, mass=0.0)  # fmt: skip
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    spec.option.iterations, spec.option.ls_iterations = 4, 8
+    native = spec.compile()
+    native.qpos0[2] += high - low
+    return _bare(native, steps, batch)
+
+
+def _bare(native: mujoco.MjModel, steps: int, batch: int, devices: int = 1) -> dict[str, Any]:
+    m = mjx.put_model(native)
+    data = jax.vmap(lambda _: mjx.make_data(m))(jnp.arange(batch))
+
+    def run(data: Any) -> Any:
+        return jax.lax.scan(lambda d, _: (jax.vmap(lambda one: mjx.step(m, one))(d), None), data, None, length=steps)[0]
+
+    return time_jax(sharded(run, devices), data, steps, batch)
+
+
+def numpy_steps(job: tuple[str, str, int, float]) -> dict[str, Any]:
+    """Steps a NumPy backend for some seconds: (engine, rover, rovers, seconds); runs in its own process too."""
+    engine, rover, rovers, seconds = job
+    model = make_model(rover)
+    if engine == "pybullet":
+        from lunar_mjx.backends.pybullet import PyBulletBackend
+
+        backend: Any = PyBulletBackend(model, rovers=rovers)
+    else:
+        backend = NativeBackend(model, rovers=rovers)
+    held = backend.controls(control(model).astype(float))
+    backend.reset(x=np.linspace(-5.0, 5.0, rovers), y=np.linspace(-3.0, 3.0, rovers))
+    for _ in range(100):
+        backend.step(held)
+    count, begin = 0, time.perf_counter()
+    while time.perf_counter() - begin < seconds:
+        for _ in range(20):
+            backend.step(held)
+        count += 20
+    wall = time.perf_counter() - begin
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    return {"steps_per_s": count * rovers / wall, "memory_MB": memory}
+
+
+def in_processes(engine: str, rover: str, rovers: int, processes: int, seconds: float) -> dict[str, Any]:
+    """The same in several processes at once; memory is that of all."""
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        parts = pool.map(numpy_steps, [(engine, rover, rovers, seconds)] * processes, chunksize=1)
+    return {key: sum(p[key] for p in parts) for key in parts[0]}
+
+
+def rows_of(rover: str, options: argparse.Namespace, add: Callable[..., None]) -> None:
+    """All rows of one rover, handed to `add(engine, batch, workers, result)`."""
+    model = make_model(rover)
+    if options.cpu_rows:
+        cores = options.cores
+        if "native" in options.engines:
+            for threads in dict.fromkeys((1, cores)):
+                add("native, bare", 512, threads, native_batch(model, threads, 512, options.native_steps))
+            for batch in options.numpy_batches:
+                add("native, NumPy effects", batch, 1, numpy_steps(("native", rover, batch, options.seconds)))
+            largest = max(options.numpy_batches)
+            if cores > 1:
+                add("native, NumPy effects", largest * cores, cores,
+                    in_processes("native", rover, largest, cores, options.seconds))  # fmt: skip
+        if "pybullet" in options.engines:
+            try:
+                add("pybullet", 1, 1, numpy_steps(("pybullet", rover, 1, options.seconds)))
+                if cores > 1:
+                    add("pybullet", cores, cores, in_processes("pybullet", rover, 1, cores, options.seconds))
+            except UserError as missing:
+                print(missing)
+    devices = options.devices
+    for batch in options.batches:
+        for engine, steps in (("structured", options.steps), ("mjx", options.mjx_steps)):
+            if engine in options.engines:
+                system = build(model, engine)
+                run = sharded(rollout(system, steps, None), devices)
+                add(engine, batch, devices, time_jax(run, starts(system, batch), steps, batch))
+        if "bare" in options.engines:
+            add("mjx, bare", batch, devices, _bare(model.rover.compile(), options.mjx_steps, batch, devices))
+        if "spheres" in options.engines:
+            add("mjx, spheres", batch, 1, spheres(model, options.mjx_steps, batch))
+
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Rover-steps per second against the batch, one panel per rover."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    rovers = list(dict.fromkeys(r["rover"] for r in rows))
+    figure, axes = plt.subplots(1, len(rovers), figsize=(5.5 * len(rovers), 4.5), sharey=True, squeeze=False)
+    for ax, rover in zip(axes[0], rovers, strict=True):
+        lines: dict[tuple[str, int], list[dict[str, Any]]] = {}
+        for row in rows:
+            if row["rover"] == rover:
+                lines.setdefault((row["engine"], row["workers"]), []).append(row)
+        for (engine, workers), own in lines.items():
+            ax.loglog([r["batch"] for r in own], [r["steps_per_s"] for r in own], "o-", label=f"{engine} x {workers}")
+        ax.set_title(rover)
+        ax.set_xlabel("rovers")
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=7)
+    axes[0][0].set_ylabel("rover-steps per second")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The rows as a Markdown table."""
+    lines = ["| rover | engine | rovers | workers | rover-steps/s | us per rover-step | compile s | memory MB |",
+             "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    for r in rows:
+        compile_s, memory = (f"{r[k]:.1f}" if r.get(k) else "" for k in ("compile_s", "memory_MB"))
+        lines.append(f"| {r['rover']} | {r['engine']} | {r['batch']:,} | {r['workers']} | {r['steps_per_s']:,.0f} | "
+                     f"{1e6 / r['steps_per_s']:.3g} | {compile_s} | {memory} |")  # fmt: skip
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    numbers = lambda text: [int(n) for n in text.split(",")]  # noqa: E731
+    parser.add_argument("--rovers", default="luvmi_x,viper")
+    parser.add_argument("--engines", default="pybullet,native,structured,mjx,bare", help=",".join(ENGINES))
+    parser.add_argument("--batches", type=numbers, default=[1, 256], help="of the JAX engines")
+    parser.add_argument("--numpy-batches", type=numbers, default=[1, 16, 128])
+    parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--devices", type=int, default=1, help="over which a batch of the JAX engines is split")
+    parser.add_argument("--cpu-rows", type=int, default=1, help="0: leave PyBullet and native MuJoCo out")
+    parser.add_argument("--seconds", type=float, default=5.0, help="per row of PyBullet and of NumPy effects")
+    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--mjx-steps", type=int, default=10)
+    parser.add_argument("--native-steps", type=int, default=200)
+    parser.add_argument("--out", type=Path, help="JSON; the plot and the table lie beside it")
+    options = parser.parse_args()
+    options.engines = options.engines.split(",")
+    for engine in options.engines:
+        if engine not in ENGINES:
+            parser.error(f"--engines: {engine} does not exist; use some of {', '.join(ENGINES)}")
+    rows: list[dict[str, Any]] = []
+    device = jax.devices()[0]
+    about = {"device": device.device_kind, "devices": options.devices, "cores": options.cores,
+             "cpu": _cpu_name(), "load_before": os.getloadavg(), "jax": jax.__version__,
+             "mujoco": mujoco.__version__}  # fmt: skip
+
+    def add(rover: str, engine: str, batch: int, workers: int, result: dict[str, Any]) -> None:
+        rows.append({"rover": rover, "engine": engine, "batch": batch, "workers": workers, **result,
+                     "us_per_rover_step": 1e6 / result["steps_per_s"], "load": os.getloadavg()[0]})  # fmt: skip
+        print(f"{rover:8s} {engine:24s} {batch:8d} x {workers:2d} {result['steps_per_s']:14,.0f} steps/s", flush=True)
+        if options.out:
+            options.out.write_text(json.dumps({"about": about, "rows": rows}, indent=1) + "\n")
+
+    for rover in options.rovers.split(","):
+        rows_of(rover, options, lambda *row, rover=rover: add(rover, *row))
+    if options.out:
+        plot(rows, options.out.with_suffix(".png"))
+        options.out.with_suffix(".md").write_text(table(rows) + "\n")
+    print(table(rows))
+
+
+def _cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+if __name__ == "__main__":
+    main()
