@@ -285,7 +285,6 @@ def effect_show(name: Annotated[str, typer.Argument(help="Catalogue name, or my_
 train_commands.register(app)
 parity_commands.register(app)
 log_commands.register(app)
-criticism_commands.register(app)
 effect_test.register(effect_app)
 
 
