@@ -12,7 +12,9 @@ import typer
 from typer.core import TyperGroup
 
 from lunar_mjx import __version__
+from lunar_mjx.commands import criticism as criticism_commands
 from lunar_mjx.commands import effect_test
+from lunar_mjx.commands import criticism as criticism_commands
 from lunar_mjx.commands import log as log_commands
 from lunar_mjx.commands import parity as parity_commands
 from lunar_mjx.commands import train as train_commands
@@ -285,6 +287,7 @@ def effect_show(name: Annotated[str, typer.Argument(help="Catalogue name, or my_
 train_commands.register(app)
 parity_commands.register(app)
 log_commands.register(app)
+criticism_commands.register(app)
 effect_test.register(effect_app)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.fitting import Fit, Progress, fit, silent
+from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import NoiseTest, errors, gain, noise_test
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
@@ -81,9 +81,21 @@ class Search:
     rivals: tuple[Candidate, ...]
 
 
-def search(problem: Problem, settings: Settings = Settings(), progress: Progress = silent) -> Search:
+def fit_baseline(problem: Problem, settings: Settings, memory: Memory, progress: Progress = silent) -> Fit:
+    """The model as it is, refitted, with its certificate; recalled where it has been done."""
+    found = memory.recall(problem, ())
+    if found is None:
+        found = fit(problem, problem.free(), starts=settings.starts, seed=settings.seed, progress=progress)
+        memory.keep(problem, (), found)
+    return found
+
+
+def search(
+    problem: Problem, settings: Settings = Settings(), progress: Progress = silent, memory: Memory | None = None
+) -> Search:
     """Fits the baseline, scores every candidate, refits the best and adds effects while they earn it."""
-    base_fit = fit(problem, problem.free(), starts=settings.starts, seed=settings.seed, progress=progress)
+    memory = memory or Memory()
+    base_fit = fit_baseline(problem, settings, memory, progress)
     base = Candidate((), base_fit, noise_test(problem, base_fit), 0.0, 0.0)
     if base_fit.problems:
         return Search(base, (), {}, (), base, ())
@@ -91,24 +103,29 @@ def search(problem: Problem, settings: Settings = Settings(), progress: Progress
     scores = _scores(problem, base, settings)
     angles = cosines([s for s in scores if s.length >= SEPARABLE])
     tried: dict[frozenset[str], Candidate] = {frozenset(): base}
-    beam, best = [base], base
+    beam, best, patience = [base], base, 1
     for level in range(settings.most):
         grown = []
         for number, parent in enumerate(beam):
             progress(f"refitting with {level + 1} effect{'s' if level else ''}", number / len(beam))
             found = scores if not parent.effects else _scores(problem, parent, settings)
             near = angles if not parent.effects else cosines([s for s in found if s.length >= SEPARABLE])
-            grown += _grow(problem, parent, found, near, settings, tried)
-        grown = [c for c in grown if _earned(c, settings)]
-        if not grown:
+            grown += _grow(problem, parent, found, near, settings, tried, memory)
+        grown = sorted((c for c in grown if np.isfinite(c.fit.chi2)), key=lambda c: c.fit.chi2)
+        passing = [c for c in grown if c.noise.passes and _earned(problem, base, c, settings)]
+        if passing:
+            best = passing[0]
             break
-        grown.sort(key=lambda c: c.fit.chi2)
-        if _better(grown[0], best, settings):
-            best = grown[0]
-        if any(c.noise.passes for c in grown):
-            best = next(c for c in grown if c.noise.passes)
+        better = [c for c in grown if _better(c, best, settings) and _earned(problem, best, c, settings)]
+        if better:
+            best = max(better, key=lambda c: gain(problem, best.fit, c.fit)[0])
+        elif not grown or not patience:
             break
-        beam = grown[: settings.beam]
+        else:
+            patience -= 1  # two effects may help only together
+        # The most promising by their fit and, where these differ, by manoeuvres left out.
+        held = sorted(grown, key=lambda c: -gain(problem, base.fit, c.fit)[0])
+        beam = list(dict.fromkeys([*better[:1], *grown[:1], *held[:1], *grown]))[: settings.beam]
     best = _pruned(problem, best, settings, tried)
     rivals = [c for c in tried.values() if c is not best and _alike(c, best, settings)]
     return Search(base, tuple(scores), angles, tuple(tried.values()), best, tuple(rivals))
@@ -139,6 +156,7 @@ def _grow(
     near: Mapping[str, Mapping[str, float]],
     settings: Settings,
     tried: dict[frozenset[str], Candidate],
+    memory: Memory,
 ) -> list[Candidate]:
     """Refits the parent with each of the best-scored effects, and with their near relatives."""
     good = [s for s in scores if worth_refitting(s, parent, settings)]
@@ -153,17 +171,19 @@ def _grow(
         effects = (*parent.effects, s.effect)
         if frozenset(effects) in tried:
             continue
-        candidate = _refit(problem, parent, effects, s)
+        candidate = _refit(problem, parent, effects, s, memory)
         tried[frozenset(effects)] = candidate
         grown.append(candidate)
     return grown
 
 
-def _refit(problem: Problem, parent: Candidate, effects: tuple[str, ...], scored: Score | None) -> Candidate:
-    """Refits from the parent with the new effect at its linear estimate, and from half of it where that fails."""
+def _refit(
+    problem: Problem, parent: Candidate, effects: tuple[str, ...], scored: Score | None, memory: Memory
+) -> Candidate:
+    """Refits from the parent with the new effect at its linear estimate, and from a third of it where that fails."""
     free = problem.free(effects)
-    found = None
-    for share in (1.0, 0.3) if scored is not None else (0.0,):
+    found = memory.recall(problem, effects)
+    for share in () if found is not None else (1.0, 0.3) if scored is not None else (0.0,):
         start = parent.fit.u.copy()
         if scored is not None:
             places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
@@ -174,13 +194,22 @@ def _refit(problem: Problem, parent: Candidate, effects: tuple[str, ...], scored
         if found.chi2 < parent.fit.chi2 and (problem.cheap_jacobian is False or share != 1.0):
             break
     assert found is not None
+    memory.keep(problem, effects, found)
     value, se = gain(problem, parent.fit, found)
     return Candidate(effects, found, noise_test(problem, found), value, se)
 
 
-def _earned(c: Candidate, settings: Settings) -> bool:
-    """Whether the last effect added pays on manoeuvres left out."""
-    return bool(np.isfinite(c.fit.chi2) and c.gain > 0.5 * settings.chi2 and c.gain > settings.gain_se * c.gain_se)
+def refit_with(problem: Problem, base: Fit, effect: str, settings: Settings, memory: Memory) -> Fit:
+    """The model refitted with one candidate, from the candidate's linear estimate."""
+    parent = Candidate((), base, noise_test(problem, base), 0.0, 0.0)
+    scored = score(problem, base, signatures(problem, base, [effect]), settings.draws, settings.seed)
+    return _refit(problem, parent, (effect,), scored[0] if scored else None, memory).fit
+
+
+def _earned(problem: Problem, before: Candidate, c: Candidate, settings: Settings) -> bool:
+    """Whether the effects beyond an earlier set pay on manoeuvres left out."""
+    value, se = gain(problem, before.fit, c.fit)
+    return bool(value > 0.5 * settings.chi2 and value > settings.gain_se * se)
 
 
 def _better(c: Candidate, best: Candidate, settings: Settings) -> bool:
@@ -224,7 +253,7 @@ def excess_explained(search_: Search, problem: Problem) -> float:
 
 
 def diagnose(
-    problem: Problem, settings: Settings = Settings(), progress: Progress = silent
+    problem: Problem, settings: Settings = Settings(), progress: Progress = silent, memory: Memory | None = None
 ) -> tuple[Diagnosis, Search]:
     """The verdict on a model and its measurements, with the evidence.
 
@@ -232,11 +261,12 @@ def diagnose(
       problem: model, candidates and measurements; the measurements must have passed the gate (`log.check`).
       settings: thresholds and effort.
       progress: told what is being done.
+      memory: finished fits of an earlier, stopped diagnosis.
 
     Returns:
       The diagnosis, and everything that it rests on.
     """
-    found = search(problem, settings, progress)
+    found = search(problem, settings, progress, memory)
     base, chosen = found.base, found.chosen
     details: dict[str, Any] = {
         "certificate": {

@@ -29,6 +29,7 @@ class Coordinate:
       unit: of the value.
       log_index: the log that a nuisance belongs to, or -1.
       amplitude: whether the value has a null at which its effect vanishes.
+      factor: whether the value is a factor on the model's own, which may differ between wheels or joints.
     """
 
     effect: str
@@ -43,6 +44,7 @@ class Coordinate:
     unit: str = "1"
     log_index: int = -1
     amplitude: bool = False
+    factor: bool = False
 
     @property
     def key(self) -> str:

@@ -13,8 +13,9 @@ import numpy as np
 
 from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
 from lunar_mjx.criticism.drive_noise import channel_noise
-from lunar_mjx.criticism.drive_runs import Bench, LogRun
-from lunar_mjx.criticism.fitting import Progress, silent
+from lunar_mjx.criticism.drive_runs import Bench, LogRun, Rows
+from lunar_mjx.criticism.fitted import fitted_model
+from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.observations import Observations, Series
 from lunar_mjx.criticism.problem import NotTested, Problem
 from lunar_mjx.effects.base import Effect
@@ -80,6 +81,8 @@ class DriveProblem(Problem):
           progress: told of every chunk.
         """
         self.logs, self.model = tuple(logs), model
+        self._splits, self._baseline_spec, self._channels = dict(splits or {}), baseline, channels
+        self._start: dict[str, float] = {}
         self.effects, self.not_tested = _usable(model, candidates)
         union = model
         for effect in self.effects.values():
@@ -99,6 +102,21 @@ class DriveProblem(Problem):
             found += mine
         self.coordinates = tuple(found)
         self.observations = _observations(self.bench, self.logs, splits or {}, channels)
+
+    def with_candidates(self, candidates: Mapping[str, Effect], fit: Fit, progress: Progress = silent) -> DriveProblem:
+        """The same logs against the fitted model, with other candidates; its origin is the fit."""
+        model = self.model
+        for name, places in self.candidates.items():
+            if np.any(fit.u[places] != 0.0):
+                model = model.add(self.effects[name], "criticism", **self.effects[name].null())
+        model = fitted_model(self, fit, model)
+        other = DriveProblem(self.logs, model, candidates, self._splits, self._baseline_spec, self._channels,
+                             self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+        other._start = {self.coordinates[i].key: fit.u[i] for i in self._nuisance}
+        return other
+
+    def origin(self) -> np.ndarray:
+        return np.array([self._start.get(c.key, 0.0) for c in self.coordinates])
 
     def predict(self, u: np.ndarray) -> np.ndarray:
         rows = np.atleast_2d(u)
@@ -143,10 +161,10 @@ class DriveProblem(Problem):
         mine = [s for s in self.observations.series if s.log == number]
         return slice(mine[0].start, mine[-1].stop) if mine else slice(0, 0)
 
-    def _values(self, rows: np.ndarray) -> dict[tuple[str, str, int], np.ndarray]:
-        """(rows,) value or factor of every coordinate, by effect, name and log."""
+    def _values(self, rows: np.ndarray) -> Rows:
         return {
-            (c.effect, c.name, c.log_index): np.asarray(c.value(rows[:, i])) for i, c in enumerate(self.coordinates)
+            (c.effect, c.name, c.log_index, c.factor): np.asarray(c.value(rows[:, i]))
+            for i, c in enumerate(self.coordinates)
         }
 
     def certificate(self, u: np.ndarray, free: np.ndarray) -> Mapping[str, float]:
@@ -191,7 +209,7 @@ def _baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tupl
             p = effect.parameters[name]
             if np.all(value > 0.0):
                 low, high = max(p.bounds[0] / value.min(), 1e-3), min(p.bounds[1] / value.max(), 1e3)
-                found.append(Coordinate(effect.name, name, 1.0, relative, low, high, True, prior, unit="1"))
+                found.append(Coordinate(effect.name, name, 1.0, relative, low, high, True, prior, factor=True))
         # Effects beyond the preset were added to explain measurements; they are refitted with the rest.
         if effect.name not in PRESETS.get(model.preset, ()) and effect.name not in NOT_MISSING:
             for name, p in effect.parameters.items():

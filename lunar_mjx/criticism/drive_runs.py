@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +22,9 @@ from lunar_mjx.model import ZERO_CELSIUS, Model
 
 if TYPE_CHECKING:
     from lunar_mjx.criticism.log import Log
+
+Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
+"""(rows,) values by effect, parameter, log (-1 for all) and whether they are factors."""
 
 SETTLE = 1.0
 """Time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
@@ -94,7 +96,7 @@ class Bench:
     def run(
         self,
         jobs: Sequence[tuple[int, int]],
-        values: Mapping[tuple[str, str, int], np.ndarray],
+        values: Rows,
         observations: Observations,
         progress: Progress,
     ) -> Iterator[tuple[int, int, np.ndarray]]:
@@ -185,7 +187,7 @@ class _Program:
         self,
         bench: Bench,
         jobs: Sequence[tuple[int, int]],
-        values: Mapping[tuple[str, str, int], np.ndarray],
+        values: Rows,
         length: int,
     ) -> dict[str, np.ndarray]:
         rows = [_row(bench, number, k, values) for number, k in jobs]
@@ -200,35 +202,20 @@ def _padded(commands: np.ndarray, length: int) -> np.ndarray:
     return np.concatenate([commands, np.repeat(commands[-1:], length - len(commands), axis=0)])
 
 
-def _row(
-    bench: Bench, number: int, k: int, values: Mapping[tuple[str, str, int], np.ndarray]
-) -> tuple[Params, dict[str, float]]:
+def _row(bench: Bench, number: int, k: int, values: Rows) -> tuple[Params, dict[str, float]]:
     """Parameters and start of one rover: the log's conditions with one row of coordinates put in."""
     base, start = bench._params[number], dict(bench.runs[number].start)
     effects = {e: {n: np.asarray(v, float) for n, v in p.items()} for e, p in base.effects.items()}
-    for (effect, name, log), column in values.items():
+    for (effect, name, log, factor), column in values.items():
         value = float(column[k])
         if effect == "initial":
             if log == number:
                 start[name] = value
-        elif _is_factor(bench, effect, name):
+        elif factor:
             effects[effect][name] = effects[effect][name] * value
         else:
             effects[effect][name] = np.full_like(effects[effect][name], value)
     return dataclasses.replace(base, effects=effects), start
-
-
-@functools.cache
-def _factor_table() -> Mapping[str, Any]:
-    from lunar_mjx.criticism.drive_problem import BASELINE
-
-    return BASELINE
-
-
-def _is_factor(bench: Bench, effect: str, name: str) -> bool:
-    """Baseline parameters move by a factor common to all wheels or joints; candidates by their value."""
-    del bench
-    return name in _factor_table().get(effect, {})
 
 
 def _modelled(model: Model) -> frozenset[str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -78,6 +79,50 @@ def whitened_residuals(problem: Problem, u: np.ndarray) -> np.ndarray:
     """(k, n) measured less predicted, whitened, at (k, coordinates); not finite where a prediction is not."""
     difference = problem.observations.value[None] - problem.predict(u)
     return problem.observations.whiten(difference.T).T
+
+
+class Memory:
+    """Finished fits by the names of their effects, so that a diagnosis that was stopped goes on where it was.
+
+    Args:
+      entries: as `entries` of an earlier memory; plain data.
+      save: called with all entries after every fit.
+    """
+
+    def __init__(
+        self, entries: Mapping[str, Any] | None = None, save: Callable[[Mapping[str, Any]], None] | None = None
+    ):
+        self.entries = dict(entries or {})
+        self._save = save
+
+    def recall(self, problem: Problem, effects: Sequence[str]) -> Fit | None:
+        """The fit with these effects at its old place, its residual and Jacobian computed anew; None if unknown."""
+        entry = self.entries.get("+".join(effects))
+        free = problem.free(effects)
+        if entry is None or set(entry["u"]) != {problem.coordinates[i].key for i in free}:
+            return None
+        u = problem.origin()
+        for i in free:
+            u[i] = entry["u"][problem.coordinates[i].key]
+        goal = _Objective(problem, free, problem.observations.in_split("fit"))
+        residual, chi2 = goal.residuals(u[None])
+        if not np.isfinite(chi2[0]):
+            return None
+        return Fit(
+            u=u, free=free, chi2=float(chi2[0]), residual=residual[0], jacobian=goal.jacobian(u), fitted=goal.fitted,
+            gradient=entry["gradient"], starts=tuple(entry["starts"]), at_bound=tuple(entry["at_bound"]),
+            extra=entry["extra"], problems=tuple(entry["problems"]),
+        )  # fmt: skip
+
+    def keep(self, problem: Problem, effects: Sequence[str], found: Fit) -> None:
+        """Remembers a fit."""
+        self.entries["+".join(effects)] = {
+            "u": {problem.coordinates[i].key: float(found.u[i]) for i in found.free}, "gradient": found.gradient,
+            "starts": list(found.starts), "at_bound": list(found.at_bound), "extra": dict(found.extra),
+            "problems": list(found.problems), "chi2": found.chi2,
+        }  # fmt: skip
+        if self._save is not None:
+            self._save(self.entries)
 
 
 class _Objective:

@@ -16,6 +16,8 @@ AT_NOISE = 1.03
 CHANNEL_AT_NOISE = 1.05
 """The same for the worst single channel."""
 _SAMPLING = 3.5
+_ENOUGH = 4
+"""Fitted manoeuvres from which leaving one out in turn is a fair judge."""
 _PIECES = 4
 """Pieces of a log that are left out in turn where there are too few manoeuvres."""
 
@@ -58,6 +60,10 @@ def gain(problem: Problem, before: Fit, after: Fit, splits: tuple[str, ...] = ("
       Sum over observations of half the drop of the squared predictive residual; its standard error.
     """
     keep = problem.observations.in_split(*splits)
+    few = len(np.unique(problem.observations.unit[before.fitted])) < _ENOUGH
+    if few and problem.observations.in_split("select").any():
+        # Leaving one of two or three groups out of a fit extrapolates too far; those never fitted judge alone.
+        keep = problem.observations.in_split("select")
     old, new = predictive_residual(problem, before), predictive_residual(problem, after)
     difference = np.where(keep, 0.5 * (old**2 - new**2), 0.0)
     difference = np.where(np.isfinite(difference), difference, 0.0)

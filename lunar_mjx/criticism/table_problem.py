@@ -110,7 +110,7 @@ class TableProblem(Problem):
           values: start of candidates' shape parameters.
           extra_sigma: a model's own known discrepancy by quantity, SI units, added to the noise.
         """
-        self.logs = tuple(logs)
+        self.logs, self.splits, self.extra_sigma = tuple(logs), dict(splits or {}), dict(extra_sigma or {})
         usable, refused = _usable(bed, candidates)
         self.effects, self.not_tested = usable, refused
         union = bed
@@ -129,6 +129,15 @@ class TableProblem(Problem):
         for c, place in zip(self.coordinates, u, strict=True):
             out.setdefault(c.effect, {})[c.name] = float(c.value(place))
         return out
+
+    def fitted_bed(self, u: np.ndarray) -> WheelBed:
+        """The wheel bed with all effects whose values a place changes from the model's, at these values."""
+        values = self.values(u)
+        moved = [e for e, places in self.candidates.items() if np.any(u[places] != 0.0)]
+        bed = self.bed
+        for name in moved:
+            bed = bed.with_effect(self.effects[name], **{**self.effects[name].null(), **values[name]})
+        return bed.with_values({e: v for e, v in values.items() if e in bed.parameters})
 
     def _vector(self, u: Any) -> Any:
         values = {e: dict(v) for e, v in self._union.parameters.items()}
