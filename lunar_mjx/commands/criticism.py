@@ -1,4 +1,4 @@
-"""`lunar-mjx compare | why | next | add | unknown | report | improve`: the loop of criticism, each verb on a run folder."""
+"""`lunar-mjx compare | why | next | add | unknown | report | improve`: criticism, verb by verb, on run folders."""
 
 from __future__ import annotations
 
