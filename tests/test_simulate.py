@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lunar_mjx.dynamics import System, Telemetry
+from lunar_mjx.dynamics import System, Telemetry, build
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
 from lunar_mjx.rover import convert
@@ -94,6 +94,22 @@ def test_channels_of_a_drive(model: Model, drive: tuple[System, Telemetry, Comma
     assert last["joint_lf_steer_angle_rad"] > 0.02, "and the front ones steered to the left"
     weight = model.rover.mass * model.gravity
     assert 0.3 * weight < sum(last[f"wheel_{c}_force_z_N"] for c in CORNERS) < 3.0 * weight
+
+
+def test_channels_are_those_of_the_sensors(model: Model, drive: tuple[System, Telemetry, Commands]) -> None:
+    """Effects at the port `sensor` change what is written and nothing else."""
+    system, seen, commands = drive
+    plain = channels(system, seen, commands)
+    askew = build(model.add("imu_bias", pitch_bias=0.1, accelerometer_x=0.5).add("bus_droop"))
+    found = channels(askew, seen, commands)
+    assert found["pitch_deg"].to_numpy() == pytest.approx(plain["pitch_deg"].to_numpy() + np.degrees(0.1), abs=1e-6)
+    power = sum(plain[f"motor_{j}_voltage_V"] * plain[f"motor_{j}_current_A"] for j in joint_channels(model.rover))
+    assert found["bus_voltage_V"].to_numpy() == pytest.approx(48.0 - 0.1 * np.asarray(power) / 48.0, rel=1e-9)
+    assert "bus_voltage_V" not in plain
+    np.testing.assert_array_equal(found["joint_lf_drive_angle_rad"], plain["joint_lf_drive_angle_rad"])
+    assert plain["accelerometer_z_m_s2"].iloc[-1] == pytest.approx(model.gravity, rel=0.5), (
+        "specific force, not acceleration"
+    )
 
 
 def test_joint_channels_go_by_corner_and_kind(tmp_path: Path) -> None:

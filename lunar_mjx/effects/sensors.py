@@ -29,7 +29,10 @@ def _offset(name: str) -> Parameter:
                      "interval at 20 Hz")  # fmt: skip
 
 
-@effect("sensor", order=90, **{name: _offset(name) for name in FAMILIES})
+_OFFSETS: dict[str, Any] = {name: _offset(name) for name in FAMILIES}
+
+
+@effect("sensor", order=90, **_OFFSETS)
 def clock_offset(ctx, p, x, signals):
     """Each family of channels is logged late by a constant: y_m(t) = y(t - delta), by cubic Hermite interpolation.
 
@@ -45,7 +48,10 @@ def _rate(name: str) -> Parameter:
                      "choice: exaggerated; crystals drift by 1e-5 to 1e-4")  # fmt: skip
 
 
-@effect("sensor", order=91, **{name: _rate(name) for name in FAMILIES})
+_RATES: dict[str, Any] = {name: _rate(name) for name in FAMILIES}
+
+
+@effect("sensor", order=91, **_RATES)
 def clock_drift(ctx, p, x, signals):
     """Each family's clock drifts: y_m(t) = y(t - eps (t - t_0)) with t_0 the first sample; families as clock_offset."""
     since = ctx.time - ctx.time[..., :1]
@@ -72,7 +78,10 @@ def _scale(name: str) -> Parameter:
     return Parameter(0.02, 0.0, (-0.5, 0.5), "1", f"relative scale error of {name}", "choice: 2 %")
 
 
-@effect("sensor", order=40, **{name: _scale(name) for name in _SCALED})
+_SCALES: dict[str, Any] = {name: _scale(name) for name in _SCALED}
+
+
+@effect("sensor", order=40, **_SCALES)
 def channel_scale(ctx, p, x, signals):
     """Each quantity reads y (1 + eps); a position by its distance from the first sample (visual odometry)."""
     changed = {}
@@ -179,11 +188,16 @@ def _angle(meaning: str) -> Parameter:
     return Parameter(0.0087, 0.0, (-0.5, 0.5), "rad", meaning, "choice: 0.5 deg of mounting tolerance")
 
 
+_BIASES: dict[str, Any] = {
+    **{f"accelerometer_{a}": _bias(a, "accelerometer", 0.02, "m/s2", _GRAVITY_MEMS) for a in "xyz"},
+    **{f"gyro_{a}": _bias(a, "gyro", 0.001, "rad/s", "choice: MEMS gyro, 200 deg/h") for a in "xyz"},
+}
+
+
 @effect(
     "sensor",
     order=20,
-    **{f"accelerometer_{a}": _bias(a, "accelerometer", 0.02, "m/s2", _GRAVITY_MEMS) for a in "xyz"},
-    **{f"gyro_{a}": _bias(a, "gyro", 0.001, "rad/s", "choice: MEMS gyro, 200 deg/h") for a in "xyz"},
+    **_BIASES,
     roll=_angle("roll of the mounted IMU about body x"),
     pitch=_angle("pitch of the mounted IMU about body y"),
     roll_bias=_angle("bias of the attitude's roll"),

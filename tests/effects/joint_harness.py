@@ -51,11 +51,12 @@ def scene(
     housing: Array | None = None,
 ) -> Scene:
     """Quantities that broadcast to (time, joint); a number is one joint in one step."""
-    housing = celsius if housing is None else housing
-    shape = np.broadcast_shapes(*(np.shape(np.atleast_2d(a)) for a in (target, angle, speed, celsius, housing, mode)))
-    full = [np.broadcast_to(np.asarray(a, float), shape) for a in (target, angle, speed, celsius, housing)]
+    housed = celsius if housing is None else housing
+    given: tuple[Array, ...] = (target, angle, speed, celsius, housed)
+    shape = np.broadcast_shapes(*(np.shape(np.atleast_2d(a)) for a in (*given, mode)))
+    full = [np.broadcast_to(np.asarray(a, float), shape) for a in given]
     modes = np.broadcast_to(mode, shape)[0].astype(int)
-    return Scene(*full[:3], full[3] + KELVIN, full[4] + KELVIN, modes, np.asarray(yaw, float))
+    return Scene(full[0], full[1], full[2], full[3] + KELVIN, full[4] + KELVIN, modes, np.asarray(yaw, float))
 
 
 def many() -> Scene:
