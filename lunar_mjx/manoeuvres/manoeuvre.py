@@ -29,8 +29,7 @@ _TOP = ("format", "description", "separates", "terrain", "start", "environment",
         "arrangement", "segment")  # fmt: skip
 _SIDES = ("front", "rear", "left", "right")
 _QUANTITIES = {"speed_m_s": "velocity", "current_A": "current"}
-_SEGMENT = ("duration_s", "ramp_s", *_QUANTITIES, "steer_deg", "suspension_deg", "note")
-SPIN = "spin"
+_SEGMENT = ("duration_s", "ramp_s", *_QUANTITIES, "steer_deg", "suspension_deg", "spin_deg_s")
 
 Sided = float | Mapping[str, float]
 
@@ -41,15 +40,19 @@ class Segment:
 
     Attributes:
       duration_s: s. ramp_s: time over which the commands change from those before in a straight line.
-      drive: rim speed m/s or motor current A of the drive joints; steer: rad, or "spin" for the wheels' angles of a
-        turn on the spot; suspension: rad. One number, or by front, rear, left, right; sides add up.
+      drive: rim speed m/s or motor current A of the drive joints; steer, suspension: rad. One number, or by front,
+        rear, left, right; sides add up.
+      spin: in place of drive and steer, a turn on the spot to the left at this nominal rate, rad/s: wheels along the
+        circle about the middle as far as they steer, rim speeds as they would roll on it (they skid, and so turn
+        slower). Zero turns the wheels there at rest. None for no such turn.
     """
 
     duration_s: float
     ramp_s: float
     drive: Sided
-    steer: Sided | str
+    steer: Sided
     suspension: Sided
+    spin: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,8 +134,11 @@ def _segment(fields: Fields, mode: str) -> Segment:
     if not 0.0 <= ramp <= duration:
         raise bad_input(fields.path, fields.field("ramp_s"), ramp, "is not within the segment", "give 0 to duration_s")
     drive = _sided(fields, next((q for q, m in _QUANTITIES.items() if m == mode), "speed_m_s"))
-    steer = SPIN if fields.values.get("steer_deg") == SPIN else _radians(_sided(fields, "steer_deg"))
-    return Segment(duration, ramp, drive, steer, _radians(_sided(fields, "suspension_deg")))
+    spin = float(np.radians(fields.number("spin_deg_s"))) if "spin_deg_s" in fields.values else None
+    if spin is not None and mode != "velocity":
+        raise bad_input(fields.path, fields.field("spin_deg_s"), spin, "needs drives in velocity mode", "set that mode")
+    steer, suspension = _radians(_sided(fields, "steer_deg")), _radians(_sided(fields, "suspension_deg"))
+    return Segment(duration, ramp, drive, steer, suspension, spin)
 
 
 def _sided(fields: Fields, key: str) -> Sided:
@@ -210,21 +216,17 @@ def commands(manoeuvre: Manoeuvre, model: Model, scale: float = 1.0) -> Commands
 def _targets(segment: Segment, model: Model) -> np.ndarray:
     """(joint,) commands of a segment, within the joints' limits."""
     rover = model.rover
-    places = wheel_places(rover) if segment.steer == SPIN else {}
+    places = wheel_places(rover) if segment.spin is not None else {}
     out = dict.fromkeys(rover.joints, 0.0)
     for wheel in rover.wheels:
-        drive = _of_wheel(segment.drive, wheel)
+        drive, steer = _of_wheel(segment.drive, wheel), _of_wheel(segment.steer, wheel)
+        if segment.spin is not None:
+            x, y = places[wheel.corner]
+            drive = segment.spin * float(np.hypot(x, y)) * (-1.0 if y > 0.0 else 1.0)
+            # the tangent of the circle, taken within 90 deg: left wheels then run backwards
+            steer = float(np.arctan2(-x, y) if y > 0.0 else np.arctan2(x, -y))
         if model.modes["drive"] == "velocity":
             drive /= wheel.radius
-        steer = 0.0
-        if segment.steer != SPIN:
-            steer = _of_wheel(segment.steer, wheel)  # type: ignore[arg-type]
-        elif wheel.steer is not None:
-            x, y = places[wheel.corner]
-            # the tangent of a circle about the middle, taken within +-90 deg: left wheels then run backwards
-            steer = float(np.arctan2(-x, y) if y > 0.0 else np.arctan2(x, -y))
-        if segment.steer == SPIN and wheel.corner[0] == "l":
-            drive = -drive
         out[wheel.drive] = drive
         for joint, value in ((wheel.steer, steer), (wheel.suspension, _of_wheel(segment.suspension, wheel))):
             if joint is not None:

@@ -55,6 +55,9 @@ def _finding(log: Log, channel: str, kind: str, message: str, row: int | None = 
     return Finding(log.name, "" if table is None else table.name, row, column, kind, message)
 
 
+LEAST = {"position": 0.02, "roll": 1.0, "pitch": 1.0, "yaw": 1.0, "joint": 0.05}
+"""Change per window, in m, deg and rad, below which nothing is said: rocking and rounding look like anything."""
+
 QUATERNION = tuple(f"quaternion_{c}" for c in "wxyz")
 
 
@@ -194,7 +197,9 @@ def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Ag
     windows = edges(*limits)
     length = float(windows[1] - windows[0])
     noise = sigma(log, integral) + abs(scale) * sigma(log, rate) * np.sqrt(length * 0.05)
-    return agreement(increments(log, integral, windows), scale * integrals(log, rate, windows), noise)
+    expected = scale * integrals(log, rate, windows, like=integral)
+    least = next(v for word, v in LEAST.items() if integral.startswith(word))
+    return agreement(increments(log, integral, windows), expected, noise, least)
 
 
 def _velocities(log: Log) -> list[Finding]:

@@ -55,10 +55,13 @@ def increments(log: Log, name: str, windows: np.ndarray) -> np.ndarray:
     return np.diff(np.interp(windows, time, smooth(values)))
 
 
-def integrals(log: Log, name: str, windows: np.ndarray) -> np.ndarray:
-    """Integral of a channel over each window."""
+def integrals(log: Log, name: str, windows: np.ndarray, like: str | None = None) -> np.ndarray:
+    """Integral of a channel over each window; its edges smoothed over as long as `increments` smooths those of `like`."""
     time, values = continuous(log, name)  # type: ignore[misc]
     total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
+    if like is not None:
+        length = SMOOTHED * np.median(np.diff(continuous(log, like)[0]))  # type: ignore[index]
+        total = smooth(total, max(1, round(float(length / np.median(np.diff(time))))))
     return np.diff(np.interp(windows, time, total))
 
 
@@ -67,7 +70,11 @@ def means(log: Log, name: str, windows: np.ndarray) -> np.ndarray:
     return integrals(log, name, windows) / np.diff(windows)
 
 
-def smooth(values: np.ndarray, width: int = 5) -> np.ndarray:
+SMOOTHED = 5
+"""Samples over which the edges of windows are averaged."""
+
+
+def smooth(values: np.ndarray, width: int = SMOOTHED) -> np.ndarray:
     """Moving mean, with the ends left as means of fewer samples."""
     kernel = np.ones(min(width, len(values)))
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
@@ -92,14 +99,14 @@ class Agreement:
         return self.reference > 0.0
 
 
-def agreement(series: np.ndarray, reference: np.ndarray, noise: float) -> Agreement | None:
-    """Compares two series; None where the reference does not rise above ten times the noise."""
+def agreement(series: np.ndarray, reference: np.ndarray, noise: float, least: float = 0.0) -> Agreement | None:
+    """Compares two series; None where the reference does not rise above ten times the noise, and above `least`."""
     keep = np.isfinite(series) & np.isfinite(reference)
     a, b = series[keep], reference[keep]
     if len(a) < 4:
         return None
     rms_a, rms_b = float(np.sqrt(np.mean(a * a))), float(np.sqrt(np.mean(b * b)))
-    if rms_b <= max(10.0 * noise, 1e-9):
+    if rms_b <= max(10.0 * noise, least, 1e-9):
         return None
     cosine = float(a @ b / (len(a) * rms_a * rms_b)) if rms_a > 0.0 else 0.0
     return Agreement(float(a @ b / (b @ b)), cosine, rms_a, rms_b)
