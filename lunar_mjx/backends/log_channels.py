@@ -51,9 +51,9 @@ def log_channels(model: Model, seen: Telemetry, commands: Commands, rover: int =
     _split(data, "wheel_{}_sinkage_m", own("sinkage"), corners)
     _split(data, "wheel_{}_slip_ratio", own("slip"), corners)
     _split(data, "wheel_{}_slip_angle_deg", np.rad2deg(own("slip_angle")), corners)
-    for i, axis in enumerate("xyz"):
-        _split(data, f"wheel_{{}}_force_{axis}_N", own("wheel_force")[..., i], corners)
-        _split(data, f"wheel_{{}}_moment_{axis}_Nm", own("wheel_moment")[..., i], corners)
+    for name, unit in (("force", "N"), ("moment", "Nm")):
+        for i, axis in enumerate("xyz"):
+            _split(data, f"wheel_{{}}_{name}_{axis}_{unit}", own(f"wheel_{name}")[..., i], corners)
     values = commands.values if commands.values.ndim == 2 else commands.values[rover]
     data |= dict(zip(command_channels(model), values.T, strict=True))
     return pd.DataFrame(data)
