@@ -115,6 +115,11 @@ class DriveProblem(Problem):
         other._start = {self.coordinates[i].key: fit.u[i] for i in self._nuisance}
         return other
 
+    def with_effects(self, candidates: Mapping[str, Effect], progress: Progress = silent) -> DriveProblem:
+        """The same model and logs with other candidates."""
+        return DriveProblem(self.logs, self.model, candidates, self._splits, self._baseline_spec, self._channels,
+                            self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+
     def origin(self) -> np.ndarray:
         return np.array([self._start.get(c.key, 0.0) for c in self.coordinates])
 
