@@ -56,7 +56,7 @@ def increments(log: Log, name: str, windows: np.ndarray) -> np.ndarray:
 
 
 def integrals(log: Log, name: str, windows: np.ndarray, like: str | None = None) -> np.ndarray:
-    """Integral of a channel over each window; its edges smoothed over as long as `increments` smooths those of `like`."""
+    """Integral of a channel over each window, its edges smoothed as `increments` smooths those of `like`."""
     time, values = continuous(log, name)  # type: ignore[misc]
     total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
     if like is not None:

@@ -14,7 +14,7 @@ from lunar_mjx.criticism.log.apply import log_model
 from lunar_mjx.criticism.log.instruments import Recording, record
 from lunar_mjx.criticism.log.log import Imu, Log, LogTable
 from lunar_mjx.criticism.log.seal import Answer, answer_path, hash_tables, write_answer
-from lunar_mjx.criticism.log.write import new_folder, write_log
+from lunar_mjx.criticism.log.write import refuse_used, write_log
 from lunar_mjx.dynamics.signals import measure, observe
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.electrical import BUS_VOLTAGE
@@ -115,7 +115,7 @@ def simulate_log(
 def _check_new(out: Path) -> None:
     if answer_path(out).exists():
         raise bad_input("log simulate", "folder", str(answer_path(out)), "exists already", "name a new folder")
-    new_folder(out)
+    refuse_used(out)
 
 
 def _hide(base: Model, effects: Sequence[Hidden]) -> tuple[Model, list[dict[str, Any]]]:

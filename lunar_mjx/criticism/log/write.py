@@ -115,10 +115,15 @@ def noise_tables(noise: Mapping[str, Noise]) -> dict[str, dict[str, Any]]:
     return tables
 
 
-def new_folder(folder: Path) -> None:
-    """Makes a folder that must not exist or be empty, so that nobody's measurements are overwritten."""
+def refuse_used(folder: Path) -> None:
+    """Refuses a folder that holds anything, so that nobody's measurements are overwritten."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise bad_input("lunar-mjx log", "folder", str(folder), "exists already", "name a new folder")
+
+
+def new_folder(folder: Path) -> None:
+    """Makes a folder that must not exist or be empty."""
+    refuse_used(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
