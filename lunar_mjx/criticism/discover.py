@@ -74,7 +74,8 @@ class Discovery:
         """A few lines for a terminal."""
         lines = [f"Port {self.port}:"]
         for i, s in enumerate(self.suggestions, 1):
-            lines.append(f"  {i}. {s.target} += ({s.amount:.3g} +- {s.std:.1g} {s.unit}) {s.formula}   chi2 -{s.chi2:.0f}, "
+            amount = f"({s.amount:.3g} +- {s.std:.1g} {s.unit})"
+            lines.append(f"  {i}. {s.target} += {amount} {s.formula}   chi2 -{s.chi2:.0f}, "
                          f"held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
                          + (", at the noise" if s.at_noise else ""))  # fmt: skip
         if self.ceiling is not None:
@@ -148,7 +149,7 @@ def suggest(
         fitted = refit_with(problem, base, s.effect, settings, Memory())
         value, se = gain(problem, base, fitted)
         noise = noise_test(problem, fitted)
-        place = [i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude][0]
+        place = next(i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude)
         c, k = problem.coordinates[place], list(fitted.free).index(place)
         std = c.std(fitted.u[place], float(fitted.covariance(problem)[k, k]) ** 0.5)
         t = library[s.effect]

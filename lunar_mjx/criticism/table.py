@@ -201,16 +201,33 @@ def _check_values(file: Path, numbers: Mapping[str, np.ndarray], slip_definition
     refuse(copied, "slip_ratio", "begins a row that occurs twice", "remove the copy")
 
 
+_SAME_LOAD = 0.25
+"""Loads of one point lie within this share of each other; the replicates of the measured wheel spread by a fifth."""
+
+
 def replicate_groups(table: SteadyStateTable) -> np.ndarray:
-    """Which point each run belongs to: same slip angle, and same rim speed (or slip ratio to 0.01).
+    """Which point each run belongs to: same slip angle, same rim and travel speed (or slip ratio to 0.01), same load.
+
+    Loads count as the same where no gap of more than 25 % lies between them.
 
     Returns:
-      Group number of each row, counted by rising slip angle and then rim speed or slip.
+      Group number of each row, counted by rising slip angle, then speeds or slip, then load.
     """
-    rim = table.test.get("rim_speed_m_s")
-    second = np.round(table.test["slip_ratio"], 2) if rim is None else np.round(rim, 4)
-    keys = np.column_stack([np.round(table.test["slip_angle_deg"], 2), second])
-    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    keys = [np.round(table.test["slip_angle_deg"], 2)]
+    if "rim_speed_m_s" in table.test:
+        keys += [np.round(table.test[c], 4) for c in _SPEEDS if c in table.test]
+        if "travel_speed_m_s" not in table.test:
+            keys.append(np.round(table.test["slip_ratio"], 2))
+    else:
+        keys.append(np.round(table.test["slip_ratio"], 2))
+    first = np.unique(np.column_stack(keys), axis=0, return_inverse=True)[1].reshape(-1)
+    level = np.zeros(len(first), int)
+    load = table.test["normal_load_N"]
+    for group in np.unique(first):
+        rows = np.flatnonzero(first == group)
+        order = rows[np.argsort(load[rows], kind="stable")]
+        level[order[1:]] = np.cumsum(np.diff(load[order]) > _SAME_LOAD * load[order[:-1]])
+    return np.unique(np.column_stack([first, level]), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def average(table: SteadyStateTable) -> SteadyStateTable:

@@ -62,7 +62,8 @@ class Term:
 def effect_of(term: Term) -> Effect:
     """The term's effect, made by running its source as a user's effect file would be."""
     module = types.ModuleType(term.name)
-    exec(compile(term.source, f"<{term.name}>", "exec"), module.__dict__)  # noqa: S102: our own text
+    # The text is our own, made above.
+    exec(compile(term.source, f"<{term.name}>", "exec"), module.__dict__)
     return next(v for v in vars(module).values() if isinstance(v, Effect))
 
 
@@ -108,7 +109,7 @@ from lunar_mjx.effects import Parameter, effect
 @effect(
     "{port}",
     order=500,
-    amount=Parameter({size!r}, 0.0, ({-bound * size!r}, {bound * size!r}), "{unit}", "amount of the term", source="suggested"),{shapes}
+    amount=Parameter({size!r}, 0.0, ({-bound * size!r}, {bound * size!r}), "{unit}", "amount", source="suggested"),{shapes}
 )
 def {term.name}(ctx, p, x, value):
     "{target} += amount * {formula}; an empirical form found in measurements, not a law."
@@ -227,7 +228,7 @@ def _geometry() -> Iterator[Term]:
 def _sensor(kinds: Sequence[str]) -> Iterator[Term]:
     for kind in kinds:
         first, unit = kind.split("_")[0], _unit_of(kind)
-        words = [w for w in kind.split("_")[1:]]
+        words = list(kind.split("_")[1:])
         test = " and ".join([f"name.startswith({first!r} + '_')", *(f"{('_' + w)!r} in name" for w in words)])
         pick = [f"chosen = [name for name in value.channels if {test}]"]
         for formula, code, per, size in (
