@@ -21,6 +21,7 @@ from lunar_mjx.model_file import load_model, save_model
 FORMAT = "lunar-mjx-run/1"
 RUN_FILE, MODEL_FILE, FITS_FILE = "run.json", "model.toml", "fits.json"
 COMPARISON_FILE, VERDICT_FILE, SERIES_FILE = "comparison.json", "verdict.json", "series.npz"
+SIGNATURES_FILE = "signatures.npz"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,15 +58,29 @@ class Run:
         return logs  # type: ignore[return-value]
 
     def write(self) -> None:
-        """Writes `run.json` and `model.toml`."""
+        """Writes `run.json` and `model.toml`; earlier looks at the test split stay on record."""
         self.folder.mkdir(parents=True, exist_ok=True)
+        opened = (self.load(RUN_FILE) or {}).get("test_opened", [])
         save_model(self.model, self.folder / MODEL_FILE)
         save_json(self.folder / RUN_FILE, {
             "format": FORMAT, "version": __version__, "logs": [str(p) for p in self.logs],
             "hashes": {str(p): folder_hash(p) for p in self.logs}, "candidates": list(self.candidates),
             "splits": dict(self.splits), "added": list(self.added), "parent": self.parent, "seed": self.seed,
-            "discrepancy": dict(self.discrepancy),
+            "discrepancy": dict(self.discrepancy), "test_opened": opened,
         })  # fmt: skip
+
+    def opened_test(self, verb: str, models: Mapping[str, str]) -> None:
+        """Puts on record that the error on the test split was computed.
+
+        Args:
+          verb: by which command.
+          models: fingerprint of the fit by the model's label; the same fit looked at again is no new opening.
+        """
+        data = self.load(RUN_FILE)
+        data["test_opened"] = [
+            *data.get("test_opened", []), *({"verb": verb, "model": m, "fit": f} for m, f in models.items())
+        ]  # fmt: skip
+        self.save(RUN_FILE, data)
 
     def load(self, name: str) -> Any:
         """Contents of one of the run's JSON files; None if it has not been written yet."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.attribute import Settings, diagnose, fit_baseline, parameters
+from lunar_mjx.criticism.attribute import Search, Settings, diagnose, fit_baseline, parameters
 from lunar_mjx.criticism.build_problem import build_problem
 from lunar_mjx.criticism.fitted import fitted_model
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent, whitened_residuals
@@ -21,6 +22,7 @@ from lunar_mjx.criticism.runs import (
     COMPARISON_FILE,
     FITS_FILE,
     SERIES_FILE,
+    SIGNATURES_FILE,
     VERDICT_FILE,
     Run,
     load_run,
@@ -82,6 +84,7 @@ def _compare(run: Run, progress: Progress) -> Run:
     fitted = fit_baseline(problem, Settings(seed=run.seed), memory, progress)
     run.save(COMPARISON_FILE, comparison(problem, start, fitted))
     _save_series(run, problem, start, {"refitted": fitted})
+    _record_test(run, "compare", problem, {"refitted": fitted})
     return run
 
 
@@ -121,12 +124,10 @@ def comparison(problem: Problem, start: np.ndarray, fitted: Fit) -> dict[str, An
                 "refitted": _rms(fitted.residual[keep]),
             })  # fmt: skip
     given = {k: _rms(start[observations.in_split(*v)]) for k, v in _SPLITS.items() if observations.in_split(*v).any()}
-    names = dict.fromkeys(problem.coordinates[i].effect for i in fitted.free if problem.coordinates[i].log_index < 0)
-    fitted_values = {e: dict(zip(("value", "std"), parameters(problem, fitted, e), strict=True)) for e in names}
     return {
         "unit": "sigma of the measurement noise", "as_given": given, "refitted": errors(problem, fitted),
         "noise_test": dataclasses.asdict(noise_test(problem, fitted)), "by_channel": table,
-        "parameters": fitted_values, "certificate": {
+        "parameters": _parameter_table(problem, fitted), "certificate": {
             "chi2": fitted.chi2, "gradient": fitted.gradient, "starts": list(fitted.starts),
             "at_bound": list(fitted.at_bound), "problems": list(fitted.problems), **fitted.extra,
         },
@@ -145,6 +146,42 @@ _SPLITS = {
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def _parameter_table(problem: Problem, fitted: Fit) -> dict[str, Any]:
+    """Fitted values and standard deviations by effect and name, with units and the values that the model came with."""
+    moved = [problem.coordinates[i] for i in fitted.free if problem.coordinates[i].log_index < 0]
+    table: dict[str, Any] = {}
+    for effect in dict.fromkeys(c.effect for c in moved):
+        value, std = parameters(problem, fitted, effect)
+        mine = [c for c in moved if c.effect == effect]
+        table[effect] = {
+            "value": value, "std": std, "given": {c.name: c.start for c in mine},
+            "unit": {c.name: "factor" if c.factor else c.unit for c in mine},
+        }  # fmt: skip
+    return table
+
+
+def _record_test(run: Run, verb: str, problem: Problem, fits: Mapping[str, Fit]) -> None:
+    """Puts on record which models' errors on the test split have been computed."""
+    if not problem.observations.in_split("test").any():
+        return
+    rows = {"as given": problem.origin(), **{label: f.u for label, f in fits.items()}}
+    prints = {}
+    for label, u in rows.items():
+        moved = [f"{c.key} {c.value(v):.9g}" for i, (c, v) in enumerate(zip(problem.coordinates, u, strict=True))
+                 if v != 0.0 or i in problem.baseline]  # fmt: skip
+        prints[label] = hashlib.sha256("\n".join(moved).encode()).hexdigest()[:16]
+    run.opened_test(verb, prints)
+
+
+def _save_signatures(run: Run, found: Search) -> None:
+    """Projected signatures over the fitted observations, each at its best linear amount, in sigma."""
+    scored = [s for s in found.scores if s.signature.size]
+    np.savez_compressed(
+        run.folder / SIGNATURES_FILE, names=np.array([s.effect for s in scored], str),
+        signatures=np.array([s.signature @ s.amount for s in scored], np.float32),
+    )  # fmt: skip
 
 
 def _save_series(run: Run, problem: Problem, start: np.ndarray, fits: Mapping[str, Fit]) -> None:
@@ -198,7 +235,8 @@ def why(
         sentence = diagnosis.sentence + (f" It acts at the port {port}." if port else "")
         diagnosis = dataclasses.replace(
             diagnosis, port=port, ports=place.ports, sentence=sentence,
-            details={**diagnosis.details, "localise": place.to_dict()},
+            details={**diagnosis.details, "localise": place.to_dict(),
+                     "parameters": _parameter_table(problem, found.chosen.fit)},
         )  # fmt: skip
         fits = {"refitted": found.base.fit}
         if found.chosen.effects:
@@ -206,6 +244,8 @@ def why(
         start = whitened_residuals(problem, problem.origin()[None])[0]
         _save_series(run, problem, start, fits)
         run.save(COMPARISON_FILE, comparison(problem, start, found.base.fit))
+        _save_signatures(run, found)
+        _record_test(run, "why", problem, fits)
     run.save(VERDICT_FILE, diagnosis.to_dict())
     return diagnosis
 
