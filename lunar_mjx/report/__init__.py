@@ -1,5 +1,6 @@
 """Reports: offline HTML pages, one visual language for figures, and progress at the command line."""
 
+from lunar_mjx.report.page import Explorer as Explorer
 from lunar_mjx.report.page import Facts as Facts
 from lunar_mjx.report.page import Figure as Figure
 from lunar_mjx.report.page import Section as Section

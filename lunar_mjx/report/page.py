@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,20 @@ class Figure(NamedTuple):
     """A figure with its caption."""
 
     figure: go.Figure
+    caption: str = ""
+
+
+class Explorer(NamedTuple):
+    """Two figures: what is clicked in the first, or chosen from a list, is drawn in the second.
+
+    Points of `figure` carry the key of a panel as their customdata. A panel holds "label" (in the list), "x" and "y",
+    one list per trace of `detail` (x may be one list for all), "title", "x_title" and "y_title" (text as plotly takes
+    it). The first panel is shown at first.
+    """
+
+    figure: go.Figure
+    detail: go.Figure
+    panels: Mapping[str, Mapping[str, Any]]
     caption: str = ""
 
 
@@ -43,11 +57,14 @@ class Facts(NamedTuple):
     pairs: Sequence[tuple[str, str]]
 
 
+Block = Figure | Explorer | Table | Text | Facts
+
+
 class Section(NamedTuple):
     """A part of a page."""
 
     title: str
-    blocks: Sequence[Figure | Table | Text | Facts]
+    blocks: Sequence[Block]
 
 
 _CONFIG = {"displaylogo": False, "responsive": True, "showLink": False,
@@ -56,8 +73,11 @@ _CONFIG = {"displaylogo": False, "responsive": True, "showLink": False,
 
 def _script() -> str:
     """plotly.js, compressed: the page stays far below 5 MB, and the browser unpacks it without any request."""
-    packed = gzip.compress(plotly.offline.get_plotlyjs().encode(), 9, mtime=0)
-    return base64.b64encode(packed).decode("ascii")
+    return _packed(plotly.offline.get_plotlyjs())
+
+
+def _packed(text: str) -> str:
+    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode("ascii")
 
 
 def _json(value: str) -> str:
@@ -95,14 +115,19 @@ def write_page(path: Path, title: str, verdict: Sequence[str], sections: Sequenc
     return path
 
 
-def _block(block: Figure | Table | Text | Facts, figures: list[str]) -> dict[str, Any]:
+def _block(block: Block, figures: list[str]) -> dict[str, Any]:
     kind = type(block).__name__.lower()
-    if not isinstance(block, Figure):
-        return {"kind": kind, **block._asdict()}
-    figures.append(_json(str(block.figure.to_json())))
-    return {
-        "kind": kind,
-        "caption": block.caption,
-        "height": block.figure.layout.height or 450,
-        "index": len(figures) - 1,
-    }
+    if isinstance(block, Figure):
+        return {"kind": kind, "caption": block.caption, **_placed(block.figure, figures)}
+    if isinstance(block, Explorer):
+        return {
+            "kind": kind, "caption": block.caption, "map": _placed(block.figure, figures),
+            "detail": _placed(block.detail, figures), "panels": _packed(json.dumps(block.panels, allow_nan=False)),
+            "choices": [(key, panel["label"]) for key, panel in block.panels.items()],
+        }  # fmt: skip
+    return {"kind": kind, **block._asdict()}
+
+
+def _placed(figure: go.Figure, figures: list[str]) -> dict[str, int]:
+    figures.append(_json(str(figure.to_json())))
+    return {"height": figure.layout.height or 450, "index": len(figures) - 1}
