@@ -180,7 +180,7 @@ def commands(manoeuvre: Manoeuvre, model: Model, scale: float = 1.0) -> Commands
     Args:
       manoeuvre: what to drive.
       model: of any rover; its control mode of `drive` must be the manoeuvre's.
-      scale: factor on all durations; speeds stay, so that a short version covers less ground.
+      scale: factor on the durations of segments; speeds stay, so that a short version covers less ground.
 
     Returns:
       One row per whole number of time steps nearest to 0.05 s.
@@ -205,8 +205,10 @@ def commands(manoeuvre: Manoeuvre, model: Model, scale: float = 1.0) -> Commands
     for row in range(count):
         time = row * interval
         i = min(int(np.searchsorted(ends, time + 1e-9, side="right")), len(ends) - 1)
-        ramp = scale * manoeuvre.segments[i].ramp_s
-        into = time - (ends[i - 1] if i else 0.0)
+        begin = ends[i - 1] if i else 0.0
+        # ramps are scaled only as far as they must, so that short versions are not rougher
+        stated = manoeuvre.segments[i].ramp_s
+        ramp, into = min(stated, max(scale * stated, 0.5 * (ends[i] - begin))), time - begin
         share = 1.0 if into >= ramp else into / ramp
         before = targets[i - 1] if i else np.zeros_like(targets[0])
         out[row] = targets[i] if share == 1.0 else before + share * (targets[i] - before)

@@ -14,6 +14,10 @@ from lunar_mjx.criticism.log.log import Log, Noise
 FACTOR = 2.0
 """A stated noise that is wrong by less than this does not mislead; the data sheets themselves are no better."""
 
+QUIETER = 3.5
+"""The same for noise smaller than stated, and only where the rest shows white noise: of noise that is nine tenths slow,
+spans of a few seconds show a third."""
+
 SETTLE = 2.0
 """Seconds after a command has changed in which a rover still rocks."""
 
@@ -22,6 +26,9 @@ STILL = 0.02
 
 LONGEST = 8.0
 """Seconds of rest taken together, over which a parabola follows whatever creeps or cools."""
+
+WHITE = 0.15
+"""Largest correlation of neighbouring samples that passes for white noise."""
 
 SHORTEST = 1.2
 MARGIN = 0.3
@@ -142,7 +149,12 @@ def _contradiction(log: Log, name: str, noise: Noise, std: float, correlation: f
     statistic, freedom = independent * ratio**2, independent
     if ratio > FACTOR and stats.chi2.sf(statistic, freedom) < CHANCE:
         side = "is noisier than stated"
-    elif ratio < 1.0 / FACTOR and step < noise.std and stats.chi2.cdf(statistic, freedom) < CHANCE:
+    elif (
+        ratio < 1.0 / QUIETER
+        and correlation < WHITE
+        and step < noise.std
+        and stats.chi2.cdf(statistic, freedom) < CHANCE
+    ):
         side = "is quieter than stated"
     else:
         return ""

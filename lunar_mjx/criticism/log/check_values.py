@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from lunar_mjx.criticism.log.apply import environment_value
@@ -126,13 +128,21 @@ def _stuck(log: Log, table: LogTable, name: str, values: np.ndarray) -> tuple[in
         return None
     noise = sigma(log, name)
     step = quantum(values) or _siblings_quantum(table, name)
-    if noise > 0.0 and step is not None and noise >= 0.5 * step:
-        rest = np.concatenate([values[:first], values[first + length :]])
-        same = max(0.2, *(float(np.mean(np.diff(b) == 0.0)) for b in np.array_split(rest, 10) if len(b) > 4), 0.0)
-        return (first, length, float(values[first])) if len(values) * same**length < CHANCE else None
+    if noise > 0.0 and step is not None and length >= _possible_run(noise, step, len(values)):
+        return first, length, float(values[first])
     if length == len(values) and _siblings_move(table, name):
         return first, length, float(values[0])
     return None
+
+
+def _possible_run(noise: float, step: float, count: int) -> float:
+    """Length of a run of equal samples that noise of this size still allows in a channel of `count` samples.
+
+    At least a tenth of the variance is taken to be white, the rest to stand still in the middle of a quantum.
+    """
+    inside = math.erf(0.5 * step / (np.sqrt(0.1) * noise * np.sqrt(2.0)))
+    same = min(inside**2 + 0.5 * (1.0 - inside) ** 2, 1.0 - 1e-12)
+    return max(SHORTEST_RUN, math.log(CHANCE / count) / math.log(max(same, 1e-3)))
 
 
 def _siblings(table: LogTable, name: str) -> list[np.ndarray]:
@@ -146,7 +156,7 @@ def _siblings(table: LogTable, name: str) -> list[np.ndarray]:
 
 
 def _siblings_quantum(table: LogTable, name: str) -> float | None:
-    steps = [quantum(v) for v in _siblings(table, name)]
+    steps = [q for v in _siblings(table, name) if (q := quantum(v)) > 0.0]
     return float(np.median(steps)) if len(steps) >= 2 else None
 
 
@@ -165,6 +175,8 @@ def _clipped(log: Log, name: str, values: np.ndarray) -> float | None:
         return None
     for extreme in (float(values.max()), float(values.min())):
         count = int((values == extreme).sum())
-        if count >= max(10, CLIPPED_SHARE * len(values)):
+        # slow noise stays at its extreme for a while too, but then its neighbours are as frequent
+        beside = int((np.abs(values - extreme) < 1.5 * step).sum()) - count
+        if count >= max(10, CLIPPED_SHARE * len(values), 5 * beside):
             return extreme
     return None

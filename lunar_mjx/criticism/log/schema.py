@@ -81,7 +81,7 @@ CHANNELS: tuple[Channel, ...] = (
     _channel("joint_{c}_{j}_angle", "rad", "joint", -1e6, 1e6, "a wheel of 0.1 m would have rolled 100 km"),
     _channel("joint_{c}_{j}_speed", "rad_s", "joint", -100.0, 100.0, "a wheel of 0.1 m would drive 10 m/s"),
     _channel("motor_{c}_{j}_current", "A", "electrical", -200.0, 200.0, _ELECTRIC),
-    _channel("motor_{c}_{j}_voltage", "V", "electrical", -400.0, 400.0, _ELECTRIC),
+    _channel("motor_{c}_{j}_voltage", "V", "electrical", -2e3, 2e3, "beyond any rover's bus, simulated or not"),
     _channel("bus_voltage", "V", "electrical", 0.0, 400.0, _ELECTRIC),
     _channel("motor_{c}_{j}_torque", "Nm", "torque", -5e3, 5e3, "more than any rover's joint bears"),
     _channel("winding_{c}_{j}_temperature", "degC", "temperature", -250.0, 300.0, _HEAT),
