@@ -162,7 +162,8 @@ def telemetry(rows: list[Observation]) -> Telemetry:
     """Observations of several times as `Telemetry` with leading axes (rover, time)."""
     names = [f.name for f in dataclasses.fields(Telemetry)]
     stacked = {name: np.stack([row[name] for row in rows], axis=1) for name in names}
-    return Telemetry(**{k: Vec3(*np.moveaxis(v, -1, 0)) if k in VECTORS else v for k, v in stacked.items()})
+    fields: dict[str, Any] = {k: Vec3(*np.moveaxis(v, -1, 0)) if k in VECTORS else v for k, v in stacked.items()}
+    return Telemetry(**fields)
 
 
 def observation(seen: Telemetry) -> Observation:

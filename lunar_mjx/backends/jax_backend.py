@@ -77,9 +77,9 @@ class JaxBackend(Backend):
 
     def reset(self, x: Any = 0.0, y: Any = 0.0, yaw: Any = 0.0, winding_temperature: Any = None) -> BackendState:
         with self._precision():
-            place = [jnp.broadcast_to(jnp.asarray(v, float), (self.rovers,)) for v in (x, y, yaw)]
+            east, north, heading = (jnp.broadcast_to(jnp.asarray(v, float), (self.rovers,)) for v in (x, y, yaw))
             reset = jax.vmap(self.system.reset, in_axes=(self._axes, 0, 0, 0, None))
-            self._state = reset(self.params, *place, winding_temperature)
+            self._state = reset(self.params, east, north, heading, winding_temperature)
         return self.state()
 
     def step(self, control: Any) -> None:
@@ -98,10 +98,15 @@ class JaxBackend(Backend):
 
     def state(self) -> BackendState:
         s = self._state
-        kelvin = [np.array(a, float) + REFERENCE_TEMPERATURE for a in (s.temperature.winding, s.temperature.housing)]
         effects = {e: {k: np.array(v, float) for k, v in own.items()} for e, own in s.effects.items()}
-        return BackendState(int(np.asarray(s.step).flat[0]), np.array(s.qpos, float), np.array(s.qvel, float),
-                            *kelvin, effects)  # fmt: skip
+        return BackendState(
+            step=int(np.asarray(s.step).flat[0]),
+            qpos=np.array(s.qpos, float),
+            qvel=np.array(s.qvel, float),
+            winding_temperature=np.array(s.temperature.winding, float) + REFERENCE_TEMPERATURE,
+            housing_temperature=np.array(s.temperature.housing, float) + REFERENCE_TEMPERATURE,
+            effects=effects,
+        )
 
     def set_state(self, state: BackendState) -> None:
         with self._precision():

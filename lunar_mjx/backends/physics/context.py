@@ -39,12 +39,41 @@ class Context:
       heat: winding, housing (n, j) W into the nodes; winding_capacity, housing_capacity (n, j) J/K.
     """
 
+    position: Any
+    rotation: Any
+    quaternion: Any
+    velocity: Any
+    angular_velocity: Any
+    joint_angle: Any
+    joint_speed: Any
+    winding_temperature: Any
+    housing_temperature: Any
+    heat_winding_temperature: Any
+    heat_housing_temperature: Any
+    steering_angle: Any
+    wheel_position: Any
+    wheel_axle: Any
+    wheel_velocity: Any
+    wheel_angular_velocity: Any
+    control: Any
+    numbers: Any
+    ground: Any
+    dt: float
+    gravity: float
+    ambient_temperature: float
+    chassis_point: Any
+    chassis_ground: Any
+
     def __init__(self, rovers: int) -> None:
         self.rovers = rovers
         self.time: float = 0.0
         self.step: int = 0
         self.resistance_factor: Any = 1.0
-        self.target = self.current = self.torque = self.resistance = self.torque_constant = None
+        self.target: Any = None
+        self.current: Any = None
+        self.torque: Any = None
+        self.resistance: Any = None
+        self.torque_constant: Any = None
         self.geometry: Values = {}
         self.contact: Values = {}
         self.soil: Values = {}
@@ -53,6 +82,3 @@ class Context:
         self.wheel: Values = {}
         self.body: Values = {}
         self.heat: Values = {}
-
-    def __getattr__(self, name: str) -> np.ndarray:  # for the type checker: the fields set by the backend
-        raise AttributeError(f"the context has no {name!r} at this point of the step")
