@@ -14,7 +14,6 @@ from typer.core import TyperGroup
 from lunar_mjx import __version__
 from lunar_mjx.commands import criticism as criticism_commands
 from lunar_mjx.commands import effect_test
-from lunar_mjx.commands import criticism as criticism_commands
 from lunar_mjx.commands import log as log_commands
 from lunar_mjx.commands import parity as parity_commands
 from lunar_mjx.commands import train as train_commands

@@ -21,10 +21,9 @@ def _figure(columns: int, width: float = 5.0, height: float = 3.6) -> Any:
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
-def moving_mean(values: Sequence[float], width: int = _BAND) -> np.ndarray:
+def moving_mean(values: Sequence[float] | np.ndarray, width: int = _BAND) -> np.ndarray:
     """Mean over the last `width` values, fewer at the beginning."""
-    values = np.asarray(values, float)
-    total = np.cumsum(np.insert(values, 0, 0.0))
+    total = np.cumsum(np.insert(np.asarray(values, float), 0, 0.0))
     last = np.arange(1, len(values) + 1)
     first = np.maximum(last - width, 0)
     return (total[last] - total[first]) / (last - first)

@@ -118,7 +118,7 @@ class Episode:
         steps = range(0, len(self.qpos), max(1, len(self.reward) // _FRAMES))
 
         def drawn(i: int) -> np.ndarray:
-            return top.frame(self.qpos[i], float(self.yaw[i]), self.goal, radius, self.qpos[: i + 1, :2], size)
+            return top.frame(self.qpos[i], float(self.yaw[i]), self.goal, radius, list(self.qpos[: i + 1, :2]), size)
 
         still = drawn(len(self.qpos) - 1)
         if view != "top":

@@ -65,7 +65,7 @@ def save_policy(policy: Policy, path: Path) -> Path:
     if policy.mean is not None:
         leaves |= {"mean": np.asarray(policy.mean), "deviation": np.asarray(policy.deviation)}
     record = {"format": FORMAT, "network": policy.network, "environment": policy.environment, "notes": policy.notes}
-    np.savez_compressed(path, record=np.array(json.dumps(record)), **leaves)
+    np.savez_compressed(path, record=np.array(json.dumps(record)), **leaves)  # pyright: ignore[reportArgumentType]
     return path
 
 

@@ -215,7 +215,11 @@ class TD3:
 
 def _with_params(optimiser: optax.GradientTransformation, params: Any) -> optax.GradientTransformation:
     """The optimiser with the parameters at hand, which decay needs and brax's update does not pass on."""
-    return optax.GradientTransformation(optimiser.init, lambda g, s, _=None: optimiser.update(g, s, params))
+
+    def update(updates: Any, state: Any, _: Any = None, **extra: Any) -> Any:
+        return optimiser.update(updates, state, params)
+
+    return optax.GradientTransformation(optimiser.init, update)  # pyright: ignore[reportArgumentType]
 
 
 def polyak(target: Any, new: Any, tau: float) -> Any:

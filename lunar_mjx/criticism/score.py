@@ -60,8 +60,8 @@ def blocks(observations: Observations, residual: np.ndarray, keep: np.ndarray, m
             count = _table_blocks(observations, mine, keep, number, count)
             continue
         timed = [s for s in mine if s.time is not None and len(s.time)]
-        first = min(float(s.time[0]) for s in timed)
-        last = max(float(s.time[-1]) for s in timed)
+        first = min(float(np.asarray(s.time)[0]) for s in timed)
+        last = max(float(np.asarray(s.time)[-1]) for s in timed)
         tau = max([_correlation_time(residual[s.start : s.stop], np.asarray(s.time)) for s in timed], default=0.0)
         length = max(5.0 * tau, (last - first) / max(4, most // max(1, len(observations.logs))), 1e-9)
         pieces = max(1, int((last - first) / length))
@@ -222,7 +222,8 @@ def _test(
     statistic = float(along @ inverse @ along)
     draws = weights @ centred
     boot = np.einsum("di,ij,dj->d", draws, inverse, draws)
-    return amount, chi2, _to_z(statistic, u.shape[1]), _to_z(boot, u.shape[1])
+    z = _to_z(np.append(boot, statistic), u.shape[1])
+    return amount, chi2, float(z[-1]), z[:-1]
 
 
 def _larger(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -231,13 +232,12 @@ def _larger(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return b + (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
-def _to_z(statistic: np.ndarray | float, degrees: int) -> np.ndarray | float:  # type: ignore[return]
+def _to_z(statistic: np.ndarray, degrees: int) -> np.ndarray:
     """One-sided normal quantile of a chi-square, so that candidates of several parameters compare."""
     tail = stats.chi2.logsf(statistic, degrees)
     # Beyond the reach of isf the asymptote z^2 = -2 log p is close enough to rank by.
     near = stats.norm.isf(np.exp(np.maximum(tail, -700.0)))
-    z = np.where(tail > -700.0, near, np.sqrt(-2.0 * tail))
-    return float(z) if np.ndim(statistic) == 0 else z
+    return np.where(tail > -700.0, near, np.sqrt(-2.0 * tail))
 
 
 def cosines(scores: list[Score]) -> dict[str, dict[str, float]]:

@@ -93,7 +93,7 @@ def _file(
 ) -> Term:
     body = "\n".join(f"    {line}" for line in (*lines, f"return {change}"))
     shapes = "".join(
-        f'\n    {name}=Parameter({n}, None, {b}, "{u}", "{m}", "choice"),'
+        f'    {name}=Parameter({n}, None, {b}, "{u}", "{m}", "choice"),\n'
         for name, (n, b, u, m) in _SHAPES.items() if f"p.{name}" in body
     )  # fmt: skip
     term = Term(port, target, formula, unit, size, "")
@@ -109,8 +109,8 @@ from lunar_mjx.effects import Parameter, effect
 @effect(
     "{port}",
     order=500,
-    amount=Parameter({size!r}, 0.0, ({-bound * size!r}, {bound * size!r}), "{unit}", "amount", source="suggested"),{shapes}
-)
+    amount=Parameter({size!r}, 0.0, ({-bound * size!r}, {bound * size!r}), "{unit}", "amount", source="suggested"),
+{shapes})
 def {term.name}(ctx, p, x, value):
     "{target} += amount * {formula}; an empirical form found in measurements, not a law."
 {body}

@@ -30,7 +30,7 @@ OVERHEAD = 0.05
 
 _FACTORS = {"[length]": 1.7, "[mass]": 0.6, "[time]": 2.3, "[temperature]": 0.8, "[current]": 1.4}
 Outputs = dict[str, Any]
-_Act = Callable[[Mapping[str, Any], Any], Outputs]
+_Act = Callable[[Mapping[str, Any] | None, Any], Outputs]
 
 
 class Check(NamedTuple):

@@ -339,7 +339,7 @@ def make_navigation(
 
         model = load_model(model)
     if model is None:
-        model = make_model(rover, terrain, preset)
+        model = make_model(rover, terrain or "lunar_plain", preset)
     elif terrain is not None:
         model = model.replace(terrain=terrain)
     return NavigationEnv(model, config, engine)

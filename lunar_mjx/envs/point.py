@@ -51,7 +51,7 @@ class PointEnv:
         inner = self._fresh(keys)
         obs, privileged = self._observe(inner)
         zero, no = jnp.zeros(keys.shape[0]), jnp.zeros(keys.shape[0], bool)
-        metrics = dict.fromkeys(("episode_return", "episode_length", "success"), zero)
+        metrics: dict[str, Any] = {name: zero for name in ("episode_return", "episode_length", "success")}  # noqa: C420
         return State(obs, privileged, zero, no, no, obs, privileged, metrics, {"goal_body": privileged}, inner)
 
     def step(self, params: Any, state: State, action: Any) -> State:

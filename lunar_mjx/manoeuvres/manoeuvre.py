@@ -243,7 +243,7 @@ def wheel_places(rover: Rover) -> Mapping[str, tuple[float, float]]:
     import mujoco
 
     model = rover.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    mujoco.mj_forward(model, data)  # pyright: ignore[reportAttributeAccessIssue]
     base = data.body(rover.chassis).xpos
     return {w.corner: tuple(map(float, (data.body(w.body).xpos - base)[:2])) for w in rover.wheels}  # type: ignore[misc]

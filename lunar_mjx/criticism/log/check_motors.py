@@ -53,7 +53,8 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
     found = []
     for a in corners:
         noise = max(sigma(log, measured[a]), 1e-3)
-        pair = agreement(seen[a], wanted[a], noise / 3.0)
+        mine, other = wanted[a], seen[a]
+        pair = None if mine is None or other is None else agreement(other, mine, noise / 3.0)
         if pair is None:
             continue
         if pair.cosine > 0.95 and (pair.factor > MANY or 0.01 < pair.factor < 1.0 / (4.0 * MANY)):
@@ -289,7 +290,7 @@ def _average(current: np.ndarray, share: float) -> np.ndarray:
 
 
 def _slope(x: np.ndarray, y: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    a, b = x - np.mean(x), y - np.mean(y)
+    a, b = x - np.mean(x), np.asarray(y) - np.mean(y)
     size = float(a @ a)
     if size <= 0.0 or not (b @ b) > 0.0:
         return 0.0, 0.0

@@ -97,7 +97,7 @@ def _signs(log: SteadyLog) -> list[Finding]:
         values = log.table.measured.get(quantity)
         if values is None or len(values) < 8 or np.ptp(slip) < 0.3:
             continue
-        rank = float(stats.spearmanr(slip, values).statistic)
+        rank = float(np.asarray(stats.spearmanr(slip, values))[0])
         noise = log.table.sigma.get(quantity, 0.0)
         if rank < -0.7 and np.ptp(values) > 10.0 * noise:
             found.append(

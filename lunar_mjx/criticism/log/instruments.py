@@ -192,4 +192,4 @@ def _lossy(frame: pd.DataFrame, share: float, rng: np.random.Generator) -> pd.Da
         frame.loc[rng.random(len(frame)) < 0.5 * share, channel] = np.nan
     keep = rng.random(len(frame)) >= 0.5 * share
     keep[0] = keep[-1] = True
-    return frame[keep].reset_index(drop=True)
+    return frame.loc[keep].reset_index(drop=True)

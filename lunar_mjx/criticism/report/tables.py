@@ -72,8 +72,8 @@ def effects(result: Result) -> list[Block]:
              "family-wise p", "held-out gain", "parameters, SI", "nearest confounder (|cos|)"],
             tested,
             "Separable: length of the effect's signature at nominal size that a refit of the model cannot absorb. "
-            "Score and p: robust score test, the largest over all effects by bootstrap. Held-out gain: expected log density "
-            "on manoeuvres left out, with its standard error. Parameters with one standard deviation.",
+            "Score and p: robust score test, the largest over all effects by bootstrap. Held-out gain: expected log "
+            "density on manoeuvres left out, with its standard error. Parameters with one standard deviation.",
             texts=3,
         ))  # fmt: skip
     by_reason: dict[str, list[str]] = {}
@@ -119,13 +119,15 @@ def by_channel(result: Result) -> list[Block]:
     """The worst channels and manoeuvres in numbers."""
     rows = (result.comparison or {}).get("by_channel") or []
     worst = sorted(rows, key=lambda r: -(r.get("refitted") or 0.0))[:_MOST_ROWS]
+    if not worst:
+        return []
     return [Table(
         f"Worst channels and manoeuvres of {result.name}, root mean square residual in sigma",
         ["manoeuvre", "split", "channel", "samples", "as given", "refitted"],
-        [[r["manoeuvre"], SPLIT_NAMES.get(r["split"], r["split"]), channel_label(r["channel"]), str(r["samples"]),
+        [[str(r["manoeuvre"]), str(SPLIT_NAMES.get(r["split"], r["split"])), channel_label(r["channel"]), str(r["samples"]),
           shown(r["as_given"]), shown(r["refitted"])] for r in worst],
         f"The {len(worst)} worst of {len(rows)}." if len(rows) > len(worst) else "", texts=3,
-    )] if worst else []  # fmt: skip
+    )]  # fmt: skip
 
 
 def findings(result: Result) -> list[Block]:

@@ -1,0 +1,1 @@
+"""Hidden-effect benchmark: generators that share no code with the tool, sealed answers, scoring, and the tables."""

@@ -1,0 +1,186 @@
+"""Whole trainings: they solve the task without physics, survive SIGKILL bit for bit, spread out, and stop at nan."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from lunar_mjx.agents import guard
+from lunar_mjx.agents.configs import TRAININGS, get_training, override
+from lunar_mjx.agents.ddpg import DDPGConfig
+from lunar_mjx.agents.evaluate import Evaluator, evaluate, wilson
+from lunar_mjx.agents.learner import Learner, TrainConfig
+from lunar_mjx.agents.policy import load_policy, save_policy
+from lunar_mjx.agents.td3 import TD3Config
+from lunar_mjx.agents.train import RunConfig, train
+from lunar_mjx.envs import PointEnv, make_agent
+from lunar_mjx.errors import UserError
+
+SCRIPT = Path(__file__).with_name("point_run.py")
+
+
+def command(*arguments: object, devices: int = 1) -> tuple[list[str], dict[str, str]]:
+    flags = f"--xla_force_host_platform_device_count={devices} --xla_cpu_multi_thread_eigen=false"
+    return [sys.executable, str(SCRIPT), *map(str, arguments)], {**os.environ, "XLA_FLAGS": flags}
+
+
+def run(*arguments: object, devices: int = 1) -> dict:
+    line, env = command(*arguments, devices=devices)
+    done = subprocess.run(line, env=env, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def settings(algorithm) -> TrainConfig:
+    return TrainConfig(
+        algorithm, envs=32, batch=256, updates=2, buffer_steps=1000, random_steps=20, noise=(0.05, 0.4), normalise=True,
+        epoch_steps=100,
+    )  # fmt: skip
+
+
+SMALL = {"actor_layers": (64, 64), "critic_layers": (64, 64), "n_step": 3, "tau": 0.02}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "algorithm",
+    [
+        TD3Config(**SMALL),
+        DDPGConfig(**SMALL),
+        TD3Config(**SMALL, atoms=31, value_range=(-10.0, 30.0), layer_norm=True, weight_decay=0.01),
+    ],
+    ids=["td3", "ddpg", "td3-distributional"],
+)
+def test_solves_the_point_task(algorithm, tmp_path):
+    env = PointEnv()
+    begin = time.monotonic()
+    result = train(Learner(env, settings(algorithm)), RunConfig(60_000, quiet=True), None)
+    assert time.monotonic() - begin < 60.0
+    before = result.rows[0]["success"]
+    policy = load_policy(save_policy(result.policy, tmp_path / "policy.npz"))
+    score = evaluate(env, lambda state, key: policy.act(state.obs), 256, seed=9)
+    chance = evaluate(env, make_agent("random", env), 256, seed=9)
+    assert score.low > 0.95 and chance.high < 0.5 and before < 0.5
+    # the straight way at full speed is the best that can be done
+    best = evaluate(env, make_agent("scripted", env), 256, seed=9)
+    assert score.episode_return > 0.97 * best.episode_return
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_it_ends_bit_for_bit_alike(tmp_path):
+    whole = run(tmp_path / "whole")
+    line, env = command(tmp_path / "broken")
+    kills = 0
+    for attempt in range(3):
+        process = subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        assert process.stdout is not None and process.stdout.readline().strip() == "begin"
+        deadline = time.monotonic() + 120
+        have = _checkpoints(tmp_path / "broken")
+        while _checkpoints(tmp_path / "broken") <= have + 2 * attempt and process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(random.Random(attempt).uniform(0.0, 0.3))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        kills += process.returncode == -signal.SIGKILL
+    assert kills >= 1
+    resumed = run(tmp_path / "broken")
+    assert resumed["digest"] == whole["digest"]
+    assert resumed["curve"] == whole["curve"]
+    rows = (tmp_path / "broken" / "progress.csv").read_text().splitlines()
+    assert len(rows) == 1 + len(whole["curve"])
+
+
+def _checkpoints(folder: Path) -> int:
+    numbers = [int(p.name) for p in (folder / "checkpoints").glob("*") if p.name.isdigit()]
+    return max(numbers, default=0)
+
+
+@pytest.mark.slow
+def test_four_devices_and_two_processes_learn_alike():
+    one, four = run("-"), run("-", devices=4)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    lines = [command("-", "--coordinator", f"127.0.0.1:{port}", "--processes", 2, "--process", i) for i in (0, 1)]
+    running = [subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+               for line, env in lines]  # fmt: skip
+    outputs = [p.communicate(timeout=300) for p in running]
+    assert all(p.returncode == 0 for p in running), outputs[0][1][-2000:]
+    two, other = (json.loads(out.splitlines()[-1]) for out, _ in outputs)
+    assert (one["devices"], four["devices"], two["devices"]) == (1, 4, 2)
+    assert two["digest"] == other["digest"], "both processes hold the same parameters"
+    for curve in (r["curve"] for r in (one, four, two)):
+        success = [row[2] for row in curve]
+        assert success[0] < 0.5 and min(success[-5:]) > 0.95
+    late = [np.mean([row[1] for row in r["curve"][-15:]]) for r in (one, four, two)]
+    assert max(late) - min(late) < 0.05 * max(late), "the same learning curve within noise"
+
+
+def test_stops_at_a_value_that_is_not_finite_and_keeps_the_state_for_replay(tmp_path):
+    env = PointEnv(episode_steps=40, poison=7)
+    config = override(get_training("point"), epoch_steps=10).train
+    with pytest.raises(guard.DivergenceError, match=r"environment \d+ .* step 7; .*not_finite.npz"):
+        train(Learner(env, config), RunConfig(3200, quiet=True), tmp_path)
+    again = guard.replay(env, tmp_path / "not_finite.npz")
+    assert math.isnan(float(again.reward[0]))
+    with pytest.raises(UserError, match="not the state of this environment"):
+        guard.replay(_Wider(), tmp_path / "not_finite.npz")
+
+
+class _Wider(PointEnv):
+    def _observe(self, inner):
+        obs, privileged = super()._observe(inner)
+        return jax.numpy.concatenate([obs, obs], axis=-1), privileged
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
+    config = override(get_training("point"), epoch_steps=5).train
+    train(Learner(PointEnv(), config), RunConfig(160, quiet=True), tmp_path)
+    other = override(get_training("point"), epoch_steps=5, actor_layers=(32, 32)).train
+    with pytest.raises(UserError, match="does not fit these settings"):
+        train(Learner(PointEnv(), other), RunConfig(320, quiet=True), tmp_path)
+
+
+def test_evaluation_counts_the_first_episode_of_each_environment():
+    env = PointEnv(episode_steps=5)
+    score = evaluate(env, make_agent("zero", env), 400, seed=0)
+    # a start within 0.1 m of its goal is a success at once: about pi 0.1^2 / 4 of all
+    assert score.success < 0.05 and score.ends["time"] == pytest.approx(1 - score.success)
+    assert score.episode_time == pytest.approx(0.5, abs=0.03)
+    twice = Evaluator(env, lambda _, state, key: make_agent("random", env)(state, key), 50)
+    assert twice(env.params, (), 3) == twice(env.params, (), 3)
+
+
+@pytest.mark.parametrize(("successes", "count", "low", "high"), [(8, 10, 0.4902, 0.9433), (0, 10, 0.0, 0.2775),
+                                                                 (256, 256, 0.9852, 1.0)])  # fmt: skip
+def test_wilson_interval(successes, count, low, high):
+    """Published values (Wilson score, 95 %)."""
+    assert wilson(successes, count) == pytest.approx((low, high), abs=1e-4)
+
+
+def test_overrides_by_name():
+    changed = override(get_training("large-td3"), envs="64", noise="0.1,0.2", atoms="51", normalise="false")
+    assert (changed.train.envs, changed.train.noise, changed.train.normalise) == (64, (0.1, 0.2), False)
+    assert changed.train.algorithm.atoms == 51
+    with pytest.raises(UserError, match="is no setting"):
+        override(TRAININGS["point"], speed=1)
+    with pytest.raises(UserError, match="is not like 4096"):
+        override(TRAININGS["large-td3"], envs="many")
+    with pytest.raises(UserError, match="does not exist"):
+        get_training("fast")
+    with pytest.raises(UserError, match="random_steps"):
+        override(TRAININGS["point"], random_steps=1)
