@@ -17,7 +17,7 @@ from pathlib import Path
 from lunar_mjx.agents.configs import TRAININGS, get_training, override
 from lunar_mjx.agents.run import run_training
 from lunar_mjx.agents.train import RunConfig
-from lunar_mjx.commands.train import pairs, env_options
+from lunar_mjx.commands.train import env_options, pairs
 
 
 def main() -> None:
