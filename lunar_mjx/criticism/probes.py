@@ -7,6 +7,7 @@ steady-state tables it is a smooth function of slip, slip angle and load.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -107,6 +108,7 @@ PROBES: Mapping[str, tuple[str, Act, float, str]] = {
 _ORDER = 1000
 
 
+@functools.cache
 def _probe(label: str, knots: int, span: float) -> Effect:
     """An effect whose amplitudes are the knots of a course over time (one knot: constant)."""
     port, act, size, unit = PROBES[label]

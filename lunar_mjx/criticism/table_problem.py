@@ -119,9 +119,14 @@ class TableProblem(Problem):
         self.bed, self._union = bed, union
         self.coordinates, self.baseline, self.candidates = _coordinates(bed, usable, baseline, values or {})
         self.observations, tests = _observations(self.logs, splits or {}, extra_sigma or {})
-        self._groups = [(test, tuple(q)) for test, q in tests]
-        self._run = jax.jit(jax.vmap(self._vector))
-        self._slope = jax.jit(jax.jacfwd(self._vector))
+        layout = tuple((c.effect, c.name, c.log) for c in self.coordinates)
+        self._run, self._slope = _programs(union, layout, tuple(tuple(q) for _, q in tests))
+        with jax.enable_x64(True):
+            self._given = (
+                {e: {k: jnp.asarray(x, float) for k, x in v.items()} for e, v in union.parameters.items()},
+                jnp.asarray([[c.start, c.scale] for c in self.coordinates], float).reshape(-1, 2),
+                [test for test, _ in tests],
+            )
 
     def values(self, u: np.ndarray) -> dict[str, dict[str, float]]:
         """Parameter values at a place, by effect and name, of the coordinates alone."""
@@ -139,24 +144,52 @@ class TableProblem(Problem):
             bed = bed.with_effect(self.effects[name], **{**self.effects[name].null(), **values[name]})
         return bed.with_values({e: v for e, v in values.items() if e in bed.parameters})
 
-    def _vector(self, u: Any) -> Any:
-        values = {e: dict(v) for e, v in self._union.parameters.items()}
-        for i, c in enumerate(self.coordinates):
-            values[c.effect][c.name] = c.start * jnp.exp(c.scale * u[i]) if c.log else c.start + c.scale * u[i]
-        parts = []
-        for test, quantities in self._groups:
-            result = self._union(values, test)
-            parts += [getattr(result, q) for q in quantities]
-        return jnp.concatenate(parts)
-
     def predict(self, u: np.ndarray) -> np.ndarray:
         with jax.enable_x64(True):
             # One row at a time: every number of rows would be another program.
-            return np.concatenate([np.asarray(self._run(jnp.asarray(row[None], float))) for row in np.atleast_2d(u)])
+            rows = [np.asarray(self._run(jnp.asarray(row, float), *self._given)) for row in np.atleast_2d(u)]
+        return np.stack(rows)
 
     def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
         with jax.enable_x64(True):
-            return np.asarray(self._slope(jnp.asarray(u, float)))[:, which]
+            return np.asarray(self._slope(jnp.asarray(u, float), *self._given))[:, which]
+
+
+_PROGRAMS: dict[Any, tuple[WheelBed, Any, Any]] = {}
+_MOST_PROGRAMS = 24
+
+
+def _programs(
+    union: WheelBed, layout: tuple[tuple[str, str, bool], ...], quantities: tuple[tuple[str, ...], ...]
+) -> tuple[Any, Any]:
+    """Predictions and their derivatives as compiled functions of (u, parameters, starts and scales, tests).
+
+    They take a table's numbers as arguments: tables of one shape and one list of effects share a program, because
+    compiling it takes a thousand times as long as running it.
+
+    Args:
+      union: the model's effects and the candidates. layout: effect, name and whether the logarithm moves, by
+        coordinate. quantities: measured by each table.
+    """
+    key = (tuple(id(e) for e in union.effects), union.gravity, layout, quantities)
+    if key not in _PROGRAMS:
+
+        def vector(u: Any, parameters: Any, scales: Any, tests: Any) -> Any:
+            values = {e: dict(v) for e, v in parameters.items()}
+            for i, (effect, name, log) in enumerate(layout):
+                start, scale = scales[i, 0], scales[i, 1]
+                values[effect][name] = start * jnp.exp(scale * u[i]) if log else start + scale * u[i]
+            parts = []
+            for test, wanted in zip(tests, quantities, strict=True):
+                result = union(values, test)
+                parts += [getattr(result, q) for q in wanted]
+            return jnp.concatenate(parts)
+
+        while len(_PROGRAMS) >= _MOST_PROGRAMS:
+            _PROGRAMS.pop(next(iter(_PROGRAMS)))
+        # The bed is kept beside its programs, so that no other effect takes the identity of one of its own.
+        _PROGRAMS[key] = union, jax.jit(vector), jax.jit(jax.jacfwd(vector))
+    return _PROGRAMS[key][1:]
 
 
 def _usable(bed: WheelBed, candidates: Mapping[str, Effect]) -> tuple[dict[str, Effect], tuple[NotTested, ...]]:
