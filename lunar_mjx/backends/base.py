@@ -88,6 +88,9 @@ class Backend(abc.ABC):
     def observe(self) -> Observation:
         """What the last step saw at its beginning, as copies."""
 
+    def close(self) -> None:  # noqa: B027 - most engines hold nothing outside Python
+        """Frees what the engine holds outside Python."""
+
     def controls(self, control: Any) -> np.ndarray:
         """The control as (rover, joint), checked."""
         wanted = (self.rovers, len(self.model.rover.joints))

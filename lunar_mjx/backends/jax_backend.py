@@ -49,8 +49,7 @@ class JaxBackend(Backend):
         with self._precision():
             self.system: System = build(model, engine)
             self.params = self.system.params
-            self._advance = jax.jit(self.system.step_batch, static_argnames="params_axes")
-            self._rollout = jax.jit(self.system.rollout_batch, static_argnames=("every", "params_axes"))
+            self._advance = jax.jit(self._hold, static_argnames="axes")
         self.name = self.system.engine.name if precision == "float64" else f"{self.system.engine.name}, float32"
         self._axes: Params | None = None
         self._seen: Telemetry | None = None
@@ -60,6 +59,22 @@ class JaxBackend(Backend):
     def _precision(self) -> Iterator[None]:
         with jax.enable_x64(self.precision == "float64"):
             yield
+
+    def _hold(self, params: Params, state: State, control: Any, count: Any, axes: Params | None) -> Any:
+        """`count` steps under one control, and what the first saw: one program for single steps and for drives."""
+
+        def one(k: Any, carry: tuple[State, Telemetry]) -> tuple[State, Telemetry]:
+            new, now = self.system.step_batch(params, carry[0], control, params_axes=axes)
+            return new, jax.tree.map(lambda a, b: jnp.where(k == 0, a, b), now, carry[1])
+
+        shapes = jax.eval_shape(lambda s: self.system.step_batch(params, s, control, params_axes=axes)[1], state)
+        empty = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+        return jax.lax.fori_loop(0, count, one, (state, empty))
+
+    def _go(self, control: np.ndarray, count: int) -> Telemetry:
+        held = jnp.asarray(self.controls(control), float)
+        self._state, seen = self._advance(self.params, self._state, held, jnp.int32(count), axes=self._axes)
+        return seen
 
     def set_terrain(self, terrain: Terrain, each: bool = False) -> None:
         """Takes another ground; one of the same grids compiles nothing anew.
@@ -72,7 +87,9 @@ class JaxBackend(Backend):
             floating = jax.tree.map(
                 lambda a: jnp.asarray(a, float if np.asarray(a).dtype.kind == "f" else None), terrain
             )
-            self.params = dataclasses.replace(self.params, terrain=floating)
+            # the name is part of the compiled structure
+            named = dataclasses.replace(floating, name=self.model.terrain.name)
+            self.params = dataclasses.replace(self.params, terrain=named)
             self._axes = _EACH_TERRAIN if each else None
 
     def reset(self, x: Any = 0.0, y: Any = 0.0, yaw: Any = 0.0, winding_temperature: Any = None) -> BackendState:
@@ -84,17 +101,14 @@ class JaxBackend(Backend):
 
     def step(self, control: Any) -> None:
         with self._precision():
-            held = jnp.asarray(self.controls(control), float)
-            self._state, self._seen = self._advance(self.params, self._state, held, params_axes=self._axes)
+            self._seen = self._go(control, 1)
 
     def run(self, commands: Commands) -> Telemetry:
         every = whole_steps(commands, self.model.timestep)
+        values = np.asarray(commands.values, float)
         with self._precision():
-            values = jnp.asarray(commands.values, float)
-            if values.ndim == 2:
-                values = jnp.broadcast_to(values, (self.rovers, *values.shape))
-            self._state, seen = self._rollout(self.params, self._state, values, every=every, params_axes=self._axes)
-            return jax.tree.map(np.asarray, seen)
+            rows = [jax.device_get(self._go(values[..., k, :], every)) for k in range(values.shape[-2])]
+        return jax.tree.map(lambda *a: np.stack(a, axis=1), *rows)
 
     def state(self) -> BackendState:
         s = self._state

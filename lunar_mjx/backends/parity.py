@@ -7,6 +7,7 @@ coordinates rounded to float32 as the noise floor.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -22,7 +23,7 @@ from lunar_mjx.backends.parity_cases import EXCEPTIONS, QUANTITIES, RELATIVE, Ca
 from lunar_mjx.dynamics.state import Telemetry
 from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands
-from lunar_mjx.terrain import stack
+from lunar_mjx.terrain import Terrain, stack
 
 STEP_QUANTITIES = ("position", "orientation", "joint_angle", "velocity", "joint_speed", "winding_temperature",
                    "housing_temperature", "shear_state")  # fmt: skip
@@ -72,56 +73,62 @@ class Result:
 
 
 class Runner:
-    """An engine that evaluates states and drives, one backend per ground."""
+    """An engine that evaluates states and drives, one backend per ground, with `rovers` at once."""
 
-    def __init__(self, name: str, make: Callable[[Model, int], Backend], model: Model, batched: bool = True) -> None:
-        self.name, self.make, self.model, self.batched = name, make, model, batched
+    def __init__(self, name: str, make: Callable[[Model, int], Backend], model: Model, rovers: int = 0) -> None:
+        self.name, self.make, self.model, self.rovers = name, make, model, rovers
 
     def step_from(self, case: Case, samples: Samples) -> tuple[Observation, Observation]:
         """Stages of the step from every sample, and the state after it."""
-        rovers = len(samples.control) if self.batched else 1
-        backend = self.make(self.model.replace(terrain=case.terrain), rovers)
-        pieces = [_evaluate(backend, s, c) for s, c in (_rows(samples, i, rovers) for i in
-                                                        range(0, len(samples.control), rovers))]  # fmt: skip
-        seen, after = ({k: np.concatenate([p[i][k] for p in pieces]) for k in pieces[0][i]} for i in (0, 1))
-        return seen, after
+        rovers = self.rovers or len(samples.control)
+        with contextlib.closing(self.make(self.model.replace(terrain=case.terrain), rovers)) as backend:
+            return _in_parts(backend, samples, rovers)
 
     def drive(self, case: Case, commands: Commands) -> Telemetry:
-        backend = self.make(self.model.replace(terrain=case.terrain), 1)
-        backend.reset()
-        return backend.run(commands)
+        with contextlib.closing(self.make(self.model.replace(terrain=case.terrain), 1)) as backend:
+            backend.reset()
+            return backend.run(commands)
+
+    def close(self) -> None:
+        """Frees what the engine keeps from one call to the next."""
 
 
 class JaxRunner(Runner):
-    """A JAX engine: compiled once for samples and once for drives, for all grounds."""
+    """A JAX engine: one compiled program of `WIDTH` rovers, each with its own ground, for samples and drives alike."""
+
+    WIDTH = 6
 
     def __init__(self, engine: str, model: Model, precision: str = "float64") -> None:
         self.engine, self.model, self.precision = engine, model, precision
         self.name = engine if precision == "float64" else f"{engine}, {precision}"
-        self._backends: dict[int, JaxBackend] = {}
+        self._backend: JaxBackend | None = None
 
-    def _backend(self, rovers: int, case: Case) -> JaxBackend:
-        if rovers not in self._backends:
-            model = self.model.replace(terrain=case.terrain)
-            self._backends[rovers] = JaxBackend(model, self.engine, rovers, self.precision)
-        backend = self._backends[rovers]
-        backend.set_terrain(case.terrain)
-        return backend
+    def _on(self, grounds: list[Terrain]) -> JaxBackend:
+        """The backend with these grounds, one per rover."""
+        if self._backend is None:
+            model = self.model.replace(terrain=grounds[0])
+            self._backend = JaxBackend(model, self.engine, self.WIDTH, self.precision)
+        self._backend.set_terrain(stack(grounds), each=True)
+        return self._backend
 
     def step_from(self, case: Case, samples: Samples) -> tuple[Observation, Observation]:
-        return _evaluate(self._backend(len(samples.control), case), samples.state, samples.control)
+        return _in_parts(self._on([case.terrain] * self.WIDTH), samples, self.WIDTH)
 
     def drives(self, cases: list[Case], commands: Commands) -> list[Telemetry]:
-        """Drives on all grounds at once."""
-        backend = self._backends.get(-1)
-        if backend is None:
-            model = self.model.replace(terrain=cases[0].terrain)
-            backend = self._backends[-1] = JaxBackend(model, self.engine, len(cases), self.precision)
-        # the name is part of the compiled structure
-        backend.set_terrain(stack([dataclasses.replace(c.terrain, name="parity") for c in cases]), each=True)
-        backend.reset()
-        seen = backend.run(commands)
-        return [jax.tree.map(lambda a, i=i: a[i : i + 1], seen) for i in range(len(cases))]
+        """Drives on several grounds at once."""
+        out: list[Telemetry] = []
+        for start in range(0, len(cases), self.WIDTH):
+            part = cases[start : start + self.WIDTH]
+            backend = self._on([c.terrain for c in _filled(part, self.WIDTH)])
+            backend.reset()
+            seen = backend.run(commands)
+            out += [jax.tree.map(lambda a, i=i: a[i : i + 1], seen) for i in range(len(part))]
+        return out
+
+    def close(self) -> None:
+        """Frees the compiled program."""
+        self._backend = None
+        jax.clear_caches()
 
 
 def native_runner(model: Model, hooks: Iterable[Hook] = (), name: str = "native") -> Runner:
@@ -129,13 +136,33 @@ def native_runner(model: Model, hooks: Iterable[Hook] = (), name: str = "native"
     return Runner(name, lambda m, n: NativeBackend(m, hooks, n), model)
 
 
-def _rows(samples: Samples, start: int, count: int) -> tuple[BackendState, np.ndarray]:
-    cut = slice(start, start + count)
+def _filled(items: list[Any], width: int) -> list[Any]:
+    """The items, and the last of them again up to `width`."""
+    return items + [items[-1]] * (width - len(items))
+
+
+def _in_parts(backend: Backend, samples: Samples, rovers: int) -> tuple[Observation, Observation]:
+    """`_evaluate` of all samples, `rovers` at once."""
+    seen: list[Observation] = []
+    after: list[Observation] = []
+    for start in range(0, len(samples.control), rovers):
+        at = list(range(start, min(start + rovers, len(samples.control))))
+        state, control = _rows(samples, np.array(_filled(at, rovers)))
+        for pieces, piece in zip((seen, after), _evaluate(backend, state, control), strict=True):
+            pieces.append({k: v[: len(at)] for k, v in piece.items()})
+    return _joined(seen), _joined(after)
+
+
+def _joined(pieces: list[Observation]) -> Observation:
+    return {k: np.concatenate([p[k] for p in pieces]) for k in pieces[0]}
+
+
+def _rows(samples: Samples, at: np.ndarray) -> tuple[BackendState, np.ndarray]:
     s = samples.state
-    effects = {e: {k: v[cut] for k, v in own.items()} for e, own in s.effects.items()}
-    state = BackendState(s.step, s.qpos[cut], s.qvel[cut], s.winding_temperature[cut], s.housing_temperature[cut],
+    effects = {e: {k: v[at] for k, v in own.items()} for e, own in s.effects.items()}
+    state = BackendState(s.step, s.qpos[at], s.qvel[at], s.winding_temperature[at], s.housing_temperature[at],
                          effects)  # fmt: skip
-    return state, samples.control[cut]
+    return state, samples.control[at]
 
 
 def _evaluate(backend: Backend, state: BackendState, control: np.ndarray) -> tuple[Observation, Observation]:

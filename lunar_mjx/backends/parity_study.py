@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -15,6 +16,7 @@ from lunar_mjx.dynamics.state import Telemetry
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.model import Model, make_model
 from lunar_mjx.report import Reporter
+from lunar_mjx.simulate import Commands
 
 ENGINES = ("structured", "mjx", "structured:float32", "mjx:float32", "pybullet", "pybullet:engine")
 """What can be compared with native MuJoCo; `pybullet:engine` bears the wheels by Bullet's own contact."""
@@ -76,7 +78,7 @@ def make_runner(engine: str, model: Model) -> Runner:
     import_pybullet()
     contact = option or "numpy"
     shown = "pybullet" if contact == "numpy" else "pybullet, own contact"
-    return Runner(shown, lambda m, n: PyBulletBackend(m, rovers=n, contact=contact), model)
+    return Runner(shown, lambda m, n: PyBulletBackend(m, rovers=n, contact=contact), model, rovers=1)
 
 
 def available(engines: Collection[str]) -> tuple[list[str], str]:
@@ -92,7 +94,7 @@ def run_study(
     rover: str,
     preset: str,
     engines: Sequence[str] = DEFAULT_ENGINES,
-    duration: float = 20.0,
+    duration: float = 10.0,
     samples: int = 16,
     grounds: Collection[str] | None = None,
     report: Reporter = lambda what, done: None,
@@ -117,32 +119,41 @@ def run_study(
     used = [c for c in known if grounds is None or c.name in grounds]
     runners = [make_runner(e, model) for e in engines]
     commands = drive(model, duration)
-    parts = len(used) * (1 + len(runners))
-    recorded, done = {}, 0
-    for case in used:
-        report(f"{preset}: native, {case.name}", done / parts)
+    parts = len(used) * (2 + 3 * len(runners))  # a drive takes about as long as the samples of two grounds
+    recorded = {}
+    for i, case in enumerate(used):
+        report(f"{preset}: native, {case.name}", 2 * i / parts)
         recorded[case.name] = record(model, case, commands, samples)
-        done += 1
     reference = Run(NativeBackend.name, {k: (r[0].stages, r[0].after) for k, r in recorded.items()},
                     {k: r[1] for k, r in recorded.items()})  # fmt: skip
-    runs = {reference.name: reference}
-    for runner in runners:
-        steps = {}
-        for case in used:
-            report(f"{preset}: {runner.name}, {case.name}", done / parts)
-            steps[case.name] = runner.step_from(case, recorded[case.name][0])
-            done += 1
-        if isinstance(runner, JaxRunner):
-            drives = dict(zip((c.name for c in used), runner.drives(used, commands), strict=True))
-        else:
-            drives = {c.name: runner.drive(c, commands) for c in used}
-        runs[runner.name] = Run(runner.name, steps, drives)
-    noise = {k: r[2] for k, r in recorded.items()}
     of = {k: r[0] for k, r in recorded.items()}
+    runs = {reference.name: reference}
+    for i, runner in enumerate(runners):
+        first = len(used) * (2 + 3 * i)
+        runs[runner.name] = _run(runner, used, of, commands, lambda what, done, first=first: report(
+            f"{preset}: {what}", (first + 3 * len(used) * done) / parts))  # fmt: skip
+    noise = {k: r[2] for k, r in recorded.items()}
     pairs = [_pair(model, used, reference, runs[r.name], of, noise) for r in runners]
     if "structured" in runs and "mjx" in runs:
         pairs.append(_pair(model, used, runs["structured"], runs["mjx"], of, noise))
     return Study(model, used, pairs, runs, noise)
+
+
+def _run(runner: Runner, used: list[Case], of: dict[str, Samples], commands: Commands, report: Reporter) -> Run:
+    """One engine over all grounds; what it holds is freed before the next."""
+    steps, drives = {}, {}
+    with contextlib.closing(runner):
+        for i, case in enumerate(used):
+            report(f"{runner.name}, states on {case.name}", i / (3 * len(used)))
+            steps[case.name] = runner.step_from(case, of[case.name])
+        if isinstance(runner, JaxRunner):
+            report(f"{runner.name}, drives", 1 / 3)
+            drives = dict(zip((c.name for c in used), runner.drives(used, commands), strict=True))
+        else:
+            for i, case in enumerate(used):
+                report(f"{runner.name}, drive on {case.name}", (1 + 2 * i / len(used)) / 3)
+                drives[case.name] = runner.drive(case, commands)
+    return Run(runner.name, steps, drives)
 
 
 def kind_of(names: tuple[str, str], model: Model) -> str:
