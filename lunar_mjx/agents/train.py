@@ -7,16 +7,18 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from lunar_mjx.agents import guard
-from lunar_mjx.agents.checkpoint import Checkpoints
 from lunar_mjx.agents.learner import EPISODE, Learner, TrainState
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.record import Progress, Record
+
+if TYPE_CHECKING:
+    from lunar_mjx.agents.checkpoint import Checkpoints
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +97,7 @@ class _Loop:
     def __init__(self, learner: Learner, run: RunConfig, folder: Path | None, environment: dict[str, Any]):
         self.learner, self.config, self.folder, self.environment = learner, run, folder, environment
         self.per_epoch = learner.config.envs * learner.config.epoch_steps
-        self.checkpoints = Checkpoints(folder / "checkpoints") if folder else None
+        self.checkpoints = _checkpoints(folder / "checkpoints") if folder else None
         self.episodes: dict[str, list[float]] = {name: [] for name in (*EPISODE, "step")}
         self.epochs, self.elapsed, rows = 0, 0.0, []
         latest = self.checkpoints.latest() if self.checkpoints and run.resume else None
@@ -205,6 +207,13 @@ class _Loop:
             self.record.close()
         if self.checkpoints:
             self.checkpoints.close()
+
+
+def _checkpoints(folder: Path) -> Checkpoints:
+    # orbax takes a second to import, and trainings without a folder do without it
+    from lunar_mjx.agents.checkpoint import Checkpoints
+
+    return Checkpoints(folder)
 
 
 def plain(value: Any) -> Any:

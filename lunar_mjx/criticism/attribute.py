@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -166,15 +167,31 @@ def _grow(
     for s in good[settings.refits :]:
         if near.get(good[0].effect, {}).get(s.effect, 0.0) >= settings.confounded and len(chosen) < 2 * settings.refits:
             chosen.append(s)
-    grown = []
-    for s in chosen:
-        effects = (*parent.effects, s.effect)
-        if frozenset(effects) in tried:
-            continue
-        candidate = _refit(problem, parent, effects, s, memory)
-        tried[frozenset(effects)] = candidate
-        grown.append(candidate)
+    new = [s for s in chosen if frozenset((*parent.effects, s.effect)) not in tried]
+    with problem.focused([*parent.effects, *(s.effect for s in new)]):
+        grown = _refit_all(problem, parent, new, memory)
+    tried.update({frozenset(c.effects): c for c in grown})
     return grown
+
+
+def _refit_all(problem: Problem, parent: Candidate, new: Sequence[Score], memory: Memory) -> list[Candidate]:
+    """Refits the parent with each of the new effects; where rows are free, all refits share their batches."""
+
+    def one(s: Score) -> Candidate:
+        return _refit(problem, parent, (*parent.effects, s.effect), s, memory)
+
+    if not problem.eager or len(new) < 2:
+        return [one(s) for s in new]
+    with problem.together(len(new)) as leave:
+
+        def tracked(s: Score) -> Candidate:
+            try:
+                return one(s)
+            finally:
+                leave()
+
+        with concurrent.futures.ThreadPoolExecutor(len(new)) as pool:
+            return list(pool.map(tracked, new))
 
 
 def _refit(

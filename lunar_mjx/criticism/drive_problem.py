@@ -6,9 +6,11 @@ one batch, so that a Jacobian costs no program of its own (`jacfwd` through the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import jax
 import numpy as np
 
 from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
@@ -16,6 +18,7 @@ from lunar_mjx.criticism.drive_noise import channel_noise
 from lunar_mjx.criticism.drive_runs import Bench, LogRun, Rows
 from lunar_mjx.criticism.fitted import fitted_model
 from lunar_mjx.criticism.fitting import Fit, Progress, silent
+from lunar_mjx.criticism.gather import Gather
 from lunar_mjx.criticism.observations import Observations, Series
 from lunar_mjx.criticism.problem import NotTested, Problem
 from lunar_mjx.effects.base import Effect
@@ -48,6 +51,10 @@ NOT_MISSING = frozenset(
     {"parking_brake", "payload", "tether", "hard_surface", "surface_type", "soil_gradient", "boulders"}
 )
 """Effects that describe an arrangement of the test, which its user knows, and are never candidates by themselves."""
+
+
+SLIP_SPEED = 0.03
+"""Speed of a wheel's rim below which a measured slip ratio is not compared, m/s."""
 
 
 class DriveProblem(Problem):
@@ -84,11 +91,13 @@ class DriveProblem(Problem):
         self._splits, self._baseline_spec, self._channels = dict(splits or {}), baseline, channels
         self._start: dict[str, float] = {}
         self.effects, self.not_tested = _usable(model, candidates)
-        union = model
-        for effect in self.effects.values():
-            union = union.add(effect, "criticism", **effect.null())
         self.progress = progress
-        self.bench = Bench(union, self.logs, chunk, engine)
+        self.bench = Bench(model, self.logs, chunk, engine)
+        self.eager = jax.default_backend() != "cpu"
+        # A program holds only the candidates that leave their null in it: fewer compile and run faster.
+        self._benches: dict[frozenset[str], Bench] = {frozenset(): self.bench}
+        self._focus: frozenset[str] = frozenset()
+        self._gather: Gather | None = None
         found = _baseline_coordinates(model, baseline)
         count = len(found)
         for number, run in enumerate(self.bench.runs):
@@ -125,21 +134,74 @@ class DriveProblem(Problem):
 
     def predict(self, u: np.ndarray) -> np.ndarray:
         rows = np.atleast_2d(u)
+        return self._predict(rows) if self._gather is None else self._gather(rows)
+
+    @contextlib.contextmanager
+    def together(self, threads: int) -> Iterator[Callable[[], None]]:
+        self._gather = Gather(self._predict, threads)
+        try:
+            yield self._gather.leave
+        finally:
+            self._gather = None
+
+    def _predict(self, rows: np.ndarray) -> np.ndarray:
+        bench = self._bench_for(rows)
         values = self._values(rows)
-        out = np.empty((len(rows), len(self.observations)))
-        for number in range(len(self.logs)):
-            out[:, self._of_log(number)] = np.nan
+        out = np.full((len(rows), len(self.observations)), np.nan)
         jobs = [(number, k) for number in range(len(self.logs)) for k in range(len(rows))]
-        for number, k, sampled in self.bench.run(jobs, values, self.observations, self.progress):
+        for number, k, sampled in bench.run(jobs, values, self.observations, self.progress):
             out[k, self._of_log(number)] = sampled
         return out
 
+    @contextlib.contextmanager
+    def focused(self, effects: Sequence[str]) -> Iterator[None]:
+        before, self._focus = self._focus, frozenset(effects)
+        try:
+            yield
+        finally:
+            self._focus = before
+
+    def _bench_for(self, rows: np.ndarray) -> Bench:
+        """The bench whose model holds every candidate that leaves its null in some row, and few others."""
+        null = np.zeros(len(self.coordinates))
+        active = frozenset(e for e, places in self.candidates.items() if np.any(rows[:, places] != null[places]))
+        fitting = [e for e in self._benches if active <= e]
+        best = min(fitting, key=len, default=None)
+        if active <= self._focus and (best is None or len(best) > len(self._focus)):
+            best = self._focus
+        elif best is None or len(best) > len(active) + 8:
+            best = active
+        if best not in self._benches:
+            union = self.model
+            for name in self.effects:
+                if name in best:
+                    union = union.add(self.effects[name], "criticism", **self.effects[name].null())
+            self._benches[best] = Bench(union, self.logs, self.bench.chunk, self.bench.engine)
+        return self._benches[best]
+
+    def linearise(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        parts = [self._difference_rows(row, which) for row in u]
+        values = self.predict(np.concatenate([rows for rows, _ in parts]))
+        ends = np.cumsum([len(rows) for rows, _ in parts])
+        pieces = np.split(values, ends[:-1])
+        return (
+            np.stack([p[0] for p in pieces]),
+            np.stack([self._quotients(p, which, steps) for p, (_, steps) in zip(pieces, parts, strict=True)]),
+        )
+
     def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
         """As in `Problem`; nuisances of different logs are perturbed together, since a log feels only its own."""
-        which = np.asarray(which)
-        own = [i for i in which if self.coordinates[i].log_index >= 0]
+        rows, steps = self._difference_rows(u, which)
+        return self._quotients(self.predict(rows), which, steps)
+
+    def _kinds(self, which: np.ndarray) -> tuple[list[int], list[int], list[str]]:
+        """Nuisances, shared coordinates, and the names of the nuisances."""
+        own = [int(i) for i in which if self.coordinates[i].log_index >= 0]
         shared = [int(i) for i in which if self.coordinates[i].log_index < 0]
-        kinds = sorted({self.coordinates[i].name for i in own})
+        return own, shared, sorted({self.coordinates[i].name for i in own})
+
+    def _difference_rows(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        own, shared, kinds = self._kinds(which)
         rows = np.repeat(u[None], 1 + len(shared) + len(kinds), axis=0)
         steps = np.empty(len(shared))
         for k, i in enumerate(shared):
@@ -149,7 +211,10 @@ class DriveProblem(Problem):
         for k, kind in enumerate(kinds):
             same = [i for i in own if self.coordinates[i].name == kind]
             rows[1 + len(shared) + k, same] += STEP
-        values = self.predict(rows)
+        return rows, steps
+
+    def _quotients(self, values: np.ndarray, which: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        _, shared, kinds = self._kinds(which)
         difference = values[1:] - values[:1]
         out = np.zeros((len(self.observations), len(which)))
         for column, i in enumerate(which):
@@ -174,7 +239,7 @@ class DriveProblem(Problem):
 
     def certificate(self, u: np.ndarray, free: np.ndarray) -> Mapping[str, float]:
         del free
-        halved = self.bench.halved()
+        halved = self._bench_for(u[None]).halved()
         values = self._values(u[None])
         fine = np.empty(len(self.observations))
         for number, _, sampled in halved.run(
@@ -243,6 +308,23 @@ def default_splits(logs: Sequence[Log]) -> list[str]:
     return out
 
 
+def _defined(log: Log, run: LogRun, channel: str, time: np.ndarray) -> np.ndarray:
+    """Where a channel means something: a slip ratio needs a wheel that turns; at rest it is noise over zero."""
+    out = np.ones(len(time), bool)
+    if not channel.endswith("_slip_ratio"):
+        return out
+    for wheel in run.model.rover.wheels:
+        if channel != f"wheel_{wheel.corner}_slip_ratio":
+            continue
+        name = f"{wheel.corner}_drive"
+        speed = log.channel(f"joint_{name}_speed_rad_s")
+        if speed is None and run.model.modes["drive"] == "velocity":
+            speed = log.channel(f"command_{name}_speed_rad_s")
+        if speed is not None:
+            out &= np.abs(np.interp(time, *speed)) * wheel.radius > SLIP_SPEED
+    return out
+
+
 def _observations(
     bench: Bench, logs: Sequence[Log], splits: Mapping[str, str], channels: Sequence[str] | None
 ) -> Observations:
@@ -256,7 +338,7 @@ def _observations(
             if found is None:
                 continue
             time, measured = found
-            inside = (time >= run.begin - 1e-9) & (time <= run.end + 1e-9)
+            inside = (time >= run.begin - 1e-9) & (time <= run.end + 1e-9) & _defined(log, run, channel, time)
             time, measured = time[inside], measured[inside]
             if len(time) < 2:
                 continue

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
+import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -28,9 +31,8 @@ Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
 
 SETTLE = 1.0
 """Time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
-CHUNK = {"cpu": 64, "gpu": 1024}
-_FEW = 8
-"""Jobs that go into a small program of their own on a CPU; a GPU takes as long for eight rovers as for a thousand."""
+CHUNK = {"cpu": 16, "gpu": 1024}
+"""Rovers simulated at once."""
 _FINEST = 0.01
 """Shortest interval of telemetry, s."""
 
@@ -71,7 +73,7 @@ class Bench:
     def halved(self) -> Bench:
         """The same with half the time step."""
         other = Bench.__new__(Bench)
-        other.logs, other.engine, other.chunk = self.logs, self.engine, min(self.chunk, 8 * ((len(self.runs) + 7) // 8))
+        other.logs, other.engine, other.chunk = self.logs, self.engine, self.chunk
         other.model = self.model.replace(timestep=0.5 * self.model.timestep)
         other.runs = [
             dataclasses.replace(r, model=r.model.replace(timestep=0.5 * r.model.timestep), every=2 * r.every)
@@ -106,16 +108,14 @@ class Bench:
         groups: dict[Any, list[tuple[int, int]]] = {}
         for job in jobs:
             program = self._program(job[0])
-            length = _bucket(len(self.runs[job[0]].commands))
+            length = program.length(len(self.runs[job[0]].commands))
             groups.setdefault((id(program), length), []).append(job)
         done = 0
         for (_, length), mine in groups.items():
             program = self._program(mine[0][0])
-            size = self.chunk if len(mine) > _FEW or self.chunk > 128 else _FEW
-            for at in range(0, len(mine), size):
-                part = mine[at : at + size]
-                padded = part + [part[-1]] * (size - len(part))
-                signals = program(self, padded, values, length)
+            parts = [mine[at : at + self.chunk] for at in range(0, len(mine), self.chunk)]
+            padded = [part + [part[-1]] * (self.chunk - len(part)) for part in parts]
+            for part, signals in zip(parts, program.all(self, padded, values, length), strict=True):
                 for i, (number, row) in enumerate(part):
                     yield number, row, self._sample(number, {c: v[i] for c, v in signals.items()}, observations)
                 done += len(part)
@@ -148,14 +148,6 @@ def _nameless(params: Params) -> Params:
     return jax.tree.map(np.asarray, dataclasses.replace(params, terrain=dataclasses.replace(params.terrain, name="")))
 
 
-def _bucket(length: int) -> int:
-    """Lengths are rounded up to one of few, so that logs of about the same length share a program."""
-    size = 64
-    while size < length:
-        size = int(size * 1.25 / 16 + 1) * 16
-    return size
-
-
 class _Program:
     """One compiled simulation of a chunk of rovers, from rest to the measured channels."""
 
@@ -165,25 +157,46 @@ class _Program:
         self.model, self.every, self.channels, self.imu = model, every, channels, imu
         with jax.enable_x64(True):
             self.system: System = build(model, engine)
-        self._run = jax.jit(self._simulate, static_argnames=())
+        # Pieces of one length, the first of which settles the rover: one program serves logs of any length.
+        self.segment = math.ceil(SETTLE / (every * self.system.dt) - 1e-9)
+        self._compiled = False
+        self.reset, self.drive, self.measure = jax.jit(self._reset), jax.jit(self._drive), jax.jit(self._measure)
 
-    def _simulate(self, params: Params, start: Mapping[str, Any], commands: Any) -> dict[str, Any]:
+    def length(self, commands: int) -> int:
+        """Number of commands rounded up to whole pieces."""
+        return self.segment * math.ceil(commands / self.segment)
+
+    def _reset(self, params: Params, start: Mapping[str, Any]) -> Any:
         system = self.system
-        state = jax.vmap(lambda p, s: system.reset(p, s["x"], s["y"], s["yaw"], s["temperature"]))(params, start)
-        axes = jax.tree.map(lambda _: 0, params)
-        still = jnp.zeros((1, commands.shape[-1]), commands.dtype)
-        warm, _ = system.rollout_batch(
-            params, state, still, round(SETTLE / system.dt), axes, report=lambda t: t.time, chunk=len(commands)
-        )
-        # The clock and the heat begin with the log.
-        state = dataclasses.replace(warm, step=state.step, temperature=state.temperature)
-        _, seen = system.rollout_batch(params, state, commands, self.every, axes, chunk=len(commands))
+        return jax.vmap(lambda p, s: system.reset(p, s["x"], s["y"], s["yaw"], s["temperature"]))(params, start)
 
+    def _drive(self, params: Params, state: Any, commands: Any) -> tuple[Any, Any]:
+        axes = jax.tree.map(lambda _: 0, params)
+        return self.system.rollout_batch(
+            params, state, commands, self.every, axes, chunk=commands.shape[0], one_body=True
+        )
+
+    def _measure(self, params: Params, seen: Any) -> dict[str, Any]:
         def channels(params: Params, seen: Any) -> dict[str, Any]:
-            found = measure(system, seen, params, self.imu if any(self.imu) else None).channels
+            found = measure(self.system, seen, params, self.imu if any(self.imu) else None).channels
             return {c: found[c] for c in self.channels}
 
         return jax.vmap(channels)(params, seen)
+
+    def all(
+        self, bench: Bench, parts: Sequence[Sequence[tuple[int, int]]], values: Rows, length: int
+    ) -> Iterator[dict[str, np.ndarray]]:
+        """Channels of every part in turn; on a CPU one part per core at a time, as XLA runs a loop on one core."""
+        workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
+        if workers < 2 or len(parts) < 2 or not self._compiled:
+            self._compiled = True
+            for part in parts[:1]:
+                yield self(bench, part, values, length)
+            parts = parts[1:]
+        if not parts:
+            return
+        with concurrent.futures.ThreadPoolExecutor(max(workers, 1)) as pool:
+            yield from pool.map(lambda part: self(bench, part, values, length), parts)
 
     def __call__(
         self,
@@ -197,7 +210,17 @@ class _Program:
         start = {name: np.array([r[1][name] for r in rows]) for name in ("x", "y", "yaw", "temperature")}
         commands = np.stack([_padded(bench.runs[number].commands, length) for number, _ in jobs])
         with jax.enable_x64(True):
-            return {c: np.asarray(v) for c, v in self._run(stacked, start, commands).items()}
+            params = jax.device_put(stacked)
+            state = self.reset(params, start)
+            settled, _ = self.drive(params, state, np.zeros_like(commands[:, : self.segment]))
+            # The clock and the heat begin with the log.
+            state = dataclasses.replace(settled, step=state.step, temperature=state.temperature)
+            seen = []
+            for at in range(0, length, self.segment):
+                state, telemetry = self.drive(params, state, commands[:, at : at + self.segment])
+                seen.append(telemetry)
+            whole = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *seen)
+            return {c: np.asarray(v) for c, v in self.measure(params, whole).items()}
 
 
 def _padded(commands: np.ndarray, length: int) -> np.ndarray:
@@ -209,6 +232,8 @@ def _row(bench: Bench, number: int, k: int, values: Rows) -> tuple[Params, dict[
     base, start = bench._params[number], dict(bench.runs[number].start)
     effects = {e: {n: np.asarray(v, float) for n, v in p.items()} for e, p in base.effects.items()}
     for (effect, name, log, factor), column in values.items():
+        if effect not in effects and effect != "initial":
+            continue  # a candidate at its null, which this program does without
         value = float(column[k])
         if effect == "initial":
             if log == number:

@@ -7,6 +7,7 @@ said about physics without a certificate (small gradient, starts that agree, no 
 from __future__ import annotations
 
 import dataclasses
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -93,6 +94,7 @@ class Memory:
         self, entries: Mapping[str, Any] | None = None, save: Callable[[Mapping[str, Any]], None] | None = None
     ):
         self.entries = dict(entries or {})
+        self._lock = threading.Lock()
         self._save = save
 
     def recall(self, problem: Problem, effects: Sequence[str]) -> Fit | None:
@@ -116,13 +118,15 @@ class Memory:
 
     def keep(self, problem: Problem, effects: Sequence[str], found: Fit) -> None:
         """Remembers a fit."""
-        self.entries["+".join(effects)] = {
+        entry = {
             "u": {problem.coordinates[i].key: float(found.u[i]) for i in found.free}, "gradient": found.gradient,
             "starts": list(found.starts), "at_bound": list(found.at_bound), "extra": dict(found.extra),
             "problems": list(found.problems), "chi2": found.chi2,
         }  # fmt: skip
-        if self._save is not None:
-            self._save(self.entries)
+        with self._lock:
+            self.entries["+".join(effects)] = entry
+            if self._save is not None:
+                self._save(dict(self.entries))
 
 
 class _Objective:
@@ -135,14 +139,25 @@ class _Objective:
     def residuals(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whitened residuals (k, n), and chi-square (k,), infinite where a prediction is not finite."""
         r = whitened_residuals(self.problem, u)
+        return r, self._chi2(u, r)
+
+    def _chi2(self, u: np.ndarray, r: np.ndarray) -> np.ndarray:
         prior = np.array([np.sum(self.problem.prior_rows(row, self.free)[0] ** 2) for row in u])
         with np.errstate(over="ignore", invalid="ignore"):
             chi2 = np.sum(r[:, self.fitted] ** 2, axis=1) + prior
-        return r, np.where(np.isfinite(chi2), chi2, np.inf)
+        return np.where(np.isfinite(chi2), chi2, np.inf)
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         j = self.problem.observations.whiten(self.problem.jacobian(u, self.free))
         return np.where(np.isfinite(j), j, 0.0)
+
+    def linearise(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whitened residuals (k, n), chi-square (k,) and Jacobians (k, n, free) in one batch."""
+        observations = self.problem.observations
+        predicted, jacobian = self.problem.linearise(u, self.free)
+        r = observations.whiten((observations.value[None] - predicted).T).T
+        j = np.stack([observations.whiten(a) for a in jacobian])
+        return r, self._chi2(u, r), np.where(np.isfinite(j), j, 0.0)
 
     def quadratic(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half the downhill gradient and the Gauss-Newton Hessian."""
@@ -188,34 +203,65 @@ class _Descent:
 
 
 def _descend(goal: _Objective, start: np.ndarray, iterations: int = _ITERATIONS) -> _Descent:
-    """Levenberg-Marquardt from one start, all dampings of an iteration in one batch."""
+    """Levenberg-Marquardt from one start, all dampings of an iteration in one batch.
+
+    Where Jacobians are dear, Broyden's update stands in for them as long as steps keep their promise.
+    """
     u = start.copy()
     u[goal.free] = np.clip(u[goal.free], goal.low, goal.high)
-    r, chi2 = goal.residuals(u[None])
-    r, best, damping = r[0], float(chi2[0]), 1e-2
-    j = goal.jacobian(u) if np.isfinite(best) else np.zeros((len(r), len(goal.free)))
-    promise = np.inf
+    lazy = not goal.problem.cheap_jacobian and not goal.problem.eager
+    if goal.problem.eager:
+        residuals, chi2, jacobians = goal.linearise(u[None])
+        r, best, j = residuals[0], float(chi2[0]), jacobians[0]
+    else:
+        residuals, chi2 = goal.residuals(u[None])
+        r, best = residuals[0], float(chi2[0])
+        j = goal.jacobian(u) if np.isfinite(best) else np.zeros((len(r), len(goal.free)))
+    damping, promise, fresh = 1e-2, np.inf, True
     for _ in range(iterations):
         if not np.isfinite(best):
             break
         downhill, hessian = goal.quadratic(u, r, j)
         promise = goal.promise(u, downhill, hessian)
         if promise < 0.2 * SMALL_GRADIENT:
-            break
+            if fresh:
+                break
+            j, fresh = goal.jacobian(u), True
+            continue
         trials = goal.steps(u, downhill, hessian, damping * _DAMPINGS)
-        residuals, chi2 = goal.residuals(trials)
+        if goal.problem.eager:
+            residuals, chi2, jacobians = goal.linearise(trials)
+        else:
+            residuals, chi2 = goal.residuals(trials)
         k = int(np.argmin(chi2))
         if not chi2[k] < best:
+            if not fresh:
+                j, fresh = goal.jacobian(u), True
+                continue
             if damping > 1e8:
                 break
             damping *= 1e3
             continue
+        kept = best - float(chi2[k]) > 0.5 * promise
+        step, before = trials[k][goal.free] - u[goal.free], r
         u, r, best = trials[k], residuals[k], float(chi2[k])
         damping = float(np.clip(damping * _DAMPINGS[k], 1e-9, 1e6))
+        if goal.problem.eager:
+            j = jacobians[k]
+        elif lazy and kept and np.isfinite(r).all():
+            j, fresh = _broyden(j, step, before - r), False
+        else:
+            j, fresh = goal.jacobian(u), True
+    if not fresh:
         j = goal.jacobian(u)
     if np.isfinite(best):
         promise = goal.promise(u, *goal.quadratic(u, r, j))
     return _Descent(u, r, j, best, promise)
+
+
+def _broyden(jacobian: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """The Jacobian that predicts the last change and differs least from the one before (Broyden 1965)."""
+    return jacobian + np.outer(change - jacobian @ step, step) / max(float(step @ step), 1e-30)
 
 
 def _same(chi2: float) -> float:

@@ -171,9 +171,11 @@ def _drive_columns(problem: DriveProblem, fit: Fit, progress: Progress) -> dict[
     usable = {label: p for label, p in probes.items() if _present(problem, label)}
     other = problem.with_candidates({p.name: p for p in usable.values()}, fit, progress)
     observations = problem.observations
+    which = np.concatenate([other.candidates[p.name] for p in usable.values()])
+    jacobian = observations.whiten(other.jacobian(other.origin(), which))
     found = {}
     for label, probe in usable.items():
-        columns = observations.whiten(other.jacobian(other.origin(), other.candidates[probe.name]))
+        columns = jacobian[:, np.isin(which, other.candidates[probe.name])]
         found[label] = _walk(_by_log(problem, np.where(np.isfinite(columns), columns, 0.0)))
     found |= _sensor_columns(problem, span)
     return found

@@ -7,8 +7,9 @@ is then a row of coordinates, not another program: candidates, parameters, start
 from __future__ import annotations
 
 import abc
+import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -36,9 +37,12 @@ class Problem(abc.ABC):
       effects: the candidates themselves.
       not_tested: catalogue effects that cannot enter.
       cheap_jacobian: whether every start of a fit can afford Jacobians of its own.
+      eager: whether a hundred more rows cost no time, so that Jacobians are best taken before they are known to be
+        needed.
     """
 
     cheap_jacobian: bool = True
+    eager: bool = False
 
     observations: Observations
     coordinates: tuple[Coordinate, ...]
@@ -69,6 +73,22 @@ class Problem(abc.ABC):
         Returns:
           (n, m), in the channels' units per unit of the coordinate.
         """
+
+    def linearise(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predictions (k, n) and Jacobians (k, n, m) at (k, coordinates) at once."""
+        return self.predict(u), np.stack([self.jacobian(row, which) for row in u])
+
+    @contextlib.contextmanager
+    def focused(self, effects: Sequence[str]) -> Iterator[None]:
+        """Within it only these candidates leave their null, which a problem may use to simulate fewer effects."""
+        del effects
+        yield
+
+    @contextlib.contextmanager
+    def together(self, threads: int) -> Iterator[Callable[[], None]]:
+        """Within it calls of so many threads may be joined; each calls what it yields when it makes no more."""
+        del threads
+        yield lambda: None
 
     def origin(self) -> np.ndarray:
         """The model as given: every coordinate at zero."""

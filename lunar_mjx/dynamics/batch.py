@@ -48,6 +48,7 @@ def rollout_batch(
     params_axes: Axes = None,
     report: Callable[[Telemetry], Any] | None = None,
     chunk: int | None = None,
+    one_body: bool = False,
 ) -> tuple[State, Any]:
     """Drives many rovers through a sequence of controls; see `System.rollout_batch`."""
     keep = report or (lambda telemetry: telemetry)
@@ -61,7 +62,19 @@ def rollout_batch(
             qpos, qvel = batch_last(change, (-1, -1))(state.qpos, state.qvel)
             return dataclasses.replace(state, qpos=qpos, qvel=qvel)
 
+        def hold_one(now: State, control: Any) -> tuple[State, Any]:
+            def again(i: Any, carry: Any) -> Any:
+                new, telemetry = run(params, carry[0], control)
+                return new, jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), keep(telemetry), carry[1])
+
+            blank = jax.tree.map(
+                lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: run(params, now, control)[1])
+            )
+            return jax.lax.fori_loop(0, every, again, (now, keep(blank)))
+
         def hold(now: State, control: Any) -> tuple[State, Any]:
+            if one_body:
+                return hold_one(now, control)
             new, telemetry = run(params, now, control)
             if every > 1:
                 new = jax.lax.fori_loop(1, every, lambda _, s: run(params, s, control)[0], new)

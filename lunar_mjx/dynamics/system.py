@@ -184,6 +184,7 @@ class System:
         params_axes: batch.Axes = None,
         report: Callable[[Telemetry], Any] | None = None,
         chunk: int | None = None,
+        one_body: bool = False,
     ) -> tuple[State, Any]:
         """Drives many rovers through a sequence of controls.
 
@@ -193,11 +194,13 @@ class System:
           controls: (batch, time, joint), or (time, joint) for all rovers, each held for `every` steps.
           every: steps per control and per reported telemetry.
           report: what to keep of a step's telemetry, elementwise; all of it if None.
+          one_body: compile the step once, not once more for the steps without telemetry: half the compile time, for
+            somewhat slower steps.
 
         Returns:
           The final states, and what was kept, with leading axes (batch, time).
         """
-        return batch.rollout_batch(self, params, state, controls, every, params_axes, report, chunk)
+        return batch.rollout_batch(self, params, state, controls, every, params_axes, report, chunk, one_body)
 
     def _context(self, params: Params, state: State, k: Kinematics) -> Context:
         dtype = state.qpos.dtype

@@ -16,7 +16,7 @@ from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.envs import kalman, randomise, rewards
 from lunar_mjx.envs.actions import action_map
 from lunar_mjx.envs.config import TASKS, NavigationConfig
-from lunar_mjx.envs.core import State, where
+from lunar_mjx.envs.core import State
 from lunar_mjx.envs.observations import Scene, observe
 from lunar_mjx.envs.places import draw_places
 from lunar_mjx.envs.view import SCAN_SCALE, Reader, View, goal_in_body, read
@@ -27,6 +27,8 @@ from lunar_mjx.pytree import pytree
 
 ENDS = ("reached", "rolled_over", "stuck", "off_terrain", "diverged")
 """Ways in which an episode terminates; the first is success, the others bring the failure reward."""
+_SHARE = 64
+"""One in so many rovers begins anew at a time."""
 
 
 @pytree
@@ -189,18 +191,34 @@ class NavigationEnv:
             # the successor of a state that is gone carries no value, but must not poison a batch
             final_obs, final_privileged = (jnp.nan_to_num(a, posinf=0.0, neginf=0.0) for a in
                                            (final_obs, final_privileged))  # fmt: skip
-        return self._restart(params, inner, view, State(
+        return self._restart(params, inner, State(
             final_obs, final_privileged, reward, terminated, truncated, final_obs, final_privileged, metrics,
             self._info(view), inner,
         ))  # fmt: skip
 
-    def _restart(self, params: NavigationParams, inner: Inner, view: View, state: State) -> State:
-        """Begins anew where the episode ended, keeping the final observations."""
-        fresh = self._fresh(params, inner.key)
-        new = where(state.done, fresh, inner)
-        first = self._view(new)
-        obs, privileged = self._observe(params, new, first)
-        return dataclasses.replace(state, obs=obs, privileged=privileged, info=self._info(first), inner=new)
+    def _restart(self, params: NavigationParams, inner: Inner, state: State) -> State:
+        """Begins anew where the episode ended, keeping the final observations.
+
+        Few episodes end in a step, so that fresh ones are made for a small share of the rovers at a time, as often as
+        it takes; every rover gets the same numbers as if all were made.
+        """
+        count = state.done.shape[0]
+        share = max(1, -(-count // _SHARE))
+
+        def begin(carry: Any) -> Any:
+            waiting, current = carry
+            # rovers beyond the waiting ones get the index `count`, which reads the last and writes nothing
+            who = jnp.nonzero(waiting, size=share, fill_value=count)[0]
+            new = self._fresh(params, inner.key.at[who].get(mode="clip"))
+            first = self._view(new)
+            fresh = (*self._observe(params, new, first), self._info(first), new)
+            current = jax.tree.map(lambda old, part: old.at[who].set(part, mode="drop"), current, fresh)
+            return waiting.at[who].set(False, mode="drop"), current
+
+        here = (state.obs, state.privileged, state.info, inner)
+        _, here = jax.lax.while_loop(lambda carry: carry[0].any(), begin, (state.done, here))
+        obs, privileged, info, inner = here
+        return dataclasses.replace(state, obs=obs, privileged=privileged, info=info, inner=inner)
 
     def _advance(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Inner, View]:
         c = self.config

@@ -124,7 +124,8 @@ def by_channel(result: Result) -> list[Block]:
     return [Table(
         f"Worst channels and manoeuvres of {result.name}, root mean square residual in sigma",
         ["manoeuvre", "split", "channel", "samples", "as given", "refitted"],
-        [[str(r["manoeuvre"]), str(SPLIT_NAMES.get(r["split"], r["split"])), channel_label(r["channel"]), str(r["samples"]),
+        [[str(r["manoeuvre"]), str(SPLIT_NAMES.get(r["split"], r["split"])), channel_label(r["channel"]),
+          str(r["samples"]),
           shown(r["as_given"]), shown(r["refitted"])] for r in worst],
         f"The {len(worst)} worst of {len(rows)}." if len(rows) > len(worst) else "", texts=3,
     )]  # fmt: skip

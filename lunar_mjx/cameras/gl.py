@@ -1,0 +1,155 @@
+"""OpenGL without a window: EGL or OSMesa, whichever is there, and MuJoCo's renderer on it."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
+from __future__ import annotations
+
+import importlib
+import os
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lunar_mjx.cameras.pinhole import Pinhole, Pose
+from lunar_mjx.errors import UserError
+
+BACKENDS = ("egl", "osmesa")
+OFF = ("disable", "disabled", "off", "false", "0")
+
+_chosen: dict[tuple[str, ...], Any] = {}
+
+
+def wanted_backends() -> tuple[str, ...]:
+    """What the environment variable MUJOCO_GL asks for, else EGL before OSMesa.
+
+    Raises:
+      UserError: it turns OpenGL off.
+    """
+    said = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if said in OFF:
+        raise UserError(f"cameras: MUJOCO_GL={said} turns OpenGL off; unset it, or set it to egl or osmesa.")
+    return (said,) if said in BACKENDS else BACKENDS
+
+
+def context_class(backends: Sequence[str] | None = None) -> Any:
+    """The class of OpenGL contexts of the first backend that works here.
+
+    Args:
+      backends: some of `BACKENDS` in order of preference; `wanted_backends()` if None.
+
+    Raises:
+      UserError: none works.
+    """
+    names = tuple(backends) if backends is not None else wanted_backends()
+    if names not in _chosen:
+        _chosen[names] = _first(names)
+    return _chosen[names]
+
+
+def _first(names: tuple[str, ...]) -> Any:
+    kept = os.environ.get("PYOPENGL_PLATFORM")
+    for name in names:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of OpenGL libraries that find no device
+                found = importlib.import_module(f"mujoco.{name}").GLContext
+                context = found(64, 64)
+                context.make_current()
+                context.free()
+        except Exception:
+            # the module that failed has set this, and the next one would refuse to load
+            if kept is None:
+                os.environ.pop("PYOPENGL_PLATFORM", None)
+            continue
+        return found
+    raise UserError(
+        f"cameras: no OpenGL works here (tried {', '.join(names)}); install EGL (Debian and Ubuntu: apt install libegl1 "
+        "libgl1-mesa-dri) or OSMesa (apt install libosmesa6)."
+    )
+
+
+class Offscreen:
+    """MuJoCo's renderer in memory: colours, and in a second pass depth and what each pixel shows.
+
+    Args:
+      model: the scene. width, height: largest picture, pixels. backends: see `context_class`.
+
+    Raises:
+      UserError: no OpenGL works here.
+    """
+
+    def __init__(self, model: Any, width: int, height: int, backends: Sequence[str] | None = None) -> None:
+        made = context_class(backends)
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._model = model
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 1000)
+        self._option = mujoco.MjvOption()
+        self._context = made(width, height)
+        self._context.make_current()
+        self._mjr: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
+        self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+
+    def look(self, data: Any, pose: Pose, camera: Pinhole, sun: np.ndarray | None = None) -> None:
+        """Places the camera; `sun` is where the shadows' light stands, (3,) m."""
+        free = mujoco.MjvCamera()
+        mujoco.mjv_updateScene(self._model, data, self._option, None, free, mujoco.mjtCatBit.mjCAT_ALL.value,
+                               self._scene)  # fmt: skip
+        tall = camera.near * np.tan(0.5 * np.radians(camera.fovy_deg))
+        for eye in self._scene.camera:
+            eye.pos, eye.forward, eye.up = pose.position, -pose.rotation[:, 2], pose.rotation[:, 1]
+            eye.frustum_near, eye.frustum_far = camera.near, camera.far
+            eye.frustum_bottom, eye.frustum_top, eye.frustum_center = -tall, tall, 0.0
+            eye.frustum_width = tall * camera.width / camera.height
+        if sun is not None and self._scene.nlight:
+            for light in self._scene.lights[: self._scene.nlight]:
+                if not light.headlight:
+                    light.pos = sun
+        self._size = camera.width, camera.height
+        self._camera = camera
+
+    def colours(self) -> np.ndarray:
+        """The picture, (height, width, 3) uint8."""
+        out = np.empty((self._size[1], self._size[0], 3), np.uint8)
+        self._render(out, None)
+        return out[::-1].copy()
+
+    def depth_and_geoms(self) -> tuple[np.ndarray, np.ndarray]:
+        """Depth, m (infinite where nothing is), and the geom that each pixel shows (-1 for none), (height, width)."""
+        flags = self._scene.flags.copy()
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = True
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        shape = (self._size[1], self._size[0])
+        colour, buffer = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
+        self._render(colour, buffer)
+        np.copyto(self._scene.flags, flags)
+        number = colour[..., 0].astype(np.int64) + 256 * colour[..., 1] + 65536 * colour[..., 2]
+        geoms = np.full(self._scene.ngeom + 1, -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                geoms[geom.segid + 1] = geom.objid
+        near, far = self._camera.near, self._camera.far
+        with np.errstate(divide="ignore"):
+            # the buffer runs from 1 at the near plane to 0 at the far one, in inverse distance
+            depth = near * far / (near + buffer.astype(float) * (far - near))
+        depth[buffer <= 0.0] = np.inf
+        return depth[::-1].astype(np.float32), geoms[number[::-1]]
+
+    def _render(self, colour: np.ndarray, depth: np.ndarray | None) -> None:
+        if self._mjr is None:
+            raise UserError("cameras: the renderer was closed; make a new one.")
+        self._context.make_current()
+        rectangle = mujoco.MjrRect(0, 0, *self._size)
+        mujoco.mjr_render(rectangle, self._scene, self._mjr)
+        mujoco.mjr_readPixels(colour, depth, rectangle, self._mjr)
+
+    def close(self) -> None:
+        """Frees the context."""
+        if self._mjr is not None:
+            self._mjr.free()
+            self._context.free()
+        self._mjr = None
