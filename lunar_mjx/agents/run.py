@@ -42,6 +42,17 @@ def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
     return env.place(model, ranges, seed=env.config.place_seed + 7919)
 
 
+def learner_agent(learner: Learner) -> Any:
+    """The learner's policy as an agent of `Evaluator`, whose parameters are those of `Learner.policy`."""
+
+    def agent(params: Any, state: Any, key: Any) -> Any:
+        weights, statistics = params
+        obs = state.obs if statistics is None else normalised(state.obs, *statistics)
+        return learner.agent.act(weights, obs)
+
+    return agent
+
+
 class Scorer:
     """Scores a training's policy on unseen ground every so often; stops it at a wanted success rate.
 
@@ -56,9 +67,14 @@ class Scorer:
                  folder: Path | None, environment: dict[str, Any]):  # fmt: skip
         self.params = unseen_params(env, unseen)
         self.every, self.target, self.folder, self.environment = every, target, folder, environment
-        self.scores: list[dict[str, Any]] = []
-        self._next, self._best, self._evaluator = every, -1.0, None
+        self._best, self._evaluator = -1.0, None
         self._env, self._episodes = env, episodes
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets the scores, for another seed."""
+        self.scores: list[dict[str, Any]] = []
+        self._next = self.every
 
     def __call__(self, learner: Learner, state: TrainState, row: dict[str, Any]) -> dict[str, Any] | None:
         if row["elapsed_s"] < self._next:
@@ -76,14 +92,7 @@ class Scorer:
     def score(self, learner: Learner, state: TrainState, seed: int = 12345) -> Score:
         """Scores the policy of a state."""
         if self._evaluator is None:
-            actor = learner.agent
-
-            def agent(params: Any, state: Any, key: Any) -> Any:
-                weights, statistics = params
-                obs = state.obs if statistics is None else normalised(state.obs, *statistics)
-                return actor.act(weights, obs)
-
-            self._evaluator = Evaluator(self._env, agent, self._episodes)
+            self._evaluator = Evaluator(self._env, learner_agent(learner), self._episodes)
         params = jax.device_put(jax.device_get(learner.policy(state)))
         return self._evaluator(self.params, params, seed)
 

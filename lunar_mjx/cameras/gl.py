@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import os
 import warnings
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -92,6 +93,7 @@ class Offscreen:
         self._context.make_current()
         self._mjr: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
+        self._free = weakref.finalize(self, _free, self._mjr, self._context)
         self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
 
     def look(self, data: Any, pose: Pose, camera: Pinhole, sun: np.ndarray | None = None) -> None:
@@ -127,7 +129,7 @@ class Offscreen:
         colour, buffer = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
         self._render(colour, buffer)
         np.copyto(self._scene.flags, flags)
-        number = colour[..., 0].astype(np.int64) + 256 * colour[..., 1] + 65536 * colour[..., 2]
+        number = colour.astype(np.int64) @ np.array([1, 256, 65536])
         geoms = np.full(self._scene.ngeom + 1, -1, np.int32)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -149,7 +151,10 @@ class Offscreen:
 
     def close(self) -> None:
         """Frees the context."""
-        if self._mjr is not None:
-            self._mjr.free()
-            self._context.free()
+        self._free()
         self._mjr = None
+
+
+def _free(renderer: Any, context: Any) -> None:
+    renderer.free()
+    context.free()

@@ -40,7 +40,9 @@ class Pinhole:
         if not 1.0 <= self.fovy_deg <= 170.0:
             raise bad_input("camera", "fovy_deg", self.fovy_deg, "is outside [1, 170]", "give about 60")
         if not 0.0 < self.near < self.far:
-            raise bad_input("camera", "near", self.near, f"is not between 0 and far = {self.far:g} m", "give about 0.02")
+            raise bad_input(
+                "camera", "near", self.near, f"is not between 0 and far = {self.far:g} m", "give about 0.02"
+            )
 
     @property
     def focal(self) -> float:

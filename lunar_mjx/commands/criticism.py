@@ -97,14 +97,21 @@ def why(
     _finish(diagnosis, as_json)
 
 
-def next_(run: RunArgument, as_json: JsonOption = False) -> None:
+def next_(
+    run: RunArgument,
+    between: Annotated[
+        list[str] | None, typer.Option(help="Effects to tell apart; else those that the verdict leaves open.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Longest drive to plan, s.", min=1.0)] = 30.0,
+    as_json: JsonOption = False,
+) -> None:
     """Name the manoeuvre that best separates the effects that survive."""
     from lunar_mjx.criticism.next_experiment import next_experiment
     from lunar_mjx.report.progress import console_progress
 
     _cache()
     with console_progress() as progress:
-        found = next_experiment(run, progress=progress)
+        found = next_experiment(run, between or (), seconds, progress)
     print(json.dumps(found.to_dict(), indent=2) if as_json else found.sentence)
 
 

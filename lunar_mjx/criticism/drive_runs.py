@@ -91,8 +91,8 @@ class Bench:
         run = self.runs[number]
         wanted = tuple(sorted({c for n in range(len(self.runs)) for c in self.channels(n)}))
         shapes = tuple((a.shape, str(a.dtype)) for a in jax.tree.leaves(self._params[number].terrain))
-        key = (tuple(sorted(run.model.modes.items())), tuple(sorted(run.model.gains.items())), shapes, run.every,
-               run.imu_position)  # fmt: skip
+        modes, gains = (tuple(sorted(d.items())) for d in (run.model.modes, run.model.gains))
+        key = (run.model.effect_names, modes, gains, shapes, run.every, run.imu_position)
         if key not in self._programs:
             self._programs[key] = _Program(run.model, run.every, wanted, run.imu_position, self.engine)
         return self._programs[key]

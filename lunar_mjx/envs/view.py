@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from lunar_mjx.dynamics import State, System
 from lunar_mjx.envs.kalman import KalmanState
 from lunar_mjx.pytree import pytree
-from lunar_mjx.terrain import Terrain, nearest_rock, sample
+from lunar_mjx.terrain import Terrain, surface
 
 SCAN_AHEAD = (-0.8, -0.4, 0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.6, 3.2, 4.0)
 SCAN_ASIDE = (-1.6, -1.1, -0.7, -0.35, 0.0, 0.35, 0.7, 1.1, 1.6)
@@ -103,17 +103,6 @@ class Reader:
 def _turn(matrix: Any, vector: Any) -> Any:
     # elementwise: a batched dot of 3 x 3 would be a library call on a GPU
     return jnp.sum(matrix * vector[:, None, :], axis=-1)
-
-
-def surface(terrain: Terrain, x: Any, y: Any) -> Any:
-    """Height of the ground or of the rock upon it, m, at points of any shape."""
-    ground, _, _ = sample(terrain.field, x, y)
-    if terrain.rocks is None:
-        return ground
-    cx, cy, cz, radius = nearest_rock(terrain.rocks, x, y)
-    inside = radius * radius - (x - cx) ** 2 - (y - cy) ** 2
-    top = cz + jnp.sqrt(jnp.maximum(inside, 0.0))
-    return jnp.where(inside > 0.0, jnp.maximum(ground, top), ground)
 
 
 def height_scan(terrain: Terrain, view: View, scale: float, ride: float) -> Float[Array, "env point"]:

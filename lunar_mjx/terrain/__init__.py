@@ -23,6 +23,7 @@ from lunar_mjx.terrain.rocks import nearest_rock as nearest_rock
 from lunar_mjx.terrain.roughness import Roughness as Roughness
 from lunar_mjx.terrain.soil_map import SoilMap as SoilMap
 from lunar_mjx.terrain.soil_map import rock_fraction as rock_fraction
+from lunar_mjx.terrain.surface import surface as surface
 from lunar_mjx.terrain.terrain import Terrain as Terrain
 from lunar_mjx.terrain.terrain import flat as flat
 from lunar_mjx.terrain.terrain import inclined as inclined

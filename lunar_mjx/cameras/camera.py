@@ -1,0 +1,126 @@
+"""Pictures of a rover on its terrain: the front camera and any free camera, in colour, depth and segmentation."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lunar_mjx.cameras.gl import Offscreen
+from lunar_mjx.cameras.mount import carried, front_mount
+from lunar_mjx.cameras.pinhole import Pinhole, Pose
+from lunar_mjx.cameras.scene import FAR_GROUND, GROUND, ROCK, Sun, build_scene
+from lunar_mjx.cameras.texture import Track
+from lunar_mjx.errors import bad_input
+from lunar_mjx.rover import Rover
+from lunar_mjx.terrain import Terrain
+
+LABELS = ("sky", "terrain", "rock", "rover")
+"""What the numbers of a segmentation mean."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Images:
+    """One view, as the seed paper's III-E defines it, and the matrices that it was taken with.
+
+    Attributes:
+      rgba: (height, width, 4) uint8; alpha is 255 everywhere.
+      depth: (height, width) m along the optical axis, infinite in the sky.
+      segmentation: (height, width) index into `LABELS`.
+      view, projection: (4, 4), world to camera and camera to clip coordinates (OpenGL's conventions).
+    """
+
+    rgba: np.ndarray
+    depth: np.ndarray
+    segmentation: np.ndarray
+    view: np.ndarray
+    projection: np.ndarray
+
+
+class RoverCamera:
+    """Renders a rover on its terrain; the picture is made by OpenGL, on one rover at a time.
+
+    For depth and heights of thousands of rovers without OpenGL see `raymarch`.
+
+    Args:
+      rover: the rover. terrain: the ground.
+      places: (n, 2) m where the rover will be, so that the ground around is drawn finely; the origin if None.
+      camera: optics of the front camera. mount: its pose in the chassis frame; on the rover's highest part if None.
+      sun: where the Sun stands. tracks: of wheels, drawn into the ground.
+      margin: how far the finely drawn ground reaches beyond `places`, m.
+      largest: width and height of the largest picture to come, pixels.
+      backends: of OpenGL; EGL or else OSMesa if None.
+
+    Raises:
+      UserError: no OpenGL works here.
+    """
+
+    def __init__(
+        self, rover: Rover, terrain: Terrain, places: Any = None, camera: Pinhole | None = None,
+        mount: Pose | None = None, sun: Sun | None = None, tracks: Sequence[Track] = (), margin: float = 15.0,
+        largest: tuple[int, int] = (1280, 960), backends: Sequence[str] | None = None,
+    ) -> None:  # fmt: skip
+        self.camera, self.sun = camera or Pinhole(), sun or Sun()
+        self.mount = mount or front_mount(rover)
+        around = np.zeros((1, 2)) if places is None else np.asarray(places, float)
+        self.model = build_scene(rover, terrain, around, self.sun, tracks, margin, self.mount, self.camera.fovy_deg)
+        self.data = mujoco.MjData(self.model)
+        self._chassis = self.model.body(rover.chassis).id
+        self._labels = np.array([_label(self.model.geom(i).name) for i in range(self.model.ngeom)] + [0])
+        self._offscreen = Offscreen(self.model, max(largest[0], self.camera.width),
+                                    max(largest[1], self.camera.height), backends)  # fmt: skip
+
+    def place(self, qpos: Any) -> None:
+        """Puts the rover into the coordinates of its MJCF."""
+        wanted = np.asarray(qpos, float)
+        if wanted.shape != (self.model.nq,):
+            raise bad_input("camera", "qpos", wanted.shape, "has another shape", f"give ({self.model.nq},)")
+        self.data.qpos[:] = wanted
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    @property
+    def front_pose(self) -> Pose:
+        """Pose of the front camera in the world."""
+        return carried(self.mount, self.data.xpos[self._chassis].copy(),
+                       self.data.xmat[self._chassis].reshape(3, 3).copy())  # fmt: skip
+
+    def front(self) -> Images:
+        """What the front camera sees."""
+        return self.take(self.front_pose, self.camera)
+
+    def take(self, pose: Pose, camera: Pinhole | None = None) -> Images:
+        """What a camera sees from anywhere."""
+        optics = camera or self.camera
+        colours = self.picture(pose, optics)
+        depth, geoms = self._offscreen.depth_and_geoms()
+        rgba = np.concatenate([colours, np.full((*colours.shape[:2], 1), 255, np.uint8)], axis=-1)
+        return Images(rgba, depth, self._labels[geoms], pose.view_matrix(), optics.projection_matrix())
+
+    def picture(self, pose: Pose, camera: Pinhole | None = None) -> np.ndarray:
+        """The colours alone, (height, width, 3) uint8: half the work of `take`."""
+        at = self.data.xpos[self._chassis]
+        self._offscreen.look(self.data, pose, camera or self.camera, at + 10.0 * self.sun.direction)
+        return self._offscreen.colours()
+
+    def close(self) -> None:
+        """Frees the OpenGL context."""
+        self._offscreen.close()
+
+    def __enter__(self) -> RoverCamera:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _label(name: str) -> int:
+    if name in (GROUND, FAR_GROUND):
+        return 1
+    return 2 if name.startswith(f"{ROCK}_") else 3

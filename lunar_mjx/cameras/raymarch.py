@@ -1,0 +1,137 @@
+"""Depth and height images of many rovers in pure JAX: rays marched over the height field, without OpenGL.
+
+A ray advances by as much as ground of a slope of `STEEPEST` would let it, and by no less than a fixed share of its
+length, until it is below the surface; bisection then finds where it went in. What is thinner than such a step seen from
+its side, such as the very edge of a rock, can be missed. The rover itself is not in the picture.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lunar_mjx.cameras.pinhole import Pinhole, Pose
+from lunar_mjx.terrain import Terrain, inside, surface
+
+STEEPEST = 1.5
+"""Slope (rise over run) up to which no step passes through the ground."""
+
+STEPS, HALVINGS = 96, 12
+START = 0.2
+"""Depth at which marching begins, m."""
+
+
+def depth_image(
+    terrain: Terrain, position: Float[Array, "3"], rotation: Float[Array, "3 3"], camera: Pinhole, far: float = 60.0,
+    steps: int = STEPS,
+) -> Float[Array, "height width"]:  # fmt: skip
+    """Depth along the optical axis of what a camera sees of the terrain and its rocks, m; infinite beyond `far`.
+
+    Args:
+      terrain: one terrain.
+      position, rotation: of the camera, as in `Pose`; see `mounted`.
+      camera: optics.
+      far: largest depth that is looked for, m. steps: of the march; more find thinner things.
+
+    Returns:
+      Depth, m. Ground beyond the edge of the grid counts as sky.
+    """
+    dtype = position.dtype
+    direction = jnp.asarray(camera.rays(), dtype) @ rotation.T
+    dx, dy, dz = (direction[..., i] for i in range(3))
+    ox, oy, oz = position[0], position[1], position[2]
+    closing = STEEPEST * jnp.sqrt(dx * dx + dy * dy) - dz
+    grow = (far / START) ** (1.0 / steps) - 1.0
+
+    def gap(t: Any) -> Any:
+        return oz + t * dz - surface(terrain, ox + t * dx, oy + t * dy)
+
+    def march(_: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+        before, t = carry
+        above = gap(t)
+        step = jnp.maximum(above / jnp.maximum(closing, 1e-3), grow * t)
+        free = (above > 0.0) & (t < far)
+        return jnp.where(free, t, before), jnp.where(free, jnp.minimum(t + step, 1.01 * far), t)
+
+    def halve(_: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+        low, high = carry
+        middle = 0.5 * (low + high)
+        above = gap(middle) > 0.0
+        return jnp.where(above, middle, low), jnp.where(above, high, middle)
+
+    zero = jnp.zeros_like(dx)
+    low, high = jax.lax.fori_loop(0, steps, march, (zero, zero + START))
+    hit = gap(high) <= 0.0
+    low, high = jax.lax.fori_loop(0, HALVINGS, halve, (low, high))
+    there = inside(terrain.field, ox + high * dx, oy + high * dy)
+    return jnp.where(hit & there & (high <= far), high, jnp.inf)
+
+
+def depth_images(
+    terrain: Terrain, position: Float[Array, "rover 3"], rotation: Float[Array, "rover 3 3"], camera: Pinhole,
+    far: float = 60.0, steps: int = STEPS, at_once: int | None = None,
+) -> Float[Array, "rover height width"]:  # fmt: skip
+    """`depth_image` of many cameras on one terrain; `at_once` bounds how many are in memory (all if None)."""
+
+    def one(pose: tuple[Any, Any]) -> Any:
+        return depth_image(terrain, pose[0], pose[1], camera, far, steps)
+
+    if at_once is None:
+        return jax.vmap(lambda p, r: one((p, r)))(position, rotation)
+    return jax.lax.map(one, (position, rotation), batch_size=at_once)
+
+
+def mounted(
+    mount: Pose, qpos: Float[Array, "*rover nq"]
+) -> tuple[Float[Array, "*rover 3"], Float[Array, "*rover 3 3"]]:
+    """Position and rotation in the world of a camera that rovers carry.
+
+    Args:
+      mount: its pose in the chassis frame, such as `front_mount(rover)`.
+      qpos: the rovers' coordinates; place and orientation of the chassis come first.
+    """
+    body = _rotation(qpos[..., 3:7])
+    arm = jnp.asarray(mount.position, qpos.dtype)
+    return qpos[..., :3] + _turned(body, arm), body @ jnp.asarray(mount.rotation, qpos.dtype)
+
+
+def height_scan(
+    terrain: Terrain, position: Float[Array, "*rover 3"], yaw: Float[Array, "*rover"],
+    shape: tuple[int, int] = (32, 32), ahead: tuple[float, float] = (-1.0, 5.0), aside: float = 3.0,
+) -> Float[Array, "*rover rows cols"]:  # fmt: skip
+    """A picture of heights around rovers, seen from above: rows from far to near, columns from left to right.
+
+    Args:
+      terrain: one terrain.
+      position: of the chassis, m. yaw: its heading, rad.
+      shape: rows and columns.
+      ahead: from where to where along the heading, m. aside: how far to either side, m.
+
+    Returns:
+      Height of the ground or rock over the chassis' position, m.
+    """
+    dtype = position.dtype
+    forward = jnp.linspace(ahead[1], ahead[0], shape[0], dtype=dtype)[:, None]
+    left = jnp.linspace(aside, -aside, shape[1], dtype=dtype)[None, :]
+    cos, sin = jnp.cos(yaw)[..., None, None], jnp.sin(yaw)[..., None, None]
+    place = position[..., None, None, :]
+    x, y = place[..., 0] + cos * forward - sin * left, place[..., 1] + sin * forward + cos * left
+    return surface(terrain, x, y) - place[..., 2]
+
+
+def _rotation(q: Float[Array, "*rover 4"]) -> Float[Array, "*rover 3 3"]:
+    unit = q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
+    w, x, y, z = (unit[..., i] for i in range(4))
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _turned(rotation: Float[Array, "*rover 3 3"], vector: Float[Array, "3"]) -> Float[Array, "*rover 3"]:
+    return jnp.sum(rotation * vector, axis=-1)

@@ -1,0 +1,199 @@
+"""A rover on its terrain as MuJoCo draws it: height fields near and far, boulders, regolith, black sky, one hard Sun."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from PIL import Image
+
+from lunar_mjx.cameras.mount import front_mount
+from lunar_mjx.cameras.pinhole import Pose
+from lunar_mjx.cameras.texture import ALBEDO, Track, paint_tracks, regolith
+from lunar_mjx.errors import bad_input
+from lunar_mjx.rover import Rover
+from lunar_mjx.rover.mjcf import quaternion
+from lunar_mjx.terrain import Terrain
+
+GROUND, FAR_GROUND, ROCK, FRONT = "ground", "far_ground", "rock", "front"
+NODES, FAR_NODES, TEXELS = 420, 160, 2048
+"""Most nodes per side of the near and the far height field, and pixels of the ground's picture."""
+
+_DROP = 3.0
+"""How far the far ground is lowered under the near one, m."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sun:
+    """Where the Sun stands: azimuth clockwise from north (y), elevation above the horizon, deg."""
+
+    azimuth_deg: float = 135.0
+    elevation_deg: float = 15.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.elevation_deg <= 90.0:
+            raise bad_input("sun", "elevation_deg", self.elevation_deg, "is outside (0, 90]", "give about 15")
+        if not math.isfinite(self.azimuth_deg):
+            raise bad_input("sun", "azimuth_deg", self.azimuth_deg, "is not finite", "give a compass direction in deg")
+
+    @property
+    def direction(self) -> np.ndarray:
+        """Unit vector towards the Sun."""
+        a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
+        return np.array([math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), math.sin(e)])
+
+    @property
+    def exposure(self) -> float:
+        """Brightness of the light: level ground looks the same down to a Sun 10 deg high, as a camera would expose."""
+        return 0.65 / max(math.sin(math.radians(self.elevation_deg)), 0.17)
+
+
+@dataclasses.dataclass(frozen=True)
+class Patch:
+    """A part of a terrain's grid: heights (rows, cols) m, and the places of its first and last node, m."""
+
+    heights: np.ndarray
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+
+def cut(terrain: Terrain, low: np.ndarray, high: np.ndarray, most: int) -> Patch:
+    """The grid between two corners, thinned to at most `most` nodes per side."""
+    field = terrain.field
+    heights, cell = np.asarray(field.heights, float), float(field.cell)
+    at, last = [], []
+    for axis, origin in ((1, float(field.x0)), (0, float(field.y0))):
+        count = heights.shape[axis]
+        first = int(np.clip(math.floor((low[1 - axis] - origin) / cell), 0, count - 2))
+        end = int(np.clip(math.ceil((high[1 - axis] - origin) / cell), first + 1, count - 1))
+        step = max(1, math.ceil((end - first) / (most - 1)))
+        nodes = np.arange(first, end + 1, step)
+        at.append(nodes)
+        last.append((origin + nodes[0] * cell, origin + nodes[-1] * cell))
+    columns, rows = at
+    return Patch(heights[np.ix_(rows, columns)], (last[0][0], last[1][0]), (last[0][1], last[1][1]))
+
+
+def build_scene(
+    rover: Rover,
+    terrain: Terrain,
+    places: np.ndarray,
+    sun: Sun,
+    tracks: Sequence[Track] = (),
+    margin: float = 15.0,
+    mount: Pose | None = None,
+    fovy_deg: float = 60.0,
+) -> Any:
+    """Compiles the scene.
+
+    Args:
+      rover, terrain: what stands where.
+      places: (n, 2) m that the near ground covers with `margin` m around.
+      sun: the light. tracks: wheel tracks on the near ground.
+      mount: of the camera "front" in the chassis frame; `front_mount` if None. fovy_deg: its angle of view.
+
+    Returns:
+      The compiled `MjModel`.
+    """
+    terrain = jax.device_get(terrain)
+    spec = rover.spec()
+    spec.stat.extent = 1.0
+    spec.stat.center = [0.0, 0.0, 0.0]
+    visual = spec.visual
+    visual.map.znear, visual.map.zfar = 0.02, 400.0
+    visual.map.shadowclip, visual.map.shadowscale = 12.0, 0.9
+    visual.quality.shadowsize, visual.quality.offsamples = 4096, 4
+    visual.headlight.ambient, visual.headlight.diffuse = [0.03] * 3, [0.0] * 3
+    visual.headlight.specular = [0.0] * 3
+    spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+                     rgb1=[0, 0, 0], rgb2=[0, 0, 0], width=32, height=192)  # fmt: skip
+    spec.worldbody.add_light(name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 20],
+                             dir=(-sun.direction).tolist(), castshadow=True, diffuse=[sun.exposure] * 3, ambient=[0.0] * 3,
+                             specular=[0.15] * 3)  # fmt: skip
+    low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
+    near = cut(terrain, low, high, NODES)
+    _add_far(spec, terrain, near)
+    _add_ground(spec, GROUND, near, _painted(near, tracks))
+    _add_rocks(spec, terrain, near)
+    pose = mount or front_mount(rover)
+    spec.body(rover.chassis).add_camera(name=FRONT, pos=pose.position, quat=quaternion(pose.rotation), fovy=fovy_deg)
+    return spec.compile()
+
+
+def _painted(patch: Patch, tracks: Sequence[Track]) -> np.ndarray:
+    extent = np.subtract(patch.high, patch.low)
+    picture = regolith(TEXELS, float(extent.max()))
+    return paint_tracks(picture, patch.low, extent, tracks)
+
+
+def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray | None) -> None:
+    """The patch as a mesh: MuJoCo lights meshes smoothly, and height fields triangle by triangle."""
+    vertices, normals, faces, texture = _surface(patch)
+    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert, mesh.usernormal = vertices.ravel(), normals.ravel()
+    mesh.userface = mesh.userfacenormal = faces.ravel()
+    material = spec.add_material(name=name, rgba=[1, 1, 1, 1], specular=0.0, shininess=0.0)
+    if picture is None:
+        material.rgba = [*ALBEDO, 1]
+    else:
+        mesh.usertexcoord, mesh.userfacetexcoord = texture.ravel(), faces.ravel()
+        file = io.BytesIO()
+        Image.fromarray(picture).save(file, "PNG", compress_level=1)
+        spec.assets = {**spec.assets, f"{name}.png": file.getvalue()}
+        spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, mass=0.0,
+                            contype=0, conaffinity=0)  # fmt: skip
+
+
+def _surface(patch: Patch) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, normals, triangles and texture coordinates (0, 0 at the picture's top left) of a patch."""
+    z = patch.heights
+    rows, cols = z.shape
+    x, y = (np.linspace(a, b, n) for a, b, n in zip(patch.low, patch.high, (cols, rows), strict=True))
+    north, east = np.gradient(z, y, x)
+    normal = np.stack([-east, -north, np.ones_like(z)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    place = np.stack([*np.meshgrid(x, y), z], axis=-1)
+    u, v = np.meshgrid(np.linspace(0, 1, cols), np.linspace(1, 0, rows))
+    index = np.arange(rows * cols).reshape(rows, cols)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    faces = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2)
+    flat = (place.reshape(-1, 3), normal.reshape(-1, 3), faces.reshape(-1, 3), np.stack([u, v], -1).reshape(-1, 2))
+    return flat[0].astype(np.float32), flat[1].astype(np.float32), flat[2].astype(np.int32), flat[3].astype(np.float32)
+
+
+def _add_far(spec: Any, terrain: Terrain, near: Patch) -> None:
+    """The rest of the terrain, coarse, lowered where the near ground covers it."""
+    field = terrain.field
+    rows, cols = np.asarray(field.heights).shape
+    origin, cell = np.array([float(field.x0), float(field.y0)]), float(field.cell)
+    whole = cut(terrain, origin, origin + cell * np.array([cols - 1, rows - 1]), FAR_NODES)
+    x, y = (np.linspace(a, b, n) for a, b, n in zip(whole.low, whole.high, whole.heights.shape[::-1], strict=True))
+    step = max(x[1] - x[0], y[1] - y[0])
+    inside = [(v > a + step) & (v < b - step) for v, a, b in zip((x, y), near.low, near.high, strict=True)]
+    if all(i.all() for i in inside) or (near.low == whole.low and near.high == whole.high):
+        return
+    heights = np.where(inside[1][:, None] & inside[0][None, :], whole.heights - _DROP, whole.heights)
+    _add_ground(spec, FAR_GROUND, dataclasses.replace(whole, heights=heights), None)
+
+
+def _add_rocks(spec: Any, terrain: Terrain, patch: Patch) -> None:
+    if terrain.rocks is None:
+        return
+    centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
+    low, high = np.asarray(patch.low), np.asarray(patch.high)
+    spec.add_material(name=ROCK, rgba=[0.5, 0.48, 0.46, 1], specular=0.1, shininess=0.1)
+    for i, (center, radius) in enumerate(zip(centers, radii, strict=True)):
+        if radius > 0 and (center[:2] > low).all() and (center[:2] < high).all():
+            spec.worldbody.add_geom(name=f"{ROCK}_{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0],
+                                    pos=center, material=ROCK, contype=0, conaffinity=0)  # fmt: skip
