@@ -27,6 +27,7 @@ class Truth:
 
     Attributes:
       points, soil, law: of the bed. effects: parameters by hidden effect. sigma: datasheet noise by quantity.
+      channels: what the bed measures.
     """
 
     points: Points
@@ -34,6 +35,7 @@ class Truth:
     effects: dict[str, dict[str, float]]
     sigma: dict[str, float]
     law: str = "closed"
+    channels: tuple[str, ...] = QUANTITIES
 
     def clean(self) -> dict[str, np.ndarray]:
         """Noise-free measurements."""
@@ -68,12 +70,18 @@ def sigmas(points: Points) -> dict[str, float]:
     return dict(zip(QUANTITIES, (force, force, force * points.radius, 4e-4), strict=True))
 
 
-def draw(rng: np.random.Generator, names: Sequence[str], points: Points, law: str = "closed") -> Truth:
+def draw(
+    rng: np.random.Generator,
+    names: Sequence[str],
+    points: Points,
+    law: str = "closed",
+    channels: tuple[str, ...] = QUANTITIES,
+) -> Truth:
     """Soil and sizes of the hidden effects, drawn until no wheel digs itself in."""
     for _ in range(200):
         kinds = {**bed_effects.KNOWN, **bed_effects.OUTSIDE}
         effects = {n: kinds[n].draw(rng, points.radius) for n in names}
-        truth = Truth(points, draw_soil(rng), effects, sigmas(points), law)
+        truth = Truth(points, draw_soil(rng), effects, sigmas(points), law, channels)
         clean = truth.clean()
         if clean["carried"].all() and clean["sinkage_m"].max() < DEEPEST * points.radius:
             return truth
@@ -106,7 +114,8 @@ def record(truth: Truth, recipe: Recipe, rng: np.random.Generator, replicates: i
         lost = (rng.random(len(frame)) < 0.06) & (frame["trial"] > 1)
         frame = frame[~lost].reset_index(drop=True)
     # the plan is stated in full digits; what is measured in the digits of the instrument
-    return frame.round(dict.fromkeys(QUANTITIES, 7) | {"slip_ratio": 4, "slip_angle_deg": 3})
+    frame = frame.drop(columns=[q for q in QUANTITIES if q not in truth.channels])
+    return frame.round(dict.fromkeys(truth.channels, 7) | {"slip_ratio": 4, "slip_angle_deg": 3})
 
 
 def write(folder: Path, frame: pd.DataFrame, truth: Truth, recipe: Recipe, commitment: str) -> None:

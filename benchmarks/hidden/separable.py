@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from . import bed_effects
 from .bed import Soil, measure
-from .bed_logs import QUANTITIES, Truth
+from .bed_logs import Truth
 
 SEPARABLE = 10.0
 """Least length in sigma of what no refit of the soil explains, for an effect to count as separable by a table."""
@@ -29,7 +29,7 @@ def left_over(truth: Truth, names: Sequence[str], scale: float = 1.0, replicates
       replicates: runs behind each point.
     """
     clean = truth.clean()
-    sigma = {q: scale * truth.sigma[q] / np.sqrt(replicates) for q in QUANTITIES}
+    sigma = {q: scale * truth.sigma[q] / np.sqrt(replicates) for q in truth.channels}
     start = np.zeros(len(_SOIL))
     kinds = {**bed_effects.KNOWN, **bed_effects.OUTSIDE}
     rng = np.random.default_rng(1)
@@ -43,7 +43,7 @@ def left_over(truth: Truth, names: Sequence[str], scale: float = 1.0, replicates
         hidden = [bed_effects.make(n, p, truth.points.radius) for n, p in effects.items()]
         with np.errstate(all="ignore"):
             got = measure(truth.points, dataclasses.replace(Soil(truth.soil.k_c), **values), hidden, truth.law)
-        out = np.concatenate([(got[q] - clean[q]) / sigma[q] for q in QUANTITIES])
+        out = np.concatenate([(got[q] - clean[q]) / sigma[q] for q in truth.channels])
         return np.where(np.isfinite(out), out, 1e3)
 
     best = np.inf

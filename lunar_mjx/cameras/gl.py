@@ -68,8 +68,8 @@ def _first(names: tuple[str, ...]) -> Any:
             continue
         return found
     raise UserError(
-        f"cameras: no OpenGL works here (tried {', '.join(names)}); install EGL (Debian and Ubuntu: apt install libegl1 "
-        "libgl1-mesa-dri) or OSMesa (apt install libosmesa6)."
+        f"cameras: no OpenGL works here (tried {', '.join(names)}); install EGL (Debian and Ubuntu: apt install "
+        "libegl1 libgl1-mesa-dri) or OSMesa (apt install libosmesa6)."
     )
 
 

@@ -28,7 +28,7 @@ def front_mount(rover: Rover, pitch_deg: float = PITCH_DEG) -> Pose:
 
 
 def facing(pitch_deg: float, yaw_deg: float = 0.0) -> np.ndarray:
-    """Rotation (3, 3) of a camera that looks along the body's x axis, turned left by `yaw_deg` and down by `pitch_deg`."""
+    """Rotation (3, 3) of a camera that looks along the body's x axis, turned left by yaw and down by pitch."""
     p, y = math.radians(pitch_deg), math.radians(yaw_deg)
     ahead = np.array([math.cos(p) * math.cos(y), math.cos(p) * math.sin(y), -math.sin(p)])
     right = np.array([math.sin(y), -math.cos(y), 0.0])

@@ -1,4 +1,4 @@
-"""A rover on its terrain as MuJoCo draws it: height fields near and far, boulders, regolith, black sky, one hard Sun."""
+"""A rover on its terrain as MuJoCo draws it: ground near and far, boulders, regolith, black sky, one hard Sun."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo is a compiled module without type stubs)
@@ -117,8 +117,8 @@ def build_scene(
     spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
                      rgb1=[0, 0, 0], rgb2=[0, 0, 0], width=32, height=192)  # fmt: skip
     spec.worldbody.add_light(name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 20],
-                             dir=(-sun.direction).tolist(), castshadow=True, diffuse=[sun.exposure] * 3, ambient=[0.0] * 3,
-                             specular=[0.15] * 3)  # fmt: skip
+                             dir=(-sun.direction).tolist(), castshadow=True, diffuse=[sun.exposure] * 3,
+                             ambient=[0.0] * 3, specular=[0.15] * 3)  # fmt: skip
     low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
     near = cut(terrain, low, high, NODES)
     _add_far(spec, terrain, near)

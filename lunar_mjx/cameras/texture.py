@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -74,8 +75,7 @@ def paint_tracks(
 
 
 def _pieces(places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    kept = thinned(places, 0.02)
-    return list(zip(kept[:-1], kept[1:], strict=True))
+    return list(itertools.pairwise(thinned(places, 0.02)))
 
 
 def thinned(places: np.ndarray, step: float) -> np.ndarray:

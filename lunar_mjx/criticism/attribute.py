@@ -286,10 +286,7 @@ def diagnose(
     found = search(problem, settings, progress, memory)
     base, chosen = found.base, found.chosen
     details: dict[str, Any] = {
-        "certificate": {
-            "chi2": base.fit.chi2, "gradient": base.fit.gradient, "starts": list(base.fit.starts),
-            "at_bound": list(base.fit.at_bound), "problems": list(base.fit.problems), **base.fit.extra,
-        },
+        "certificate": _certificate(base.fit),
         "noise_test_before": dataclasses.asdict(base.noise),
         "noise_test_after": dataclasses.asdict(chosen.noise),
         "seed": settings.seed, "alpha": settings.alpha,
@@ -299,6 +296,16 @@ def diagnose(
         reason = "; ".join(base.fit.problems)
         sentence = f"The baseline fit has no certificate ({reason}), so nothing is said about physics."
         return Diagnosis(Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details), found
+    if chosen.effects:
+        progress("certifying", 0.0)
+        final = certify(problem, chosen, settings)
+        details["certificate_after"] = _certificate(final)
+        if final.problems:
+            reason = "; ".join(final.problems)
+            sentence = f"The fit with {', '.join(chosen.effects)} has no certificate ({reason}), so nothing is said."
+            return Diagnosis(
+                Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details
+            ), found
     evidence = _evidence(problem, found, settings)
     undecidable = tuple(e.effect for e in evidence if e.status == "not tested")
     explained = excess_explained(found, problem)
@@ -310,6 +317,19 @@ def diagnose(
         isolability=found.cosines, undecidable=undecidable, details=details,
     )  # fmt: skip
     return diagnosis, found
+
+
+def certify(problem: Problem, chosen: Candidate, settings: Settings) -> Fit:
+    """The chosen model fitted once more from several starts, with its own certificate."""
+    with problem.focused(chosen.effects):
+        return fit(problem, problem.free(chosen.effects), chosen.fit.u, settings.starts, settings.seed, spread=0.5)
+
+
+def _certificate(found: Fit) -> dict[str, Any]:
+    return {
+        "chi2": found.chi2, "gradient": found.gradient, "starts": list(found.starts),
+        "at_bound": list(found.at_bound), "problems": list(found.problems), **found.extra,
+    }  # fmt: skip
 
 
 def _verdict(found: Search, explained: float, settings: Settings) -> tuple[Verdict, tuple[str, ...], str]:

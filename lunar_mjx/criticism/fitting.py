@@ -25,6 +25,10 @@ SMALL_GRADIENT = 0.5
 HALF_STEP = 25.0
 """Largest change of chi-square by halving the time step: below what would name an effect."""
 
+MISFIT_SHARE = 0.005
+"""Where a model misfits, all three may be this share of chi-square beyond the noise: what a better fit could still gain
+is then nothing beside what it must explain."""
+
 _DAMPINGS = np.array([1e-4, 1e-2, 1.0, 1e2])
 _ITERATIONS = 40
 _EDGE = 1e-6
@@ -223,7 +227,7 @@ def _descend(goal: _Objective, start: np.ndarray, iterations: int = _ITERATIONS)
             break
         downhill, hessian = goal.quadratic(u, r, j)
         promise = goal.promise(u, downhill, hessian)
-        if promise < 0.2 * SMALL_GRADIENT:
+        if promise < 0.2 * max(SMALL_GRADIENT, _slack(best, int(goal.fitted.sum()))):
             if fresh:
                 break
             j, fresh = goal.jacobian(u), True
@@ -264,8 +268,13 @@ def _broyden(jacobian: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.n
     return jacobian + np.outer(change - jacobian @ step, step) / max(float(step @ step), 1e-30)
 
 
-def _same(chi2: float) -> float:
-    return max(SAME_CHI2, 1e-4 * chi2)
+def _slack(chi2: float, observations: int) -> float:
+    """Chi-square that does not matter in a fit that is beyond the noise; zero where it is not."""
+    return MISFIT_SHARE * max(0.0, chi2 - observations - 5.0 * np.sqrt(2.0 * observations))
+
+
+def _same(chi2: float, observations: int) -> float:
+    return max(SAME_CHI2, 1e-4 * chi2, _slack(chi2, observations))
 
 
 def _with_own_nuisances(goal: _Objective, best: _Descent) -> _Descent:
@@ -295,10 +304,11 @@ def _chase(goal: _Objective, best: _Descent, starts: np.ndarray, rounds: int = 8
     The fixed Jacobian (chord method) converges linearly to the same optimum where there is one.
     """
     u = starts.copy()
+    same = _same(best.chi2, int(goal.fitted.sum()))
     residual, chi2 = goal.residuals(u)
     share = np.ones(len(u))
     for _ in range(rounds):
-        if np.all(chi2 < best.chi2 + 0.5 * _same(best.chi2)):
+        if np.all(chi2 < best.chi2 + 0.5 * same):
             break
         trial = u.copy()
         for i in range(len(u)):
@@ -347,8 +357,7 @@ def fit(
     origin = problem.origin() if start is None else np.asarray(start, float)
     progress("fitting", 0.0)
     found = [_descend(goal, origin)]
-    others = _other_starts(problem, free, origin if not problem.cheap_jacobian else problem.origin(), starts - 1, seed,
-                           spread, goal)  # fmt: skip
+    others = _other_starts(problem, free, origin, starts - 1, seed, spread, goal)
     ends: list[float] = []
     if problem.cheap_jacobian:
         for i, other in enumerate(others):
@@ -363,8 +372,9 @@ def fit(
     chi2s = tuple(sorted([d.chi2 for d in found] + ends))
     edge = _at_bound(problem, goal, best)
     extra = dict(problem.certificate(best.u, free)) if certify and np.isfinite(best.chi2) else {}
-    agreeing = sum(c <= best.chi2 + _same(best.chi2) for c in chi2s)
-    problems = _faults(best, agreeing, starts, edge, extra)
+    count = int(fitted.sum())
+    agreeing = sum(c <= best.chi2 + _same(best.chi2, count) for c in chi2s)
+    problems = _faults(best, _slack(best.chi2, count), agreeing, starts, edge, extra)
     return Fit(
         u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual, jacobian=best.jacobian,
         fitted=fitted, gradient=best.promise, starts=chi2s, at_bound=edge, extra=extra, problems=problems,
@@ -372,18 +382,19 @@ def fit(
 
 
 def _faults(
-    best: _Descent, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float]
+    best: _Descent, slack: float, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float]
 ) -> tuple[str, ...]:
     problems = []
     if not np.isfinite(best.chi2):
         return ("every start diverged",)
-    if best.promise > SMALL_GRADIENT:
+    if best.promise > max(SMALL_GRADIENT, slack):
         problems.append(f"the gradient still promises a drop of chi-square of {best.promise:.2g}")
     if starts >= AGREEING and agreeing < AGREEING:
         problems.append(f"only {agreeing} of {starts} starts agree")
-    if edge:
+    # A model that misfits presses its parameters against bounds; they count once it is at the noise.
+    if edge and not slack:
         problems.append(f"{', '.join(edge)} ended at a bound")
-    if extra.get("half_step_chi2", 0.0) > HALF_STEP:
+    if extra.get("half_step_chi2", 0.0) > max(HALF_STEP, slack):
         problems.append(f"halving the time step changes chi-square by {extra['half_step_chi2']:.2g}")
     return tuple(problems)
 
