@@ -132,7 +132,7 @@ def build_scene(
 def _painted(patch: Patch, tracks: Sequence[Track]) -> np.ndarray:
     extent = np.subtract(patch.high, patch.low)
     picture = regolith(TEXELS, float(extent.max()))
-    return paint_tracks(picture, patch.low, extent, tracks)
+    return paint_tracks(picture, patch.low, extent.tolist(), tracks)
 
 
 def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray | None) -> None:
