@@ -94,7 +94,7 @@ def run_study(
     rover: str,
     preset: str,
     engines: Sequence[str] = DEFAULT_ENGINES,
-    duration: float = 10.0,
+    duration: float = 5.0,
     samples: int = 16,
     grounds: Collection[str] | None = None,
     report: Reporter = lambda what, done: None,

@@ -16,7 +16,7 @@ def parity(
         str, typer.Option(help="Comma-separated: structured, mjx, structured:float32, mjx:float32, pybullet, "
                                "pybullet:engine; default is all that are installed, but mjx:float32.")
     ] = "",
-    duration: Annotated[float, typer.Option(help="of the drives, s")] = 10.0,
+    duration: Annotated[float, typer.Option(help="of the drives, s")] = 5.0,
     samples: Annotated[int, typer.Option(help="states per ground for the comparison of single steps")] = 16,
 ) -> None:  # fmt: skip
     """Compare the engines with native MuJoCo: one state stage by stage, single steps, and drives; write a page."""

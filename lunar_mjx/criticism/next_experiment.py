@@ -25,6 +25,7 @@ from lunar_mjx.criticism.runs import FITS_FILE, VERDICT_FILE, Run, load_run
 from lunar_mjx.criticism.score import SEPARABLE
 from lunar_mjx.errors import UserError
 
+NEXT_FILE = "next.json"
 NOTHING = "no further effect"
 SECONDS = 30.0
 """Longest planned drive by default, s."""
@@ -70,7 +71,7 @@ def next_experiment(
     seconds: float = SECONDS,
     progress: Progress = silent,
 ) -> NextExperiment:
-    """The manoeuvre (or sweep of a test bed) that best separates what the logs so far leave open.
+    """The manoeuvre (or sweep of a test bed) that best separates what the logs leave open; writes `next.json`.
 
     Args:
       folder: of a run on which `why` has been called.
@@ -104,7 +105,9 @@ def next_experiment(
         plans = planned_drives(logs, run.model, seconds)  # type: ignore[arg-type]
         new = DriveProblem([p[2] for p in plans], run.model, problem.effects, progress=progress)  # type: ignore[arg-type]
     ranked = _rank(new, known, usable, [(name, text) for name, text, _ in plans])
-    return NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
+    found = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
+    run.save(NEXT_FILE, found.to_dict())
+    return found
 
 
 def _hypotheses(verdict: dict[str, Any], between: Sequence[str], candidates: set[str]) -> list[str]:

@@ -1,0 +1,1 @@
+"""Looking at drives: telemetry folders read back, plots, videos and a viewer."""

@@ -1,0 +1,60 @@
+"""Shaded relief of a terrain, as a grey picture with its extent, and its rocks."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from lunar_mjx.terrain import Terrain
+
+LIGHT = (315.0, 20.0)
+"""Compass azimuth and elevation of the light, deg: from the north-west, as maps are lit."""
+
+
+class Relief(NamedTuple):
+    """A piece of ground.
+
+    Attributes:
+      grey: (rows, cols) 0 to 1, south first. heights: m, alike.
+      west, east, south, north: edges, m.
+    """
+
+    grey: np.ndarray
+    heights: np.ndarray
+    west: float
+    east: float
+    south: float
+    north: float
+
+
+def relief(terrain: Terrain, low: np.ndarray, high: np.ndarray, most: int = 700, light: tuple = LIGHT) -> Relief:
+    """Shades the ground between two corners (2,) m, with at most about `most` cells per side."""
+    field = terrain.field
+    heights, cell = np.asarray(field.heights, float), float(field.cell)
+    rows, cols = heights.shape
+    origin = (float(field.x0), float(field.y0))
+    i0, i1 = (int(np.clip((v - origin[0]) / cell, 0, cols - 1)) for v in (low[0], high[0]))
+    j0, j1 = (int(np.clip((v - origin[1]) / cell, 0, rows - 1)) for v in (low[1], high[1]))
+    step = max(1, round(max(i1 - i0, j1 - j0) / most))
+    part = heights[j0 : j1 + 1 : step, i0 : i1 + 1 : step]
+    if min(part.shape) < 2:
+        part = np.tile(part[:1, :1], (2, 2))
+    north, east = np.gradient(part, cell * step)
+    azimuth, elevation = (math.radians(v) for v in light)
+    sun = np.array([math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation), math.sin(elevation)])
+    lit = (-east * sun[0] - north * sun[1] + sun[2]) / np.sqrt(1.0 + east**2 + north**2)
+    grey = np.clip(0.59 + 0.94 * (lit - sun[2]), 0.24, 0.92)
+    half = 0.5 * cell * step
+    west, south = origin[0] + i0 * cell - half, origin[1] + j0 * cell - half
+    return Relief(grey, part, west, west + part.shape[1] * cell * step, south, south + part.shape[0] * cell * step)
+
+
+def rocks_within(terrain: Terrain, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Centre x, y and radius of the rocks between two corners, (n, 3) m."""
+    if terrain.rocks is None:
+        return np.zeros((0, 3))
+    centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
+    near = (radii > 0) & (centers[:, :2] > low).all(axis=1) & (centers[:, :2] < high).all(axis=1)
+    return np.column_stack([centers[near, :2], radii[near]])
