@@ -33,18 +33,33 @@ def _columns(log: SteadyLog) -> dict[str, np.ndarray]:
 
 
 def _copies(log: SteadyLog) -> list[Finding]:
-    """Rows whose measured values all occur again: no bed measures the same to the last digit twice."""
+    """Rows whose measured values all occur again, more often than the digits of the instruments explain."""
     measured = np.column_stack(list(log.table.measured.values()))
     if measured.shape[1] < 2:  # one quantity with few digits repeats by chance
         measured = np.column_stack([measured, *log.table.test.values()])
     _, first, count = np.unique(measured, axis=0, return_index=True, return_counts=True)
     trivial = np.all(measured[first] == 0.0, axis=1)
-    if not ((count > 1) & ~trivial).any():
+    copies = int((count - 1)[~trivial].sum())
+    if not copies or stats.poisson.sf(copies - 1, _coincidences(log)) >= CHANCE:
         return []
     original = int(first[np.argmax((count > 1) & ~trivial)])
     copy = int(np.flatnonzero((measured == measured[original]).all(axis=1))[1])
     line = int(log.rows[original]) + 2 if len(log.rows) else original + 2
     return [_finding(log, copy, "", "copy", f"holds the same measurements as line {line}; remove the copy")]
+
+
+def _coincidences(log: SteadyLog) -> float:
+    """Replicates that agree in everything measured by chance alone: instruments of few digits repeat themselves."""
+    group = replicate_groups(log.table)
+
+    def pairs(keys: list[np.ndarray]) -> float:
+        count = np.unique(np.column_stack(keys), axis=0, return_counts=True)[1]
+        return float((count * (count - 1) // 2).sum())
+
+    number, whole = pairs([group]), pairs([group, *log.table.measured.values()])
+    # a copied row must not count as proof that instruments repeat themselves
+    shares = [(pairs([group, values]) - whole) / max(number, 1.0) for values in log.table.measured.values()]
+    return number * float(np.prod(shares))
 
 
 def _ranges(log: SteadyLog) -> list[Finding]:
