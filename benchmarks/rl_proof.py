@@ -23,9 +23,10 @@ from typing import Any
 
 from rl_paper import paper_child, paper_merge, paper_start
 
-SIZES = (65536, 4096, 16384, 1024)
 PERIOD = {"all": 535.0, "large": 300.0, "rates": 200.0, "paper": 400.0, "scaling": 150.0}
 """s that each part may take."""
+FINAL = 54321
+"""Seed of the episodes that final scores are taken from; scores during training have others."""
 
 
 class Clock:
@@ -79,13 +80,39 @@ def training_of(args: argparse.Namespace) -> Any:
     return dataclasses.replace(training, options={**options, **env_options(args.env)}, unseen=unseen)
 
 
+class Judge:
+    """Scores the learner's policy and the agents that learn nothing on unseen ground, compiled once for all of them."""
+
+    def __init__(self, learner: Any, unseen: dict[str, Any], episodes: int):
+        import jax.numpy as jnp
+
+        from lunar_mjx.agents.evaluate import Evaluator
+        from lunar_mjx.agents.run import learner_agent, unseen_params
+        from lunar_mjx.envs.scripted import AGENTS, make_agent
+
+        env, self.learner, self.names = learner.env, learner, AGENTS
+        self.params = unseen_params(env, unseen)
+        agents = [learner_agent(learner), *(lambda _, state, key, a=make_agent(n, env): a(state, key) for n in AGENTS)]
+
+        def act(params: Any, state: Any, key: Any) -> Any:
+            which, policy = params
+            return jnp.stack([agent(policy, state, key) for agent in agents])[which]
+
+        self._evaluator = Evaluator(env, act, episodes)
+
+    def score(self, state: Any, seed: int, agent: str | None = None) -> Any:
+        """Score of the policy of a training's state, or of an agent."""
+        import jax.numpy as jnp
+
+        which = 0 if agent is None else 1 + self.names.index(agent)
+        return self._evaluator(self.params, (jnp.asarray(which), self.learner.policy(state)), seed)
+
+
 def large(args: argparse.Namespace, clock: Clock, name: str = "large") -> None:
     """Trains seed after seed; the JSON file is written anew after every one."""
     import jax
 
-    from lunar_mjx.agents.evaluate import Evaluator
     from lunar_mjx.agents.learner import Learner
-    from lunar_mjx.agents.run import Scorer, learner_agent
     from lunar_mjx.agents.train import plain
     from lunar_mjx.envs import make
 
@@ -93,65 +120,63 @@ def large(args: argparse.Namespace, clock: Clock, name: str = "large") -> None:
     env = make(training.environment, **training.options)
     environment = {"name": training.environment, "options": plain(dict(training.options)), "unseen": training.unseen}
     learner = Learner(env, training.train)
-    few, many = (16, 32) if args.tiny else (512, 1024)
-    scorer = Scorer(env, training.unseen, few, args.eval_every, args.target, None, environment)
-    judge = Evaluator(env, learner_agent(learner), many)
+    judge = Judge(learner, dict(training.unseen), 32 if args.tiny else 1024)
     record: dict[str, Any] = {
         "rover": args.rover, "environment": environment, "train": dataclasses.asdict(training.train),
-        "target": args.target, "setup_s": clock.spent, "seeds": [], "agents": {},
+        "target": args.target, "setup_s": clock.spent, "seeds": [],
     }  # fmt: skip
     say(f"{name}: made in {clock.spent:.0f} s, observation {env.observation_size} + {env.privileged_size} numbers")
     begin = time.monotonic()
-    state, _ = learner.epoch(env.params, learner.init(10_000))
-    jax.block_until_ready(state)
+    state, _ = jax.block_until_ready(learner.epoch(env.params, learner.init(10_000)))
     record["compile_epoch_s"] = time.monotonic() - begin
     begin = time.monotonic()
-    untrained = scorer.score(learner, state)
+    record["agents"] = {"untrained": judge.score(state, FINAL).record()}
     record["compile_score_s"] = time.monotonic() - begin
-    record["untrained"] = untrained.record()
-    say(f"{name}: compiled in {record['compile_epoch_s']:.0f} + {record['compile_score_s']:.0f} s, "
-        f"untrained {100 * untrained.success:.1f} %")  # fmt: skip
+    for agent in judge.names:
+        record["agents"][agent] = judge.score(state, FINAL, agent).record()
+    for agent, score in record["agents"].items():
+        say(f"{name}: {agent} agent {100 * score['success']:.1f} % on unseen ground, ends {short(score['ends'])}")
+    say(f"{name}: compiled in {record['compile_epoch_s']:.0f} + {record['compile_score_s']:.0f} s")
     save(args.out, name, record)
-    record |= update_rate(learner, state)
-    del state
     best = -1.0
     for seed in range(args.first_seed, args.first_seed + args.seeds):
-        spare = 0.0 if args.tiny else 12.0
-        last = record["seeds"][-1]["process_s"] if record["seeds"] else 0.0
-        if clock.left < max(spare, min(last, 90.0)) + (0.0 if record["agents"] else args.agents_s):
+        if seed > args.first_seed and clock.left < 0.8 * record["seeds"][-1]["process_s"]:
             say(f"{name}: no time for seed {seed}")
             break
-        best = one_seed(args, clock, name, record, learner, scorer, judge, seed, best)
-        if not record["agents"]:
-            record["agents"] = agents_scores(env, scorer.params, many)
+        best = one_seed(args, clock, name, record, judge, seed, best)
+        if "updates_per_s" not in record and clock.left > 30.0:
+            record |= update_rate(learner, state)
             save(args.out, name, record)
+            state = None
 
 
-def one_seed(args: Any, clock: Clock, name: str, record: dict[str, Any], learner: Any, scorer: Any,
-             judge: Any, seed: int, best: float) -> float:  # fmt: skip
+def one_seed(args: Any, clock: Clock, name: str, record: dict[str, Any], judge: Judge, seed: int, best: float
+             ) -> float:  # fmt: skip
     """Trains one seed, keeps its policy if it is the best; returns the best score."""
     from lunar_mjx.agents.policy import save_policy
     from lunar_mjx.agents.train import RunConfig, train
 
-    begin = time.monotonic()
-    reserve = 0.0 if args.tiny else 12.0 + (0.0 if record["agents"] else args.agents_s)
-    limit = min(args.seed_seconds, clock.left - reserve)
-    scorer.restart()
-    run = RunConfig(args.steps, seed, max(limit, 1.0), float("inf"), quiet=args.tiny)
+    begin, scores, due = time.monotonic(), [], args.eval_every
+    limit = max(1.0, min(args.seed_seconds, clock.left - (0.0 if args.tiny else 8.0)))
 
     def check(learner: Any, state: Any, row: dict[str, Any]) -> dict[str, Any] | None:
-        extra = scorer(learner, state, row)
-        if extra:
-            say(f"{name}: seed {seed}: {row['elapsed_s']:.1f} s of training, {row['steps']:,} steps, "
-                f"{row['steps_per_s']:,.0f} steps/s, {100 * extra['unseen_success']:.1f} % on unseen ground, "
-                f"ends {json.dumps({k: round(v, 3) for k, v in scorer.scores[-1]['ends'].items()})}")  # fmt: skip
-        return extra
+        nonlocal due
+        if row["elapsed_s"] < due:
+            return None
+        due = row["elapsed_s"] + args.eval_every
+        score = judge.score(state, 12345)
+        scores.append({"steps": row["steps"], "elapsed_s": row["elapsed_s"], **score.record()})
+        say(f"{name}: seed {seed}: {row['elapsed_s']:.1f} s of training, {row['steps']:,} steps, "
+            f"{row['steps_per_s']:,.0f} steps/s, {100 * score.success:.1f} % on unseen ground, "
+            f"ends {short(score.ends)}")  # fmt: skip
+        return {"unseen_success": score.success, "stop": score.success >= args.target}
 
-    result = train(learner, run, None, scorer.environment, check)
-    final = judge(scorer.params, learner.policy(result.state), 54321)
-    reached = next((s for s in scorer.scores if s["success"] >= args.target), None)
+    run = RunConfig(args.steps, seed, limit, float("inf"), quiet=True)
+    result = train(judge.learner, run, None, record["environment"], check)
+    final = judge.score(result.state, FINAL)
+    reached = next((s for s in scores if s["success"] >= args.target), None)
     record["seeds"].append({
-        "seed": seed, "rows": result.rows, "unseen": list(scorer.scores), "final": final.record(),
+        "seed": seed, "rows": result.rows, "unseen": scores, "final": final.record(),
         "train_s": result.rows[-1]["elapsed_s"], "steps": result.rows[-1]["steps"],
         "seconds_to_target": reached and reached["elapsed_s"], "steps_to_target": reached and reached["steps"],
         "process_s": time.monotonic() - begin,
@@ -161,30 +186,13 @@ def one_seed(args: Any, clock: Clock, name: str, record: dict[str, Any], learner
     if final.success > best:
         best = final.success
         notes = {**result.policy.notes, "score": final.record(), "seed": seed}
-        policy = dataclasses.replace(result.policy, notes=notes)
-        save_policy(policy, args.out / f"policy_{args.rover}.npz")
+        save_policy(dataclasses.replace(result.policy, notes=notes), args.out / f"policy_{args.rover}.npz")
     save(args.out, name, record)
     return best
 
 
-def agents_scores(env: Any, params: Any, episodes: int) -> dict[str, Any]:
-    """Zero, random and straight-line agents on the final evaluation's episodes; compiled once for the three."""
-    import jax.numpy as jnp
-
-    from lunar_mjx.agents.evaluate import Evaluator
-    from lunar_mjx.envs.scripted import AGENTS, make_agent
-
-    agents = [make_agent(name, env) for name in AGENTS]
-
-    def act(which: Any, state: Any, key: Any) -> Any:
-        return jnp.stack([agent(state, key) for agent in agents])[which]
-
-    evaluator = Evaluator(env, act, episodes)
-    scores = {name: evaluator(params, jnp.asarray(i), 54321).record() for i, name in enumerate(AGENTS)}
-    for name, score in scores.items():
-        ends = {k: round(v, 3) for k, v in score["ends"].items()}
-        say(f"large: {name} agent {100 * score['success']:.1f} % on unseen ground, ends {json.dumps(ends)}")
-    return scores
+def short(ends: dict[str, float]) -> str:
+    return json.dumps({k: round(v, 3) for k, v in ends.items() if v > 0.0})
 
 
 def update_rate(learner: Any, state: Any, count: int = 50) -> dict[str, Any]:
@@ -229,25 +237,28 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
     from lunar_mjx.envs.observations import PAPER_OBSERVATION
 
     ground = {"terrain": "flat", "goal_distance": (2.0, 4.0), "places": 256} if args.tiny else {}
-    cases = [
-        ("17 numbers", {"decimation": 5, "observations": PAPER_OBSERVATION, "privileged": ()}, SIZES),
-        ("all observations", {"decimation": 50}, SIZES[:2]),
-        ("all observations", {"decimation": 5}, SIZES[:1]),
-    ]
+    few = {"observations": PAPER_OBSERVATION, "privileged": ()}
+    plan = [("17 numbers", 5, 65536), ("all observations", 50, 65536), ("17 numbers", 5, 4096),
+            ("17 numbers", 5, 16384), ("17 numbers", 5, 1024), ("all observations", 50, 4096),
+            ("all observations", 5, 65536), ("17 numbers", 50, 65536)]  # fmt: skip
+    made: dict[tuple[str, int], Any] = {}
     rows: list[dict[str, Any]] = []
-    for label, options, sizes in cases[:1] if args.tiny else cases:
-        env = make_navigation("large", args.rover, **{**ground, **options})
-        steps = 4 if args.tiny else max(20, 1000 // env.config.decimation)
-        for size in (8,) if args.tiny else sizes:
-            if clock.left < 35.0 and rows and not args.tiny:
-                say("rates: no time for more")
-                return
-            row = rate_of(env, size, steps, args.tiny)
-            rows.append({"observation": label, "decimation": env.config.decimation, "rovers": size, **row})
-            say(f"rates: {label}, decimation {env.config.decimation}, {size:,} rovers: "
-                f"{row['env_steps_per_s']:,.0f} environment steps/s, bare physics {row['bare_steps_per_s']:,.0f}, "
-                f"ratio {row['ratio']:.3f}")  # fmt: skip
-            save(args.out, "rates", {"rover": args.rover, "rows": rows})
+    for label, decimation, size in [("17 numbers", 5, 8)] if args.tiny else plan:
+        if rows and clock.left < 1.3 * rows[-1]["process_s"]:
+            say("rates: no time for more")
+            return
+        begin = time.monotonic()
+        if (label, decimation) not in made:
+            options = {"decimation": decimation, "places": 2048, **(few if label == "17 numbers" else {}), **ground}
+            made[label, decimation] = make_navigation("large", args.rover, **options)
+        steps = 4 if args.tiny else max(20, 1000 // decimation)
+        row = rate_of(made[label, decimation], size, steps, args.tiny)
+        rows.append({"observation": label, "decimation": decimation, "rovers": size, **row,
+                     "process_s": time.monotonic() - begin})  # fmt: skip
+        say(f"rates: {label}, decimation {decimation}, {size:,} rovers: "
+            f"{row['env_steps_per_s']:,.0f} environment steps/s, bare physics {row['bare_steps_per_s']:,.0f}, "
+            f"ratio {row['ratio']:.3f}")  # fmt: skip
+        save(args.out, "rates", {"rover": args.rover, "rows": rows})
 
 
 def rate_of(env: Any, size: int, steps: int, tiny: bool) -> dict[str, Any]:
@@ -336,7 +347,6 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=2_000_000_000, help="most environment steps of a seed")
     parser.add_argument("--seed-seconds", type=float, default=150.0, help="most s of one seed of part large")
-    parser.add_argument("--agents-s", type=float, default=35.0, help="s kept back for the agents that learn nothing")
     parser.add_argument("--eval-every", type=float, default=8.0, help="s of training")
     parser.add_argument("--target", type=float, default=0.95)
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
@@ -356,7 +366,7 @@ def main() -> None:
         children = paper_start(args, clock.left - 25.0)
     try:
         if args.part in ("all", "large"):
-            large(args, Clock(0.62 * clock.left if args.part == "all" else clock.left))
+            large(args, Clock(0.7 * clock.left if args.part == "all" else clock.left))
         if args.part in ("all", "rates"):
             rates(args, Clock(clock.left - 15.0))
         if args.part == "scaling":

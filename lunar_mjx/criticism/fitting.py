@@ -32,6 +32,7 @@ is then nothing beside what it must explain."""
 _DAMPINGS = np.array([1e-4, 1e-2, 1.0, 1e2])
 _ITERATIONS = 40
 _EDGE = 1e-6
+_PROBE = 0.1
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share that is done, 0 to 1."""
@@ -188,6 +189,26 @@ class _Objective:
             out[i, self.free] = np.clip(new, self.low, self.high)
         return out
 
+    def bent(
+        self, u: np.ndarray, r: np.ndarray, j: np.ndarray, hessian: np.ndarray, trials: np.ndarray, dampings: np.ndarray
+    ) -> np.ndarray:
+        """Steps bent along a curved valley by the second derivative in their direction (Transtrum and Sethna 2012)."""
+        steps = (trials - u)[:, self.free]
+        probes = np.repeat(u[None], len(steps), axis=0)
+        probes[:, self.free] += _PROBE * steps
+        ahead, _ = self.residuals(probes)
+        out = trials.copy()
+        for i, (step, damping) in enumerate(zip(steps, dampings, strict=True)):
+            if not np.isfinite(ahead[i]).all() or not np.any(step):
+                continue
+            second = -2.0 / _PROBE * ((ahead[i] - r) / _PROBE + j @ step)
+            inner = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
+            bend = -0.5 * np.linalg.lstsq(inner, j[self.fitted].T @ second[self.fitted], rcond=None)[0]
+            # beyond this the quadratic path is not to be trusted either
+            bend *= min(1.0, 0.75 * np.linalg.norm(step) / max(2.0 * float(np.linalg.norm(bend)), 1e-30))
+            out[i, self.free] = np.clip(u[self.free] + step + bend, self.low, self.high)
+        return out
+
     def promise(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> float:
         """Drop of chi-square that a full Gauss-Newton step over the unheld coordinates promises."""
         move = ~self.held(u[self.free], downhill)
@@ -221,7 +242,7 @@ def _descend(goal: _Objective, start: np.ndarray, iterations: int = _ITERATIONS)
         residuals, chi2 = goal.residuals(u[None])
         r, best = residuals[0], float(chi2[0])
         j = goal.jacobian(u) if np.isfinite(best) else np.zeros((len(r), len(goal.free)))
-    damping, promise, fresh = 1e-2, np.inf, True
+    damping, promise, fresh, curved = 1e-2, np.inf, True, False
     for _ in range(iterations):
         if not np.isfinite(best):
             break
@@ -232,7 +253,10 @@ def _descend(goal: _Objective, start: np.ndarray, iterations: int = _ITERATIONS)
                 break
             j, fresh = goal.jacobian(u), True
             continue
-        trials = goal.steps(u, downhill, hessian, damping * _DAMPINGS)
+        dampings = damping * _DAMPINGS
+        trials = goal.steps(u, downhill, hessian, dampings)
+        if curved:
+            trials = np.concatenate([trials, goal.bent(u, r, j, hessian, trials, dampings)])
         if goal.problem.eager:
             residuals, chi2, jacobians = goal.linearise(trials)
         else:
@@ -244,12 +268,13 @@ def _descend(goal: _Objective, start: np.ndarray, iterations: int = _ITERATIONS)
                 continue
             if damping > 1e8:
                 break
-            damping *= 1e3
+            damping, curved = damping * 1e2, True
             continue
         kept = best - float(chi2[k]) > 0.5 * promise
+        curved = not kept
         step, before = trials[k][goal.free] - u[goal.free], r
         u, r, best = trials[k], residuals[k], float(chi2[k])
-        damping = float(np.clip(damping * _DAMPINGS[k], 1e-9, 1e6))
+        damping = float(np.clip(dampings[k % len(dampings)], 1e-9, 1e6))
         if goal.problem.eager:
             j = jacobians[k]
         elif lazy and kept and np.isfinite(r).all():
@@ -415,5 +440,7 @@ def _other_starts(
 def _at_bound(problem: Problem, goal: _Objective, best: _Descent) -> tuple[str, ...]:
     at = best.u[goal.free]
     edge = (at <= goal.low + _EDGE) | (at >= goal.high - _EDGE)
+    # The bounds of a candidate are where its physics ends: a share of 1, a friction of 0.
+    own = np.concatenate([np.zeros(0, int), *problem.candidates.values()])
     return tuple(problem.coordinates[i].key for i, e in zip(goal.free, edge, strict=True)
-                 if e and not problem.coordinates[i].physical)  # fmt: skip
+                 if e and not problem.coordinates[i].physical and i not in own)  # fmt: skip

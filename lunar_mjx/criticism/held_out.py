@@ -68,10 +68,14 @@ def gain(problem: Problem, before: Fit, after: Fit, splits: tuple[str, ...] = ("
     difference = np.where(keep, 0.5 * (old**2 - new**2), 0.0)
     difference = np.where(np.isfinite(difference), difference, 0.0)
     block = blocks(problem.observations, after.residual, keep)
-    per = np.bincount(block[block >= 0], weights=difference[block >= 0])
-    if len(per) < 2:
-        return float(per.sum()), float("inf")
-    return float(per.sum()), float(np.sqrt(len(per) * per.var(ddof=1)))
+    inside = (block >= 0) & np.isfinite(old) & np.isfinite(new)
+    if block.max(initial=-1) < 1:
+        return float(difference.sum()), float("inf")
+    # With the change d of the residual given, the gain is d^2 / 2 + d e; only the residual e is random.
+    change = np.where(inside, old - new, 0.0)
+    per = np.bincount(block[inside], weights=(change * new)[inside])
+    noise = max(float(np.sum(per**2)), float(np.sum(change**2)))
+    return float(difference.sum()), float(np.sqrt(noise))
 
 
 @dataclasses.dataclass(frozen=True)

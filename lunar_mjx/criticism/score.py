@@ -212,15 +212,15 @@ def _test(
     amount = (vt[rank].T @ (along / s[rank])) / np.where(size > _TINY, size, np.inf)
     chi2 = float(along @ along)
     contributions = np.zeros((weights.shape[1], u.shape[1]))
-    np.add.at(contributions, block, u * residual[:, None])
     # Residuals that are larger than their noise (misfit, understated noise) must not count as evidence: the variance is
-    # the larger of the model's and of the blocks' own scatter about their mean.
-    centred = contributions - contributions.mean(axis=0)
-    robust = centred.T @ centred * len(contributions) / max(len(contributions) - 1, 1)
+    # the larger of the model's and of the blocks' own scatter. The effect itself is taken out before: that it shows in
+    # some manoeuvres more than in others is no noise.
+    np.add.at(contributions, block, u * (residual - u @ along)[:, None])
+    robust = contributions.T @ contributions * len(contributions) / max(len(contributions) - u.shape[1], 1)
     variance = _larger(robust, np.eye(u.shape[1]))
     inverse = np.linalg.inv(variance)
     statistic = float(along @ inverse @ along)
-    draws = weights @ centred
+    draws = weights @ contributions
     boot = np.einsum("di,ij,dj->d", draws, inverse, draws)
     z = _to_z(np.append(boot, statistic), u.shape[1])
     return amount, chi2, float(z[-1]), z[:-1]
