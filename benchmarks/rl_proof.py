@@ -92,11 +92,11 @@ class Judge:
 
         env, self.learner, self.names = learner.env, learner, AGENTS
         self.params = unseen_params(env, unseen)
-        agents = [learner_agent(learner), *(lambda _, state, key, a=make_agent(n, env): a(state, key) for n in AGENTS)]
+        trained, others = learner_agent(learner), [make_agent(n, env) for n in AGENTS]
 
         def act(params: Any, state: Any, key: Any) -> Any:
             which, policy = params
-            return jnp.stack([agent(policy, state, key) for agent in agents])[which]
+            return jnp.stack([trained(policy, state, key), *(agent(state, key) for agent in others)])[which]
 
         self._evaluator = Evaluator(env, act, episodes)
 
