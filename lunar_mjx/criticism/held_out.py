@@ -105,22 +105,24 @@ def noise_test(problem: Problem, fit: Fit, splits: tuple[str, ...] = ("fit", "se
     freedom = max(n - fitted_share * len(fit.free), 0.25 * n, 1.0)
     squares = np.where(keep, fit.residual**2, 0.0)
     rms = float(np.sqrt(squares.sum() / freedom))
-    limit = AT_NOISE + _SAMPLING * np.sqrt(0.5 / max(n, 1))
-    channels: dict[str, list[float]] = {}
+    channels: dict[str, np.ndarray] = {}
     for s in observations.series:
         part = slice(s.start, s.stop)
-        entry = channels.setdefault(s.channel, [0.0, 0.0])
-        entry[0] += float(squares[part].sum())
-        entry[1] += float(keep[part].sum())
+        count = float(keep[part].sum())
+        # squares, observations, and the variance of half their sum: of the noise itself, and of what is known of it
+        row = np.array([squares[part].sum(), count, 0.5 * s.dependence * count + (count * s.level) ** 2])
+        channels[s.channel] = channels.get(s.channel, np.zeros(3)) + row
+    spread = float(sum(row[2] for row in channels.values()))
+    limit = AT_NOISE + _SAMPLING * np.sqrt(spread) / max(n, 1)
     by_channel, worst, ratio = {}, "", 0.0
-    for channel, (total, count) in channels.items():
+    for channel, (total, count, variance) in channels.items():
         if count < 1:
             continue
         value = float(np.sqrt(total / count * n / freedom))
         by_channel[channel] = value
-        share = value / (CHANNEL_AT_NOISE + _SAMPLING * np.sqrt(0.5 / count))
+        share = value / (CHANNEL_AT_NOISE + _SAMPLING * np.sqrt(variance) / count)
         if share > ratio:
-            worst, ratio = channel, share
+            worst, ratio = channel, float(share)
     return NoiseTest(rms, float(limit), by_channel, worst, float(ratio), bool(rms <= limit and ratio <= 1.0))
 
 

@@ -19,6 +19,8 @@ class Series:
       white: standard deviation of the white noise, in the channel's unit, one number or one per observation.
       coloured: standard deviation of the correlated noise, same unit.
       correlation_time: of the correlated noise, s.
+      level: relative standard deviation of the noise level itself, where it comes from few replicates.
+      dependence: observations per independent one, where the noise of neighbours in a table is correlated.
     """
 
     log: int
@@ -29,6 +31,8 @@ class Series:
     white: np.ndarray | float
     coloured: float = 0.0
     correlation_time: float = 0.0
+    level: float = 0.0
+    dependence: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

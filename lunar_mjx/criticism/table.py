@@ -201,7 +201,7 @@ def _check_values(file: Path, numbers: Mapping[str, np.ndarray], slip_definition
     refuse(copied, "slip_ratio", "begins a row that occurs twice", "remove the copy")
 
 
-_SAME_LOAD = 0.25
+SAME_LOAD = 0.25
 """Loads of one point lie within this share of each other; the replicates of the measured wheel spread by a fifth."""
 
 
@@ -226,7 +226,7 @@ def replicate_groups(table: SteadyStateTable) -> np.ndarray:
     for group in np.unique(first):
         rows = np.flatnonzero(first == group)
         order = rows[np.argsort(load[rows], kind="stable")]
-        level[order[1:]] = np.cumsum(np.diff(load[order]) > _SAME_LOAD * load[order[:-1]])
+        level[order[1:]] = np.cumsum(np.diff(load[order]) > SAME_LOAD * load[order[:-1]])
     return np.unique(np.column_stack([first, level]), axis=0, return_inverse=True)[1].reshape(-1)
 
 

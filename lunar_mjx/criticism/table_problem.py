@@ -14,6 +14,7 @@ from lunar_mjx.criticism.observations import Observations, Series
 from lunar_mjx.criticism.problem import NotTested, Problem
 from lunar_mjx.criticism.single_wheel import PORTS, WheelBed, WheelTest
 from lunar_mjx.criticism.table import QUANTITIES, SteadyStateTable, average
+from lunar_mjx.criticism.table_noise import level_and_dependence
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError
 
@@ -248,6 +249,7 @@ def _observations(
     at = 0
     for number, log in enumerate(logs):
         table, noise = points(log)
+        known = level_and_dependence(log)
         group, names = default_units(table)
         apart = [bool(np.all(np.abs(table.test["slip_angle_deg"][group == g]) > APART_DEG)) for g in range(len(names))]
         default = default_splits(len(names), apart)
@@ -256,7 +258,9 @@ def _observations(
         for quantity, measured in table.measured.items():
             n = len(measured)
             white = np.sqrt(noise[quantity] ** 2 + extra_sigma.get(quantity, 0.0) ** 2)
-            series.append(Series(number, QUANTITIES[quantity][0], at, at + n, None, white))
+            level, dependence = known[quantity]
+            series.append(Series(number, QUANTITIES[quantity][0], at, at + n, None, white, level=level,
+                                 dependence=dependence))  # fmt: skip
             value.append(measured)
             unit.append(group + len(unit_names))
             place.append(covariates)
