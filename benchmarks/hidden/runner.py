@@ -1,0 +1,136 @@
+"""Runs cases in pieces: what is on disk is done, the seed is drawn once, and a piece ends when its time is up."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import datetime
+import hashlib
+import json
+import multiprocessing
+import os
+import subprocess
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+Job = tuple[str, int]
+Solve = Callable[..., dict[str, Any]]
+_ROOT = Path(__file__).resolve().parents[2]
+
+
+def commit() -> tuple[str, bool]:
+    """The commit of the code under test, and whether files that count differ from it; "" where git is not there."""
+    try:
+        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=_ROOT, capture_output=True, text=True, check=True)
+        changed = subprocess.run(["git", "status", "--porcelain", "--", "lunar_mjx", "benchmarks/hidden"], cwd=_ROOT,
+                                 capture_output=True, text=True, check=True)  # fmt: skip
+    except (OSError, subprocess.CalledProcessError):
+        return os.environ.get("HIDDEN_COMMIT", ""), False
+    return head.stdout.strip(), bool(changed.stdout.strip())
+
+
+def campaign(out: Path, seed: int | None) -> dict[str, Any]:
+    """The campaign's seed, drawn from the commit and the time unless it is given or drawn already."""
+    path = out.with_suffix(".seed.json")
+    head, dirty = commit()
+    if path.is_file():
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if seed is not None and str(seed) != data["seed"]:
+            raise SystemExit(f"{path}: seed {data['seed']} was drawn for these results; name another --out for {seed}.")
+        return data
+    now = datetime.datetime.now(datetime.UTC)
+    drawn = int.from_bytes(hashlib.sha256(f"{head} {now.isoformat()} {time.time_ns()}".encode()).digest()[:7], "big")
+    data = {
+        "seed": str(drawn if seed is None else seed), "given": seed is not None, "commit": head,
+        "uncommitted_changes": dirty, "drawn": now.isoformat(timespec="seconds"),
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    return data
+
+
+def read_rows(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """Rows of results files, the last of each case; a line cut short by a stop is left out."""
+    rows: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for path in paths:
+        for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+            try:
+                row = json.loads(line)
+            except ValueError:
+                continue
+            rows[row["kind"], row["seed"], row["case"]] = row
+    return list(rows.values())
+
+
+def order(counts: Mapping[str, int]) -> list[Job]:
+    """All cases, every group in proportion, so that a part of them is a small copy of the whole."""
+    jobs = [((n + 0.5) / count, place, group, n) for place, (group, count) in enumerate(counts.items())
+            for n in range(count)]  # fmt: skip
+    return [(group, n) for _, _, group, n in sorted(jobs)]
+
+
+def work(solve: Solve, jobs: Sequence[Job], out: Path, seed: int, minutes: float, workers: int, **options: Any) -> int:
+    """Runs jobs until they are done or the time is up; appends a row per case.
+
+    Args:
+      solve: makes a row from (group, number, seed, **options). jobs: what is left to do.
+      out: JSON lines. seed: of the campaign. minutes: after which nothing new is begun. workers: processes.
+      **options: handed to `solve`.
+
+    Returns:
+      Number of cases done.
+    """
+    until = time.monotonic() + 60.0 * minutes
+    head, dirty = commit()
+    done = 0
+    with out.open("a", encoding="utf-8") as file:
+        for row in _rows(solve, jobs, seed, until, workers, options):
+            row |= {"commit": head, "uncommitted_changes": dirty}
+            file.write(json.dumps(_plain(row), allow_nan=False) + "\n")
+            file.flush()
+            done += 1
+            print(f"{row['case']:<18} {row['verdict']:<12} {row.get('outcome', ''):<18} "
+                  f"{', '.join(row.get('named', []))} ({row.get('seconds', 0.0):.0f} s)", flush=True)  # fmt: skip
+    return done
+
+
+def _rows(
+    solve: Solve, jobs: Sequence[Job], seed: int, until: float, workers: int, options: Mapping[str, Any]
+) -> Iterator[dict[str, Any]]:
+    if workers <= 1:
+        for job in jobs:
+            if time.monotonic() > until:
+                return
+            yield guarded(solve, *job, seed, options)
+        return
+    context = multiprocessing.get_context("spawn")
+    left = iter(jobs)
+    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+        running: set[concurrent.futures.Future[dict[str, Any]]] = set()
+        while True:
+            while len(running) < workers and time.monotonic() < until and (job := next(left, None)) is not None:
+                running.add(pool.submit(guarded, solve, *job, seed, options))
+            if not running:
+                return
+            finished, running = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
+            for future in finished:
+                yield future.result()
+
+
+def guarded(solve: Solve, group: str, number: int, seed: int, options: Mapping[str, Any]) -> dict[str, Any]:
+    """A case's row; where something crashes, a row that counts as wrong and tells what."""
+    try:
+        return solve(group, number, seed, **options)
+    except Exception:
+        kind = "drives" if "drive" in solve.__name__ else "tables"
+        return {"case": f"{group}-{number:03d}", "kind": kind, "group": group, "seed": str(seed), "verdict": "CRASH",
+                "named": [], "truth": {"effects": {}}, "right": False, "outcome": "crash", "wrong_name": False,
+                "sentence": traceback.format_exc(limit=-4), "seconds": 0.0}  # fmt: skip
+
+
+def _plain(value: Any) -> Any:
+    from lunar_mjx.criticism.runs import plain
+
+    return plain(value)

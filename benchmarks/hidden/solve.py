@@ -1,0 +1,161 @@
+"""Gives the log of a case to the tool, as a user would, and sets what it answers beside the sealed answer."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.criticism import verbs
+from lunar_mjx.criticism.attribute import Settings
+from lunar_mjx.criticism.runs import SERIES_FILE, Run
+from lunar_mjx.criticism.verdict import Diagnosis, Verdict
+from lunar_mjx.errors import UserError
+from lunar_mjx.model import Model, make_model
+
+from . import bed_effects, bed_logs, cases
+from .judge import outcome
+from .separable import left_over
+
+_95 = 1.959964
+
+
+@functools.cache
+def nominal_model() -> Model:
+    """The model that every table is held against: the default preset."""
+    return make_model("luvmi_x", terrain="flat")
+
+
+def ask(log: Path, out: Path, effect: str | None = None) -> tuple[Diagnosis | None, Diagnosis | None, str]:
+    """The tool's answer to a log.
+
+    Args:
+      log: its folder. out: the run's folder. effect: asked about by name, if any.
+
+    Returns:
+      The diagnosis, the answer about the effect, and the message where the log was refused as a user's mistake.
+    """
+    try:
+        run = verbs.compare([log], nominal_model(), out)
+        found = verbs.why(run)
+    except verbs.BadData as bad:
+        return bad.diagnosis, None, ""
+    except UserError as error:
+        return None, None, str(error)
+    if effect is None or found.verdict is Verdict.BAD_FIT:
+        return found, None, ""
+    return found, verbs.explain(found, effect), ""
+
+
+def table_row(group: str, number: int, seed: int, suggest: bool = False, keep: str | None = None) -> dict[str, Any]:
+    """Makes one case on the test bed, asks the tool, opens the seal, and judges.
+
+    Args:
+      group, number, seed: of the case. suggest: ask for formulas where the effect is outside the catalogue.
+      keep: folder in which log and run stay.
+    """
+    began = time.monotonic()
+    case = cases.make(group, number, seed)
+    drawn = time.monotonic()
+    place = Path(keep) / case.name if keep else Path(tempfile.mkdtemp(prefix="hidden-"))
+    if keep and place.exists():
+        shutil.rmtree(place)
+    try:
+        case.write(place / "log")
+        truth = case.truth
+        asked = next(iter(truth.effects)) if group == "undecidable" else None
+        found, answer, refused = ask(place / "log", place / "run", asked)
+        seconds = time.monotonic() - drawn
+        verdict = found.verdict.label if found else "REFUSED"
+        row: dict[str, Any] = {
+            "case": case.name, "kind": "tables", "group": group, "seed": str(seed), "truth": case.answer(),
+            "commitment": case.commitment(), "separable": case.separable, "noise": case.recipe.kind,
+            "scale": case.recipe.scale, "dirt": case.recipe.dirt, "verdict": verdict,
+            "sentence": found.sentence if found else refused, "named": list(found.effects) if found else [],
+        }  # fmt: skip
+        row["explained"] = answer.verdict.label if answer else None
+        if found is not None and found.verdict not in (Verdict.BAD_DATA, Verdict.BAD_FIT):
+            row |= _physics(case, found, place / "run")
+        row |= outcome(row, functools.partial(_twins, truth))
+        if suggest and group == "outside" and row["verdict"] == "UNKNOWN":
+            row["suggestions"] = _suggestions(place / "run")
+        row |= {"seconds": round(seconds, 2), "seconds_drawing": round(drawn - began, 2), "pid": os.getpid()}
+        return row
+    finally:
+        if not keep:
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def _twins(truth: bed_logs.Truth, name: str) -> float:
+    """Sigma that tell the truth from another effect, by the generator's own physics."""
+    return left_over(truth, [name]) if name in bed_effects.KNOWN else float("inf")
+
+
+def _physics(case: cases.Case, found: Diagnosis, run: Path) -> dict[str, Any]:
+    values = _values(case.truth.effects, found)
+    held = found.error_after.get("held_out")
+    floor = noise_floor(case.truth, run)
+    return {
+        "port": found.port, "ports": dict(found.ports), "true_ports": _ports(case.truth.effects),
+        "error_before": dict(found.error_before), "error_after": dict(found.error_after), "floor": floor,
+        "over_floor": held / floor if held and floor else None, "parameters": values,
+        "undecidable": list(found.undecidable),
+    }  # fmt: skip
+
+
+def _ports(effects: Mapping[str, Any]) -> list[str]:
+    kinds = {**bed_effects.KNOWN, **bed_effects.OUTSIDE}
+    return sorted({port for n in effects for port in kinds[n].ports})
+
+
+def _values(effects: Mapping[str, Mapping[str, float]], found: Diagnosis) -> list[dict[str, Any]]:
+    """True and fitted parameters of the effects that were named rightly."""
+    rows = []
+    for e in found.evidence:
+        for name, true in effects.get(e.effect, {}).items() if e.effect in found.effects else ():
+            if name in e.values and np.isfinite(e.std.get(name, np.nan)):
+                value, std = e.values[name], e.std[name]
+                away = abs(value - true)
+                rows.append({"effect": e.effect, "name": name, "truth": true, "value": value, "std": std,
+                             "error": away / abs(true), "covered": away <= _95 * std})  # fmt: skip
+    return rows
+
+
+def noise_floor(truth: bed_logs.Truth, run: Path) -> float | None:
+    """Root mean square of measured less true values over the held-out points, in the tool's sigma: nobody beats it."""
+    path = run / SERIES_FILE
+    if not path.is_file():
+        return None
+    with np.load(path) as data:
+        held = np.isin(data["split"][data["unit"]], ("select", "test"))
+        at = data["place"]
+        points = dataclasses.replace(truth.points, slip=at[:, 0], angle=np.radians(at[:, 1]), load=at[:, 2])
+        clean = dataclasses.replace(truth, points=points).clean()
+        ends = [*data["series_start"][1:], len(at)]
+        true = np.empty(len(at))
+        for channel, start, stop in zip(data["series_channel"], data["series_start"], ends, strict=True):
+            true[start:stop] = clean[str(channel)][start:stop]
+        away = ((data["measured"] - true) / data["sigma"])[held]
+    return float(np.sqrt(np.mean(away**2))) if len(away) else None
+
+
+def _suggestions(run: Path) -> list[dict[str, Any]]:
+    """The tool's first formulas at the port that it named."""
+    from lunar_mjx.criticism.discover import discover
+    from lunar_mjx.criticism.runs import load_run
+
+    loaded: Run = load_run(run)
+    try:
+        found = discover(loaded, settings=Settings(seed=loaded.seed))
+    except UserError as error:
+        return [{"refused": str(error)}]
+    return [{"port": s.port, "target": s.target, "formula": s.formula, "at_noise": s.at_noise}
+            for s in found.suggestions[:3]]  # fmt: skip

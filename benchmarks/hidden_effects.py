@@ -1,0 +1,66 @@
+"""How often the tool finds what is missing, and how often it is wrong: hidden effects in logs with sealed answers.
+
+    python benchmarks/hidden_effects.py run --out build/hidden.jsonl --minutes 9      tables; again to go on
+    python benchmarks/hidden_effects.py generate build/drives --count 20              drives: logs and sealed answers
+    python benchmarks/hidden_effects.py score build/drives --out build/drives.jsonl   drives: here or on another machine
+    python benchmarks/hidden_effects.py summary build/hidden.jsonl build/drives.jsonl --out build/hidden
+
+Tables come from a test bed written in NumPy from the equations, drives from native MuJoCo with NumPy forces and hidden
+hooks; neither shares the tool's physics. The seed of a campaign is drawn from the commit and the time when it begins.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
+os.environ.setdefault("MUJOCO_GL", "disable")
+
+
+def _counts(names: str, count: int | None, whole: dict[str, int]) -> dict[str, int]:
+    chosen = list(whole) if names == "all" else names.split(",")
+    unknown = [n for n in chosen if n not in whole]
+    if unknown:
+        raise SystemExit(f"--cases {unknown[0]}: there is no such group; use some of {','.join(whole)}.")
+    return {n: whole[n] if count is None else count for n in chosen}
+
+
+def run(args: argparse.Namespace) -> None:
+    """Tables: draws, asks, judges."""
+    from benchmarks.hidden import cases, runner, solve
+
+    counts = _counts(args.cases, args.count, dict(cases.GROUPS))
+    seed = int(runner.campaign(args.out, args.seed)["seed"])
+    done = {row["case"] for row in runner.read_rows([args.out]) if row["seed"] == str(seed)}
+    left = [job for job in runner.order(counts) if f"{job[0]}-{job[1]:03d}" not in done]
+    print(f"seed {seed}: {len(left)} of {sum(counts.values())} cases are left")
+    number = runner.work(solve.table_row, left, args.out, seed, args.minutes, args.workers, suggest=args.suggest,
+                         keep=str(args.keep) if args.keep else None)  # fmt: skip
+    print(f"{number} cases done, {len(left) - number} left")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    whole = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    verbs = whole.add_subparsers(dest="verb", required=True)
+    tables = verbs.add_parser("run", help="tables of a test bed")
+    tables.add_argument("--out", type=Path, required=True, help="JSON lines, one row per case")
+    tables.add_argument("--cases", default="all", help="groups, separated by commas")
+    tables.add_argument("--count", type=int, help="cases of each group; the whole benchmark's if left out")
+    tables.add_argument("--seed", type=int, help="drawn from the commit and the time if left out")
+    tables.add_argument("--minutes", type=float, default=9.0, help="after which no new case is begun")
+    tables.add_argument("--workers", type=int, default=1)
+    tables.add_argument("--suggest", action="store_true", help="ask for formulas where the effect is not listed")
+    tables.add_argument("--keep", type=Path, help="folder in which logs and runs stay")
+    tables.set_defaults(do=run)
+    return whole
+
+
+if __name__ == "__main__":
+    arguments = parser().parse_args()
+    arguments.do(arguments)
