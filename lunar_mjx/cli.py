@@ -16,6 +16,7 @@ from lunar_mjx.commands import criticism as criticism_commands
 from lunar_mjx.commands import effect_test
 from lunar_mjx.commands import log as log_commands
 from lunar_mjx.commands import parity as parity_commands
+from lunar_mjx.commands import seeing as seeing_commands
 from lunar_mjx.commands import train as train_commands
 from lunar_mjx.errors import EXIT_STATUS, UserError, bad_input
 
@@ -285,6 +286,7 @@ def effect_show(name: Annotated[str, typer.Argument(help="Catalogue name, or my_
 
 train_commands.register(app)
 parity_commands.register(app)
+seeing_commands.register(app, terrain_app)
 log_commands.register(app)
 criticism_commands.register(app)
 effect_test.register(effect_app)

@@ -226,7 +226,9 @@ def refit_with(problem: Problem, base: Fit, effect: str, settings: Settings, mem
 def _earned(problem: Problem, before: Candidate, c: Candidate, settings: Settings) -> bool:
     """Whether the effects beyond an earlier set pay on manoeuvres left out."""
     value, se = gain(problem, before.fit, c.fit)
-    return bool(value > 0.5 * settings.chi2 and value > settings.gain_se * se)
+    # Reaching the noise on all manoeuvres is evidence of its own.
+    needed = 1.0 if c.noise.passes and not before.noise.passes else settings.gain_se
+    return bool(value > 0.5 * settings.chi2 and value > needed * se)
 
 
 def _better(c: Candidate, best: Candidate, settings: Settings) -> bool:

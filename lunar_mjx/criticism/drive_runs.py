@@ -59,6 +59,12 @@ class LogRun:
     imu_position: tuple[float, float, float]
 
 
+_PROGRAMS: dict[Any, _Program] = {}
+"""Programs take every number as an argument, so that campaigns of one rover share them; a program keeps its model, so
+that no other effect takes the identity of one of its own."""
+_MOST_PROGRAMS = 32
+
+
 class Bench:
     """All logs of a campaign, grouped by what one program can run."""
 
@@ -68,7 +74,6 @@ class Bench:
         self.runs = [log_run(log, model) for log in logs]
         with jax.enable_x64(True):
             self._params = [_nameless(default_params(run.model)) for run in self.runs]
-        self._programs: dict[Any, _Program] = {}
 
     def halved(self) -> Bench:
         """The same with half the time step."""
@@ -79,7 +84,7 @@ class Bench:
             dataclasses.replace(r, model=r.model.replace(timestep=0.5 * r.model.timestep), every=2 * r.every)
             for r in self.runs
         ]
-        other._params, other._programs = self._params, {}
+        other._params = self._params
         return other
 
     def channels(self, number: int) -> list[str]:
@@ -92,10 +97,16 @@ class Bench:
         wanted = tuple(sorted({c for n in range(len(self.runs)) for c in self.channels(n)}))
         shapes = tuple((a.shape, str(a.dtype)) for a in jax.tree.leaves(self._params[number].terrain))
         modes, gains = (tuple(sorted(d.items())) for d in (run.model.modes, run.model.gains))
-        key = (run.model.effect_names, modes, gains, shapes, run.every, run.imu_position)
-        if key not in self._programs:
-            self._programs[key] = _Program(run.model, run.every, wanted, run.imu_position, self.engine)
-        return self._programs[key]
+        model = run.model
+        key = (
+            str(model.rover.folder), model.timestep, model.thermal_integrator, tuple(id(e) for e in model.effects),
+            self.engine, modes, gains, shapes, run.every, run.imu_position, wanted,
+        )  # fmt: skip
+        if key not in _PROGRAMS:
+            while len(_PROGRAMS) >= _MOST_PROGRAMS:
+                _PROGRAMS.pop(next(iter(_PROGRAMS)))
+            _PROGRAMS[key] = _Program(run.model, run.every, wanted, run.imu_position, self.engine)
+        return _PROGRAMS[key]
 
     def run(
         self,

@@ -45,12 +45,12 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray) -> Any:
-    """Draws shaded ground with contours of height and rocks; returns the extent that was drawn."""
+def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray, contours: bool = True) -> None:
+    """Draws shaded ground with rocks, and contours of height."""
     ground = relief(terrain, low, high)
     extent = (ground.west, ground.east, ground.south, ground.north)
     axes.imshow(ground.grey, cmap="gray", vmin=0, vmax=1, extent=extent, origin="lower", interpolation="bilinear")
-    if np.ptp(ground.heights) > 1e-6:
+    if contours and np.ptp(ground.heights) > 1e-6:
         rows, cols = ground.heights.shape
         x = np.linspace(ground.west, ground.east, cols)
         y = np.linspace(ground.south, ground.north, rows)
@@ -61,7 +61,6 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray)
     axes.set_aspect("equal")
     axes.set_xlabel("east, m")
     axes.set_ylabel("north, m")
-    return extent
 
 
 def bounds(places: np.ndarray, margin: float = _MARGIN) -> tuple[np.ndarray, np.ndarray]:
@@ -148,8 +147,14 @@ def _temperature(axes: Axes, drive: RecordedDrive) -> None:
 
 
 def _power(axes: Axes, drive: RecordedDrive) -> None:
-    axes.plot(drive.time, drive.power, color=INK, linewidth=1.1)
+    power = drive.power
+    axes.plot(drive.time, power, color=INK, linewidth=1.1)
     axes.axhline(0.0, color=RULE, linewidth=0.8)
+    # a start from rest is a spike of milliseconds that would flatten all else
+    low, high = (float(v) for v in np.percentile(power, (2.0, 98.0)))
+    edge = 0.15 * max(high - min(low, 0.0), 1.0)
+    axes.set_ylim(min(low, 0.0) - edge, high + edge)
+    axes.text(0.99, 0.95, f"peak {power.max():.3g} W", transform=axes.transAxes, ha="right", va="top", fontsize=7)
     style(axes, "motors' power, W")
 
 
@@ -161,7 +166,7 @@ def terrain_preview(terrain: Terrain) -> Figure:
     high = low + cell * (np.array(heights.shape[::-1]) - 1)
     figure = Figure(figsize=(13.0, 4.6), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 0.8))
-    draw_relief(left, terrain, low, high)
+    draw_relief(left, terrain, low, high, contours=False)
     left.set_title("shaded relief with rocks, light from the north-west", loc="left", fontsize=9)
     step = max(1, round(max(heights.shape) / 600))
     north, east = np.gradient(heights[::step, ::step], cell * step)

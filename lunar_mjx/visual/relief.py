@@ -43,7 +43,9 @@ def relief(terrain: Terrain, low: np.ndarray, high: np.ndarray, most: int = 700,
         part = np.tile(part[:1, :1], (2, 2))
     north, east = np.gradient(part, cell * step)
     azimuth, elevation = (math.radians(v) for v in light)
-    sun = np.array([math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation), math.sin(elevation)])
+    sun = np.array(
+        [math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation), math.sin(elevation)]
+    )
     lit = (-east * sun[0] - north * sun[1] + sun[2]) / np.sqrt(1.0 + east**2 + north**2)
     grey = np.clip(0.59 + 0.94 * (lit - sun[2]), 0.24, 0.92)
     half = 0.5 * cell * step

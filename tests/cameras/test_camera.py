@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from camera_scene import EYE
 
-from lunar_mjx.cameras import LABELS, Pinhole, Sun, Track, look_at, orbit, project
+from lunar_mjx.cameras import LABELS, Pinhole, RoverCamera, Sun, Track, look_at, orbit, project
 from lunar_mjx.cameras import gl as camera_gl
 from lunar_mjx.cameras.texture import paint_tracks, regolith, thinned
 from lunar_mjx.errors import UserError
+from lunar_mjx.rover import load_rover
+from lunar_mjx.terrain import flat
 
 SKY, GROUND, ROCK, ROVER = range(4)
 
@@ -98,3 +100,21 @@ def test_mistakes_are_one_sentence(scene):
     camera, qpos = scene
     with pytest.raises(UserError, match=r"qpos = .* has another shape; give "):
         camera.place(qpos[:5])
+
+
+def test_tracks_show_in_the_picture(opengl):
+    """Painted into the texture while the rover drives: seen from above, north up, where the wheel rolled."""
+    at = np.linspace(-2.0, 2.0, 101)
+    track = Track(np.stack([at, np.full(101, 1.0)], axis=-1), 0.4, 0.0)
+    with RoverCamera(load_rover("luvmi_x"), flat(20.0), np.zeros((1, 2)), EYE, sun=Sun(180.0, 60.0), tracks=[track],
+                     margin=6.0, largest=(200, 200), backends=opengl, untrodden=True) as camera:  # fmt: skip
+        above, optics = look_at((0.0, 1.0, 5.0), (0.0, 1.0, 0.0), up=(0.0, 1.0, 0.0)), Pinhole(200, 200, 50.0)
+        before = camera.picture(above, optics).astype(float).mean(-1)
+        camera.roll(51)
+        half = camera.picture(above, optics).astype(float).mean(-1) / before
+        camera.roll(101)
+        whole = camera.picture(above, optics).astype(float).mean(-1) / before
+    # 5 m above, 50 deg: 4.66 m are 200 pixels; the track runs along the middle row
+    assert half[95:105, 30:90].mean() < 0.85 and half[95:105, 115:180].mean() > 0.97
+    assert whole[95:105, 30:170].mean() < 0.85
+    assert whole[60:80, 30:170].mean() > 0.97 and whole[125:140, 130:170].mean() > 0.97
