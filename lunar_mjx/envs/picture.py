@@ -1,0 +1,94 @@
+"""Pictures of one rover's episode as it goes on: MuJoCo's camera where there is OpenGL, else a shaded map."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.envs.core import State
+from lunar_mjx.envs.navigation import NavigationEnv
+from lunar_mjx.envs.render import Camera, TopView
+from lunar_mjx.errors import UserError, bad_input
+
+VIEWS = ("auto", "camera", "top")
+_FAR = 3.0
+"""m beyond start and goal that the map shows, since a rover may leave the straight line."""
+
+
+class Picture:
+    """Draws the first rover of a batch.
+
+    Args:
+      env: with a rover. view: one of `VIEWS`.
+
+    Raises:
+      UserError: unknown view.
+    """
+
+    def __init__(self, env: Any, view: str = "auto"):
+        if view not in VIEWS:
+            raise bad_input("render", "view", view, "does not exist", f"use one of {', '.join(VIEWS)}")
+        self.env, self._view = env, view
+        self._camera: Camera | None = None
+        self._top: TopView | None = None
+        self._qpos = np.zeros(0)
+        self._path: list[np.ndarray] = []
+
+    @staticmethod
+    def fits(env: Any) -> bool:
+        """Whether the environment has a rover to draw."""
+        return isinstance(env, NavigationEnv)
+
+    def begin(self, state: State) -> None:
+        """A new episode."""
+        self.close()
+        self._qpos = np.asarray(state.inner.physics.qpos[0])
+        self._goal = np.asarray(state.inner.goal[0])
+        self._ground = float(self._qpos[2]) - self.env.model.rover.standing_height
+        self._path = [self._qpos[:2]]
+        self._top, self._camera, self._tried = None, None, False
+
+    def add(self, state: State, done: bool) -> None:
+        """A step later; the pose after the last step is gone with the reset, so the one before stays."""
+        if not done:
+            self._qpos = np.asarray(state.inner.physics.qpos[0])
+            self._path.append(self._qpos[:2])
+
+    def frame(self) -> np.ndarray:
+        """The picture now, (height, width, 3) uint8.
+
+        Raises:
+          UserError: before the first reset, or view `camera` without OpenGL.
+        """
+        if not len(self._qpos):
+            raise bad_input("render", "frame", "a picture", "comes before the first reset", "call reset first")
+        w, x, y, z = self._qpos[3:7]
+        yaw = float(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
+        camera = self._open()
+        if camera is not None:
+            return camera.frame(self._qpos, yaw, self._goal, self._ground)
+        if self._top is None:
+            self._top = TopView(self.env.params.system.terrain, self._places())
+        size = 5.0 * self.env.model.rover.standing_height
+        return self._top.frame(self._qpos, yaw, self._goal, self.env.config.goal_radius, self._path, size)
+
+    def _places(self) -> np.ndarray:
+        ends = np.stack([self._path[0], self._goal])
+        return np.concatenate([ends - _FAR, ends + _FAR])
+
+    def _open(self) -> Camera | None:
+        if self._camera is None and self._view != "top" and not self._tried:
+            self._tried = True
+            try:
+                self._camera = Camera(self.env.model.rover, self.env.params.system.terrain, self._places())
+            except UserError:
+                if self._view == "camera":
+                    raise
+        return self._camera
+
+    def close(self) -> None:
+        """Lets the renderer go."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None

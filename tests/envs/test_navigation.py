@@ -1,0 +1,131 @@
+"""The navigation task with a rover: adapters, rewards and ends as the physics' own state says. One compiled step."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from lunar_mjx.envs import make_navigation, rewards
+from lunar_mjx.envs.actions import action_map
+from lunar_mjx.envs.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
+from lunar_mjx.envs.gymnasium_env import NAVIGATION
+from lunar_mjx.envs.places import draw_places
+from lunar_mjx.envs.randomise import Range, check_ranges
+from lunar_mjx.errors import UserError
+from lunar_mjx.model import make_model
+from lunar_mjx.terrain import load_terrain
+
+SHORT = {"task": "consistent", "terrain": "flat", "decimation": 50, "episode_time": 1.0, "places": 64,
+         "goal_distance": (1.0, 1.5), "randomise": (Range("soil.cohesion", 0.5, 2.0, "log", relative=True),
+                                                    Range("winding_temperature", 280.0, 300.0))}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def env():
+    made = gym.make(NAVIGATION, render_mode="rgb_array", view="top", **SHORT)
+    yield made
+    made.close()
+
+
+@pytest.mark.slow
+def test_passes_gymnasiums_check(env):
+    check_env(env.unwrapped, skip_render_check=True)
+    assert env.observation_space.shape == (17,) and env.action_space.shape == (6,)
+
+
+@pytest.mark.slow
+def test_observation_reward_and_end_follow_the_physics(env):
+    own = env.unwrapped
+    obs, info = env.reset(seed=4)
+    state = own._state
+    assert 1.0 <= np.hypot(*obs[15:]) <= 1.5 and (obs[:3] == 0).all() and np.hypot(*info["goal_body"]) >= 1.0
+    assert 280.0 < float(state.inner.drawn["winding_temperature"][0]) < 300.0
+    total, steps = 0.0, own.env.episode_steps
+    assert steps == 10
+    for i in range(steps):
+        before = np.asarray(own._state.inner.physics.qpos[0, :2])
+        goal = np.asarray(own._state.inner.goal[0])
+        obs, reward, terminated, truncated, info = env.step(np.array([1.0, 0.3, 0, 0, 0, 0], np.float32))
+        place = before * 0 + np.asarray(state.inner.origin[0, :2]) + obs[:2]
+        gained = np.hypot(*(goal - before)) - np.hypot(*(goal - place))
+        bearing = np.arctan2(*(goal - place)[::-1]) - obs[5]
+        hand = 20 * gained + 0.1 * np.cos(bearing) - 0.05 * np.abs(obs[3:5]).sum() - 0.1 * abs(obs[14])
+        assert reward == pytest.approx(hand, abs=1e-2)
+        total += reward
+        assert truncated == (i == steps - 1) and not terminated
+    assert info["episode_return"] == pytest.approx(total, rel=1e-4) and info["success"] == 0.0
+    assert np.hypot(*obs[:2]) > 0.01, "it drove"
+    fresh = own._state.inner
+    assert int(fresh.steps[0]) == 0 and not np.allclose(fresh.goal[0], goal), "the next episode has another goal"
+
+
+@pytest.mark.slow
+def test_pictures_show_rover_and_goal(env):
+    env.reset(seed=4)
+    first = env.render()
+    assert first.dtype == np.uint8 and first.ndim == 3 and first.shape[2] == 3
+    rover, goal = (255, 196, 60), (90, 255, 120)
+    for colour in (rover, goal):
+        assert (np.abs(first.astype(int) - colour).sum(axis=2) < 30).sum() > 10
+    for _ in range(9):
+        env.step(np.array([1.0, 0, 0, 0, 0, 0], np.float32))
+    assert (env.render() != first).any(), "it moves"
+    with pytest.raises(UserError, match="view"):
+        gym.make(NAVIGATION, render_mode="rgb_array", view="side", **SHORT)
+
+
+def test_six_actions_drive_the_joints_that_the_paper_names():
+    model = make_model("luvmi_x", "flat")
+    rover = model.rover
+    two, four = (action_map(model, "velocity", 0.5, four_wheel_steering=w) for w in (False, True))
+    assert two.names[:2] == ("drive", "steer") and two.size == 6
+    groups = dict(zip(rover.joints, (g.name for g in rover.groups for _ in g.joints), strict=True))
+    turned = np.asarray(two.controls(np.array([[1.0, 0.0, 0, 0, 0, 0], [0.0, 1.0, 0, 0, 0, 0]], np.float32)))
+    radius = rover.wheels[0].radius
+    for i, joint in enumerate(rover.joints):
+        if groups[joint] == "drive":
+            assert turned[0, i] == pytest.approx(0.5 / radius) and turned[1, i] == 0
+        elif groups[joint] == "steer":
+            front = next(w for w in rover.wheels if w.steer == joint).corner in ("lf", "rf")
+            assert turned[0, i] == 0 and (turned[1, i] > 0) == front
+            assert (four.scale[i] > 0) == front and abs(four.scale[i]) > 0
+        else:
+            assert (turned[:, i] == 0).all()
+    assert action_map(model, "joint_torque", 0.5).size == len(rover.joints) == 12
+    with pytest.raises(UserError, match="does not exist"):
+        action_map(model, "thoughts", 0.5)
+
+
+def test_places_lie_within_bounds_clear_of_rocks_and_as_far_apart_as_asked():
+    ground = load_terrain({"seed": 3, "surface": {"width": 30.0, "height": 30.0, "cell": 0.2},
+                           "rocks": {"abundance": 0.05, "smallest": 0.4, "largest": 1.0, "gap": 0.5}})  # fmt: skip
+    starts, goals = draw_places(ground, 300, (3.0, 6.0), 1, clearance=0.4, margin=2.0)
+    apart = np.hypot(*(goals - starts).T)
+    assert apart.min() >= 3.0 - 1e-5 and apart.max() <= 6.0 + 1e-5
+    rocks, radii = np.asarray(ground.rocks.centers), np.asarray(ground.rocks.radii)
+    real = radii > 0
+    for points in (starts, goals):
+        gap = np.hypot(*(points[:, None] - rocks[real, :2]).transpose(2, 0, 1)) - radii[real]
+        assert gap.min() > 0.4 - 1e-5 and np.abs(points).max() <= 13.0
+    with pytest.raises(UserError, match="too few places"):
+        draw_places(ground, 10, (40.0, 50.0), 1, clearance=0.4)
+
+
+def test_held_out_soil_is_outside_all_of_training():
+    trained = {r.parameter: r for r in SOIL_RANGES}
+    for r in UNSEEN_SOIL:
+        inside = trained[r.parameter]
+        assert r.high <= inside.low or r.low >= inside.high, r.parameter
+    check_ranges(make_model("luvmi_x", "flat"), UNSEEN_SOIL)
+
+
+def test_tasks_and_mistakes():
+    assert TASKS["paper"].weights == rewards.PAPER_WEIGHTS and TASKS["large"].goal_distance == (10.0, 40.0)
+    for settings, said in (({"task": "easy"}, "paper, consistent, large"), ({"decimation": 0}, "decimation"),
+                           ({"speed": 3}, "is no setting"), ({"observations": ("smell",)}, "is no observation"),
+                           ({"goal_distance": (0.1, 5.0)}, "goal_radius"), ({"weights": {"joy": 1.0}}, "reward term"),
+                           ({"randomise": (Range("soil.joy", 1, 2),)}, "no parameter")):  # fmt: skip
+        with pytest.raises(UserError, match=said):
+            make_navigation(**{"terrain": "flat", **settings})
