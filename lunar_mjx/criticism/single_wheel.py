@@ -275,8 +275,8 @@ class WheelBed:
     def _loads(self, parameters: Parameters, test: WheelTest, terrain: Terrain, sinkage: Any) -> _Loads:
         ctx = _bed_context(parameters, test, terrain, sinkage, self.gravity)
         geometry, _ = self._pipeline.run("geometry", ctx, {}, nominal_geometry(ctx.rover))
-        # A bed turns the wheel at an angular velocity, and states rim speed and slip for the radius that was drawn; load
-        # and sinkage are those of the wheel as it is, so its hub stands at the true radius.
+        # A bed turns the wheel at an angular velocity; its rim speed and slip are those of the radius that was drawn.
+        # Load and sinkage belong to the wheel as it is, so its hub stands at the true radius.
         spin = Vec3(ctx.wheel_velocity.x * 0.0, test.rim_speed / test.radius, ctx.wheel_velocity.x * 0.0)
         place = ctx.wheel_position._replace(z=geometry.radius - sinkage)
         ctx = dataclasses.replace(ctx, geometry=geometry, wheel_angular_velocity=spin, wheel_position=place)
