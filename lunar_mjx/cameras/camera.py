@@ -52,7 +52,7 @@ class RoverCamera:
       rover: the rover. terrain: the ground.
       places: (n, 2) m where the rover will be, so that the ground around is drawn finely; the origin if None.
       camera: optics of the front camera. mount: its pose in the chassis frame; on the rover's highest part if None.
-      sun: where the Sun stands. tracks: of wheels, drawn into the ground.
+      sun: where the Sun stands. tracks: of wheels, drawn into the ground. untrodden: begin without them; see `roll`.
       margin: how far the finely drawn ground reaches beyond `places`, m.
       largest: width and height of the largest picture to come, pixels.
       backends: of OpenGL; EGL or else OSMesa if None.
@@ -64,17 +64,29 @@ class RoverCamera:
     def __init__(
         self, rover: Rover, terrain: Terrain, places: Any = None, camera: Pinhole | None = None,
         mount: Pose | None = None, sun: Sun | None = None, tracks: Sequence[Track] = (), margin: float = 15.0,
-        largest: tuple[int, int] = (1280, 960), backends: Sequence[str] | None = None,
+        largest: tuple[int, int] = (1280, 960), backends: Sequence[str] | None = None, untrodden: bool = False,
     ) -> None:  # fmt: skip
         self.camera, self.sun = camera or Pinhole(), sun or Sun()
         self.mount = mount or front_mount(rover)
         around = np.zeros((1, 2)) if places is None else np.asarray(places, float)
-        self.model = build_scene(rover, terrain, around, self.sun, tracks, margin, self.mount, self.camera.fovy_deg)
+        self.model, self._painter = build_scene(rover, terrain, around, self.sun, tracks, margin, self.mount,
+                                                self.camera.fovy_deg)  # fmt: skip
         self.data = mujoco.MjData(self.model)
         self._chassis = self.model.body(rover.chassis).id
         self._labels = np.array([_label(self.model.geom(i).name) for i in range(self.model.ngeom)] + [0])
         self._offscreen = Offscreen(self.model, max(largest[0], self.camera.width),
                                     max(largest[1], self.camera.height), backends)  # fmt: skip
+        self.place(self.model.qpos0)
+        if tracks and not untrodden:
+            self.roll(max(len(t.places) for t in tracks))
+
+    def roll(self, rows: int) -> None:
+        """Shows the wheel tracks up to a row of their places; call it with rising rows for a video."""
+        texture = self.model.texture(GROUND).id
+        start = self.model.tex_adr[texture]
+        picture = self._painter.paint(rows)
+        self.model.tex_data[start : start + picture.size] = picture.ravel()
+        self._offscreen.upload(texture)
 
     def place(self, qpos: Any) -> None:
         """Puts the rover into the coordinates of its MJCF."""

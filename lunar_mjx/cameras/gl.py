@@ -141,6 +141,11 @@ class Offscreen:
         depth[buffer <= 0.0] = np.inf
         return depth[::-1].astype(np.float32), geoms[number[::-1]]
 
+    def upload(self, texture: int) -> None:
+        """Sends a texture of the model anew."""
+        self._context.make_current()
+        mujoco.mjr_uploadTexture(self._model, self._mjr, texture)
+
     def _render(self, colour: np.ndarray, depth: np.ndarray | None) -> None:
         if self._mjr is None:
             raise UserError("cameras: the renderer was closed; make a new one.")

@@ -18,7 +18,7 @@ from PIL import Image
 
 from lunar_mjx.cameras.mount import front_mount
 from lunar_mjx.cameras.pinhole import Pose
-from lunar_mjx.cameras.texture import ALBEDO, Track, paint_tracks, regolith
+from lunar_mjx.cameras.texture import ALBEDO, Track, TrackPainter, regolith
 from lunar_mjx.errors import bad_input
 from lunar_mjx.rover import Rover
 from lunar_mjx.rover.mjcf import quaternion
@@ -92,7 +92,7 @@ def build_scene(
     margin: float = 15.0,
     mount: Pose | None = None,
     fovy_deg: float = 60.0,
-) -> Any:
+) -> tuple[Any, TrackPainter]:
     """Compiles the scene.
 
     Args:
@@ -102,7 +102,7 @@ def build_scene(
       mount: of the camera "front" in the chassis frame; `front_mount` if None. fovy_deg: its angle of view.
 
     Returns:
-      The compiled `MjModel`.
+      The compiled `MjModel`, with untrodden ground, and what paints the tracks into its texture.
     """
     terrain = jax.device_get(terrain)
     spec = rover.spec()
@@ -112,7 +112,7 @@ def build_scene(
     visual.map.znear, visual.map.zfar = 0.02, 400.0
     visual.map.shadowclip, visual.map.shadowscale = 12.0, 0.9
     visual.quality.shadowsize, visual.quality.offsamples = 4096, 4
-    visual.headlight.ambient, visual.headlight.diffuse = [0.03] * 3, [0.0] * 3
+    visual.headlight.ambient, visual.headlight.diffuse = [0.04] * 3, [0.05] * 3
     visual.headlight.specular = [0.0] * 3
     spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
                      rgb1=[0, 0, 0], rgb2=[0, 0, 0], width=32, height=192)  # fmt: skip
@@ -122,17 +122,18 @@ def build_scene(
     low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
     near = cut(terrain, low, high, NODES)
     _add_far(spec, terrain, near)
-    _add_ground(spec, GROUND, near, _painted(near, tracks))
+    painter = _painter(near, tracks)
+    _add_ground(spec, GROUND, near, painter.paint(0))
     _add_rocks(spec, terrain, near)
     pose = mount or front_mount(rover)
     spec.body(rover.chassis).add_camera(name=FRONT, pos=pose.position, quat=quaternion(pose.rotation), fovy=fovy_deg)
-    return spec.compile()
+    return spec.compile(), painter
 
 
-def _painted(patch: Patch, tracks: Sequence[Track]) -> np.ndarray:
+def _painter(patch: Patch, tracks: Sequence[Track]) -> TrackPainter:
     extent = np.subtract(patch.high, patch.low)
     picture = regolith(TEXELS, float(extent.max()))
-    return paint_tracks(picture, patch.low, extent.tolist(), tracks)
+    return TrackPainter(picture, patch.low, extent.tolist(), tracks)
 
 
 def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray | None) -> None:

@@ -16,6 +16,8 @@ CONTRAST = 0.10
 """Deviation of the mottling, of the brightness."""
 
 _OCTAVES = 7
+_RUT, _PRINT = 205, 140
+"""Brightness of a track's bottom and of its bars, of 255."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,64 +49,75 @@ def regolith(size: int, metres: float, seed: int = 0) -> np.ndarray:
     return np.clip(255.0 * ALBEDO * (1.0 + grey[..., None]), 0, 255).astype(np.uint8)
 
 
-def paint_tracks(
-    picture: np.ndarray, low: Sequence[float], metres: Sequence[float], tracks: Sequence[Track]
-) -> np.ndarray:
-    """The picture with wheel tracks.
+class TrackPainter:
+    """Paints wheel tracks into a picture of the ground, row by row of the drive.
 
     Args:
       picture: (rows, cols, 3) uint8, north up.
       low: west and south edge, m. metres: extent east and north, m.
-      tracks: wheels' paths.
-
-    Returns:
-      A new picture: compacted soil a little darker, bars where grousers pressed.
+      tracks: wheels' paths, all with a place for each row of the drive.
     """
-    rows, cols = picture.shape[:2]
-    scale = np.array([cols / metres[0], rows / metres[1]])
-    shade = Image.new("L", (cols, rows), 255)
-    draw = ImageDraw.Draw(shade)
-    for track in tracks:
-        for a, b in _pieces(track.places):
-            draw.polygon(_bar(a, b, track.width, low, scale, rows), fill=205)
-    for track in tracks:
-        for middle, along in _prints(track.places, track.pitch):
-            a, b = middle - 0.12 * track.pitch * along, middle + 0.12 * track.pitch * along
-            draw.polygon(_bar(a, b, 0.94 * track.width, low, scale, rows), fill=140)
-    return (picture * (np.asarray(shade, np.float32)[..., None] / 255.0)).astype(np.uint8)
 
+    def __init__(
+        self, picture: np.ndarray, low: Sequence[float], metres: Sequence[float], tracks: Sequence[Track]
+    ) -> None:
+        self._ground, self._low = picture, np.asarray(low, float)
+        self._rows, cols = picture.shape[:2]
+        self._scale = np.array([cols / metres[0], self._rows / metres[1]])
+        self._shade = Image.new("L", (cols, self._rows), 255)
+        self._todo: list[tuple[int, list, int]] = []
+        for track in tracks:
+            self._todo += self._ruts(track) + self._prints(track)
+        self._todo.sort(key=lambda bar: bar[0])
 
-def _pieces(places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    return list(itertools.pairwise(thinned(places, 0.02)))
+    def paint(self, rows: int) -> np.ndarray:
+        """The picture after so many rows of the drive: soil a little darker, bars where grousers pressed."""
+        draw, count = ImageDraw.Draw(self._shade), 0
+        for row, corners, shade in self._todo:
+            if row >= rows:
+                break
+            draw.polygon(corners, fill=shade)
+            count += 1
+        del self._todo[:count]
+        return (self._ground * (np.asarray(self._shade, np.float32)[..., None] / 255.0)).astype(np.uint8)
+
+    def _ruts(self, track: Track) -> list[tuple[int, list, int]]:
+        kept = thinned(track.places, 0.02)
+        return [(int(j), self._bar(track.places[i], track.places[j], track.width), _RUT)
+                for i, j in itertools.pairwise(kept)]  # fmt: skip
+
+    def _prints(self, track: Track) -> list[tuple[int, list, int]]:
+        """A bar every `pitch` m of path."""
+        places, pitch = track.places, track.pitch
+        length = _along(places)
+        if pitch <= 0.0 or length[-1] < pitch:
+            return []
+        keep = np.concatenate([[True], np.diff(length) > 1e-9])
+
+        def place(at: np.ndarray) -> np.ndarray:
+            return np.stack([np.interp(at, length[keep], places[keep, i]) for i in range(2)], axis=-1)
+
+        at = np.arange(0.0, length[-1], pitch)
+        middle, way = place(at), place(at + 0.5 * pitch) - place(at - 0.5 * pitch)
+        way *= 0.12 * pitch / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+        # a little after the rut beneath it, which would else be painted over it
+        when = np.searchsorted(length, np.minimum(at + 0.03, length[-1]))
+        return [(int(w) + 1, self._bar(m - d, m + d, 0.94 * track.width), _PRINT)
+                for w, m, d in zip(when, middle, way, strict=True)]  # fmt: skip
+
+    def _bar(self, a: np.ndarray, b: np.ndarray, width: float) -> list[tuple[float, float]]:
+        """Corners in pixels of the bar from a to b."""
+        along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+        aside = 0.5 * width * np.array([-along[1], along[0]])
+        corners = (np.array([a + aside, b + aside, b - aside, a - aside]) - self._low) * self._scale
+        return [(float(u), float(self._rows - v)) for u, v in corners]
 
 
 def thinned(places: np.ndarray, step: float) -> np.ndarray:
-    """Every place that lies at least `step` m of path after the one before."""
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
-    _, first = np.unique((length / step).astype(int), return_index=True)
-    return places[first]
+    """Indices of places that lie at least `step` m of path after the one before."""
+    return np.unique((_along(places) / step).astype(int), return_index=True)[1]
 
 
-def _bar(a: np.ndarray, b: np.ndarray, width: float, low: Sequence[float], scale: np.ndarray, rows: int) -> list:
-    """Corners in pixels of the bar from a to b."""
-    along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
-    aside = 0.5 * width * np.array([-along[1], along[0]])
-    corners = (np.array([a + aside, b + aside, b - aside, a - aside]) - np.asarray(low)) * scale
-    return [(float(u), float(rows - v)) for u, v in corners]
-
-
-def _prints(places: np.ndarray, pitch: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Places and directions every `pitch` m of path."""
-    if pitch <= 0.0 or len(places) < 2:
-        return []
-    step = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    length = np.concatenate([[0.0], np.cumsum(step)])
-    at = np.arange(0.0, length[-1], pitch)
-    keep = np.concatenate([[True], step > 1e-9])
-    x, y = (np.interp(at, length[keep], places[keep, i]) for i in range(2))
-    middle = np.stack([x, y], axis=-1)
-    if len(middle) < 2:
-        return []
-    along = np.gradient(middle, axis=0)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    return list(zip(middle, along, strict=True))
+def _along(places: np.ndarray) -> np.ndarray:
+    """Length of the path up to each place, m."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])

@@ -80,7 +80,7 @@ class RecordedDrive:
 
     @functools.cached_property
     def slope(self) -> np.ndarray:
-        """Of the ground under the chassis: along and across the heading, (time, 2) deg, positive uphill and to the left."""
+        """Of the ground under the chassis, (time, 2) deg: along the heading (positive uphill), and up to the left."""
         x, y = self.position[:, 0], self.position[:, 1]
         east, north = (np.asarray(v, float) for v in gradient(self.model.terrain.field, x, y))
         yaw = np.radians(self.columns(["yaw_deg"])[:, 0])

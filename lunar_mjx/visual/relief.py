@@ -35,8 +35,8 @@ def relief(terrain: Terrain, low: np.ndarray, high: np.ndarray, most: int = 700,
     heights, cell = np.asarray(field.heights, float), float(field.cell)
     rows, cols = heights.shape
     origin = (float(field.x0), float(field.y0))
-    i0, i1 = (int(np.clip((v - origin[0]) / cell, 0, cols - 1)) for v in (low[0], high[0]))
-    j0, j1 = (int(np.clip((v - origin[1]) / cell, 0, rows - 1)) for v in (low[1], high[1]))
+    i0, i1 = (int(np.clip((v - origin[0]) / cell, 0, cols - 1)) for v in (low[0] - cell, high[0] + cell))
+    j0, j1 = (int(np.clip((v - origin[1]) / cell, 0, rows - 1)) for v in (low[1] - cell, high[1] + cell))
     step = max(1, round(max(i1 - i0, j1 - j0) / most))
     part = heights[j0 : j1 + 1 : step, i0 : i1 + 1 : step]
     if min(part.shape) < 2:

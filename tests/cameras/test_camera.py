@@ -10,7 +10,7 @@ from camera_scene import EYE
 
 from lunar_mjx.cameras import LABELS, Pinhole, RoverCamera, Sun, Track, look_at, orbit, project
 from lunar_mjx.cameras import gl as camera_gl
-from lunar_mjx.cameras.texture import paint_tracks, regolith, thinned
+from lunar_mjx.cameras.texture import TrackPainter, regolith, thinned
 from lunar_mjx.errors import UserError
 from lunar_mjx.rover import load_rover
 from lunar_mjx.terrain import flat
@@ -67,7 +67,11 @@ def test_tracks_darken_where_wheels_rolled():
     ground = regolith(400, 4.0)
     assert ground.shape == (400, 400, 3) and 0.02 < ground.std() / ground.mean() < 0.3
     line = np.stack([np.linspace(0.5, 3.5, 200), np.full(200, 1.0)], axis=-1)
-    painted = paint_tracks(ground, (0.0, 0.0), (4.0, 4.0), [Track(line, 0.2)])
+    painter = TrackPainter(ground, (0.0, 0.0), (4.0, 4.0), [Track(line, 0.2)])
+    assert (painter.paint(0) == ground).all()
+    half = painter.paint(100).astype(float).mean(-1) / np.maximum(ground.mean(-1), 1.0)
+    assert half[300, 150] < 0.85 and half[300, 250] > 0.98
+    painted = painter.paint(200)
     change = painted.astype(float).mean(-1) / np.maximum(ground.mean(-1), 1.0)
     inside = change[295:305, 60:340]  # row 300 is y = 1 m, north up
     assert inside.max() < 0.85 and inside.min() < 0.6
@@ -109,7 +113,7 @@ def test_tracks_show_in_the_picture(opengl):
     with RoverCamera(load_rover("luvmi_x"), flat(20.0), np.zeros((1, 2)), EYE, sun=Sun(180.0, 60.0), tracks=[track],
                      margin=6.0, largest=(200, 200), backends=opengl, untrodden=True) as camera:  # fmt: skip
         above, optics = look_at((0.0, 1.0, 5.0), (0.0, 1.0, 0.0), up=(0.0, 1.0, 0.0)), Pinhole(200, 200, 50.0)
-        before = camera.picture(above, optics).astype(float).mean(-1)
+        before = np.maximum(camera.picture(above, optics).astype(float).mean(-1), 1.0)
         camera.roll(51)
         half = camera.picture(above, optics).astype(float).mean(-1) / before
         camera.roll(101)

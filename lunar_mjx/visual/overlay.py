@@ -1,0 +1,178 @@
+"""What is drawn over a video: numbers, a map with the path, and slip and temperature over time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from lunar_mjx.visual.plots import WHEEL_STYLES, bounds
+from lunar_mjx.visual.recorded import RecordedDrive
+from lunar_mjx.visual.relief import relief, rocks_within
+
+_GLASS = (10, 12, 16, 170)
+_TEXT, _FAINT, _PATH, _HOT = (240, 240, 240), (150, 155, 160), (120, 190, 255), (255, 140, 70)
+
+
+def wheel_colour(corner: str) -> tuple[int, int, int]:
+    """RGB of a wheel's line on a dark ground: sides differ in colour as in the plots, rear wheels are dimmer."""
+    colour = WHEEL_STYLES.get(corner, ("#888888",))[0]
+    bright = 0.62 if corner in ("lr", "rr") else 1.0
+    red, green, blue = (round(bright * min(255, int(colour[i : i + 2], 16) + 60)) for i in (1, 3, 5))
+    return red, green, blue
+
+
+class Overlay:
+    """Draws on pictures of one size.
+
+    Args:
+      drive: shown. size: width and height of the pictures, pixels. with_map: whether to inset a map.
+    """
+
+    def __init__(self, drive: RecordedDrive, size: tuple[int, int], with_map: bool = True) -> None:
+        self._drive, self._size = drive, size
+        small = max(10, size[1] // 42)
+        self._font = ImageFont.load_default(small)
+        self._line = round(1.35 * small)
+        self._slip = drive.per_wheel("wheel_{}_slip_ratio")
+        self._sinkage = 1e3 * drive.per_wheel("wheel_{}_sinkage_m").max(axis=1)
+        self._hot = drive.per_motor("winding_{}_temperature_degC").max(axis=1)
+        self._strip, self._frames = self._draw_strip()
+        self._map = MapInset(drive, round(0.30 * size[1])) if with_map else None
+
+    def draw(self, picture: np.ndarray, row: int) -> np.ndarray:
+        """The picture with everything that is known at a row of the drive, (height, width, 3) uint8."""
+        image = Image.fromarray(picture).convert("RGBA")
+        width, height = self._size
+        image.alpha_composite(self._strip, (0, height - self._strip.height))
+        draw = ImageDraw.Draw(image)
+        share = (self._drive.time[row] - self._drive.time[0]) / (self._drive.time[-1] - self._drive.time[0])
+        for left, right, top, bottom in self._frames:
+            x = left + share * (right - left)
+            draw.line([x, height - self._strip.height + top, x, height - self._strip.height + bottom], fill=_TEXT)
+        self._draw_numbers(image, row)
+        if self._map is not None:
+            inset = self._map.draw(row)
+            image.alpha_composite(inset, (width - inset.width - 8, 8))
+        return np.asarray(image.convert("RGB"))
+
+    def _draw_numbers(self, image: Image.Image, row: int) -> None:
+        drive = self._drive
+        along, across = drive.slope[row]
+        lines = [
+            f"{drive.model.rover.name} on {drive.model.terrain.name}",
+            f"time      {drive.time[row]:7.1f} s",
+            f"speed     {100 * drive.speed[row]:7.1f} cm/s",
+            f"slope     {along:7.1f}° along",
+            f"          {across:7.1f}° across",
+            f"slip      {np.nanmean(self._slip[row]):7.2f} mean",
+            f"sinkage   {self._sinkage[row]:7.1f} mm deepest",
+            f"winding   {self._hot[row]:7.1f} °C hottest",
+        ]
+        pad = self._line // 2
+        widest = max(self._font.getlength(lines[0]), 10.0 * self._line)
+        glass = Image.new("RGBA", (round(widest) + 2 * pad, len(lines) * self._line + 2 * pad), _GLASS)
+        draw = ImageDraw.Draw(glass)
+        for i, line in enumerate(lines):
+            name, rest = (line, "") if i == 0 else (line[:10].strip(), line[10:])
+            y = pad + i * self._line
+            draw.text((pad, y), name, font=self._font, fill=_TEXT if i == 0 else _FAINT)
+            if rest:
+                draw.text((pad + 4.6 * self._line, y), rest.strip(), font=self._font, fill=_TEXT)
+        image.alpha_composite(glass, (8, 8))
+
+    def _draw_strip(self) -> tuple[Image.Image, list[tuple[float, float, float, float]]]:
+        """Slip of the wheels and the hottest winding over the whole drive, and where the two plots lie."""
+        width, height = self._size[0], round(0.2 * self._size[1])
+        strip = Image.new("RGBA", (width, height), _GLASS)
+        draw = ImageDraw.Draw(strip)
+        top, bottom = 1.6 * self._line, height - 0.5 * self._line
+        frames = [
+            (4.0 * self._line, 0.49 * width, top, bottom),
+            (0.49 * width + 5.0 * self._line, width - 14, top, bottom),
+        ]
+        slip = np.clip(np.nan_to_num(self._slip), -1.0, 1.0)
+        low, high = min(0.0, float(np.percentile(slip, 1))), max(0.5, float(np.percentile(slip, 99)))
+        colours = [wheel_colour(c) for c in self._drive.corners]
+        self._plot(draw, frames[0], slip, low, high, colours, "slip ratio")
+        x = frames[0][0] + 5.5 * self._line
+        for corner, colour in zip(self._drive.corners, colours, strict=True):
+            draw.text((x, 0.3 * self._line), corner, font=self._font, fill=colour)
+            x += 1.8 * self._line
+        hot = self._hot[:, None]
+        self._plot(draw, frames[1], hot, float(hot.min()), max(float(hot.max()), float(hot.min()) + 1.0), [_HOT],
+                   "hottest winding, °C")  # fmt: skip
+        return strip, frames
+
+    def _plot(
+        self, draw: Any, frame: tuple[float, float, float, float], values: np.ndarray, low: float, high: float,
+        colours: list[tuple[int, int, int]], title: str,
+    ) -> None:  # fmt: skip
+        left, right, top, bottom = frame
+        draw.text((left, 0.3 * self._line), title, font=self._font, fill=_TEXT)
+        for value in (low, high):
+            y = bottom - (value - low) / (high - low) * (bottom - top)
+            draw.line([left, y, right, y], fill=(90, 95, 100))
+            label = f"{value:.3g}"
+            draw.text(
+                (left - 6 - self._font.getlength(label), y - 0.6 * self._line), label, font=self._font, fill=_FAINT
+            )
+        time = self._drive.time
+        x = left + (time - time[0]) / (time[-1] - time[0]) * (right - left)
+        for column, colour in zip(values.T, colours, strict=True):
+            y = bottom - (np.clip(column, low, high) - low) / (high - low) * (bottom - top)
+            draw.line(list(zip(x.tolist(), y.tolist(), strict=True)), fill=colour, width=2)
+
+
+class MapInset:
+    """A small map of the whole path, north up, with the part driven so far.
+
+    Args:
+      drive: shown. size: pixels of a side.
+    """
+
+    def __init__(self, drive: RecordedDrive, size: int) -> None:
+        self._drive = drive
+        low, high = bounds(drive.position[:, :2], 0.25)
+        ground = relief(drive.terrain, low, high)
+        self._low, self._scale, self._size = low, size / (high - low), size
+        grey = Image.fromarray((255 * ground.grey[::-1]).astype(np.uint8))
+        edges = [
+            (v - a) * s
+            for v, a, s in (
+                (ground.west, low[0], self._scale[0]),
+                (ground.east, low[0], self._scale[0]),
+                (ground.south, low[1], self._scale[1]),
+                (ground.north, low[1], self._scale[1]),
+            )
+        ]
+        west, east, south, north = edges
+        self._base = Image.new("RGBA", (size, size), (30, 30, 30, 255))
+        placed = grey.resize((max(1, round(east - west)), max(1, round(north - south))), Image.Resampling.BICUBIC)
+        self._base.paste(placed.convert("RGBA"), (round(west), round(size - north)))
+        draw = ImageDraw.Draw(self._base)
+        for x, y, radius in rocks_within(drive.terrain, low, high):
+            u, v = self._pixel(np.array([x, y]))
+            r = max(1.0, radius * self._scale[0])
+            draw.ellipse([u - r, v - r, u + r, v + r], fill=(58, 58, 58))
+        self._path = [self._pixel(p) for p in drive.position[:, :2]]
+        draw.line(self._path, fill=(235, 235, 235), width=1)
+        draw.rectangle([0, 0, size - 1, size - 1], outline=(200, 200, 200))
+
+    def _pixel(self, place: np.ndarray) -> tuple[float, float]:
+        u, v = (place - self._low) * self._scale
+        return float(u), float(self._size - v)
+
+    def draw(self, row: int) -> Image.Image:
+        """The map at a row of the drive."""
+        image = self._base.copy()
+        draw = ImageDraw.Draw(image)
+        if row:
+            draw.line(self._path[: row + 1], fill=_PATH, width=3)
+        yaw = np.radians(self._drive.table["yaw_deg"].to_numpy(float)[row])
+        u, v = self._path[row]
+        r = max(5.0, 0.035 * self._size)
+        nose = [(u + k * r * np.cos(yaw + t), v - k * r * np.sin(yaw + t)) for k, t in ((1.4, 0), (1, 2.5), (1, -2.5))]
+        draw.polygon(nose, fill=(255, 196, 60), outline=(40, 30, 0))
+        return image
