@@ -206,7 +206,7 @@ OUTSIDE: Mapping[str, Kind] = {k.name: k for k in (
     Kind("speed_stiffness", _amount(0.1, 0.3), _scaled("speed_stiffness", "k_c k_phi", lambda v, p: np.maximum(
         1.0 - v["s"], 0.1) ** p["amount"]), _SOIL),
     Kind("cable_drag", _amount(0.03, 0.08), _added("cable_drag", "fx", lambda v, p: -p["amount"] * 1500.0 * v["r"]
-                                                   * v["b"] * np.cos(v["beta"])), _SHEAR),
+                                                   * v["b"] * np.cos(v["beta"])), ("wheel_shear", "wheel_normal")),
     Kind("side_offset", _amount(0.03, 0.08), _added("side_offset", "fy", lambda v, p: p["amount"] * 1500.0 * v["r"]
                                                     * v["b"]), _SHEAR),
     Kind("load_friction", _amount(0.08, 0.2), _scaled("load_friction", "tan_phi", lambda v, p: _loaded(v)

@@ -15,7 +15,7 @@ import pandas as pd
 from . import bed_effects, bed_logs
 from .bed_logs import QUANTITIES, Truth
 from .noise import NOISES, Recipe
-from .separable import SEPARABLE, left_over
+from .separable import SEPARABLE, left_over, nearest
 
 GROUPS: Mapping[str, int] = {
     "nulls": 400, "singles": 300, "singles_x5": 100, "pairs": 100, "triples": 30, "outside": 100, "undecidable": 50,
@@ -132,13 +132,16 @@ def _several(many: int) -> Callable[[Rng, int], tuple[Truth, Recipe, float, str]
 
 
 def _outside(rng: Rng, number: int) -> tuple[Truth, Recipe, float, str]:
+    """An effect that neither a refit of the soil nor any one effect of the catalogue imitates."""
     kinds = list(bed_effects.OUTSIDE)
     for k in range(len(kinds)):
-        try:
-            truth, left = _hiding(rng, (kinds[(number + k) % len(kinds)],))
-        except RuntimeError:
-            continue  # a refit of the soil absorbs this kind whatever its size
-        return truth, _noise(number), left, ""
+        for _ in range(6):
+            truth = bed_logs.draw(rng, (kinds[(number + k) % len(kinds)],), bed_logs.grid(rng))
+            left = left_over(truth, [])
+            left = min(left, nearest(truth)[1]) if left >= SEPARABLE else left
+            if left >= SEPARABLE:
+                return truth, _noise(number), left, ""
+        # a refit of the soil, or an effect of the catalogue, imitates this kind
     raise RuntimeError("no effect outside the catalogue can be separated by a table")
 
 

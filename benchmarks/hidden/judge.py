@@ -35,7 +35,7 @@ def outcome(row: Mapping[str, Any], tells: Tells) -> dict[str, Any]:
     if group == "undecidable":
         return _undecidable(row, hidden, named, says)
     if group == "outside":
-        return _outside(verdict, named, tells)
+        return _outside(verdict)
     if group in ("pairs", "triples"):
         return _several(verdict, hidden, named)
     return _single(group, verdict, hidden, named, tells)
@@ -66,11 +66,9 @@ def _several(verdict: str, hidden: set[str], named: set[str]) -> dict[str, Any]:
     return _is(False, verdict.lower())
 
 
-def _outside(verdict: str, named: set[str], tells: Tells) -> dict[str, Any]:
+def _outside(verdict: str) -> dict[str, Any]:
     if verdict in ("UNKNOWN", "KNOWN_CLASS"):
         return _is(True, verdict.lower())
-    if verdict == "KNOWN" and tells(next(iter(named))) < TELLS:
-        return _is(True, "imitated")
     return _is(False, "wrong name" if verdict in NAMES else verdict.lower(), verdict in NAMES)
 
 
