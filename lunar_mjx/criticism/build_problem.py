@@ -23,6 +23,10 @@ NO_CANDIDATE = frozenset({
 """Effects that are an arrangement of the test which its user knows, an engine's substitute for physics, or without a
 derivative: they are never proposed as missing."""
 
+TABLE_ONLY = frozenset({"slide_softening", "side_entry", "shear_softening", "skid_shear", "side_wall"})
+"""Finer forms of slip_sinkage, angle_sinkage and bulldozing: only a test bed that imposes slip and slip angle can tell
+them from these, so they are proposed for tables and not for drives."""
+
 
 def candidate_effects(run: Run) -> dict[str, Effect]:
     """Every effect that may be proposed: the catalogue's, and the user's own."""
@@ -56,6 +60,7 @@ def build_problem(
         candidates = {n: candidates[n] for n in only}
     if isinstance(logs[0], SteadyLog):
         return table_problem(run, logs, candidates)
+    candidates = {n: e for n, e in candidates.items() if n not in TABLE_ONLY or n in (only or ())}
     return DriveProblem(logs, run.model, candidates, run.splits, progress=progress)  # type: ignore[arg-type]
 
 

@@ -36,7 +36,7 @@ _ANGLES = "Wong & Reece 1967, J. Terramechanics 4(1):81"
 @effect(
     "wheel_normal",
     order=1,
-    c1=Parameter(0.4, 0.5, (0.2, 0.8), "1", "theta_m/theta_1 without slip", "Ishigami et al. 2007: a_0 = 0.4"),
+    c1=Parameter(0.4, 0.5, (0.05, 0.95), "1", "theta_m/theta_1 without slip", "Ishigami et al. 2007: a_0 = 0.4"),
     c2=Parameter(0.15, 0.0, (-0.5, 0.5), "1", "its growth with slip", "Ishigami et al. 2007: a_1 = 0.15"),
     c3=Parameter(0.2, 0.0, (0.0, 0.9), "1", "-theta_2/theta_1 without slip",
                  "choice: rear contact of dry sand, " + _ANGLES),
