@@ -44,6 +44,18 @@ def run(args: argparse.Namespace) -> None:
     print(f"{number} cases done, {len(left) - number} left")
 
 
+def summary(args: argparse.Namespace) -> None:
+    """The table of all results, with intervals, as JSON and text; and the confusion matrix."""
+    import json
+
+    from benchmarks.hidden import runner
+    from benchmarks.hidden import summary as tables
+
+    seeds = [p.with_suffix(".seed.json") for p in args.results]
+    drawn = [json.loads(p.read_text(encoding="utf-8")) for p in seeds if p.is_file()]
+    print(tables.write(runner.read_rows(args.results), args.out, drawn))
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     whole = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -58,6 +70,10 @@ def parser() -> argparse.ArgumentParser:
     tables.add_argument("--suggest", action="store_true", help="ask for formulas where the effect is not listed")
     tables.add_argument("--keep", type=Path, help="folder in which logs and runs stay")
     tables.set_defaults(do=run)
+    table = verbs.add_parser("summary", help="figures with intervals, and the confusion matrix")
+    table.add_argument("results", type=Path, nargs="+", help="JSON lines")
+    table.add_argument("--out", type=Path, required=True, help="without ending: .json and .png are written")
+    table.set_defaults(do=summary)
     return whole
 
 

@@ -1,0 +1,182 @@
+"""The benchmark's table: every row with counts, Wilson 95 % intervals and its target; and the confusion matrix."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .judge import NAMES
+
+Row = Mapping[str, Any]
+_Z = 1.959964
+
+
+def wilson(hits: int, number: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    if number == 0:
+        return 0.0, 1.0
+    p, z2 = hits / number, _Z**2 / number
+    middle = (p + 0.5 * z2) / (1.0 + z2)
+    half = _Z * np.sqrt(p * (1.0 - p) / number + 0.25 * z2 / number) / (1.0 + z2)
+    return float(max(0.0, middle - half)), float(min(1.0, middle + half))
+
+
+def share(rows: Sequence[Row], hit: Callable[[Row], bool]) -> dict[str, Any]:
+    """Count, share and interval."""
+    hits = sum(bool(hit(r)) for r in rows)
+    low, high = wilson(hits, len(rows))
+    return {"hits": hits, "of": len(rows), "share": hits / len(rows) if rows else None, "low": low, "high": high}
+
+
+def _spread(values: Sequence[float], *quantiles: float) -> dict[str, Any]:
+    known = [v for v in values if v is not None and np.isfinite(v)]
+    out: dict[str, Any] = {"of": len(known)}
+    for q in quantiles:
+        out[f"q{100 * q:g}"] = float(np.quantile(known, q)) if known else None
+    return out
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Every figure of the benchmark, for all rows and by kind of log."""
+    kinds = sorted({r["kind"] for r in rows})
+    return {"all": _figures(rows), **{k: _figures([r for r in rows if r["kind"] == k]) for k in kinds}}
+
+
+def _figures(rows: Sequence[Row]) -> dict[str, Any]:
+    by = {g: [r for r in rows if r["group"] == g] for g in {r["group"] for r in rows}}
+
+    def group(name: str) -> list[Row]:
+        return by.get(name, [])
+
+    right: Callable[[Row], bool] = lambda r: r["right"]  # noqa: E731
+    wrong: Callable[[Row], bool] = lambda r: r["wrong_name"]  # noqa: E731
+    nulls, outside = group("nulls"), group("outside")
+    suggested = [r for r in outside if r.get("suggestions")]
+    named = [r for r in rows if r["right"] and r["verdict"] in NAMES and r.get("over_floor")]
+    values = [p for r in named if r["group"] == "singles" for p in r.get("parameters", ())]
+    return {
+        "singles": {"target": ">= 0.97", **share(group("singles"), right)},
+        "singles, wrong name": share(group("singles"), wrong),
+        "singles at 5 times the noise": {"target": ">= 0.80", **share(group("singles_x5"), right)},
+        "singles at 5 times the noise, wrong name": {"target": "<= 0.02", **share(group("singles_x5"), wrong)},
+        "nulls, false alarm": {"target": "<= 0.01", **share(nulls, lambda r: r["outcome"] == "false alarm")},
+        "nulls, something named": share(nulls, wrong),
+        "nulls, not answered": share(nulls, lambda r: r["outcome"] in ("refused", "crash")),
+        "pairs, all named": {"target": ">= 0.85", **share(group("pairs"), right)},
+        "pairs, wrong name": share(group("pairs"), wrong),
+        "triples, all named": {"target": ">= 0.70", **share(group("triples"), right)},
+        "outside the catalogue": {"target": ">= 0.90", **share(outside, right)},
+        "outside, right port": {"target": ">= 0.85", **share(
+            [r for r in outside if r["verdict"] == "UNKNOWN"], lambda r: r.get("port") in r.get("true_ports", ()))},
+        "outside, one of three formulas fits": {"target": ">= 0.80", **share(
+            suggested, lambda r: any(s.get("at_noise") for s in r["suggestions"]))},
+        "undecidable, called so": {"target": ">= 0.95", **share(group("undecidable"), right)},
+        "sabotaged, BAD_DATA": {"target": ">= 0.95", **share(group("sabotaged"), right)},
+        "dirt, wrong name": share(group("dirt"), wrong),
+        "held-out error over the floor": {
+            "target": "median <= 1.01, 95th percentile <= 1.03",
+            **_spread([r["over_floor"] for r in named], 0.5, 0.95)},
+        "relative parameter error": {
+            "target": "median <= 0.02, 90th percentile <= 0.10", **_spread([p["error"] for p in values], 0.5, 0.9)},
+        "95 % interval covers": {"target": "0.93 to 0.97", **share(values, lambda p: p["covered"])},
+        "seconds": _spread([r.get("seconds", 0.0) for r in rows], 0.5, 0.9),
+        "crashes": share(rows, lambda r: r["verdict"] == "CRASH"),
+        "by effect": _by_effect(group("singles")),
+        "dirt by size": _by_dirt(group("dirt")),
+        "by noise": {n: share([r for r in group("nulls") if r.get("noise") == n],
+                              lambda r: r["outcome"] == "false alarm")
+                     for n in sorted({str(r.get("noise")) for r in group("nulls")})},
+    }  # fmt: skip
+
+
+def _by_effect(rows: Sequence[Row]) -> dict[str, Any]:
+    names = sorted({n for r in rows for n in r["truth"]["effects"]})
+    return {n: share([r for r in rows if n in r["truth"]["effects"]], lambda r: r["right"]) for n in names}
+
+
+def _by_dirt(rows: Sequence[Row]) -> dict[str, Any]:
+    out = {}
+    for size in sorted({r["dirt"] for r in rows}):
+        here = [r for r in rows if r["dirt"] == size]
+        verdicts = sorted({r["verdict"] for r in here})
+        out[f"{size:g}"] = {"wrong name": share(here, lambda r: r["wrong_name"]),
+                            **{v: sum(r["verdict"] == v for r in here) for v in verdicts}}  # fmt: skip
+    return out
+
+
+def text(figures: Mapping[str, Any]) -> str:
+    """The table as plain text."""
+    lines = []
+    for name, f in figures.items():
+        if "hits" in f and f["of"]:
+            value = f"{f['hits']}/{f['of']} = {100 * f['share']:.1f} % ({100 * f['low']:.1f} to {100 * f['high']:.1f})"
+        elif "q50" in f and f["of"]:
+            value = ", ".join(f"{k} {v:.4g}" for k, v in f.items() if k.startswith("q")) + f" (of {f['of']})"
+        else:
+            continue
+        lines.append(f"{name:<42} {value:<42} {f.get('target', '')}")
+    return "\n".join(lines)
+
+
+def confusion(rows: Sequence[Row]) -> tuple[list[str], list[str], np.ndarray]:
+    """Counts of answers by truth, over nulls, singles and effects outside the catalogue."""
+    known = sorted({n for r in rows if r["group"] == "singles" for n in r["truth"]["effects"]})
+    truths = ["nothing", *known, "outside"]
+    answers = ["NOISE_ONLY", *known, "another effect", "a class", "MULTIPLE", "UNKNOWN", "BAD_DATA, BAD_FIT"]
+    counts = np.zeros((len(truths), len(answers)), int)
+    for r in rows:
+        if r["group"] not in ("nulls", "singles", "outside"):
+            continue
+        truth = {"nulls": "nothing", "outside": "outside"}.get(r["group"]) or next(iter(r["truth"]["effects"]), "")
+        if truth in truths:
+            counts[truths.index(truth), answers.index(_answer(r, known))] += 1
+    return truths, answers, counts
+
+
+def _answer(r: Row, known: Sequence[str]) -> str:
+    if r["verdict"] == "KNOWN":
+        return r["named"][0] if r["named"][0] in known else "another effect"
+    return {"KNOWN_CLASS": "a class"}.get(
+        r["verdict"], r["verdict"] if r["verdict"] in ("NOISE_ONLY", "MULTIPLE", "UNKNOWN") else "BAD_DATA, BAD_FIT"
+    )
+
+
+def plot(rows: Sequence[Row], path: Path) -> None:
+    """Confusion matrix; counts are written in the cells, the shade is the share of the row (legible in grey)."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    truths, answers, counts = confusion(rows)
+    part = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    figure, axes = plt.subplots(figsize=(2.5 + 0.55 * len(answers), 2.0 + 0.45 * len(truths)), layout="constrained")
+    axes.imshow(part, cmap="Greys", vmin=0.0, vmax=1.0, aspect="auto")
+    for i, j in np.argwhere(counts > 0):
+        axes.text(j, i, str(counts[i, j]), ha="center", va="center", color="white" if part[i, j] > 0.5 else "black")
+    axes.set_xticks(range(len(answers)), answers, rotation=45, ha="right")
+    axes.set_yticks(range(len(truths)), [f"{t} ({n})" for t, n in zip(truths, counts.sum(axis=1), strict=True)])
+    axes.set_xlabel("answer")
+    axes.set_ylabel("hidden (cases)")
+    axes.set_xticks(np.arange(-0.5, len(answers)), minor=True)
+    axes.set_yticks(np.arange(-0.5, len(truths)), minor=True)
+    axes.grid(which="minor", color="0.8", linewidth=0.6)
+    axes.tick_params(which="minor", length=0)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def write(rows: Sequence[Row], out: Path, seeds: Sequence[Mapping[str, Any]]) -> str:
+    """Writes `OUT.json` and `OUT.png`; returns the table as text."""
+    figures = summarise(rows)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    shown = ("case", "kind", "seed", "verdict", "named", "outcome", "right", "wrong_name")
+    cases = [{k: r.get(k) for k in shown} for r in rows]
+    content = {"figures": figures, "campaigns": list(seeds), "cases": cases}
+    out.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    plot(rows, out.with_suffix(".png"))
+    return "\n\n".join(f"{kind}\n{text(f)}" for kind, f in figures.items())
