@@ -12,7 +12,8 @@ _BAND = 20
 """Episodes in the moving mean of curves by episode."""
 
 
-def _figure(columns: int, width: float = 5.0, height: float = 3.6) -> Any:
+def new_figure(columns: int, width: float = 5.0, height: float = 3.6) -> Any:
+    """A figure with one row of axes, and those axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -42,7 +43,7 @@ def mean_interval(curves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str = "") -> Path:
     """Return and success over environment steps, and success on unseen ground over wall time; a line per record."""
-    figure, (first, second, third) = _figure(3)
+    figure, (first, second, third) = new_figure(3)
     for record in records:
         rows = [r for r in record["rows"] if r.get("episode_return") is not None]
         steps, label = [r["steps"] for r in rows], f"seed {record['seed']}"
@@ -67,7 +68,7 @@ def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path,
       path: of the picture.
       most: episodes to show; as many as every seed has if None.
     """
-    figure, (axes,) = _figure(1, 6.0)
+    figure, (axes,) = new_figure(1, 6.0)
     styles = ["-", "--", "-.", ":"]
     for i, (name, records) in enumerate(groups.items()):
         curves = [moving_mean(r["episodes"]["episode_return"]) for r in records]

@@ -97,11 +97,13 @@ def train(
 
 
 AgentArgument = Annotated[str, typer.Argument(help="policy.npz, a shipped policy's rover, or zero, random, scripted.")]
+AgentOption = Annotated[str | None, typer.Option("--agent", help="The same as an option, for zero, random, scripted.")]
 TaskOption = Annotated[str, typer.Option(help="Task for agents without a policy: paper, consistent or large.")]
 
 
 def evaluate(
-    agent: AgentArgument,
+    agent: AgentArgument = "luvmi_x",
+    agent_option: AgentOption = None,
     episodes: Annotated[int, typer.Option(min=1)] = 256,
     seed: Annotated[int, typer.Option(min=0)] = 54321,
     task: TaskOption = "large",
@@ -119,7 +121,7 @@ def evaluate(
     from lunar_mjx.agents.play import open_agent
     from lunar_mjx.agents.run import unseen_params
 
-    made, act, unseen = open_agent(agent, task, env_options(env))
+    made, act, unseen = open_agent(agent_option or agent, task, env_options(env))
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}
     params = made.params if seen and terrain is None else unseen_params(made, {} if seen else unseen)
@@ -130,12 +132,15 @@ def evaluate(
     print(", ".join(f"{name} {100 * share:.1f} %" for name, share in score.ends.items()))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps({"agent": agent, **score.record()}, indent=1) + "\n", encoding="utf-8")
+        out.write_text(
+            json.dumps({"agent": agent_option or agent, **score.record()}, indent=1) + "\n", encoding="utf-8"
+        )
         print(out)
 
 
 def play(
     agent: AgentArgument = "luvmi_x",
+    agent_option: AgentOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("runs/play"),
     seed: Annotated[int, typer.Option(min=0)] = 0,
     task: TaskOption = "large",
@@ -152,7 +157,7 @@ def play(
     from lunar_mjx.agents.play import open_agent, play_episode
     from lunar_mjx.agents.run import unseen_params
 
-    made, act, unseen = open_agent(agent, task, env_options(env))
+    made, act, unseen = open_agent(agent_option or agent, task, env_options(env))
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}
     episode = play_episode(made, unseen_params(made, unseen), act, seed)

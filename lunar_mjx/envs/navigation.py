@@ -81,7 +81,7 @@ class Inner:
 
 
 class NavigationEnv:
-    """Drive to a goal over lunar terrain; see `docs/training.md` and `NavigationConfig`.
+    """Drive to a goal over lunar terrain; see `docs/reinforcement_learning.md` and `NavigationConfig`.
 
     Args:
       model: rover, terrain and effects.

@@ -72,8 +72,8 @@ def test_ddpg(batch):
         error = hand.value(0, b.obs, b.privileged, b.action) - target
         kernel, bias = hand.critic_step(0, b, target)
         actor = hand.actor_step(b, kernel)
-        close = {"rtol": 0, "atol": 2e-7}
-        assert float(losses["critic_loss"]) == pytest.approx((error**2).mean(), abs=1e-7)
+        close = {"rtol": 0, "atol": 1e-6}
+        assert float(losses["critic_loss"]) == pytest.approx((error**2).mean(), abs=1e-6)
         np.testing.assert_allclose(linear(new.critic)[0][0], kernel, **close)
         np.testing.assert_allclose(linear(new.critic)[1][0], bias, **close)
         for found, wanted in zip(linear(new.actor), actor, strict=True):
@@ -97,8 +97,8 @@ def test_td3_takes_the_least_target_and_waits_with_the_policy(batch):
         target = b.reward + b.discount * np.minimum(*values)
         assert (values[0] < values[1]).any() and (values[1] < values[0]).any(), "both critics count"
         errors = [hand.value(i, b.obs, b.privileged, b.action) - target for i in (0, 1)]
-        close = {"rtol": 0, "atol": 2e-7}
-        assert float(losses["critic_loss"]) == pytest.approx(sum((e**2).mean() for e in errors), abs=1e-7)
+        close = {"rtol": 0, "atol": 1e-6}
+        assert float(losses["critic_loss"]) == pytest.approx(sum((e**2).mean() for e in errors), abs=1e-6)
         for i in (0, 1):
             kernel, bias = hand.critic_step(i, b, target)
             np.testing.assert_allclose(linear(first.critic)[0][i], kernel, **close)
@@ -132,7 +132,7 @@ def test_projection_keeps_probability_and_mean_and_clips():
     places = 0.2 + 0.5 * support[None]
     out = project(support, places, probabilities)
     assert float(out.sum()) == pytest.approx(1.0)
-    assert float(out @ support) == pytest.approx(float((places * probabilities).sum()), abs=1e-6)
+    assert float((out @ support)[0]) == pytest.approx(float((places * probabilities).sum()), abs=1e-6)
     # 0.2 lies 0.4 of a step above 0: shares by hand, all mass at one place
     one = project(support, jnp.full((1, 5), 0.2), probabilities)
     np.testing.assert_allclose(one[0], [0, 0, 0.6, 0.4, 0], atol=1e-6)
@@ -147,7 +147,7 @@ def test_distributional_critic_learns_the_mean(batch):
     agent = TD3(config, 2, 1, 1)
     state = agent.init(jax.random.PRNGKey(0))
     update = jax.jit(lambda s, k: agent.update(s, b, k)[0])
-    for i in range(400):
+    for i in range(250):
         state = update(state, jax.random.PRNGKey(i))
     out = agent.critics.apply(state.critic, jnp.concatenate([b.obs, b.privileged], 1), b.action)
     np.testing.assert_allclose(agent.mean_value(jax.nn.softmax(out, -1)), np.tile(b.reward, (2, 1)), atol=0.15)

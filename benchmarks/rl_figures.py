@@ -1,0 +1,148 @@
+"""Curves, tables and model cards from what rl_proof.py measured; no number is typed in by hand.
+
+python benchmarks/rl_figures.py runs/proof                        # figures to docs/figures, tables to the screen
+python benchmarks/rl_figures.py runs/proof --ship luvmi_x         # also the policy and its card to models/luvmi_x
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.agents.curves import mean_interval, new_figure, plot_episodes
+
+ROOT = Path(__file__).parents[1]
+_LIMIT = 2_000_000
+"""Bytes that a shipped policy may have."""
+
+
+def read(folder: Path, name: str) -> dict[str, Any] | None:
+    path = folder / f"rl_{name}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def percent(score: dict[str, Any]) -> str:
+    return f"{100 * score['success']:.1f} % ({100 * score['low']:.1f} to {100 * score['high']:.1f})"
+
+
+def plot_large(record: dict[str, Any], path: Path) -> None:
+    """Success on unseen ground and return in training over wall time; the agents that learn nothing as lines."""
+    figure, (left, right) = new_figure(2)
+    for seed in record["seeds"]:
+        found = seed["unseen"]
+        left.plot([s["elapsed_s"] for s in found], [100 * s["success"] for s in found], "o-", ms=3, lw=1,
+                  label=f"seed {seed['seed']}")  # fmt: skip
+        rows = [r for r in seed["rows"] if r.get("episode_return") is not None]
+        right.plot([r["elapsed_s"] for r in rows], [r["episode_return"] for r in rows], lw=1)
+    for style, (name, score) in zip(("--", "-.", ":", (0, (1, 4))), record["agents"].items(), strict=False):
+        left.axhline(100 * score["success"], color="0.5", lw=0.8, ls=style, label=name)
+    left.axhline(100 * record["target"], color="0.7", lw=0.8)
+    left.set(xlabel="wall time of training, s", ylabel="success on unseen ground, %", ylim=(-3, 103))
+    right.set(xlabel="wall time of training, s", ylabel="return of ended episodes in training")
+    left.legend(frameon=False, fontsize=7)
+    figure.savefig(path, dpi=120)
+
+
+def table_large(record: dict[str, Any]) -> list[str]:
+    lines = [f"Large batch, {record['rover']}, {record['about']['device']}:"]
+    for name, score in record["agents"].items():
+        lines.append(f"  {name:10s} {percent(score)}")
+    for seed in record["seeds"]:
+        after = seed["seconds_to_target"]
+        said = f"{after:.0f} s, {seed['steps_to_target'] / 1e6:.1f} M steps" if after else "not reached"
+        lines.append(f"  seed {seed['seed']}: final {percent(seed['final'])}; {100 * record['target']:.0f} % after "
+                     f"{said} (training {seed['train_s']:.0f} s)")  # fmt: skip
+    times = [s["seconds_to_target"] for s in record["seeds"] if s["seconds_to_target"]]
+    if len(times) > 1:
+        mean, low, high = (float(a) for a in mean_interval(np.array(times)[:, None].astype(float)))
+        lines.append(f"  time to target {mean:.0f} s ({low:.0f} to {high:.0f}, 95 %, n = {len(times)})")
+    if "updates_per_s" in record:
+        lines.append(f"  learner {record['updates_per_s']:,.0f} updates/s of {record['train']['batch']:,} transitions")
+    return lines
+
+
+def table_rates(record: dict[str, Any]) -> list[str]:
+    lines = [f"Environment steps per second, {record['rover']}, {record['about']['device']}:"]
+    for r in record["rows"]:
+        lines.append(f"  {r['observation']:17s} decimation {r['decimation']:3d} rovers {r['rovers']:6d} "
+                     f"{r['env_steps_per_s'] / 1e6:8.2f} M/s, bare {r['bare_steps_per_s'] / 1e6:8.2f} M/s, "
+                     f"ratio {r['ratio']:.3f}, {r['state_bytes_per_rover'] / 1e3:.1f} kB a rover")  # fmt: skip
+    return lines
+
+
+def card(record: dict[str, Any], seed: dict[str, Any], size: int) -> str:
+    """The model card of a shipped policy."""
+    options = record["environment"]["options"]
+    agents = "\n".join(f"| {name} | {percent(score)} |" for name, score in record["agents"].items())
+    train = record["train"]
+    return f"""# Trained policy of {record["rover"]}
+
+`policy.npz` ({size / 1e6:.2f} MB): weights, observation statistics and the environment's options, without pickles.
+
+    lunar-mjx play {record["rover"]}
+    lunar-mjx evaluate {record["rover"]}
+
+**Task.** `{options.get("task")}`: drive 10 to 40 m to a goal over rough ground with rocks and craters; success is being
+within the goal's radius before the time is up. Options: `{json.dumps(options)}`.
+
+**Training.** TD3 with a distributional critic, {train["envs"]:,} rovers, batches of {train["batch"]:,}, seed
+{seed["seed"]}: {seed["steps"] / 1e6:.1f} M environment steps in {seed["train_s"]:.0f} s on one
+{record["about"]["device"]} (without compilation, {record["compile_epoch_s"]:.0f} s). Script: `benchmarks/rl_proof.py`.
+
+**Score** on ground, goals and soil never trained on (`{json.dumps(record["environment"]["unseen"])}`),
+{seed["final"]["episodes"]} episodes, 95 % Wilson interval:
+
+| agent | success |
+|---|---|
+| this policy | {percent(seed["final"])} |
+{agents}
+
+Ends of this policy's episodes: {json.dumps({k: round(v, 4) for k, v in seed["final"]["ends"].items()})}.
+
+**Limits.** Trained in simulation only, with the model's effects and the spread of soils and motors of
+`lunar_mjx.envs.config.SOIL_RANGES`. It sees exact poses and a height map without noise. It has driven no real rover.
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "figures")
+    parser.add_argument("--ship", help="rover whose policy goes to models/")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    lines: list[str] = []
+    large, rates, paper = (read(args.folder, name) for name in ("large", "rates", "paper"))
+    if large and large["seeds"]:
+        plot_large(large, args.out / f"rl_large_{large['rover']}.png")
+        lines += table_large(large)
+    if rates:
+        lines += table_rates(rates)
+    if paper:
+        groups = {n.removeprefix("paper-").upper(): runs for n, runs in paper["runs"].items() if runs}
+        if groups:
+            plot_episodes(groups, args.out / "rl_paper.png")
+        for name, runs in groups.items():
+            last = [np.mean(r["episodes"]["success"][-50:]) for r in runs]
+            counts = [len(r["episodes"]["success"]) for r in runs]
+            lines.append(f"{name}: episodes of {len(runs)} seeds {counts}, success of the last 50 "
+                         f"{np.round(last, 2).tolist()}")  # fmt: skip
+    if args.ship:
+        assert large is not None and large["rover"] == args.ship, "the folder holds another rover's training"
+        policy = args.folder / f"policy_{args.ship}.npz"
+        best = max(large["seeds"], key=lambda s: s["final"]["success"])
+        assert policy.stat().st_size < _LIMIT, "the policy is too large to ship"
+        home = ROOT / "models" / args.ship
+        shutil.copy(policy, home / "policy.npz")
+        (home / "POLICY.md").write_text(card(large, best, policy.stat().st_size), encoding="utf-8")
+        lines.append(f"shipped {home / 'policy.npz'}")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

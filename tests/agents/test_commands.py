@@ -1,0 +1,69 @@
+"""`lunar-mjx train`, `evaluate` and `play`, and what they say to mistakes."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+SHORT = [f"--env={text}" for text in ("terrain=flat", "goal_distance=[1.0, 1.5]", "places=64", "decimation=25",
+                                      "episode_time=3.0", "action=velocity", "start_yaw=0.3")]  # fmt: skip
+"""A goal a few seconds away: the straight line reaches it."""
+
+
+@pytest.mark.slow
+def test_trains_resumes_and_evaluates_without_physics(run, tmp_path):
+    line = ("train", "point", "-o", tmp_path, "--set", "epoch_steps=20", "--eval-every", 1, "--eval-episodes", 32)
+    first = run(*line, "--steps", 1280)
+    assert first.status == 0 and "success on unseen ground" in first.out and str(tmp_path / "policy.npz") in first.out
+    assert "1,280 steps" in first.err
+    second = run(*line, "--steps", 2560)
+    assert second.status == 0 and "2,560 steps" in second.err and "\n640 steps" not in second.err
+    rows = (tmp_path / "progress.csv").read_text().splitlines()
+    assert [r.split(",")[0] for r in rows] == ["steps", "640", "1280", "1920", "2560"]
+    record = json.loads((tmp_path / "curve.json").read_text())
+    assert record["finished"] and record["final"]["episodes"] == 32
+    for picture in ("curve.png", "episodes.png"):
+        assert np.ptp(np.asarray(Image.open(tmp_path / picture))) > 100
+    scored = run("evaluate", tmp_path / "policy.npz", "--episodes", 16, "-o", tmp_path / "score.json")
+    assert scored.status == 0 and "of 16 episodes" in scored.out
+    assert json.loads((tmp_path / "score.json").read_text())["episodes"] == 16
+
+
+@pytest.mark.slow
+def test_plays_an_agent_as_video_picture_and_table(run, tmp_path):
+    found = run("play", "--agent", "scripted", "--task", "consistent", "--view", "top", "-o", tmp_path, *SHORT)
+    assert found.status == 0, found.err
+    assert found.out.startswith("goal reached after")
+    with Image.open(tmp_path / "episode.webp") as video:
+        assert video.n_frames > 5
+        first = np.asarray(video.convert("RGB"))
+        video.seek(video.n_frames - 1)
+        assert (np.asarray(video.convert("RGB")) != first).any()
+    table = np.genfromtxt(tmp_path / "episode.csv", delimiter=",", names=True)
+    assert {"time_s", "position_x_m", "action_drive", "action_steer"} <= set(table.dtype.names)
+    assert table["reward"][-1] > 400.0, "the goal pays 500"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("train", "fast"), "does not exist"),
+        (("train", "point", "--set", "speed=1"), "is no setting"),
+        (("train", "point", "--set", "envs"), "is not name=value"),
+        (("train", "point", "--environment", "nowhere"), "navigation, point"),
+        (("evaluate", "clever"), "is no rover with a trained policy"),
+        (("evaluate", "missing.npz"), "missing.npz"),
+        (("play", "zero", "--task", "easy"), "paper, consistent, large"),
+    ],
+)
+def test_mistakes_are_one_sentence(run, tmp_path, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    found = run(*arguments)
+    assert found.status == 2 and said in found.err and "Traceback" not in found.err
+
+
+def test_lists_the_trainings(run):
+    assert "large-td3" in run("train", "--list").out
