@@ -44,6 +44,38 @@ def run(args: argparse.Namespace) -> None:
     print(f"{number} cases done, {len(left) - number} left")
 
 
+def generate(args: argparse.Namespace) -> None:
+    """Drives: logs and sealed answers on disk."""
+    import time
+
+    from benchmarks.hidden import drives, runner
+
+    counts = _counts(args.cases, args.count, dict(drives.GROUPS))
+    seed = int(runner.campaign(args.folder / "drives", args.seed)["seed"])
+    until = time.monotonic() + 60.0 * args.minutes
+    for group, number in runner.order(counts):
+        done = (args.folder / "answers" / f"{group}-{number:03d}.json").is_file()
+        if not done and time.monotonic() < until:
+            print(drives.generate(group, number, seed, args.folder), flush=True)
+
+
+def score(args: argparse.Namespace) -> None:
+    """Drives: asks about the logs on disk, opens the seals, judges."""
+    import json
+
+    from benchmarks.hidden import drives, runner, solve
+
+    drawn = json.loads((args.folder / "drives.seed.json").read_text(encoding="utf-8"))
+    seed = int(drawn["seed"])
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.with_suffix(".seed.json").write_text(json.dumps(drawn, indent=1) + "\n", encoding="utf-8")
+    done = {row["case"] for row in runner.read_rows([args.out]) if row["seed"] == str(seed)}
+    left = [job for job in drives.waiting(args.folder) if f"{job[0]}-{job[1]:03d}" not in done]
+    number = runner.work(solve.drive_row, left, args.out, seed, args.minutes, args.workers, folder=str(args.folder),
+                         keep=str(args.keep) if args.keep else None)  # fmt: skip
+    print(f"{number} campaigns done, {len(left) - number} left")
+
+
 def summary(args: argparse.Namespace) -> None:
     """The table of all results, with intervals, as JSON and text; and the confusion matrix."""
     import json
@@ -70,6 +102,20 @@ def parser() -> argparse.ArgumentParser:
     tables.add_argument("--suggest", action="store_true", help="ask for formulas where the effect is not listed")
     tables.add_argument("--keep", type=Path, help="folder in which logs and runs stay")
     tables.set_defaults(do=run)
+    made = verbs.add_parser("generate", help="logs of drives, with sealed answers")
+    made.add_argument("folder", type=Path)
+    made.add_argument("--cases", default="all", help="groups, separated by commas")
+    made.add_argument("--count", type=int, help="campaigns of each group; the whole benchmark's if left out")
+    made.add_argument("--seed", type=int, help="drawn from the commit and the time if left out")
+    made.add_argument("--minutes", type=float, default=9.0)
+    made.set_defaults(do=generate)
+    scored = verbs.add_parser("score", help="ask about drives on disk, and judge")
+    scored.add_argument("folder", type=Path)
+    scored.add_argument("--out", type=Path, required=True, help="JSON lines, one row per campaign")
+    scored.add_argument("--minutes", type=float, default=9.0)
+    scored.add_argument("--workers", type=int, default=1)
+    scored.add_argument("--keep", type=Path, help="folder in which runs stay")
+    scored.set_defaults(do=score)
     table = verbs.add_parser("summary", help="figures with intervals, and the confusion matrix")
     table.add_argument("results", type=Path, nargs="+", help="JSON lines")
     table.add_argument("--out", type=Path, required=True, help="without ending: .json and .png are written")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import os
 import shutil
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from lunar_mjx.criticism.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
 
-from . import bed_effects, bed_logs, cases
+from . import bed_effects, bed_logs, cases, drive_effects, drives
 from .judge import outcome
 from .separable import left_over
 
@@ -34,17 +35,17 @@ def nominal_model() -> Model:
     return make_model("luvmi_x", terrain="flat")
 
 
-def ask(log: Path, out: Path, effect: str | None = None) -> tuple[Diagnosis | None, Diagnosis | None, str]:
-    """The tool's answer to a log.
+def ask(logs: Sequence[Path], out: Path, effect: str | None = None) -> tuple[Diagnosis | None, Diagnosis | None, str]:
+    """The tool's answer to logs.
 
     Args:
-      log: its folder. out: the run's folder. effect: asked about by name, if any.
+      logs: their folders. out: the run's folder. effect: asked about by name, if any.
 
     Returns:
       The diagnosis, the answer about the effect, and the message where the log was refused as a user's mistake.
     """
     try:
-        run = verbs.compare([log], nominal_model(), out)
+        run = verbs.compare(logs, nominal_model(), out)
         found = verbs.why(run)
     except verbs.BadData as bad:
         return bad.diagnosis, None, ""
@@ -72,7 +73,7 @@ def table_row(group: str, number: int, seed: int, suggest: bool = False, keep: s
         case.write(place / "log")
         truth = case.truth
         asked = next(iter(truth.effects)) if group == "undecidable" else None
-        found, answer, refused = ask(place / "log", place / "run", asked)
+        found, answer, refused = ask([place / "log"], place / "run", asked)
         seconds = time.monotonic() - drawn
         verdict = found.verdict.label if found else "REFUSED"
         row: dict[str, Any] = {
@@ -89,6 +90,45 @@ def table_row(group: str, number: int, seed: int, suggest: bool = False, keep: s
             row["suggestions"] = _suggestions(place / "run")
         row |= {"seconds": round(seconds, 2), "seconds_drawing": round(drawn - began, 2), "pid": os.getpid()}
         return row
+    finally:
+        if not keep:
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def drive_row(group: str, number: int, seed: int, folder: str, keep: str | None = None) -> dict[str, Any]:
+    """Asks the tool about one campaign that lies on disk, opens the seal, and judges.
+
+    How far two effects can be told apart by a drive is not known beforehand, so a class that holds the truth is right
+    whatever its size.
+
+    Args:
+      group, number: of the campaign. seed: of the campaign's drawing. folder: where `generate` wrote.
+      keep: folder in which the run stays.
+    """
+    name = f"{group}-{number:03d}"
+    began = time.monotonic()
+    place = Path(keep) / name if keep else Path(tempfile.mkdtemp(prefix="hidden-"))
+    try:
+        found, _, refused = ask([Path(folder) / "logs" / name], place)
+        seconds = time.monotonic() - began
+        sealed = json.loads((Path(folder) / "answers" / f"{name}.json").read_text(encoding="utf-8"))
+        answer = sealed["answer"]
+        row: dict[str, Any] = {
+            "case": name, "kind": "drives", "group": group, "seed": str(seed), "truth": answer,
+            "commitment": sealed["commitment"], "sealed_well": sealed["commitment"] == drives.commitment(answer),
+            "noise": answer["recipe"]["kind"], "scale": answer["recipe"]["scale"], "dirt": answer["recipe"]["dirt"],
+            "verdict": found.verdict.label if found else "REFUSED", "named": list(found.effects) if found else [],
+            "sentence": found.sentence if found else refused, "seconds": round(seconds, 2),
+        }  # fmt: skip
+        if found is not None and found.verdict not in (Verdict.BAD_DATA, Verdict.BAD_FIT):
+            kinds = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
+            row |= {
+                "port": found.port, "ports": dict(found.ports), "parameters": _values(answer["effects"], found),
+                "true_ports": sorted({port for n in answer["effects"] for port in kinds[n].ports}),
+                "error_before": dict(found.error_before), "error_after": dict(found.error_after),
+                "undecidable": list(found.undecidable),
+            }  # fmt: skip
+        return row | outcome(row, lambda other: 0.0)
     finally:
         if not keep:
             shutil.rmtree(place, ignore_errors=True)
