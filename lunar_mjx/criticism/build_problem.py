@@ -23,9 +23,9 @@ NO_CANDIDATE = frozenset({
 """Effects that are an arrangement of the test which its user knows, an engine's substitute for physics, or without a
 derivative: they are never proposed as missing."""
 
-TABLE_ONLY = frozenset({"slide_softening", "side_entry", "shear_softening", "skid_shear", "side_wall"})
-"""Finer forms of slip_sinkage, angle_sinkage and bulldozing: only a test bed that imposes slip and slip angle can tell
-them from these, so they are proposed for tables and not for drives."""
+FINER_FORMS = frozenset({"slide_softening", "side_entry", "shear_softening", "skid_shear", "side_wall"})
+"""Finer forms of slip_sinkage, angle_sinkage and bulldozing: only a test bed that imposes slip and slip angle, against a
+model that integrates the stress, can tell them from these; elsewhere they would only be their twins."""
 
 
 def candidate_effects(run: Run) -> dict[str, Effect]:
@@ -58,9 +58,11 @@ def build_problem(
             if name not in candidates:
                 raise UserError(f"effect {name!r} is no candidate here; use one of {', '.join(candidates)}.")
         candidates = {n: candidates[n] for n in only}
+    finer = isinstance(logs[0], SteadyLog) and "stress_integral" in run.model.effect_names
+    if only is None and not finer:
+        candidates = {n: e for n, e in candidates.items() if n not in FINER_FORMS}
     if isinstance(logs[0], SteadyLog):
         return table_problem(run, logs, candidates)
-    candidates = {n: e for n, e in candidates.items() if n not in TABLE_ONLY or n in (only or ())}
     return DriveProblem(logs, run.model, candidates, run.splits, progress=progress)  # type: ignore[arg-type]
 
 

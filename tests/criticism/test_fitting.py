@@ -1,0 +1,98 @@
+"""Fits: known optima, and what is refused a certificate."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from toy_problem import Decay, Linear, TwoMinima, manoeuvres
+
+from lunar_mjx.criticism.fitting import Memory, fit
+
+RNG = np.random.default_rng(0)
+BASE = RNG.standard_normal((120, 3))
+TIME = np.linspace(0.0, 4.0, 80)
+
+
+def linear(value: np.ndarray, **limits) -> Linear:
+    observations = dataclasses.replace(manoeuvres(3, 40), value=value)
+    return Linear(BASE, {"extra": np.cos(np.arange(120))}, observations, **limits)
+
+
+def decay(noise: float = 0.01, **limits) -> Decay:
+    value = 2.0 * np.exp(-0.7 * TIME) + noise * np.random.default_rng(1).standard_normal(len(TIME))
+    return Decay(TIME, value, **limits)
+
+
+def test_a_linear_fit_is_least_squares_with_its_prior():
+    value = BASE @ [1.0, -2.0, 3.0] + RNG.standard_normal(120)
+    problem = linear(value, prior=2.0)
+    found = fit(problem, problem.free())
+    exact = np.linalg.solve(BASE.T @ BASE + np.eye(3) / 4.0, BASE.T @ value)
+    np.testing.assert_allclose(found.u[:3], exact, rtol=1e-3)
+    assert found.u[3] == 0.0
+    assert found.problems == ()
+    np.testing.assert_allclose(found.covariance(problem), np.linalg.inv(BASE.T @ BASE + np.eye(3) / 4.0), rtol=1e-6)
+
+
+def test_every_start_finds_the_optimum_of_a_decay():
+    problem = decay()
+    found = fit(problem, problem.free(), np.array([1.0, 0.2]), starts=4)
+    assert found.problems == ()
+    assert found.u == pytest.approx([2.0, 0.7], rel=0.03)
+    assert found.rms(found.fitted) == pytest.approx(1.0, abs=0.25)
+
+
+def test_starts_that_disagree_are_refused():
+    """A quartic with a second, worse minimum: only the first start lies in the basin of the better one."""
+    problem = TwoMinima()
+    found = fit(problem, problem.free(), np.array([1.2]), starts=4, spread=0.3)
+    assert found.u == pytest.approx([1.0], abs=0.01)
+    assert found.chi2 == pytest.approx(0.0, abs=0.1)
+    assert found.problems == ("only 1 of 4 starts agree",)
+
+
+def test_a_start_that_diverges_gets_no_certificate():
+    problem = linear(np.zeros(120))
+    problem.matrix = problem.matrix * np.inf
+    with np.errstate(invalid="ignore"):
+        assert fit(problem, problem.free()).problems == ("every start diverged",)
+
+
+def test_resting_on_a_bound_is_refused_unless_it_is_physics():
+    refused = decay(high=1.999)
+    found = fit(refused, refused.free(), np.array([0.5, 0.5]))
+    assert found.at_bound == ("base.a",)
+    assert found.problems == ("base.a ended at a bound",)
+    allowed = decay(high=1.999, physical=True)
+    assert fit(allowed, allowed.free(), np.array([0.5, 0.5])).problems == ()
+
+
+def test_held_out_observations_do_not_move_a_fit():
+    observations = manoeuvres(6, 20)
+    value = BASE @ [1.0, -2.0, 3.0]
+    value[80:] += 100.0
+    problem = Linear(BASE, {}, dataclasses.replace(observations, value=value))
+    found = fit(problem, problem.free())
+    np.testing.assert_allclose(found.u, [1.0, -2.0, 3.0], rtol=1e-3)
+    assert found.rms(~found.fitted) > 50.0
+
+
+def test_a_memory_gives_back_the_fit_it_kept():
+    problem = decay()
+    found = fit(problem, problem.free(), np.array([1.0, 0.2]))
+    written = []
+    memory = Memory(save=lambda entries: written.append(dict(entries)))
+    memory.keep(problem, (), found)
+    again = Memory(written[-1]).recall(problem, ())
+    assert again is not None
+    np.testing.assert_array_equal(again.u, found.u)
+    assert again.chi2 == pytest.approx(found.chi2)
+    assert again.problems == found.problems
+
+
+def test_a_memory_of_other_coordinates_is_not_used():
+    problem = decay()
+    memory = Memory({"": {"u": {"base.a": 1.0}}})
+    assert memory.recall(problem, ()) is None

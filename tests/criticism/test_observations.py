@@ -1,0 +1,61 @@
+"""Whitening against dense Gaussians."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from toy_problem import manoeuvres
+
+from lunar_mjx.criticism.observations import Observations, Series
+
+WHITE, COLOURED, TAU = 0.7, 1.3, 0.8
+
+
+def irregular(n: int = 60) -> tuple[Observations, np.ndarray]:
+    """One series at irregular times, and the dense covariance of its noise."""
+    time = np.cumsum(np.random.default_rng(1).uniform(0.05, 0.6, n))
+    series = (Series(0, "y", 0, n, time, WHITE, COLOURED, TAU),)
+    o = Observations(np.zeros(n), series, ("a",), ("fit",), np.zeros(n, int), ("fit",), ("a",))
+    covariance = COLOURED**2 * np.exp(-np.abs(time[:, None] - time) / TAU) + WHITE**2 * np.eye(n)
+    return o, covariance
+
+
+def test_whitening_divides_out_the_dense_covariance():
+    o, covariance = irregular()
+    w = o.whiten(np.eye(len(o)))
+    np.testing.assert_allclose(w @ covariance @ w.T, np.eye(len(o)), atol=1e-12)
+    # the Gaussian's density: the determinant too
+    assert -2.0 * np.log(np.abs(np.diag(w))).sum() == pytest.approx(np.linalg.slogdet(covariance)[1])
+
+
+def test_whitened_noise_has_unit_variance_and_no_memory():
+    o, covariance = irregular(200)
+    draws = np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal((200, 500))
+    white = o.whiten(draws)
+    assert white.var() == pytest.approx(1.0, abs=0.02)
+    assert np.mean(white[1:] * white[:-1]) == pytest.approx(0.0, abs=0.02)
+
+
+def test_series_of_equal_times_are_whitened_as_if_alone():
+    both = manoeuvres(2, 40, coloured=COLOURED, correlation_time=TAU)
+    one = manoeuvres(1, 40, coloured=COLOURED, correlation_time=TAU)
+    data = np.random.default_rng(2).standard_normal((80, 3))
+    np.testing.assert_allclose(both.whiten(data)[40:], one.whiten(data[40:]), rtol=1e-12)
+
+
+def test_points_of_a_table_have_noise_of_their_own():
+    o = manoeuvres(1, 4)
+    std = np.array([1.0, 2.0, 4.0, 8.0])
+    o = dataclasses.replace(o, series=(Series(0, "y", 0, 4, None, std),))
+    np.testing.assert_allclose(o.whiten(std), 1.0)
+    np.testing.assert_allclose(o.sigma(), std)
+
+
+def test_splits_choose_observations():
+    o = manoeuvres(6, 3)
+    assert o.in_split("fit").sum() == 12
+    assert o.in_split("select").sum() == 6
+    assert o.in_split("fit", "select").all()
+    assert not o.in_split("test").any()

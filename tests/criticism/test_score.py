@@ -1,0 +1,90 @@
+"""Score tests with known answers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from toy_problem import Linear, manoeuvres
+
+from lunar_mjx.criticism.fitting import fit
+from lunar_mjx.criticism.score import blocks, cosines, project, score, signatures
+
+RNG = np.random.default_rng(0)
+LOGS, SAMPLES = 4, 100
+BASE = RNG.standard_normal((LOGS * SAMPLES, 3))
+EFFECTS = {"slow": np.sin(np.arange(LOGS * SAMPLES) * 0.02), "fast": np.sin(np.arange(LOGS * SAMPLES) * 0.7)}
+EFFECTS["faint"] = 0.05 * RNG.standard_normal(LOGS * SAMPLES)
+
+
+def scored(value: np.ndarray, draws: int = 200):
+    observations = dataclasses.replace(manoeuvres(LOGS, SAMPLES), value=value)
+    problem = Linear(BASE, EFFECTS, observations)
+    base = fit(problem, problem.free(), starts=1)
+    found = score(problem, base, signatures(problem, base, list(EFFECTS)), draws)
+    return {s.effect: s for s in found}
+
+
+def test_projection_leaves_nothing_that_a_refit_takes():
+    mixed = BASE @ np.array([[1.0], [-2.0], [0.5]])
+    assert np.linalg.norm(project(mixed, BASE, np.full(3, 1e-6))) < 1e-4
+    left = project(EFFECTS["slow"][:, None], BASE, np.full(3, 1e-6))[: len(BASE)]
+    np.testing.assert_allclose(BASE.T @ left, 0.0, atol=1e-8)
+
+
+def test_a_tight_prior_keeps_what_a_loose_one_gives_away():
+    column = BASE[:, :1]
+    assert np.linalg.norm(project(column, BASE, np.full(3, 1e4))) > 0.99 * np.linalg.norm(column)
+
+
+def test_the_amount_of_a_planted_effect_is_unbiased():
+    rng = np.random.default_rng(3)
+    amounts = []
+    for _ in range(60):
+        value = BASE @ [1.0, 2.0, 3.0] + 1.5 * EFFECTS["fast"] + rng.standard_normal(len(BASE))
+        amounts.append(float(scored(value, 20)["fast"].amount[0]))
+    error = 1.0 / np.linalg.norm(EFFECTS["fast"]) / np.sqrt(60)
+    assert np.mean(amounts) == pytest.approx(1.5, abs=4.0 * error)
+
+
+def test_the_planted_effect_leads_and_the_faint_one_is_not_tested():
+    value = 1.0 * EFFECTS["slow"] + np.random.default_rng(4).standard_normal(len(BASE))
+    found = scored(value)
+    assert max(found.values(), key=lambda s: s.chi2).effect == "slow"
+    assert found["slow"].p <= 0.01
+    assert found["faint"].length < 5.0
+    assert found["faint"].p == 1.0
+
+
+def test_pure_noise_is_significant_as_often_as_stated():
+    rng = np.random.default_rng(5)
+    smallest = [min(s.p for s in scored(rng.standard_normal(len(BASE)), 200).values()) for _ in range(150)]
+    assert np.mean(np.array(smallest) <= 0.05) < 0.11  # 3.4 standard deviations above 5 %
+    assert np.mean(np.array(smallest) <= 0.5) > 0.3
+
+
+def test_a_residual_larger_than_its_noise_is_not_evidence_by_itself():
+    rng = np.random.default_rng(6)
+    smallest = [min(s.p for s in scored(5.0 * rng.standard_normal(len(BASE)), 200).values()) for _ in range(60)]
+    assert np.mean(np.array(smallest) <= 0.01) <= 0.1
+
+
+def test_twins_are_alike_and_strangers_are_not():
+    observations = manoeuvres(LOGS, SAMPLES)
+    problem = Linear(BASE, {**EFFECTS, "twin": EFFECTS["slow"] + BASE[:, 0]}, observations)
+    base = fit(problem, problem.free(), starts=1)
+    near = cosines(score(problem, base, signatures(problem, base, list(problem.candidates)), 20))
+    assert near["slow"]["twin"] == pytest.approx(1.0, abs=1e-4)
+    assert near["slow"]["fast"] < 0.3
+
+
+def test_blocks_follow_the_correlation_time():
+    o = manoeuvres(1, 4000)
+    rng = np.random.default_rng(7)
+    white = rng.standard_normal(4000)
+    slow = np.convolve(white, np.exp(-np.arange(2000) / 200.0))[:4000]
+    every = np.ones(4000, bool)
+    many, few = blocks(o, white, every).max() + 1, blocks(o, slow, every).max() + 1
+    assert few < many
+    assert 4000 * 0.1 / few >= 5.0 * 10.0  # seconds: five correlation times or more
