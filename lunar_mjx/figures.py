@@ -1,8 +1,9 @@
-"""The seed paper's figures and the slope check, run anew and plotted: a PNG and the numbers as JSON for each."""
+"""The seed paper's figures and the slope check, made anew: a PNG and the numbers as JSON for each."""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lunar_mjx.effects.presets import UNSAID
+from lunar_mjx.errors import UserError
 from lunar_mjx.experiments import hot_motor, slope_runs, soft_ground
 
 # Okabe and Ito's colours, told apart by colour-blind eyes; line styles tell them apart in grey.
@@ -133,5 +135,36 @@ def _crossing(x: np.ndarray, y: np.ndarray, level: float) -> float | None:
     return float(x[i - 1] + (level - y[i - 1]) / (y[i] - y[i - 1]) * (x[i] - x[i - 1]))
 
 
-FIGURES: dict[str, Callable[[], tuple[Figure, dict]]] = {"3": figure_3, "5": figure_5, "slope": figure_slope}
-_FILES = {"3": "fig3_motor_heat", "5": "fig5_soft_ground", "slope": "slope_stall"}
+def _from_paper_figures(name: str) -> Callable[[], tuple[Figure, dict]]:
+    def make() -> tuple[Figure, dict]:
+        from lunar_mjx.visual import paper_figures  # which needs OpenGL and is slow to import
+
+        return getattr(paper_figures, name)()
+
+    return make
+
+
+FIGURES: dict[str, Callable[[], tuple[Figure, dict]]] = {
+    "1": _from_paper_figures("figure_1"),
+    "2": _from_paper_figures("figure_2"),
+    "3": figure_3,
+    "4": _from_paper_figures("figure_4"),
+    "5": figure_5,
+    "slope": figure_slope,
+}
+_FILES = {"1": "fig1_display", "2": "fig2_workflow", "3": "fig3_motor_heat", "4": "fig4_rovers_and_terrain",
+          "5": "fig5_soft_ground", "slope": "slope_stall"}  # fmt: skip
+NEED_OPENGL = ("1", "4")
+"""Figures that MuJoCo's renderer draws."""
+
+
+def available_figures() -> list[str]:
+    """All figures that can be made here; says on standard error what is left out without OpenGL."""
+    from lunar_mjx.cameras.gl import context_class
+
+    try:
+        context_class()
+    except UserError as missing:
+        print(f"Figs. {' and '.join(NEED_OPENGL)} are left out: {missing}", file=sys.stderr)
+        return [name for name in FIGURES if name not in NEED_OPENGL]
+    return list(FIGURES)

@@ -115,7 +115,7 @@ def _drift(study: Study, pair: Pair) -> go.Figure:
                                name=name if name != "noise floor" else f"{case.name}, noise floor",
                                line={"color": style.colour, "dash": dash, "width": 2 if dash == "solid" else 1},
                                showlegend=dash == "solid")  # fmt: skip
-    finish(figure, 420)
+    finish(figure, 420, margin={"l": 84, "r": 16, "t": 60, "b": 52})
     figure.update_xaxes(title_text="time, s")
     figure.update_yaxes(title_text="distance, m (dotted: noise floor)", type="log", exponentformat="power")
     return figure

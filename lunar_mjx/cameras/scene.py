@@ -28,8 +28,8 @@ GROUND, FAR_GROUND, ROCK, FRONT = "ground", "far_ground", "rock", "front"
 NODES, FAR_NODES, TEXELS = 420, 160, 2048
 """Most nodes per side of the near and the far height field, and pixels of the ground's picture."""
 
-_DROP = 3.0
-"""How far the far ground is lowered under the near one, m."""
+_DROP, _SEAM = 3.0, 0.05
+"""How far the far ground is lowered under the near one, and everywhere, so that the two never meet, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Sun:
     @property
     def exposure(self) -> float:
         """Brightness of the light: level ground looks the same down to a Sun 10 deg high, as a camera would expose."""
-        return 0.65 / max(math.sin(math.radians(self.elevation_deg)), 0.17)
+        return 0.55 / max(math.sin(math.radians(self.elevation_deg)), 0.17)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,9 +136,9 @@ def _painter(patch: Patch, tracks: Sequence[Track]) -> TrackPainter:
     return TrackPainter(picture, patch.low, extent.tolist(), tracks)
 
 
-def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray | None) -> None:
+def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray | None, lower: Any = 0.0) -> None:
     """The patch as a mesh: MuJoCo lights meshes smoothly, and height fields triangle by triangle."""
-    vertices, normals, faces, texture = _surface(patch)
+    vertices, normals, faces, texture = _surface(patch, lower)
     mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     mesh.uservert, mesh.usernormal = vertices.ravel(), normals.ravel()
     mesh.userface = mesh.userfacenormal = faces.ravel()
@@ -156,7 +156,7 @@ def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray | None) 
                             contype=0, conaffinity=0)  # fmt: skip
 
 
-def _surface(patch: Patch) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _surface(patch: Patch, lower: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices, normals, triangles and texture coordinates (0, 0 at the picture's top left) of a patch."""
     z = patch.heights
     rows, cols = z.shape
@@ -164,7 +164,7 @@ def _surface(patch: Patch) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     north, east = np.gradient(z, y, x)
     normal = np.stack([-east, -north, np.ones_like(z)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    place = np.stack([*np.meshgrid(x, y), z], axis=-1)
+    place = np.stack([*np.meshgrid(x, y), z - lower], axis=-1)
     u, v = np.meshgrid(np.linspace(0, 1, cols), np.linspace(1, 0, rows))
     index = np.arange(rows * cols).reshape(rows, cols)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
@@ -184,8 +184,8 @@ def _add_far(spec: Any, terrain: Terrain, near: Patch) -> None:
     inside = [(v > a + step) & (v < b - step) for v, a, b in zip((x, y), near.low, near.high, strict=True)]
     if all(i.all() for i in inside) or (near.low == whole.low and near.high == whole.high):
         return
-    heights = np.where(inside[1][:, None] & inside[0][None, :], whole.heights - _DROP, whole.heights)
-    _add_ground(spec, FAR_GROUND, dataclasses.replace(whole, heights=heights), None)
+    hidden = inside[1][:, None] & inside[0][None, :]
+    _add_ground(spec, FAR_GROUND, whole, None, np.where(hidden, _DROP, _SEAM))
 
 
 def _add_rocks(spec: Any, terrain: Terrain, patch: Patch) -> None:
