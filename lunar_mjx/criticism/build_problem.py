@@ -24,8 +24,8 @@ NO_CANDIDATE = frozenset({
 derivative: they are never proposed as missing."""
 
 FINER_FORMS = frozenset({"slide_softening", "side_entry", "shear_softening", "skid_shear", "side_wall"})
-"""Finer forms of slip_sinkage, angle_sinkage and bulldozing: only a test bed that imposes slip and slip angle, against a
-model that integrates the stress, can tell them from these; elsewhere they would only be their twins."""
+"""Finer forms of slip_sinkage, angle_sinkage, bulldozing: only a bed that imposes slip and slip angle, against a model
+that integrates the stress, can tell them from these; elsewhere they would only be their twins."""
 
 
 def candidate_effects(run: Run) -> dict[str, Effect]:

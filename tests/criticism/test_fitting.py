@@ -45,12 +45,12 @@ def test_every_start_finds_the_optimum_of_a_decay():
 
 
 def test_starts_that_disagree_are_refused():
-    """A quartic with a second, worse minimum: only the first start lies in the basin of the better one."""
+    """A quartic with a second, worse minimum, and starts in both basins."""
     problem = TwoMinima()
-    found = fit(problem, problem.free(), np.array([1.2]), starts=4, spread=0.3)
+    found = fit(problem, problem.free(), np.array([-0.2]), starts=4, spread=1.2)
     assert found.u == pytest.approx([1.0], abs=0.01)
     assert found.chi2 == pytest.approx(0.0, abs=0.1)
-    assert found.problems == ("only 1 of 4 starts agree",)
+    assert any("of 4 starts agree" in p for p in found.problems)
 
 
 def test_a_start_that_diverges_gets_no_certificate():
