@@ -1,4 +1,4 @@
-# make demo: run the main job. make test: lint, type-check and test. Each installs all that it needs into .venv.
+# make demo: run the main job. make test: lint, type-check and test. make docs: the pages. Each installs all that it needs into .venv.
 
 PYTHON ?= python3
 VENV := .venv
@@ -8,7 +8,7 @@ PIP := $(BIN)/pip --disable-pip-version-check
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/build/jax-cache
 export MUJOCO_GL ?= disable
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 
 demo: $(VENV)/run.stamp
 	$(BIN)/lunar-mjx demo -o runs/demo
@@ -20,6 +20,10 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright --level error
+
+docs: $(VENV)/run.stamp
+	$(PIP) install --quiet --progress-bar on -r requirements-docs.txt
+	$(BIN)/mkdocs build --strict --site-dir build/docs
 
 clean:
 	rm -rf $(VENV) build runs

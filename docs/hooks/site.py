@@ -1,0 +1,111 @@
+"""Hooks of mkdocs: tables of the physics from the catalogue at build time, and a navigation of the pages there are."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from lunar_mjx.effects.base import PORTS, Effect
+from lunar_mjx.effects.catalogue import CATALOGUE
+from lunar_mjx.effects.motor import WINDINGS
+from lunar_mjx.effects.paper import REGULARISATIONS
+from lunar_mjx.effects.presets import FLAWS, PRESETS, UNSAID
+from lunar_mjx.effects.soil import SOILS
+
+
+def on_config(config: Any) -> Any:
+    """Leaves out pages that are not there."""
+    config.nav = _present(config.nav, Path(config.docs_dir))
+    return config
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Puts a table in place of each `<!-- table: name -->`."""
+    return re.sub(r"<!-- table: (\w+) -->", lambda found: TABLES[found.group(1)](), markdown)
+
+
+def _present(nav: Any, docs: Path) -> Any:
+    if isinstance(nav, list):
+        return [kept for entry in nav if (kept := _present(entry, docs)) is not None]
+    if isinstance(nav, dict):
+        kept = {title: inner for title, entry in nav.items() if (inner := _present(entry, docs))}
+        return kept or None
+    return nav if (docs / nav).is_file() else None
+
+
+def effects() -> str:
+    """Every effect of the catalogue, by the first port at which it acts."""
+    out = []
+    for port in PORTS:
+        own = [e for e in CATALOGUE.values() if next(p for p in PORTS if p in e.ports) == port]
+        if own:
+            out.append(f"## Port `{port}`")
+            out += [_effect(e) for e in own]
+    return "\n\n".join(out)
+
+
+def _effect(e: Effect) -> str:
+    presets = [f"`{name}`" for name, names in PRESETS.items() if e.name in names]
+    facts = [f"ports {', '.join(f'`{p}`' for p in e.ports)}"]
+    facts.append(f"in the preset {' and '.join(presets)}" if presets else "in no preset")
+    if e.replaces:
+        facts.append(f"replaces {', '.join(f'`{r}`' for r in e.replaces)}")
+    parts = [f"### {e.name}", cell(e.doc), f"*{'; '.join(facts)}*"]
+    if e.parameters:
+        rows = [[f"`{k}`", cell(p.meaning), f"{p.nominal:.6g}", "" if p.null is None else f"{p.null:.6g}",
+                 f"{p.bounds[0]:.4g} to {p.bounds[1]:.4g}", cell(p.unit), cell(p.source)]
+                for k, p in e.parameters.items()]  # fmt: skip
+        parts.append(table(["parameter", "meaning", "nominal", "null", "bounds", "unit", "source"], rows))
+    if e.state:
+        rows = [[f"`{k}`", cell(s.meaning), s.axis, cell(s.unit)] for k, s in e.state.items()]
+        parts.append(table(["state", "meaning", "one per", "unit"], rows))
+    return "\n\n".join(parts)
+
+
+def presets() -> str:
+    """Which effects each preset holds."""
+    names = list(dict.fromkeys(name for listed in PRESETS.values() for name in listed))
+    rows = [[f"`{n}`", *("yes" if n in listed else "" for listed in PRESETS.values())] for n in names]
+    return table(["effect", *PRESETS], rows)
+
+
+def flaws() -> str:
+    """What the paper prints and what `consistent` computes."""
+    rows = [[str(f.number), cell(f.where), cell(f.paper), cell(f.consistent), cell(f.mended_by)] for f in FLAWS]
+    return table(["", "where", "`paper`", "`consistent`", "mended by"], rows)
+
+
+def unsaid() -> str:
+    """What the paper leaves unsaid, and where it needs regularising."""
+    rows = [[cell(k), cell(str(v)), "unsaid"] for k, v in UNSAID.items()]
+    rows += [[cell(k), cell(str(v)), "undefined"] for k, v in REGULARISATIONS.items()]
+    return table(["what", "taken here", "in the paper"], rows)
+
+
+def soils() -> str:
+    """The soils by name."""
+    keys = list(next(iter(SOILS.values())))
+    return table(["soil", *keys], [[f"`{n}`", *(f"{s[k]:.6g}" for k in keys)] for n, s in SOILS.items()])
+
+
+def windings() -> str:
+    """The windings of the motor."""
+    keys = list(next(iter(WINDINGS.values())))
+    return table(["winding, V", *keys], [[str(n), *(f"{w[k]:.6g}" for k in keys)] for n, w in WINDINGS.items()])
+
+
+TABLES = {"effects": effects, "presets": presets, "flaws": flaws, "unsaid": unsaid, "soils": soils,
+          "windings": windings}  # fmt: skip
+"""What a page may ask for by name."""
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def cell(text: str) -> str:
+    """Text of a docstring as one line that Markdown takes literally."""
+    return re.sub(r"([\\|*_<>\[\]`#])", r"\\\1", " ".join(text.split()))
