@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -20,16 +22,7 @@ STD = {"drawbar_pull_N": 0.1, "side_force_N": 0.1, "sinkage_m": 1e-4}
 RADIUS, WIDTH, LOADS = 0.0625, 0.05, (8.0, 20.0, 45.0)
 """Several loads, which tell the sinkage exponent from the modulus."""
 HIDDEN = 0.4
-OWN = """
-import dataclasses
-from lunar_mjx.effects import Parameter, effect
-
-@effect("wheel_shear", drag=Parameter(0.1, 0.0, (0.0, 1.0), "1", "drag of the cable over the load", "guess"))
-def cable(ctx, p, x, wheel):
-    "F_x -= d W: a cable that drags behind the wheel."
-    push = wheel.force.x - p.drag * ctx.normal.load
-    return dataclasses.replace(wheel, force=wheel.force._replace(x=push))
-"""
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "criticism.md"
 
 
 def write_table(folder, driving: float, seed: int = 0) -> None:
@@ -149,7 +142,9 @@ def test_an_interrupt_leaves_a_usable_folder(run, logs, work, monkeypatch):
 
 def test_an_effect_of_ones_own_can_be_proposed(run, logs, work):
     file = work / "my_effects.py"
-    file.write_text(OWN)
+    example = re.search(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
+    assert example is not None
+    file.write_text(example[1])
     assert run("effect", "test", f"{file}:cable").status == 0
     found = run("compare", logs / "null", "--effects", f"{file}:cable", "-o", work / "own")
     assert found.status == 0, found.err
