@@ -200,16 +200,26 @@ def _refit(
     """Refits from the parent with the new effect at its linear estimate, and from a third of it where that fails."""
     free = problem.free(effects)
     found = memory.recall(problem, effects)
-    for share in () if found is not None else (1.0, 0.3) if scored is not None else (0.0,):
+    if found is not None:
+        value, se = gain(problem, parent.fit, found)
+        return Candidate(effects, found, noise_test(problem, found), value, se)
+    places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
+    for share in (1.0, 0.3) if scored is not None else (0.0,):
         start = parent.fit.u.copy()
         if scored is not None:
-            places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
             start[places] += share * np.clip(scored.amount, -3.0, 3.0)
         trial = fit(problem, free, start, starts=1, certify=False)
         if found is None or trial.chi2 < found.chi2:
             found = trial
         if found.chi2 < parent.fit.chi2 and (problem.cheap_jacobian is False or share != 1.0):
             break
+    if scored is not None and problem.cheap_jacobian:
+        # A baseline that misfits may have gone far along a valley, from where the way back is long.
+        start = problem.origin()
+        start[places] += np.clip(scored.amount, -1.0, 1.0)
+        trial = fit(problem, free, start, starts=1, certify=False)
+        if found is None or trial.chi2 < found.chi2:
+            found = trial
     assert found is not None
     memory.keep(problem, effects, found)
     value, se = gain(problem, parent.fit, found)

@@ -32,7 +32,7 @@ has to reach the noise. (Scores do not feel a fit that has not quite converged: 
 sensitivities, and that is projected out.)"""
 
 _DAMPINGS = np.array([1e-4, 1e-2, 1.0, 1e2])
-_ITERATIONS = 40
+_ITERATIONS = 60
 _EDGE = 1e-6
 _PROBE = 0.1
 

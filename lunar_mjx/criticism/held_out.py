@@ -59,12 +59,25 @@ def gain(problem: Problem, before: Fit, after: Fit, splits: tuple[str, ...] = ("
     Returns:
       Sum over observations of half the drop of the squared predictive residual; its standard error.
     """
+    old, new = predictive_residual(problem, before), predictive_residual(problem, after)
+    return predictive_gain(problem, before, after, old, new, splits)
+
+
+def predictive_gain(
+    problem: Problem, before: Fit, after: Fit, old: np.ndarray, new: np.ndarray,
+    splits: tuple[str, ...] = ("fit", "select"),
+) -> tuple[float, float]:  # fmt: skip
+    """As `gain`, from predictive residuals: for models that are not of one problem, but of the same measurements.
+
+    Args:
+      problem: whose measurements. before, after: the fits. old, new: (n,) their predictive residuals.
+      splits: that judge.
+    """
     keep = problem.observations.in_split(*splits)
     few = len(np.unique(problem.observations.unit[before.fitted])) < _ENOUGH
     if few and problem.observations.in_split("select").any():
         # Leaving one of two or three groups out of a fit extrapolates too far; those never fitted judge alone.
         keep = problem.observations.in_split("select")
-    old, new = predictive_residual(problem, before), predictive_residual(problem, after)
     difference = np.where(keep, 0.5 * (old**2 - new**2), 0.0)
     difference = np.where(np.isfinite(difference), difference, 0.0)
     block = blocks(problem.observations, after.residual, keep)

@@ -233,9 +233,20 @@ def why(
         place = localise(problem, found, progress)
         port = place.port if diagnosis.verdict is Verdict.UNKNOWN else None
         sentence = diagnosis.sentence + (f" It acts at the port {port}." if port else "")
+        others: list[dict[str, Any]] = []
+        if diagnosis.verdict is Verdict.UNKNOWN and only is None and problem.cheap_jacobian:
+            from lunar_mjx.criticism.alternatives import alternatives
+
+            tried = alternatives(run, campaign, problem, found.chosen, progress)
+            others = [dataclasses.asdict(a) for a in tried]
+            if tried and tried[0].helps:
+                sentence += (
+                    f" {tried[0].effect} in place of {', '.join(tried[0].replaces)} does better on what was left out "
+                    f"(gain {tried[0].held_out_gain:.0f} +- {tried[0].held_out_se:.0f}): add it and ask again."
+                )
         diagnosis = dataclasses.replace(
             diagnosis, port=port, ports=place.ports, sentence=sentence,
-            details={**diagnosis.details, "localise": place.to_dict(),
+            details={**diagnosis.details, "localise": place.to_dict(), "alternatives": others,
                      "parameters": _parameter_table(problem, found.chosen.fit)},
         )  # fmt: skip
         fits = {"refitted": found.base.fit}

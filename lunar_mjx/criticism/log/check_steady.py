@@ -17,7 +17,7 @@ def check_steady(log: SteadyLog) -> list[Finding]:
     """Findings beyond what reading found."""
     if len(log.table) == 0:
         return [Finding(log.name, "", None, "", "dropout", "holds no usable row; see the other findings, or fill it")]
-    found = _copies(log) + _ranges(log) + _signs(log)
+    found = _copies(log) + _ranges(log) + _signs(log) + _swapped(log) + _clipped(log)
     return found + (_replicates(log) if not found else [])
 
 
@@ -137,6 +137,40 @@ def _signs(log: SteadyLog) -> list[Finding]:
                 f"is {np.median(sinkage):.3g} m at the median; sinkage counts downwards",
             )
         )
+    return found
+
+
+def _swapped(log: SteadyLog) -> list[Finding]:
+    """A wheel that heads where it goes has no side force; one that follows the slip there is the drawbar pull."""
+    side, pull = log.table.measured.get("side_force"), log.table.measured.get("drawbar_pull")
+    straight = np.abs(log.table.test["slip_angle_deg"]) < 1.0
+    slip = log.table.test["slip_ratio"][straight]
+    if side is None or pull is None or straight.sum() < 8 or np.ptp(slip) < 0.3:
+        return []
+    side, pull = side[straight], pull[straight]
+    rank = float(np.asarray(stats.spearmanr(slip, side))[0])
+    if rank < 0.7 or np.std(side) < 5.0 * np.std(pull):
+        return []
+    message = f"follows the slip at zero slip angle (rank correlation {rank:.2f}), and the drawbar pull does not"
+    return [_finding(log, None, "side_force_N", "frame", f"{message}: the two columns are swapped")]
+
+
+_AT_LIMIT = 0.05
+"""Share of the rows at one extreme value from which a channel is saturated."""
+
+
+def _clipped(log: SteadyLog) -> list[Finding]:
+    """An extreme value that many rows share, where other values do not repeat so often: the instrument's limit."""
+    found = []
+    for quantity, values in log.table.measured.items():
+        count = np.unique(values, return_counts=True)[1]
+        for at, extreme in ((-1, values.max()), (0, values.min())):
+            others = np.delete(count, at)
+            often = max(8.0, _AT_LIMIT * len(values), 4.0 * float(others.max(initial=1)))
+            if len(count) > 2 and extreme != 0.0 and count[at] >= often:
+                row = int(np.argmax(values == extreme))
+                message = f"stays at {extreme:.5g} in {count[at]} of {len(values)} rows; leave out what was cut off"
+                found.append(_finding(log, row, QUANTITIES[quantity][0], "saturation", message))
     return found
 
 

@@ -1,0 +1,66 @@
+"""Other forms of what a model has already: effects that would replace some of its own, refitted in their place."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from lunar_mjx.criticism.attribute import Candidate
+from lunar_mjx.criticism.build_problem import build_problem, candidate_effects
+from lunar_mjx.criticism.fitting import Progress, fit
+from lunar_mjx.criticism.held_out import errors, predictive_gain, predictive_residual
+from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.runs import Run
+
+
+@dataclasses.dataclass(frozen=True)
+class Alternative:
+    """Another form of part of the model.
+
+    Attributes:
+      effect: that is put in. replaces: what goes out. chi2: of the refit, and chi2_before: of the model as it is, both
+        with the effects that `why` named.
+      error: root mean square residual in sigma by split.
+      held_out_gain, held_out_se: of expected log density on manoeuvres left out.
+    """
+
+    effect: str
+    replaces: tuple[str, ...]
+    chi2: float
+    chi2_before: float
+    error: dict[str, float]
+    held_out_gain: float
+    held_out_se: float
+
+    @property
+    def helps(self) -> bool:
+        """Whether it earns its place on manoeuvres left out."""
+        return self.chi2 < self.chi2_before and self.held_out_gain > 2.0 * self.held_out_se
+
+
+def alternatives(
+    run: Run, logs: Sequence[Any], problem: Problem, chosen: Candidate, progress: Progress
+) -> tuple[Alternative, ...]:
+    """Refits the model with every effect that would replace some of its own, the most helpful first.
+
+    Args:
+      run: model and candidates. logs: of the run. problem, chosen: what the model as it is explains, and with what.
+      progress: told of every refit.
+    """
+    present = set(run.model.effect_names)
+    found = []
+    kinds = {n: e for n, e in candidate_effects(run).items() if present & set(e.replaces) and n not in present}
+    old = predictive_residual(problem, chosen.fit)
+    for number, (name, effect) in enumerate(kinds.items()):
+        progress(f"refitting with {name} instead", number / len(kinds))
+        other = dataclasses.replace(run, model=run.model.add(effect, "alternative"))
+        mine = build_problem(other, logs, [e for e in chosen.effects if e in candidate_effects(other)])
+        free = mine.free([e for e in chosen.effects if e in mine.candidates])
+        refitted = fit(mine, free, starts=2 if mine.cheap_jacobian else 1, certify=False)
+        gain, se = predictive_gain(problem, chosen.fit, refitted, old, predictive_residual(mine, refitted))
+        found.append(Alternative(
+            name, tuple(e for e in effect.replaces if e in present), refitted.chi2, chosen.fit.chi2,
+            errors(mine, refitted), gain, se,
+        ))  # fmt: skip
+    return tuple(sorted(found, key=lambda a: -a.held_out_gain))
