@@ -135,15 +135,17 @@ SOIL_RANGES = (
 """Training's spread of soils and motors about the model's values."""
 
 UNSEEN_SOIL = (
-    Range("soil.k_phi", 0.3, 0.5, "log", relative=True),
+    Range("soil.k_phi", 0.4, 0.5, "log", relative=True),
     Range("soil.cohesion", 0.4, 0.5, "log", relative=True),
-    Range("soil.friction_angle", 0.86, 0.9, relative=True),
-    Range("soil.shear_modulus_x", 1.4, 1.6, "log", relative=True),
+    Range("soil.friction_angle", 1.1, 1.15, relative=True),
+    Range("soil.shear_modulus_x", 0.6, 0.7, "log", relative=True),
     Range("motor.torque_constant", 0.93, 0.95, relative=True),
     Range("motor.resistance", 1.05, 1.07, relative=True),
     Range("winding_temperature", 240.0, 250.0),
 )
-"""The held-out soil: weaker and softer than any in training, in every parameter, with tired and colder motors."""
+"""The held-out soil: softer and less cohesive, with more friction that takes less slip to build up, and tired, colder
+motors; outside training's range in every parameter. The weak end of all ranges at once is no test: slip is 0.7 on flat
+ground, and 9 rovers of 10 dig in on the slopes of `world:train` without any rock."""
 
 TASKS: dict[str, NavigationConfig] = {
     "paper": NavigationConfig(
@@ -156,8 +158,10 @@ TASKS: dict[str, NavigationConfig] = {
         observations=EGOCENTRIC,
         privileged=("sinkage", "temperatures", "drawn"),
         goal_distance=(10.0, 40.0),
-        episode_time=90.0,
-        weights={"progress": 20.0, "tilt": 0.05, "excite": 0.1, "time": 0.5, "jerkiness": 0.02},
+        episode_time=120.0,
+        # no price on time: discounting presses enough, and a price makes it pay to end an episode by getting stuck
+        weights={"progress": 20.0, "tilt": 0.05, "excite": 0.02, "jerkiness": 0.02},
+        failure=-100.0,
         randomise=SOIL_RANGES,
         divergence="reset",
     ),

@@ -26,8 +26,8 @@ def _world(seed: int, deviation: float, density: float, deepest: float, abundanc
 
 
 WORLDS: dict[str, dict[str, Any]] = {
-    "train": _world(101, 0.022, 0.05, 0.10, 0.10, 160.0),
-    "heldout": _world(977, 0.025, 0.06, 0.11, 0.10, 160.0),
+    "train": _world(101, 0.022, 0.05, 0.10, 0.035, 160.0),
+    "heldout": _world(977, 0.025, 0.06, 0.11, 0.035, 160.0),
     "mild": _world(31, 0.015, 0.02, 0.06, 0.01, 80.0),
 }
 """Tables as of a `terrain.toml`. `train` and `heldout` share their size, so that one compiled program runs on both;

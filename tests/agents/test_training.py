@@ -55,13 +55,16 @@ SMALL = {"actor_layers": (64, 64), "critic_layers": (64, 64), "n_step": 3, "tau"
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "algorithm",
-    [DDPGConfig(**SMALL), TD3Config(**SMALL, atoms=31, value_range=(-10.0, 30.0), layer_norm=True, weight_decay=0.01)],
+    ("algorithm", "steps"),
+    [
+        (DDPGConfig(**SMALL), 25_600),
+        (TD3Config(**SMALL, atoms=31, value_range=(-10.0, 30.0), layer_norm=True, weight_decay=0.01), 60_000),
+    ],
     ids=["ddpg", "td3-distributional"],
 )
-def test_solves_the_point_task(algorithm, tmp_path):
+def test_solves_the_point_task(algorithm, steps, tmp_path):
     env = PointEnv()
-    result = train(Learner(env, settings(algorithm)), RunConfig(25_600, quiet=True), None)
+    result = train(Learner(env, settings(algorithm)), RunConfig(steps, quiet=True), None)
     policy = load_policy(save_policy(result.policy, tmp_path / "policy.npz"))
     score = evaluate(env, lambda state, key: policy.act(state.obs), 256, seed=9)
     chance = evaluate(env, make_agent("random", env), 256, seed=9)

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from lunar_mjx.envs import make_navigation, rewards
+from lunar_mjx.agents.evaluate import Evaluator
+from lunar_mjx.agents.run import unseen_params
+from lunar_mjx.envs import make_agent, make_navigation, rewards
 from lunar_mjx.envs.actions import action_map
 from lunar_mjx.envs.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
@@ -74,6 +76,28 @@ def test_pictures_show_rover_and_goal(env):
     assert (env.render() != first).any(), "it moves"
     with pytest.raises(UserError, match="view"):
         gym.make(NAVIGATION, render_mode="rgb_array", view="side", **SHORT)
+
+
+@pytest.mark.slow
+def test_the_straight_way_is_passable_on_flat_ground_in_every_soil():
+    env = make_navigation(
+        "large", terrain="flat", goal_distance=(4.0, 5.0), episode_time=25.0, places=64, decimation=25
+    )
+    evaluator = Evaluator(env, lambda _, state, key, agent=make_agent("scripted", env): agent(state, key), 16)
+    for params in (env.params, unseen_params(env, {"ranges": "unseen"})):
+        assert evaluator(params, (), 0).success >= 0.8
+
+
+def test_it_never_pays_to_end_an_episode_early():
+    """Sitting out an episode, shaken and leaning, costs less than failing; the worst way to the goal beats both."""
+    c = TASKS["large"]
+    two = np.zeros((1, 2), np.float32)
+    idle = rewards.Transition(two + 30.0, two + 30.0, np.full(1, 0.2), np.full(1, 0.2), np.zeros(1), np.ones(1),
+                              np.zeros((1, 6)), np.zeros((1, 6)))  # fmt: skip
+    step = sum(w * float(rewards.TERMS[n](idle)[0]) for n, w in c.weights.items())
+    whole = step * round(c.episode_time / (c.decimation * 0.002))
+    assert c.failure < whole <= 0.0
+    assert c.success + 20.0 * c.goal_distance[0] + whole > 0.0
 
 
 def test_six_actions_drive_the_joints_that_the_paper_names():
