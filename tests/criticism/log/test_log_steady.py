@@ -82,6 +82,18 @@ CASES: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str, str, int | N
     "sinkage's sign": (lambda f: f.assign(sinkage_m=-f.sinkage_m), "frame", "sinkage_m", None),
     "sinkage in mm": (lambda f: f.assign(sinkage_m=1000.0 * f.sinkage_m), "range", "sinkage_m", 2),
     "forces in mN": (lambda f: f.assign(drawbar_pull_N=1000.0 * f.drawbar_pull_N), "unit", "drawbar_pull_N", None),
+    "forces swapped": (
+        lambda f: f.assign(drawbar_pull_N=0.0 * f.drawbar_pull_N + f.side_force_N, side_force_N=f.drawbar_pull_N),
+        "frame",
+        "side_force_N",
+        None,
+    ),
+    "pull cut off": (
+        lambda f: f.assign(drawbar_pull_N=f.drawbar_pull_N.clip(upper=5.0)),
+        "saturation",
+        "drawbar_pull_N",
+        None,
+    ),
     "unit": (lambda f: f.rename(columns={"sinkage_m": "sinkage_degC"}), "unit", "sinkage_degC", None),
     "text": (lambda f: f.astype(object).pipe(cell("drawbar_pull_N", 3, "strong")), "number", "drawbar_pull_N", 5),  # type: ignore[arg-type]
     "gap in what was imposed": (cell("slip_angle_deg", 7, float("nan")), "gap", "slip_angle_deg", 9),
