@@ -10,8 +10,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lunar_mjx.criticism import WheelBed, compare, fit, load_figures
+from lunar_mjx.criticism import WheelBed, fit, load_figures
 from lunar_mjx.criticism.fit import BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
+from lunar_mjx.criticism.steady_state import compare
 
 
 def main() -> None:

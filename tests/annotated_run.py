@@ -24,7 +24,8 @@ CHECKER.check = beartype(conf=BeartypeConf(is_pep484_tower=True))  # type: ignor
 sys.modules["strict_checker"] = CHECKER
 install_import_hook("lunar_mjx", "strict_checker.check")
 
-from lunar_mjx.criticism import WheelBed, compare, load_figures
+from lunar_mjx.criticism import WheelBed, load_figures
+from lunar_mjx.criticism.steady_state import compare
 from lunar_mjx.dynamics import build
 from lunar_mjx.dynamics.state import Temperature
 from lunar_mjx.effects.catalogue import CATALOGUE

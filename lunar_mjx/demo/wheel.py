@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from lunar_mjx.criticism import Comparison, SteadyStateTable, WheelBed, WheelFit, compare, fit, load_figures
+from lunar_mjx.criticism import Comparison, SteadyStateTable, WheelBed, WheelFit, fit, load_figures
 from lunar_mjx.criticism.fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
 from lunar_mjx.criticism.single_wheel import wheel_test
+from lunar_mjx.criticism.steady_state import compare
 
 
 class Case(NamedTuple):

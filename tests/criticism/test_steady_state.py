@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lunar_mjx.criticism import average, compare, fit, load_figures, read_table, replicate_scatter
+from lunar_mjx.criticism import average, fit, load_figures, read_table, replicate_scatter
 from lunar_mjx.criticism.fit import Free
+from lunar_mjx.criticism.steady_state import compare
 from lunar_mjx.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
