@@ -80,10 +80,10 @@ def test_pictures_show_rover_and_goal(env):
 
 @pytest.mark.slow
 def test_the_straight_way_is_passable_on_flat_ground_in_every_soil():
-    env = make_navigation(
-        "large", terrain="flat", goal_distance=(4.0, 5.0), episode_time=25.0, places=64, decimation=25
-    )
-    evaluator = Evaluator(env, lambda _, state, key, agent=make_agent("scripted", env): agent(state, key), 16)
+    settings = {"goal_distance": (4.0, 5.0), "episode_time": 25.0, "places": 64, "decimation": 25}
+    env = make_navigation("large", terrain="flat", **settings)
+    agent = make_agent("scripted", env)
+    evaluator = Evaluator(env, lambda _, state, key: agent(state, key), 16)
     for params in (env.params, unseen_params(env, {"ranges": "unseen"})):
         assert evaluator(params, (), 0).success >= 0.8
 
