@@ -12,16 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from benchmarks.hidden import bed_effects, cases, runner
+from benchmarks.hidden import bed_effects, cases, drive_effects, drives, runner
 from benchmarks.hidden.judge import outcome
 from benchmarks.hidden.solve import table_row
 from benchmarks.hidden.summary import summarise, wilson
+from lunar_mjx.backends import NativeBackend
 from lunar_mjx.criticism.log import check, read_log
 from lunar_mjx.criticism.log.findings import is_bad
+from lunar_mjx.model import make_model
+from lunar_mjx.simulate import joint_channels
 
 SEED = 20261
+DRIVE_KINDS = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
 NULLS, SINGLES = 12, len(bed_effects.KNOWN)
 
 
@@ -79,6 +84,44 @@ def test_a_case_is_sealed_and_comes_back_the_same(tmp_path: Path) -> None:
     text = (tmp_path / "log" / "log.toml").read_text(encoding="utf-8")
     assert one.commitment() in text
     assert not any(word in text for word in (*bed_effects.KNOWN, one.nonce))
+
+
+@pytest.fixture(scope="module")
+def plain_drive() -> dict[str, np.ndarray]:
+    return short_drive({})
+
+
+def short_drive(effects: dict[str, dict[str, float]]) -> dict[str, np.ndarray]:
+    """The rover's last step after a short drive with hidden effects."""
+    model = make_model(drives.ROVER, terrain="flat", timestep=drives.STEP)
+    driven = np.array(["drive" in j for j in joint_channels(model.rover)], float)
+    hooks = [make(p, driven) for n, p in effects.items() if (make := DRIVE_KINDS[n].hook) is not None]
+    backend = NativeBackend(model, hooks)
+    backend.reset()
+    for k in range(220):
+        backend.step((0.0 if k < 20 else 2.0) * driven)
+    return backend.observe()
+
+
+@pytest.mark.parametrize("name", [n for n, kind in DRIVE_KINDS.items() if kind.hook is not None])
+def test_every_hidden_effect_changes_the_drive(name: str, plain_drive: dict[str, np.ndarray]) -> None:
+    seen = short_drive({name: DRIVE_KINDS[name].draw(np.random.default_rng(0))})
+    assert all(np.isfinite(v).all() for v in seen.values())
+    keys = ("position", "joint_speed", "current", "winding_temperature", "housing_temperature", "sinkage")
+    assert any(np.abs(seen[k] - plain_drive[k]).max() > 1e-7 for k in keys)
+
+
+@pytest.mark.parametrize("name", [n for n, kind in DRIVE_KINDS.items() if kind.sensor is not None])
+def test_every_hidden_sensor_effect_changes_the_log(name: str) -> None:
+    t = np.arange(0.0, 10.0, 0.05)
+    frame = pd.DataFrame({"time_s": t, "position_x_m": 0.1 * t, "motor_lf_drive_current_A": np.sin(t),
+                          "motor_lf_drive_voltage_V": 5.0 + 0.0 * t, "winding_lf_drive_temperature_degC": 25.0 + t,
+                          "housing_lf_drive_temperature_degC": 25.0 + 0.1 * t})  # fmt: skip
+    kind = DRIVE_KINDS[name]
+    assert kind.sensor is not None
+    changed = kind.sensor(frame, kind.draw(np.random.default_rng(0)))
+    assert np.isfinite(changed.to_numpy()).all() and list(changed) == list(frame)
+    assert np.abs(changed.to_numpy() - frame.to_numpy()).max() > 1e-3
 
 
 def row(group: str, verdict: str, named: list[str], hidden: list[str], **more: Any) -> Mapping[str, Any]:
