@@ -84,7 +84,8 @@ def test_the_loop_names_the_hidden_effect_and_the_error_falls(run, logs, work):
     added = run("add", work / "run1", "slip_sinkage", "-o", work / "run2")
     assert added.status == 0, added.err
     after = json.loads((work / "run2" / "comparison.json").read_text())
-    assert after["refitted"]["held_out"] < 1.2
+    # 42 points: the noise itself lies within 0.7 and 1.3
+    assert after["refitted"]["held_out"] < min(1.4, 0.5 * before["refitted"]["held_out"])
     again = run("why", work / "run2")
     assert again.status == Verdict.NOISE_ONLY.exit_status
     assert again.out.startswith("NOISE_ONLY")
