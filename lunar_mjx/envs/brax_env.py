@@ -15,7 +15,6 @@ import jax.numpy as jnp
 
 from lunar_mjx._quiet import without_warp_notices
 from lunar_mjx.envs.core import Environment
-from lunar_mjx.envs.core import State as Own
 from lunar_mjx.errors import bad_input
 
 with without_warp_notices(), warnings.catch_warnings():
@@ -60,13 +59,13 @@ class BraxEnv(Env):
         return "lunar_mjx"
 
 
-def _metrics(state: Own) -> dict[str, Any]:
+def _metrics(state: Any) -> dict[str, Any]:
     """Success where an episode ended, and the parts of the reward: sums over an episode make sense of both."""
     parts = {k: v for k, v in state.metrics.items() if k.startswith("reward_")}
     return {"success": jnp.where(state.done, state.metrics["success"], 0.0), **parts}
 
 
-def _single(state: Own) -> BraxState:
+def _single(state: Any) -> BraxState:
     one = jax.tree.map(lambda leaf: leaf[0], state)
     return BraxState(one, one.final_obs, one.reward, one.terminated.astype(one.reward.dtype), _metrics(one), {})
 
@@ -78,7 +77,7 @@ class _Batch(Env):
         self.env = env.env
 
     def reset(self, rng: jax.Array) -> BraxState:
-        state = self.env.reset(self.env.params, rng)
+        state: Any = self.env.reset(self.env.params, rng)
         zero = jnp.zeros_like(state.reward)
         metrics = _metrics(state)
         info = {
@@ -90,7 +89,8 @@ class _Batch(Env):
         return BraxState(state, state.obs, zero, zero, metrics, info)  # fmt: skip
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
-        own = self.env.step(self.env.params, state.pipeline_state, action)
+        before: Any = state.pipeline_state
+        own: Any = self.env.step(self.env.params, before, action)
         metrics, info, reward = _metrics(own), state.info, own.reward
         done = own.done.astype(reward.dtype)
         going = 1.0 - info["episode_done"]

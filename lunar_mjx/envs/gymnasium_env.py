@@ -70,7 +70,7 @@ class SingleEnv(gym.Env):
         self.metadata = {"render_modes": modes, "render_fps": max(1, round(1.0 / self.env.control_interval))}
         self.observation_space, self.action_space = _spaces(self.env)
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
-        self._state: State | None = None
+        self._state: Any = None
         self._picture = Picture(self.env, view) if render_mode else None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
@@ -183,7 +183,7 @@ class VectorEnv(gym.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
-        self.state: State | None = None
+        self.state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Begins an episode in every environment."""
