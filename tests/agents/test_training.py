@@ -135,16 +135,21 @@ def test_two_processes_on_loopback_are_two_devices(spread):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    lines = [command("-", "--steps", 3200, "--coordinator", f"127.0.0.1:{port}", "--processes", 2, "--process", i)
+    lines = [command("-", "--steps", 1600, "--coordinator", f"127.0.0.1:{port}", "--processes", 2, "--process", i)
              for i in (0, 1)]  # fmt: skip
     running = [subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
                for line, env in lines]  # fmt: skip
-    outputs = [p.communicate(timeout=300) for p in running]
+    try:
+        outputs = [p.communicate(timeout=300) for p in running]
+    finally:
+        for process in running:
+            process.kill()
+            process.communicate()
     assert all(p.returncode == 0 for p in running), outputs[0][1][-2000:]
     two, other = (json.loads(out.splitlines()[-1]) for out, _ in outputs)
     assert two["devices"] == 2
     assert two["digest"] == other["digest"], "both processes hold the same parameters"
-    np.testing.assert_allclose(two["curve"], spread["curve"][:4], rtol=0.02)
+    np.testing.assert_allclose(two["curve"], spread["curve"][:2], rtol=0.02)
 
 
 def test_stops_at_a_value_that_is_not_finite_and_keeps_the_state_for_replay(tmp_path):
