@@ -1,0 +1,278 @@
+"""The loop of criticism on a real wheel: name the effect that is missing, add it, refit, and see the error fall.
+
+    python benchmarks/real_wheel.py [--seconds 600] [--anew]
+
+CMU's smooth wheel. Slip angles 0, 30, 60 deg are fitted; 15 and 45 (inside) and 75 (extrapolated) are never fitted and
+choose nothing; 90 is apart. Errors are root mean squares in pooled standard deviations of single runs. One compiled
+wheel holds every effect, at its null until it is added. Every step is written to `real_wheel.json` at once, and a run
+that was stopped goes on from there; the waterfall is `docs/figures/real_wheel.svg`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from scipy.optimize import least_squares
+
+from lunar_mjx.criticism import WheelBed, load_figures
+from lunar_mjx.criticism.score import project
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULT, FIGURE = ROOT / "benchmarks" / "real_wheel.json", ROOT / "docs" / "figures" / "real_wheel.svg"
+PARTS = {"fitted": (0, 30, 60), "inside": (15, 45), "extrapolated": (75,), "held_out": (15, 45, 75)}
+LEAST = 25.0
+"""Least drop of chi-square by an effect that is added."""
+
+
+class Free(NamedTuple):
+    """A parameter that a fit moves: start and bounds of its value, its scale, and whether its logarithm moves."""
+
+    effect: str
+    name: str
+    start: float
+    low: float
+    high: float
+    scale: float
+    log: bool = False
+
+
+SOIL_FREE = (
+    Free("soil", "k_phi", 1.0e6, 1e4, 1e9, 0.3, True),
+    Free("soil", "n", 1.0, 0.3, 2.2, 0.2),
+    Free("soil", "friction_angle", 0.6, 0.1, 0.9, 0.1),
+    Free("soil", "cohesion", 50.0, 0.0, 3e3, 100.0),
+    Free("soil", "shear_modulus_x", 0.02, 5e-4, 0.1, 0.3, True),
+    Free("soil", "shear_modulus_y", 0.02, 5e-4, 0.1, 0.3, True),
+)
+EFFECTS: Mapping[str, tuple[Free, ...]] = {
+    "friction_circle": (Free("friction_circle", "share", 0.0, 0.0, 1.0, 0.5),),
+    "exit_angle": (
+        Free("exit_angle", "c1", 0.5, 0.05, 0.95, 0.1), Free("exit_angle", "c2", 0.0, -0.5, 0.5, 0.1),
+        Free("exit_angle", "c3", 0.0, 0.0, 0.9, 0.2), Free("exit_angle", "c4", 0.0, -0.9, 0.9, 0.2),
+    ),
+    "slide_softening": (Free("slide_softening", "softening", 0.0, 0.0, 20.0, 0.5),),
+    "side_entry": (Free("side_entry", "kept", 1.0, 0.0, 1.0, 0.3),),
+    "shear_softening": (Free("shear_softening", "loss", 0.0, 0.0, 0.98, 0.3),),
+    "skid_shear": (Free("skid_shear", "share", 0.0, 0.0, 0.99, 0.5),),
+    "side_wall": (Free("side_wall", "pressure", 0.0, 0.0, 10.0, 0.5),),
+}  # fmt: skip
+"""Candidates and what they free, from their nulls. The order is that of adding to the wheel, and means nothing else."""
+TOGETHER = {"soil.n": 1.8, "soil.k_phi": 3e7, "soil.friction_angle": 0.5, "friction_circle.share": 1.0,
+            "exit_angle.c3": 0.8, "exit_angle.c4": 0.5, "slide_softening.softening": 1.0, "side_entry.kept": 0.55,
+            "shear_softening.loss": 0.75, "skid_shear.share": 0.9, "side_wall.pressure": 0.9,
+            "soil.cohesion": 5.0}  # fmt: skip
+"""Start of the fit of all effects together: they help only jointly, and one by one lead elsewhere."""
+
+
+class Bench:
+    """The measured wheel, and one compiled wheel bed with every candidate in it."""
+
+    def __init__(self) -> None:
+        self.table = load_figures()
+        bed = WheelBed(["soil", "pressure_sinkage", "closed_form_shear"]).with_effect("stress_integral")
+        for name in EFFECTS:
+            bed = bed.with_effect(name)
+        self.bed = bed.with_values({e: {f.name: f.start for f in free} for e, free in EFFECTS.items()})
+        self.bed = self.bed.with_values({"soil": {"k_c": 0.0}})
+        with jax.enable_x64(True):
+            self.test = self.table.wheel_test()
+        self.angle = np.round(self.table.test["slip_angle_deg"])
+
+    def residuals(self, values: Mapping[str, Mapping[str, float]]) -> np.ndarray:
+        """(points, quantities) model less measurement, in sigma of single runs."""
+        result = self.bed.with_values(values).run(self.test)
+        return np.column_stack([(getattr(result, q) - v) / self.table.sigma[q] for q, v in self.table.measured.items()])
+
+    def errors(self, residual: np.ndarray) -> dict[str, Any]:
+        """Errors by part, and by quantity."""
+        out: dict[str, Any] = {}
+        for part, angles in PARTS.items():
+            keep = np.isin(self.angle, angles)
+            out[part] = float(np.sqrt(np.mean(residual[keep] ** 2)))
+            rms = np.sqrt(np.mean(residual[keep] ** 2, axis=0))
+            out[f"{part}_by_quantity"] = dict(zip(self.table.measured, rms.tolist(), strict=True))
+        return out
+
+
+class Model:
+    """Parameters that move, with their places as scaled numbers."""
+
+    def __init__(self, bench: Bench, free: Sequence[Free]):
+        self.bench, self.free = bench, tuple(free)
+        self.keep = np.isin(bench.angle, PARTS["fitted"])
+
+    def values(self, u: np.ndarray) -> dict[str, dict[str, float]]:
+        out: dict[str, dict[str, float]] = {}
+        for f, x in zip(self.free, u, strict=True):
+            out.setdefault(f.effect, {})[f.name] = float(
+                f.start * np.exp(f.scale * x) if f.log else f.start + f.scale * x
+            )
+        return out
+
+    def place(self, values: Mapping[str, float]) -> np.ndarray:
+        """Coordinates of values by "effect.name"; the start where none is given."""
+        out = []
+        for f in self.free:
+            v = values.get(f"{f.effect}.{f.name}", f.start)
+            out.append(np.log(v / f.start) / f.scale if f.log else (v - f.start) / f.scale)
+        return np.array(out)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        low = [np.log(f.low / f.start) / f.scale if f.log else (f.low - f.start) / f.scale for f in self.free]
+        high = [np.log(f.high / f.start) / f.scale if f.log else (f.high - f.start) / f.scale for f in self.free]
+        return np.array(low), np.array(high)
+
+    def fitted(self, u: np.ndarray) -> np.ndarray:
+        return self.bench.residuals(self.values(u))[self.keep].ravel()
+
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        """One-sided differences, inward at a bound: the sinkage is found to rounding, and has no noise."""
+        base, (_, high) = self.fitted(u), self.bounds()
+        columns = []
+        for i in range(len(u)):
+            step = np.zeros_like(u)
+            step[i] = 1e-5 if u[i] + 1e-5 < high[i] else -1e-5
+            columns.append((self.fitted(u + step) - base) / step[i])
+        return np.nan_to_num(np.column_stack(columns))
+
+    def fit(self, start: np.ndarray, evaluations: int = 25) -> tuple[np.ndarray, float, int]:
+        """Least squares from a start; place, chi-square and number of evaluations."""
+        low, high = self.bounds()
+        start = np.clip(start, low + 1e-6, high - 1e-6)
+        found = least_squares(self.fitted, start, self.jacobian, (low, high), x_scale=1.0, max_nfev=evaluations,
+                              ftol=1e-4)  # fmt: skip
+        return found.x, float(2.0 * found.cost), int(found.nfev)
+
+
+def flat(values: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    return {f"{e}.{k}": v for e, row in values.items() for k, v in row.items()}
+
+
+def free_of(effects: Sequence[str]) -> list[Free]:
+    return [*SOIL_FREE, *(f for e in effects for f in EFFECTS[e])]
+
+
+def row(bench: Bench, name: str, effects: Sequence[str], model: Model, u: np.ndarray, **more: Any) -> dict[str, Any]:
+    values = model.values(u)
+    low, high = model.bounds()
+    at = [
+        f"{f.effect}.{f.name}"
+        for f, x, a, b in zip(model.free, u, low, high, strict=True)
+        if x < a + 1e-3 or x > b - 1e-3
+    ]
+    found = {"model": name, "effects": list(effects), "free_parameters": len(u), "values": flat(values), "at_bound": at,
+             **bench.errors(bench.residuals(values)), **more}  # fmt: skip
+    print(f"{name:44} fitted {found['fitted']:6.2f}  inside {found['inside']:6.2f}  75 deg {found['extrapolated']:6.2f}"
+          f"  together {found['held_out']:6.2f}", flush=True)  # fmt: skip
+    return found
+
+
+def presets() -> list[dict[str, Any]]:
+    """The presets as they are and refitted with the closed form, as `wheel_fits.py` measured them."""
+    kept = json.loads((ROOT / "benchmarks" / "wheel_fits.json").read_text())
+    rows = []
+    for preset, case in (("paper", "paper, soil and contact"), ("consistent", "consistent, soil")):
+        r = next(r for r in kept if r["name"] == case)
+        for name, e in ((preset, r["nominal"]), (f"{preset}, refitted", r)):
+            rows.append({"model": name, "effects": [], "fitted": e["fitted"], "inside": e["inside"],
+                         "held_out": e["held_out"],
+                         "extrapolated": e.get("beyond", float("nan"))})  # fmt: skip
+            print(f"{name:44} fitted {e['fitted']:6.2f}  together {e['held_out']:6.2f}", flush=True)
+    return rows
+
+
+def scores(model: Model, u: np.ndarray, rest: Sequence[str]) -> dict[str, float]:
+    """Drop of chi-square that each candidate promises in linear approximation, a refit of the present model counted."""
+    residual, now = model.fitted(u), model.jacobian(u)
+    out = {}
+    for effect in rest:
+        grown = Model(model.bench, [*model.free, *EFFECTS[effect]])
+        columns = grown.jacobian(np.concatenate([u, np.zeros(len(EFFECTS[effect]))]))[:, len(u) :]
+        left = project(columns, now, np.full(now.shape[1], 1e-3))[: len(residual)]
+        amount = np.linalg.lstsq(left, residual, rcond=1e-6)[0]
+        out[effect] = float(residual @ left @ amount)
+    return out
+
+
+def climb(bench: Bench, result: dict[str, Any], late: Callable[[], bool], save: Callable[[], None]) -> None:
+    """Adds the best-scored effect, refits, and goes on while one pays and time is left."""
+    ladder = result["ladder"]
+    if not ladder:
+        model = Model(bench, SOIL_FREE)
+        u, chi2, count = model.fit(model.place({}))
+        ladder.append(row(bench, "stress integral, refitted", (), model, u, chi2=chi2, evaluations=count))
+        save()
+    while not late() and not result.get("finished"):
+        added = ladder[-1]["effects"]
+        model = Model(bench, free_of(added))
+        u = model.place(ladder[-1]["values"])
+        ranked = scores(model, u, [e for e in EFFECTS if e not in added])
+        for best in sorted(ranked, key=lambda e: -ranked[e])[:2]:
+            grown = Model(bench, free_of([*added, best]))
+            place, chi2, count = grown.fit(grown.place(ladder[-1]["values"]))
+            if ladder[-1]["chi2"] - chi2 >= LEAST:
+                ladder.append(row(bench, f"+ {best}", [*added, best], grown, place, chi2=chi2, evaluations=count,
+                                  why=ranked))  # fmt: skip
+                break
+        else:
+            result["finished"] = ranked
+        save()
+
+
+def draw(result: Mapping[str, Any]) -> None:
+    """The waterfall of the error."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    import matplotlib.pyplot as plt
+
+    rows = [*result.get("presets", []), *result["ladder"], *([result["together"]] if "together" in result else [])]
+    fig, ax = plt.subplots(figsize=(9.0, 4.2), layout="constrained")
+    for part, mark in (("fitted", "o"), ("inside", "s"), ("extrapolated", "^")):
+        angles = ", ".join(str(a) for a in PARTS[part])
+        ax.plot([r[part] for r in rows], mark + "-", label=f"{part}: {angles} deg", linewidth=1.2, markersize=5)
+    for level, label in ((2.5, "target inside"), (5.0, "target extrapolated"), (1.0, "replicates")):
+        ax.axhline(level, color="0.6", linewidth=0.8, linestyle=":")
+        ax.annotate(label, (0, level), fontsize=7, color="0.4", va="bottom")
+    ax.set_yscale("log")
+    ax.set_yticks([1, 2, 5, 10, 20, 40], ["1", "2", "5", "10", "20", "40"])
+    ax.set_ylabel("error, sigma of single runs")
+    ax.set_xticks(range(len(rows)), [r["model"] for r in rows], rotation=35, ha="right", fontsize=8)
+    ax.legend(frameon=False, fontsize=8)
+    fig.savefig(FIGURE, metadata={"Date": None})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=1e9, help="no new step is begun after this time")
+    parser.add_argument("--anew", action="store_true", help="forget what is on disk")
+    chosen = parser.parse_args()
+    start = time.perf_counter()
+    result = json.loads(RESULT.read_text()) if RESULT.is_file() and not chosen.anew else {}
+    result = {"unit": "pooled standard deviation of single runs", "ladder": [], **result}
+
+    def save() -> None:
+        RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+    bench = Bench()
+    if "together" not in result:
+        model = Model(bench, free_of(list(EFFECTS)))
+        u, chi2, count = model.fit(model.place(TOGETHER))
+        result["together"] = row(bench, "all together", list(EFFECTS), model, u, chi2=chi2, evaluations=count)
+        save()
+    if "presets" not in result:
+        result["presets"] = presets()
+        save()
+    climb(bench, result, lambda: time.perf_counter() - start > chosen.seconds, save)
+    draw(result)
+
+
+if __name__ == "__main__":
+    main()
