@@ -1,4 +1,5 @@
-# make demo: run the main job. make test: lint, type-check and test. make docs: the pages. Each installs all that it needs into .venv.
+# make demo: run the main job. make test: lint, type-check and test; make test-all: the slow tests, too. make docs: the pages.
+# Each installs all that it needs into .venv.
 
 PYTHON ?= python3
 VENV := .venv
