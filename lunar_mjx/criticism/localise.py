@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _SIZES = np.geomspace(1e-3, 1e2, 21)
 """Sizes of an unknown input, in units of its typical one, over which the evidence is maximised."""
+_SAME = 1.0
+"""Difference of log evidence below which two ports count as one."""
 COVARIATES = ("slip ratio", "slip angle", "load")
 
 
@@ -37,9 +39,18 @@ class Localisation:
     ceiling: Mapping[str, float]
     dependence: Mapping[str, float]
 
+    @property
+    def alike(self) -> tuple[str, ...]:
+        """The port, and others whose evidence is as good: the same signal may enter a bed at two of them."""
+        if self.port is None:
+            return ()
+        best = self.ports[self.label]
+        near = [label.partition(":")[0] for label, gain in self.ports.items() if gain > best - _SAME]
+        return tuple(dict.fromkeys([self.port, *near]))
+
     def to_dict(self) -> dict[str, Any]:
         """Numbers and names only."""
-        return dataclasses.asdict(self)
+        return {**dataclasses.asdict(self), "alike": list(self.alike)}
 
 
 def localise(problem: Problem, found: Search, progress: Progress = silent, always: bool = False) -> Localisation:

@@ -232,7 +232,7 @@ def why(
 
         place = localise(problem, found, progress)
         port = place.port if diagnosis.verdict is Verdict.UNKNOWN else None
-        sentence = diagnosis.sentence + (f" It acts at the port {port}." if port else "")
+        sentence = diagnosis.sentence + (f" It acts at the port {' or '.join(place.alike)}." if port else "")
         others: list[dict[str, Any]] = []
         if diagnosis.verdict is Verdict.UNKNOWN and only is None and problem.cheap_jacobian:
             from lunar_mjx.criticism.alternatives import alternatives
