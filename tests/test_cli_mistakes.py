@@ -186,7 +186,7 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {"mine.py": "from lunar_mjx.effects import Parameter\nParameter(5.0, None, (0.0, 1.0), '1', 'a', 'b')\n"},
         ["nominal = 5.0", "outside the bounds"],
     ),
-    "figure unknown": (["figures", "--only", "4", "--out", "OUT"], {}, ["--only = '4'", "3", "5", "slope"]),
+    "figure unknown": (["figures", "--only", "9", "--out", "OUT"], {}, ["--only = '9'", "3", "5", "slope"]),
     "figures on an unknown device": (["figures", "--device", "tpu", "--out", "OUT"], {}, ["--device = 'tpu'"]),
     "demo on an unknown device": (["demo", "--device", "tpu", "--out", "OUT"], {}, ["--device = 'tpu'"]),
     "demo into a file": (["demo", "--out", "OUT/kept.txt"], {}, ["--out", "kept.txt", "not a folder"]),

@@ -141,6 +141,7 @@ def test_an_interrupt_leaves_a_usable_folder(run, logs, work, monkeypatch):
     assert verbs.why(folder).verdict is Verdict.NOISE_ONLY
 
 
+@pytest.mark.slow
 def test_an_effect_of_ones_own_can_be_proposed(run, logs, work):
     file = work / "my_effects.py"
     example = re.search(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)

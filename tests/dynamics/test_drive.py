@@ -158,6 +158,7 @@ def test_reset_leans_with_the_slope(rover: str) -> None:
     assert np.abs(seen.position.z[0, -1] - seen.position.z[0, 0]) < 0.05
 
 
+@pytest.mark.slow
 def test_halving_the_step_hardly_moves_the_end_of_a_drive(rover: str) -> None:
     """20 s of driving with steering on a slope: halving dt changes the end position by < 1 % of the way."""
     ends = []
@@ -171,6 +172,7 @@ def test_halving_the_step_hardly_moves_the_end_of_a_drive(rover: str) -> None:
     assert np.linalg.norm(ends[0][1] - ends[1][1]) < 0.01 * way
 
 
+@pytest.mark.slow
 def test_payload_weighs_on_the_wheels_near_it() -> None:
     """A payload adds its weight, and more of it to the side where it lies."""
     from lunar_mjx.dynamics import build

@@ -38,6 +38,7 @@ def drives():
     return jax.device_get(jax.jit(jax.vmap(run))(jnp.array([0.0, -6.0, 8.0, LOW_LINE])))
 
 
+@pytest.mark.slow
 def test_a_boulder_stops_or_lifts_the_rover(drives) -> None:
     """No wheel centre ever enters the boulder, and the rover that meets it lags behind the one that does not."""
     x, y, z = (np.asarray(c)[0] for c in drives.wheel_position)

@@ -64,7 +64,9 @@ def test_one_step_agrees_with_mjx_in_float32():
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4 * max(1.0, float(jnp.abs(b).max())))
 
 
-@pytest.mark.parametrize("chunk", [None, 4, 3])
+@pytest.mark.parametrize(
+    "chunk", [pytest.param(None, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow), 3]
+)
 def test_batches_equal_single_rovers(chunk):
     """Batch last inside, chunks that do and do not divide the batch, terrains and parameters per rover."""
     system = build(make_model("viper", terrain=inclined(0.1)))
