@@ -58,7 +58,7 @@ def audit(
     Nulls and single effects take turns. Earlier cases of the same model and logs are kept and added to.
 
     Args:
-      folder: of the run. seconds: to spend; the case in progress is finished.
+      folder: of the run. seconds: to spend; the case in progress is finished, and two are diagnosed at least.
       progress: told what is being done. settings: thresholds and effort of the diagnoses.
 
     Raises:
@@ -76,8 +76,10 @@ def audit(
     base = fit_baseline(problem, settings, Memory(run.load(FITS_FILE)), progress)
     sizes = _sizes(problem, base, settings)
     begun = time.monotonic()
-    while time.monotonic() < end:
-        progress(f"auditing, case {len(cases) + 1}", (time.monotonic() - begun) / max(end - begun, 1e-9))
+    done = 0
+    while done < 2 or time.monotonic() < end:
+        done += 1
+        progress(f"auditing, case {len(cases) + 1}", min(1.0, (time.monotonic() - begun) / max(end - begun, 1e-9)))
         cases.append(_case(problem, base, sizes, len(cases), settings))
         found = _summary(cases)
         run.save(AUDIT_FILE, {"key": key, **found.to_dict()})

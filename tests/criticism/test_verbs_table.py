@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lunar_mjx.criticism import WheelBed, build_problem, fitting, verbs, wheel_test
+from lunar_mjx.criticism import WheelBed, audit, build_problem, fitting, verbs, wheel_test
 from lunar_mjx.criticism.log import Noise, write_steady_log
 from lunar_mjx.criticism.verdict import Verdict
 from lunar_mjx.effects import catalogue
@@ -186,3 +186,32 @@ def test_bad_data_is_a_verdict_of_its_own(run, logs, work):
     assert found.status == Verdict.BAD_DATA.exit_status
     assert "BAD_DATA" in found.out
     assert "normal_load_N" in found.out
+
+
+def test_next_names_the_sweep_that_tells_two_effects_apart(run, logs, work):
+    if not (work / "run1" / "verdict.json").is_file():
+        pytest.skip("needs the run of the first test")
+    found = run("next", work / "run1", "--between", FEW[0], "--between", FEW[1], "--json")
+    assert found.status == 0, found.err
+    answer = json.loads(found.out)
+    separations = [p["separation"] for p in answer["plans"]]
+    assert separations == sorted(separations, reverse=True)
+    assert separations[0] > 5.0
+    assert separations[0] > 2.0 * separations[-1], "no plan would matter"
+    assert set(answer["plans"][0]["pair"]) == set(FEW)
+    assert answer["plans"][0]["name"] in answer["sentence"]
+    assert json.loads((work / "run1" / "next.json").read_text()) == answer
+
+
+def test_an_audit_counts_and_goes_on_where_it_was(logs, work):
+    if not (work / "null" / "fits.json").is_file():
+        pytest.skip("needs the run of a test before")
+    first = audit(work / "null", 1e-3)
+    assert [c["truth"] == "nothing" for c in first.cases] == [True, False]
+    assert first.cases[0]["outcome"] == "silent, rightly"
+    assert first.cases[1]["truth"] in FEW
+    assert first.cases[1]["outcome"] not in ("wrongly named", "false alarm")
+    second = audit(work / "null", 1e-3)
+    assert len(second.cases) == 4 and second.cases[:2] == first.cases
+    assert second.rates["false alarms"]["of"] == 2
+    assert "of 2" in json.loads((work / "null" / "audit.json").read_text())["sentence"]
