@@ -169,19 +169,32 @@ def _grow(
             chosen.append(s)
     new = [s for s in chosen if frozenset((*parent.effects, s.effect)) not in tried]
     with problem.focused([*parent.effects, *(s.effect for s in new)]):
-        grown = _refit_all(problem, parent, new, memory)
+        grown = _refit_all(problem, parent, new, near, settings, memory)
     tried.update({frozenset(c.effects): c for c in grown})
     return grown
 
 
-def _refit_all(problem: Problem, parent: Candidate, new: Sequence[Score], memory: Memory) -> list[Candidate]:
-    """Refits the parent with each of the new effects; where rows are free, all refits share their batches."""
+def _refit_all(
+    problem: Problem, parent: Candidate, new: Sequence[Score], near: Mapping[str, Mapping[str, float]],
+    settings: Settings, memory: Memory,
+) -> list[Candidate]:  # fmt: skip
+    """Refits the parent with each of the new effects.
+
+    Where rows are free, all refits share their batches. Where they are dear, the best is refitted first, and once one
+    reaches the noise only its near relatives could still rival it.
+    """
 
     def one(s: Score) -> Candidate:
         return _refit(problem, parent, (*parent.effects, s.effect), s, memory)
 
     if not problem.eager or len(new) < 2:
-        return [one(s) for s in new]
+        grown: list[Candidate] = []
+        for s in new:
+            reached = [c.effects[-1] for c in grown if c.noise.passes]
+            rival = any(near.get(e, {}).get(s.effect, 0.0) >= settings.confounded for e in reached)
+            if problem.cheap_jacobian or not reached or rival:
+                grown.append(one(s))
+        return grown
     with problem.together(len(new)) as leave:
 
         def tracked(s: Score) -> Candidate:
