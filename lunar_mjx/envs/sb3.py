@@ -13,7 +13,7 @@ from lunar_mjx.envs.gymnasium_env import VectorEnv
 from lunar_mjx.errors import UserError
 
 try:
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise UserError("envs.sb3: stable-baselines3 is not installed; install the extra lunar-mjx[sb3].") from error
 
