@@ -123,7 +123,7 @@ def simulate(
         a start off the terrain, an effect that does not run, or a simulation that diverged.
     """
     check_effects(model, "simulate")
-    _check_start(model, x, y, yaw)
+    check_start(model, x, y, yaw)
     system = build(model, engine)
     joints = len(system.joint_names)
     if commands.values.ndim != 2 or commands.values.shape[1] != joints:
@@ -161,7 +161,8 @@ def check_finite(telemetry: Telemetry) -> None:
                         "use a smaller timestep_s, softer gains or smaller commands")  # fmt: skip
 
 
-def _check_start(model: Model, x: float, y: float, yaw: float) -> None:
+def check_start(model: Model, x: float, y: float, yaw: float) -> None:
+    """Raises `UserError` if a start is not finite or off the terrain."""
     for name, value in (("x", x), ("y", y), ("yaw", yaw)):
         require_finite("simulate", name, value)
     field = model.terrain.field
