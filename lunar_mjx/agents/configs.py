@@ -32,7 +32,7 @@ class Training:
 
 
 _LARGE = TrainConfig(
-    td3.TUNED, envs=4096, batch=16384, updates=4, buffer_steps=256, random_steps=8, noise=(0.05, 0.5), normalise=True,
+    td3.TUNED, envs=8192, batch=16384, updates=4, buffer_steps=256, random_steps=8, noise=(0.02, 0.4), normalise=True,
     epoch_steps=50, episodes=False,
 )  # fmt: skip
 _SMALL_TD3 = td3.TD3Config(

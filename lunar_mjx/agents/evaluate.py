@@ -75,6 +75,20 @@ class Evaluator:
 
         self._piece = jax.jit(piece)
 
+    def compile(self, env_params: Any, agent_params: Any) -> None:
+        """Compiles ahead for arguments like these; shapes suffice for the agent's."""
+        key = jax.random.PRNGKey(0)
+        reset = self._reset.lower(env_params, key)
+        state = jax.eval_shape(self._reset, env_params, key)
+        piece = self._piece.lower(env_params, agent_params, self._carry(state), key)
+        self._reset, self._piece = reset.compile(), piece.compile()
+
+    def _carry(self, state: Any) -> Any:
+        """State, whether each first episode is over, and what it came to."""
+        zero = jnp.zeros(self.episodes)
+        seen = {k: zero for k in state.metrics if not k.startswith("reward_")}
+        return state, jnp.zeros(self.episodes, bool), seen
+
     def __call__(self, env_params: Any, agent_params: Any, seed: int) -> Score:
         """Plays the episodes.
 
@@ -85,9 +99,7 @@ class Evaluator:
         """
         key_reset, key = jax.random.split(jax.random.PRNGKey(seed))
         state = self._reset(env_params, key_reset)
-        zero = jnp.zeros(self.episodes)
-        seen = {k: zero for k in state.metrics if not k.startswith("reward_")}
-        carry = (state, jnp.zeros(self.episodes, bool), seen)
+        carry = self._carry(state)
         for i in range(math.ceil(self.env.episode_steps / _PIECE)):
             carry = self._piece(env_params, agent_params, carry, jax.random.fold_in(key, i))
             if bool(carry[1].all()):

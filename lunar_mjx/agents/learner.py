@@ -141,6 +141,14 @@ class Learner:
         with jax.default_matmul_precision(self.config.precision):
             return self._epoch(env_params, state)
 
+    def compile(self) -> None:
+        """Compiles ahead what `init` and `epoch` run; several learners may do so in threads at once."""
+        with jax.default_matmul_precision(self.config.precision):
+            state = self.abstract()
+            key = jax.random.PRNGKey(0)
+            begin, epoch = self._init.lower(key), self._epoch.lower(self.env.params, state)
+            self._init, self._epoch = begin.compile(), epoch.compile()
+
     def shardings(self, state: Any) -> Any:
         """Where every leaf of a state like `state` lives."""
         prefix = jax.tree.map(lambda s: NamedSharding(self.mesh, s), self.specs, is_leaf=lambda s: isinstance(s, Spec))

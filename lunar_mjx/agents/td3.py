@@ -83,13 +83,13 @@ TUNED = TD3Config(
     actor_rate=3e-4,
     critic_rate=3e-4,
     weight_decay=0.1,
-    gamma=0.99,
+    gamma=0.995,
     tau=0.1,
     target_noise=0.1,
     target_clip=0.3,
     n_step=3,
     atoms=101,
-    value_range=(-5.0, 15.0),
+    value_range=(-3.0, 7.0),
     reward_scale=0.01,
 )
 """For thousands of environments and batches of 8,192 and more: a distributional critic, layer norm, AdamW and fast
@@ -175,7 +175,9 @@ class TD3:
             due = state.updates % c.policy_delay == 0
             state, actor_loss = jax.lax.cond(due, improve, lambda s: (s, jnp.zeros((), loss.dtype)), state)
             actor_loss = actor_loss * c.policy_delay  # zero in between: the mean over updates is the loss
-        return state, {"critic_loss": loss, "actor_loss": actor_loss, "target": jnp.mean(self.mean_value(target))}
+        value = self.mean_value(target)
+        return state, {"critic_loss": loss, "actor_loss": actor_loss, "target": jnp.mean(value),
+                       "target_low": jnp.min(value), "target_high": jnp.max(value)}  # fmt: skip
 
     def targets(self, state: TD3State, batch: Batch, key: Any) -> Any:
         """What the critics should say: (batch,) returns, or (batch, atom) probabilities."""

@@ -120,7 +120,7 @@ def _check(c: NavigationConfig) -> None:
 
 
 EGOCENTRIC = ("goal_body", "up", "body_velocity", "body_rates", "acceleration", "joints", "slip", "last_action",
-              "height_scan")  # fmt: skip
+              "waited", "height_scan")  # fmt: skip
 """What the tuned policies see: nothing depends on where in the world the rover is or which way north lies."""
 
 SOIL_RANGES = (
@@ -162,6 +162,9 @@ TASKS: dict[str, NavigationConfig] = {
         # no price on time: discounting presses enough, and a price makes it pay to end an episode by getting stuck
         weights={"progress": 20.0, "tilt": 0.05, "excite": 0.02, "jerkiness": 0.02},
         failure=-100.0,
+        # a rover that rocks to and fro upon a stone is stuck too
+        stuck_time=10.0,
+        stuck_distance=0.3,
         randomise=SOIL_RANGES,
         divergence="reset",
     ),

@@ -302,7 +302,7 @@ class NavigationEnv:
     def _view(self, inner: Inner) -> View:
         return read(
             self._reader, inner.physics, slip=inner.slip, sinkage=inner.sinkage, origin=inner.origin, goal=inner.goal,
-            filtered=inner.filtered, last_action=inner.last_action,
+            filtered=inner.filtered, last_action=inner.last_action, waited=inner.waited,
         )  # fmt: skip
 
     def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:

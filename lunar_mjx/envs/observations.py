@@ -117,6 +117,11 @@ def last_action(v: View, s: Scene) -> Any:
     return v.last_action
 
 
+def waited(v: View, s: Scene) -> Any:
+    """Time since the rover left the place that it may be stuck at, in units of 10 s."""
+    return v.waited[:, None] / 10.0
+
+
 def drawn(v: View, s: Scene) -> Any:
     """What was drawn for the episode, logarithms of the sizes; for critics only, a rover cannot know it."""
     parts = [jnp.log(jnp.abs(a).reshape(a.shape[0], -1) + 1e-6) for _, a in sorted(s.drawn.items())]
@@ -127,7 +132,7 @@ BLOCKS: dict[str, Block] = {
     f.__name__: f
     for f in (
         position, euler, velocity, angular_velocity, acceleration, goal, goal_body, up, body_velocity, body_rates,
-        joints, temperatures, slip, sinkage, last_action, drawn,
+        joints, temperatures, slip, sinkage, last_action, waited, drawn,
     )
 } | {"height_scan": scan}  # fmt: skip
 """All blocks by name."""

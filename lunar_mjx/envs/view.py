@@ -12,9 +12,12 @@ from lunar_mjx.envs.kalman import KalmanState
 from lunar_mjx.pytree import pytree
 from lunar_mjx.terrain import Terrain, surface
 
-SCAN_AHEAD = (-0.8, -0.4, 0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.6, 3.2, 4.0)
-SCAN_ASIDE = (-1.6, -1.1, -0.7, -0.35, 0.0, 0.35, 0.7, 1.1, 1.6)
+SCAN_AHEAD = (-1.0, -0.7, -0.35, 0.0, 0.35, 0.65, 0.95, 1.25, 1.6, 2.0, 2.5, 3.1, 3.8)
+SCAN_ASIDE = (-1.6, -1.1, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.1, 1.6)
 """Places of the height scan relative to the rover, m, along and across its heading; times `SCAN_SCALE`."""
+SCAN_REACH = 0.2
+"""Radius of the cell about each place, m, times `SCAN_SCALE`: the scan keeps the highest rock within it, as elevation
+maps do. Without it the smallest rocks, 0.25 m wide, slip between the places and end up under the chassis."""
 SCAN_SCALE = {"viper": 1.6}
 """Larger rovers look farther."""
 
@@ -35,6 +38,7 @@ class View:
       goal: horizontal, m.
       filtered: the Kalman filter's estimates.
       last_action: in [-1, 1].
+      waited: time since the rover left the place that it is said to be stuck at, s.
     """
 
     position: Float[Array, "env 3"]
@@ -56,6 +60,7 @@ class View:
     goal: Float[Array, "env 2"]
     filtered: KalmanState
     last_action: Float[Array, "env action"]
+    waited: Float[Array, "env"]
 
 
 def rotation(quaternion: Float[Array, "env 4"]) -> Float[Array, "env 3 3"]:
@@ -108,6 +113,8 @@ def _turn(matrix: Any, vector: Any) -> Any:
 def height_scan(terrain: Terrain, view: View, scale: float, ride: float) -> Float[Array, "env point"]:
     """Height of the surface around the rover over the plane its wheels would stand on if it were level, m.
 
+    Rocks count with their highest point within `SCAN_REACH` of each place.
+
     Args:
       terrain: one for all.
       view: the rovers.
@@ -119,7 +126,7 @@ def height_scan(terrain: Terrain, view: View, scale: float, ride: float) -> Floa
     cos, sin = jnp.cos(view.yaw)[:, None], jnp.sin(view.yaw)[:, None]
     x = view.position[:, 0, None] + cos * ahead - sin * aside
     y = view.position[:, 1, None] + sin * ahead + cos * aside
-    return surface(terrain, x, y) - (view.position[:, 2, None] - ride)
+    return surface(terrain, x, y, scale * SCAN_REACH) - (view.position[:, 2, None] - ride)
 
 
 def goal_in_body(view: View) -> Float[Array, "env 2"]:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
+
+import jax.numpy as jnp
 
 from lunar_mjx.errors import bad_input
 from lunar_mjx.terrain import Terrain, load_terrain
 
 PREFIX = "world:"
+_ROCKS = 512
+"""Numbers of rocks are filled up to a multiple of this, so that worlds of like abundance share one program."""
 
 
 def _world(seed: int, deviation: float, density: float, deepest: float, abundance: float, extent: float) -> Any:
@@ -44,4 +49,12 @@ def world(name: str) -> Terrain:
     if name not in WORLDS:
         known = ", ".join(PREFIX + w for w in WORLDS)
         raise bad_input("navigation", "terrain", PREFIX + name, "does not exist", f"use one of {known}, or a terrain")
-    return load_terrain(WORLDS[name])
+    terrain = load_terrain(WORLDS[name])
+    rocks = terrain.rocks
+    if rocks is None:
+        return terrain
+    spare = -len(rocks.radii) % _ROCKS
+    rocks = dataclasses.replace(
+        rocks, centers=jnp.pad(rocks.centers, ((0, spare), (0, 0))), radii=jnp.pad(rocks.radii, (0, spare))
+    )
+    return dataclasses.replace(terrain, rocks=rocks)
