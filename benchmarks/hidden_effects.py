@@ -46,17 +46,17 @@ def run(args: argparse.Namespace) -> None:
 
 def generate(args: argparse.Namespace) -> None:
     """Drives: logs and sealed answers on disk."""
-    import time
-
     from benchmarks.hidden import drives, runner
 
     counts = _counts(args.cases, args.count, dict(drives.GROUPS))
     seed = int(runner.campaign(args.folder / "drives", args.seed)["seed"])
-    until = time.monotonic() + 60.0 * args.minutes
-    for group, number in runner.order(counts):
-        done = (args.folder / "answers" / f"{group}-{number:03d}.json").is_file()
-        if not done and time.monotonic() < until:
-            print(drives.generate(group, number, seed, args.folder), flush=True)
+    left = [job for job in runner.order(counts)
+            if not (args.folder / "answers" / f"{job[0]}-{job[1]:03d}.json").is_file()]  # fmt: skip
+    number = 0
+    for row in runner.rows(drives.generate, left, seed, args.minutes, args.workers, out=args.folder):
+        print(row, flush=True)
+        number += 1
+    print(f"{number} campaigns made, {len(left) - number} left")
 
 
 def score(args: argparse.Namespace) -> None:
@@ -108,6 +108,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--count", type=int, help="campaigns of each group; the whole benchmark's if left out")
     made.add_argument("--seed", type=int, help="drawn from the commit and the time if left out")
     made.add_argument("--minutes", type=float, default=9.0)
+    made.add_argument("--workers", type=int, default=1)
     made.set_defaults(do=generate)
     scored = verbs.add_parser("score", help="ask about drives on disk, and judge")
     scored.add_argument("folder", type=Path)

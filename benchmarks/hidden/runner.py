@@ -82,11 +82,10 @@ def work(solve: Solve, jobs: Sequence[Job], out: Path, seed: int, minutes: float
     Returns:
       Number of cases done.
     """
-    until = time.monotonic() + 60.0 * minutes
     head, dirty = commit()
     done = 0
     with out.open("a", encoding="utf-8") as file:
-        for row in _rows(solve, jobs, seed, until, workers, options):
+        for row in rows(solve, jobs, seed, minutes, workers, **options):
             row |= {"commit": head, "uncommitted_changes": dirty}
             file.write(json.dumps(_plain(row), allow_nan=False) + "\n")
             file.flush()
@@ -96,9 +95,11 @@ def work(solve: Solve, jobs: Sequence[Job], out: Path, seed: int, minutes: float
     return done
 
 
-def _rows(
-    solve: Solve, jobs: Sequence[Job], seed: int, until: float, workers: int, options: Mapping[str, Any]
+def rows(
+    solve: Solve, jobs: Sequence[Job], seed: int, minutes: float, workers: int, **options: Any
 ) -> Iterator[dict[str, Any]]:
+    """Rows of jobs as they are done, as `work` writes them."""
+    until = time.monotonic() + 60.0 * minutes
     if workers <= 1:
         for job in jobs:
             if time.monotonic() > until:
@@ -107,7 +108,8 @@ def _rows(
         return
     context = multiprocessing.get_context("spawn")
     left = iter(jobs)
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+    place = context.Value("i", 0)
+    with concurrent.futures.ProcessPoolExecutor(workers, context, _pin, (place, workers)) as pool:
         running: set[concurrent.futures.Future[dict[str, Any]]] = set()
         while True:
             while len(running) < workers and time.monotonic() < until and (job := next(left, None)) is not None:
@@ -117,6 +119,18 @@ def _rows(
             finished, running = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
             for future in finished:
                 yield future.result()
+
+
+def _pin(place: Any, workers: int) -> None:
+    """Gives each process its own share of the cores, so that none starts more threads than it can run."""
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    with place.get_lock():
+        mine, place.value = place.value, place.value + 1
+    cores = sorted(os.sched_getaffinity(0))
+    share = max(1, len(cores) // workers)
+    first = mine * share % max(1, len(cores) - share + 1)
+    os.sched_setaffinity(0, cores[first : first + share])
 
 
 def guarded(solve: Solve, group: str, number: int, seed: int, options: Mapping[str, Any]) -> dict[str, Any]:

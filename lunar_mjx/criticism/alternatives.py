@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from lunar_mjx.criticism.attribute import Candidate
 from lunar_mjx.criticism.build_problem import build_problem, candidate_effects
 from lunar_mjx.criticism.fitting import Progress, fit
 from lunar_mjx.criticism.held_out import errors, predictive_gain, predictive_residual
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.runs import Run
+from lunar_mjx.criticism.search import Candidate
 
 
 @dataclasses.dataclass(frozen=True)

@@ -71,7 +71,7 @@ class Bench:
     def __init__(self, model: Model, logs: Sequence[Log], chunk: int | None, engine: str):
         self.logs, self.model, self.engine = tuple(logs), model, engine
         self.chunk = chunk or CHUNK.get(jax.default_backend(), 64)
-        self.runs = [log_run(log, model) for log in logs]
+        self.runs = _alike([log_run(log, model) for log in logs])
         with jax.enable_x64(True):
             self._params = [_nameless(default_params(run.model)) for run in self.runs]
 
@@ -154,6 +154,19 @@ class Bench:
         return np.concatenate(parts) if parts else np.zeros(0)
 
 
+def _alike(runs: Sequence[LogRun]) -> list[LogRun]:
+    """Runs whose models all hold what the conditions of some log add, at its null elsewhere: one program for all."""
+    extra = {e.name: e for r in runs for e in r.model.effects if any(e.name not in o.model.effect_names for o in runs)}
+    out = []
+    for run in runs:
+        model = run.model
+        for name, effect in extra.items():
+            if name not in model.effect_names and any(p.null is not None for p in effect.parameters.values()):
+                model = model.add(effect, "criticism", **effect.null())
+        out.append(dataclasses.replace(run, model=model))
+    return out
+
+
 def _nameless(params: Params) -> Params:
     """Parameters whose terrain has no name, which would make programs of their own."""
     return jax.tree.map(np.asarray, dataclasses.replace(params, terrain=dataclasses.replace(params.terrain, name="")))
@@ -198,7 +211,7 @@ class _Program:
         self, bench: Bench, parts: Sequence[Sequence[tuple[int, int]]], values: Rows, length: int
     ) -> Iterator[dict[str, np.ndarray]]:
         """Channels of every part in turn; on a CPU one part per core at a time, as XLA runs a loop on one core."""
-        workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
+        workers = _cores() if jax.default_backend() == "cpu" else 1
         if workers < 2 or len(parts) < 2 or not self._compiled:
             self._compiled = True
             for part in parts[:1]:
@@ -232,6 +245,11 @@ class _Program:
                 seen.append(telemetry)
             whole = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *seen)
             return {c: np.asarray(v) for c, v in self.measure(params, whole).items()}
+
+
+def _cores() -> int:
+    """Cores that this process may use, which may be fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _padded(commands: np.ndarray, length: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.score import project
 
 if TYPE_CHECKING:
-    from lunar_mjx.criticism.attribute import Search
+    from lunar_mjx.criticism.search import Search
 
 _SIZES = np.geomspace(1e-3, 1e2, 21)
 """Sizes of an unknown input, in units of its typical one, over which the evidence is maximised."""

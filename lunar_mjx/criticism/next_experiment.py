@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.attribute import Settings, fit_baseline
 from lunar_mjx.criticism.build_problem import build_problem, candidate_effects, table_problem
 from lunar_mjx.criticism.drive_problem import DriveProblem
 from lunar_mjx.criticism.fitting import Memory, Progress, silent
@@ -23,6 +22,7 @@ from lunar_mjx.criticism.planned import planned_drives, planned_sweeps
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.runs import FITS_FILE, VERDICT_FILE, Run, load_run
 from lunar_mjx.criticism.score import SEPARABLE
+from lunar_mjx.criticism.search import Settings, fit_baseline
 from lunar_mjx.errors import UserError
 
 NEXT_FILE = "next.json"

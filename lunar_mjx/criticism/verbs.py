@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.attribute import Search, Settings, diagnose, fit_baseline, parameters
+from lunar_mjx.criticism.attribute import diagnose, parameters
 from lunar_mjx.criticism.build_problem import build_problem
+from lunar_mjx.criticism.descent import whitened_residuals
 from lunar_mjx.criticism.fitted import fitted_model
-from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent, whitened_residuals
+from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
 from lunar_mjx.criticism.held_out import errors, noise_test
 from lunar_mjx.criticism.log import check
 from lunar_mjx.criticism.log.findings import is_bad
@@ -28,6 +29,7 @@ from lunar_mjx.criticism.runs import (
     load_run,
     log_folders,
 )
+from lunar_mjx.criticism.search import Search, Settings, fit_baseline
 from lunar_mjx.criticism.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model
@@ -318,7 +320,7 @@ def add(folder: str | Path | Run, effect: str, out: str | Path, progress: Progre
         problem = build_problem(grown, campaign, [new.name], progress)
         memory = _memory(run)
         base = fit_baseline(problem, Settings(seed=run.seed), memory, progress)
-        from lunar_mjx.criticism.attribute import refit_with
+        from lunar_mjx.criticism.search import refit_with
 
         fitted = refit_with(problem, base, new.name, Settings(seed=run.seed), memory)
         model = fitted_model(problem, fitted, model, held=values)

@@ -7,10 +7,11 @@ import pytest
 from drive_campaign import drive_campaign
 
 from lunar_mjx.backends import Hook
-from lunar_mjx.criticism.attribute import Settings, diagnose
+from lunar_mjx.criticism.attribute import diagnose
 from lunar_mjx.criticism.drive_problem import DriveProblem
 from lunar_mjx.criticism.log import check, read_campaign
 from lunar_mjx.criticism.log.findings import is_bad
+from lunar_mjx.criticism.search import Settings
 from lunar_mjx.criticism.verdict import Verdict
 from lunar_mjx.effects import catalogue
 from lunar_mjx.model import make_model

@@ -122,7 +122,7 @@ def test_fits_on_disk_are_not_made_again(logs, work, monkeypatch):
     def refuse(*_args, **_kwargs):
         raise AssertionError("a fit that is on disk was made again")
 
-    monkeypatch.setattr(fitting, "_descend", refuse)
+    monkeypatch.setattr(fitting, "descend", refuse)
     assert verbs.why(folder).verdict is Verdict.NOISE_ONLY
 
 
@@ -135,7 +135,7 @@ def test_an_interrupt_leaves_a_usable_folder(run, logs, work, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "_descend", stop)
+        patch.setattr(fitting, "descend", stop)
         with pytest.raises(KeyboardInterrupt):
             verbs.why(folder)
     assert verbs.why(folder).verdict is Verdict.NOISE_ONLY
