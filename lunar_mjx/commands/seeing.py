@@ -1,7 +1,8 @@
-"""The commands `lunar-mjx plot` and `lunar-mjx render`."""
+"""The commands `lunar-mjx view`, `plot`, `render` and `terrain preview`."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from lunar_mjx.errors import bad_input
 
+ModelOption = Annotated[Path | None, typer.Option(help="model.toml; overrides --rover, --terrain and --preset.")]
 RunArgument = Annotated[Path, typer.Argument(help="Folder that `simulate` wrote.")]
 
 
@@ -74,6 +76,57 @@ def render(
         print(render_video(read_drive(run), path, view, (width, height), fps, speed, light, report))
 
 
+def view(
+    rover: Annotated[str, typer.Option(help="Name of a shipped rover, or folder that `convert` wrote.")] = "viper",
+    terrain: Annotated[
+        str, typer.Option(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")
+    ] = "lunar_plain",
+    preset: Annotated[str, typer.Option(help="consistent or paper.")] = "consistent",
+    model: ModelOption = None,
+    effects: Annotated[
+        list[str] | None, typer.Option(help="Effect to add: catalogue name, my_effects.py or my_effects.py:name.")
+    ] = None,
+    speed: Annotated[float, typer.Option(help="top speed of the wheels' rims, m/s")] = 0.5,
+    x: Annotated[float, typer.Option(help="start, m")] = 0.0,
+    y: Annotated[float, typer.Option(help="start, m")] = 0.0,
+    yaw_deg: Annotated[float, typer.Option(help="start heading, deg")] = 0.0,
+    web: Annotated[bool, typer.Option("--web", help="A web page on this machine although there is a screen.")] = False,
+    port: Annotated[int, typer.Option(help="Of the web page; 0 for any that is free.")] = 8600,
+    sun: Annotated[str, typer.Option(help="azimuth,elevation of the Sun, deg")] = "135,15",
+    engine: Annotated[
+        str, typer.Option(help="native (starts at once), structured, mjx; auto: native where it has every effect.")
+    ] = "auto",
+) -> None:  # fmt: skip
+    """Drive a rover by keyboard: in a window, or without a screen on a web page that only this machine can open."""
+    from lunar_mjx.cli import check_finite
+
+    check_finite(speed=speed, x=x, y=y, yaw_deg=yaw_deg)
+    azimuth, elevation = _numbers("--sun", sun, ",", float)
+    from lunar_mjx.cameras import Sun
+    from lunar_mjx.model import make_model
+    from lunar_mjx.model_file import load_model
+    from lunar_mjx.viewer.drive import LiveDrive
+    from lunar_mjx.viewer.server import Viewer, check_port
+    from lunar_mjx.viewer.window import has_screen, show_window
+
+    light = Sun(azimuth, elevation)
+    check_port(port)
+    built = load_model(model) if model else make_model(rover, terrain, preset)
+    for effect in effects or []:
+        built = built.add(effect, "--effects")
+    drive = LiveDrive(built, engine, speed, x, y, math.radians(yaw_deg))
+    if has_screen() and not web:
+        show_window(drive, light)
+    else:
+        server = Viewer(drive, port, light)
+        try:
+            print(f"{server.address}  (Ctrl-C ends the drive)", flush=True)
+            server.run()
+        except KeyboardInterrupt:  # before or after it could be caught there
+            server.close()
+    print(f"{built.rover.name} drove {drive.path:.1f} m in {drive.time:.1f} s")
+
+
 def _numbers(option: str, text: str, between: str, kind: type) -> list:
     parts = text.split(between)
     try:
@@ -98,6 +151,7 @@ def _check_file(path: Path, endings: tuple[str, ...]) -> None:
 
 def register(app: typer.Typer, terrain_app: typer.Typer) -> None:
     """Adds the commands to the application."""
+    app.command()(view)
     app.command()(plot)
     app.command()(render)
     terrain_app.command("preview")(preview)

@@ -1,0 +1,101 @@
+"""What the web page draws: the rover's shapes, once, and the ground around a place, whenever it is asked for."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lunar_mjx.cameras.scene import FAR_NODES, Patch, Sun, cut
+from lunar_mjx.model import Model
+from lunar_mjx.terrain import Terrain
+
+NEAR, NODES = 20.0, 420
+"""How far the ground is drawn finely around the rover, m, and nodes per side there."""
+
+_SHAPES = {
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+}
+_HIDDEN_GROUP = 3
+"""MuJoCo's convention: geoms of this group and above are for collisions, not for the eye."""
+
+
+def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
+    """The rover's shapes, wheels, and the light, as plain data for JSON."""
+    rover = model.rover
+    mj = rover.compile()
+    shapes = [_shape(mj, i) for i in range(mj.ngeom)
+              if mj.geom_group[i] < _HIDDEN_GROUP and int(mj.geom_type[i]) in _SHAPES]  # fmt: skip
+    return {
+        "rover": rover.name,
+        "terrain": model.terrain.name,
+        "shapes": shapes,
+        "chassis": int(mj.body(rover.chassis).id),
+        "wheels": [
+            {"corner": w.corner, "body": int(mj.body(w.body).id), "radius": w.radius, "width": w.width}
+            for w in rover.wheels
+        ],
+        "size": float(2.0 * np.abs(rover.chassis_points).max()),
+        "sun": sun.direction.tolist(),
+        "exposure": sun.exposure,
+    }
+
+
+def _shape(mj: mujoco.MjModel, i: int) -> dict[str, Any]:
+    kind = _SHAPES[int(mj.geom_type[i])]
+    size = mj.geom_size[i].tolist()
+    if mj.geom_type[i] == mujoco.mjtGeom.mjGEOM_SPHERE:
+        size = size[:1] * 3
+    shape = {"kind": kind, "body": int(mj.geom_bodyid[i]), "size": size, "place": mj.geom_pos[i].tolist(),
+             "turn": mj.geom_quat[i].tolist(), "colour": mj.geom_rgba[i].tolist()}  # fmt: skip
+    if kind == "mesh":
+        k = int(mj.geom_dataid[i])
+        first, count = int(mj.mesh_vertadr[k]), int(mj.mesh_vertnum[k])
+        face, faces = int(mj.mesh_faceadr[k]), int(mj.mesh_facenum[k])
+        shape["corners"] = _packed(mj.mesh_vert[first : first + count])
+        shape["faces"] = _packed(mj.mesh_face[face : face + faces], "<u4")
+    return shape
+
+
+def ground_scene(terrain: Terrain, x: float, y: float) -> dict[str, Any]:
+    """The fine ground around a place, the whole ground coarsely, and the rocks nearby.
+
+    Args:
+      terrain: with NumPy arrays. x, y: m.
+    """
+    field = terrain.field
+    rows, cols = np.asarray(field.heights).shape
+    origin, cell = np.array([float(field.x0), float(field.y0)]), float(field.cell)
+    end = origin + cell * np.array([cols - 1, rows - 1])
+    middle = np.clip([x, y], origin, end)
+    near = cut(terrain, middle - NEAR, middle + NEAR, NODES)
+    return {"near": _grid(near), "far": _grid(cut(terrain, origin, end, FAR_NODES)), "rocks": _rocks(terrain, near)}
+
+
+def _grid(patch: Patch) -> dict[str, Any]:
+    rows, cols = patch.heights.shape
+    return {"rows": rows, "cols": cols, "low": patch.low, "high": patch.high, "heights": _packed(patch.heights)}
+
+
+def _rocks(terrain: Terrain, near: Patch) -> list[list[float]]:
+    """Centre x, y, z and radius of the rocks on the fine ground, m."""
+    if terrain.rocks is None:
+        return []
+    centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
+    low, high = np.asarray(near.low), np.asarray(near.high)
+    seen = (radii > 0) & (centers[:, :2] > low).all(axis=1) & (centers[:, :2] < high).all(axis=1)
+    return np.column_stack([centers, radii])[seen].round(4).tolist()
+
+
+def _packed(values: np.ndarray, kind: str = "<f4") -> str:
+    return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode("ascii")

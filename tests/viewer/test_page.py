@@ -1,0 +1,61 @@
+"""The page in a real browser: the rover is drawn, and a key that is pressed drives it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+from viewer_browser import CHROMIUM, Browser
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")]
+
+
+@pytest.fixture
+def browser(tmp_path):
+    opened = Browser(tmp_path / "profile")
+    yield opened
+    opened.close()
+
+
+def _number(browser, element):
+    return float(browser.value(f"document.getElementById('{element}').textContent").split()[0].replace("−", "-"))
+
+
+def test_keys_drive_what_the_page_shows(viewer, browser, tmp_path):
+    browser.open(viewer.address)
+    browser.wait("Number(document.body?.dataset.pictures) > 3")
+    assert browser.value("document.getElementById('title').textContent") == "luvmi_x on lunar_plain"
+    assert browser.value("document.querySelectorAll('#wheels tbody tr').length") == 4
+    assert browser.value("document.getElementById('note').hidden")
+    before = _number(browser, "path")
+    browser.key("keyDown", "ArrowUp", "ArrowUp")
+    browser.wait(f"parseFloat(document.getElementById('path').textContent) > {before + 0.3}")
+    assert browser.value("document.querySelector('[data-key=forward]').className") == "held"
+    assert _number(browser, "speed") > 0.05
+    picture = browser.picture(tmp_path / "page.png")
+    browser.key("keyUp", "ArrowUp", "ArrowUp")
+    browser.wait("parseFloat(document.getElementById('speed').textContent) < 0.05")
+
+    shown = np.asarray(Image.open(picture).convert("RGB"), float)
+    sky, ground = shown[10:60, 500:800], shown[600:640, 700:1200]
+    assert np.median(sky) < 12 and 60 < ground.mean() < 230 and ground.std() > 2
+    middle = shown[250:520, 480:800]
+    assert (middle[..., 2] > middle[..., 0] + 25).mean() > 0.02  # the rover's blue top
+
+    browser.key("keyDown", "KeyR", "r")
+    browser.wait("parseFloat(document.getElementById('path').textContent) < 0.1")
+    browser.value("document.getElementById('camera').click()")
+    assert browser.value("document.getElementById('camera').textContent") == "camera: fixed"
+    assert not browser.problems
+
+
+def test_a_page_from_elsewhere_can_neither_read_nor_drive(viewer, browser):
+    """The browser's own rules and the server's together, from a page without an origin of ours."""
+    viewer.drive.pilot.hold([])
+    browser.open("data:text/html,<p>elsewhere")
+    browser.wait("document.body?.textContent === 'elsewhere'")
+    forward = "{method: 'POST', mode: 'no-cors', body: '{\"held\": [\"forward\"]}'}"
+    for path, options in (("scene", "{}"), ("scene", "{mode: 'no-cors'}"), ("keys", forward)):
+        ask = f"fetch('{viewer.address}{path}', {options}).then(r => r.text(), () => '')"
+        assert browser.value(ask) == ""
+    assert viewer.drive.pilot.throttle == 0.0

@@ -1,0 +1,161 @@
+"""The page of a drive: who may ask, what is answered, and that keys move the rover."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from viewer_client import ask, pictures
+
+from lunar_mjx.errors import UserError
+from lunar_mjx.terrain import sample
+from lunar_mjx.viewer.server import DEAD_MAN, Viewer
+
+PATHS = ("/", "/main.js", "/scene", "/ground?x=0&y=0", "/pictures", "/nothing")
+
+
+def test_listens_on_the_loopback_address_only(viewer):
+    host, port = viewer.socket.getsockname()
+    assert host == "127.0.0.1"
+    for other in ("127.0.0.2", socket.gethostbyname(socket.gethostname())):
+        if other != host:
+            with pytest.raises(OSError), socket.create_connection((other, port), timeout=2):
+                pass
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example:{port}", "127.0.0.1:1",
+                                  "", "[::1]:{port}"])  # fmt: skip
+def test_a_foreign_name_for_this_machine_is_refused(viewer, path, host):
+    status, _, text = ask(viewer, "GET", path, Host=host.format(port=viewer.server_address[1]))
+    assert status == 403 and viewer.address.encode() in text and len(text) < 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "https://127.0.0.1:{port}", "http://127.0.0.1:1", "null", "",
+                                    "http://127.0.0.1:{port}.evil.example", "http://localhost"])  # fmt: skip
+def test_pages_of_another_origin_are_refused(viewer, origin):
+    foreign = origin.format(port=viewer.server_address[1])
+    for path in PATHS:
+        assert ask(viewer, "GET", path, Origin=foreign)[0] == 403
+    viewer.drive.pilot.hold([])
+    for path in ("/keys", "/reset"):
+        assert ask(viewer, "POST", path, {"held": ["forward"]}, Origin=foreign)[0] == 403
+    assert viewer.drive.pilot.throttle == 0.0
+
+
+def test_what_another_site_asks_for_without_an_origin_is_refused(viewer):
+    """A script or picture element sends no Origin; a link that is clicked may open the page, though not in a frame."""
+    for site in ("cross-site", "same-site"):
+        assert ask(viewer, "GET", "/main.js", Sec_Fetch_Site=site, Sec_Fetch_Mode="no-cors")[0] == 403
+        assert ask(viewer, "POST", "/reset", {}, Sec_Fetch_Site=site, Sec_Fetch_Mode="navigate")[0] == 403
+        status, headers, _ = ask(viewer, "GET", "/", Sec_Fetch_Site=site, Sec_Fetch_Mode="navigate")
+        assert status == 200 and headers["X-Frame-Options"] == "DENY"
+    # a form of another page can send text, but not JSON
+    assert ask(viewer, "POST", "/reset", "x", Content_Type="text/plain")[0] == 415
+
+
+def test_its_own_page_is_answered(viewer):
+    own = viewer.address.rstrip("/")
+    status, headers, page = ask(viewer, "GET", "/", Origin=own, Sec_Fetch_Site="same-origin")
+    assert status == 200 and "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+    wanted = re.findall(r'(?:src|href)="(/[^"]+)"', page.decode())
+    scripts = ask(viewer, "GET", "/main.js")[2].decode()
+    wanted += ["/" + name for name in re.findall(r'from "\./([^"]+)"', scripts)]
+    assert len(wanted) >= 6
+    for path in wanted:
+        assert ask(viewer, "GET", path)[0] == 200, path
+    port = viewer.server_address[1]
+    assert ask(viewer, "GET", "/", Host=f"localhost:{port}", Origin=f"http://localhost:{port}")[0] == 200
+
+
+@pytest.mark.parametrize("path", PATHS[:2])
+def test_nothing_is_asked_of_the_internet(viewer, path):
+    text = ask(viewer, "GET", path)[2].decode()
+    assert "http://" not in text.replace("http://www.w3.org/2000/svg", "") and "https://" not in text
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "status"),
+    [("/keys", {"held": ["fly"]}, 400), ("/keys", {"held": [["forward"]]}, 400), ("/keys", {"held": "forward"}, 400),
+     ("/keys", [], 400), ("/keys", "{", 400), ("/keys", "[" * 3000, 400), ("/keys", "9" * 5000, 400),
+     ("/elsewhere", {}, 400), ("/reset", {}, 200)],
+)  # fmt: skip
+def test_messages_are_checked(viewer, path, body, status):
+    assert ask(viewer, "POST", path, body)[0] == status
+
+
+@pytest.mark.parametrize("query", ["", "?x=1", "?x=nan&y=0", "?x=a&y=0", "?x=inf&y=1"])
+def test_places_are_checked(viewer, query):
+    assert ask(viewer, "GET", f"/ground{query}")[0] == 400
+
+
+def test_files_beside_the_page_are_not_served(viewer):
+    for path in ("/../server.py", "/%2e%2e/server.py", "/page/index.html", "//etc/passwd", "/index.html/"):
+        assert ask(viewer, "GET", path)[0] in (403, 404)
+
+
+def test_ground_is_the_terrains(viewer):
+    near = json.loads(ask(viewer, "GET", "/ground?x=3&y=-4")[2])["near"]
+    heights = np.frombuffer(base64.b64decode(near["heights"]), "<f4").reshape(near["rows"], near["cols"])
+    x = np.linspace(near["low"][0], near["high"][0], near["cols"])
+    y = np.linspace(near["low"][1], near["high"][1], near["rows"])
+    assert x[0] < 3 - 19 and x[-1] > 3 + 19 and y[0] < -4 - 19 and y[-1] > -4 + 19
+    found = sample(viewer.drive.model.terrain.field, *(a.astype(np.float32) for a in np.meshgrid(x, y)))[0]
+    np.testing.assert_allclose(heights, found, atol=2e-3)
+    assert json.loads(ask(viewer, "GET", "/ground?x=1e9&y=0")[2])["near"]["cols"] > 1  # off the map: its edge
+
+
+def _until(viewer, condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    for picture in pictures(viewer):
+        if condition(picture):
+            return picture
+        assert time.monotonic() < end, picture
+    raise AssertionError("the pictures ended")
+
+
+def test_keys_move_the_rover_and_a_silent_page_lets_go(viewer):
+    ask(viewer, "POST", "/reset", {})
+    still = next(iter(pictures(viewer)))
+    assert still["path_m"] < 0.05 and still["asked_m_s"] == 0.0
+    assert ask(viewer, "POST", "/keys", {"held": ["forward", "left"]})[0] == 200
+    driven = _until(viewer, lambda p: p["path_m"] > 0.1)
+    assert driven["asked_m_s"] > 0 and driven["speed_m_s"] > 0.05 and 0.0 < driven["heading_deg"] < 90.0
+    assert driven["bodies"][1][0] > still["bodies"][1][0] + 0.05
+    assert len(driven["slip"]) == len(driven["sinkage_mm"]) == len(driven["winding_degC"]) == 4
+    assert max(driven["sinkage_mm"]) > 1.0 and driven["hottest_degC"] > 20.0
+    # nothing more is said: after DEAD_MAN the keys are let go and the rover stops
+    released = _until(viewer, lambda p: p["asked_m_s"] == 0.0, seconds=DEAD_MAN + 5)
+    _until(viewer, lambda p: p["time_s"] > released["time_s"] + 1.0 and p["speed_m_s"] < 0.05)
+    ask(viewer, "POST", "/reset", {})
+    assert _until(viewer, lambda p: p["time_s"] < 1.0)["path_m"] < 0.05
+
+
+def test_a_taken_port_is_one_sentence(viewer):
+    with pytest.raises(UserError, match=r"--port = \d+ cannot be opened \(Address already in use\); name another port"):
+        Viewer(viewer.drive, viewer.server_address[1])
+    with pytest.raises(UserError, match="--port = 70000 is no port"):
+        Viewer(viewer.drive, 70000)
+
+
+def test_pictures_end_with_the_drive(viewer):
+    served = Viewer(viewer.drive, 0)
+    served._show()
+    reader: list[dict] = []
+    thread = threading.Thread(target=lambda: reader.extend(pictures(served)))
+    runner = threading.Thread(target=served.serve_forever)
+    runner.start()
+    thread.start()
+    time.sleep(0.3)
+    served.shutdown()
+    served.close()
+    for t in (thread, runner):
+        t.join(timeout=5)
+        assert not t.is_alive()
+    assert reader

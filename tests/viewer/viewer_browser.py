@@ -1,0 +1,101 @@
+"""A headless Chromium, spoken to through its DevTools protocol over pipes: no port is opened, nothing is downloaded."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+CHROMIUM = next((p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None)
+
+
+class Browser:
+    """One page of a headless Chromium with software WebGL."""
+
+    def __init__(self, folder: Path, size: tuple[int, int] = (1280, 760)):
+        assert CHROMIUM is not None
+        to_read, self._write = os.pipe()
+        self._read, to_write = os.pipe()
+        flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+                 "--disable-dev-shm-usage", "--no-first-run", "--disable-background-networking", "--hide-scrollbars",
+                 "--remote-debugging-pipe", f"--user-data-dir={folder}"]  # fmt: skip
+        # DevTools speaks on the file descriptors 3 and 4
+        shell = f"exec '{CHROMIUM}' \"$@\" 3<&{to_read} 4>&{to_write}"
+        self._process = subprocess.Popen(["bash", "-c", shell, "chromium", *flags, "about:blank"],
+                                         pass_fds=(to_read, to_write), stdout=subprocess.DEVNULL,
+                                         stderr=subprocess.DEVNULL)  # fmt: skip
+        os.close(to_read)
+        os.close(to_write)
+        self._count, self._rest, self.problems = 0, b"", []
+        self._session: str | None = None
+        targets = self.call("Target.getTargets")["targetInfos"]
+        page = next(t["targetId"] for t in targets if t["type"] == "page")
+        self._session = self.call("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
+        self.call("Page.enable")
+        self.call("Runtime.enable")
+        self.call("Log.enable")
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
+        )
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Calls a method of the protocol and returns its result."""
+        self._count += 1
+        message = {"id": self._count, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._next()
+            if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
+                self.problems.append(answer["params"])
+            if answer.get("id") == self._count:
+                assert "error" not in answer, answer["error"]
+                return answer["result"]
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self._rest:
+            piece = os.read(self._read, 1 << 16)
+            assert piece, "Chromium ended"
+            self._rest += piece
+        text, _, self._rest = self._rest.partition(b"\0")
+        return json.loads(text)
+
+    def open(self, address: str) -> None:
+        self.call("Page.navigate", url=address)
+
+    def value(self, expression: str) -> Any:
+        """Value of a JavaScript expression on the page; promises are awaited."""
+        result = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def wait(self, expression: str, seconds: float = 60.0) -> Any:
+        """Waits until an expression is true."""
+        end = time.monotonic() + seconds
+        while not (value := self.value(expression)):
+            assert time.monotonic() < end, f"{expression} did not come true; {self.problems}"
+            time.sleep(0.2)
+        return value
+
+    def key(self, kind: str, code: str, key: str) -> None:
+        """`kind` is keyDown or keyUp."""
+        self.call("Input.dispatchKeyEvent", type=kind, code=code, key=key)
+
+    def picture(self, path: Path) -> Path:
+        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
+        return path
+
+    def close(self) -> None:
+        os.close(self._write)  # Chromium ends when its pipe does
+        try:
+            self._process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        os.close(self._read)
