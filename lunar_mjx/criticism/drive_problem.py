@@ -15,7 +15,8 @@ import numpy as np
 
 from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
 from lunar_mjx.criticism.drive_noise import channel_noise
-from lunar_mjx.criticism.drive_runs import Bench, LogRun, Rows
+from lunar_mjx.criticism.drive_program import Rows
+from lunar_mjx.criticism.drive_runs import Bench, LogRun
 from lunar_mjx.criticism.fitted import fitted_model
 from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.gather import Gather
@@ -93,7 +94,7 @@ class DriveProblem(Problem):
         self.effects, self.not_tested = _usable(model, candidates)
         self.progress = progress
         self.bench = Bench(model, self.logs, chunk, engine)
-        self.eager = jax.default_backend() != "cpu"
+        self._batched = jax.default_backend() != "cpu"
         # A program holds only the candidates that leave their null in it: fewer compile and run faster.
         self._benches: dict[frozenset[str], Bench] = {frozenset(): self.bench}
         self._focus: frozenset[str] = frozenset()
@@ -111,6 +112,11 @@ class DriveProblem(Problem):
             found += mine
         self.coordinates = tuple(found)
         self.observations = _observations(self.bench, self.logs, splits or {}, channels)
+
+    @property
+    def eager(self) -> bool:
+        """On a GPU a Jacobian costs as little as a residual; not, though, for many refits at once."""
+        return self._batched and self._gather is None
 
     def with_candidates(self, candidates: Mapping[str, Effect], fit: Fit, progress: Progress = silent) -> DriveProblem:
         """The same logs against the fitted model, with other candidates; its origin is the fit."""
@@ -148,8 +154,7 @@ class DriveProblem(Problem):
         bench = self._bench_for(rows)
         values = self._values(rows)
         out = np.full((len(rows), len(self.observations)), np.nan)
-        jobs = [(number, k) for number in range(len(self.logs)) for k in range(len(rows))]
-        for number, k, sampled in bench.run(jobs, values, self.observations, self.progress):
+        for number, k, sampled in bench.run(len(rows), values, self.observations, self.progress):
             out[k, self._of_log(number)] = sampled
         return out
 
@@ -242,10 +247,8 @@ class DriveProblem(Problem):
         halved = self._bench_for(u[None]).halved()
         values = self._values(u[None])
         fine = np.empty(len(self.observations))
-        for number, _, sampled in halved.run(
-            [(n, 0) for n in range(len(self.logs))], values, self.observations, silent
-        ):
-            fine[self._of_log(number)] = sampled
+        for number, _, sampled in halved.run(1, values, self.observations, silent):
+            fine[self._of_log(number)] = sampled[0]
         keep = self.observations.in_split("fit")
         measured = self.observations.value
         coarse = self.predict(u[None])[0]

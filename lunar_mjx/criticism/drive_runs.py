@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
-import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from lunar_mjx.criticism.drive_program import Logs, Program, Rows, cores, stack_logs
 from lunar_mjx.criticism.fitting import Progress
 from lunar_mjx.criticism.observations import Observations
-from lunar_mjx.dynamics import System, build
-from lunar_mjx.dynamics.signals import measure
 from lunar_mjx.dynamics.state import Params
 from lunar_mjx.dynamics.system import default_params
 from lunar_mjx.effects.channels import EULER
@@ -26,12 +22,7 @@ from lunar_mjx.model import ZERO_CELSIUS, Model
 if TYPE_CHECKING:
     from lunar_mjx.criticism.log import Log
 
-Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
-"""(rows,) values by effect, parameter, log (-1 for all) and whether they are factors."""
-
-SETTLE = 1.0
-"""Time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
-CHUNK = {"cpu": 16, "gpu": 1024}
+CHUNK = {"cpu": 16, "gpu": 2048}
 """Rovers simulated at once."""
 _FINEST = 0.01
 """Shortest interval of telemetry, s."""
@@ -59,7 +50,7 @@ class LogRun:
     imu_position: tuple[float, float, float]
 
 
-_PROGRAMS: dict[Any, _Program] = {}
+_PROGRAMS: dict[Any, Program] = {}
 """Programs take every number as an argument, so that campaigns of one rover share them; a program keeps its model, so
 that no other effect takes the identity of one of its own."""
 _MOST_PROGRAMS = 32
@@ -74,6 +65,7 @@ class Bench:
         self.runs = _alike([log_run(log, model) for log in logs])
         with jax.enable_x64(True):
             self._params = [_nameless(default_params(run.model)) for run in self.runs]
+        self._stacked: list[Logs] | None = None
 
     def halved(self) -> Bench:
         """The same with half the time step."""
@@ -84,7 +76,7 @@ class Bench:
             dataclasses.replace(r, model=r.model.replace(timestep=0.5 * r.model.timestep), every=2 * r.every)
             for r in self.runs
         ]
-        other._params = self._params
+        other._params, other._stacked = self._params, None
         return other
 
     def channels(self, number: int) -> list[str]:
@@ -92,7 +84,7 @@ class Bench:
         known = _modelled(self.runs[number].model)
         return [c for c in self.logs[number].channel_names if c in known and not c.startswith("quaternion")]
 
-    def _program(self, number: int) -> _Program:
+    def _program(self, number: int) -> Program:
         run = self.runs[number]
         wanted = tuple(sorted({c for n in range(len(self.runs)) for c in self.channels(n)}))
         shapes = tuple((a.shape, str(a.dtype)) for a in jax.tree.leaves(self._params[number].terrain))
@@ -105,32 +97,55 @@ class Bench:
         if key not in _PROGRAMS:
             while len(_PROGRAMS) >= _MOST_PROGRAMS:
                 _PROGRAMS.pop(next(iter(_PROGRAMS)))
-            _PROGRAMS[key] = _Program(run.model, run.every, wanted, run.imu_position, self.engine)
+            _PROGRAMS[key] = Program(run.model, run.every, wanted, run.imu_position, self.engine)
         return _PROGRAMS[key]
 
+    def _groups(self) -> list[Logs]:
+        """Logs by the program and the length that they share."""
+        if self._stacked is None:
+            groups: dict[Any, list[int]] = {}
+            for number, run in enumerate(self.runs):
+                program = self._program(number)
+                groups.setdefault((id(program), program.length(len(run.commands))), []).append(number)
+            self._stacked = [
+                stack_logs(self._program(n[0]), n, [self.runs[i] for i in n], [self._params[i] for i in n])
+                for n in groups.values()
+            ]
+        return self._stacked
+
     def run(
-        self,
-        jobs: Sequence[tuple[int, int]],
-        values: Rows,
-        observations: Observations,
-        progress: Progress,
-    ) -> Iterator[tuple[int, int, np.ndarray]]:
-        """Simulates jobs (log, row) and yields (log, row, samples of the log's observations)."""
-        groups: dict[Any, list[tuple[int, int]]] = {}
-        for job in jobs:
-            program = self._program(job[0])
-            length = program.length(len(self.runs[job[0]].commands))
-            groups.setdefault((id(program), length), []).append(job)
+        self, rows: int, values: Rows, observations: Observations, progress: Progress
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Simulates all logs with all rows and yields (log, rows, (rows, samples) of the log's observations)."""
         done = 0
-        for (_, length), mine in groups.items():
-            program = self._program(mine[0][0])
-            parts = [mine[at : at + self.chunk] for at in range(0, len(mine), self.chunk)]
-            padded = [part + [part[-1]] * (self.chunk - len(part)) for part in parts]
-            for part, signals in zip(parts, program.all(self, padded, values, length), strict=True):
-                for i, (number, row) in enumerate(part):
-                    yield number, row, self._sample(number, {c: v[i] for c, v in signals.items()}, observations)
+        for logs in self._groups():
+            jobs = np.stack(np.meshgrid(np.arange(len(logs.numbers)), np.arange(rows), indexing="ij"), -1).reshape(
+                -1, 2
+            )
+            parts = [jobs[at : at + self.chunk] for at in range(0, len(jobs), self.chunk)]
+            for part, signals in zip(parts, self._signals(logs, parts, values), strict=True):
+                for log in np.unique(part[:, 0]):
+                    mine = np.flatnonzero(part[:, 0] == log)
+                    number = logs.numbers[log]
+                    chosen = {c: v[mine] for c, v in signals.items()}
+                    yield number, part[mine, 1], self._sample(number, chosen, observations)
                 done += len(part)
-                progress("simulating", done / len(jobs))
+                progress("simulating", done / (rows * len(self.runs)))
+
+    def _signals(self, logs: Logs, parts: Sequence[np.ndarray], values: Rows) -> Iterator[dict[str, np.ndarray]]:
+        """Channels of every part in turn; on a CPU one part per core at a time, as XLA runs a loop on one core."""
+
+        def one(part: np.ndarray) -> dict[str, np.ndarray]:
+            full = np.concatenate([part, np.repeat(part[-1:], self.chunk - len(part), axis=0)])
+            return logs.program(logs, full[:, 0], full[:, 1], values)
+
+        workers = cores() if jax.default_backend() == "cpu" else 1
+        if workers < 2 or len(parts) < 2 or not logs.program.compiled:
+            yield one(parts[0])
+            parts = parts[1:]
+        if parts:
+            with concurrent.futures.ThreadPoolExecutor(max(workers, 1)) as pool:
+                yield from pool.map(one, parts)
 
     def _sample(self, number: int, signals: Mapping[str, np.ndarray], observations: Observations) -> np.ndarray:
         run = self.runs[number]
@@ -142,16 +157,16 @@ class Bench:
             values = signals[s.channel]
             assert s.time is not None
             place = (s.time - run.begin) / step
-            low = np.clip(np.floor(place).astype(int), 0, len(values) - 2)
+            low = np.clip(np.floor(place).astype(int), 0, values.shape[1] - 2)
             share = place - low
             if s.channel in EULER:
-                values = np.rad2deg(np.unwrap(np.deg2rad(values)))
-            sampled = values[low] * (1.0 - share) + values[low + 1] * share
+                values = np.rad2deg(np.unwrap(np.deg2rad(values), axis=1))
+            sampled = values[:, low] * (1.0 - share) + values[:, low + 1] * share
             if s.channel in EULER:
                 measured = observations.value[s.start : s.stop]
                 sampled = measured + (sampled - measured + 180.0) % 360.0 - 180.0
             parts.append(sampled)
-        return np.concatenate(parts) if parts else np.zeros(0)
+        return np.concatenate(parts, axis=1) if parts else np.zeros((len(next(iter(signals.values()))), 0))
 
 
 def _alike(runs: Sequence[LogRun]) -> list[LogRun]:
@@ -170,108 +185,6 @@ def _alike(runs: Sequence[LogRun]) -> list[LogRun]:
 def _nameless(params: Params) -> Params:
     """Parameters whose terrain has no name, which would make programs of their own."""
     return jax.tree.map(np.asarray, dataclasses.replace(params, terrain=dataclasses.replace(params.terrain, name="")))
-
-
-class _Program:
-    """One compiled simulation of a chunk of rovers, from rest to the measured channels."""
-
-    def __init__(
-        self, model: Model, every: int, channels: tuple[str, ...], imu: tuple[float, float, float], engine: str
-    ):
-        self.model, self.every, self.channels, self.imu = model, every, channels, imu
-        with jax.enable_x64(True):
-            self.system: System = build(model, engine)
-        # Pieces of one length, the first of which settles the rover: one program serves logs of any length.
-        self.segment = math.ceil(SETTLE / (every * self.system.dt) - 1e-9)
-        self._compiled = False
-        self.reset, self.drive, self.measure = jax.jit(self._reset), jax.jit(self._drive), jax.jit(self._measure)
-
-    def length(self, commands: int) -> int:
-        """Number of commands rounded up to whole pieces."""
-        return self.segment * math.ceil(commands / self.segment)
-
-    def _reset(self, params: Params, start: Mapping[str, Any]) -> Any:
-        system = self.system
-        return jax.vmap(lambda p, s: system.reset(p, s["x"], s["y"], s["yaw"], s["temperature"]))(params, start)
-
-    def _drive(self, params: Params, state: Any, commands: Any) -> tuple[Any, Any]:
-        axes = jax.tree.map(lambda _: 0, params)
-        return self.system.rollout_batch(
-            params, state, commands, self.every, axes, chunk=commands.shape[0], one_body=True
-        )
-
-    def _measure(self, params: Params, seen: Any) -> dict[str, Any]:
-        def channels(params: Params, seen: Any) -> dict[str, Any]:
-            found = measure(self.system, seen, params, self.imu if any(self.imu) else None).channels
-            return {c: found[c] for c in self.channels}
-
-        return jax.vmap(channels)(params, seen)
-
-    def all(
-        self, bench: Bench, parts: Sequence[Sequence[tuple[int, int]]], values: Rows, length: int
-    ) -> Iterator[dict[str, np.ndarray]]:
-        """Channels of every part in turn; on a CPU one part per core at a time, as XLA runs a loop on one core."""
-        workers = _cores() if jax.default_backend() == "cpu" else 1
-        if workers < 2 or len(parts) < 2 or not self._compiled:
-            self._compiled = True
-            for part in parts[:1]:
-                yield self(bench, part, values, length)
-            parts = parts[1:]
-        if not parts:
-            return
-        with concurrent.futures.ThreadPoolExecutor(max(workers, 1)) as pool:
-            yield from pool.map(lambda part: self(bench, part, values, length), parts)
-
-    def __call__(
-        self,
-        bench: Bench,
-        jobs: Sequence[tuple[int, int]],
-        values: Rows,
-        length: int,
-    ) -> dict[str, np.ndarray]:
-        rows = [_row(bench, number, k, values) for number, k in jobs]
-        stacked = jax.tree.map(lambda *a: np.stack(a), *[r[0] for r in rows])
-        start = {name: np.array([r[1][name] for r in rows]) for name in ("x", "y", "yaw", "temperature")}
-        commands = np.stack([_padded(bench.runs[number].commands, length) for number, _ in jobs])
-        with jax.enable_x64(True):
-            params = jax.device_put(stacked)
-            state = self.reset(params, start)
-            settled, _ = self.drive(params, state, np.zeros_like(commands[:, : self.segment]))
-            # The clock and the heat begin with the log.
-            state = dataclasses.replace(settled, step=state.step, temperature=state.temperature)
-            seen = []
-            for at in range(0, length, self.segment):
-                state, telemetry = self.drive(params, state, commands[:, at : at + self.segment])
-                seen.append(telemetry)
-            whole = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *seen)
-            return {c: np.asarray(v) for c, v in self.measure(params, whole).items()}
-
-
-def _cores() -> int:
-    """Cores that this process may use, which may be fewer than the machine has."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _padded(commands: np.ndarray, length: int) -> np.ndarray:
-    return np.concatenate([commands, np.repeat(commands[-1:], length - len(commands), axis=0)])
-
-
-def _row(bench: Bench, number: int, k: int, values: Rows) -> tuple[Params, dict[str, float]]:
-    """Parameters and start of one rover: the log's conditions with one row of coordinates put in."""
-    base, start = bench._params[number], dict(bench.runs[number].start)
-    effects = {e: {n: np.asarray(v, float) for n, v in p.items()} for e, p in base.effects.items()}
-    for (effect, name, log, factor), column in values.items():
-        if effect not in effects and effect != "initial":
-            continue  # a candidate at its null, which this program does without
-        value = float(column[k])
-        if effect == "initial":
-            if log == number:
-                start[name] = value
-        elif factor:
-            effects[effect][name] = effects[effect][name] * value
-        else:
-            effects[effect][name] = np.full_like(effects[effect][name], value)
-    return dataclasses.replace(base, effects=effects), start
 
 
 def _modelled(model: Model) -> frozenset[str]:

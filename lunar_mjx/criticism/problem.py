@@ -42,7 +42,6 @@ class Problem(abc.ABC):
     """
 
     cheap_jacobian: bool = True
-    eager: bool = False
 
     observations: Observations
     coordinates: tuple[Coordinate, ...]
@@ -50,6 +49,11 @@ class Problem(abc.ABC):
     candidates: Mapping[str, np.ndarray]
     effects: Mapping[str, Effect]
     not_tested: tuple[NotTested, ...]
+
+    @property
+    def eager(self) -> bool:
+        """See above."""
+        return False
 
     @abc.abstractmethod
     def predict(self, u: np.ndarray) -> np.ndarray:

@@ -1,0 +1,240 @@
+"""Levenberg-Marquardt on whitened residuals with priors and bounds, from one start or chased from many.
+
+Sources: Levenberg-Marquardt with geodesic acceleration (Transtrum & Sethna 2012); Broyden (1965).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from lunar_mjx.criticism.problem import Problem
+
+SAME_CHI2 = 1.0
+"""Chi-squares that differ by less, or by less than a ten-thousandth, are the same fit."""
+SMALL_GRADIENT = 0.5
+"""Largest drop of chi-square that one more Gauss-Newton step may still promise: under a sigma in all directions."""
+MISFIT_SHARE = 0.1
+"""Where a model misfits, all three may be this share of chi-square beyond the noise: a better fit would misfit, too.
+Bounds and starts that do not agree are then no faults either; both count in the fit of the model that is named, which
+has to reach the noise. (Scores do not feel a fit that has not quite converged: what it lacks lies in the span of its
+sensitivities, and that is projected out.)"""
+
+_DAMPINGS = np.array([1e-4, 1e-2, 1.0, 1e2])
+_ITERATIONS = 60
+EDGE = 1e-6
+_PROBE = 0.1
+_PATIENCE = 2
+"""Steps in a row that may gain less than matters."""
+_HOPE = 4.0
+"""Drop of chi-square that is still hoped for, in terms of what a Gauss-Newton step promises."""
+
+
+def whitened_residuals(problem: Problem, u: np.ndarray) -> np.ndarray:
+    """(k, n) measured less predicted, whitened, at (k, coordinates); not finite where a prediction is not."""
+    difference = problem.observations.value[None] - problem.predict(u)
+    return problem.observations.whiten(difference.T).T
+
+
+class Objective:
+    """Chi-square of the fitted observations with the priors, and its quadratic model, over the free coordinates."""
+
+    def __init__(self, problem: Problem, free: np.ndarray, fitted: np.ndarray):
+        self.problem, self.free, self.fitted = problem, free, fitted
+        self.low, self.high = problem.bounds(free)
+
+    def residuals(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residuals (k, n), and chi-square (k,), infinite where a prediction is not finite."""
+        r = whitened_residuals(self.problem, u)
+        return r, self._chi2(u, r)
+
+    def _chi2(self, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+        prior = np.array([np.sum(self.problem.prior_rows(row, self.free)[0] ** 2) for row in u])
+        with np.errstate(over="ignore", invalid="ignore"):
+            chi2 = np.sum(r[:, self.fitted] ** 2, axis=1) + prior
+        return np.where(np.isfinite(chi2), chi2, np.inf)
+
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        j = self.problem.observations.whiten(self.problem.jacobian(u, self.free))
+        return np.where(np.isfinite(j), j, 0.0)
+
+    def linearise(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whitened residuals (k, n), chi-square (k,) and Jacobians (k, n, free) in one batch."""
+        observations = self.problem.observations
+        predicted, jacobian = self.problem.linearise(u, self.free)
+        r = observations.whiten((observations.value[None] - predicted).T).T
+        j = np.stack([observations.whiten(a) for a in jacobian])
+        return r, self._chi2(u, r), np.where(np.isfinite(j), j, 0.0)
+
+    def quadratic(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Half the downhill gradient and the Gauss-Newton Hessian."""
+        prior, scale = self.problem.prior_rows(u, self.free)
+        j = j[self.fitted]
+        return j.T @ r[self.fitted] - scale * prior, j.T @ j + np.diag(scale**2)
+
+    def held(self, at: np.ndarray, downhill: np.ndarray) -> np.ndarray:
+        """Coordinates at a bound that the gradient pushes against."""
+        return ((at <= self.low + EDGE) & (downhill < 0.0)) | ((at >= self.high - EDGE) & (downhill > 0.0))
+
+    def steps(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray, dampings: np.ndarray) -> np.ndarray:
+        """(dampings, coordinates) damped Gauss-Newton steps, cut at the bounds."""
+        at = u[self.free]
+        move = ~self.held(at, downhill)
+        out = np.repeat(u[None], len(dampings), axis=0)
+        if not move.any():
+            return out
+        inner = hessian[np.ix_(move, move)]
+        for i, damping in enumerate(dampings):
+            step = np.linalg.lstsq(inner + damping * np.diag(np.diag(inner) + 1e-12), downhill[move], rcond=None)[0]
+            new = at.copy()
+            new[move] = at[move] + step
+            out[i, self.free] = np.clip(new, self.low, self.high)
+        return out
+
+    def bent(
+        self, u: np.ndarray, r: np.ndarray, j: np.ndarray, hessian: np.ndarray, trials: np.ndarray, dampings: np.ndarray
+    ) -> np.ndarray:
+        """Steps bent along a curved valley by the second derivative in their direction (Transtrum and Sethna 2012)."""
+        steps = (trials - u)[:, self.free]
+        probes = np.repeat(u[None], len(steps), axis=0)
+        probes[:, self.free] += _PROBE * steps
+        ahead, _ = self.residuals(probes)
+        out = trials.copy()
+        for i, (step, damping) in enumerate(zip(steps, dampings, strict=True)):
+            if not np.isfinite(ahead[i]).all() or not np.any(step):
+                continue
+            second = -2.0 / _PROBE * ((ahead[i] - r) / _PROBE + j @ step)
+            inner = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
+            bend = -0.5 * np.linalg.lstsq(inner, j[self.fitted].T @ second[self.fitted], rcond=None)[0]
+            # beyond this the quadratic path is not to be trusted either
+            bend *= min(1.0, 0.75 * np.linalg.norm(step) / max(2.0 * float(np.linalg.norm(bend)), 1e-30))
+            out[i, self.free] = np.clip(u[self.free] + step + bend, self.low, self.high)
+        return out
+
+    def promise(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> float:
+        """Drop of chi-square that a full Gauss-Newton step over the unheld coordinates promises."""
+        move = ~self.held(u[self.free], downhill)
+        if not move.any():
+            return 0.0
+        inner = hessian[np.ix_(move, move)]
+        return float(downhill[move] @ np.linalg.lstsq(inner, downhill[move], rcond=None)[0])
+
+
+@dataclasses.dataclass
+class Descent:
+    u: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+    chi2: float
+    promise: float
+
+
+def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, rival: float = np.inf) -> Descent:
+    """Levenberg-Marquardt from one start, all dampings of an iteration in one batch.
+
+    Where Jacobians are dear, Broyden's update stands in for them as long as steps keep their promise, and a descent
+    that falls far short of a rival's chi-square is left.
+    """
+    u = start.copy()
+    u[goal.free] = np.clip(u[goal.free], goal.low, goal.high)
+    lazy = not goal.problem.cheap_jacobian and not goal.problem.eager
+    if goal.problem.eager:
+        residuals, chi2, jacobians = goal.linearise(u[None])
+        r, best, j = residuals[0], float(chi2[0]), jacobians[0]
+    else:
+        residuals, chi2 = goal.residuals(u[None])
+        r, best = residuals[0], float(chi2[0])
+        j = goal.jacobian(u) if np.isfinite(best) else np.zeros((len(r), len(goal.free)))
+    damping, promise, fresh, curved, slow = 1e-2, np.inf, True, False, 0
+    for _ in range(iterations):
+        if not np.isfinite(best):
+            break
+        downhill, hessian = goal.quadratic(u, r, j)
+        promise = goal.promise(u, downhill, hessian)
+        enough = 0.0 if goal.problem.cheap_jacobian else 0.2 * slack_of(best, int(goal.fitted.sum()))
+        if fresh and not goal.problem.cheap_jacobian and best - _HOPE * promise > rival:
+            break
+        if slow >= _PATIENCE:
+            break
+        if promise < max(0.2 * SMALL_GRADIENT, enough):
+            if fresh:
+                break
+            j, fresh = goal.jacobian(u), True
+            continue
+        dampings = damping * _DAMPINGS
+        trials = goal.steps(u, downhill, hessian, dampings)
+        if curved:
+            trials = np.concatenate([trials, goal.bent(u, r, j, hessian, trials, dampings)])
+        if goal.problem.eager:
+            residuals, chi2, jacobians = goal.linearise(trials)
+        else:
+            residuals, chi2 = goal.residuals(trials)
+        k = int(np.argmin(chi2))
+        if not chi2[k] < best:
+            if not fresh:
+                j, fresh = goal.jacobian(u), True
+                continue
+            if damping > 1e8:
+                break
+            damping, curved = damping * 1e2, True
+            continue
+        # A model that misfits creeps along valleys that lead nowhere; what it gains there does not matter.
+        slow = slow + 1 if best - float(chi2[k]) < enough else 0
+        kept = best - float(chi2[k]) > 0.5 * promise
+        curved = not kept
+        step, before = trials[k][goal.free] - u[goal.free], r
+        u, r, best = trials[k], residuals[k], float(chi2[k])
+        damping = float(np.clip(dampings[k % len(dampings)], 1e-9, 1e6))
+        if goal.problem.eager:
+            j = jacobians[k]
+        elif lazy and kept and np.isfinite(r).all():
+            j, fresh = _broyden(j, step, before - r), False
+        else:
+            j, fresh = goal.jacobian(u), True
+    if not fresh:
+        j = goal.jacobian(u)
+    if np.isfinite(best):
+        promise = goal.promise(u, *goal.quadratic(u, r, j))
+    return Descent(u, r, j, best, promise)
+
+
+def _broyden(jacobian: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """The Jacobian that predicts the last change and differs least from the one before (Broyden 1965)."""
+    return jacobian + np.outer(change - jacobian @ step, step) / max(float(step @ step), 1e-30)
+
+
+def slack_of(chi2: float, observations: int) -> float:
+    """Chi-square that does not matter in a fit that is beyond the noise; zero where it is not."""
+    return MISFIT_SHARE * max(0.0, chi2 - 1.06 * observations - 5.0 * np.sqrt(2.0 * observations))
+
+
+def same_chi2(chi2: float, observations: int) -> float:
+    return max(SAME_CHI2, 1e-4 * chi2, slack_of(chi2, observations))
+
+
+def chase(goal: Objective, best: Descent, starts: np.ndarray, rounds: int = 8) -> list[float]:
+    """Chi-square that other starts reach with the best start's Jacobian, all starts in one batch.
+
+    The fixed Jacobian (chord method) converges linearly to the same optimum where there is one.
+    """
+    u = starts.copy()
+    same = same_chi2(best.chi2, int(goal.fitted.sum()))
+    residual, chi2 = goal.residuals(u)
+    share = np.ones(len(u))
+    for _ in range(rounds):
+        if np.all(chi2 < best.chi2 + 0.5 * same):
+            break
+        trial = u.copy()
+        for i in range(len(u)):
+            if np.isfinite(chi2[i]):
+                downhill, hessian = goal.quadratic(u[i], residual[i], best.jacobian)
+                full = goal.steps(u[i], downhill, hessian, np.array([1e-6]))[0]
+                trial[i] = u[i] + share[i] * (full - u[i])
+            else:
+                trial[i] = 0.5 * (u[i] + best.u)
+        new_residual, new_chi2 = goal.residuals(trial)
+        better = new_chi2 < chi2
+        share = np.where(better, np.minimum(1.0, 2.0 * share), 0.4 * share)
+        u[better], residual[better], chi2 = trial[better], new_residual[better], np.minimum(chi2, new_chi2)
+    return [float(c) for c in chi2]

@@ -1,0 +1,153 @@
+"""The compiled simulation of a chunk of rovers that differ in parameters, starts, commands and ground."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.dynamics import System, build
+from lunar_mjx.dynamics.signals import measure
+from lunar_mjx.dynamics.state import Params
+from lunar_mjx.model import Model
+
+if TYPE_CHECKING:
+    from lunar_mjx.criticism.drive_runs import LogRun
+
+Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
+"""(rows,) values by effect, parameter, log (-1 for all) and whether they are factors."""
+
+SETTLE = 1.0
+"""Time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
+
+
+class Program:
+    """One compiled simulation of a chunk of rovers, from rest to the measured channels."""
+
+    def __init__(
+        self, model: Model, every: int, channels: tuple[str, ...], imu: tuple[float, float, float], engine: str
+    ):
+        self.model, self.every, self.channels, self.imu = model, every, channels, imu
+        with jax.enable_x64(True):
+            self.system: System = build(model, engine)
+        # Pieces of one length, the first of which settles the rover: one program serves logs of any length.
+        self.segment = math.ceil(SETTLE / (every * self.system.dt) - 1e-9)
+        self.compiled = False
+        self._reset = jax.jit(self._reset_all)
+        self._drive = jax.jit(self._drive_all, static_argnames="shared")
+        self._measure = jax.jit(self._measure_all, static_argnames="shared")
+
+    def length(self, commands: int) -> int:
+        """Number of commands rounded up to whole pieces."""
+        return self.segment * math.ceil(commands / self.segment)
+
+    def _axes(self, params: Params, shared: bool) -> Any:
+        axes = jax.tree.map(lambda _: 0, params)
+        return dataclasses.replace(axes, terrain=None) if shared else axes
+
+    def _reset_all(self, params: Params, start: Mapping[str, Any], terrain: Any, log: Any) -> tuple[Params, Any]:
+        """Parameters with their ground, and states at the start."""
+        shared = log is None
+        if not shared:
+            terrain = jax.tree.map(lambda a: a[log], terrain)
+        params = dataclasses.replace(params, terrain=terrain)
+        one = lambda p, s: self.system.reset(p, s["x"], s["y"], s["yaw"], s["temperature"])  # noqa: E731
+        return params, jax.vmap(one, (self._axes(params, shared), 0))(params, start)
+
+    def _drive_all(self, params: Params, state: Any, commands: Any, shared: bool) -> tuple[Any, Any]:
+        return self.system.rollout_batch(
+            params, state, commands, self.every, self._axes(params, shared), chunk=commands.shape[0], one_body=True
+        )
+
+    def _measure_all(self, params: Params, seen: Any, shared: bool) -> dict[str, Any]:
+        def channels(params: Params, seen: Any) -> dict[str, Any]:
+            found = measure(self.system, seen, params, self.imu if any(self.imu) else None).channels
+            return {c: found[c] for c in self.channels}
+
+        return jax.vmap(channels, (self._axes(params, shared), 0))(params, seen)
+
+    def __call__(self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows) -> dict[str, np.ndarray]:
+        """Channels (rovers, time) of rovers by their log (place in `logs`) and their row of `values`."""
+        params, start = logs.rovers(log, row, values)
+        commands = logs.commands[log]
+        self.compiled = True
+        with jax.enable_x64(True):
+            own, shared = (None, True) if logs.shared else (log, False)
+            full, state = self._reset(params, start, logs.terrain, own)
+            settled, _ = self._drive(full, state, np.zeros_like(commands[:, : self.segment]), shared=shared)
+            # The clock and the heat begin with the log.
+            state = dataclasses.replace(settled, step=state.step, temperature=state.temperature)
+            seen = []
+            for at in range(0, commands.shape[1], self.segment):
+                state, telemetry = self._drive(full, state, commands[:, at : at + self.segment], shared=shared)
+                seen.append(telemetry)
+            whole = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *seen)
+            return {c: np.asarray(v) for c, v in self._measure(full, whole, shared=shared).items()}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Logs:
+    """Logs that one program runs, stacked, so that a rover is a pair of indices.
+
+    Attributes:
+      program: which runs them. numbers: of the logs in the campaign.
+      params: with a leading axis of logs, but for the ground. start: (logs,) by name.
+      terrain: the ground, with a leading axis of logs unless `shared` by all of them.
+      commands: (logs, time, joint), the last ones repeated up to whole pieces.
+    """
+
+    program: Program
+    numbers: tuple[int, ...]
+    params: Params
+    start: Mapping[str, np.ndarray]
+    terrain: Any
+    shared: bool
+    commands: np.ndarray
+
+    def rovers(self, log: np.ndarray, row: np.ndarray, values: Rows) -> tuple[Params, dict[str, np.ndarray]]:
+        """Parameters (but for the ground) and starts of rovers: the logs' conditions with rows of values put in."""
+        params = jax.tree.map(lambda a: a[log], self.params)
+        start = {name: column[log].copy() for name, column in self.start.items()}
+        number = np.asarray(self.numbers)[log]
+        for (effect, name, own, factor), column in values.items():
+            value = column[row]
+            if effect == "initial":
+                start[name] = np.where(number == own, value, start[name])
+            elif effect in params.effects:  # else a candidate at its null, which this program does without
+                old = params.effects[effect][name]
+                spread = value.reshape(-1, *[1] * (old.ndim - 1))
+                params.effects[effect][name] = old * spread if factor else np.broadcast_to(spread, old.shape)
+        return params, start
+
+
+def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun], params: Sequence[Params]) -> Logs:
+    """Makes logs of one program and one length ready."""
+    length = program.length(max(len(r.commands) for r in runs))
+    terrains = [p.terrain for p in params]
+    leaves = [jax.tree.leaves(t) for t in terrains]
+    shared = all(np.array_equal(a, b) for other in leaves[1:] for a, b in zip(leaves[0], other, strict=True))
+    bare = [dataclasses.replace(p, terrain=None) for p in params]  # type: ignore[arg-type]
+    with jax.enable_x64(True):
+        ground = terrains[0] if shared else jax.tree.map(lambda *a: np.stack(a), *terrains)
+        ground = jax.device_put(ground)
+    return Logs(
+        program=program, numbers=tuple(numbers), params=jax.tree.map(lambda *a: np.stack(a), *bare),
+        start={n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature")},
+        terrain=ground, shared=shared,
+        commands=np.stack([_padded(r.commands, length) for r in runs]),
+    )  # fmt: skip
+
+
+def cores() -> int:
+    """Cores that this process may use, which may be fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _padded(commands: np.ndarray, length: int) -> np.ndarray:
+    return np.concatenate([commands, np.repeat(commands[-1:], length - len(commands), axis=0)])
