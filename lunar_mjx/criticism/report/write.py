@@ -13,7 +13,7 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.report.page import Block, Figure, Section, Text, write_page
 
 
-def write_report(runs: Sequence[Path], out: Path) -> Path:
+def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
     """Writes one offline page on a chain of runs.
 
     Args:
@@ -42,7 +42,7 @@ def write_report(runs: Sequence[Path], out: Path) -> Path:
     sections.append(Section("Provenance", tables.provenance(results)))
     logs = list(dict.fromkeys(Path(p).name for p in results[-1].run.get("logs") or []))
     title = f"Criticism of a model: {and_list(logs[:4])}" + (f" and {len(logs) - 4} more" if len(logs) > 4 else "")
-    return write_page(out, title, _verdict(results, judge, steps), [s for s in sections if s.blocks])
+    return write_page(Path(out), title, _verdict(results, judge, steps), [s for s in sections if s.blocks])
 
 
 def _verdict(results: Sequence[Result], judge: Result, steps: Sequence[Step]) -> list[str]:
