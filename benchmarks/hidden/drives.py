@@ -11,7 +11,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,9 @@ def commitment(answer: Mapping[str, Any]) -> str:
     return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
 
 
-def generate(group: str, number: int, seed: int, out: Path) -> dict[str, Any]:
+def generate(
+    group: str, number: int, seed: int, out: Path, manoeuvres: Sequence[Manoeuvre] = MANOEUVRES
+) -> dict[str, Any]:
     """Makes one campaign: log folders under `out/logs/NAME`, the answer as `out/answers/NAME.json`.
 
     Returns:
@@ -106,8 +108,8 @@ def generate(group: str, number: int, seed: int, out: Path) -> dict[str, Any]:
         shutil.rmtree(folder)
     recipe = Recipe(**answer["recipe"])
     seal = commitment(answer)
-    for terrain, payload in dict.fromkeys((m.terrain, m.payload) for m in MANOEUVRES):
-        mine = [m for m in MANOEUVRES if (m.terrain, m.payload) == (terrain, payload)]
+    for terrain, payload in dict.fromkeys((m.terrain, m.payload) for m in manoeuvres):
+        mine = [m for m in manoeuvres if (m.terrain, m.payload) == (terrain, payload)]
         for manoeuvre, frame in zip(mine, _drive(answer, terrain, payload, mine), strict=True):
             _write(folder / manoeuvre.name, manoeuvre, _spoil(frame, recipe, rng), recipe, seal)
     path = out / "answers" / f"{name}.json"

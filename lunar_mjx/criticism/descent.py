@@ -185,7 +185,7 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, r
         curved = not kept
         step, before = trials[k][goal.free] - u[goal.free], r
         u, r, best = trials[k], residuals[k], float(chi2[k])
-        damping = float(np.clip(dampings[k % len(dampings)], 1e-9, 1e6))
+        damping = float(np.clip(dampings[k % len(dampings)], 1e-4, 1e6))
         if goal.problem.eager:
             j = jacobians[k]
         elif lazy and kept and np.isfinite(r).all():
