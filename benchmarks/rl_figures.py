@@ -1,7 +1,8 @@
 """Curves, tables and model cards from what rl_proof.py measured; no number is typed in by hand.
 
 python benchmarks/rl_figures.py runs/proof                        # figures to docs/figures, tables to the screen
-python benchmarks/rl_figures.py runs/proof --ship luvmi_x         # also the policy and its card to models/luvmi_x
+python benchmarks/rl_figures.py runs/proof runs/more --ship luvmi_x   # seeds of both runs; also the policy and its card
+                                                                  # to models/luvmi_x, the record to benchmarks
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.agents.curves import mean_interval, new_figure, plot_episodes
+from lunar_mjx.agents.policy import load_policy
 
 ROOT = Path(__file__).parents[1]
 _LIMIT = 2_000_000
@@ -24,6 +26,27 @@ _LIMIT = 2_000_000
 def read(folder: Path, name: str) -> dict[str, Any] | None:
     path = folder / f"rl_{name}.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def read_large(folders: list[Path]) -> dict[str, Any] | None:
+    """The record of part `large`; seeds of further runs of the same settings join those of the first."""
+    records = [r for r in (read(f, "large") for f in folders) if r]
+    if not records:
+        return None
+    first, *others = records
+    for other in others:
+        assert all(other[k] == first[k] for k in ("rover", "environment", "train", "agents", "about")), "not alike"
+        first["seeds"] += other["seeds"]
+    return first
+
+
+def rounded(value: Any) -> Any:
+    """Numbers with five digits, which is more than one seed tells."""
+    if isinstance(value, dict):
+        return {k: rounded(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [rounded(v) for v in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
 def percent(score: dict[str, Any]) -> str:
@@ -59,7 +82,7 @@ def table_large(record: dict[str, Any]) -> list[str]:
                      f"{said} (training {seed['train_s']:.0f} s)")  # fmt: skip
     times = [s["seconds_to_target"] for s in record["seeds"] if s["seconds_to_target"]]
     if len(times) > 1:
-        mean, low, high = (float(a) for a in mean_interval(np.array(times)[:, None].astype(float)))
+        mean, low, high = (float(a[0]) for a in mean_interval(np.array(times)[:, None].astype(float)))
         lines.append(f"  time to target {mean:.0f} s ({low:.0f} to {high:.0f}, 95 %, n = {len(times)})")
     if "updates_per_s" in record:
         lines.append(f"  learner {record['updates_per_s']:,.0f} updates/s of {record['train']['batch']:,} transitions")
@@ -79,7 +102,8 @@ def card(record: dict[str, Any], seed: dict[str, Any], size: int) -> str:
     """The model card of a shipped policy."""
     options = record["environment"]["options"]
     agents = "\n".join(f"| {name} | {percent(score)} |" for name, score in record["agents"].items())
-    train = record["train"]
+    train, kept = record["train"], seed["kept"]
+    others = [str(s["seed"]) for s in record["seeds"] if s is not seed]
     return f"""# Trained policy of {record["rover"]}
 
 `policy.npz` ({size / 1e6:.2f} MB): weights, observation statistics and the environment's options, without pickles.
@@ -91,8 +115,10 @@ def card(record: dict[str, Any], seed: dict[str, Any], size: int) -> str:
 within the goal's radius before the time is up. Options: `{json.dumps(options)}`.
 
 **Training.** TD3 with a distributional critic, {train["envs"]:,} rovers, batches of {train["batch"]:,}, seed
-{seed["seed"]}: {seed["steps"] / 1e6:.1f} M environment steps in {seed["train_s"]:.0f} s on one
+{seed["seed"]}: {kept["steps"] / 1e6:.1f} M environment steps in {kept["elapsed_s"]:.0f} s on one
 {record["about"]["device"]} (without compilation, {record["compile_epoch_s"]:.0f} s). Script: `benchmarks/rl_proof.py`.
+Of the policies of this training and its other seeds ({", ".join(others) or "none"}), it scored best on the ground and
+soils of the training: {percent(kept["train_score"])}.
 
 **Score** on ground, goals and soil never trained on (`{json.dumps(record["environment"]["unseen"])}`),
 {seed["final"]["episodes"]} episodes, 95 % Wilson interval:
@@ -109,15 +135,28 @@ Ends of this policy's episodes: {json.dumps({k: round(v, 4) for k, v in seed["fi
 """
 
 
+def ship(record: dict[str, Any], folders: list[Path], home: Path) -> Path:
+    """Copies the policy that scored best on the ground of its training, writes its card, and keeps the record."""
+    best = max(record["seeds"], key=lambda s: s["kept"]["train_score"]["success"])
+    found = [f / f"policy_{record['rover']}.npz" for f in folders]
+    policy = next(p for p in found if load_policy(p).notes["seed"] == best["seed"])
+    assert policy.stat().st_size < _LIMIT, "the policy is too large to ship"
+    shutil.copyfile(policy, home / "policy.npz")
+    (home / "POLICY.md").write_text(card(record, best, policy.stat().st_size), encoding="utf-8")
+    text = json.dumps(rounded(record), separators=(",", ":")) + "\n"
+    (ROOT / "benchmarks" / f"rl_large_{record['rover']}.json").write_text(text, encoding="utf-8")
+    return home / "policy.npz"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "figures")
     parser.add_argument("--ship", help="rover whose policy goes to models/")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
-    large, rates, paper = (read(args.folder, name) for name in ("large", "rates", "paper"))
+    large, rates, paper = read_large(args.folders), *(read(args.folders[0], name) for name in ("rates", "paper"))
     if large and large["seeds"]:
         plot_large(large, args.out / f"rl_large_{large['rover']}.png")
         lines += table_large(large)
@@ -134,13 +173,7 @@ def main() -> None:
                          f"{np.round(last, 2).tolist()}")  # fmt: skip
     if args.ship:
         assert large is not None and large["rover"] == args.ship, "the folder holds another rover's training"
-        policy = args.folder / f"policy_{args.ship}.npz"
-        best = max(large["seeds"], key=lambda s: s["final"]["success"])
-        assert policy.stat().st_size < _LIMIT, "the policy is too large to ship"
-        home = ROOT / "models" / args.ship
-        shutil.copy(policy, home / "policy.npz")
-        (home / "POLICY.md").write_text(card(large, best, policy.stat().st_size), encoding="utf-8")
-        lines.append(f"shipped {home / 'policy.npz'}")
+        lines.append(f"shipped {ship(large, args.folders, ROOT / 'models' / args.ship)}")
     print("\n".join(lines))
 
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gymnasium as gym
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from lunar_mjx.agents.evaluate import Evaluator
+from lunar_mjx.agents.play import shipped_policy
+from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.envs import make_agent, make_navigation, rewards
 from lunar_mjx.envs.actions import action_map
@@ -15,9 +21,12 @@ from lunar_mjx.envs.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
 from lunar_mjx.envs.places import draw_places
 from lunar_mjx.envs.randomise import Range, check_ranges
+from lunar_mjx.envs.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_REACH
+from lunar_mjx.envs.worlds import WORLDS, world
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
-from lunar_mjx.terrain import load_terrain
+from lunar_mjx.terrain import load_terrain, surface
+from lunar_mjx.terrain.rocks import build_rocks
 
 SHORT = {"task": "consistent", "terrain": "flat", "decimation": 50, "episode_time": 1.0, "places": 64,
          "goal_distance": (1.0, 1.5), "randomise": (Range("soil.cohesion", 0.5, 2.0, "log", relative=True),
@@ -79,13 +88,46 @@ def test_pictures_show_rover_and_goal(env):
 
 
 @pytest.mark.slow
-def test_the_straight_way_is_passable_on_flat_ground_in_every_soil():
-    settings = {"goal_distance": (4.0, 5.0), "episode_time": 25.0, "places": 64, "decimation": 25}
-    env = make_navigation("large", terrain="flat", **settings)
-    agent = make_agent("scripted", env)
-    evaluator = Evaluator(env, lambda _, state, key: agent(state, key), 16)
+def test_straight_line_and_shipped_policy_reach_goals_on_flat_ground_in_every_soil():
+    env = make_navigation("large", terrain="flat", goal_distance=(4.0, 5.0), episode_time=25.0, places=64)
+    straight, policy = make_agent("scripted", env), load_policy(shipped_policy("luvmi_x"))
+    evaluator = Evaluator(env, lambda trained, s, key: jnp.where(trained, policy.act(s.obs), straight(s, key)), 16)
     for params in (env.params, unseen_params(env, {"ranges": "unseen"})):
-        assert evaluator(params, (), 0).success >= 0.8
+        for trained in (False, True):
+            assert evaluator(params, jnp.array(trained), 0).success >= 0.8, trained
+
+
+@pytest.mark.parametrize("rover", ["luvmi_x", "viper"])
+def test_shipped_policies_fit_their_task_and_hold_what_they_scored(rover):
+    path = shipped_policy(rover)
+    policy = load_policy(path)
+    assert path.stat().st_size < 2_000_000 and policy.environment["options"] == {"task": "large", "rover": rover}
+    env = make_navigation("large", rover, terrain="flat", places=64, goal_distance=(4.0, 5.0))
+    assert policy.network["obs"] == env.observation_size and policy.network["actions"] == env.action_size
+    assert policy.notes["train_score"]["success"] > 0.95
+    action = policy.act(jnp.asarray(policy.mean)[None])
+    assert action.shape == (1, 6) and (abs(action) <= 1.0).all()
+
+
+def test_the_height_scan_misses_no_rock():
+    """Wherever the smallest rock lies among the near places of the scan, some place shows it."""
+    radius = 0.125
+    ahead, aside = np.meshgrid(SCAN_AHEAD, SCAN_ASIDE, indexing="ij")
+    for at in np.random.default_rng(0).uniform([-1.0, -0.75], [1.6, 0.75], (20, 2)):
+        rocks = build_rocks(np.array([[*at, 0.0]]), np.array([radius]), (-4.0, -4.0, 4.0, 4.0))
+        ground = load_terrain("flat")
+        ground = dataclasses.replace(ground, rocks=rocks)
+        seen = np.asarray(surface(ground, jnp.asarray(ahead, jnp.float32), jnp.asarray(aside, jnp.float32), SCAN_REACH))
+        assert seen.max() > 0.02, at
+        bare = np.hypot(ahead - at[0], aside - at[1]) - radius
+        assert (seen[bare > SCAN_REACH] == 0.0).all() and (seen[bare < 0.0] > 0.0).all()
+
+
+def test_worlds_share_one_shape_and_padding_adds_no_rock():
+    train, unseen = world("train"), world("heldout")
+    assert [a.shape for a in jax.tree.leaves(train)] == [a.shape for a in jax.tree.leaves(unseen)]
+    raw = load_terrain(WORLDS["train"]).rocks
+    assert (np.asarray(train.rocks.radii) > 0).sum() == (np.asarray(raw.radii) > 0).sum() > 1000
 
 
 def test_it_never_pays_to_end_an_episode_early():
