@@ -1,4 +1,4 @@
-"""`lunar-mjx log`: template, check, recording from the simulator, and sealed answers."""
+"""`lunar-mjx log`: template, import, check, recording from the simulator, and sealed answers."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ BAD_DATA_STATUS = 10
 
 def register(app: typer.Typer) -> None:
     """Adds the command `log` to the application."""
-    log_app = typer.Typer(help="Measurement logs: make, check, simulate, unseal.", no_args_is_help=True)
+    log_app = typer.Typer(help="Measurement logs: make, import, check, simulate, unseal.", no_args_is_help=True)
     log_app.command("new")(new)
+    log_app.command("import")(import_)
     log_app.command("check")(check)
     log_app.command("simulate")(simulate)
     log_app.command("unseal")(unseal)
@@ -34,6 +35,17 @@ def new(
     from lunar_mjx.criticism.log import new_log
 
     print(new_log(folder, rover, manoeuvre, steady))
+
+
+def import_(
+    recording: Annotated[Path, typer.Argument(help="MCAP file, bag of ROS 1, file or folder of a ROS 2 bag.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the log; must not exist or be empty.")],
+    mapping: Annotated[Path, typer.Option("--map", help="TOML file: which field of which topic is which channel.")],
+) -> None:
+    """Make a log from a recording of ROS or MCAP; check it next."""
+    from lunar_mjx.criticism.log import import_log
+
+    print(import_log(recording, out, mapping))
 
 
 def check(
