@@ -208,19 +208,22 @@ def preset(
 @app.command()
 def figures(
     out: OutOption = Path("runs/figures"),
-    only: Annotated[str, typer.Option(help="all, or some of 1,2,3,4,5,slope")] = "all",
+    only: Annotated[str, typer.Option(help="all, or some of 1,2,3,4,5,6,slope")] = "all",
+    training: Annotated[
+        list[Path] | None, typer.Option(help="Folder that `train` wrote, for Fig. 6; may be repeated.")
+    ] = None,
     device: DeviceOption = "auto",
 ) -> None:
-    """Make the counterparts of the paper's Figs. 1 to 5, and the slope check; 1 and 4 need OpenGL."""
+    """Make the counterparts of the paper's Figs. 1 to 6, and the slope check; 1 and 4 need OpenGL, 6 a training."""
     check_folder(out)
     select_device(device)
     from lunar_mjx.figures import FIGURES, available_figures, make_figures
 
-    names = available_figures() if only == "all" else only.split(",")
+    names = available_figures(training or ()) if only == "all" else only.split(",")
     for name in names:
         if name not in FIGURES:
             raise bad_input("figures", "--only", name, "does not exist", f"use all or some of {', '.join(FIGURES)}")
-    for path in make_figures(names, make_folder(out)):
+    for path in make_figures(names, make_folder(out), training or ()):
         print(path)
 
 

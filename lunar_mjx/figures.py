@@ -24,11 +24,15 @@ STALL_SLIP = 0.95
 """Slip of the whole rover at which it is called stalled."""
 
 
-def make_figures(names: Sequence[str], out: Path) -> list[Path]:
-    """Runs and draws figures; returns the files written (PNG and JSON for each name)."""
+def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()) -> list[Path]:
+    """Runs and draws figures; returns the files written (PNG and JSON for each name).
+
+    Args:
+      names: of `FIGURES`. out: folder. trainings: what Fig. 6 draws; see `training_figure.read_trainings`.
+    """
     written = []
     for name in names:
-        figure, numbers = FIGURES[name]()
+        figure, numbers = FIGURES[name](trainings) if name in NEED_TRAININGS else FIGURES[name]()
         figure.set_layout_engine("constrained")
         FigureCanvasAgg(figure)
         image, data = out / f"{_FILES[name]}.png", out / f"{_FILES[name]}.json"
@@ -144,27 +148,41 @@ def _from_paper_figures(name: str) -> Callable[[], tuple[Figure, dict]]:
     return make
 
 
-FIGURES: dict[str, Callable[[], tuple[Figure, dict]]] = {
+def figure_6(trainings: Sequence[Path]) -> tuple[Figure, dict]:
+    """Learning curves of trainings that were made."""
+    from lunar_mjx.visual.training_figure import figure_6  # which needs the extra rl
+
+    return figure_6(trainings)
+
+
+FIGURES: dict[str, Callable[..., tuple[Figure, dict]]] = {
     "1": _from_paper_figures("figure_1"),
     "2": _from_paper_figures("figure_2"),
     "3": figure_3,
     "4": _from_paper_figures("figure_4"),
     "5": figure_5,
+    "6": figure_6,
     "slope": figure_slope,
 }
 _FILES = {"1": "fig1_display", "2": "fig2_workflow", "3": "fig3_motor_heat", "4": "fig4_rovers_and_terrain",
-          "5": "fig5_soft_ground", "slope": "slope_stall"}  # fmt: skip
+          "5": "fig5_soft_ground", "6": "fig6_training", "slope": "slope_stall"}  # fmt: skip
 NEED_OPENGL = ("1", "4")
 """Figures that MuJoCo's renderer draws."""
+NEED_TRAININGS = ("6",)
+"""Figures of trainings, which must have been made: nothing is trained or invented here."""
 
 
-def available_figures() -> list[str]:
-    """All figures that can be made here; says on standard error what is left out without OpenGL."""
+def available_figures(trainings: Sequence[Path] = ()) -> list[str]:
+    """All figures that can be made here; says on standard error what is left out without OpenGL or trainings."""
     from lunar_mjx.cameras.gl import context_class
 
+    names = list(FIGURES)
+    if not trainings:
+        print("Fig. 6 is left out: it draws trainings; give the folder of one with --training.", file=sys.stderr)
+        names = [name for name in names if name not in NEED_TRAININGS]
     try:
         context_class()
     except UserError as missing:
         print(f"Figs. {' and '.join(NEED_OPENGL)} are left out: {missing}", file=sys.stderr)
-        return [name for name in FIGURES if name not in NEED_OPENGL]
-    return list(FIGURES)
+        names = [name for name in names if name not in NEED_OPENGL]
+    return names

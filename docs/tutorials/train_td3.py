@@ -24,10 +24,12 @@ print(state.obs.round(2))
 
 # %%
 import subprocess
+import sys
 
 
 def shell(line):
-    done = subprocess.run(line.split(), capture_output=True, text=True)
+    command = [sys.executable, "-m", "lunar_mjx.cli", *line.split()[1:]]  # lunar-mjx of this Python
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     print(done.stdout.strip())
 

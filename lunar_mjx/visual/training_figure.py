@@ -1,0 +1,121 @@
+"""The counterpart of the seed paper's Fig. 6: how the return of an episode grows while a policy learns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from lunar_mjx.agents.curves import mean_interval, moving_mean
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.report.style import BLUE, GREEN, ORANGE, PURPLE, RULE, SKY, VERMILION
+
+CURVE = "curve.json"
+_LOOKS = ((BLUE, "-"), (VERMILION, "--"), (GREEN, "-."), (ORANGE, ":"), (PURPLE, (0, (6, 2, 1, 2))), (SKY, (0, (1, 1))))
+_NEEDED = ("rows", "seed")
+
+
+def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]]]:
+    """Records of trainings by name, one per seed.
+
+    Args:
+      paths: folders that `lunar-mjx train` wrote, or JSON files: their `curve.json`, or what `benchmarks/rl_proof.py`
+        wrote.
+
+    Raises:
+      UserError: no training is given, or a file holds none.
+    """
+    if not paths:
+        raise UserError("figures: Fig. 6 needs trainings; make one with lunar-mjx train, and give its folder with "
+                        "--training.")  # fmt: skip
+    found: dict[str, list[dict[str, Any]]] = {}
+    for path in map(Path, paths):
+        file = path / CURVE if path.is_dir() else path
+        try:
+            data = json.loads(file.read_text(encoding="utf-8"))
+            named = list(_records(data))
+            if not named or any(r.get(k) is None for _, r in named for k in _NEEDED):
+                raise KeyError
+        except FileNotFoundError:
+            raise bad_input("figures", "--training", str(path), f"has no {CURVE}" if path.is_dir() else "is not there",
+                            "give a folder that lunar-mjx train has finished") from None  # fmt: skip
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise bad_input("figures", "--training", str(path), "holds no record of a training",
+                            "give a folder that lunar-mjx train wrote") from None  # fmt: skip
+        for name, record in named:
+            found.setdefault(name, []).append(record)
+    return found
+
+
+def _records(data: dict[str, Any]) -> Iterable[tuple[str, dict[str, Any]]]:
+    """Name and record of every run in a file of one of the kinds."""
+    if "seeds" in data:  # many rovers, several seeds
+        yield from ((f"TD3, {data['rover']}, {data['train']['envs']:,} at once", r) for r in data["seeds"])
+    elif "runs" in data:  # the paper's own task
+        yield from ((name, record) for name, runs in data["runs"].items() for record in runs)
+    else:
+        yield data["training"], data
+
+
+def figure_6(paths: Sequence[str | Path]) -> tuple[Figure, dict[str, Any]]:
+    """Return of an episode in training, by episode as in the paper where all trainings kept them, else by step; and
+    success: in training as lines, on unseen ground as dots."""
+    groups = read_trainings(paths)
+    records = [r for runs in groups.values() for r in runs]
+    episodes = all((r.get("episodes") or {}).get("episode_return") for r in records)
+    figure = Figure(figsize=(9.5, 3.8))
+    left, right = figure.subplots(1, 2)
+    for (colour, line), (name, runs) in zip(_LOOKS * len(groups), groups.items(), strict=False):
+        label = f"{name} ({len(runs)} seed{'s' if len(runs) > 1 else ''})"
+        if episodes:
+            _by_episode(left, runs, label, colour, line)
+        for i, run in enumerate(runs):
+            rows = [r for r in run["rows"] if r.get("episode_return") is not None]
+            steps = [r["steps"] for r in rows]
+            if not episodes:
+                left.plot(steps, [r["episode_return"] for r in rows], color=colour, linestyle=line, linewidth=1.1,
+                          label=label if i == 0 else None)  # fmt: skip
+            right.plot(steps, [100.0 * r["success"] for r in rows], color=colour, linestyle=line, linewidth=1.0)
+            unseen = run.get("unseen") or []
+            right.plot([s["steps"] for s in unseen], [100.0 * s["success"] for s in unseen], "o", color=colour,
+                       markersize=4, markeredgecolor="white", markeredgewidth=0.6)  # fmt: skip
+    _finish(left, "episode" if episodes else "environment steps",
+            "average return per episode" + (" (mean of 20)" if episodes else ""))  # fmt: skip
+    _finish(right, "environment steps", "success, %   (dots: on unseen ground)")
+    right.set_ylim(-3.0, 103.0)
+    left.legend(frameon=False, fontsize=8)
+    return figure, {"axis": "episode" if episodes else "steps",
+                    "trainings": {name: [_numbers(r) for r in runs] for name, runs in groups.items()}}  # fmt: skip
+
+
+def _by_episode(axes: Axes, runs: Sequence[dict[str, Any]], label: str, colour: str, line: Any) -> None:
+    """Mean over seeds with its 95 % interval, as far as every seed has episodes."""
+    curves = [moving_mean(r["episodes"]["episode_return"]) for r in runs]
+    count = min(len(c) for c in curves)
+    mean, low, high = mean_interval(np.stack([c[:count] for c in curves]))
+    at = np.arange(1, count + 1)
+    axes.plot(at, mean, color=colour, linestyle=line, label=label)
+    if len(curves) > 1:
+        axes.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+def _finish(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(True, color=RULE, linewidth=0.6)
+    axes.xaxis.set_major_formatter(lambda v, _: f"{v / 1e6:g} M" if v >= 1e6 else f"{v:g}")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def _numbers(record: dict[str, Any]) -> dict[str, Any]:
+    rows = [r for r in record["rows"] if r.get("episode_return") is not None]
+    return {"seed": record["seed"], "steps": record["rows"][-1]["steps"] if record["rows"] else 0,
+            "last_return": rows[-1]["episode_return"] if rows else None,
+            "last_success_in_training": rows[-1]["success"] if rows else None,
+            "final_on_unseen_ground": record.get("final")}  # fmt: skip
