@@ -60,7 +60,7 @@ class Evaluator:
 
     def __init__(self, env: Environment, agent: Any, episodes: int):
         self.env, self.episodes = env, episodes
-        self._reset = jax.jit(lambda params, key: env.reset(params, split_keys(key, episodes)))
+        self._reset: Any = jax.jit(lambda params, key: env.reset(params, split_keys(key, episodes)))
 
         def piece(params: Any, agent_params: Any, carry: Any, key: Any) -> Any:
             def step(carry: Any, key: Any) -> Any:
@@ -73,7 +73,7 @@ class Evaluator:
 
             return jax.lax.scan(step, carry, jax.random.split(key, _PIECE))[0]
 
-        self._piece = jax.jit(piece)
+        self._piece: Any = jax.jit(piece)
 
     def compile(self, env_params: Any, agent_params: Any) -> None:
         """Compiles ahead for arguments like these; shapes suffice for the agent's."""

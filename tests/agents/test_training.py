@@ -200,7 +200,7 @@ def test_overrides_by_name():
     assert changed.train.algorithm.atoms == 51
     with pytest.raises(UserError, match="is no setting"):
         override(TRAININGS["point"], speed=1)
-    with pytest.raises(UserError, match="is not like 4096"):
+    with pytest.raises(UserError, match="is not like 8192"):
         override(TRAININGS["large-td3"], envs="many")
     with pytest.raises(UserError, match="does not exist"):
         get_training("fast")
