@@ -4,8 +4,9 @@
 
 CMU's smooth wheel. Slip angles 0, 30, 60 deg are fitted; 15 and 45 (inside) and 75 (extrapolated) are never fitted and
 choose nothing; 90 is apart. Errors are root mean squares in pooled standard deviations of single runs. One compiled
-wheel holds every effect, at its null until it is added. Every step is written to `real_wheel.json` at once, and a run
-that was stopped goes on from there; the waterfall is `docs/figures/real_wheel.svg`.
+wheel holds every effect, at its null until it is added. Where no effect pays any more, every formula that `lunar-mjx
+unknown` knows at the wheel's ports is scored, and the best are refitted. Every step is written to `real_wheel.json` at
+once, and a run that was stopped goes on from there; the waterfall is `docs/figures/real_wheel.svg`.
 """
 
 from __future__ import annotations
@@ -23,10 +24,14 @@ from scipy.optimize import least_squares
 
 from lunar_mjx.criticism import WheelBed, load_figures
 from lunar_mjx.criticism.score import project
+from lunar_mjx.criticism.terms import effect_of, terms
+from lunar_mjx.effects.base import Effect
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT, FIGURE = ROOT / "benchmarks" / "real_wheel.json", ROOT / "docs" / "figures" / "real_wheel.svg"
 PARTS = {"fitted": (0, 30, 60), "inside": (15, 45), "extrapolated": (75,), "held_out": (15, 45, 75)}
+FORMULA_PORTS = ("soil", "wheel_normal", "wheel_shear")
+"""Ports of a wheel where formulas are sought."""
 LEAST = 25.0
 """Least drop of chi-square by an effect that is added."""
 
@@ -74,13 +79,15 @@ TOGETHER = {"soil.n": 1.8, "soil.k_phi": 3e7, "soil.friction_angle": 0.5, "frict
 class Bench:
     """The measured wheel, and one compiled wheel bed with every candidate in it."""
 
-    def __init__(self) -> None:
+    def __init__(self, formulas: Sequence[Effect] = ()) -> None:
         self.table = load_figures()
         bed = WheelBed(["soil", "pressure_sinkage", "closed_form_shear"]).with_effect("stress_integral")
         for name in EFFECTS:
             bed = bed.with_effect(name)
         self.bed = bed.with_values({e: {f.name: f.start for f in free} for e, free in EFFECTS.items()})
         self.bed = self.bed.with_values({"soil": {"k_c": 0.0}})
+        for formula in formulas:
+            self.bed = self.bed.with_effect(formula, **formula.null())
         with jax.enable_x64(True):
             self.test = self.table.wheel_test()
         self.angle = np.round(self.table.test["slip_angle_deg"])
@@ -132,11 +139,14 @@ class Model:
     def fitted(self, u: np.ndarray) -> np.ndarray:
         return self.bench.residuals(self.values(u))[self.keep].ravel()
 
-    def jacobian(self, u: np.ndarray) -> np.ndarray:
-        """One-sided differences, inward at a bound: the sinkage is found to rounding, and has no noise."""
+    def jacobian(self, u: np.ndarray, first: int = 0) -> np.ndarray:
+        """One-sided differences, inward at a bound: the sinkage is found to rounding, and has no noise.
+
+        Columns begin with the coordinate `first`.
+        """
         base, (_, high) = self.fitted(u), self.bounds()
         columns = []
-        for i in range(len(u)):
+        for i in range(first, len(u)):
             step = np.zeros_like(u)
             step[i] = 1e-5 if u[i] + 1e-5 < high[i] else -1e-5
             columns.append((self.fitted(u + step) - base) / step[i])
@@ -188,13 +198,12 @@ def presets() -> list[dict[str, Any]]:
     return rows
 
 
-def scores(model: Model, u: np.ndarray, rest: Sequence[str]) -> dict[str, float]:
+def scores(model: Model, u: np.ndarray, rest: Mapping[str, Sequence[Free]]) -> dict[str, float]:
     """Drop of chi-square that each candidate promises in linear approximation, a refit of the present model counted."""
     residual, now = model.fitted(u), model.jacobian(u)
     out = {}
-    for effect in rest:
-        grown = Model(model.bench, [*model.free, *EFFECTS[effect]])
-        columns = grown.jacobian(np.concatenate([u, np.zeros(len(EFFECTS[effect]))]))[:, len(u) :]
+    for effect, free in rest.items():
+        columns = Model(model.bench, [*model.free, *free]).jacobian(np.concatenate([u, np.zeros(len(free))]), len(u))
         left = project(columns, now, np.full(now.shape[1], 1e-3))[: len(residual)]
         amount = np.linalg.lstsq(left, residual, rcond=1e-6)[0]
         out[effect] = float(residual @ left @ amount)
@@ -209,11 +218,11 @@ def climb(bench: Bench, result: dict[str, Any], late: Callable[[], bool], save: 
         u, chi2, count = model.fit(model.place({}))
         ladder.append(row(bench, "stress integral, refitted", (), model, u, chi2=chi2, evaluations=count))
         save()
-    while not late() and not result.get("finished"):
+    while not late() and "finished" not in result:
         added = ladder[-1]["effects"]
         model = Model(bench, free_of(added))
         u = model.place(ladder[-1]["values"])
-        ranked = scores(model, u, [e for e in EFFECTS if e not in added])
+        ranked = scores(model, u, {e: f for e, f in EFFECTS.items() if e not in added})
         for best in sorted(ranked, key=lambda e: -ranked[e])[:2]:
             grown = Model(bench, free_of([*added, best]))
             place, chi2, count = grown.fit(grown.place(ladder[-1]["values"]))
@@ -224,6 +233,34 @@ def climb(bench: Bench, result: dict[str, Any], late: Callable[[], bool], save: 
         else:
             result["finished"] = ranked
         save()
+
+
+def unknown(result: Mapping[str, Any], most: int = 5) -> dict[str, Any]:
+    """What `unknown` suggests for the remainder of the last model: every formula scored, the best refitted.
+
+    Only the fitted angles score and refit. The model itself is refitted once more, too, so that a formula gets no
+    credit for another round of the same descent.
+    """
+    last = result["ladder"][-1]
+    library = {t.name: t for port in FORMULA_PORTS for t in terms(port)}
+    effects = {name: effect_of(t) for name, t in library.items()}
+    bench = Bench(list(effects.values()))
+    model = Model(bench, free_of(last["effects"]))
+    u, chi2, _ = model.fit(model.place(last["values"]))
+    base = row(bench, f"{last['model']}, refitted once more", last["effects"], model, u, chi2=chi2)
+    free = {n: (Free(n, "amount", 0.0, *effects[n].parameters["amount"].bounds, t.size),) for n, t in library.items()}
+    ranked = scores(model, u, free)
+    suggestions = []
+    for name in sorted(ranked, key=lambda n: -ranked[n])[:most]:
+        t, grown = library[name], Model(bench, [*model.free, *free[name]])
+        place, better, _ = grown.fit(grown.place(flat(model.values(u))))
+        found = row(bench, f"+ {t.target} += {t.formula}", [*last["effects"], name], grown, place, chi2=better)
+        suggestions.append({"port": t.port, "target": t.target, "formula": t.formula, "unit": t.unit,
+                            "amount": found["values"][f"{name}.amount"], "score": ranked[name],
+                            **{k: v for k, v in found.items() if k not in ("effects", "model")}})  # fmt: skip
+    listed = {f"{library[n].target} += {library[n].formula}": v for n, v in ranked.items()}
+    return {"of": base, "suggestions": sorted(suggestions, key=lambda r: r["chi2"]),
+            "scored": dict(sorted(listed.items(), key=lambda r: -r[1]))}  # fmt: skip
 
 
 def draw(result: Mapping[str, Any]) -> None:
@@ -271,6 +308,9 @@ def main() -> None:
         result["presets"] = presets()
         save()
     climb(bench, result, lambda: time.perf_counter() - start > chosen.seconds, save)
+    if "finished" in result and "unknown" not in result:
+        result["unknown"] = unknown(result)
+        save()
     draw(result)
 
 
