@@ -52,7 +52,7 @@ import numpy as np  # noqa: E402
 from benchmarks import baseline_tools as tools  # noqa: E402
 from lunar_mjx.errors import UserError  # noqa: E402
 
-COUNTS = {"singles": 300, "nulls": 400, "outside": 100}
+COUNTS = {"singles": 300, "nulls": 400, "outside": 100, "singles_x5": 100}
 QUANTITIES_OF: Mapping[str, frozenset[str]] = {k: frozenset(v.split()) for k, v in {
     "slip_sinkage": "slip", "angle_sinkage": "angle", "exit_angle": "slip 1", "bulldozing": "sinkage",
     "grousers": "load 1", "friction_circle": "angle slip", "rolling_resistance": "load",
