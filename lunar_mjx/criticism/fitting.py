@@ -33,6 +33,9 @@ HALF_STEP = 25.0
 """Largest change of chi-square by halving the time step: below what would name an effect."""
 
 
+ROUGH = 4.0
+"""Times the jumps of a rough chi-square that its gradient may promise."""
+
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share that is done, 0 to 1."""
 
@@ -198,6 +201,8 @@ def fit(
     edge = _at_bound(problem, goal, best)
     extra = dict(problem.certificate(best.u, free)) if certify and np.isfinite(best.chi2) else {}
     count = int(fitted.sum())
+    if certify and np.isfinite(best.chi2) and not problem.cheap_jacobian and best.promise > SMALL_GRADIENT:
+        extra["roughness_chi2"] = goal.roughness(found[0].u, found[0].residual, found[0].jacobian)
     agreeing = sum(c <= best.chi2 + same_chi2(best.chi2, count) for c in chi2s)
     problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra)
     return Fit(
@@ -212,7 +217,8 @@ def _faults(
     problems = []
     if not np.isfinite(best.chi2):
         return ("every start diverged",)
-    if best.promise > max(SMALL_GRADIENT, slack):
+    rough = ROUGH * min(extra.get("roughness_chi2", 0.0), HALF_STEP)
+    if best.promise > max(SMALL_GRADIENT, slack, rough):
         problems.append(f"the gradient still promises a drop of chi-square of {best.promise:.2g}")
     if starts >= AGREEING and agreeing < AGREEING and not slack:
         problems.append(f"only {agreeing} of {starts} starts agree")
