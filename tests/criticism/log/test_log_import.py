@@ -148,32 +148,37 @@ def write_ros_mcap(path: Path) -> None:
 
 
 def write_ros_bag(path: Path) -> None:
-    """A folder with metadata.yaml and SQLite, as `ros2 bag record` writes it."""
-    rosbags = pytest.importorskip("rosbags.rosbag2")
+    """A folder with metadata.yaml and SQLite, as `ros2 bag record` writes it; or a file of ROS 1."""
+    pytest.importorskip("rosbags")
+    from rosbags import rosbag1, rosbag2  # pyright: ignore[reportMissingImports]
     from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    old = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
     kinds = {n.rpartition("/")[2]: store.types[n] for n in (
         "sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time",
         "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Pose", "geometry_msgs/msg/Point",
         "geometry_msgs/msg/Quaternion")}  # fmt: skip
-    with rosbags.Writer(path, version=9) as writer:
+    with rosbag1.Writer(path) if old else rosbag2.Writer(path, version=9) as writer:
         connections = [writer.add_connection(t, n, typestore=store) for t, n in (
             ("/joint_states", "sensor_msgs/msg/JointState"), ("/odom", "geometry_msgs/msg/PoseStamped"))]  # fmt: skip
         for k in range(COUNT):
             stamped, recorded = times(k)
-            header = kinds["Header"](kinds["Time"](stamped // 10**9, stamped % 10**9), "")
+            number = (k,) if old else ()
+            header = kinds["Header"](*number, kinds["Time"](stamped // 10**9, stamped % 10**9), "")
             d = joints(k, None)
             first = kinds["JointState"](
                 header, d["name"], *(np.array(d[n]) for n in ("position", "velocity", "effort"))
             )
             pose = kinds["Pose"](kinds["Point"](5.0 + k, 0.0, 0.0), kinds["Quaternion"](0.0, 0.0, 0.0, 1.0))
             for connection, message in zip(connections, (first, kinds["PoseStamped"](header, pose)), strict=True):
-                writer.write(connection, recorded, store.serialize_cdr(message, connection.msgtype))
+                write = store.serialize_ros1 if old else store.serialize_cdr
+                writer.write(connection, recorded, write(message, connection.msgtype))
 
 
 RECORDINGS: dict[str, Callable[[Path], None]] = {
     "json.mcap": write_json_mcap, "ros.mcap": write_ros_mcap, "bag": write_ros_bag,
+    "ros1.bag": write_ros_bag,
 }  # fmt: skip
 
 
