@@ -10,14 +10,14 @@ from lunar_mjx.criticism.log.check_values import CHANCE
 from lunar_mjx.criticism.log.findings import WARNING, Finding
 from lunar_mjx.criticism.log.log import SteadyLog
 from lunar_mjx.criticism.log.schema import STEADY_CHANNELS
-from lunar_mjx.criticism.table import QUANTITIES, replicate_groups
+from lunar_mjx.criticism.table import QUANTITIES, average, replicate_groups
 
 
 def check_steady(log: SteadyLog) -> list[Finding]:
     """Findings beyond what reading found."""
     if len(log.table) == 0:
         return [Finding(log.name, "", None, "", "dropout", "holds no usable row; see the other findings, or fill it")]
-    found = _copies(log) + _ranges(log) + _signs(log) + _swapped(log) + _clipped(log)
+    found = _copies(log) + _ranges(log) + _signs(log) + _swapped(log) + _clipped(log) + _noiseless(log)
     return found + (_replicates(log) if not found else [])
 
 
@@ -171,6 +171,20 @@ def _clipped(log: SteadyLog) -> list[Finding]:
                 row = int(np.argmax(values == extreme))
                 message = f"stays at {extreme:.5g} in {count[at]} of {len(values)} rows; leave out what was cut off"
                 found.append(_finding(log, row, QUANTITIES[quantity][0], "saturation", message))
+    return found
+
+
+def _noiseless(log: SteadyLog) -> list[Finding]:
+    """Quantities whose noise neither the log nor replicates tell: nothing could be counted in sigma."""
+    told = average(log.table).sigma
+    found = []
+    for quantity in log.table.measured:
+        column = QUANTITIES[quantity][0]
+        if not told.get(quantity, 0.0) > 0.0 and column not in log.noise:
+            message = (
+                f"nothing tells its noise; state [noise.{column}] std in log.toml, give replicates, or leave it out"
+            )
+            found.append(_finding(log, None, column, "noise", message))
     return found
 
 

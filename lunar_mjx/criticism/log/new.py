@@ -71,6 +71,14 @@ grouser_height_m = 0.0
 std = 1.0
 source = "datasheet"
 
+[noise.side_force_N]
+std = 1.0
+source = "datasheet"
+
+[noise.driving_torque_Nm]
+std = 0.1
+source = "datasheet"
+
 [noise.sinkage_m]
 std = 0.001
 source = "datasheet"

@@ -57,6 +57,14 @@ def test_replicates_that_agree_in_few_digits_are_no_copies(tmp_path: Path) -> No
     assert agreeing > 0
 
 
+def test_a_quantity_whose_noise_nobody_knows_is_told(tmp_path: Path) -> None:
+    once = points(0)[lambda f: f["trial"] == 1].drop(columns="trial")
+    frame = once.assign(driving_torque_Nm=0.1 + 0.2 * once["slip_ratio"])
+    (finding,) = check(make(tmp_path / "once", frame))
+    assert finding.column == "driving_torque_Nm" and "[noise.driving_torque_Nm]" in finding.message
+    assert is_bad([finding])
+
+
 def test_the_measured_wheel_passes(tmp_path: Path) -> None:
     figures = load_figures()
     frame = pd.DataFrame({**figures.test, "drawbar_pull_N": figures.measured["drawbar_pull"],
