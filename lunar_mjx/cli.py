@@ -18,6 +18,7 @@ from lunar_mjx.commands import log as log_commands
 from lunar_mjx.commands import parity as parity_commands
 from lunar_mjx.commands import seeing as seeing_commands
 from lunar_mjx.commands import train as train_commands
+from lunar_mjx.commands.compiled import keep_compiled
 from lunar_mjx.errors import EXIT_STATUS, UserError, bad_input
 
 INTERRUPTED = 130
@@ -175,6 +176,9 @@ def simulate(
         wanted = read_commands(commands, built)
     else:
         wanted = front_steering(built, constant_commands(built, duration, drive=drive), steer)
+    keep_compiled()
+    if sys.stderr.isatty():
+        print("compiling and driving; the first time can take a minute", file=sys.stderr)
     system, seen = run(built, wanted, x, y, math.radians(yaw_deg))
     folder = make_folder(out)
     table = channels(system, seen, wanted)

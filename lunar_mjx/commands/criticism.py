@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lunar_mjx.commands.compiled import keep_compiled
 from lunar_mjx.errors import UserError, bad_input
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def compare(
     from lunar_mjx.criticism import verbs
     from lunar_mjx.report.progress import console_progress
 
-    _cache()
+    keep_compiled()
     try:
         with console_progress() as progress:
             run = verbs.compare(logs, _model(model, preset, logs), out, effects or (), _pairs("--split", split), seed,
@@ -84,7 +84,7 @@ def why(
     from lunar_mjx.criticism import verbs
     from lunar_mjx.report.progress import console_progress
 
-    _cache()
+    keep_compiled()
     with console_progress() as progress:
         diagnosis = verbs.why(run, only, progress=progress)
         if audit > 0:
@@ -109,7 +109,7 @@ def next_(
     from lunar_mjx.criticism.next_experiment import next_experiment
     from lunar_mjx.report.progress import console_progress
 
-    _cache()
+    keep_compiled()
     with console_progress() as progress:
         found = next_experiment(run, between or (), seconds, progress)
     print(json.dumps(found.to_dict(), indent=2) if as_json else found.sentence)
@@ -124,7 +124,7 @@ def add(
     from lunar_mjx.criticism import verbs
     from lunar_mjx.report.progress import console_progress
 
-    _cache()
+    keep_compiled()
     try:
         with console_progress() as progress:
             grown = verbs.add(run, effect, out, progress)
@@ -144,7 +144,7 @@ def unknown(
     from lunar_mjx.criticism.discover import discover
     from lunar_mjx.report.progress import console_progress
 
-    _cache()
+    keep_compiled()
     with console_progress() as progress:
         found = discover(run, port, out, progress=progress)
     print(json.dumps(found.to_dict(), indent=2) if as_json else found.text())
@@ -177,7 +177,7 @@ def improve(
     from lunar_mjx.criticism import verbs
     from lunar_mjx.report.progress import console_progress
 
-    _cache()
+    keep_compiled()
     with console_progress() as progress:
         diagnosis, runs = verbs.improve(
             logs, _model(model, preset, logs), out, effects or (), _pairs("--split", split), seed,
@@ -186,16 +186,6 @@ def improve(
     if runs:
         _write_report([r.folder for r in runs], out / "report.html")
     _finish(diagnosis, as_json)
-
-
-def _cache() -> None:
-    """Keeps compiled programs between commands: a diagnosis compiles for a minute, and its successors need not."""
-    import jax
-
-    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-        jax.config.update("jax_compilation_cache_dir", str(home / "lunar-mjx" / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
 def _model(path: Path | None, preset: str, logs: Sequence[Path]) -> Model:
@@ -271,16 +261,20 @@ def _finish(diagnosis: Diagnosis, as_json: bool) -> None:
     effects = f" {', '.join(diagnosis.effects)}" if diagnosis.effects else ""
     console.print(f"{diagnosis.verdict.label}{effects}", style="bold", highlight=False)
     console.print(diagnosis.sentence, highlight=False)
-    if diagnosis.evidence:
-        table = make_table("effect", "status", "separable", "chi2", "p", "held-out gain", "value", "nearest")
-        for e in diagnosis.evidence[:15]:
+    tested = [e for e in diagnosis.evidence if e.status != "not tested"]
+    if tested:
+        table = make_table("effect", "status", "separable", "chi2", "p", "gain", names=6)
+        for e in tested[:15]:
             gain = "-" if e.held_out_gain != e.held_out_gain else f"{e.held_out_gain:.0f} +- {e.held_out_se:.0f}"
-            value = ", ".join(f"{k} {v:.3g} +- {e.std.get(k, 0.0):.1g}" for k, v in e.values.items())
-            near = f"{e.nearest[0]} {e.nearest[1]:.2f}" if e.nearest[0] else ""
-            table.add_row(
-                e.effect, e.status, f"{e.separable_sigma:.1f}", f"{e.chi2:.0f}", f"{e.p:.2g}", gain, value, near
-            )
+            table.add_row(e.effect, e.status, f"{e.separable_sigma:.1f}", f"{e.chi2:.0f}", f"{e.p:.2g}", gain)
         console.print(table)
+    for e in tested:
+        if e.values:
+            fitted = ", ".join(f"{k} {v:.3g} +- {e.std.get(k, 0.0):.1g}" for k, v in e.values.items())
+            near = f"; nearest {e.nearest[0]}, cosine {e.nearest[1]:.2f}" if e.nearest[0] else ""
+            console.print(f"fitted {e.effect}: {fitted}{near}", highlight=False)
+    if untested := [e.effect for e in diagnosis.evidence if e.status == "not tested"]:
+        console.print(f"not tested, no separable signal here: {', '.join(untested)}", highlight=False)
     for finding in diagnosis.details.get("findings", [])[:20]:
         console.print(f"  {finding['message']}", highlight=False)
     raise typer.Exit(diagnosis.verdict.exit_status)
