@@ -62,7 +62,10 @@ class Checkpoints:
                 "train with the settings that made it, or into another folder."
             ) from error
         leaves = [
-            found["state"][jax.tree_util.keystr(path)] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype)
+            # an empty array, too, must lie as the compiled step expects it
+            found["state"][jax.tree_util.keystr(path)]
+            if leaf.size
+            else jnp.zeros(leaf.shape, leaf.dtype, device=getattr(leaf, "sharding", None))
             for path, leaf in jax.tree_util.tree_leaves_with_path(like)
         ]
         return jax.tree.unflatten(jax.tree.structure(like), leaves), found["notes"]
