@@ -141,8 +141,7 @@ def _twins(truth: bed_logs.Truth, name: str) -> float:
 
 def _physics(case: cases.Case, found: Diagnosis, run: Path) -> dict[str, Any]:
     values = _values(case.truth.effects, found)
-    held = found.error_after.get("held_out")
-    floor = noise_floor(case.truth, run)
+    held, floor = held_out(case.truth, run)
     return {
         "port": found.port, "ports": dict(found.ports), "true_ports": _ports(case.truth.effects),
         "error_before": dict(found.error_before), "error_after": dict(found.error_after), "floor": floor,
@@ -169,11 +168,15 @@ def _values(effects: Mapping[str, Mapping[str, float]], found: Diagnosis) -> lis
     return rows
 
 
-def noise_floor(truth: bed_logs.Truth, run: Path) -> float | None:
-    """Root mean square of measured less true values over the held-out points, in the tool's sigma: nobody beats it."""
+def held_out(truth: bed_logs.Truth, run: Path) -> tuple[float | None, float | None]:
+    """Error of the tool's last model over the held-out points, and that of the truth itself, which nobody beats.
+
+    Returns:
+      Root mean squares of measured less predicted and of measured less true values, in the tool's sigma.
+    """
     path = run / SERIES_FILE
     if not path.is_file():
-        return None
+        return None, None
     with np.load(path) as data:
         held = np.isin(data["split"][data["unit"]], ("select", "test"))
         at = data["place"]
@@ -183,8 +186,11 @@ def noise_floor(truth: bed_logs.Truth, run: Path) -> float | None:
         true = np.empty(len(at))
         for channel, start, stop in zip(data["series_channel"], data["series_start"], ends, strict=True):
             true[start:stop] = clean[str(channel)][start:stop]
-        away = ((data["measured"] - true) / data["sigma"])[held]
-    return float(np.sqrt(np.mean(away**2))) if len(away) else None
+        away = [((data["measured"] - values) / data["sigma"])[held] for values in (data["predicted"][-1], true)]
+    if not held.any():
+        return None, None
+    error, floor = (float(np.sqrt(np.mean(a**2))) for a in away)
+    return error, floor
 
 
 def _suggestions(run: Path) -> list[dict[str, Any]]:

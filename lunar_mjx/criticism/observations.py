@@ -1,4 +1,4 @@
-"""Measurements as one vector, with their noise: series by log and channel, whitened by an Ornstein-Uhlenbeck model."""
+"""Measurements as one vector, with their noise: series by log and channel, whitened by models of correlated noise."""
 
 from __future__ import annotations
 
@@ -6,6 +6,31 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Chain:
+    """Points of a table whose neighbours have correlated noise.
+
+    Attributes:
+      order: (n,) places along sweeps. follows: (n,) whether the point at each of these places follows its neighbour.
+      correlation: of neighbours. innovation: standard deviation of what a point adds to it, in sigma.
+    """
+
+    order: np.ndarray
+    follows: np.ndarray
+    correlation: float
+    innovation: float
+
+    def whiten(self, columns: np.ndarray) -> np.ndarray:
+        """Innovations of (n, k) columns in sigma, each at the place of its point."""
+        along = columns[self.order]
+        out = along.copy()
+        at = np.flatnonzero(self.follows)
+        out[at] = (along[at] - self.correlation * along[at - 1]) / self.innovation
+        back = np.empty_like(out)
+        back[self.order] = out
+        return back
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +45,8 @@ class Series:
       coloured: standard deviation of the correlated noise, same unit.
       correlation_time: of the correlated noise, s.
       level: relative standard deviation of the noise level itself, where it comes from few replicates.
-      dependence: observations per independent one, where the noise of neighbours in a table is correlated.
+      dependence: observations per independent one, where correlated noise of neighbours cannot be whitened.
+      chain: how it can be.
     """
 
     log: int
@@ -33,6 +59,7 @@ class Series:
     correlation_time: float = 0.0
     level: float = 0.0
     dependence: float = 1.0
+    chain: Chain | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,6 +114,8 @@ class Observations:
             part = slice(s.start, s.stop)
             if s.time is None or s.coloured <= 0.0 or s.correlation_time <= 0.0:
                 out[part] = flat[part] / np.sqrt(np.square(s.white) + s.coloured**2).reshape(-1, 1)
+                if s.chain is not None:
+                    out[part] = s.chain.whiten(out[part])
             else:
                 batches.setdefault((s.stop - s.start, np.asarray(s.time).tobytes()), []).append(s)
         for group in batches.values():

@@ -1,7 +1,8 @@
-"""How well the scatter of replicates tells the noise of a table, and whether the noise of neighbours is correlated."""
+"""What the scatter of replicates tells about the noise of a table: its level, and whether neighbours are correlated."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,46 +15,83 @@ if TYPE_CHECKING:
 _MOST = 0.95
 _SURE = 2.5
 """Standard errors from which a correlation counts."""
+_FEWEST = 8
+_GAP = 1.5
+"""Median steps of slip beyond which two points of a sweep are no neighbours."""
 
 
-def level_and_dependence(log: SteadyLog) -> dict[str, tuple[float, float]]:
-    """What the replicates of a table tell about the noise itself.
+@dataclasses.dataclass(frozen=True)
+class Scatter:
+    """What replicates tell about one quantity's noise.
 
-    Returns:
-      By quantity: relative standard deviation of the noise level that the replicates give (0 without replicates, where
-      it is stated), and the number of neighbours in a sweep that count as one independent observation.
+    Attributes:
+      level: relative standard deviation of the noise level that they give; 0 without replicates, where it is stated.
+      correlation: of the noise between neighbours of a sweep; 0 where none is sure.
+      innovation: standard deviation of what a point's noise adds to `correlation` times its neighbour's, in sigma.
     """
+
+    level: float = 0.0
+    correlation: float = 0.0
+    innovation: float = 1.0
+
+    @property
+    def dependence(self) -> float:
+        """Neighbours whose squares count as one: squares of AR(1) noise correlate by its correlation squared."""
+        return (1.0 + self.correlation**2) / (1.0 - self.correlation**2)
+
+
+def scatter(log: SteadyLog) -> dict[str, Scatter]:
+    """What the replicates of a table tell about the noise, by quantity."""
     table = log.table
     group = replicate_groups(table)
     freedom = len(table) - len(np.unique(group))
     out = {}
     for quantity, values in table.measured.items():
         if freedom < 1:
-            out[quantity] = (0.0, 1.0)
+            out[quantity] = Scatter()
             continue
         mean = np.bincount(group, weights=values) / np.bincount(group)
-        correlation = _neighbours(log, values - mean[group])
-        # squares of an AR(1) noise correlate by the square of its correlation
-        dependence = (1.0 + correlation**2) / (1.0 - correlation**2)
-        out[quantity] = (float(np.sqrt(0.5 * dependence / freedom)), float(dependence))
+        found = Scatter(0.0, *_neighbours(log, values - mean[group]))
+        out[quantity] = dataclasses.replace(found, level=float(np.sqrt(0.5 * found.dependence / freedom)))
     return out
 
 
-def _neighbours(log: SteadyLog, residual: np.ndarray) -> float:
-    """Correlation of the noise between neighbours in slip of one trial; 0 where none is sure."""
+def _neighbours(log: SteadyLog, residual: np.ndarray) -> tuple[float, float]:
+    """Correlation of the noise between neighbours in slip of one trial, and the size of its innovations."""
     if log.trial is None:
-        return 0.0
-    table = log.table
-    keys = np.column_stack([log.trial, np.round(table.test["slip_angle_deg"], 2), _levels(table)])
-    sweep = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
-    order = np.lexsort([table.test["slip_ratio"], sweep])
-    pair = np.diff(sweep[order]) == 0
-    first, second = residual[order][:-1][pair], residual[order][1:][pair]
-    size = float(np.sqrt((first @ first) * (second @ second)))
-    if len(first) < 8 or size <= 0.0:
-        return 0.0
+        return 0.0, 1.0
+    order, follows = sweeps(log.table, np.asarray(log.trial))
+    first, second = residual[order][:-1][follows[1:]], residual[order][1:][follows[1:]]
+    power = float(first @ first)
+    size = float(np.sqrt(power * (second @ second)))
+    if len(first) < _FEWEST or size <= 0.0:
+        return 0.0, 1.0
     correlation = float(first @ second) / size
-    return min(correlation, _MOST) if correlation > _SURE / np.sqrt(len(first)) else 0.0
+    if correlation <= _SURE / np.sqrt(len(first)):
+        return 0.0, 1.0
+    correlation = min(correlation, _MOST)
+    left = second - correlation * first
+    return correlation, float(np.sqrt(np.mean(left**2) / np.mean(residual**2)))
+
+
+def sweeps(table: SteadyStateTable, key: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order of points along sweeps of the slip ratio, and which follow a neighbour.
+
+    Args:
+      table: n points.
+      key: (n,) whatever else separates sweeps beside slip angle and load: the trial, or the group left out together.
+
+    Returns:
+      (n,) places in the order of sweeps; (n,) whether the point at each of these places follows its neighbour.
+    """
+    slip = table.test["slip_ratio"]
+    keys = np.column_stack([key, np.round(table.test["slip_angle_deg"], 2), _levels(table)])
+    sweep = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.lexsort([slip, sweep])
+    same = np.diff(sweep[order]) == 0
+    gap = np.diff(slip[order])
+    near = gap <= _GAP * np.median(gap[same]) if same.any() else same
+    return order, np.concatenate([[False], same & near])
 
 
 def _levels(table: SteadyStateTable) -> np.ndarray:

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.criticism.coordinates import WIDE, Coordinate, of_candidate
-from lunar_mjx.criticism.observations import Observations, Series
+from lunar_mjx.criticism.observations import Chain, Observations, Series
 from lunar_mjx.criticism.problem import NotTested, Problem
 from lunar_mjx.criticism.single_wheel import PORTS, WheelBed, WheelTest
 from lunar_mjx.criticism.table import QUANTITIES, SteadyStateTable, average
-from lunar_mjx.criticism.table_noise import level_and_dependence
+from lunar_mjx.criticism.table_noise import scatter, sweeps
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError
 
@@ -249,18 +249,23 @@ def _observations(
     at = 0
     for number, log in enumerate(logs):
         table, noise = points(log)
-        known = level_and_dependence(log)
+        known = scatter(log)
         group, names = default_units(table)
         apart = [bool(np.all(np.abs(table.test["slip_angle_deg"][group == g]) > APART_DEG)) for g in range(len(names))]
         default = default_splits(len(names), apart)
         chosen = [log.split or splits.get(name, default[i]) for i, name in enumerate(names)]
+        order, follows = sweeps(table, group)
         covariates = np.column_stack([table.test[c] for c in ("slip_ratio", "slip_angle_deg", "normal_load_N")])
         for quantity, measured in table.measured.items():
             n = len(measured)
             white = np.sqrt(noise[quantity] ** 2 + extra_sigma.get(quantity, 0.0) ** 2)
-            level, dependence = known[quantity]
-            series.append(Series(number, QUANTITIES[quantity][0], at, at + n, None, white, level=level,
-                                 dependence=dependence))  # fmt: skip
+            own = known[quantity]
+            chain = None
+            # what a known discrepancy adds is no noise, and follows no chain
+            if own.correlation and follows.any() and not extra_sigma.get(quantity, 0.0):
+                chain = Chain(order, follows, own.correlation, own.innovation)
+            series.append(Series(number, QUANTITIES[quantity][0], at, at + n, None, white, level=own.level, chain=chain,
+                                 dependence=1.0 if chain else own.dependence))  # fmt: skip
             value.append(measured)
             unit.append(group + len(unit_names))
             place.append(covariates)
