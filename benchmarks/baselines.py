@@ -189,9 +189,14 @@ def summary(args: argparse.Namespace) -> None:
         raise UserError(f"{args.results[0]}: holds no results; run the cases first.")
     found = figures(rows)
     seeds = [p.with_suffix(".seed.json") for p in args.results]
-    shown = ("case", "seed", "commit", "uncommitted_changes", "verdict", "named", "outcome", "refit", "sindy")
-    content = {"figures": found, "campaigns": [json.loads(p.read_text("utf-8")) for p in seeds if p.is_file()],
-               "cases": [{k: r.get(k) for k in shown} | {"hidden": r["truth"]["effects"]} for r in rows]}  # fmt: skip
+    shown = ("case", "seed", "commit", "uncommitted_changes", "verdict", "named", "outcome", "port", "true_ports",
+             "suggestions", "refit", "sindy")  # fmt: skip
+    cases = [{k: r.get(k) for k in shown} | {"hidden": r["truth"]["effects"]} for r in rows]
+    for case in cases:
+        if case["sindy"]:  # the dearest terms are those that count
+            case["sindy"] = case["sindy"] | {"terms": {c: t[:2] for c, t in case["sindy"]["terms"].items()}}
+    campaigns = [json.loads(p.read_text(encoding="utf-8")) for p in seeds if p.is_file()]
+    content = {"figures": found, "campaigns": campaigns, "cases": cases}
     args.out.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     for group, table in found.items():
         print(group)
