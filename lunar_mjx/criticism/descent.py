@@ -21,12 +21,14 @@ Bounds and starts that do not agree are then no faults either; both count in the
 has to reach the noise. (Scores do not feel a fit that has not quite converged: what it lacks lies in the span of its
 sensitivities, and that is projected out.)"""
 
-_DAMPINGS = np.array([1e-4, 1e-2, 1.0, 1e2])
+_DAMPINGS = np.array([1e-4, 1e-2, 1e-1, 1.0, 1e2])
 _ITERATIONS = 60
 EDGE = 1e-6
 _PROBE = 0.1
 _PATIENCE = 2
 """Steps in a row that may gain less than matters."""
+_CREEP = 2.0
+"""Drop of chi-square that does not matter where rows are dear: it takes 25 to name an effect."""
 _NEAR = np.array([0.003, 0.01, 0.03])
 _HOPE = 4.0
 """Drop of chi-square that is still hoped for, in terms of what a Gauss-Newton step promises."""
@@ -48,9 +50,10 @@ class Objective:
     def residuals(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whitened residuals (k, n), and chi-square (k,), infinite where a prediction is not finite."""
         r = whitened_residuals(self.problem, u)
-        return r, self._chi2(u, r)
+        return r, self.chi2(u, r)
 
-    def _chi2(self, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+    def chi2(self, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """(k,) chi-square of (k, n) residuals at (k, coordinates); infinite where a prediction is not finite."""
         prior = np.array([np.sum(self.problem.prior_rows(row, self.free)[0] ** 2) for row in u])
         with np.errstate(over="ignore", invalid="ignore"):
             chi2 = np.sum(r[:, self.fitted] ** 2, axis=1) + prior
@@ -66,7 +69,7 @@ class Objective:
         predicted, jacobian = self.problem.linearise(u, self.free)
         r = observations.whiten((observations.value[None] - predicted).T).T
         j = np.stack([observations.whiten(a) for a in jacobian])
-        return r, self._chi2(u, r), np.where(np.isfinite(j), j, 0.0)
+        return r, self.chi2(u, r), np.where(np.isfinite(j), j, 0.0)
 
     def quadratic(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half the downhill gradient and the Gauss-Newton Hessian."""
@@ -95,8 +98,12 @@ class Objective:
 
     def bent(
         self, u: np.ndarray, r: np.ndarray, j: np.ndarray, hessian: np.ndarray, trials: np.ndarray, dampings: np.ndarray
-    ) -> np.ndarray:
-        """Steps bent along a curved valley by the second derivative in their direction (Transtrum and Sethna 2012)."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Steps bent along a curved valley by the second derivative in their direction (Transtrum and Sethna 2012).
+
+        Returns:
+          Their ends; and the probes by which the derivative was taken, with their residuals: steps as well, if short.
+        """
         steps = (trials - u)[:, self.free]
         probes = np.repeat(u[None], len(steps), axis=0)
         probes[:, self.free] += _PROBE * steps
@@ -111,7 +118,7 @@ class Objective:
             # beyond this the quadratic path is not to be trusted either
             bend *= min(1.0, 0.75 * np.linalg.norm(step) / max(2.0 * float(np.linalg.norm(bend)), 1e-30))
             out[i, self.free] = np.clip(u[self.free] + step + bend, self.low, self.high)
-        return out
+        return out, probes, ahead
 
     def roughness(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> float:
         """Scatter of chi-square about its quadratic model over the first hundredths of a Gauss-Newton step.
@@ -177,13 +184,17 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, r
             j, fresh = goal.jacobian(u), True
             continue
         dampings = damping * _DAMPINGS
-        trials = goal.steps(u, downhill, hessian, dampings)
+        trials, probes, ahead = goal.steps(u, downhill, hessian, dampings), np.zeros((0, len(u))), r[:0]
         if curved:
-            trials = np.concatenate([trials, goal.bent(u, r, j, hessian, trials, dampings)])
+            bent, probes, ahead = goal.bent(u, r, j, hessian, trials, dampings)
+            trials = np.concatenate([trials, bent])
         if goal.problem.eager:
             residuals, chi2, jacobians = goal.linearise(trials)
         else:
             residuals, chi2 = goal.residuals(trials)
+        if len(probes):
+            trials = np.concatenate([trials, probes])
+            residuals, chi2 = np.concatenate([residuals, ahead]), np.concatenate([chi2, goal.chi2(probes, ahead)])
         k = int(np.argmin(chi2))
         if not chi2[k] < best:
             if not fresh:
@@ -196,13 +207,14 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, r
             damping, curved = damping * 1e2, True
             continue
         # A model that misfits creeps along valleys that lead nowhere; what it gains there does not matter.
-        slow = slow + 1 if best - float(chi2[k]) < enough else 0
+        creep = 0.0 if goal.problem.cheap_jacobian else max(enough, _CREEP)
+        slow = slow + 1 if best - float(chi2[k]) < creep else 0
         kept, failed = best - float(chi2[k]) > 0.5 * promise, 0
         curved = not kept
         step, before = trials[k][goal.free] - u[goal.free], r
         u, r, best = trials[k], residuals[k], float(chi2[k])
         damping = float(np.clip(dampings[k % len(dampings)], 1e-4, 1e6))
-        if goal.problem.eager:
+        if goal.problem.eager and k < len(jacobians):
             j = jacobians[k]
         elif lazy and kept and np.isfinite(r).all():
             j, fresh = _broyden(j, step, before - r), False
@@ -222,7 +234,8 @@ def _broyden(jacobian: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.n
 
 def slack_of(chi2: float, observations: int) -> float:
     """Chi-square that does not matter in a fit that is beyond the noise; zero where it is not."""
-    return MISFIT_SHARE * max(0.0, chi2 - 1.06 * observations - 5.0 * np.sqrt(2.0 * observations))
+    beyond = chi2 > 1.06 * observations + 5.0 * np.sqrt(2.0 * observations)
+    return MISFIT_SHARE * (chi2 - observations) if beyond else 0.0
 
 
 def same_chi2(chi2: float, observations: int) -> float:

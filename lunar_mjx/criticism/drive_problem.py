@@ -29,7 +29,7 @@ from lunar_mjx.model import Model
 if TYPE_CHECKING:
     from lunar_mjx.criticism.log import Log
 
-STEP = 1e-6
+STEP = 1e-7
 """Difference quotient's step in scales. Predictions jump by hundredths of a sigma where a wheel at rest changes the
 sign of its slip; a step this short rarely meets a jump, and rounding spoils only the faintest derivatives."""
 
