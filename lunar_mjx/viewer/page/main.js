@@ -5,7 +5,7 @@ import { Renderer } from "./render.js";
 import { ground, shapeOf, sphere } from "./shapes.js";
 
 const GROUND = [0.60, 0.585, 0.565], ROCK = [0.5, 0.48, 0.46], STILL = pose([0, 0, 0], [1, 0, 0, 0]);
-const FETCH_AGAIN = 7, BAR = 0.022, VIEWS = ["follow", "fixed", "from above"];
+const FETCH_AGAIN = 7, BAR = 0.022, MOST_BARS = 80000, VIEWS = ["follow", "fixed", "from above"];
 
 async function json(path) {
   const answer = await fetch(path);
@@ -30,7 +30,8 @@ class View {
   restart() {
     this.last = null;
     this.run = this.scene.wheels.map(() => 0);
-    this.renderer.clearTracks();
+    this.prints = [];
+    this.renderer.clearTracks(this.middle ?? [0, 0]);
   }
 
   async surround(x, y) {
@@ -51,6 +52,8 @@ class View {
         this.soil.push({ mesh: this.ball, model, colour: ROCK, kind: 3 });
       }
       this.middle = [x, y];
+      this.renderer.clearTracks(this.middle);
+      this.prints.forEach((bar) => this.renderer.print(bar));
       this.height = fine.height;
     } finally {
       this.fetching = false;
@@ -68,10 +71,12 @@ class View {
       const first = Math.ceil(this.run[k] / BAR);
       for (let bar = first; bar * BAR < this.run[k] + length; bar++) {
         const s = bar * BAR - this.run[k];
-        this.renderer.print([before[0] + s * unit[0], before[1] + s * unit[1]], unit, wheel.width, BAR, bar % 3 ? 150 : 255);
+        this.prints.push([before[0] + s * unit[0], before[1] + s * unit[1], ...unit, wheel.width, BAR, bar % 3 ? 150 : 255]);
+        this.renderer.print(this.prints.at(-1));
       }
       this.run[k] += length;
     });
+    if (this.prints.length > MOST_BARS) this.prints.splice(0, MOST_BARS / 4);
     this.last = bodies;
   }
 

@@ -2,7 +2,8 @@
 import { clamp } from "./maths.js";
 
 const byId = (id) => document.getElementById(id);
-const number = (v, digits) => (v === null ? "–" : v.toFixed(digits).replace("-", "−"));
+const number = (v, digits) =>
+  v === null ? "–" : (Number(v.toFixed(digits)) || 0).toFixed(digits).replace("-", "−");   // no minus before zero
 
 export class Panel {
   constructor(scene) {
@@ -35,7 +36,7 @@ export class Panel {
     byId("time").textContent = `${number(now.time_s, 1)} s` + (now.rate < 0.9 ? `, ${number(now.rate, 2)} × real time` : "");
     byId("speed").textContent = `${number(now.speed_m_s, 2)} m/s`;
     byId("path").textContent = `${number(now.path_m, 1)} m`;
-    byId("heading").textContent = `${number(now.heading_deg, 0)}°`;
+    byId("heading").textContent = `${number(Math.round(now.heading_deg) % 360, 0)}°`;
     byId("pitch").textContent = `${number(-now.pitch_deg, 1)}°`;
     byId("roll").textContent = `${number(now.roll_deg, 1)}°`;
     byId("power").textContent = `${number(now.power_W, 0)} W`;

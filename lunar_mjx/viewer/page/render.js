@@ -3,7 +3,7 @@
 import { multiply, orthographic, lookAt, add, scale } from "./maths.js";
 
 const SHADOW = 2048, REACH = 11, TRACK = 2048;
-export const TRACK_SPAN = 36;
+const TRACK_SPAN = 36;
 
 const DEPTH_VERTEX = `#version 300 es
 layout(location = 0) in vec3 place;
@@ -41,6 +41,7 @@ in vec4 shade;
 in float edgewise;   // 1 on a wheel's flanks, 0 on its rim
 uniform vec3 eye, sun, colour;
 uniform float exposure, span;
+uniform vec2 middle;         // of the ground on which tracks are drawn
 uniform int kind;            // 0 rover, 1 near ground, 2 far ground, 3 rock, 4 wheel
 uniform sampler2DShadow shadows;
 uniform sampler2D tracks;
@@ -51,18 +52,23 @@ float random(ivec2 p) {
   n ^= n >> 15; n *= 2246822519u; n ^= n >> 13; n *= 3266489917u; n ^= n >> 16;
   return float(n >> 8) / 16777216.0;
 }
-float noise(vec2 p) {
+// Value and gradient.
+vec3 noise(vec2 p) {
   ivec2 i = ivec2(floor(p));
   vec2 f = fract(p), s = f * f * (3.0 - 2.0 * f);
-  return mix(mix(random(i), random(i + ivec2(1, 0)), s.x), mix(random(i + ivec2(0, 1)), random(i + ivec2(1, 1)), s.x), s.y);
+  float a = random(i), b = random(i + ivec2(1, 0)), c = random(i + ivec2(0, 1)), d = random(i + ivec2(1, 1));
+  vec2 slope = 6.0 * f * (1.0 - f) * (vec2(b - a, c - a) + (a - b - c + d) * s.yx);
+  return vec3(mix(mix(a, b, s.x), mix(c, d, s.x), s.y), slope);
 }
-// Mottling down to what a pixel still resolves.
-float regolith(vec2 p, float footprint) {
-  float sum = 0.0, size = 1.9;
-  for (int k = 0; k < 8; k++) {
-    float seen = clamp(size / (2.5 * footprint) - 0.6, 0.0, 1.0);
+// Mottling down to what a pixel still resolves, with its gradient.
+vec3 regolith(vec2 p, float footprint) {
+  vec3 sum = vec3(0.0);
+  float size = 1.9;
+  for (int k = 0; k < 6; k++) {
+    float seen = clamp(size / (2.5 * footprint) - 0.6, 0.0, 1.0) * (k < 2 ? 0.55 : 1.0);
     if (seen <= 0.0) break;
-    sum += seen * (noise(p / size + float(17 * k)) - 0.5) * (k < 2 ? 0.55 : 1.0);
+    vec3 one = noise(p / size + float(17 * k));
+    sum += seen * vec3(one.x - 0.5, one.yz / size);
     size *= 0.43;
   }
   return sum;
@@ -82,11 +88,11 @@ void main() {
   float footprint = max(length(dFdx(at)), length(dFdy(at))), gloss = 0.12;
   if (kind == 1 || kind == 2) {
     gloss = 0.0;
-    float grain = regolith(at.xy, footprint), step = max(0.012, 1.5 * footprint);
-    float east = regolith(at.xy + vec2(step, 0.0), footprint), north = regolith(at.xy + vec2(0.0, step), footprint);
-    n = normalize(n - 0.004 * vec3(east - grain, north - grain, 0.0) / step);
-    base *= 1.0 + 0.13 * grain;
-    if (kind == 1) {
+    vec3 grain = regolith(at.xy, footprint);
+    n = normalize(n - vec3(0.0048 * grain.yz, 0.0));
+    base *= 1.0 + 0.13 * grain.x;
+    vec2 from = abs(at.xy - middle);
+    if (kind == 1 && max(from.x, from.y) < 0.5 * span) {
       vec2 uv = at.xy / span;
       float e = 1.0 / float(textureSize(tracks, 0).x);
       float rut = texture(tracks, uv).r;
@@ -97,7 +103,7 @@ void main() {
     }
   } else if (kind == 3) {
     gloss = 0.0;
-    float grain = noise(at.xy * 9.0 + at.z * 7.0) + 0.6 * noise(at.yz * 31.0 + at.x * 5.0);
+    float grain = noise(at.xy * 9.0 + at.z * 7.0).x + 0.6 * noise(at.yz * 31.0 + at.x * 5.0).x;
     base *= 0.72 + 0.34 * grain;
   } else if (kind == 4) {
     // grousers and spokes, so that the eye sees it roll
@@ -105,7 +111,7 @@ void main() {
     float rim = step(abs(fract(24.0 * turn) - 0.5), 0.16), spoke = step(abs(fract(6.0 * turn) - 0.5), 0.10);
     base *= 1.0 + 1.2 * (edgewise > 0.5 ? spoke : rim);
   }
-  float facingSun = max(dot(n, sun), 0.0), light = facingSun > 0.0 ? lit() : 0.0;
+  float facingSun = max(dot(n, sun), 0.0), light = facingSun > 0.0 ? (kind == 2 ? 1.0 : lit()) : 0.0;  // else the seam would cast one
   float shine = gloss * pow(max(dot(n, normalize(sun + toEye)), 0.0), 40.0);
   // fill: light thrown back by the ground, so that shadows are dark but not holes
   float fill = 0.06 + 0.05 * (1.0 - n.z);
@@ -226,7 +232,9 @@ export class Renderer {
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
   }
 
-  clearTracks() {
+  // Begins with untrodden ground around a place; tracks farther away than half a span would repeat on it.
+  clearTracks(middle) {
+    this.middle = middle;
     this.ruts.fill(0);
     this.uploadRows(0, TRACK);
   }
@@ -238,8 +246,9 @@ export class Renderer {
       this.ruts.subarray(first * TRACK, (first + count) * TRACK));
   }
 
-  // One bar of a track across the way [dx, dy] (a unit vector) at x, y.
-  print([x, y], [dx, dy], width, length, depth) {
+  // One bar of a track at x, y across the way dx, dy (a unit vector).
+  print([x, y, dx, dy, width, length, depth]) {
+    if (Math.max(Math.abs(x - this.middle[0]), Math.abs(y - this.middle[1])) > TRACK_SPAN / 2) return;
     const cell = TRACK_SPAN / TRACK, wrap = (i) => ((i % TRACK) + TRACK) % TRACK;
     const reach = Math.hypot(width, length) / 2 + cell;
     const rows = [Math.floor((y - reach) / cell), Math.ceil((y + reach) / cell)];
@@ -308,6 +317,7 @@ export class Renderer {
     gl.uniform3fv(at.sun, this.sun);
     gl.uniform1f(at.exposure, this.exposure);
     gl.uniform1f(at.span, TRACK_SPAN);
+    gl.uniform2fv(at.middle, this.middle);
     gl.uniform1f(at.offset, 1.6 * 2 * REACH / SHADOW);
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D, this.tracks);
