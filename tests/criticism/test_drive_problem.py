@@ -31,16 +31,27 @@ def _friction(ctx, state, torque):
     return torque - FRICTION * np.tanh(ctx.joint_speed / 0.03)
 
 
-def _problem(folder):
+def _problem(folder, engine="auto"):
     logs = read_campaign([folder])
     assert not is_bad(check(logs))
     candidates = {n: catalogue.get(n) for n in CANDIDATES}
-    return DriveProblem(logs, make_model("luvmi_x", terrain="flat", timestep=0.0025), candidates, baseline=BASELINE)
+    return DriveProblem(logs, make_model("luvmi_x", terrain="flat", timestep=0.0025), candidates, baseline=BASELINE,
+                        engine=engine)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def quiet(tmp_path_factory):
-    return _problem(drive_campaign(tmp_path_factory.mktemp("quiet")))
+def quiet_logs(tmp_path_factory):
+    return drive_campaign(tmp_path_factory.mktemp("quiet"))
+
+
+@pytest.fixture(scope="module")
+def rubbing_logs(tmp_path_factory):
+    return drive_campaign(tmp_path_factory.mktemp("rubbing"), [Hook("friction", {"torque": _friction})], seed=1)
+
+
+@pytest.fixture(scope="module")
+def quiet(quiet_logs):
+    return _problem(quiet_logs)
 
 
 def test_quotients_agree_with_a_change_of_the_parameter(quiet):
@@ -73,11 +84,20 @@ def test_drives_without_a_hidden_effect_are_noise_only(quiet):
     assert found.base.fit.rms(found.base.fit.fitted) == pytest.approx(1.0, abs=0.05)
 
 
-def test_friction_hidden_in_a_drive_is_named_and_sized(tmp_path):
-    problem = _problem(drive_campaign(tmp_path, [Hook("friction", {"torque": _friction})], seed=1))
+def test_friction_hidden_in_a_drive_is_named_and_sized(rubbing_logs):
+    problem = _problem(rubbing_logs)
     diagnosis, found = diagnose(problem, SETTINGS)
     assert diagnosis.verdict is Verdict.KNOWN, diagnosis.sentence
     assert diagnosis.effects == ("coulomb_friction",)
     row = diagnosis.evidence[0]
     assert row.values["torque"] == pytest.approx(FRICTION, rel=0.1)
     assert found.chosen.fit.rms(found.chosen.fit.fitted) < 1.05 < 1.2 < found.base.fit.rms(found.base.fit.fitted)
+
+
+def test_the_other_engine_gives_the_same_verdicts(quiet_logs, rubbing_logs):
+    nothing, _ = diagnose(_problem(quiet_logs, "mjx"), SETTINGS)
+    assert nothing.verdict is Verdict.NOISE_ONLY, nothing.sentence
+    friction, _ = diagnose(_problem(rubbing_logs, "mjx"), SETTINGS)
+    assert friction.verdict is Verdict.KNOWN, friction.sentence
+    assert friction.effects == ("coulomb_friction",)
+    assert friction.evidence[0].values["torque"] == pytest.approx(FRICTION, rel=0.1)
