@@ -29,7 +29,7 @@ from .noise import NOISES, Recipe, ar1, rounded, smooth
 
 GROUPS: Mapping[str, int] = {"nulls": 34, "singles": 44, "pairs": 12, "outside": 10}
 """Groups of campaigns and their number in the whole benchmark."""
-ROVER, STEP, INTERVAL = "luvmi_x", 2e-3, 0.05
+ROVER, STEP, INTERVAL = "luvmi_x", 1e-3, 0.05
 SETTLE, LENGTH = 1.5, 10.0
 """s: at rest before the log begins, and the log."""
 GRAVITY, AMBIENT_degC = 1.625, 25.0
