@@ -27,6 +27,9 @@ INTERVAL = 0.05
 
 MOST_COMMANDS = 1_000_000
 
+PIECE = 100
+"""Commands driven in one call of the compiled program, which so fits drives of every length."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Commands:
@@ -138,14 +141,20 @@ def simulate(
                         f"is no whole number of time steps of {model.timestep:g} s",
                         f"set timestep_s = {commands.interval / max(every, 1):.6g}, or resample the commands"
                         )  # fmt: skip
-    start = system.reset(system.params, x, y, yaw)
+    state = system.reset(system.params, x, y, yaw)
     run = jax.jit(lambda p, s, c: system.rollout(p, s, c, every=every))
+    count = len(commands.values)
+    values = jnp.asarray(np.pad(commands.values, ((0, -count % PIECE), (0, 0)), mode="edge"))
     try:
-        compiled = run.lower(system.params, start, jnp.asarray(commands.values)).compile()
+        compiled = run.lower(system.params, state, values[:PIECE]).compile()
     except Exception as error:
         _blame_user_effect(model, error)
         raise
-    telemetry = jax.device_get(compiled(system.params, start, jnp.asarray(commands.values))[1])
+    parts = []
+    for first in range(0, count, PIECE):
+        state, seen = compiled(system.params, state, values[first : first + PIECE])
+        parts.append(jax.device_get(seen))
+    telemetry = jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
     check_finite(telemetry)
     return system, telemetry
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from lunar_mjx.commands.compiled import keep_compiled
 from lunar_mjx.errors import bad_input
 
 ModelOption = Annotated[Path | None, typer.Option(help="model.toml; overrides --rover, --terrain and --preset.")]
@@ -111,6 +112,7 @@ def view(
 
     light = Sun(azimuth, elevation)
     check_port(port)
+    keep_compiled()
     built = load_model(model) if model else make_model(rover, terrain, preset)
     for effect in effects or []:
         built = built.add(effect, "--effects")

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -54,6 +55,7 @@ def open_engine(model: Model, engine: str) -> Backend:
                 raise
     from lunar_mjx.backends.jax_backend import JaxBackend
 
+    print("view: this engine compiles first, which can take a minute", file=sys.stderr)
     return JaxBackend(model, engine, precision="float32")
 
 
