@@ -30,6 +30,8 @@ _PATIENCE = 2
 _CREEP = 2.0
 """Drop of chi-square that does not matter where rows are dear: it takes 25 to name an effect."""
 _NEAR = np.array([0.003, 0.01, 0.03])
+_TRIED = 3
+"""Steps that a descent may take before it is compared with a rival."""
 _HOPE = 4.0
 """Drop of chi-square that is still hoped for, in terms of what a Gauss-Newton step promises."""
 
@@ -151,30 +153,40 @@ class Descent:
     promise: float
 
 
-def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, rival: float = np.inf) -> Descent:
+def descend(
+    goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, rival: float = np.inf,
+    known: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Descent:  # fmt: skip
     """Levenberg-Marquardt from one start, all dampings of an iteration in one batch.
 
     Where Jacobians are dear, Broyden's update stands in for them as long as steps keep their promise, and a descent
     that falls far short of a rival's chi-square is left.
+
+    Args:
+      goal: what is minimised. start: (coordinates,) where from. iterations: most steps. rival: chi-square to be caught.
+      known: whitened residual (n,) and Jacobian (n, free) at the start, if they have been computed.
     """
     u = start.copy()
     u[goal.free] = np.clip(u[goal.free], goal.low, goal.high)
     lazy = not goal.problem.cheap_jacobian and not goal.problem.eager
-    if goal.problem.eager:
+    if known is not None:
+        r, j = known
+        best = float(goal.chi2(u[None], r[None])[0])
+    elif goal.problem.eager:
         residuals, chi2, jacobians = goal.linearise(u[None])
         r, best, j = residuals[0], float(chi2[0]), jacobians[0]
     else:
         residuals, chi2 = goal.residuals(u[None])
         r, best = residuals[0], float(chi2[0])
         j = goal.jacobian(u) if np.isfinite(best) else np.zeros((len(r), len(goal.free)))
-    damping, promise, fresh, curved, slow, failed = 1e-2, np.inf, True, False, 0, 0
+    damping, promise, fresh, curved, slow, failed, taken = 1e-2, np.inf, True, False, 0, 0, 0
     for _ in range(iterations):
         if not np.isfinite(best):
             break
         downhill, hessian = goal.quadratic(u, r, j)
         promise = goal.promise(u, downhill, hessian)
         enough = 0.0 if goal.problem.cheap_jacobian else 0.2 * slack_of(best, int(goal.fitted.sum()))
-        if fresh and not goal.problem.cheap_jacobian and best - _HOPE * promise > rival:
+        if taken >= _TRIED and fresh and not goal.problem.cheap_jacobian and best - _HOPE * promise > rival:
             break
         if slow >= _PATIENCE:
             break
@@ -209,7 +221,7 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, r
         # A model that misfits creeps along valleys that lead nowhere; what it gains there does not matter.
         creep = 0.0 if goal.problem.cheap_jacobian else max(enough, _CREEP)
         slow = slow + 1 if best - float(chi2[k]) < creep else 0
-        kept, failed = best - float(chi2[k]) > 0.5 * promise, 0
+        kept, failed, taken = best - float(chi2[k]) > 0.5 * promise, 0, taken + 1
         curved = not kept
         step, before = trials[k][goal.free] - u[goal.free], r
         u, r, best = trials[k], residuals[k], float(chi2[k])

@@ -162,6 +162,7 @@ def fit(
     certify: bool = True,
     progress: Progress = silent,
     rival: float = np.inf,
+    known: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Fit:
     """Fits coordinates to the observations of some splits.
 
@@ -176,6 +177,7 @@ def fit(
       certify: whether to ask the problem for its own part of the certificate, too.
       progress: told of every start.
       rival: chi-square that another model reaches: a fit that cannot is left unfinished where fits are dear.
+      known: whitened residual (n,) and Jacobian (n, free) at the start, if they have been computed.
 
     Returns:
       The best fit, with its certificate.
@@ -184,7 +186,7 @@ def fit(
     goal = Objective(problem, free, fitted)
     origin = problem.origin() if start is None else np.asarray(start, float)
     progress("fitting", 0.0)
-    found = [descend(goal, origin, rival=rival)]
+    found = [descend(goal, origin, rival=rival, known=known)]
     others = _other_starts(problem, free, origin, starts - 1, seed, spread, goal)
     ends: list[float] = []
     if problem.cheap_jacobian:

@@ -28,6 +28,7 @@ class Score:
     Attributes:
       effect: its name.
       signature: (n, m) projected whitened signature of its amplitudes over the fitted observations.
+      columns: (n, m) whitened sensitivities of all observations to its amplitudes.
       length: of the projected signature at nominal size, in sigma. share: of the unprojected length.
       amount: (m,) best amount in units of the coordinates. chi2: reduction of chi-square by it.
       z: robust significance in sigma, p: family-wise p value.
@@ -41,6 +42,7 @@ class Score:
     chi2: float
     z: float
     p: float = 1.0
+    columns: np.ndarray | None = None
 
 
 def blocks(observations: Observations, residual: np.ndarray, keep: np.ndarray, most: int = 400) -> np.ndarray:
@@ -185,7 +187,7 @@ def score(problem: Problem, fit: Fit, found: Mapping[str, np.ndarray], draws: in
         amount, chi2, z, boot = _test(signature, residual, block, weights)
         if length < SEPARABLE:
             z, boot = 0.0, None
-        results.append(Score(name, signature, length, share, amount, chi2, z))
+        results.append(Score(name, signature, length, share, amount, chi2, z, columns=found[name]))
         if boot is not None:
             boots.append(boot)
     highest = np.max(boots, axis=0) if boots else np.zeros(draws)

@@ -161,25 +161,26 @@ def _grow(
     good = [s for s in scores if worth_refitting(s, parent, settings)]
     if not good:
         return []
-    chosen = list(good[: settings.refits])
-    for s in good[settings.refits :]:
+    # Far from the noise linear scores order effects badly, and tables have one more start against that.
+    refits = settings.refits if problem.cheap_jacobian else 2 * settings.refits
+    chosen = list(good[:refits])
+    for s in good[refits:]:
         if near.get(good[0].effect, {}).get(s.effect, 0.0) >= settings.confounded and len(chosen) < 2 * settings.refits:
             chosen.append(s)
     new = [s for s in chosen if frozenset((*parent.effects, s.effect)) not in tried]
     with problem.focused([*parent.effects, *(s.effect for s in new)]):
-        grown = _refit_all(problem, parent, new, near, settings, memory)
+        grown = _refit_all(problem, parent, new, settings, memory)
     tried.update({frozenset(c.effects): c for c in grown})
     return grown
 
 
 def _refit_all(
-    problem: Problem, parent: Candidate, new: Sequence[Score], near: Mapping[str, Mapping[str, float]],
-    settings: Settings, memory: Memory,
-) -> list[Candidate]:  # fmt: skip
+    problem: Problem, parent: Candidate, new: Sequence[Score], settings: Settings, memory: Memory
+) -> list[Candidate]:
     """Refits the parent with each of the new effects.
 
-    Where rows are free, all refits share their batches. Where they are dear, the best is refitted first, and once one
-    reaches the noise only its near relatives could still rival it.
+    Where rows are free, all refits share their batches. Where they are dear, the best is refitted first, and others
+    only as far as they may still rival it.
     """
 
     def one(s: Score, rival: float = np.inf) -> Candidate:
@@ -188,10 +189,9 @@ def _refit_all(
     if not problem.eager or len(new) < 2:
         grown: list[Candidate] = []
         for s in new:
-            reached = {c.effects[-1]: c.fit.chi2 for c in grown if c.noise.passes}
-            related = any(near.get(e, {}).get(s.effect, 0.0) >= settings.confounded for e in reached)
-            if problem.cheap_jacobian or not reached or related:
-                grown.append(one(s, min(reached.values(), default=np.inf) + settings.same))
+            # What falls far short of one that reaches the noise is left soon.
+            reached = [c.fit.chi2 for c in grown if c.noise.passes]
+            grown.append(one(s, min(reached, default=np.inf) + settings.same))
         return grown
     with problem.together(len(new)) as leave:
 
@@ -216,15 +216,20 @@ def _refit(
         value, se = gain(problem, parent.fit, found)
         return Candidate(effects, found, noise_test(problem, found), value, se)
     places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
-    for share in (1.0, 0.3) if scored is not None else (0.0,):
-        start = parent.fit.u.copy()
-        if scored is not None:
-            start[places] += share * np.clip(scored.amount, -3.0, 3.0)
-        trial = fit(problem, free, start, starts=1, certify=False, rival=rival)
-        if found is None or trial.chi2 < found.chi2:
-            found = trial
-        if found.chi2 < parent.fit.chi2 and (problem.cheap_jacobian is False or share != 1.0):
-            break
+    if scored is not None and scored.columns is not None and not problem.cheap_jacobian:
+        # The score has taken all derivatives at the parent's fit: the first step costs nothing.
+        known = parent.fit.residual, _joined(problem, parent.fit, free, places, scored.columns)
+        found = fit(problem, free, parent.fit.u, starts=1, certify=False, rival=rival, known=known)
+    else:
+        for share in (1.0, 0.3) if scored is not None else (0.0,):
+            start = parent.fit.u.copy()
+            if scored is not None:
+                start[places] += share * np.clip(scored.amount, -3.0, 3.0)
+            trial = fit(problem, free, start, starts=1, certify=False, rival=rival)
+            if found is None or trial.chi2 < found.chi2:
+                found = trial
+            if found.chi2 < parent.fit.chi2 and share != 1.0:
+                break
     if scored is not None and problem.cheap_jacobian:
         # A baseline that misfits may have gone far along a valley, from where the way back is long.
         start = problem.origin()
@@ -236,6 +241,17 @@ def _refit(
     memory.keep(problem, effects, found)
     value, se = gain(problem, parent.fit, found)
     return Candidate(effects, found, noise_test(problem, found), value, se)
+
+
+def _joined(problem: Problem, parent: Fit, free: np.ndarray, places: Sequence[int], columns: np.ndarray) -> np.ndarray:
+    """(n, free) Jacobian at the parent's fit, with the columns of a candidate; its shapes do nothing at its null."""
+    out = np.zeros((len(problem.observations), len(free)))
+    at = {int(i): k for k, i in enumerate(free)}
+    for k, i in enumerate(parent.free):
+        out[:, at[int(i)]] = parent.jacobian[:, k]
+    for k, i in enumerate(places):
+        out[:, at[int(i)]] = columns[:, k]
+    return out
 
 
 def refit_with(problem: Problem, base: Fit, effect: str, settings: Settings, memory: Memory) -> Fit:

@@ -151,8 +151,34 @@ def _normal() -> Iterator[Term]:
                         "dataclasses.replace(value, load=value.load * factor, sigma_m=value.sigma_m * factor)",
                         5.0)  # fmt: skip
 
+    yield _file("wheel_normal", "resistance", "1", "N", 5.0, [],
+                "dataclasses.replace(value, resistance=value.resistance + p.amount)")  # fmt: skip
+    yield _file("wheel_normal", "load", "W log(W/100 N)", "1", 0.2,
+                [f"factor = 1.0 + p.amount * {_HEAVY.format('value')}"],
+                "dataclasses.replace(value, load=value.load * factor, sigma_m=value.sigma_m * factor)",
+                5.0)  # fmt: skip
+
+
+_HEAVY = "jnp.log(jnp.maximum({}.load, 1.0) / 100.0)"
+"""Loads about 100 N; where a table holds one load only, such a term is a change of the soil."""
+
 
 def _shear() -> Iterator[Term]:
+    # what does not grow with the load: cables, seals, a wheel that is mounted askew
+    yield _file("wheel_shear", "longitudinal force", "1", "N", 5.0, ["extra = p.amount * value.direction"],
+                "dataclasses.replace(value, force=value.force._replace(x=value.force.x + extra))")  # fmt: skip
+    for formula, code, unit, size in (
+        ("1", "p.amount", "N", 5.0), ("W", "p.amount * ctx.normal.load", "1", 0.05),
+        ("-sgn(v_y)", "-p.amount * jnp.tanh(20.0 * value.slip_y)", "N", 5.0),
+    ):  # fmt: skip
+        yield _file("wheel_shear", "lateral force", formula, unit, size, [f"extra = {code}"],
+                    "dataclasses.replace(value, force=value.force._replace(y=value.force.y + extra))")  # fmt: skip
+    yield _file("wheel_shear", "driving torque", "1", "N m", 0.5, ["extra = -p.amount * value.direction"],
+                "dataclasses.replace(value, moment=value.moment._replace(y=value.moment.y + extra))")  # fmt: skip
+    yield _file("wheel_shear", "shear force", "F log(W/100 N)", "1", 0.2,
+                [f"factor = 1.0 + p.amount * {_HEAVY.format('ctx.normal')}",
+                 "force = value.force._replace(x=value.force.x * factor, y=value.force.y * factor)"],
+                "dataclasses.replace(value, force=force)", 5.0)  # fmt: skip
     for formula, code, lines in _products():
         yield _file("wheel_shear", "longitudinal force", f"W {formula}", "1", 0.1,
                     [*lines, f"extra = p.amount * ctx.normal.load * value.direction * {code}"],
