@@ -15,6 +15,7 @@ import numpy as np
 
 from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
 from lunar_mjx.criticism.drive_noise import channel_noise
+from lunar_mjx.criticism.drive_nuisances import STEP_ERROR, direction, from_first, is_linear, nuisances
 from lunar_mjx.criticism.drive_program import Rows
 from lunar_mjx.criticism.drive_runs import Bench, LogRun
 from lunar_mjx.criticism.fitted import fitted_model
@@ -102,8 +103,9 @@ class DriveProblem(Problem):
         self._gather: Gather | None = None
         found = _baseline_coordinates(model, baseline)
         count = len(found)
+        self.observations = _observations(self.bench, self.logs, splits or {}, channels)
         for number, run in enumerate(self.bench.runs):
-            found += _nuisances(number, run)
+            found += nuisances(number, run, self.observations)
         self.baseline = np.arange(len(found))
         self._nuisance = np.arange(count, len(found))
         self.candidates = {}
@@ -112,7 +114,7 @@ class DriveProblem(Problem):
             self.candidates[name] = np.arange(len(found), len(found) + len(mine))
             found += mine
         self.coordinates = tuple(found)
-        self.observations = _observations(self.bench, self.logs, splits or {}, channels)
+        self._step_error: np.ndarray | None = None
 
     @property
     def eager(self) -> bool:
@@ -157,7 +159,35 @@ class DriveProblem(Problem):
         out = np.full((len(rows), len(self.observations)), np.nan)
         for number, k, sampled in bench.run(len(rows), values, self.observations, self.progress):
             out[k, self._of_log(number)] = sampled
+        out = from_first(out, self.observations)
+        for i, c in enumerate(self.coordinates):
+            if is_linear(c) and np.any(amount := c.value(rows[:, i])):
+                out += np.outer(amount, self._direction(c))
         return out
+
+    def _direction(self, c: Coordinate) -> np.ndarray:
+        return direction(c, self.observations, self.step_error if c.name == STEP_ERROR else np.zeros(0))
+
+    @property
+    def step_error(self) -> np.ndarray:
+        """(n,) what a vanishing time step would add to the predictions of the model as given, to first order.
+
+        The step's error leads joints by a step or so, which an encoder sees. How much of it a log contains is a
+        nuisance of the log: all where a rover was measured, nothing where a simulator with the same step recorded it.
+        """
+        if self._step_error is None:
+            origin = self.origin()[None] * 0.0
+            coarse, fine = self._simulated(self.bench, origin), self._simulated(self.bench.halved(), origin)
+            found = 2.0 * (fine - coarse)
+            self._step_error = np.where(np.isfinite(found), found, 0.0)
+        return self._step_error
+
+    def _simulated(self, bench: Bench, row: np.ndarray) -> np.ndarray:
+        """(n,) what a bench predicts for one row of coordinates, without linear nuisances."""
+        out = np.full(len(self.observations), np.nan)
+        for number, _, sampled in bench.run(1, self._values(row), self.observations, silent):
+            out[self._of_log(number)] = sampled[0]
+        return from_first(out, self.observations)
 
     @contextlib.contextmanager
     def focused(self, effects: Sequence[str]) -> Iterator[None]:
@@ -202,7 +232,7 @@ class DriveProblem(Problem):
 
     def _kinds(self, which: np.ndarray) -> tuple[list[int], list[int], list[str]]:
         """Nuisances, shared coordinates, and the names of the nuisances."""
-        own = [int(i) for i in which if self.coordinates[i].log_index >= 0]
+        own = [int(i) for i in which if self.coordinates[i].log_index >= 0 and not is_linear(self.coordinates[i])]
         shared = [int(i) for i in which if self.coordinates[i].log_index < 0]
         return own, shared, sorted({self.coordinates[i].name for i in own})
 
@@ -225,7 +255,9 @@ class DriveProblem(Problem):
         out = np.zeros((len(self.observations), len(which)))
         for column, i in enumerate(which):
             c = self.coordinates[i]
-            if c.log_index < 0:
+            if is_linear(c):
+                out[:, column] = c.scale * self._direction(c)
+            elif c.log_index < 0:
                 k = shared.index(int(i))
                 out[:, column] = difference[k] / steps[k]
             else:
@@ -244,16 +276,22 @@ class DriveProblem(Problem):
         }
 
     def certificate(self, u: np.ndarray, free: np.ndarray) -> Mapping[str, float]:
+        """The change of chi-square by halving the time step, beyond what the nuisance of the step's error absorbs."""
         del free
-        halved = self._bench_for(u[None]).halved()
-        values = self._values(u[None])
-        fine = np.empty(len(self.observations))
-        for number, _, sampled in halved.run(1, values, self.observations, silent):
-            fine[self._of_log(number)] = sampled[0]
+        whiten = self.observations.whiten
+        bench = self._bench_for(u[None])
+        change = self._simulated(bench.halved(), u[None]) - self._simulated(bench, u[None])
+        for c in self.coordinates:
+            if c.name == STEP_ERROR:
+                mine, own = self._of_log(c.log_index), np.zeros(len(change))
+                own[mine] = change[mine]
+                known = self._direction(c)
+                along = whiten(known)
+                size = float(along @ along)
+                change -= (float(along @ whiten(own)) / size if size > 0.0 else 0.0) * known
         keep = self.observations.in_split("fit")
-        measured = self.observations.value
-        coarse = self.predict(u[None])[0]
-        chi2 = [np.sum(self.observations.whiten(measured - p)[keep] ** 2) for p in (coarse, fine)]
+        coarse = self.observations.value - self.predict(u[None])[0]
+        chi2 = [np.sum(whiten(r)[keep] ** 2) for r in (coarse, coarse - change)]
         return {"half_step_chi2": float(abs(chi2[0] - chi2[1]))}
 
 
@@ -291,16 +329,6 @@ def _baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tupl
                 if p.null is not None and value.ndim == 0:
                     found.append(default_coordinate(effect, name, float(value), 0.3, 10.0))
     return found
-
-
-def _nuisances(number: int, run: LogRun) -> list[Coordinate]:
-    """What nobody knows exactly about the start of a log: pose in the plane and temperature."""
-    wide = {"x": (0.01, 1.0), "y": (0.01, 1.0), "yaw": (0.01, 0.6), "temperature": (1.0, 100.0)}
-    return [
-        Coordinate("initial", name, run.start[name], wide[name][0], run.start[name] - wide[name][1],
-                   run.start[name] + wide[name][1], prior=10.0, log_index=number)
-        for name in run.unknown
-    ]  # fmt: skip
 
 
 def default_splits(logs: Sequence[Log]) -> list[str]:

@@ -118,7 +118,8 @@ class Logs:
         for (effect, name, own, factor), column in values.items():
             value = column[row]
             if effect == "initial":
-                start[name] = np.where(number == own, value, start[name])
+                if name in start:
+                    start[name] = np.where(number == own, value, start[name])
             elif effect in params.effects:  # else a candidate at its null, which this program does without
                 old = params.effects[effect][name]
                 spread = value.reshape(-1, *[1] * (old.ndim - 1))

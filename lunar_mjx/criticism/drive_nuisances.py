@@ -1,0 +1,68 @@
+"""What nobody knows exactly of a log: its start, the zero of its encoders, how its time compares with finite steps."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lunar_mjx.criticism.coordinates import Coordinate
+from lunar_mjx.criticism.observations import Observations, Series
+
+if TYPE_CHECKING:
+    from lunar_mjx.criticism.drive_runs import LogRun
+
+STEP_ERROR = "step_error"
+"""Name of the nuisance by which a log differs from what steps of finite length predict."""
+_ENCODER = re.compile(r"joint_\w*drive_angle_rad")
+_START = {"x": (0.01, 1.0), "y": (0.01, 1.0), "yaw": (0.01, 0.6), "temperature": (1.0, 100.0)}
+"""Scale and reach of what is measured with noise at the start, m, rad, K."""
+
+
+def is_encoder(series: Series) -> bool:
+    """Whether a channel counts a wheel's turns from a zero of its own."""
+    return _ENCODER.fullmatch(series.channel) is not None
+
+
+def nuisances(number: int, run: LogRun, observations: Observations) -> list[Coordinate]:
+    """Coordinates of one log's nuisances; those of `is_linear` need no simulation."""
+    found = [
+        Coordinate("initial", name, run.start[name], _START[name][0], run.start[name] - _START[name][1],
+                   run.start[name] + _START[name][1], prior=10.0, log_index=number)
+        for name in run.unknown
+    ]  # fmt: skip
+    found.append(Coordinate("initial", STEP_ERROR, 0.0, 1.0, -2.0, 2.0, prior=1.0, physical=True, log_index=number))
+    for s in observations.series:
+        if s.log == number and is_encoder(s):
+            first = float(np.mean(observations.value[s.start : s.stop][:5]))
+            scale = 3.0 * float(observations.sigma()[s.start])
+            found.append(Coordinate("initial", s.channel, first, scale, first - 30.0 * scale, first + 30.0 * scale,
+                                    prior=10.0, log_index=number))  # fmt: skip
+    return found
+
+
+def is_linear(c: Coordinate) -> bool:
+    """Whether a coordinate adds a known vector to the predictions, whatever the others are."""
+    return c.log_index >= 0 and (c.name == STEP_ERROR or _ENCODER.fullmatch(c.name) is not None)
+
+
+def direction(c: Coordinate, observations: Observations, step_error: np.ndarray) -> np.ndarray:
+    """(n,) what one unit of a linear nuisance's value adds to the predictions."""
+    out = np.zeros(len(observations))
+    for s in observations.series:
+        if s.log == c.log_index:
+            part = slice(s.start, s.stop)
+            if c.name == STEP_ERROR:
+                out[part] = step_error[part]
+            elif c.name == s.channel:
+                out[part] = 1.0
+    return out
+
+
+def from_first(predicted: np.ndarray, observations: Observations) -> np.ndarray:
+    """Predictions (..., n) with the angles of encoders counted from their first sample."""
+    for s in observations.series:
+        if is_encoder(s):
+            predicted[..., s.start : s.stop] -= predicted[..., s.start : s.start + 1]
+    return predicted
