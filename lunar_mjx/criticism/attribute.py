@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
+from lunar_mjx.criticism.fitting import HALF_STEP, Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import errors
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.score import SEPARABLE, Score
-from lunar_mjx.criticism.search import Candidate, Search, Settings, excess_explained, search, significant
+from lunar_mjx.criticism.search import Search, Settings, excess_explained, search, significant
 from lunar_mjx.criticism.verdict import Diagnosis, EffectEvidence, Verdict
+
+STEP_SHARE = 0.01
+"""Share of what an effect explains that the error of the time step may amount to."""
 
 
 def diagnose(
@@ -45,7 +48,7 @@ def diagnose(
         return Diagnosis(Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details), found
     if chosen.effects:
         progress("certifying", 0.0)
-        final = certify(problem, chosen, settings)
+        final = certify(problem, found, settings)
         details["certificate_after"] = _certificate(final)
         if final.problems:
             reason = "; ".join(final.problems)
@@ -66,10 +69,19 @@ def diagnose(
     return diagnosis, found
 
 
-def certify(problem: Problem, chosen: Candidate, settings: Settings) -> Fit:
-    """The chosen model fitted once more from several starts, with its own certificate."""
+def certify(problem: Problem, found: Search, settings: Settings) -> Fit:
+    """The chosen model fitted once more from several starts, with its own certificate.
+
+    The error of the time step must not be what an effect explains: it may change chi-square by a hundredth of what the
+    least of the effects does, where that is more than would name one.
+    """
+    chosen = found.chosen
+    without = [c.fit.chi2 for c in found.tried if set(c.effects) < set(chosen.effects)
+               and len(c.effects) == len(chosen.effects) - 1]  # fmt: skip
+    least = min(without, default=found.base.fit.chi2) - chosen.fit.chi2
     with problem.focused(chosen.effects):
-        return fit(problem, problem.free(chosen.effects), chosen.fit.u, settings.starts, settings.seed, spread=0.5)
+        return fit(problem, problem.free(chosen.effects), chosen.fit.u, settings.starts, settings.seed, spread=0.5,
+                   half_step=max(HALF_STEP, STEP_SHARE * least))  # fmt: skip
 
 
 def _certificate(found: Fit) -> dict[str, Any]:

@@ -163,6 +163,7 @@ def fit(
     progress: Progress = silent,
     rival: float = np.inf,
     known: tuple[np.ndarray, np.ndarray] | None = None,
+    half_step: float = HALF_STEP,
 ) -> Fit:
     """Fits coordinates to the observations of some splits.
 
@@ -178,6 +179,7 @@ def fit(
       progress: told of every start.
       rival: chi-square that another model reaches: a fit that cannot is left unfinished where fits are dear.
       known: whitened residual (n,) and Jacobian (n, free) at the start, if they have been computed.
+      half_step: largest change of chi-square by halving the time step.
 
     Returns:
       The best fit, with its certificate.
@@ -206,7 +208,7 @@ def fit(
     if certify and np.isfinite(best.chi2) and not problem.cheap_jacobian and best.promise > SMALL_GRADIENT:
         extra["roughness_chi2"] = goal.roughness(found[0].u, found[0].residual, found[0].jacobian)
     agreeing = sum(c <= best.chi2 + same_chi2(best.chi2, count) for c in chi2s)
-    problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra)
+    problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra, half_step)
     return Fit(
         u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual, jacobian=best.jacobian,
         fitted=fitted, gradient=best.promise, starts=chi2s, at_bound=edge, extra=extra, problems=problems,
@@ -214,8 +216,9 @@ def fit(
 
 
 def _faults(
-    best: Descent, slack: float, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float]
-) -> tuple[str, ...]:
+    best: Descent, slack: float, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float],
+    half_step: float,
+) -> tuple[str, ...]:  # fmt: skip
     problems = []
     if not np.isfinite(best.chi2):
         return ("every start diverged",)
@@ -227,7 +230,7 @@ def _faults(
     # A model that misfits presses its parameters against bounds; they count once it is at the noise.
     if edge and not slack:
         problems.append(f"{', '.join(edge)} ended at a bound")
-    if extra.get("half_step_chi2", 0.0) > max(HALF_STEP, slack):
+    if extra.get("half_step_chi2", 0.0) > max(half_step, slack):
         problems.append(f"halving the time step changes chi-square by {extra['half_step_chi2']:.2g}")
     return tuple(problems)
 

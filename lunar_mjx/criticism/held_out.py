@@ -16,6 +16,8 @@ AT_NOISE = 1.03
 CHANNEL_AT_NOISE = 1.05
 """The same for the worst single channel."""
 _SAMPLING = 3.5
+_KNOWN = 1e-2
+"""Share of what is known about a direction from which the other manoeuvres count as knowing it."""
 _ENOUGH = 4
 """Fitted manoeuvres from which leaving one out in turn is a fair judge."""
 _PIECES = 4
@@ -31,13 +33,18 @@ def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
     _, scale = problem.prior_rows(fit.u, fit.free)
     j = fit.jacobian[fit.fitted]
     hessian = j.T @ j + np.diag(scale**2)
+    size = np.sqrt(np.diag(hessian))
+    size = np.where(size > 0.0, size, 1.0)
+    known, axes = np.linalg.eigh(hessian / np.outer(size, size))
+    kept = known > 1e-13
+    unit = axes[:, kept] / np.sqrt(known[kept]) / size[:, None]  # in which all that is known weighs one
     for part in _left_out(problem, fit):
         jb, rb = fit.jacobian[part], fit.residual[part]
-        rest = hessian - jb.T @ jb
-        # A direction that only this manoeuvre knows stays where the fit put it.
-        values, vectors = np.linalg.eigh(0.5 * (rest + rest.T))
-        live = values > 1e-8 * max(float(values.max()), 1e-30)
-        step = (vectors[:, live] / values[live]) @ (vectors[:, live].T @ (jb.T @ rb))
+        mine = jb @ unit
+        values, vectors = np.linalg.eigh(np.eye(mine.shape[1]) - mine.T @ mine)
+        # A direction of which the other manoeuvres know next to nothing stays where the fit put it.
+        live = values > _KNOWN
+        step = unit @ ((vectors[:, live] / values[live]) @ (vectors[:, live].T @ (mine.T @ rb)))
         out[part] = rb + jb @ step
     return out
 
