@@ -264,6 +264,8 @@ def test_folder_layout(rover: Rover, models: Path) -> None:
         "README.md",
         "LICENSE",
         "CHANGELOG.md",
+        "policy.npz",
+        "POLICY.md",
     }
     assert {p.name for p in rover.folder.iterdir()} == expected
     assert re.fullmatch(r"[a-z][a-z0-9_]*", rover.name)
