@@ -161,11 +161,17 @@ def test_mistakes_are_one_sentence(run, arguments, message):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals differ")
 def test_control_c_ends_it_cleanly():
-    process = subprocess.Popen([sys.executable, "-c", MAIN, "view", "--web", "--rover", "luvmi_x", "--terrain", "flat",
+    # a job in the background ignores the interrupt, and its children inherit that
+    main = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {MAIN}"
+    process = subprocess.Popen([sys.executable, "-c", main, "view", "--web", "--rover", "luvmi_x", "--terrain", "flat",
                                 "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                                env={**os.environ, "PYTHONUNBUFFERED": "1"})  # fmt: skip
-    assert process.stdout is not None
-    assert "http://127.0.0.1:" in process.stdout.readline()
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    with process:
+        try:
+            assert process.stdout is not None
+            assert "http://127.0.0.1:" in process.stdout.readline()
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+        finally:
+            process.kill()
     assert process.returncode == 0 and not err and "luvmi_x drove 0.0 m" in out

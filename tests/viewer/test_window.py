@@ -33,7 +33,9 @@ def screen():
 
 
 def test_opens_drives_and_ends_with_control_c(screen):
-    command = [sys.executable, "-c", MAIN, "view", "--rover", "luvmi_x", "--terrain", "flat"]
+    # a job in the background ignores the interrupt, and its children inherit that
+    main = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {MAIN}"
+    command = [sys.executable, "-c", main, "view", "--rover", "luvmi_x", "--terrain", "flat"]
     process = subprocess.Popen(command, env=screen, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     time.sleep(12.0)
     assert process.poll() is None, process.communicate()
