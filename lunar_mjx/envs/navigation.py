@@ -220,7 +220,8 @@ class NavigationEnv:
         obs, privileged, info, inner = here
         return dataclasses.replace(state, obs=obs, privileged=privileged, info=info, inner=inner)
 
-    def _advance(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Inner, View]:
+    def _drive(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Physics, Any, Any]:
+        """The physics of one action: its state after, and slip and sinkage (env, wheel) of its last step."""
         c = self.config
         system, axes = randomise.apply(params.system, inner.drawn)
         controls = self.actions.controls(action)
@@ -228,6 +229,11 @@ class NavigationEnv:
         physics, (slip, sinkage) = self.system.rollout_batch(
             system, inner.physics, held, 1, axes, lambda seen: (seen.slip, seen.sinkage)
         )
+        return physics, slip[:, -1], sinkage[:, -1]
+
+    def _advance(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Inner, View]:
+        c = self.config
+        physics, slip, sinkage = self._drive(params, inner, action)
         position, velocity = physics.qpos[:, :3], physics.qvel[:, :3]
         filtered = kalman.update(params.gains, self.control_interval, inner.filtered, position, velocity)
         away = rewards.length(position[:, :2] - inner.anchor) > c.stuck_distance
@@ -236,8 +242,8 @@ class NavigationEnv:
             inner,
             physics=physics,
             filtered=filtered,
-            slip=slip[:, -1],
-            sinkage=sinkage[:, -1],
+            slip=slip,
+            sinkage=sinkage,
             last_action=action,
             anchor=jnp.where(away[:, None], position[:, :2], inner.anchor),
             waited=waited,
