@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 from lunar_mjx import __version__
 from lunar_mjx.commands import criticism as criticism_commands
-from lunar_mjx.commands import effect_test
+from lunar_mjx.commands import effect_test, usage
 from lunar_mjx.commands import log as log_commands
 from lunar_mjx.commands import parity as parity_commands
 from lunar_mjx.commands import seeing as seeing_commands
@@ -309,7 +309,11 @@ def main() -> None:
     """Entry point of the command."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
-        app(prog_name="lunar-mjx")
+        status = app(prog_name="lunar-mjx", standalone_mode=False)
+    except usage.UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # Typer has printed the help
+            sys.exit(EXIT_STATUS)
+        _fail(usage.describe(error, sys.argv[1:]), EXIT_STATUS)
     except UserError as error:
         _fail(str(error), EXIT_STATUS)
     except OSError as error:  # unreadable, unwritable, disk full
@@ -318,10 +322,13 @@ def main() -> None:
         _fail(f"{error.filename}: {error.strerror or error}; check the path and its permissions.", EXIT_STATUS)
     except (_Interrupted, KeyboardInterrupt):
         _fail("interrupted", INTERRUPTED)
+    else:
+        sys.exit(status if isinstance(status, int) else 0)
 
 
 def _fail(sentence: str, status: int) -> None:
-    print(f"lunar-mjx: {' '.join(sentence.splitlines())}", file=sys.stderr)
+    line = " ".join(sentence.splitlines()).removeprefix("lunar-mjx: ").removeprefix("lunar-mjx ")
+    print(f"lunar-mjx: {line}", file=sys.stderr)
     sys.exit(status)
 
 

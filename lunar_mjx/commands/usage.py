@@ -1,0 +1,60 @@
+"""A mistake on the command line itself, such as an unknown option, told in one sentence instead of Typer's box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import typer
+
+UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
+"""Typer's own, wherever this version of Typer keeps it."""
+
+_PROBLEMS = (
+    ("valid integer", "is not a whole number"),
+    ("valid int", "is not a whole number"),
+    ("valid number", "is not a number"),
+    ("valid float", "is not a number"),
+    ("greater than or equal to ", "is below {}"),
+    ("less than or equal to ", "is above {}"),
+)
+
+
+def describe(error: Any, arguments: Sequence[str]) -> str:
+    """The sentence: which option of which command, what was given, and where to read more.
+
+    Args:
+      error: a `UsageError`. arguments: of the command line, in which the value is found.
+    """
+    command = error.ctx.command_path if error.ctx else "lunar-mjx"
+    names = list(getattr(getattr(error, "param", None), "opts", ()))
+    name = next((n for n in names if n.startswith("--")), names[0] if names else "")
+    if type(error).__name__ != "BadParameter" or not name:
+        text = _clause(error.format_message())
+        return f"{command}: {text}; see {command} --help."
+    value = _given(names, arguments)
+    shown = name if value is None else f"{name} = {value!r}"
+    return f"{command}: {shown} {_problem(error.message)}; see {command} --help."
+
+
+def _problem(message: str) -> str:
+    for words, problem in _PROBLEMS:
+        _, found, rest = message.partition(words)
+        if found:
+            return problem.format(rest)
+    return f"is not accepted: {_clause(message)}"
+
+
+def _clause(message: str) -> str:
+    text = " ".join(message.split()).rstrip(".")
+    return text[:1].lower() + text[1:]
+
+
+def _given(names: Sequence[str], arguments: Sequence[str]) -> str | None:
+    """What an option was given last, which counts; None for an argument, which has no name to be found by."""
+    found = None
+    for i, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        if option in names:
+            found = value if equals else next(iter(arguments[i + 1 :]), None)
+    return found
