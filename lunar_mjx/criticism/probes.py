@@ -70,12 +70,12 @@ def _moment_y(ctx, a, value):
 
 
 def _push(ctx, a, value):
-    forward = ctx.frame.x
+    forward = ctx.frame.forward
     return dataclasses.replace(value, force=value.force + forward * a)
 
 
 def _tilt(ctx, a, value):
-    left = ctx.frame.y
+    left = ctx.frame.left
     return dataclasses.replace(value, moment=value.moment + left * a)
 
 
@@ -109,8 +109,8 @@ _ORDER = 1000
 
 
 @functools.cache
-def _probe(label: str, knots: int, span: float) -> Effect:
-    """An effect whose amplitudes are the knots of a course over time (one knot: constant)."""
+def unknown_input(label: str, knots: int, span: float) -> Effect:
+    """An unknown input as an effect whose amplitudes are the knots of a course over time (one knot: constant)."""
     port, act, size, unit = PROBES[label]
 
     def function(ctx, p, x, value):
@@ -141,7 +141,7 @@ def _table_columns(problem: TableProblem, fit: Fit) -> dict[str, np.ndarray]:
     labels = [
         label for label, probe in PROBES.items() if probe[0] in ("geometry", "soil", "wheel_normal", "wheel_shear")
     ]
-    probes = {label: _probe(label, 1, 1.0) for label in labels}
+    probes = {label: unknown_input(label, 1, 1.0) for label in labels}
     other = TableProblem(
         problem.logs, problem.fitted_bed(fit.u), {p.name: p for p in probes.values()}, problem.splits,
         extra_sigma=problem.extra_sigma,
@@ -167,7 +167,7 @@ def _smooth_modes(place: np.ndarray | None) -> np.ndarray:
 
 def _drive_columns(problem: DriveProblem, fit: Fit, progress: Progress) -> dict[str, np.ndarray]:
     span = max(r.end - r.begin for r in problem.bench.runs)
-    probes = {label: _probe(label, KNOTS, span) for label in PROBES}
+    probes = {label: unknown_input(label, KNOTS, span) for label in PROBES}
     usable = {label: p for label, p in probes.items() if _present(problem, label)}
     other = problem.with_candidates({p.name: p for p in usable.values()}, fit, progress)
     observations = problem.observations

@@ -233,16 +233,16 @@ def _command() -> Iterator[Term]:
 
 
 def _body() -> Iterator[Term]:
-    speed = "v = ctx.velocity.dot(ctx.frame.x)"
+    speed = "v = ctx.velocity.dot(ctx.frame.forward)"
     for formula, code, unit, size in (("1", "1.0", "N", 5.0), ("v", "v", "N s/m", 20.0),
                                       ("v |v|", "v * jnp.abs(v)", "N s2/m2", 50.0),
-                                      ("sin pitch", "-ctx.frame.x.z", "N", 20.0)):  # fmt: skip
+                                      ("sin pitch", "-ctx.frame.forward.z", "N", 20.0)):  # fmt: skip
         lines = [speed] if "v" in code.replace("jnp", "") and "frame" not in code else []
         yield _file("body_wrench", "push forward", f"-{formula}", unit, size,
                     [*lines, f"push = -p.amount * ({code})"],
-                    "dataclasses.replace(value, force=value.force + ctx.frame.x * push)")  # fmt: skip
+                    "dataclasses.replace(value, force=value.force + ctx.frame.forward * push)")  # fmt: skip
     yield _file("body_wrench", "pitching moment", "1", "N m", 2.0, ["turn = p.amount"],
-                "dataclasses.replace(value, moment=value.moment + ctx.frame.y * turn)")  # fmt: skip
+                "dataclasses.replace(value, moment=value.moment + ctx.frame.left * turn)")  # fmt: skip
 
 
 def _geometry() -> Iterator[Term]:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lunar_mjx.criticism.discover import discover
+from lunar_mjx.criticism.probes import PROBES, unknown_input
 from lunar_mjx.criticism.runs import VERDICT_FILE, Run
 from lunar_mjx.criticism.terms import effect_of, terms, with_amount
-from lunar_mjx.effects import catalogue
+from lunar_mjx.effects import catalogue, probe
 from lunar_mjx.effects.base import PORTS
+from lunar_mjx.effects.contract import base_list
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 
@@ -56,3 +62,19 @@ def test_a_search_needs_a_port(tmp_path):
 
 def test_amounts_are_numbers_of_clear_size():
     assert all(np.isfinite(t.size) and t.size > 0.0 for library in LIBRARIES.values() for t in library)
+
+
+def _felt(effects):
+    """What a rover feels, as shapes, with these effects beside the standing ones; an effect that cannot act raises."""
+    moment = jax.tree.map(lambda v: jnp.asarray(v[0]), probe.states(1, 4))
+    present = [*base_list(effects[0], without=True), *effects]
+    return jax.eval_shape(functools.partial(probe.act, present, probe.terrain(), {}), moment)
+
+
+@pytest.mark.parametrize("port", [p for p in PORTS if p != "sensor"])
+def test_every_formula_acts_on_a_rover(port):
+    assert "chassis_force" in _felt([effect_of(term) for term in LIBRARIES[port]])
+
+
+def test_every_unknown_input_acts_on_a_rover():
+    assert "chassis_force" in _felt([unknown_input(label, 8, 10.0) for label in PROBES])

@@ -345,8 +345,28 @@ def _left_right(log: Log) -> list[Finding]:
     return []
 
 
+_LEVEL = 2.0
+"""deg of pitch up to which no rover slides back on its own."""
+
+
+def _climbs(log: Log, windows: np.ndarray, spin: np.ndarray) -> np.ndarray:
+    """Windows in which the wheels drive uphill while the rover, as far as its altitude is known, does not rise.
+
+    A rover that climbs more than its soil bears slides back over spinning wheels. With an axis of its position reversed
+    it would seem to, too, but it would rise.
+    """
+    limits = span(log, ("pitch_deg",))
+    if limits is None or limits[0] > windows[0] or limits[1] < windows[-1]:
+        return np.zeros(len(windows) - 1, bool)
+    uphill = -means(log, "pitch_deg", windows) * np.sign(spin) > _LEVEL
+    height = span(log, ("position_z_m",))
+    if height is None or height[0] > windows[0] or height[1] < windows[-1]:
+        return uphill
+    return uphill & (increments(log, "position_z_m", windows) < 0.0)
+
+
 def _course(log: Log) -> list[Finding]:
-    """A rover that is not steered goes where it heads, or straight back."""
+    """A rover that is not steered goes where its wheels drive it, along its heading; unless it slides back downhill."""
     names = ("position_x_m", "position_y_m", "yaw_deg")
     drives = [SPEED.format(c) for c in ("lf", "rf", "lr", "rr")]
     limits = span(log, (*names, *drives))
@@ -358,11 +378,13 @@ def _course(log: Log) -> list[Finding]:
     turned = np.abs(increments(log, "yaw_deg", windows))
     moved = np.hypot(east, north) * np.sign(spin)
     keep = (np.abs(moved) > max(20.0 * sigma(log, names[0]), 1e-3)) & (np.abs(spin) > 0.05) & (turned < 20.0)
-    if keep.sum() < 5:
-        return []
     heading = np.radians(means(log, "yaw_deg", windows))
     along, across = east * np.cos(heading) + north * np.sin(heading), north * np.cos(heading) - east * np.sin(heading)
-    off = np.degrees(np.arctan2(across * np.sign(spin), along * np.sign(spin)))[keep]
+    off = np.degrees(np.arctan2(across * np.sign(spin), along * np.sign(spin)))
+    keep &= (np.abs(off) < 90.0) | ~_climbs(log, windows, spin)
+    if keep.sum() < 5:
+        return []
+    off = off[keep]
     if np.median(np.abs(off)) < COURSE_TOLERANCE:
         return []
     return [

@@ -11,6 +11,7 @@ import pytest
 from log_files import GRAVITY, make_log, noise
 
 from lunar_mjx.criticism.log import Noise, check
+from lunar_mjx.criticism.log.check_frames import check_frames
 from lunar_mjx.criticism.log.findings import is_bad
 
 Tables = dict[str, pd.DataFrame]
@@ -245,3 +246,29 @@ def test_the_imu_may_be_mounted_in_any_way(tmp_path: Path) -> None:
     upside_down = {"quaternion": [0.0, 1.0, 0.0, 0.0]}
     assert not [f for f in check(make_log(tmp_path / "a", change, imu=upside_down)) if f.kind == "gravity"]
     assert [f for f in check(make_log(tmp_path / "b", change)) if f.kind == "gravity"]
+
+
+@pytest.mark.parametrize(("way", "rise", "told"), [(-0.2, -0.028, False), (-0.2, 0.028, True), (0.2, 0.028, False)])
+def test_a_rover_that_slides_back_down_a_slope_is_no_reversed_axis(
+    way: float, rise: float, told: bool, tmp_path: Path
+) -> None:
+    """Wheels drive forward up 8 deg; along x, and in height, the rover moves `way` and `rise` m/s."""
+
+    def change(tables: Tables) -> None:
+        drive = tables["drive"]
+        t = drive["time_s"].to_numpy()
+        keep = [c for c in drive if c.startswith(("time", "position", "roll", "pitch", "yaw", "joint", "command"))
+                and "angle" not in c]  # fmt: skip
+        drive = drive[keep].copy()
+        rng = np.random.default_rng(1)
+        for axis, speed in zip("xyz", (way, 0.0, rise), strict=True):
+            drive[f"position_{axis}_m"] = speed * t + 2e-3 * rng.standard_normal(len(t))
+        for angle, value in (("roll", 0.0), ("pitch", -8.0), ("yaw", 0.0)):
+            drive[f"{angle}_deg"] = value + 0.1 * rng.standard_normal(len(t))
+        for corner in ("lf", "rf", "lr", "rr"):
+            drive[f"command_{corner}_drive_speed_rad_s"] = 1.5
+            drive[f"joint_{corner}_drive_speed_rad_s"] = 1.5 + 5e-3 * rng.standard_normal(len(t))
+        tables["drive"] = drive
+
+    found = check_frames(make_log(tmp_path / "a", change, terrain="slope:8deg"))
+    assert bool([f for f in found if "heading" in f.message]) is told, [(f.column, f.message) for f in found]
