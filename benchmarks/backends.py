@@ -1,8 +1,7 @@
 """Every backend side by side in one run: rover-steps per second, compile time and memory against the batch size.
 
-    python benchmarks/backends.py --batches 1,16,256 --out benchmarks/backends_cpu.json              # CPU
-    python benchmarks/backends.py --cpu-rows 0 --batches 4096,32768,65536 --out benchmarks/backends_h200.json
-    python benchmarks/backends.py --cpu-rows 0 --engines structured,mjx --devices 4 --batches 262144 ...
+    python benchmarks/backends.py --platforms cpu --batches 1,1024 --out benchmarks/backends_cpu.json
+    python benchmarks/backends.py --cpu-rows 0 --batches 32768 --devices 1,2 --out benchmarks/backends_h200.json
 
 Rows with effects run the preset `consistent` on `lunar_plain`, thermal network included:
   pybullet                 Bullet with forces in NumPy, in one process and in one per core
@@ -12,7 +11,9 @@ Rows without, as floors:
   native, bare             `mujoco.rollout` of the same rover, on one thread and on all
   mjx, bare                `mjx.step` of the same rover
   mjx, spheres             `mjx.step` with a sphere per wheel on a height field, the usual terrain in MJX
-The load of the machine before the run is kept in the JSON: rows of a busy machine are lower bounds.
+Workers are threads, processes, cores (JAX on CPU) or GPUs. With several GPUs each takes a whole batch of `--batches`.
+The load of the machine before the run is kept in the JSON: rows of a busy machine are lower bounds. Two runs may share
+a machine: give each its own cores (`taskset`) and both the same `--lock`, which one holds while it times a GPU.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ import argparse
 import json
 import multiprocessing
 import os
-import platform
 import resource
 import time
 from collections.abc import Callable
@@ -33,6 +33,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from speed import control, native_batch, rollout, starts
+from timing import LOCK, alone, cpu_name, sharded
 
 from lunar_mjx._quiet import mjx
 from lunar_mjx.backends import NativeBackend
@@ -41,6 +42,7 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
 
 ENGINES = ("pybullet", "native", "structured", "mjx", "bare", "spheres")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def time_jax(function: Callable[[Any], Any], state: Any, steps: int, batch: int, repeats: int = 3) -> dict[str, Any]:
@@ -49,33 +51,27 @@ def time_jax(function: Callable[[Any], Any], state: Any, steps: int, batch: int,
     compiled = jax.jit(function).lower(state).compile()
     compile_s = time.perf_counter() - begin
     memory = compiled.memory_analysis()
-    new = jax.block_until_ready(compiled(state))
     best = float("inf")
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        new = jax.block_until_ready(compiled(new))
-        best = min(best, time.perf_counter() - begin)
+    with alone():
+        new = jax.block_until_ready(compiled(state))
+        for _ in range(repeats):
+            begin = time.perf_counter()
+            new = jax.block_until_ready(compiled(new))
+            best = min(best, time.perf_counter() - begin)
     used = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes if memory else None
     return {
         "steps_per_s": batch * steps / best,
         "compile_s": compile_s,
         "memory_MB": used and used / 1e6,
-        "finite": all(bool(jnp.isfinite(a).all()) for a in jax.tree.leaves(new)),
+        "finite": all(bool(np.isfinite(a).all()) for a in jax.tree.leaves(jax.device_get(new))),
     }
-
-
-def sharded(function: Callable[[Any], Any], devices: int) -> Callable[[Any], Any]:
-    """`function` with the batch split over devices."""
-    if devices == 1:
-        return function
-    mesh = jax.make_mesh((devices,), ("batch",))
-    split = jax.sharding.PartitionSpec("batch")
-    return jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
 
 
 def spheres(model: Model, steps: int, batch: int) -> dict[str, Any]:
     """MJX with a sphere for every wheel on a height field, and solver iterations that converge (4, line search 8)."""
     spec = model.rover.spec()
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
     field = model.terrain.field
     heights = np.asarray(field.heights)[:128, :128]
     low, high = float(heights.min()), float(heights.max())
@@ -93,14 +89,14 @@ def spheres(model: Model, steps: int, batch: int) -> dict[str, Any]:
     return _bare(native, steps, batch)
 
 
-def _bare(native: mujoco.MjModel, steps: int, batch: int, devices: int = 1) -> dict[str, Any]:
+def _bare(native: mujoco.MjModel, steps: int, batch: int) -> dict[str, Any]:
     m = mjx.put_model(native)
     data = jax.vmap(lambda _: mjx.make_data(m))(jnp.arange(batch))
 
     def run(data: Any) -> Any:
         return jax.lax.scan(lambda d, _: (jax.vmap(lambda one: mjx.step(m, one))(d), None), data, None, length=steps)[0]
 
-    return time_jax(sharded(run, devices), data, steps, batch)
+    return time_jax(run, data, steps, batch)
 
 
 def numpy_steps(job: tuple[str, str, int, float]) -> dict[str, Any]:
@@ -128,7 +124,8 @@ def numpy_steps(job: tuple[str, str, int, float]) -> dict[str, Any]:
 
 
 def in_processes(engine: str, rover: str, rovers: int, processes: int, seconds: float) -> dict[str, Any]:
-    """The same in several processes at once; memory is that of all."""
+    """The same in several processes at once, each on one thread; memory is that of all."""
+    os.environ |= dict.fromkeys(THREADS, "1") | {"JAX_PLATFORMS": "cpu"}  # which the processes inherit
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
         parts = pool.map(numpy_steps, [(engine, rover, rovers, seconds)] * processes, chunksize=1)
     return {key: sum(p[key] for p in parts) for key in parts[0]}
@@ -155,17 +152,36 @@ def rows_of(rover: str, options: argparse.Namespace, add: Callable[..., None]) -
                     add("pybullet", cores, cores, in_processes("pybullet", rover, 1, cores, options.seconds))
             except UserError as missing:
                 print(missing)
-    devices = options.devices
-    for batch in options.batches:
-        for engine, steps in (("structured", options.steps), ("mjx", options.mjx_steps)):
+    for platform_name in options.platforms:
+        found = jax.devices(platform_name)
+        for devices in options.devices:
+            if devices > len(found):
+                print(f"{platform_name}: {len(found)} devices, not {devices}; their rows are left out")
+                continue
+            with jax.default_device(found[0]):
+                jax_rows(model, options, found[:devices], add)
+
+
+def jax_rows(model: Model, options: argparse.Namespace, devices: list[Any], add: Callable[..., None]) -> None:
+    """The rows of the JAX engines on some devices of one kind, each of which takes the whole of a batch."""
+    on_cpu = devices[0].platform == "cpu"
+    workers = options.cores if on_cpu else len(devices)
+    for each in options.batches:
+        batch = each * len(devices)
+        long = max(1, 256 // batch)  # a few steps of few rovers are over before the clock ticks
+        for engine, steps in (("structured", options.steps * long), ("mjx", options.mjx_steps * long)):
             if engine in options.engines:
                 system = build(model, engine)
-                run = sharded(rollout(system, steps, None), devices)
-                add(engine, batch, devices, time_jax(run, starts(system, batch), steps, batch))
+                run, state = sharded(rollout(system, steps, None), starts(system, batch), devices)
+                result = time_jax(run, state, steps, batch)
+                add(f"{engine}, CPU" if on_cpu else engine, batch, workers, result)
+        steps = options.mjx_steps * long
+        if len(devices) > 1:  # the floors, once
+            continue
         if "bare" in options.engines:
-            add("mjx, bare", batch, devices, _bare(model.rover.compile(), options.mjx_steps, batch, devices))
+            add("mjx, bare, CPU" if on_cpu else "mjx, bare", batch, workers, _bare(model.rover.compile(), steps, batch))
         if "spheres" in options.engines:
-            add("mjx, spheres", batch, 1, spheres(model, options.mjx_steps, batch))
+            add("mjx, spheres, CPU" if on_cpu else "mjx, spheres", batch, workers, spheres(model, steps, batch))
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
@@ -211,8 +227,10 @@ def main() -> None:
     parser.add_argument("--engines", default="pybullet,native,structured,mjx,bare", help=",".join(ENGINES))
     parser.add_argument("--batches", type=numbers, default=[1, 256], help="of the JAX engines")
     parser.add_argument("--numpy-batches", type=numbers, default=[1, 16, 128])
-    parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--devices", type=int, default=1, help="over which a batch of the JAX engines is split")
+    parser.add_argument("--cores", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--platforms", default="", help="of the JAX engines: cpu, cuda; JAX's choice if left out")
+    parser.add_argument("--devices", type=numbers, default=[1], help="how many GPUs; each takes a whole batch")
+    parser.add_argument("--lock", type=Path, help="file that is locked while a row of the JAX engines is timed")
     parser.add_argument("--cpu-rows", type=int, default=1, help="0: leave PyBullet and native MuJoCo out")
     parser.add_argument("--seconds", type=float, default=5.0, help="per row of PyBullet and of NumPy effects")
     parser.add_argument("--steps", type=int, default=50)
@@ -225,9 +243,11 @@ def main() -> None:
         if engine not in ENGINES:
             parser.error(f"--engines: {engine} does not exist; use some of {', '.join(ENGINES)}")
     rows: list[dict[str, Any]] = []
+    LOCK[:] = [options.lock] if options.lock else []
     device = jax.devices()[0]
+    options.platforms = options.platforms.split(",") if options.platforms else [device.platform]
     about = {"device": device.device_kind, "devices": options.devices, "cores": options.cores,
-             "cpu": _cpu_name(), "load_before": os.getloadavg(), "jax": jax.__version__,
+             "cpu": cpu_name(), "load_before": os.getloadavg(), "jax": jax.__version__,
              "mujoco": mujoco.__version__}  # fmt: skip
 
     def add(rover: str, engine: str, batch: int, workers: int, result: dict[str, Any]) -> None:
@@ -243,12 +263,6 @@ def main() -> None:
         plot(rows, options.out.with_suffix(".png"))
         options.out.with_suffix(".md").write_text(table(rows) + "\n")
     print(table(rows))
-
-
-def _cpu_name() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 if __name__ == "__main__":

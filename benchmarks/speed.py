@@ -13,9 +13,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import platform
+import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
+from timing import LOCK, alone, cpu_name, sharded
 
+from lunar_mjx._quiet import mjx
 from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.model import Model, make_model
 
@@ -90,12 +92,13 @@ def timed(function: Any, state: Any, steps: int, batch: int, repeats: int = 3) -
     compiled = lowered.compile()
     compile_s = time.perf_counter() - begin - traced
     text, cost = compiled.as_text() or "", compiled.cost_analysis() or {}
-    new = jax.block_until_ready(compiled(state))
     best = cpu = float("inf")
-    for _ in range(repeats):
-        wall, process = time.perf_counter(), time.process_time()
-        new = jax.block_until_ready(compiled(new))
-        best, cpu = min(best, time.perf_counter() - wall), min(cpu, time.process_time() - process)
+    with alone():
+        new = jax.block_until_ready(compiled(state))
+        for _ in range(repeats):
+            wall, process = time.perf_counter(), time.process_time()
+            new = jax.block_until_ready(compiled(new))
+            best, cpu = min(best, time.perf_counter() - wall), min(cpu, time.process_time() - process)
     return {
         "steps_per_s": batch * steps / best,
         "us_per_batch_step": best / steps * 1e6,
@@ -106,7 +109,7 @@ def timed(function: Any, state: Any, steps: int, batch: int, repeats: int = 3) -
         # XLA's analysis counts the body of the loop over time once
         "bytes_per_step": cost.get("bytes accessed", 0.0) / batch,
         "flop_per_step": cost.get("flops", 0.0) / batch,
-        "finite": all(bool(jnp.isfinite(a).all()) for a in jax.tree.leaves(new)),
+        "finite": all(bool(np.isfinite(a).all()) for a in jax.tree.leaves(jax.device_get(new))),
     }
 
 
@@ -174,18 +177,19 @@ def native_batch(model: Model, threads: int, batch: int, steps: int = 200) -> di
     return {"steps_per_s": batch * steps / best, "threads": threads}
 
 
-def rows_of(rover: str, options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows_of(rover: str, options: argparse.Namespace, rows: list[dict[str, Any]], save: Callable[[], None]) -> None:
+    """Appends the rows of one rover, and saves them one by one."""
     model = make_model(rover)
     gap = parity(model)
-    rows: list[dict[str, Any]] = []
 
     def add(engine: str, batch: int, result: dict[str, Any]) -> None:
         counted = {"parity": gap < TOLERANCE, "parity_gap": gap} if engine.startswith("structured") else {}
         rows.append({"rover": rover, "engine": engine, "batch": batch, **counted, **result})
         print(f"{rover:8s} {engine:28s} {batch:8d} {result['steps_per_s']:14,.0f} steps/s  " + ", ".join(
             f"{k} {v:.3g}" for k, v in result.items() if k in ("compile_s", "kernels_in_loop", "bytes_per_step",
-                                                               "flop_per_step", "process_cpu_ns_per_step")
+                                                               "flop_per_step", "process_cpu_ns_per_step", "efficiency")
         ), flush=True)  # fmt: skip
+        save()
 
     full, bare = build(model, "structured"), model
     integral = build(model.add("stress_integral"), "structured")
@@ -194,8 +198,15 @@ def rows_of(rover: str, options: argparse.Namespace) -> list[dict[str, Any]]:
     for batch in options.batches:
         chunk = options.chunk or None
         state = starts(full, batch)
-        add("structured", batch, timed(rollout(full, options.steps, chunk), state, options.steps, batch))
-        if batch == options.batches[-1] or batch == options.main:
+        steps = options.steps * max(1, 256 // batch)  # a few steps of few rovers are over before the clock ticks
+        add("structured", batch, timed(rollout(full, steps, chunk), state, steps, batch))
+        single = rows[-1]["steps_per_s"]
+        for count in options.devices[1:]:
+            run, split = sharded(rollout(full, steps, chunk), starts(full, count * batch), jax.devices()[:count])
+            own = timed(run, split, steps, count * batch)
+            share = own["steps_per_s"] / (count * single)
+            add(f"structured, {count} devices", count * batch, own | {"efficiency": share})
+        if not options.only_full and batch in (options.batches[-1], options.main):
             own = starts(integral, batch)
             add("structured, stress integral", batch,
                 timed(rollout(integral, options.steps, chunk), own, options.steps, batch))  # fmt: skip
@@ -216,7 +227,6 @@ def rows_of(rover: str, options: argparse.Namespace) -> list[dict[str, Any]]:
                 add("bare mjx.step", batch, bare_mjx(model, options.mjx_steps, batch))
     if options.threads:
         add("native rollout, no effects", 512, native_batch(model, options.threads, 512))
-    return rows
 
 
 def _terrain_axes(params: Params) -> Params:
@@ -235,18 +245,25 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--mjx-steps", type=int, default=10)
     parser.add_argument("--chunk", type=int, default=0, help="rovers per chunk; 0: the library's choice")
+    parser.add_argument("--devices", type=numbers, default=[1], help="such as 1,2,4: with several, each takes a batch")
+    parser.add_argument("--lock", type=Path, help="file that is locked while a row is timed; see backends.py")
     parser.add_argument("--threads", type=int, default=0, help="threads of native MuJoCo; 0: leave it out")
     parser.add_argument("--skip-mjx", action="store_true")
+    parser.add_argument("--only-full", action="store_true", help="leave out stress integral and no effects")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
-    for rover in options.rovers.split(","):
-        rows += rows_of(rover, options)
+    LOCK[:] = [options.lock] if options.lock else []
+    about = {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "mujoco": mujoco.__version__,
+             "cpu": cpu_name(), "cores": len(os.sched_getaffinity(0)), "steps": options.steps,
+             "chunk": options.chunk}  # fmt: skip
+
+    def save() -> None:
         if options.out:
-            device = jax.devices()[0]
-            about = {"device": device.device_kind, "jax": jax.__version__, "mujoco": mujoco.__version__,
-                     "cpu": platform.processor(), "steps": options.steps, "chunk": options.chunk}  # fmt: skip
             options.out.write_text(json.dumps({"about": about, "rows": rows}, indent=1) + "\n")
+
+    for rover in options.rovers.split(","):
+        rows_of(rover, options, rows, save)
 
 
 if __name__ == "__main__":
