@@ -214,11 +214,12 @@ def figures(
     out: OutOption = Path("runs/figures"),
     only: Annotated[str, typer.Option(help="all, or some of 1,2,3,4,5,6,slope")] = "all",
     training: Annotated[
-        list[Path] | None, typer.Option(help="Folder that `train` wrote, for Fig. 6; may be repeated.")
+        list[Path] | None,
+        typer.Option(help="Folder that `train` wrote, for Fig. 6; may be repeated. Kept records if left out."),
     ] = None,
     device: DeviceOption = "auto",
 ) -> None:
-    """Make the counterparts of the paper's Figs. 1 to 6, and the slope check; 1 and 4 need OpenGL, 6 a training."""
+    """Make the counterparts of the paper's Figs. 1 to 6, and the slope check; 1 and 4 need OpenGL."""
     check_folder(out)
     select_device(device)
     from lunar_mjx.figures import FIGURES, available_figures, make_figures

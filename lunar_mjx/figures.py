@@ -149,10 +149,14 @@ def _from_paper_figures(name: str) -> Callable[[], tuple[Figure, dict]]:
 
 
 def figure_6(trainings: Sequence[Path]) -> tuple[Figure, dict]:
-    """Learning curves of trainings that were made."""
-    from lunar_mjx.visual.training_figure import figure_6  # which needs the extra rl
+    """Learning curves of trainings that were made; of those that the checkout keeps if none are given."""
+    from lunar_mjx.visual.training_figure import figure_6, kept_trainings  # which needs the extra rl
 
-    return figure_6(trainings)
+    kept = () if trainings else kept_trainings()
+    if kept:
+        print(f"Fig. 6 draws the trainings kept in {' and '.join(f'benchmarks/{p.name}' for p in kept)}; others: "
+              "--training.", file=sys.stderr)  # fmt: skip
+    return figure_6(trainings or kept)
 
 
 FIGURES: dict[str, Callable[..., tuple[Figure, dict]]] = {
@@ -175,9 +179,10 @@ NEED_TRAININGS = ("6",)
 def available_figures(trainings: Sequence[Path] = ()) -> list[str]:
     """All figures that can be made here; says on standard error what is left out without OpenGL or trainings."""
     from lunar_mjx.cameras.gl import context_class
+    from lunar_mjx.visual.training_figure import kept_trainings
 
     names = list(FIGURES)
-    if not trainings:
+    if not (trainings or kept_trainings()):
         print("Fig. 6 is left out: it draws trainings; give the folder of one with --training.", file=sys.stderr)
         names = [name for name in names if name not in NEED_TRAININGS]
     try:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-_BAND = 20
+EPISODES = 20
 """Episodes in the moving mean of curves by episode."""
 
 
@@ -22,7 +22,7 @@ def new_figure(columns: int, width: float = 5.0, height: float = 3.6) -> Any:
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
-def moving_mean(values: Sequence[float] | np.ndarray, width: int = _BAND) -> np.ndarray:
+def moving_mean(values: Sequence[float] | np.ndarray, width: int = EPISODES) -> np.ndarray:
     """Mean over the last `width` values, fewer at the beginning."""
     total = np.cumsum(np.insert(np.asarray(values, float), 0, 0.0))
     last = np.arange(1, len(values) + 1)
@@ -78,7 +78,7 @@ def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path,
         axes.plot(np.arange(1, count + 1), mean, styles[i % 4], label=name)
         if len(curves) > 1:
             axes.fill_between(np.arange(1, count + 1), low, high, alpha=0.2)
-    axes.set(xlabel="episode", ylabel=f"average return per episode (mean of {_BAND})")
+    axes.set(xlabel="episode", ylabel=f"average return per episode (mean of {EPISODES})")
     axes.legend(frameon=False)
     figure.savefig(path, dpi=120)
     return path

@@ -11,13 +11,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lunar_mjx.agents.curves import mean_interval, moving_mean
+from lunar_mjx.agents.curves import EPISODES, mean_interval, moving_mean
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.report.style import BLUE, GREEN, ORANGE, PURPLE, RULE, SKY, VERMILION
 
 CURVE = "curve.json"
 _LOOKS = ((BLUE, "-"), (VERMILION, "--"), (GREEN, "-."), (ORANGE, ":"), (PURPLE, (0, (6, 2, 1, 2))), (SKY, (0, (1, 1))))
-_NEEDED = ("rows", "seed")
+RECORDS = Path(__file__).resolve().parents[2] / "benchmarks"
+"""Where a checkout keeps records of trainings."""
+
+
+def kept_trainings() -> list[Path]:
+    """Records that the checkout keeps: of the paper's own task, else of thousands of rovers; none when installed."""
+    return sorted(RECORDS.glob("rl_paper*.json")) or sorted(RECORDS.glob("rl_large_*.json"))
 
 
 def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]]]:
@@ -39,7 +45,7 @@ def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]
         try:
             data = json.loads(file.read_text(encoding="utf-8"))
             named = list(_records(data))
-            if not named or any(r.get(k) is None for _, r in named for k in _NEEDED):
+            if not named or not all(_is_training(r) for _, r in named):
                 raise KeyError
         except FileNotFoundError:
             raise bad_input("figures", "--training", str(path), f"has no {CURVE}" if path.is_dir() else "is not there",
@@ -50,6 +56,14 @@ def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]
         for name, record in named:
             found.setdefault(name, []).append(record)
     return found
+
+
+def _is_training(record: dict[str, Any]) -> bool:
+    return record.get("seed") is not None and (record.get("rows") is not None or _has_episodes(record))
+
+
+def _has_episodes(record: dict[str, Any]) -> bool:
+    return bool((record.get("episodes") or {}).get("episode_return"))
 
 
 def _records(data: dict[str, Any]) -> Iterable[tuple[str, dict[str, Any]]]:
@@ -63,45 +77,51 @@ def _records(data: dict[str, Any]) -> Iterable[tuple[str, dict[str, Any]]]:
 
 
 def figure_6(paths: Sequence[str | Path]) -> tuple[Figure, dict[str, Any]]:
-    """Return of an episode in training, by episode as in the paper where all trainings kept them, else by step; and
-    success: in training as lines, on unseen ground as dots."""
+    """Return of an episode and success in training, by episode as in the paper where all trainings kept them, else by
+    step, with success on unseen ground as dots."""
     groups = read_trainings(paths)
     records = [r for runs in groups.values() for r in runs]
-    episodes = all((r.get("episodes") or {}).get("episode_return") for r in records)
+    episodes = all(_has_episodes(r) for r in records)
     figure = Figure(figsize=(9.5, 3.8))
     left, right = figure.subplots(1, 2)
+    draw = _by_episode if episodes else _by_step
     for (colour, line), (name, runs) in zip(_LOOKS * len(groups), groups.items(), strict=False):
-        label = f"{name} ({len(runs)} seed{'s' if len(runs) > 1 else ''})"
-        if episodes:
-            _by_episode(left, runs, label, colour, line)
-        for i, run in enumerate(runs):
-            rows = [r for r in run["rows"] if r.get("episode_return") is not None]
-            steps = [r["steps"] for r in rows]
-            if not episodes:
-                left.plot(steps, [r["episode_return"] for r in rows], color=colour, linestyle=line, linewidth=1.1,
-                          label=label if i == 0 else None)  # fmt: skip
-            right.plot(steps, [100.0 * r["success"] for r in rows], color=colour, linestyle=line, linewidth=1.0)
-            unseen = run.get("unseen") or []
-            right.plot([s["steps"] for s in unseen], [100.0 * s["success"] for s in unseen], "o", color=colour,
-                       markersize=4, markeredgecolor="white", markeredgewidth=0.6)  # fmt: skip
-    _finish(left, "episode" if episodes else "environment steps",
-            "average return per episode" + (" (mean of 20)" if episodes else ""))  # fmt: skip
-    _finish(right, "environment steps", "success, %   (dots: on unseen ground)")
+        draw((left, right), runs, f"{name} ({len(runs)} seed{'s' if len(runs) > 1 else ''})", colour, line)
+    x, mean = ("episode", f" (mean of {EPISODES})") if episodes else ("environment steps", "")
+    _finish(left, x, f"average return per episode{mean}")
+    _finish(right, x, f"success, %{mean}" if episodes else "success, %   (dots: on unseen ground)")
     right.set_ylim(-3.0, 103.0)
     left.legend(frameon=False, fontsize=8)
     return figure, {"axis": "episode" if episodes else "steps",
                     "trainings": {name: [_numbers(r) for r in runs] for name, runs in groups.items()}}  # fmt: skip
 
 
-def _by_episode(axes: Axes, runs: Sequence[dict[str, Any]], label: str, colour: str, line: Any) -> None:
+def _by_step(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str, colour: str, line: Any) -> None:
+    """A line for every seed."""
+    left, right = panels
+    for i, run in enumerate(runs):
+        rows = [r for r in run["rows"] if r.get("episode_return") is not None]
+        steps = [r["steps"] for r in rows]
+        left.plot(steps, [r["episode_return"] for r in rows], color=colour, linestyle=line, linewidth=1.1,
+                  label=label if i == 0 else None)  # fmt: skip
+        right.plot(steps, [100.0 * r["success"] for r in rows], color=colour, linestyle=line, linewidth=1.0)
+        unseen = run.get("unseen") or []
+        right.plot([s["steps"] for s in unseen], [100.0 * s["success"] for s in unseen], "o", color=colour,
+                   markersize=4, markeredgecolor="white", markeredgewidth=0.6)  # fmt: skip
+
+
+def _by_episode(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str, colour: str, line: Any) -> None:
     """Mean over seeds with its 95 % interval, as far as every seed has episodes."""
-    curves = [moving_mean(r["episodes"]["episode_return"]) for r in runs]
-    count = min(len(c) for c in curves)
-    mean, low, high = mean_interval(np.stack([c[:count] for c in curves]))
-    at = np.arange(1, count + 1)
-    axes.plot(at, mean, color=colour, linestyle=line, label=label)
-    if len(curves) > 1:
-        axes.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
+    for axes, quantity, factor in zip(panels, ("episode_return", "success"), (1.0, 100.0), strict=True):
+        curves = [factor * moving_mean(r["episodes"][quantity]) for r in runs if quantity in r["episodes"]]
+        if not curves:
+            continue
+        count = min(len(c) for c in curves)
+        mean, low, high = mean_interval(np.stack([c[:count] for c in curves]))
+        at = np.arange(1, count + 1)
+        axes.plot(at, mean, color=colour, linestyle=line, label=label)
+        if len(curves) > 1:
+            axes.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
 
 
 def _finish(axes: Axes, x: str, y: str) -> None:
@@ -114,8 +134,14 @@ def _finish(axes: Axes, x: str, y: str) -> None:
 
 
 def _numbers(record: dict[str, Any]) -> dict[str, Any]:
-    rows = [r for r in record["rows"] if r.get("episode_return") is not None]
-    return {"seed": record["seed"], "steps": record["rows"][-1]["steps"] if record["rows"] else 0,
-            "last_return": rows[-1]["episode_return"] if rows else None,
-            "last_success_in_training": rows[-1]["success"] if rows else None,
-            "final_on_unseen_ground": record.get("final")}  # fmt: skip
+    rows = [r for r in record.get("rows") or [] if r.get("episode_return") is not None]
+    out = {"seed": record["seed"], "steps": record.get("steps") or (rows[-1]["steps"] if rows else 0),
+           "last_return": rows[-1]["episode_return"] if rows else None,
+           "last_success_in_training": rows[-1]["success"] if rows else None,
+           "final_on_unseen_ground": record.get("final")}  # fmt: skip
+    if _has_episodes(record):
+        kept = record["episodes"]
+        out["episodes"] = len(kept["episode_return"])
+        out["mean_of_last_50_episodes"] = {k: float(np.mean(v[-50:])) for k, v in kept.items()
+                                           if k in ("episode_return", "success")}  # fmt: skip
+    return out

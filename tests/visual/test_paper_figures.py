@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from lunar_mjx.figures import FIGURES, available_figures, make_figures
+from lunar_mjx.visual import training_figure
 from lunar_mjx.visual.training_figure import figure_6
 
 
-def test_all_figures_have_a_counterpart(monkeypatch, capsys):
+def test_all_figures_have_a_counterpart(monkeypatch, capsys, tmp_path):
     assert set("123456") <= set(FIGURES)
     monkeypatch.setenv("MUJOCO_GL", "disable")
+    monkeypatch.setattr(training_figure, "RECORDS", tmp_path)  # an installed wheel has no records
     assert set(available_figures()) == set(FIGURES) - {"1", "4", "6"}
     said = capsys.readouterr().err
     assert "Figs. 1 and 4 are left out: cameras: MUJOCO_GL=disable" in said and "Fig. 6 is left out" in said
@@ -47,6 +49,24 @@ def test_learning_curves_are_those_of_the_trainings(tmp_path):
     assert mean[0] == pytest.approx(0.5) and mean[-1] == pytest.approx(np.mean(np.arange(9, 29)) + 0.5)
 
 
+def test_kept_trainings_are_drawn_when_none_is_given(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(training_figure, "RECORDS", tmp_path)
+    many = {"rover": "viper", "train": {"envs": 8192}, "seeds": [_record(0, False)]}
+    (tmp_path / "rl_large_viper.json").write_text(json.dumps(many))
+    assert "6" in available_figures()
+    assert json.loads(make_figures(["6"], tmp_path)[1].read_text())["axis"] == "steps"
+    assert "kept in benchmarks/rl_large_viper.json" in capsys.readouterr().err
+
+    episodes = {"episode_return": [float(i) for i in range(60)], "success": [i >= 30 for i in range(60)]}
+    runs = {"paper-td3": [{"seed": s, "episodes": episodes, "steps": 900} for s in (0, 1)]}
+    (tmp_path / "rl_paper.json").write_text(json.dumps({"runs": runs}))
+    numbers = json.loads(make_figures(["6"], tmp_path)[1].read_text())
+    assert numbers["axis"] == "episode" and list(numbers["trainings"]) == ["paper-td3"]
+    assert numbers["trainings"]["paper-td3"][0]["mean_of_last_50_episodes"] == {"episode_return": 34.5, "success": 0.6}
+    figure, _ = figure_6([tmp_path / "rl_paper.json"])
+    assert figure.axes[1].get_xlabel() == "episode" and figure.axes[1].lines[0].get_ydata()[-1] == 100.0
+
+
 def test_learning_curves_of_many_rovers_are_by_step(tmp_path):
     many = {"rover": "viper", "train": {"envs": 8192}, "seeds": [_record(0, False), _record(1, False)]}
     (tmp_path / "many.json").write_text(json.dumps(many))
@@ -61,12 +81,13 @@ def test_learning_curves_of_many_rovers_are_by_step(tmp_path):
     [(None, "is not there"), ("{", "holds no record"), ("[]", "holds no record"),
      ('{"training": "x"}', "holds no record"), ('{"seeds": []}', "holds no record")],
 )  # fmt: skip
-def test_what_is_no_training_is_one_sentence(run, tmp_path, content, message):
+def test_what_is_no_training_is_one_sentence(run, tmp_path, monkeypatch, content, message):
     file = tmp_path / "curve.json"
     if content is not None:
         file.write_text(content)
     result = run("figures", "--only", "6", "--training", file, "-o", tmp_path / "out")
     assert result.status == 2 and message in result.err
+    monkeypatch.setattr(training_figure, "RECORDS", tmp_path / "none")
     assert run("figures", "--only", "6").status == 2
 
 
