@@ -93,8 +93,11 @@ def _certificate(found: Fit) -> dict[str, Any]:
 
 def _verdict(found: Search, explained: float, settings: Settings) -> tuple[Verdict, tuple[str, ...], str]:
     base, chosen = found.base, found.chosen
-    enough = chosen.noise.passes or explained >= settings.explained
+    enough = chosen.at_noise or explained >= settings.explained
+    left = " What it leaves is small, but it has a pattern that noise has not." if chosen.patterned else ""
     if not chosen.effects:
+        if base.patterned:
+            return Verdict.UNKNOWN, (), f"No catalogue effect explains the residual.{left}"
         if base.noise.passes:
             return Verdict.NOISE_ONLY, (), "Nothing significant is missing: the residual is at the noise."
         worst = f"{base.noise.worst}, {base.noise.channels[base.noise.worst]:.2f} sigma"
@@ -110,7 +113,7 @@ def _verdict(found: Search, explained: float, settings: Settings) -> tuple[Verdi
             chosen.effects,
             (
                 f"Something is missing that no catalogue effect brings to the noise; {names} helps, from "
-                f"{base.noise.rms:.2f} to {chosen.noise.rms:.2f} sigma."
+                f"{base.noise.rms:.2f} to {chosen.noise.rms:.2f} sigma.{left}"
             ),
         )
     members = list(dict.fromkeys([*chosen.effects, *(e for c in found.rivals for e in c.effects)]))

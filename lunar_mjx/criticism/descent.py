@@ -84,18 +84,27 @@ class Objective:
         return ((at <= self.low + EDGE) & (downhill < 0.0)) | ((at >= self.high - EDGE) & (downhill > 0.0))
 
     def steps(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray, dampings: np.ndarray) -> np.ndarray:
-        """(dampings, coordinates) damped Gauss-Newton steps, cut at the bounds."""
+        """(dampings, coordinates) damped Gauss-Newton steps within the bounds.
+
+        What would pass a bound stops there, and the others' step is found anew: cut only, it would lead where they fit
+        a coordinate that is somewhere else.
+        """
         at = u[self.free]
-        move = ~self.held(at, downhill)
         out = np.repeat(u[None], len(dampings), axis=0)
-        if not move.any():
-            return out
-        inner = hessian[np.ix_(move, move)]
         for i, damping in enumerate(dampings):
-            step = np.linalg.lstsq(inner + damping * np.diag(np.diag(inner) + 1e-12), downhill[move], rcond=None)[0]
-            new = at.copy()
-            new[move] = at[move] + step
-            out[i, self.free] = np.clip(new, self.low, self.high)
+            damped = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
+            move, step = ~self.held(at, downhill), np.zeros(len(at))
+            for _ in range(len(at)):
+                if not move.any():
+                    break
+                pull = downhill[move] - damped[np.ix_(move, ~move)] @ step[~move]
+                step[move] = np.linalg.lstsq(damped[np.ix_(move, move)], pull, rcond=None)[0]
+                beyond = move & ((at + step < self.low) | (at + step > self.high))
+                if not beyond.any():
+                    break
+                step[beyond] = np.clip(at + step, self.low, self.high)[beyond] - at[beyond]
+                move &= ~beyond
+            out[i, self.free] = np.clip(at + step, self.low, self.high)
         return out
 
     def bent(
@@ -136,12 +145,9 @@ class Objective:
         return float(np.max(np.abs(chi2[1:] - chi2[0] - model)))
 
     def promise(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> float:
-        """Drop of chi-square that a full Gauss-Newton step over the unheld coordinates promises."""
-        move = ~self.held(u[self.free], downhill)
-        if not move.any():
-            return 0.0
-        inner = hessian[np.ix_(move, move)]
-        return float(downhill[move] @ np.linalg.lstsq(inner, downhill[move], rcond=None)[0])
+        """Drop of chi-square that a full Gauss-Newton step within the bounds promises."""
+        step = (self.steps(u, downhill, hessian, np.zeros(1))[0] - u)[self.free]
+        return float(2.0 * downhill @ step - step @ hessian @ step)
 
 
 @dataclasses.dataclass

@@ -11,7 +11,7 @@ import numpy as np
 from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.probes import port_columns
 from lunar_mjx.criticism.problem import Problem
-from lunar_mjx.criticism.score import project
+from lunar_mjx.criticism.score import leash, project
 
 if TYPE_CHECKING:
     from lunar_mjx.criticism.search import Search
@@ -61,17 +61,27 @@ def localise(problem: Problem, found: Search, progress: Progress = silent, alway
       always: also where the residual is at the noise.
     """
     base, chosen = found.base, found.chosen
-    if not always and chosen.noise.passes:
+    if not always and chosen.at_noise:
         return Localisation(None, "", {}, {}, {})
-    at = base.fit if not chosen.effects or chosen.noise.passes else chosen.fit
-    columns = port_columns(problem, at, progress)
+    at = base.fit if not chosen.effects or chosen.at_noise else chosen.fit
     gains, ceiling = {}, {}
-    for label, signature in columns.items():
+    for label, signature in port_columns(problem, at, progress).items():
         gains[label], ceiling[label] = evidence(problem, at, signature)
     best = max(gains, key=lambda k: gains[k]) if gains else ""
     port = best.partition(":")[0] if best and gains[best] > 3.0 else None
     ordered = dict(sorted(gains.items(), key=lambda item: -item[1]))
     return Localisation(port, best, ordered, ceiling, dependence(problem, at))
+
+
+def pattern(problem: Problem, fit: Fit) -> float:
+    """Log evidence of the best smooth unknown input in what a fit leaves; 0 where derivatives are dear.
+
+    A root mean square at the noise may hide a small misfit that all manoeuvres share, most of all in coloured noise.
+    """
+    if not problem.cheap_jacobian:
+        return 0.0
+    columns = port_columns(problem, fit, silent)
+    return max((evidence(problem, fit, signature)[0] for signature in columns.values()), default=0.0)
 
 
 def evidence(problem: Problem, fit: Fit, signature: np.ndarray) -> tuple[float, float]:
@@ -81,8 +91,7 @@ def evidence(problem: Problem, fit: Fit, signature: np.ndarray) -> tuple[float, 
       problem: model and measurements. fit: where the residual is taken. signature: (n, m) whitened, unit prior.
     """
     keep = problem.observations.in_split("fit", "select")
-    _, scale = problem.prior_rows(fit.u, fit.free)
-    columns = project(signature[keep], fit.jacobian[keep], scale)[: int(keep.sum())]
+    columns = project(signature[keep], fit.jacobian[keep], leash(problem, fit))[: int(keep.sum())]
     residual = fit.residual[keep]
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     along = u.T @ residual

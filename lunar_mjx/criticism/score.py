@@ -134,6 +134,19 @@ def project(columns: np.ndarray, jacobian: np.ndarray, prior_scale: np.ndarray) 
     return extended
 
 
+def leash(problem: Problem, fit: Fit) -> np.ndarray:
+    """(free,) reciprocal standard deviations within which a refit may move the coordinates of a fit, by a linear guess.
+
+    Beside the priors, a move over all of a coordinate's range counts as much as all of the misfit: in a model far from
+    its data, a prior alone would let a nuisance take in any effect by moving far past its bounds.
+    """
+    _, prior = problem.prior_rows(fit.u, fit.free)
+    low, high = problem.bounds(fit.free)
+    residual = fit.residual[fit.fitted]
+    excess = max(float(residual @ residual) - len(residual), 0.0)
+    return np.sqrt(prior**2 + excess / (high - low) ** 2)
+
+
 def signatures(problem: Problem, fit: Fit, names: list[str]) -> dict[str, np.ndarray]:
     """(n, m) whitened derivative with respect to the amplitudes of every candidate, at the fit; secants where zero."""
     amplitudes = {e: [i for i in problem.candidates[e] if problem.coordinates[i].amplitude] for e in names}
@@ -172,7 +185,7 @@ def score(problem: Problem, fit: Fit, found: Mapping[str, np.ndarray], draws: in
     """
     keep = fit.fitted
     block = blocks(problem.observations, fit.residual, keep)[keep]
-    _, prior_scale = problem.prior_rows(fit.u, fit.free)
+    prior_scale = leash(problem, fit)
     jacobian = fit.jacobian[keep]
     residual = fit.residual[keep]
     rows = []
