@@ -185,8 +185,9 @@ def simulate(
     path = folder / "drive.csv"
     table.to_csv(path, index=False, float_format="%.9g")
     save_model(built, folder / "model.toml")
-    last = table.iloc[-1]
-    print(f"{built.rover.name} drove {math.hypot(last.position_x_m - x, last.position_y_m - y):.3f} m "
+    first, last = table.iloc[0], table.iloc[-1]  # on a slope the chassis leans away from where its wheels were put
+    way = math.hypot(last.position_x_m - first.position_x_m, last.position_y_m - first.position_y_m)
+    print(f"{built.rover.name} drove {way:.3f} m "
           f"in {last.time_s:.1f} s")  # fmt: skip
     print(path)
 

@@ -34,6 +34,9 @@ TICK = 0.04
 _MOST = 0.2
 """Simulated time that one tick may catch up with, s: a slow machine falls behind rather than stops."""
 
+_CREEP = 0.01
+"""Speed of rim and wheel below which a wheel counts as at rest, m/s."""
+
 _ROLLED = math.cos(math.radians(75.0))
 
 
@@ -87,6 +90,7 @@ class LiveDrive:
         self._scene = self.model.rover.compile()
         self._data = mujoco.MjData(self._scene)
         self._chassis = self._scene.body(self.model.rover.chassis).id
+        self._radius = np.array([w.radius for w in self.model.rover.wheels])
         self._drives = [self.model.rover.joints.index(w.drive) for w in self.model.rover.wheels]
         self._joints = joint_channels(self.model.rover)
         self._behind, self.rate = 0.0, 1.0
@@ -137,7 +141,7 @@ class LiveDrive:
         return np.concatenate([self._data.xpos, self._data.xquat], axis=1)
 
     def readings(self) -> dict[str, Any]:
-        """What instruments would show; SI units but where the name says otherwise."""
+        """What instruments would show; SI units but where the name says otherwise; slip is None for a wheel at rest."""
         seen = self._seen
         roll, pitch, yaw = np.degrees(seen["euler"])
         winding = seen["winding_temperature"] - ZERO_CELSIUS
@@ -150,7 +154,7 @@ class LiveDrive:
             "roll_deg": float(roll),
             "pitch_deg": float(pitch),
             "power_W": float((seen["voltage"] * seen["current"]).sum()),
-            "slip": seen["slip"].tolist(),
+            "slip": [None if rest else slip for slip, rest in zip(seen["slip"].tolist(), self._rests(), strict=True)],
             "sinkage_mm": (1e3 * seen["sinkage"]).tolist(),
             "winding_degC": winding[self._drives].tolist(),
             "hottest": self._joints[hottest],
@@ -160,6 +164,11 @@ class LiveDrive:
             "rate": self.rate,
             "note": self.note or self._warning(seen),
         }
+
+    def _rests(self) -> list[bool]:
+        """Wheels whose rim and centre both creep: their ratio is that of two roundings."""
+        rim = self._radius * np.abs(self._seen["joint_speed"][self._drives])
+        return (np.maximum(rim, np.linalg.norm(self._seen["wheel_velocity"], axis=-1)) < _CREEP).tolist()
 
     def _warning(self, seen: dict[str, np.ndarray]) -> str:
         x, y = self.qpos[4:6]

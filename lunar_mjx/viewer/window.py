@@ -137,7 +137,8 @@ def captions(drive: LiveDrive) -> tuple[str, str]:
         ("hottest winding", f"{now['hottest']} {now['hottest_degC']:.1f} degC"),
     ]
     for wheel, slip, sinkage in zip(drive.model.rover.wheels, now["slip"], now["sinkage_mm"], strict=True):
-        rows.append((f"{wheel.corner} slip, sinkage", f"{slip:5.2f}, {sinkage:.1f} mm"))
+        shown = "at rest" if slip is None else f"{slip:5.2f}"
+        rows.append((f"{wheel.corner} slip, sinkage", f"{shown}, {sinkage:.1f} mm"))
     if now["note"]:
         rows.append(("", now["note"]))
     return "\n".join(name for name, _ in rows), "\n".join(value for _, value in rows)

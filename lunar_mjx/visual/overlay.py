@@ -59,7 +59,7 @@ class Overlay:
 
     def _draw_numbers(self, image: Image.Image, row: int) -> None:
         drive = self._drive
-        along, across = drive.slope[row]
+        along, across = drive.slope[row].round(1) + 0.0  # no minus before zero
         lines = [
             f"{drive.model.rover.name} on {drive.model.terrain.name}",
             f"time      {drive.time[row]:7.1f} s",

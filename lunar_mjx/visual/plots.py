@@ -153,7 +153,7 @@ def _power(axes: Axes, drive: RecordedDrive) -> None:
     low, high = (float(v) for v in np.percentile(power, (2.0, 98.0)))
     edge = 0.15 * max(high - min(low, 0.0), 1.0)
     axes.set_ylim(min(low, 0.0) - edge, high + edge)
-    axes.text(0.99, 0.95, f"peak {power.max():.3g} W", transform=axes.transAxes, ha="right", va="top", fontsize=7)
+    axes.text(0.99, 0.95, f"peak {power.max():,.0f} W", transform=axes.transAxes, ha="right", va="top", fontsize=7)
     style(axes, "motors' power, W")
 
 

@@ -99,6 +99,19 @@ def test_left_is_left_and_backwards_is_backwards(drive):
     assert 3.0 < now["heading_deg"] < 90.0 and now["power_W"] > 1.0 and not now["note"]
 
 
+def test_a_wheel_at_rest_has_no_slip(drive):
+    drive.reset()
+    drive.pilot.hold([])
+    for _ in range(30):
+        drive.advance(0.1)
+    assert drive.readings()["slip"] == [None] * 4
+    assert "lf slip, sinkage" in window.captions(drive)[0] and "at rest" in window.captions(drive)[1]
+    drive.pilot.hold(["forward"])
+    for _ in range(10):
+        drive.advance(0.1)
+    assert all(isinstance(s, float) and abs(s) <= 2.0 for s in drive.readings()["slip"])
+
+
 def test_a_drive_that_diverges_begins_anew(model):
     drive = LiveDrive(model, "native")
     drive.advance(0.1)
