@@ -14,29 +14,40 @@ from pathlib import Path
 from typing import Any
 
 TRAININGS = ("paper-td3", "paper-ddpg")
-SEEDS = 5
+VARIANTS: dict[str, tuple[int, dict[str, Any]]] = {
+    "signed": (5, {"task": "consistent", "places": 1, "decimation": 100}),
+    "printed": (5, {"places": 1}),
+    "drawn": (1, {"task": "consistent", "decimation": 100}),
+}
+"""Seeds and options. `signed`: progress with its sign, one predefined start and destination as in section V, acted on
+at 5 Hz. `printed`: the reward as printed, likewise, at the task's 10 Hz; at 5 Hz and a discount of 0.99 driving on for
+ever would be worth more than arriving. `drawn`: start and destination drawn for every episode."""
+MAIN = "signed"
 
 
 def paper_start(args: argparse.Namespace, seconds: float) -> list[dict[str, Any]]:
     """Starts one process per algorithm and seed, each on a core of its own; returns them."""
     folder = Path(tempfile.mkdtemp(prefix="rl_paper_"))
     cores = sorted(os.sched_getaffinity(0))
-    seeds = 1 if args.tiny else SEEDS
-    jobs = [(training, seed) for seed in range(seeds) for training in TRAININGS]
+    jobs = [(variant, training, seed) for variant in args.variants for seed in range(VARIANTS[variant][0])
+            for training in TRAININGS]  # fmt: skip
+    jobs = jobs[:2] if args.tiny else jobs
     # two cores are left to the process that drives the GPU
-    free = cores[2:] if len(cores) > 2 else cores
+    free = cores[2:] if args.part == "all" and len(cores) > 2 else cores
     jobs = jobs[: max(2, len(free))]
     env = {**os.environ, "JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "",
            "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}  # fmt: skip
     children = []
-    for i, (training, seed) in enumerate(jobs):
-        out = folder / f"{training}_{seed}"
+    for i, (variant, training, seed) in enumerate(jobs):
+        out = folder / f"{variant.replace(', ', '_').replace(' ', '_')}_{training}_{seed}"
         line = [sys.executable, str(Path(__file__).with_name("rl_proof.py")), "--part", "paper-child", "--training",
                 training, "--first-seed", seed, "--seconds", seconds, "--out", out, "--core", free[i % len(free)],
-                *(["--tiny"] if args.tiny else [])]  # fmt: skip
-        log = (folder / f"{training}_{seed}.log").open("w")
+                "--variants", variant, *(["--tiny"] if args.tiny else [])]  # fmt: skip
+        log = out.with_suffix(".log").open("w")
         process = subprocess.Popen([str(a) for a in line], env=env, stdout=log, stderr=log)
-        children.append({"training": training, "seed": seed, "out": out, "process": process, "log": log})
+        children.append(
+            {"variant": variant, "training": training, "seed": seed, "out": out, "process": process, "log": log}
+        )
     print(f"paper: {len(jobs)} runs of {seconds:.0f} s on CPU cores", flush=True)
     return children
 
@@ -46,30 +57,46 @@ def paper_child(args: argparse.Namespace) -> None:
     if args.core is not None:
         os.sched_setaffinity(0, {args.core})
     begin = time.monotonic()
+    import jax
+    import numpy as np
+
     from lunar_mjx.agents.configs import get_training, override
-    from lunar_mjx.agents.learner import Learner
-    from lunar_mjx.agents.train import RunConfig, plain, train
+    from lunar_mjx.agents.learner import EPISODE, Learner
+    from lunar_mjx.agents.train import plain
     from lunar_mjx.envs import make
 
     training = override(get_training(args.training), epoch_steps=50 if args.tiny else 250)
-    learner = Learner(make(training.environment, **training.options), training.train)
-    steps = 200 if args.tiny else training.steps
+    options = {**training.options, **VARIANTS[args.variants[0]][1]}
+    learner = Learner(make(training.environment, **options), training.train)
+    episodes: dict[str, list[float]] = {name: [] for name in (*EPISODE, "step")}
     record: dict[str, Any] = {"seed": args.first_seed, "train": plain(dataclasses.asdict(training.train)),
-                              "environment": plain(dict(training.options))}  # fmt: skip
-    limit = max(1.0, args.seconds - (time.monotonic() - begin))
-    result = train(learner, RunConfig(steps, args.first_seed, limit, float("inf"), quiet=True))
-    record |= {
-        "episodes": result.episodes,
-        "steps": result.rows[-1]["steps"],
-        "elapsed_s": result.rows[-1]["elapsed_s"],
-    }
-    (args.out / "record.json").write_text(json.dumps(plain(record)), encoding="utf-8")
+                              "environment": plain(options), "episodes": episodes}  # fmt: skip
+    state, steps, saved = learner.init(args.first_seed), 0, time.monotonic()
+    while steps < (200 if args.tiny else training.steps) and time.monotonic() - begin < args.seconds:
+        state, (_, found) = learner.epoch(learner.env.params, state)
+        found = jax.device_get(found)
+        ended = np.flatnonzero(found["done"][0])
+        for name in EPISODE:
+            episodes[name] += found[name][0, ended].astype(float).tolist()
+        episodes["step"] += (steps + ended + 1.0).tolist()
+        steps += training.train.epoch_steps
+        if time.monotonic() - saved > 10.0 or steps == training.train.epoch_steps:
+            saved = time.monotonic()
+            keep(args.out / "record.json", record, steps, saved - begin)
+    keep(args.out / "record.json", record, steps, time.monotonic() - begin)
+
+
+def keep(path: Path, record: dict[str, Any], steps: int, elapsed: float) -> None:
+    """Writes a record, whole at every moment; the time counts from the process' beginning, compilation included."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps({**record, "steps": steps, "elapsed_s": elapsed}), encoding="utf-8")
+    part.replace(path)
 
 
 def paper_merge(children: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
     """Waits for the runs, ends what is left, and puts their records together."""
     deadline = time.monotonic() + max(seconds, 1.0)
-    runs: dict[str, list[dict[str, Any]]] = {name: [] for name in TRAININGS}
+    runs: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for child in children:
         try:
             child["process"].wait(max(0.1, deadline - time.monotonic()))
@@ -77,16 +104,18 @@ def paper_merge(children: list[dict[str, Any]], seconds: float) -> dict[str, Any
             child["process"].kill()
             child["process"].wait()
         child["log"].close()
-        path = child["out"] / "record.json"
+        path, what = child["out"] / "record.json", f"{child['variant']}, {child['training']}"
         if path.is_file():
-            runs[child["training"]].append(json.loads(path.read_text(encoding="utf-8")))
+            group = runs.setdefault(child["variant"], {}).setdefault(child["training"], [])
+            group.append(json.loads(path.read_text(encoding="utf-8")))
         else:
-            print(f"paper: {child['training']} seed {child['seed']} left nothing: "
+            print(f"paper: {what} seed {child['seed']} left nothing: "
                   f"{Path(child['log'].name).read_text(encoding='utf-8')[-600:]}", flush=True)  # fmt: skip
-    for name, found in runs.items():
-        steps = [r["steps"] for r in found]
-        counts = [len(r["episodes"]["episode_return"]) for r in found]
-        lasts = [r["episodes"]["success"][-50:] for r in found]
-        shares = [round(sum(last) / max(1, len(last)), 2) for last in lasts]
-        print(f"{name}: steps {steps}, episodes {counts}, success of the last 50 {shares}", flush=True)
-    return {"runs": runs}
+    for variant, groups in runs.items():
+        for name, found in groups.items():
+            lasts = [r["episodes"]["success"][-50:] for r in found]
+            print(f"paper: {variant}, {name}: steps {[r['steps'] for r in found]}, episodes "
+                  f"{[len(r['episodes']['success']) for r in found]}, success of the last 50 "
+                  f"{[round(sum(last) / max(1, len(last)), 2) for last in lasts]}", flush=True)  # fmt: skip
+    others = {v: {"options": VARIANTS[v][1], "runs": found} for v, found in runs.items() if v != MAIN}
+    return {"variant": MAIN, "options": VARIANTS[MAIN][1], "runs": runs.get(MAIN, {}), "others": others}

@@ -10,6 +10,8 @@ zero, random and straight-line agents on the same episodes; learner updates per 
 `rates`: environment steps per second, with observation, reward, reset and randomisation, against the bare physics.
 `paper`: TD3 and DDPG on the paper's own task with one rover each, five seeds each, on CPU cores beside the GPU.
 `scaling`: steps of whole training per second on 1, 2, 4, ... devices of the host, the same share for each device.
+`brax`: brax's PPO and SAC in the same environment, with the same scores.
+`realism`: TD3 trained with and without the thermal and soil effects, each scored with and without them.
 """
 
 from __future__ import annotations
@@ -17,104 +19,132 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from rl_brax import brax
 from rl_common import Clock, save, say
 from rl_large import large, training_of
-from rl_paper import paper_child, paper_merge, paper_start
+from rl_paper import VARIANTS, paper_child, paper_merge, paper_start
+from rl_realism import realism
 
-PERIOD = {"all": 535.0, "large": 300.0, "rates": 200.0, "paper": 400.0, "scaling": 150.0}
+PERIOD = {"all": 535.0, "large": 300.0, "rates": 200.0, "paper": 400.0, "scaling": 150.0,
+          "brax": 340.0, "realism": 300.0}  # fmt: skip
 """s that each part may take."""
 
 
 # Rates of the environment
 
 
-def timed(function: Any, args: tuple[Any, ...], repeats: int = 3) -> tuple[float, float, Any]:
-    """Best time in s of `function(*args) -> args[-1]`, its compile time, and its memory analysis."""
-    import jax
-
-    begin = time.monotonic()
-    compiled = jax.jit(function, donate_argnums=len(args) - 1).lower(*args).compile()
-    compile_s = time.monotonic() - begin
-    *fixed, state = args
-    best = float("inf")
-    for i in range(repeats + 1):
-        begin = time.monotonic()
-        state = jax.block_until_ready(compiled(*fixed, state))
-        if i:
-            best = min(best, time.monotonic() - begin)
-    return best, compile_s, compiled.memory_analysis()
-
-
 def rates(args: argparse.Namespace, clock: Clock) -> None:
+    """Compiles every row in threads, waits for quiet if told to, and measures."""
     from lunar_mjx.envs import make_navigation
     from lunar_mjx.envs.observations import PAPER_OBSERVATION
 
     ground = {"terrain": "flat", "goal_distance": (2.0, 4.0), "places": 256} if args.tiny else {}
     few = {"observations": PAPER_OBSERVATION, "privileged": ()}
-    plan = [("17 numbers", 5, 65536), ("all observations", 50, 65536), ("17 numbers", 5, 4096),
-            ("17 numbers", 5, 16384), ("17 numbers", 5, 1024), ("all observations", 50, 4096),
-            ("all observations", 5, 65536), ("17 numbers", 50, 65536)]  # fmt: skip
+    plan = [("17 numbers", 5, 65536), ("all observations", 50, 65536), ("17 numbers", 5, 1024),
+            ("17 numbers", 5, 4096), ("17 numbers", 5, 16384), ("17 numbers", 50, 65536),
+            ("all observations", 5, 65536), ("all observations", 50, 4096), ("17 numbers", 5, 262144)]  # fmt: skip
+    plan = [("17 numbers", 5, 8)] if args.tiny else plan
     made: dict[tuple[str, int], Any] = {}
+    for label, decimation, _ in plan:
+        options = {"decimation": decimation, "places": 2048, **(few if label == "17 numbers" else {}), **ground}
+        if (label, decimation) not in made:
+            made[label, decimation] = make_navigation("large", args.rover, **options)
+    with ThreadPoolExecutor(4) as pool:
+        waits = [pool.submit(Rate, made[label, decimation], size, 4 if args.tiny else max(20, 1000 // decimation))
+                 for label, decimation, size in plan]  # fmt: skip
+        ready = [w.result() for w in waits]
+    say(f"rates: {len(ready)} rows compiled after {clock.spent:.0f} s")
+    wait(args, clock)
     rows: list[dict[str, Any]] = []
-    for label, decimation, size in [("17 numbers", 5, 8)] if args.tiny else plan:
-        if rows and clock.left < 1.3 * rows[-1]["process_s"]:
+    for (label, decimation, size), rate in zip(plan, ready, strict=True):
+        if clock.left < 2.0:
             say("rates: no time for more")
             return
-        begin = time.monotonic()
-        if (label, decimation) not in made:
-            options = {"decimation": decimation, "places": 2048, **(few if label == "17 numbers" else {}), **ground}
-            made[label, decimation] = make_navigation("large", args.rover, **options)
-        steps = 4 if args.tiny else max(20, 1000 // decimation)
-        row = rate_of(made[label, decimation], size, steps, args.tiny)
-        rows.append({"observation": label, "decimation": decimation, "rovers": size, **row,
-                     "process_s": time.monotonic() - begin})  # fmt: skip
+        row = rate.measure(1 if args.tiny else 5)
+        rows.append({"observation": label, "decimation": decimation, "rovers": size, **row})
         say(f"rates: {label}, decimation {decimation}, {size:,} rovers: "
             f"{row['env_steps_per_s']:,.0f} environment steps/s, bare physics {row['bare_steps_per_s']:,.0f}, "
             f"ratio {row['ratio']:.3f}")  # fmt: skip
         save(args.out, "rates", {"rover": args.rover, "rows": rows})
 
 
-def rate_of(env: Any, size: int, steps: int, tiny: bool) -> dict[str, Any]:
-    """Steps per second of the environment under random actions, and of its physics alone under the same changes."""
-    import jax
-    import jax.numpy as jnp
+def wait(args: argparse.Namespace, clock: Clock) -> None:
+    """Until the file of --wait-for is there, or time is up."""
+    while args.wait_for is not None and not args.wait_for.exists() and clock.left > 0.0:
+        time.sleep(0.5)
 
-    from lunar_mjx.envs import split_keys
 
-    decimation, key = env.config.decimation, jax.random.PRNGKey(0)
+class Rate:
+    """The environment under random actions, and its physics alone under the same changes; compiled when made."""
 
-    def drive(params: Any, state: Any) -> Any:
-        def step(state: Any, key: Any) -> Any:
-            action = jax.random.uniform(key, (size, env.action_size), minval=-1.0)
-            return env.step(params, state, action), None
+    def __init__(self, env: Any, size: int, steps: int):
+        import jax
+        import jax.numpy as jnp
 
-        return jax.lax.scan(step, state, jax.random.split(key, steps))[0]
+        self.env, self.size, self.steps = env, size, steps
+        decimation, key = env.config.decimation, jax.random.PRNGKey(0)
 
-    shares = jax.random.uniform(key, (steps, env.action_size), minval=-1.0)
-    controls = env.actions.controls(shares)
+        def drive(params: Any, state: Any) -> Any:
+            def step(state: Any, key: Any) -> Any:
+                action = jax.random.uniform(key, (size, env.action_size), minval=-1.0)
+                state = env.step(params, state, action)
+                return state, jnp.sum(state.done)
 
-    def bare(params: Any, state: Any) -> Any:
-        return env.system.rollout_batch(params.system, state, controls, decimation, report=lambda t: None)[0]
+            state, ended = jax.lax.scan(step, state, jax.random.split(key, steps))
+            return state, jnp.sum(ended)
 
-    repeats = 1 if tiny else 3
-    state = jax.block_until_ready(jax.jit(env.reset)(env.params, split_keys(key, size)))
-    physics = jax.tree.map(jnp.copy, state.inner.physics)
-    held = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / size
-    ours, compile_s, memory = timed(drive, (env.params, state), repeats)
-    naked, bare_compile_s, _ = timed(bare, (env.params, physics), repeats)
-    return {
-        "env_steps_per_s": size * steps / ours,
-        "physics_steps_per_s": size * steps * decimation / ours,
-        "bare_steps_per_s": size * steps / naked,
-        "ratio": naked / ours,
-        "compile_s": compile_s,
-        "bare_compile_s": bare_compile_s,
-        "state_bytes_per_rover": held,
-        "temporary_bytes_per_rover": getattr(memory, "temp_size_in_bytes", 0) / size,
-    }
+        shares = jax.random.uniform(key, (steps, env.action_size), minval=-1.0)
+        controls = env.actions.controls(shares)
+
+        def bare(params: Any, state: Any) -> Any:
+            return env.system.rollout_batch(params.system, state, controls, decimation, report=lambda t: None)[0]
+
+        keys = jax.ShapeDtypeStruct((size, 2), jnp.uint32)
+        state = jax.eval_shape(env.reset, env.params, keys)
+        self._reset = jax.jit(env.reset).lower(env.params, keys).compile()
+        self._drive = jax.jit(drive, donate_argnums=1).lower(env.params, state).compile()
+        self._bare = jax.jit(bare, donate_argnums=1).lower(env.params, state.inner.physics).compile()
+
+    def measure(self, repeats: int) -> dict[str, Any]:
+        """Best of several repetitions, in turns."""
+        import jax
+        import jax.numpy as jnp
+
+        from lunar_mjx.envs import split_keys
+
+        params = self.env.params
+        state = jax.block_until_ready(self._reset(params, split_keys(jax.random.PRNGKey(0), self.size)))
+        # episodes at every stage, so that as many end in one step as in the next
+        share = jax.random.uniform(jax.random.PRNGKey(1), (self.size,))
+        inner = dataclasses.replace(state.inner, waited=share * self.env.config.stuck_time)
+        state = dataclasses.replace(state, inner=inner)
+        physics = jax.tree.map(jnp.copy, state.inner.physics)
+        held = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / self.size
+        ours, naked, ended = [], [], 0
+        for _ in range(repeats + 1):
+            begin = time.monotonic()
+            state, ended = jax.block_until_ready(self._drive(params, state))
+            middle = time.monotonic()
+            physics = jax.block_until_ready(self._bare(params, physics))
+            ours.append(middle - begin)
+            naked.append(time.monotonic() - middle)
+        best, bare = min(ours[1:]), min(naked[1:])
+        memory = self._drive.memory_analysis()
+        return {
+            "env_steps_per_s": self.size * self.steps / best,
+            "physics_steps_per_s": self.size * self.steps * self.env.config.decimation / best,
+            "bare_steps_per_s": self.size * self.steps / bare,
+            "ratio": bare / best,
+            "resets_per_step": int(ended) / self.steps,
+            "seconds": ours[1:],
+            "bare_seconds": naked[1:],
+            "state_bytes_per_rover": held,
+            "temporary_bytes_per_rover": getattr(memory, "temp_size_in_bytes", 0) / self.size,
+        }
 
 
 # Several devices
@@ -131,15 +161,22 @@ def scaling(args: argparse.Namespace, clock: Clock) -> None:
 
     training = training_of(args)
     env = make(training.environment, **training.options)
-    rows: list[dict[str, Any]] = []
-    count = 1
-    while count <= jax.device_count() and (not rows or clock.left > 30.0):
+    counts = [2**i for i in range(jax.device_count().bit_length())]
+    learners = {}
+    for count in counts:
         config = dataclasses.replace(training.train, envs=training.train.envs * count,
                                      batch=training.train.batch * count)  # fmt: skip
-        learner = Learner(env, config, Mesh(np.array(jax.devices()[:count]), (AXIS,)))
+        learners[count] = Learner(env, config, Mesh(np.array(jax.devices()[:count]), (AXIS,)))
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(lambda learner: learner.compile(), learners.values()))
+    say(f"scaling: compiled after {clock.spent:.0f} s")
+    wait(args, clock)
+    rows: list[dict[str, Any]] = []
+    for count, learner in learners.items():
+        config = learner.config
         state = learner.init(0)
         best = float("inf")
-        for i in range(2 if args.tiny else 5):
+        for i in range(2 if args.tiny else 9):
             begin = time.monotonic()
             state, _ = jax.block_until_ready(learner.epoch(env.params, state))
             if i:
@@ -149,7 +186,7 @@ def scaling(args: argparse.Namespace, clock: Clock) -> None:
                      "efficiency": rate / count / (rows[0]["steps_per_s"] if rows else rate)})  # fmt: skip
         say(f"scaling: {count} devices, {rate:,.0f} steps/s, efficiency {rows[-1]['efficiency']:.3f}")
         save(args.out, "scaling", {"rover": args.rover, "rows": rows})
-        count *= 2
+        del state
 
 
 def main() -> None:
@@ -170,7 +207,9 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment")
     parser.add_argument("--training", default="paper-td3", help="of part paper-child")
+    parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS), help="of part paper")
     parser.add_argument("--core", type=int, help="CPU core of part paper-child")
+    parser.add_argument("--wait-for", type=Path, help="parts rates and scaling measure once this file is there")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     clock = Clock(args.seconds or PERIOD.get(args.part, 60.0))
@@ -187,8 +226,9 @@ def main() -> None:
             large(args, Clock(0.7 * clock.left if args.part == "all" else clock.left))
         if args.part in ("all", "rates"):
             rates(args, Clock(clock.left - 15.0))
-        if args.part == "scaling":
-            scaling(args, clock)
+        for name, function in (("scaling", scaling), ("brax", brax), ("realism", realism)):
+            if args.part == name:
+                function(args, clock)
     finally:
         if children:
             save(args.out, "paper", paper_merge(children, clock.left))

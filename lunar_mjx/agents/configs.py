@@ -49,11 +49,11 @@ _UNSEEN = {"terrain": "world:heldout", "ranges": "unseen"}
 
 TRAININGS: dict[str, Training] = {
     "paper-td3": Training(
-        "navigation", {"task": "paper"}, TrainConfig(td3.TD3Config(), buffer_steps=200_000), 120_000,
+        "navigation", {"task": "paper"}, TrainConfig(td3.TD3Config(), batch=100, buffer_steps=200_000), 120_000,
         note="section V with SB3's defaults of TD3",
     ),
     "paper-ddpg": Training(
-        "navigation", {"task": "paper"}, TrainConfig(ddpg.DDPGConfig(), buffer_steps=200_000), 120_000,
+        "navigation", {"task": "paper"}, TrainConfig(ddpg.DDPGConfig(), batch=100, buffer_steps=200_000), 120_000,
         note="section V with SB3's defaults of DDPG",
     ),
     "large-td3": Training(

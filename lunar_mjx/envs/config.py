@@ -197,6 +197,9 @@ UNSAID: dict[str, tuple[str, str]] = {
     "frame of positions": ("world axes, origin at the episode's start", "so that places on a large map look alike"),
     "reward of a control step": ("once per action, not per physics step", "as a Gym environment returns it"),
     "r_prog": ("distance in the plane", "the goal has no height"),
-    "algorithm settings": ("Stable-Baselines3's defaults of its 2.x releases", "the paper changes none"),
+    "algorithm settings": (
+        "Stable-Baselines3's defaults of the paper's time (before 2.3), batches of 100, one update per step",
+        "the paper changes none",
+    ),
 }
 """What the paper leaves unsaid about the task: the choice and its reason."""
