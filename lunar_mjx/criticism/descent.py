@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from lunar_mjx.criticism.problem import Problem
 
@@ -30,6 +31,8 @@ _PATIENCE = 2
 _CREEP = 2.0
 """Drop of chi-square that does not matter where rows are dear: it takes 25 to name an effect."""
 _NEAR = np.array([0.003, 0.01, 0.03])
+_ROOM = 1e-12
+"""Width that the solver needs between bounds."""
 _TRIED = 3
 """Steps that a descent may take before it is compared with a rival."""
 _HOPE = 4.0
@@ -79,31 +82,16 @@ class Objective:
         j = j[self.fitted]
         return j.T @ r[self.fitted] - scale * prior, j.T @ j + np.diag(scale**2)
 
-    def held(self, at: np.ndarray, downhill: np.ndarray) -> np.ndarray:
-        """Coordinates at a bound that the gradient pushes against."""
-        return ((at <= self.low + EDGE) & (downhill < 0.0)) | ((at >= self.high - EDGE) & (downhill > 0.0))
-
     def steps(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray, dampings: np.ndarray) -> np.ndarray:
-        """(dampings, coordinates) damped Gauss-Newton steps within the bounds.
+        """(dampings, coordinates) damped Gauss-Newton steps, each the best within the bounds.
 
-        What would pass a bound stops there, and the others' step is found anew: cut only, it would lead where they fit
-        a coordinate that is somewhere else.
+        Cut at the bounds only, a step would lead where the others fit a coordinate that is somewhere else.
         """
         at = u[self.free]
         out = np.repeat(u[None], len(dampings), axis=0)
         for i, damping in enumerate(dampings):
             damped = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
-            move, step = ~self.held(at, downhill), np.zeros(len(at))
-            for _ in range(len(at)):
-                if not move.any():
-                    break
-                pull = downhill[move] - damped[np.ix_(move, ~move)] @ step[~move]
-                step[move] = np.linalg.lstsq(damped[np.ix_(move, move)], pull, rcond=None)[0]
-                beyond = move & ((at + step < self.low) | (at + step > self.high))
-                if not beyond.any():
-                    break
-                step[beyond] = np.clip(at + step, self.low, self.high)[beyond] - at[beyond]
-                move &= ~beyond
+            step = _within(damped, downhill, self.low - at, self.high - at)
             out[i, self.free] = np.clip(at + step, self.low, self.high)
         return out
 
@@ -148,6 +136,19 @@ class Objective:
         """Drop of chi-square that a full Gauss-Newton step within the bounds promises."""
         step = (self.steps(u, downhill, hessian, np.zeros(1))[0] - u)[self.free]
         return float(2.0 * downhill @ step - step @ hessian @ step)
+
+
+def _within(hessian: np.ndarray, downhill: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(n,) step that minimises a quadratic model between bounds about zero."""
+    step = np.linalg.lstsq(hessian, downhill, rcond=None)[0]
+    if np.all((step >= low) & (step <= high)):
+        return step
+    size = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    values, axes = np.linalg.eigh(hessian * np.outer(size, size))
+    root = np.sqrt(np.maximum(values, 1e-14 * max(float(values[-1]), 1e-30)))
+    rows = root[:, None] * axes.T
+    found = lsq_linear(rows, (axes.T @ (size * downhill)) / root, (low / size - _ROOM, high / size + _ROOM), "bvls")
+    return found.x * size
 
 
 @dataclasses.dataclass

@@ -12,6 +12,7 @@ from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.probes import port_columns
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.score import leash, project
+from lunar_mjx.criticism.table_problem import TableProblem
 
 if TYPE_CHECKING:
     from lunar_mjx.criticism.search import Search
@@ -74,11 +75,11 @@ def localise(problem: Problem, found: Search, progress: Progress = silent, alway
 
 
 def pattern(problem: Problem, fit: Fit) -> float:
-    """Log evidence of the best smooth unknown input in what a fit leaves; 0 where derivatives are dear.
+    """Log evidence of the best smooth unknown input in what a fit to tables leaves; 0 for drives, where it is dear.
 
     A root mean square at the noise may hide a small misfit that all manoeuvres share, most of all in coloured noise.
     """
-    if not problem.cheap_jacobian:
+    if not isinstance(problem, TableProblem):
         return 0.0
     columns = port_columns(problem, fit, silent)
     return max((evidence(problem, fit, signature)[0] for signature in columns.values()), default=0.0)

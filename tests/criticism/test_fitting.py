@@ -6,8 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 from toy_problem import Decay, Linear, TwoMinima, manoeuvres
 
+from lunar_mjx.criticism.descent import Objective
 from lunar_mjx.criticism.fitting import Memory, fit
 
 RNG = np.random.default_rng(0)
@@ -96,3 +98,18 @@ def test_a_memory_of_other_coordinates_is_not_used():
     problem = decay()
     memory = Memory({"": {"u": {"base.a": 1.0}}})
     assert memory.recall(problem, ()) is None
+
+
+def test_a_step_that_meets_a_bound_is_the_best_within_it():
+    rng = np.random.default_rng(5)
+    columns = rng.standard_normal((300, 3)) @ np.array([[1.0, 0.9, 0.0], [0.0, 0.3, 0.5], [0.0, 0.0, 1.0]])
+    observations = dataclasses.replace(manoeuvres(3, 100), value=columns @ [3.0, -4.0, 0.5])
+    problem = Linear(columns, {}, observations, low=-2.0, high=2.0)
+    goal = Objective(problem, problem.free(), np.ones(300, bool))
+    residual, _ = goal.residuals(problem.origin()[None])
+    downhill, hessian = goal.quadratic(problem.origin(), residual[0], columns)
+    step = goal.steps(problem.origin(), downhill, hessian, np.zeros(1))[0]
+    best = lsq_linear(columns, observations.value, (-2.0, 2.0), tol=1e-14).x
+    np.testing.assert_allclose(step, best, atol=1e-4)
+    dropped = goal.residuals(problem.origin()[None])[1][0] - goal.residuals(step[None])[1][0]
+    assert goal.promise(problem.origin(), downhill, hessian) == pytest.approx(dropped, rel=1e-6)

@@ -88,3 +88,17 @@ def test_blocks_follow_the_correlation_time():
     many, few = blocks(o, white, every).max() + 1, blocks(o, slow, every).max() + 1
     assert few < many
     assert 4000 * 0.1 / few >= 5.0 * 10.0  # seconds: five correlation times or more
+
+
+def test_a_nuisance_takes_in_no_effect_by_moving_past_its_bounds():
+    """The nuisance has nearly the effect's shape, and would have to move to fifty times its bound."""
+    slow = EFFECTS["slow"]
+    nuisance = 0.02 * slow + 0.001 * RNG.standard_normal(len(slow))
+    observations = dataclasses.replace(manoeuvres(LOGS, SAMPLES), value=200.0 * slow)
+    share = {}
+    for reach in (1e6, 2.0):
+        problem = Linear(nuisance[:, None], {"slow": slow}, observations, low=-reach, high=reach)
+        base = fit(problem, problem.free(), np.zeros(2), starts=1, certify=False)
+        base = dataclasses.replace(base, u=np.zeros(2), residual=observations.value)
+        share[reach] = score(problem, base, signatures(problem, base, ["slow"]), 50)[0].share
+    assert share[1e6] < 0.1 and share[2.0] > 0.9
