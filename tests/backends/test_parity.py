@@ -67,7 +67,8 @@ def test_faults_are_told_at_the_loosest_tolerance_too(fault, luvmi):
 def test_a_drive_stays_within_tolerance_and_noise(luvmi):
     """The reference against itself, started from float32 coordinates: told by a drive only beyond the floor."""
     case = luvmi.cases[0]
-    _, run, noise = luvmi.of[case.name]
+    _, run, perturbed = luvmi.of[case.name]
+    noise = perturbed.start
     wanted = parity.tolerances("float64", drive=True)
     same = parity.judge_drive(case, run, noise, run, wanted, luvmi.model)
     assert all(r.error == 0.0 and r.floor > 0.0 for r in same if r.quantity in ("position", "sinkage", "slip"))

@@ -51,7 +51,8 @@ def test_agrees_with_native(luvmi):
     runner = make_runner("pybullet", luvmi.model)
     assert not _failed(luvmi.judge(runner, "pybullet"))
     case = luvmi.cases[0]
-    _, run, noise = luvmi.of[case.name]
+    _, run, perturbed = luvmi.of[case.name]
+    noise = perturbed.held
     wanted = parity.tolerances("pybullet", drive=True)
     drive = runner.drive(case, luvmi.commands)
     assert not _failed(parity.judge_drive(case, run, noise, drive, wanted, luvmi.model))
