@@ -27,8 +27,8 @@ from lunar_mjx.pytree import pytree
 
 ENDS = ("reached", "rolled_over", "stuck", "off_terrain", "diverged")
 """Ways in which an episode terminates; the first is success, the others bring the failure reward."""
-_SHARE = 64
-"""One in so many rovers begins anew at a time."""
+_GROUP = 16
+"""At most one in so many rovers begins anew at a time."""
 
 
 @pytree
@@ -199,21 +199,28 @@ class NavigationEnv:
     def _restart(self, params: NavigationParams, inner: Inner, state: State) -> State:
         """Begins anew where the episode ended, keeping the final observations.
 
-        Few episodes end in a step, so that fresh ones are made for a small share of the rovers at a time, as often as
-        it takes; every rover gets the same numbers as if all were made.
+        Few episodes end in a step, so that one rover of every group begins at a time, as often as it takes: fresh
+        rovers are few, and take their places by a selection, which costs no gathering and scattering of every array.
+        Every rover gets the same numbers as if all were made.
         """
         count = state.done.shape[0]
-        share = max(1, -(-count // _SHARE))
+        size = next(n for n in range(min(_GROUP, count), 0, -1) if count % n == 0)
+        groups = count // size
 
         def begin(carry: Any) -> Any:
             waiting, current = carry
-            # rovers beyond the waiting ones get the index `count`, which reads the last and writes nothing
-            who = jnp.nonzero(waiting, size=share, fill_value=count)[0]
-            new = self._fresh(params, inner.key.at[who].get(mode="clip"))
-            first = self._view(new)
-            fresh = (*self._observe(params, new, first), self._info(first), new)
-            current = jax.tree.map(lambda old, part: old.at[who].set(part, mode="drop"), current, fresh)
-            return waiting.at[who].set(False, mode="drop"), current
+            rows = waiting.reshape(groups, size)
+            first = jnp.argmax(rows, axis=1)
+            chosen = rows & (jnp.arange(size) == first[:, None])
+            new = self._fresh(params, inner.key.reshape(groups, size, 2)[jnp.arange(groups), first])
+            view = self._view(new)
+            fresh = (*self._observe(params, new, view), self._info(view), new)
+
+            def put(old: Any, part: Any) -> Any:
+                at = chosen.reshape(groups, size, *[1] * (old.ndim - 1))
+                return jnp.where(at, part[:, None], old.reshape(groups, size, *old.shape[1:])).reshape(old.shape)
+
+            return waiting & ~chosen.reshape(-1), jax.tree.map(put, current, fresh)
 
         here = (state.obs, state.privileged, state.info, inner)
         _, here = jax.lax.while_loop(lambda carry: carry[0].any(), begin, (state.done, here))

@@ -15,7 +15,7 @@ from lunar_mjx.agents.evaluate import Evaluator
 from lunar_mjx.agents.play import shipped_policy
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.agents.run import unseen_params
-from lunar_mjx.envs import make_agent, make_navigation, rewards
+from lunar_mjx.envs import make_agent, make_navigation, rewards, split_keys
 from lunar_mjx.envs.actions import action_map
 from lunar_mjx.envs.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
@@ -70,6 +70,24 @@ def test_observation_reward_and_end_follow_the_physics(env):
     assert np.hypot(*obs[:2]) > 0.01, "it drove"
     fresh = own._state.inner
     assert int(fresh.steps[0]) == 0 and not np.allclose(fresh.goal[0], goal), "the next episode has another goal"
+
+
+@pytest.mark.slow
+def test_episodes_begin_anew_where_and_only_where_they_ended(env):
+    own = env.unwrapped.env
+    state = own.reset(own.params, split_keys(jax.random.PRNGKey(3), 40))
+    done = np.zeros(40, bool)
+    done[[0, 3, 4, 5, 19, 39]] = True
+    state = dataclasses.replace(state, terminated=jnp.asarray(done), final_obs=state.obs + 1.0)
+    made = jax.jit(own._restart)(own.params, state.inner, state)
+    anew = own.reset(own.params, state.inner.key)
+    for name in ("obs", "info", "inner"):
+        whole = [jax.tree.leaves(getattr(s, name)) for s in (made, anew, state)]
+        for got, fresh, old in zip(*whole, strict=True):
+            at = done.reshape(-1, *[1] * (got.ndim - 1))
+            np.testing.assert_allclose(got, np.where(at, fresh, old), rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(made.final_obs, state.final_obs)
+    assert not np.allclose(made.inner.goal[done], state.inner.goal[done])
 
 
 @pytest.mark.slow
