@@ -14,14 +14,24 @@ from pathlib import Path
 from typing import Any
 
 TRAININGS = ("paper-td3", "paper-ddpg")
-VARIANTS: dict[str, tuple[int, dict[str, Any]]] = {
-    "signed": (5, {"task": "consistent", "places": 1, "decimation": 100}),
-    "printed": (5, {"places": 1}),
-    "drawn": (1, {"task": "consistent", "decimation": 100}),
-}
-"""Seeds and options. `signed`: progress with its sign, one predefined start and destination as in section V, acted on
-at 5 Hz. `printed`: the reward as printed, likewise, at the task's 10 Hz; at 5 Hz and a discount of 0.99 driving on for
-ever would be worth more than arriving. `drawn`: start and destination drawn for every episode."""
+_SIGNED = {"task": "consistent", "places": 1, "decimation": 100}
+VARIANTS: dict[str, tuple[int, dict[str, Any], dict[str, Any], tuple[str, ...]]] = {
+    "signed": (5, _SIGNED, {}, TRAININGS),
+    "printed": (5, {"places": 1}, {}, TRAININGS),
+    "drawn": (1, {"task": "consistent", "decimation": 100}, {}, TRAININGS),
+    "scaled": (5, _SIGNED, {"reward_scale": 0.01}, TRAININGS),
+    "slow actor": (4, _SIGNED, {"actor_rate": 1e-4}, TRAININGS[1:]),
+    "scaled, slow actor": (4, _SIGNED, {"reward_scale": 0.01, "actor_rate": 1e-4}, TRAININGS[1:]),
+    "scaled, slow actor, normalised": (4, _SIGNED, {"reward_scale": 0.01, "actor_rate": 1e-4, "normalise": True},
+                                       TRAININGS[1:]),
+    "ahead": (4, {**_SIGNED, "start_yaw": 0.5}, {}, TRAININGS[1:]),
+}  # fmt: skip
+"""Seeds, options of the environment, settings of the training, and the algorithms. `signed`: progress with its sign,
+one predefined start and destination as in section V, acted on at 5 Hz. `printed`: the reward as printed, likewise, at
+the task's 10 Hz; at 5 Hz and a discount of 0.99 driving on for ever would be worth more than arriving. `drawn`: start
+and destination drawn for every episode. The others are `signed` with settings that might help: rewards scaled, a slower
+actor, normalised observations, and a start that faces the destination within 0.5 rad."""
+DEFAULT = ("signed", "printed", "drawn")
 MAIN = "signed"
 
 
@@ -30,7 +40,7 @@ def paper_start(args: argparse.Namespace, seconds: float) -> list[dict[str, Any]
     folder = Path(tempfile.mkdtemp(prefix="rl_paper_"))
     cores = sorted(os.sched_getaffinity(0))
     jobs = [(variant, training, seed) for variant in args.variants for seed in range(VARIANTS[variant][0])
-            for training in TRAININGS]  # fmt: skip
+            for training in VARIANTS[variant][3]]  # fmt: skip
     jobs = jobs[:2] if args.tiny else jobs
     # two cores are left to the process that drives the GPU
     free = cores[2:] if args.part == "all" and len(cores) > 2 else cores
@@ -39,7 +49,7 @@ def paper_start(args: argparse.Namespace, seconds: float) -> list[dict[str, Any]
            "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}  # fmt: skip
     children = []
     for i, (variant, training, seed) in enumerate(jobs):
-        out = folder / f"{variant.replace(', ', '_').replace(' ', '_')}_{training}_{seed}"
+        out = folder / f"{list(VARIANTS).index(variant)}_{training}_{seed}"
         line = [sys.executable, str(Path(__file__).with_name("rl_proof.py")), "--part", "paper-child", "--training",
                 training, "--first-seed", seed, "--seconds", seconds, "--out", out, "--core", free[i % len(free)],
                 "--variants", variant, *(["--tiny"] if args.tiny else [])]  # fmt: skip
@@ -53,11 +63,12 @@ def paper_start(args: argparse.Namespace, seconds: float) -> list[dict[str, Any]
 
 
 def paper_child(args: argparse.Namespace) -> None:
-    """One run in a process of its own; its record is written anew every few seconds."""
+    """Runs of one or several seeds in a process of their own; the records are written anew every few seconds."""
     if args.core is not None:
         os.sched_setaffinity(0, {args.core})
     begin = time.monotonic()
     import jax
+    import jax.numpy as jnp
     import numpy as np
 
     from lunar_mjx.agents.configs import get_training, override
@@ -65,31 +76,38 @@ def paper_child(args: argparse.Namespace) -> None:
     from lunar_mjx.agents.train import plain
     from lunar_mjx.envs import make
 
-    training = override(get_training(args.training), epoch_steps=50 if args.tiny else 250)
-    options = {**training.options, **VARIANTS[args.variants[0]][1]}
+    _, changes, settings, _ = VARIANTS[args.variants[0]]
+    training = override(get_training(args.training), **{"epoch_steps": 50 if args.tiny else 250, **settings})
+    options = {**training.options, **changes}
     learner = Learner(make(training.environment, **options), training.train)
-    episodes: dict[str, list[float]] = {name: [] for name in (*EPISODE, "step")}
-    record: dict[str, Any] = {"seed": args.first_seed, "train": plain(dataclasses.asdict(training.train)),
-                              "environment": plain(options), "episodes": episodes}  # fmt: skip
-    state, steps, saved = learner.init(args.first_seed), 0, time.monotonic()
+    seeds = range(args.first_seed, args.first_seed + args.together)
+    records: list[dict[str, Any]] = [
+        {"seed": seed, "train": plain(dataclasses.asdict(training.train)), "environment": plain(options),
+         "episodes": {name: [] for name in (*EPISODE, "step")}} for seed in seeds
+    ]  # fmt: skip
+    # all seeds in one program, each with everything of its own
+    epoch: Any = jax.jit(jax.vmap(learner._epoch, in_axes=(None, 0)), donate_argnums=1)
+    state = jax.jit(jax.vmap(learner._init))(jnp.stack([jax.random.PRNGKey(seed) for seed in seeds]))
+    steps, saved = 0, time.monotonic()
     while steps < (200 if args.tiny else training.steps) and time.monotonic() - begin < args.seconds:
-        state, (_, found) = learner.epoch(learner.env.params, state)
+        state, (_, found) = epoch(learner.env.params, state)
         found = jax.device_get(found)
-        ended = np.flatnonzero(found["done"][0])
-        for name in EPISODE:
-            episodes[name] += found[name][0, ended].astype(float).tolist()
-        episodes["step"] += (steps + ended + 1.0).tolist()
+        for i, record in enumerate(records):
+            episodes, ended = record["episodes"], np.flatnonzero(found["done"][i, 0])
+            for name in EPISODE:
+                episodes[name] += found[name][i, 0, ended].astype(float).tolist()
+            episodes["step"] += (steps + ended + 1.0).tolist()
         steps += training.train.epoch_steps
         if time.monotonic() - saved > 10.0 or steps == training.train.epoch_steps:
             saved = time.monotonic()
-            keep(args.out / "record.json", record, steps, saved - begin)
-    keep(args.out / "record.json", record, steps, time.monotonic() - begin)
+            keep(args.out / "record.json", records, steps, saved - begin)
+    keep(args.out / "record.json", records, steps, time.monotonic() - begin)
 
 
-def keep(path: Path, record: dict[str, Any], steps: int, elapsed: float) -> None:
-    """Writes a record, whole at every moment; the time counts from the process' beginning, compilation included."""
+def keep(path: Path, records: list[dict[str, Any]], steps: int, elapsed: float) -> None:
+    """Writes records, whole at every moment; the time counts from the process' beginning, compilation included."""
     part = path.with_suffix(".part")
-    part.write_text(json.dumps({**record, "steps": steps, "elapsed_s": elapsed}), encoding="utf-8")
+    part.write_text(json.dumps([{**r, "steps": steps, "elapsed_s": elapsed} for r in records]), encoding="utf-8")
     part.replace(path)
 
 
@@ -107,7 +125,7 @@ def paper_merge(children: list[dict[str, Any]], seconds: float) -> dict[str, Any
         path, what = child["out"] / "record.json", f"{child['variant']}, {child['training']}"
         if path.is_file():
             group = runs.setdefault(child["variant"], {}).setdefault(child["training"], [])
-            group.append(json.loads(path.read_text(encoding="utf-8")))
+            group += json.loads(path.read_text(encoding="utf-8"))
         else:
             print(f"paper: {what} seed {child['seed']} left nothing: "
                   f"{Path(child['log'].name).read_text(encoding='utf-8')[-600:]}", flush=True)  # fmt: skip
@@ -117,5 +135,6 @@ def paper_merge(children: list[dict[str, Any]], seconds: float) -> dict[str, Any
             print(f"paper: {variant}, {name}: steps {[r['steps'] for r in found]}, episodes "
                   f"{[len(r['episodes']['success']) for r in found]}, success of the last 50 "
                   f"{[round(sum(last) / max(1, len(last)), 2) for last in lasts]}", flush=True)  # fmt: skip
-    others = {v: {"options": VARIANTS[v][1], "runs": found} for v, found in runs.items() if v != MAIN}
-    return {"variant": MAIN, "options": VARIANTS[MAIN][1], "runs": runs.get(MAIN, {}), "others": others}
+    about = {v: {"options": VARIANTS[v][1], "settings": VARIANTS[v][2]} for v in (MAIN, *runs)}
+    others = {v: {**about[v], "runs": found} for v, found in runs.items() if v != MAIN}
+    return {"variant": MAIN, **about[MAIN], "runs": runs.get(MAIN, {}), "others": others}

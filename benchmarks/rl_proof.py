@@ -26,7 +26,7 @@ from typing import Any
 from rl_brax import brax
 from rl_common import Clock, save, say
 from rl_large import large, training_of
-from rl_paper import VARIANTS, paper_child, paper_merge, paper_start
+from rl_paper import DEFAULT, VARIANTS, paper_child, paper_merge, paper_start
 from rl_realism import realism
 
 PERIOD = {"all": 535.0, "large": 300.0, "rates": 200.0, "paper": 400.0, "scaling": 150.0,
@@ -207,7 +207,8 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment")
     parser.add_argument("--training", default="paper-td3", help="of part paper-child")
-    parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS), help="of part paper")
+    parser.add_argument("--variants", nargs="*", default=list(DEFAULT), choices=list(VARIANTS), help="of part paper")
+    parser.add_argument("--together", type=int, default=1, help="seeds in one program of part paper-child")
     parser.add_argument("--core", type=int, help="CPU core of part paper-child")
     parser.add_argument("--wait-for", type=Path, help="parts rates and scaling measure once this file is there")
     args = parser.parse_args()
