@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy import stats
+from scipy.special import gammaln
 
 from lunar_mjx.criticism.fitting import Fit
 from lunar_mjx.criticism.observations import Observations
@@ -249,7 +250,10 @@ def _larger(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _to_z(statistic: np.ndarray, degrees: int) -> np.ndarray:
     """One-sided normal quantile of a chi-square, so that candidates of several parameters compare."""
-    tail = stats.chi2.logsf(statistic, degrees)
+    half = 0.5 * np.maximum(statistic, 1e-30)
+    # logsf underflows; the leading term of the incomplete gamma function's expansion does not.
+    far = (0.5 * degrees - 1.0) * np.log(half) - half - gammaln(0.5 * degrees)
+    tail = np.where(half > 350.0 + degrees, far, stats.chi2.logsf(statistic, degrees))
     # Beyond the reach of isf the asymptote z^2 = -2 log p is close enough to rank by.
     near = stats.norm.isf(np.exp(np.maximum(tail, -700.0)))
     return np.where(tail > -700.0, near, np.sqrt(-2.0 * tail))

@@ -8,11 +8,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from lunar_mjx.criticism.descent import Objective
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
 from lunar_mjx.criticism.localise import pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
+
+_AMOUNTS = np.array([0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0])
+"""Amounts of a candidate, in terms of its nominal one, that are tried where derivatives may mislead."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -250,7 +254,10 @@ def _refit(
         value, se = gain(problem, parent.fit, found)
         return Candidate(effects, found, noise_test(problem, found), value, se)
     places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
-    if scored is not None and scored.columns is not None and not problem.cheap_jacobian:
+    scanned = _scan(problem, parent, places, scored)
+    if scanned is not None:
+        found = fit(problem, free, scanned, starts=1, certify=False, rival=rival)
+    elif scored is not None and scored.columns is not None and not problem.cheap_jacobian:
         # The score has taken all derivatives at the parent's fit: the first step costs nothing.
         known = parent.fit.residual, _joined(problem, parent.fit, free, places, scored.columns)
         found = fit(problem, free, parent.fit.u, starts=1, certify=False, rival=rival, known=known)
@@ -275,6 +282,26 @@ def _refit(
     memory.keep(problem, effects, found)
     value, se = gain(problem, parent.fit, found)
     return Candidate(effects, found, noise_test(problem, found), value, se)
+
+
+def _scan(problem: Problem, parent: Candidate, places: Sequence[int], scored: Score | None) -> np.ndarray | None:
+    """(coordinates,) the parent with the best amount of a candidate, where that beats what its derivative promises.
+
+    Derivatives at the null say little about effects that act in jumps: a delay moves a held command past the next
+    sample, or does nothing. For drives, and candidates of one amplitude.
+    """
+    if scored is None or problem.cheap_jacobian or len(places) != 1:
+        return None
+    low, high = problem.coordinates[places[0]].bounds()
+    amounts = np.array([a for a in (*_AMOUNTS, *-_AMOUNTS) if low < a < high])
+    rows = np.repeat(parent.fit.u[None], len(amounts), axis=0)
+    rows[:, places[0]] = amounts
+    goal = Objective(problem, problem.free(), parent.fit.fitted)
+    _, chi2 = goal.residuals(rows)
+    best = int(np.argmin(chi2)) if len(chi2) else 0
+    if not len(chi2) or not parent.fit.chi2 - chi2[best] > scored.chi2:
+        return None
+    return rows[best]
 
 
 def _joined(problem: Problem, parent: Fit, free: np.ndarray, places: Sequence[int], columns: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from toy_problem import Linear, manoeuvres
 
 from lunar_mjx.criticism.fitting import fit
-from lunar_mjx.criticism.score import blocks, cosines, project, score, signatures
+from lunar_mjx.criticism.score import _to_z, blocks, cosines, project, score, signatures
 
 RNG = np.random.default_rng(0)
 LOGS, SAMPLES = 4, 100
@@ -102,3 +102,9 @@ def test_a_nuisance_takes_in_no_effect_by_moving_past_its_bounds():
         base = dataclasses.replace(base, u=np.zeros(2), residual=observations.value)
         share[reach] = score(problem, base, signatures(problem, base, ["slow"]), 50)[0].share
     assert share[1e6] < 0.1 and share[2.0] > 0.9
+
+
+def test_z_of_overwhelming_evidence_is_a_number():
+    z = _to_z(np.array([4.0, 500.0, 1e3, 1e4, 1e8]), 2)
+    assert np.all(np.isfinite(z)) and np.all(np.diff(z) > 0.0)
+    assert z[-1] == pytest.approx(1e4, rel=1e-3)
