@@ -3,6 +3,8 @@
 python benchmarks/rl_figures.py runs/proof                        # figures to docs/figures, tables to the screen
 python benchmarks/rl_figures.py runs/proof runs/more --ship luvmi_x   # seeds of both runs; also the policy and its card
                                                                   # to models/luvmi_x, the record to benchmarks
+python benchmarks/rl_figures.py runs/proof --keep                 # the other parts' records to benchmarks
+python benchmarks/rl_figures.py benchmarks                        # figures and tables of the records kept there
 """
 
 from __future__ import annotations
@@ -14,11 +16,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rl_more_figures as more
+from rl_more_figures import percent
 
-from lunar_mjx.agents.curves import mean_interval, new_figure, plot_episodes
+from lunar_mjx.agents.curves import mean_interval, new_figure
 from lunar_mjx.agents.policy import load_policy
 
 ROOT = Path(__file__).parents[1]
+TABLES = {"paper": more.table_paper, "rates": more.table_rates, "scaling": more.table_scaling,
+          "realism": more.table_realism, "brax": more.table_brax, "sb3": more.table_sb3}  # fmt: skip
+PLOTS = {"paper": more.plot_paper, "rates": more.plot_rates, "realism": more.plot_realism}
+PARTS = tuple(TABLES)
 _LIMIT = 2_000_000
 """Bytes that a shipped policy may have."""
 
@@ -47,10 +55,6 @@ def rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [rounded(v) for v in value]
     return float(f"{value:.5g}") if isinstance(value, float) else value
-
-
-def percent(score: dict[str, Any]) -> str:
-    return f"{100 * score['success']:.1f} % ({100 * score['low']:.1f} to {100 * score['high']:.1f})"
 
 
 def plot_large(record: dict[str, Any], path: Path) -> None:
@@ -86,15 +90,6 @@ def table_large(record: dict[str, Any]) -> list[str]:
         lines.append(f"  time to target {mean:.0f} s ({low:.0f} to {high:.0f}, 95 %, n = {len(times)})")
     if "updates_per_s" in record:
         lines.append(f"  learner {record['updates_per_s']:,.0f} updates/s of {record['train']['batch']:,} transitions")
-    return lines
-
-
-def table_rates(record: dict[str, Any]) -> list[str]:
-    lines = [f"Environment steps per second, {record['rover']}, {record['about']['device']}:"]
-    for r in record["rows"]:
-        lines.append(f"  {r['observation']:17s} decimation {r['decimation']:3d} rovers {r['rovers']:6d} "
-                     f"{r['env_steps_per_s'] / 1e6:8.2f} M/s, bare {r['bare_steps_per_s'] / 1e6:8.2f} M/s, "
-                     f"ratio {r['ratio']:.3f}, {r['state_bytes_per_rover'] / 1e3:.1f} kB a rover")  # fmt: skip
     return lines
 
 
@@ -152,25 +147,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "figures")
+    parser.add_argument("--keep", action="store_true", help="records of the other parts go to benchmarks")
     parser.add_argument("--ship", help="rover whose policy goes to models/")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
-    large, rates, paper = read_large(args.folders), *(read(args.folders[0], name) for name in ("rates", "paper"))
+    large = read_large(args.folders)
     if large and large["seeds"]:
         plot_large(large, args.out / f"rl_large_{large['rover']}.png")
         lines += table_large(large)
-    if rates:
-        lines += table_rates(rates)
-    if paper:
-        groups = {n.removeprefix("paper-").upper(): runs for n, runs in paper["runs"].items() if runs}
-        if groups:
-            plot_episodes(groups, args.out / "rl_paper.png")
-        for name, runs in groups.items():
-            last = [np.mean(r["episodes"]["success"][-50:]) for r in runs]
-            counts = [len(r["episodes"]["success"]) for r in runs]
-            lines.append(f"{name}: episodes of {len(runs)} seeds {counts}, success of the last 50 "
-                         f"{np.round(last, 2).tolist()}")  # fmt: skip
+    parts = {name: found for name in PARTS for folder in args.folders if (found := read(folder, name))}
+    for name, record in parts.items():
+        lines += TABLES[name](record)
+        if name in PLOTS:
+            PLOTS[name](record, args.out / f"rl_{name}.png")
+        if args.keep:
+            text = json.dumps(rounded(record), separators=(",", ":")) + "\n"
+            (ROOT / "benchmarks" / f"rl_{name}.json").write_text(text, encoding="utf-8")
+    if "brax" in parts:
+        kept = ROOT / "benchmarks" / f"rl_large_{parts['brax']['rover']}.json"
+        compared = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else large
+        more.plot_learners(compared, parts["brax"], args.out / "rl_learners.png")
     if args.ship:
         assert large is not None and large["rover"] == args.ship, "the folder holds another rover's training"
         lines.append(f"shipped {ship(large, args.folders, ROOT / 'models' / args.ship)}")

@@ -11,4 +11,5 @@ from lunar_mjx.envs.navigation import make_navigation as make_navigation
 from lunar_mjx.envs.point import PointEnv as PointEnv
 from lunar_mjx.envs.randomise import Range as Range
 from lunar_mjx.envs.registry import make as make
+from lunar_mjx.envs.registry import register as register
 from lunar_mjx.envs.scripted import make_agent as make_agent

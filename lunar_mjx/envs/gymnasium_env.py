@@ -139,15 +139,17 @@ class NavigationGymEnv(SingleEnv):
     ## Rewards
     Per action: 20 times the metres come nearer to the goal (`task="paper"`: as printed, the length of the way, which
     also pays for driving away), 0.1 cos(bearing of the goal), 0.05 (-|roll| - |pitch|) and -0.1 |vertical
-    acceleration|; 500 at the goal and -60 at a failure.
+    acceleration|; 500 at the goal and -60 at a failure. `large`: progress, 0.05 of the tilt, 0.02 of the acceleration
+    and -0.02 times the squared change of the action; -100 at a failure.
 
     ## Starting state
     At rest on the ground within 2 m of the origin, heading within 90 degrees of the goal, 4 to 6 m away. The task
     `large` starts anywhere on rough ground with any heading, goals 10 to 40 m away, soil and motors drawn anew.
 
     ## Episode end
-    Terminated at the goal (within 0.5 m; VIPER 1 m), rolled over (60 degrees), stuck (within 0.1 m for 8 s) or off the
-    terrain. Truncated after 30 s (task `large`: 90 s). `info` then holds `success`, `episode_return` and the ends.
+    Terminated at the goal (within 0.5 m; VIPER 1 m), rolled over (60 degrees), stuck (within 0.1 m for 8 s; task
+    `large` 0.3 m for 10 s) or off the terrain. Truncated after 30 s (`large`: 120 s). `info` then holds `success`,
+    `episode_return` and the ends.
 
     ## Arguments
     `task` = `paper`, `consistent` (default) or `large`; `rover`, `terrain`, `preset`, `model`, `engine`; every field of

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from importlib import metadata
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.envs import PointEnv, make, make_agent, split_keys
+from lunar_mjx.envs import PointEnv, make, make_agent, register, registry, split_keys
 from lunar_mjx.envs.contract import check_environment
 from lunar_mjx.errors import UserError
 
@@ -62,6 +64,25 @@ def test_environments_from_a_users_file(tmp_path):
     file.write_text("1/0")
     with pytest.raises(UserError, match="ZeroDivisionError"):
         make(f"{file}:env")
+
+
+def test_environments_known_by_name(monkeypatch):
+    register("my_points", lambda steps=5: PointEnv(steps))
+    assert make("my_points", steps=9).episode_steps == 9
+    points = metadata.EntryPoints(
+        [metadata.EntryPoint("theirs", "lunar_mjx.envs:PointEnv", registry.GROUP),
+         metadata.EntryPoint("broken", "no_such_module:env", registry.GROUP)]
+    )  # fmt: skip
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points.select(group=group))
+    assert make("theirs", episode_steps=7).episode_steps == 7
+    with pytest.raises(UserError, match=r"broken.*does not load.*ModuleNotFoundError"):
+        make("broken")
+    with pytest.raises(UserError, match="my_points, theirs"):
+        make("nowhere")
+    with pytest.raises(UserError, match="is taken"):
+        register("point", PointEnv)
+    with pytest.raises(UserError, match="no plain word"):
+        register("a.py:b", PointEnv)
 
 
 def test_refuses_unknown_names():
