@@ -11,7 +11,6 @@ from lunar_mjx.dynamics.structured import StructuredEngine
 from lunar_mjx.dynamics.suitability import UnsuitableError
 from lunar_mjx.rover import load_rover
 
-STATES = 100
 OPEN = ("luvmi_x", "three_legs", "six_legs", "mixed")
 
 
@@ -38,35 +37,61 @@ def _relative(a, b):
     return np.abs(a - b).max() / max(np.abs(b).max(), 1.0)
 
 
+LOOPED = ("viper", "lower", "coupler", "upper")
+
+
 @pytest.mark.parametrize("name", OPEN)
 def test_open_chains_equal_native_mujoco(name, tmp_path):
-    reference = Reference(_rover(name, tmp_path))
-    qpos, qvel, forces = reference.random(STATES)
+    _assert_equals_native(_rover(name, tmp_path), 100)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OPEN)
+def test_open_chains_equal_native_mujoco_from_a_thousand_states(name, tmp_path):
+    _assert_equals_native(_rover(name, tmp_path), 1000)
+
+
+def _assert_equals_native(rover, states):
+    """Poses, joints and velocities after one step, and where the wheels were."""
+    reference = Reference(rover)
+    qpos, qvel, forces = reference.random(states)
     seen, (new_qpos, new_qvel) = reference.step(qpos, qvel, forces)
-    for i in range(STATES):
+    new_qpos, new_qvel = np.asarray(new_qpos), np.asarray(new_qvel)
+    wheels = np.stack([np.asarray(c) for c in seen.wheel_position], axis=-1)
+    for i in range(states):
         q, v, places = reference.native(qpos[i], qvel[i], {k: f[i] for k, f in forces.items()})
-        assert _relative(np.asarray(new_qpos[i, :7]), q[:7]) < 1e-12  # position and orientation
-        assert _relative(np.asarray(new_qpos[i]), q) < 1e-12
-        assert _relative(np.asarray(new_qvel[i]), v) < 1e-12
-        assert _relative(np.stack([c[i] for c in seen.wheel_position], axis=-1), places) < 1e-12
+        assert _relative(new_qpos[i, :7], q[:7]) < 1e-12  # position and orientation
+        assert _relative(new_qpos[i], q) < 1e-12
+        assert _relative(new_qvel[i], v) < 1e-12
+        assert _relative(wheels[i], places) < 1e-12
 
 
-@pytest.mark.parametrize("name", ["viper", "lower", "coupler", "upper"])
+@pytest.mark.parametrize("name", LOOPED)
 def test_loops_equal_the_rigid_loop(name, tmp_path):
+    _assert_equals_rigid_loop(_rover(name, tmp_path), 20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LOOPED)
+def test_loops_equal_the_rigid_loop_from_a_thousand_states(name, tmp_path):
+    _assert_equals_rigid_loop(_rover(name, tmp_path), 1000)
+
+
+def _assert_equals_rigid_loop(rover, states):
     """Accelerations of the base and the independent joints, with implicit damping within the loop."""
-    reference = Reference(_rover(name, tmp_path))
+    reference = Reference(rover)
     reference.model.opt.jacobian = 0
     dt = reference.engine.timestep
-    qpos, qvel, forces = reference.random(20)
+    qpos, qvel, forces = reference.random(states)
     # short of the dead points of the general loops
     qpos[:, 7:] = np.clip(qpos[:, 7:], -0.15, 0.15)
     qpos, qvel = reference.closed(qpos, qvel)
-    _, (_, new_qvel) = reference.step(qpos, qvel, forces)
+    new_qvel = np.asarray(reference.step(qpos, qvel, forces)[1][1])
     free = np.r_[:6, [link.dof[i] for g in reference.engine.structure.groups for link in
                       (g.links[k] for k in g.free) for i in range(g.count)]]  # fmt: skip
-    for i in range(len(qpos)):
+    for i in range(states):
         exact = reference.hard_loop(qpos[i], qvel[i], {k: f[i] for k, f in forces.items()})
-        found = (np.asarray(new_qvel[i]) - qvel[i]) / dt
+        found = (new_qvel[i] - qvel[i]) / dt
         assert np.abs(found - exact)[free].max() < 1e-6 * np.abs(exact).max()
 
 
