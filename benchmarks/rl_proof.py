@@ -47,13 +47,14 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
     plan = [("17 numbers", 5, 65536), ("all observations", 50, 65536), ("17 numbers", 5, 1024),
             ("17 numbers", 5, 4096), ("17 numbers", 5, 16384), ("17 numbers", 50, 65536),
             ("all observations", 5, 65536), ("all observations", 50, 4096), ("17 numbers", 5, 262144)]  # fmt: skip
+    plan = [row for row in plan if args.rows is None or f"{row[0][:2]}/{row[1]}/{row[2]}" in args.rows]
     plan = [("17 numbers", 5, 8)] if args.tiny else plan
     made: dict[tuple[str, int], Any] = {}
     for label, decimation, _ in plan:
         options = {"decimation": decimation, "places": 2048, **(few if label == "17 numbers" else {}), **ground}
         if (label, decimation) not in made:
             made[label, decimation] = make_navigation("large", args.rover, **options)
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(8) as pool:
         waits = [pool.submit(Rate, made[label, decimation], size, 4 if args.tiny else max(20, 1000 // decimation))
                  for label, decimation, size in plan]  # fmt: skip
         ready = [w.result() for w in waits]
@@ -207,6 +208,7 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment")
     parser.add_argument("--training", default="paper-td3", help="of part paper-child")
+    parser.add_argument("--rows", nargs="*", help="of part rates, such as 17/5/65536 (numbers/decimation/rovers)")
     parser.add_argument("--variants", nargs="*", default=list(DEFAULT), choices=list(VARIANTS), help="of part paper")
     parser.add_argument("--together", type=int, default=1, help="seeds in one program of part paper-child")
     parser.add_argument("--core", type=int, help="CPU core of part paper-child")
