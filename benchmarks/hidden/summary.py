@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .judge import NAMES
+from .noise import NOISES
 
 Row = Mapping[str, Any]
 _Z = 1.959964
@@ -80,8 +81,12 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
         "held-out error over the floor": {
             "target": "median <= 1.01, 95th percentile <= 1.03",
             **_spread([r["over_floor"] for r in named], 0.5, 0.95)},
+        **{f"held-out error over the floor, {noise}": _spread(
+            [r["over_floor"] for r in named if r.get("noise") == noise], 0.5, 0.95) for noise in NOISES},
         "relative parameter error": {
             "target": "median <= 0.02, 90th percentile <= 0.10", **_spread([p["error"] for p in values], 0.5, 0.9)},
+        "the same, where the stated error is below a tenth": _spread(
+            [p["error"] for p in values if p["std"] < 0.1 * abs(p["value"])], 0.5, 0.9),
         "95 % interval covers": {"target": "0.93 to 0.97", **share(values, lambda p: p["covered"])},
         "seconds": _spread([r.get("seconds", 0.0) for r in rows], 0.5, 0.9),
         "crashes": share(rows, lambda r: r["verdict"] == "CRASH"),
