@@ -19,6 +19,7 @@ a machine: give each its own cores (`taskset`) and both the same `--lock`, which
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import os
@@ -40,6 +41,7 @@ from lunar_mjx.backends import NativeBackend
 from lunar_mjx.dynamics import build
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
+from lunar_mjx.report.style import BLUE, GREEN, INK, ORANGE, PURPLE, RULE, SKY, VERMILION
 
 ENGINES = ("pybullet", "native", "structured", "mjx", "bare", "spheres")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -184,29 +186,61 @@ def jax_rows(model: Model, options: argparse.Namespace, devices: list[Any], add:
             add("mjx, spheres, CPU" if on_cpu else "mjx, spheres", batch, workers, spheres(model, steps, batch))
 
 
-def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Rover-steps per second against the batch, one panel per rover."""
-    import matplotlib
+LOOKS = {"structured": (BLUE, "o"), "mjx": (VERMILION, "s"), "mjx, bare": (ORANGE, "^"), "mjx, spheres": (PURPLE, "v"),
+         "native, bare": (GREEN, "P"), "native, NumPy effects": (SKY, "X"), "pybullet": (INK, "D")}  # fmt: skip
+"""Colour and marker of every engine; hollow on a CPU where there is a row of a GPU, too."""
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Rover-steps per second against the batch, one panel per rover; every row is named beside its marker."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
     rovers = list(dict.fromkeys(r["rover"] for r in rows))
-    figure, axes = plt.subplots(1, len(rovers), figsize=(5.5 * len(rovers), 4.5), sharey=True, squeeze=False)
-    for ax, rover in zip(axes[0], rovers, strict=True):
+    figure = Figure(figsize=(6.2 * len(rovers), 5.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(rovers), sharey=True, squeeze=False)[0]
+    for axes, rover in zip(panels, rovers, strict=True):
         lines: dict[tuple[str, int], list[dict[str, Any]]] = {}
         for row in rows:
-            if row["rover"] == rover:
+            if row["rover"] == rover and row.get("finite", True):
                 lines.setdefault((row["engine"], row["workers"]), []).append(row)
-        for (engine, workers), own in lines.items():
-            ax.loglog([r["batch"] for r in own], [r["steps_per_s"] for r in own], "o-", label=f"{engine} x {workers}")
-        ax.set_title(rover)
-        ax.set_xlabel("rovers")
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
-    axes[0][0].set_ylabel("rover-steps per second")
-    figure.tight_layout()
+        for (engine, _), own in lines.items():
+            own.sort(key=lambda r: r["batch"])
+            colour, marker = LOOKS[engine.removesuffix(", CPU")]
+            hollow = engine.endswith(", CPU")
+            axes.loglog([r["batch"] for r in own], [r["steps_per_s"] for r in own], marker=marker, color=colour,
+                        linestyle=":" if hollow else "-", linewidth=1.1, markersize=6,
+                        markerfacecolor="white" if hollow else colour)  # fmt: skip
+        heights = _spread([own[-1]["steps_per_s"] for own in lines.values()])
+        for ((engine, workers), own), height in zip(lines.items(), heights, strict=True):
+            axes.text(1.5 * own[-1]["batch"], height, f"{engine}, {workers} {_unit(engine, workers)}", fontsize=7,
+                      color=INK, va="center")  # fmt: skip
+        axes.set_xlim(0.7, 3e6)
+        axes.set_title(rover, loc="left", fontsize=10)
+        axes.set_xlabel("rovers at once")
+        axes.grid(color=RULE, linewidth=0.6)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    panels[0].set_ylabel("rover-steps per second")
     figure.savefig(path, dpi=120)
+
+
+def _spread(values: list[float], least: float = 1.45) -> list[float]:
+    """The values, moved up until each is `least` times the one below: labels there do not overlap."""
+    out = list(values)
+    order = sorted(range(len(values)), key=values.__getitem__)
+    for below, i in itertools.pairwise(order):
+        out[i] = max(out[i], least * out[below])
+    return out
+
+
+def _unit(engine: str, workers: int) -> str:
+    """What the workers of a row are."""
+    if engine.endswith(", CPU"):
+        return "cores"
+    name = {"native, bare": "thread", "native, NumPy effects": "process", "pybullet": "process"}.get(engine, "GPU")
+    return name if workers == 1 else f"{name}es" if name.endswith("s") else f"{name}s"
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -215,9 +249,20 @@ def table(rows: list[dict[str, Any]]) -> str:
              "|---|---|---|---|---|---|---|---|"]  # fmt: skip
     for r in rows:
         compile_s, memory = (f"{r[k]:.1f}" if r.get(k) else "" for k in ("compile_s", "memory_MB"))
-        lines.append(f"| {r['rover']} | {r['engine']} | {r['batch']:,} | {r['workers']} | {r['steps_per_s']:,.0f} | "
+        workers, finite = f"{r['workers']} {_unit(r['engine'], r['workers'])}", r.get("finite", True)
+        lines.append(f"| {r['rover']} | {r['engine']} | {r['batch']:,} | {workers} | "
+                     f"{r['steps_per_s']:,.0f}{'' if finite else ' (not finite)'} | "
                      f"{1e6 / r['steps_per_s']:.3g} | {compile_s} | {memory} |")  # fmt: skip
     return "\n".join(lines)
+
+
+def merge(files: list[Path], out: Path) -> None:
+    """Puts runs side by side on one machine into one record, with its plot and table."""
+    parts = [json.loads(f.read_text()) for f in files]
+    rows = [row for part in parts for row in part["rows"]]
+    out.write_text(json.dumps({"about": [part["about"] for part in parts], "rows": rows}, indent=1) + "\n")
+    plot(rows, out.with_suffix(".png"))
+    out.with_suffix(".md").write_text(table(rows) + "\n")
 
 
 def main() -> None:
@@ -237,7 +282,11 @@ def main() -> None:
     parser.add_argument("--mjx-steps", type=int, default=10)
     parser.add_argument("--native-steps", type=int, default=200)
     parser.add_argument("--out", type=Path, help="JSON; the plot and the table lie beside it")
+    parser.add_argument("--merge", type=Path, nargs="+", help="JSON files of runs on one machine, put into one --out")
     options = parser.parse_args()
+    if options.merge:
+        merge(options.merge, options.out)
+        return
     options.engines = options.engines.split(",")
     for engine in options.engines:
         if engine not in ENGINES:
