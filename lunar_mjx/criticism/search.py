@@ -285,23 +285,27 @@ def _refit(
 
 
 def _scan(problem: Problem, parent: Candidate, places: Sequence[int], scored: Score | None) -> np.ndarray | None:
-    """(coordinates,) the parent with the best amount of a candidate, where that beats what its derivative promises.
+    """(coordinates,) where an amount of a candidate does better than its derivative at the parent promises.
 
     Derivatives at the null say little about effects that act in jumps: a delay moves a held command past the next
-    sample, or does nothing. For drives, and candidates of one amplitude.
+    sample, or does nothing. And a model that misfits may have gone to where no effect can help, so that the model as it
+    was given is a start, too. For drives; tables are fitted from several starts.
     """
-    if scored is None or problem.cheap_jacobian or len(places) != 1:
+    if scored is None or problem.cheap_jacobian:
         return None
-    low, high = problem.coordinates[places[0]].bounds()
-    amounts = np.array([a for a in (*_AMOUNTS, *-_AMOUNTS) if low < a < high])
-    rows = np.repeat(parent.fit.u[None], len(amounts), axis=0)
-    rows[:, places[0]] = amounts
-    goal = Objective(problem, problem.free(), parent.fit.fitted)
-    _, chi2 = goal.residuals(rows)
+    if len(places) == 1:
+        low, high = problem.coordinates[places[0]].bounds()
+        amounts = np.array([[a] for a in (*_AMOUNTS, *-_AMOUNTS) if low < a < high]).reshape(-1, 1)
+    else:
+        amounts = np.array([1.0, 0.3])[:, None] * np.clip(scored.amount, -3.0, 3.0)
+    given = problem.origin()
+    for e in parent.effects:
+        given[problem.candidates[e]] = parent.fit.u[problem.candidates[e]]
+    rows = np.repeat(np.stack([parent.fit.u, given]), len(amounts), axis=0)
+    rows[:, places] = np.tile(amounts, (2, 1))
+    _, chi2 = Objective(problem, problem.free(parent.effects), parent.fit.fitted).residuals(rows)
     best = int(np.argmin(chi2)) if len(chi2) else 0
-    if not len(chi2) or not parent.fit.chi2 - chi2[best] > scored.chi2:
-        return None
-    return rows[best]
+    return rows[best] if len(chi2) and parent.fit.chi2 - chi2[best] > scored.chi2 else None
 
 
 def _joined(problem: Problem, parent: Fit, free: np.ndarray, places: Sequence[int], columns: np.ndarray) -> np.ndarray:
