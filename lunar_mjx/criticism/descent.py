@@ -160,6 +160,99 @@ class Descent:
     promise: float
 
 
+@dataclasses.dataclass
+class _Walk:
+    """Where a descent is, and how it got on lately.
+
+    Attributes:
+      u, r, j, chi2: place, whitened residual, Jacobian, chi-square. damping: of the last step taken.
+      promise: drop of chi-square that a Gauss-Newton step promises. fresh: whether the Jacobian was taken here.
+      curved: whether steps are to be bent. slow: steps in a row that gained little. failed: rounds without a better
+        step. taken: steps.
+    """
+
+    goal: Objective
+    u: np.ndarray
+    r: np.ndarray
+    j: np.ndarray
+    chi2: float
+    damping: float = 1e-2
+    promise: float = np.inf
+    fresh: bool = True
+    curved: bool = False
+    slow: int = 0
+    failed: int = 0
+    taken: int = 0
+
+    @property
+    def dear(self) -> bool:
+        """Whether rows cost simulations."""
+        return not self.goal.problem.cheap_jacobian
+
+    @property
+    def enough(self) -> float:
+        """Drop of chi-square that does not matter where the model misfits."""
+        return 0.2 * slack_of(self.chi2, int(self.goal.fitted.sum())) if self.dear else 0.0
+
+    def refresh(self) -> None:
+        """Takes the Jacobian where the descent is."""
+        self.j, self.fresh = self.goal.jacobian(self.u), True
+
+    def hopeless(self, rival: float) -> bool:
+        """Whether it creeps, or falls far short of a rival."""
+        behind = self.taken >= _TRIED and self.fresh and self.dear and self.chi2 - _HOPE * self.promise > rival
+        return behind or self.slow >= _PATIENCE
+
+    def step(self, downhill: np.ndarray, hessian: np.ndarray) -> bool:
+        """Tries all dampings at once, and goes where chi-square is least; False where it is nowhere less."""
+        goal, dampings = self.goal, self.damping * _DAMPINGS
+        trials, probes = goal.steps(self.u, downhill, hessian, dampings), np.zeros((0, len(self.u)))
+        if self.curved:
+            bent, probes, ahead = goal.bent(self.u, self.r, self.j, hessian, trials, dampings)
+            trials = np.concatenate([trials, bent])
+        jacobians: np.ndarray | tuple = ()
+        if goal.problem.eager:
+            residuals, chi2, jacobians = goal.linearise(trials)
+        else:
+            residuals, chi2 = goal.residuals(trials)
+        if len(probes):
+            trials = np.concatenate([trials, probes])
+            residuals, chi2 = np.concatenate([residuals, ahead]), np.concatenate([chi2, goal.chi2(probes, ahead)])
+        k = int(np.argmin(chi2))
+        if not chi2[k] < self.chi2:
+            return False
+        self._take(trials[k], residuals[k], float(chi2[k]), jacobians[k] if k < len(jacobians) else None)
+        self.damping = float(np.clip(dampings[k % len(dampings)], 1e-4, 1e6))
+        return True
+
+    def _take(self, u: np.ndarray, r: np.ndarray, chi2: float, jacobian: np.ndarray | None) -> None:
+        # A model that misfits creeps along valleys that lead nowhere; what it gains there does not matter.
+        creep = max(self.enough, _CREEP) if self.dear else 0.0
+        self.slow = self.slow + 1 if self.chi2 - chi2 < creep else 0
+        kept = self.chi2 - chi2 > 0.5 * self.promise
+        self.curved, self.failed, self.taken = not kept, 0, self.taken + 1
+        moved, before = u[self.goal.free] - self.u[self.goal.free], self.r
+        self.u, self.r, self.chi2 = u, r, chi2
+        if jacobian is not None:
+            self.j = jacobian
+        elif self.dear and not self.goal.problem.eager and kept and np.isfinite(r).all():
+            self.j, self.fresh = _broyden(self.j, moved, before - r), False
+        else:
+            self.refresh()
+
+    def try_again(self) -> bool:
+        """After a failed step: a Jacobian of this place, then larger dampings; False where that is of no use."""
+        if not self.fresh:
+            self.refresh()
+            return True
+        self.failed += 1
+        # where rows are dear, two rounds from Gauss-Newton to steepest descent are enough
+        if self.damping > 1e8 or (self.failed > 1 and self.dear and self.damping >= 1.0):
+            return False
+        self.damping, self.curved = self.damping * 1e2, True
+        return True
+
+
 def descend(
     goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, rival: float = np.inf,
     known: tuple[np.ndarray, np.ndarray] | None = None,
@@ -173,77 +266,39 @@ def descend(
       goal: what is minimised. start: (coordinates,) where from. iterations: most steps. rival: chi-square to be caught.
       known: whitened residual (n,) and Jacobian (n, free) at the start, if they have been computed.
     """
+    walk = _begin(goal, start, known)
+    for _ in range(iterations):
+        if not np.isfinite(walk.chi2):
+            break
+        downhill, hessian = goal.quadratic(walk.u, walk.r, walk.j)
+        walk.promise = goal.promise(walk.u, downhill, hessian)
+        if walk.hopeless(rival):
+            break
+        if walk.promise < max(0.2 * SMALL_GRADIENT, walk.enough):
+            if walk.fresh:
+                break
+            walk.refresh()
+        elif not walk.step(downhill, hessian) and not walk.try_again():
+            break
+    if not walk.fresh:
+        walk.refresh()
+    if np.isfinite(walk.chi2):
+        walk.promise = goal.promise(walk.u, *goal.quadratic(walk.u, walk.r, walk.j))
+    return Descent(walk.u, walk.r, walk.j, walk.chi2, walk.promise)
+
+
+def _begin(goal: Objective, start: np.ndarray, known: tuple[np.ndarray, np.ndarray] | None) -> _Walk:
     u = start.copy()
     u[goal.free] = np.clip(u[goal.free], goal.low, goal.high)
-    lazy = not goal.problem.cheap_jacobian and not goal.problem.eager
     if known is not None:
-        r, j = known
-        best = float(goal.chi2(u[None], r[None])[0])
-    elif goal.problem.eager:
+        return _Walk(goal, u, *known, float(goal.chi2(u[None], known[0][None])[0]))
+    if goal.problem.eager:
         residuals, chi2, jacobians = goal.linearise(u[None])
-        r, best, j = residuals[0], float(chi2[0]), jacobians[0]
-    else:
-        residuals, chi2 = goal.residuals(u[None])
-        r, best = residuals[0], float(chi2[0])
-        j = goal.jacobian(u) if np.isfinite(best) else np.zeros((len(r), len(goal.free)))
-    damping, promise, fresh, curved, slow, failed, taken = 1e-2, np.inf, True, False, 0, 0, 0
-    for _ in range(iterations):
-        if not np.isfinite(best):
-            break
-        downhill, hessian = goal.quadratic(u, r, j)
-        promise = goal.promise(u, downhill, hessian)
-        enough = 0.0 if goal.problem.cheap_jacobian else 0.2 * slack_of(best, int(goal.fitted.sum()))
-        if taken >= _TRIED and fresh and not goal.problem.cheap_jacobian and best - _HOPE * promise > rival:
-            break
-        if slow >= _PATIENCE:
-            break
-        if promise < max(0.2 * SMALL_GRADIENT, enough):
-            if fresh:
-                break
-            j, fresh = goal.jacobian(u), True
-            continue
-        dampings = damping * _DAMPINGS
-        trials, probes, ahead = goal.steps(u, downhill, hessian, dampings), np.zeros((0, len(u))), r[:0]
-        if curved:
-            bent, probes, ahead = goal.bent(u, r, j, hessian, trials, dampings)
-            trials = np.concatenate([trials, bent])
-        if goal.problem.eager:
-            residuals, chi2, jacobians = goal.linearise(trials)
-        else:
-            residuals, chi2 = goal.residuals(trials)
-        if len(probes):
-            trials = np.concatenate([trials, probes])
-            residuals, chi2 = np.concatenate([residuals, ahead]), np.concatenate([chi2, goal.chi2(probes, ahead)])
-        k = int(np.argmin(chi2))
-        if not chi2[k] < best:
-            if not fresh:
-                j, fresh = goal.jacobian(u), True
-                continue
-            # where rows are dear, two rounds from Gauss-Newton to steepest descent are enough
-            failed += 1
-            if damping > 1e8 or (failed > 1 and not goal.problem.cheap_jacobian and damping >= 1.0):
-                break
-            damping, curved = damping * 1e2, True
-            continue
-        # A model that misfits creeps along valleys that lead nowhere; what it gains there does not matter.
-        creep = 0.0 if goal.problem.cheap_jacobian else max(enough, _CREEP)
-        slow = slow + 1 if best - float(chi2[k]) < creep else 0
-        kept, failed, taken = best - float(chi2[k]) > 0.5 * promise, 0, taken + 1
-        curved = not kept
-        step, before = trials[k][goal.free] - u[goal.free], r
-        u, r, best = trials[k], residuals[k], float(chi2[k])
-        damping = float(np.clip(dampings[k % len(dampings)], 1e-4, 1e6))
-        if goal.problem.eager and k < len(jacobians):
-            j = jacobians[k]
-        elif lazy and kept and np.isfinite(r).all():
-            j, fresh = _broyden(j, step, before - r), False
-        else:
-            j, fresh = goal.jacobian(u), True
-    if not fresh:
-        j = goal.jacobian(u)
-    if np.isfinite(best):
-        promise = goal.promise(u, *goal.quadratic(u, r, j))
-    return Descent(u, r, j, best, promise)
+        return _Walk(goal, u, residuals[0], jacobians[0], float(chi2[0]))
+    residuals, chi2 = goal.residuals(u[None])
+    finite = np.isfinite(chi2[0])
+    j = goal.jacobian(u) if finite else np.zeros((residuals.shape[1], len(goal.free)))
+    return _Walk(goal, u, residuals[0], j, float(chi2[0]))
 
 
 def _broyden(jacobian: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:

@@ -187,32 +187,38 @@ def fit(
     fitted = problem.observations.in_split(*splits)
     goal = Objective(problem, free, fitted)
     origin = problem.origin() if start is None else np.asarray(start, float)
-    progress("fitting", 0.0)
-    found = [descend(goal, origin, rival=rival, known=known)]
     others = _other_starts(problem, free, origin, starts - 1, seed, spread, goal)
-    ends: list[float] = []
-    if problem.cheap_jacobian:
-        for i, other in enumerate(others):
-            progress("fitting", (i + 1) / max(starts, 1))
-            found.append(descend(goal, other))
-    elif len(others) and not slack_of(found[0].chi2, int(fitted.sum())):
-        near = found[0].u[None] + 0.3 * (others - origin[None])
-        near[:, free] = np.clip(near[:, free], goal.low, goal.high)
-        ends = chase(goal, found[0], near)
-    found.sort(key=lambda d: d.chi2)
-    best = _with_own_nuisances(goal, found[0])
-    chi2s = tuple(sorted([d.chi2 for d in found] + ends))
+    lowest, chi2s = _descents(goal, origin, others, rival, known, progress)
+    best = _with_own_nuisances(goal, lowest)
     edge = _at_bound(problem, goal, best)
     extra = dict(problem.certificate(best.u, free)) if certify and np.isfinite(best.chi2) else {}
     count = int(fitted.sum())
     if certify and np.isfinite(best.chi2) and not problem.cheap_jacobian and best.promise > SMALL_GRADIENT:
-        extra["roughness_chi2"] = goal.roughness(found[0].u, found[0].residual, found[0].jacobian)
+        extra["roughness_chi2"] = goal.roughness(lowest.u, lowest.residual, lowest.jacobian)
     agreeing = sum(c <= best.chi2 + same_chi2(best.chi2, count) for c in chi2s)
     problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra, half_step)
     return Fit(
         u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual, jacobian=best.jacobian,
         fitted=fitted, gradient=best.promise, starts=chi2s, at_bound=edge, extra=extra, problems=problems,
     )  # fmt: skip
+
+
+def _descents(
+    goal: Objective, origin: np.ndarray, others: np.ndarray, rival: float,
+    known: tuple[np.ndarray, np.ndarray] | None, progress: Progress,
+) -> tuple[Descent, tuple[float, ...]]:  # fmt: skip
+    """The lowest descent, and the chi-square of every start; where rows are dear, other starts chase the first."""
+    progress("fitting", 0.0)
+    found, ends = [descend(goal, origin, rival=rival, known=known)], []
+    if goal.problem.cheap_jacobian:
+        for i, other in enumerate(others):
+            progress("fitting", (i + 1) / (len(others) + 1))
+            found.append(descend(goal, other))
+    elif len(others) and not slack_of(found[0].chi2, int(goal.fitted.sum())):
+        near = found[0].u[None] + 0.3 * (others - origin[None])
+        near[:, goal.free] = np.clip(near[:, goal.free], goal.low, goal.high)
+        ends = chase(goal, found[0], near)
+    return min(found, key=lambda d: d.chi2), tuple(sorted([d.chi2 for d in found] + ends))
 
 
 def _faults(
