@@ -15,8 +15,10 @@ from lunar_mjx.criticism.localise import pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
 
-_AMOUNTS = np.array([0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0])
+_AMOUNTS = np.array([0.1, 0.3, 1.0, 2.0, 3.0])
 """Amounts of a candidate, in terms of its nominal one, that are tried where derivatives may mislead."""
+_FAR = 4.0
+"""Chi-square per observation from which a model is so far from the data that derivatives may mislead."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -291,11 +293,12 @@ def _scan(problem: Problem, parent: Candidate, places: Sequence[int], scored: Sc
     sample, or does nothing. And a model that misfits may have gone to where no effect can help, so that the model as it
     was given is a start, too. For drives; tables are fitted from several starts.
     """
-    if scored is None or problem.cheap_jacobian:
+    if scored is None or problem.cheap_jacobian or parent.fit.chi2 < _FAR * parent.fit.fitted.sum():
         return None
     if len(places) == 1:
         low, high = problem.coordinates[places[0]].bounds()
-        amounts = np.array([[a] for a in (*_AMOUNTS, *-_AMOUNTS) if low < a < high]).reshape(-1, 1)
+        tried = np.sign(scored.amount[0]) * _AMOUNTS
+        amounts = tried[(tried > low) & (tried < high), None]
     else:
         amounts = np.array([1.0, 0.3])[:, None] * np.clip(scored.amount, -3.0, 3.0)
     given = problem.origin()
