@@ -83,20 +83,23 @@ def paper_child(args: argparse.Namespace) -> None:
     seeds = range(args.first_seed, args.first_seed + args.together)
     records: list[dict[str, Any]] = [
         {"seed": seed, "train": plain(dataclasses.asdict(training.train)), "environment": plain(options),
-         "episodes": {name: [] for name in (*EPISODE, "step")}} for seed in seeds
+         "episodes": {name: [] for name in (*EPISODE, "step")}, "critic": {"step": [], "target": [], "loss": []}}
+        for seed in seeds
     ]  # fmt: skip
     # all seeds in one program, each with everything of its own
     epoch: Any = jax.jit(jax.vmap(learner._epoch, in_axes=(None, 0)), donate_argnums=1)
     state = jax.jit(jax.vmap(learner._init))(jnp.stack([jax.random.PRNGKey(seed) for seed in seeds]))
     steps, saved = 0, time.monotonic()
     while steps < (200 if args.tiny else training.steps) and time.monotonic() - begin < args.seconds:
-        state, (_, found) = epoch(learner.env.params, state)
-        found = jax.device_get(found)
+        state, (numbers, found) = epoch(learner.env.params, state)
+        numbers, found = jax.device_get((numbers, found))
         for i, record in enumerate(records):
             episodes, ended = record["episodes"], np.flatnonzero(found["done"][i, 0])
             for name in EPISODE:
                 episodes[name] += found[name][i, 0, ended].astype(float).tolist()
             episodes["step"] += (steps + ended + 1.0).tolist()
+            for name, value in (("step", steps), ("target", numbers["target"][i]), ("loss", numbers["critic_loss"][i])):
+                record["critic"][name].append(float(value))
         steps += training.train.epoch_steps
         if time.monotonic() - saved > 10.0 or steps == training.train.epoch_steps:
             saved = time.monotonic()
