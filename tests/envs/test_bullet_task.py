@@ -1,0 +1,38 @@
+"""The task around another engine's physics, as the benchmark trains Stable-Baselines3 on PyBullet."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lunar_mjx.envs import make
+
+
+@pytest.mark.slow
+def test_pybullet_gives_the_same_observations_and_rewards(monkeypatch):
+    pytest.importorskip("pybullet")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    for name in ("JAX_PLATFORMS", "XLA_FLAGS"):  # the script sets them where they are not set
+        monkeypatch.setenv(name, "cpu" if name == "JAX_PLATFORMS" else "")
+    from rl_sb3 import BulletNavigation
+
+    options = {"task": "large", "randomise": (), "terrain": "flat", "goal_distance": (2.0, 4.0), "places": 64,
+               "episode_time": 1.0}  # fmt: skip
+    bullet, own = BulletNavigation(options), make("navigation", **options)
+    obs, _ = bullet.reset(seed=3)
+    state, step = bullet._state, jax.jit(own.step)
+    np.testing.assert_array_equal(obs, state.obs[0])
+    for k in range(10):
+        action = np.array([1.0, 0.5, 0.0, 0.1 * k, 0.0, 0.0], np.float32)
+        obs, reward, terminated, truncated, metrics = bullet.step(action)
+        state = step(own.params, state, jnp.asarray(action)[None])
+        np.testing.assert_allclose(obs, state.final_obs[0], atol=2e-3)
+        assert reward == pytest.approx(float(state.reward[0]), abs=2e-3)
+        assert truncated == (k == 9) and not terminated
+    assert metrics["episode_length"] == 10.0 and np.hypot(*obs[:2]) > 0.0
+    sys.modules.pop("rl_sb3")
