@@ -42,7 +42,7 @@ def diagnose(
         "seed": settings.seed, "alpha": settings.alpha,
         "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
     }  # fmt: skip
-    if base.fit.problems:
+    if base.fit.problems and not (chosen.effects and chosen.at_noise):
         reason = "; ".join(base.fit.problems)
         sentence = f"The baseline fit has no certificate ({reason}), so nothing is said about physics."
         return Diagnosis(Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details), found

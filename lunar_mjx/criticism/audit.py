@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar_mjx import __version__
 from lunar_mjx.criticism.attribute import diagnose
 from lunar_mjx.criticism.build_problem import build_problem
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
@@ -69,7 +70,7 @@ def audit(
         raise bad_input("why", "--audit", seconds, "is not a time", "give minutes above 0")
     run = folder if isinstance(folder, Run) else load_run(folder)
     settings = settings or Settings(seed=run.seed)
-    key = _key(run)
+    key = _key(run, settings)
     stored = run.load(AUDIT_FILE) or {}
     cases: list[dict[str, Any]] = list(stored.get("cases", [])) if stored.get("key") == key else []
     end = time.monotonic() + seconds
@@ -83,16 +84,17 @@ def audit(
         progress(f"auditing, case {len(cases) + 1}", min(1.0, (time.monotonic() - begun) / max(end - begun, 1e-9)))
         cases.append(_case(problem, base, sizes, len(cases), settings))
         found = _summary(cases)
-        run.save(AUDIT_FILE, {"key": key, **found.to_dict()})
+        run.save(AUDIT_FILE, {"key": key, "version": __version__, **found.to_dict()})
     return _summary(cases)
 
 
-def _key(run: Run) -> str:
-    """Of the model and the campaign that an audit belongs to."""
+def _key(run: Run, settings: Settings) -> str:
+    """Of the model and the campaign that an audit belongs to, and of the tool that was audited."""
     digest = hashlib.sha256((run.folder / MODEL_FILE).read_bytes())
     for log in run.logs:
         digest.update(folder_hash(log).encode())
     digest.update(repr((run.candidates, sorted(run.splits.items()), sorted(run.discrepancy.items()))).encode())
+    digest.update(repr((__version__, dataclasses.astuple(settings))).encode())
     return digest.hexdigest()
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lunar_mjx.criticism.descent import Objective
+from lunar_mjx.criticism.descent import Objective, slack_of
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
 from lunar_mjx.criticism.localise import pattern
@@ -110,11 +110,15 @@ def fit_baseline(problem: Problem, settings: Settings, memory: Memory, progress:
 def search(
     problem: Problem, settings: Settings = Settings(), progress: Progress = silent, memory: Memory | None = None
 ) -> Search:
-    """Fits the baseline, scores every candidate, refits the best and adds effects while they earn it."""
+    """Fits the baseline, scores every candidate, refits the best and adds effects while they earn it.
+
+    A baseline that passes for noise needs its certificate first: otherwise noise looks like physics. One far beyond the
+    noise may be where no descent converges; whether an effect brings it to the noise can be seen all the same.
+    """
     memory = memory or Memory()
     base_fit = fit_baseline(problem, settings, memory, progress)
     base = Candidate((), base_fit, noise_test(problem, base_fit), 0.0, 0.0)
-    if base_fit.problems:
+    if base_fit.problems and not slack_of(base_fit.chi2, int(base_fit.fitted.sum())):
         return Search(base, (), {}, (), base, ())
     progress("scoring", 0.0)
     scores = _scores(problem, base, settings)

@@ -94,6 +94,8 @@ def test_the_loop_names_the_hidden_effect_and_the_error_falls(run, logs, work):
     assert page.status == 0, page.err
     text = (work / "report.html").read_text()
     assert "slip_sinkage" in text
+    for part in ("Click a field", "averaged in bins", "Shapes of missing effects", "noise floor"):
+        assert part in text, part
     assert len(text) < 5e6
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from lunar_mjx.criticism.report import figures, tables
+from lunar_mjx import __version__
+from lunar_mjx.criticism.report import explore, figures, tables
 from lunar_mjx.criticism.report.read import Result, read_result
 from lunar_mjx.criticism.report.steps import Step, ceiling, chain, comparable, error, judged
 from lunar_mjx.criticism.report.words import and_list, shown
@@ -37,7 +38,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
     if steps:
         sections += [_error_section(steps, results), _where(judge)]
     if judge.verdict:
-        sections.append(_why(judge))
+        sections.append(_why(judge, results))
     sections.append(Section("Parameters", tables.parameters(results[0], results[-1])))
     sections.append(Section("Provenance", tables.provenance(results)))
     logs = list(dict.fromkeys(Path(p).name for p in results[-1].run.get("logs") or []))
@@ -64,9 +65,10 @@ def _verdict(results: Sequence[Result], judge: Result, steps: Sequence[Step]) ->
 
 
 def _audit_line(result: Result) -> str:
-    sentence = (result.audit or {}).get("sentence")
-    if sentence:
-        return str(sentence)
+    audit = result.audit or {}
+    if audit.get("sentence"):
+        older = audit.get("version", __version__) != __version__
+        return str(audit["sentence"]) + (f" (Measured with version {audit['version']}.)" if older else "")
     return (f"How often this tool is wrong on logs like these has not been measured; lunar-mjx why {result.name} "
             "--audit 30 measures it in 30 minutes.")  # fmt: skip
 
@@ -95,7 +97,7 @@ def _error_section(steps: Sequence[Step], results: Sequence[Result]) -> Section:
 
 
 def _where(judge: Result) -> Section:
-    blocks: list[Block] = [*tables.by_channel(judge)]
+    blocks: list[Block] = [*explore.panels(judge), *tables.by_channel(judge), *explore.dependence(judge)]
     verdict = judge.verdict or {}
     ports = verdict.get("ports") or {}
     if ports:
@@ -112,7 +114,7 @@ def _where(judge: Result) -> Section:
     return Section("Where it fails", blocks)
 
 
-def _why(judge: Result) -> Section:
+def _why(judge: Result, results: Sequence[Result]) -> Section:
     blocks = tables.effects(judge)
     table = (judge.verdict or {}).get("isolability") or {}
     if len(table) > 1:
@@ -121,4 +123,6 @@ def _why(judge: Result) -> Section:
             "the two effects apart."
         )
         blocks.append(Figure(figures.isolability(table), caption))
+    named = next((r for r in reversed(results) if (r.verdict or {}).get("effects")), judge)
+    blocks += explore.gallery(named)
     return Section("Why: the evidence for every effect", blocks)
