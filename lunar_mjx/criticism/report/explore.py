@@ -19,7 +19,9 @@ from lunar_mjx.report.style import BLUE, INK, MEASURED, MUTED, ORANGE, SERIES, f
 _MOST_VALUES = 250_000
 """Numbers in the panels of one page; longer series are thinned."""
 _BINS, _LEAST = 16, 8
-"""Bins of a covariate; observations that make a bin, or a shape worth showing."""
+"""Bins of a covariate; observations that make a bin."""
+_FEW = 4
+"""Observations that make a shape."""
 _LINES = 5
 """Channels drawn over a covariate."""
 _SHAPES = 6
@@ -252,6 +254,6 @@ def _binned(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float], lis
 
 def _largest(o: Observations, shape: np.ndarray) -> tuple[str, int, np.ndarray] | None:
     """Channel, manoeuvre and observations where a shape has most of its length."""
-    cells = [(c, u, at) for c, u, at in _cells(o) if len(at) >= _LEAST]
+    cells = [(c, u, at) for c, u, at in _cells(o) if len(at) >= _FEW]
     best = max(cells, key=lambda cell: float(np.sum(shape[cell[2]] ** 2)), default=None)
     return best if best is not None and np.any(shape[best[2]]) else None
