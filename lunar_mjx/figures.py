@@ -92,7 +92,8 @@ def figure_5() -> tuple[Figure, dict]:
             label = "hard" if hard else f"soft, softer to the {'left' if run.side > 0 else 'right'}"
             if hard and run.side < 0:
                 continue
-            axes.plot(run.x - run.x[0], run.y - run.y[0], color=colour, linestyle="--" if hard else "-", label=label)
+            line = "--" if hard else ("-" if run.side > 0 else "-.")
+            axes.plot(run.x - run.x[0], run.y - run.y[0], color=colour, linestyle=line, label=label)
         _style(axes, "x, m", "y (left), m", f"preset {preset}")
         axes.legend(frameon=False, fontsize=8)
         ends = {(r.ground, r.side): r.y[-1] - r.y[0] for r in runs}

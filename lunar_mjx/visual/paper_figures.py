@@ -79,7 +79,7 @@ def figure_2() -> tuple[Figure, dict[str, Any]]:
         axes.add_patch(FancyArrowPatch(tail, head, arrowstyle="-|>", mutation_scale=12, color=INK))
     axes.add_patch(FancyArrowPatch((3.3 + wide / 2, -0.06), (wide / 2, -0.06), connectionstyle="arc3,rad=-0.16",
                                    arrowstyle="-|>", mutation_scale=12, color=ORANGE, linestyle="--"))  # fmt: skip
-    axes.text(1.1 * 1.85, -0.72, "the effect that was missing", ha="center", fontsize=8, color=ORANGE)
+    axes.text(1.1 * 1.85, -0.5, "the effect that was missing", ha="center", fontsize=8, color=INK)
     axes.set_xlim(-0.1, 4.2)
     axes.set_ylim(-0.85, 2.75)
     axes.axis("off")
@@ -113,7 +113,7 @@ def figure_4() -> tuple[Figure, dict[str, Any]]:
     surface.plot_surface(
         x, y, part, facecolors=grey, rcount=160, ccount=160, linewidth=0, antialiased=False, shade=False
     )
-    surface.zaxis.set_major_locator(MaxNLocator(3))
+    surface.zaxis.set_major_locator(MaxNLocator(2))  # flat at its true scale
     surface.set_box_aspect((1, 1, max(0.01, float(np.ptp(part)) / (extent[1] - extent[0]))))
     surface.set(xlabel="east, m", ylabel="north, m", zlabel="height, m")
     surface.set_title("(d) its surface, true to scale", loc="left", fontsize=10)
