@@ -1,8 +1,8 @@
 """The MJX engine: one physics step from MJX's public stages, for any rover; the reference for other engines.
 
-Contacts are off and the constraints are equalities only, so the solver's problem is quadratic, and is solved at once.
-Matrix products keep all bits of float32: a GPU would else shorten them to ten, and a stiff loop's curvature would
-no longer be positive definite. Kinematics run once per step and are fresh when the effects read them.
+Contacts are off and the solver sees equality constraints only, so its problem is quadratic and one Newton iteration
+is exact. Matrix products keep all bits of float32, of which a GPU would else drop half. Kinematics run once per step and
+are fresh when the effects read them.
 """
 
 # MuJoCo ships no type stubs for its compiled module.
@@ -106,7 +106,7 @@ class MjxEngine:
         d = mjx.fwd_velocity(m, d)
         d = self._apply(m, d, forces)
         d = mjx.fwd_acceleration(m, mjx.fwd_actuation(m, d))
-        d = d.replace(qacc=d.qacc_smooth) if m.neq == 0 else solve_equalities(m, d)
+        d = d.replace(qacc=d.qacc_smooth) if m.neq == 0 else mjx.solve(m, d)
         d = mjx.euler(m, d)
         return d.qpos, d.qvel
 
@@ -151,22 +151,6 @@ class MjxEngine:
         return d.replace(xfrc_applied=xfrc, qfrc_applied=qfrc)
 
 
-def solve_equalities(m: mjx.Model, d: mjx.Data) -> mjx.Data:
-    """MuJoCo's constraint problem where all constraints are equalities, min (a - a0)'M(a - a0) + (Ja - b)'D(Ja - b).
-
-    It is quadratic, so (M + J'DJ)(a - a0) = J'D(b - J a0) is its solution; `mjx.solve` takes a line search to it.
-    """
-    internal: Any = d._impl
-    jacobian, weight = internal.efc_J, internal.efc_D
-    short = internal.efc_aref - jacobian @ d.qacc_smooth
-    weighed = jnp.sqrt(weight)[:, None] * jacobian  # its square cannot have a negative curvature
-    factor = jax.scipy.linalg.cho_factor(mjx.full_m(m, d) + weighed.T @ weighed)
-    change = jax.scipy.linalg.cho_solve(factor, jacobian.T @ (weight * short))
-    force = weight * (short - jacobian @ change)
-    d = d.replace(qacc=d.qacc_smooth + change, qfrc_constraint=jacobian.T @ force)
-    return d.tree_replace({"_impl.efc_force": force})  # type: ignore[return-value]
-
-
 def _with_gravity(m: mjx.Model, gravity: Any) -> mjx.Model:
     zero = jnp.zeros_like(gravity)
     return m.replace(opt=m.opt.replace(gravity=jnp.stack([zero, zero, -gravity])))
@@ -186,7 +170,7 @@ def _point_inertia(mass: Any, r: Any) -> Any:
 
 
 def _check_options(model: mujoco.MjModel, rover: Rover) -> None:
-    """Refuses models whose constraints are more than equalities."""
+    """Refuses models for which one Newton iteration would not be exact."""
     disabled = model.opt.disableflags
     problems = []
     if not disabled & mujoco.mjtDisableBit.mjDSBL_CONTACT:
