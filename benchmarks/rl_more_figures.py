@@ -37,12 +37,13 @@ def first_good(run: dict[str, Any], share: float = 0.9) -> int | None:
 def plot_paper(record: dict[str, Any], path: Path) -> None:
     """Return by episode on the axes of the paper's Fig. 6 (above) and success (below), a column per variant."""
     groups = variants(record)
-    figure, above = new_figure(len(groups), 3.4, 5.2)
+    figure, above = new_figure(len(groups), 2.7, 5.0)
     for axes in above:
         axes.remove()
     rows = figure.subplots(2, len(groups), sharex="col", squeeze=False)
     for column, (variant, algorithms) in enumerate(groups.items()):
-        for i, (name, runs) in enumerate(algorithms.items()):
+        for name, runs in algorithms.items():
+            i = int(name == "DDPG")
             for axes, quantity, factor in ((rows[0][column], "episode_return", 1.0), (rows[1][column], "success", 100)):
                 curves = [factor * moving_mean(r["episodes"][quantity]) for r in runs]
                 count = min(len(c) for c in curves)
@@ -51,7 +52,7 @@ def plot_paper(record: dict[str, Any], path: Path) -> None:
                 label = f"{name}, {len(runs)} seed{'s' if len(runs) > 1 else ''}"
                 axes.plot(x, mean, "-" if i == 0 else "--", color=f"C{i}", label=label)
                 axes.fill_between(x, low, high, color=f"C{i}", alpha=0.2, lw=0)
-        rows[0][column].set(title=variant)
+        rows[0][column].set_title(variant, fontsize=9)
         rows[1][column].set(xlabel="episode", ylim=(-3, 103))
         rows[0][column].legend(frameon=False, fontsize=7)
     rows[0][0].set(ylabel="average return per episode")
