@@ -227,8 +227,13 @@ def _refit_all(
     only as far as they may still rival it.
     """
 
+    scans = _scans(problem, parent, new)
+    new = sorted(new, key=lambda s: scans[s.effect][0] if s.effect in scans else parent.fit.chi2 - s.chi2)
+
     def one(s: Score, rival: float = np.inf) -> Candidate:
-        return _refit(problem, parent, (*parent.effects, s.effect), s, memory, rival)
+        chi2, start = scans.get(s.effect, (np.inf, None))
+        better = chi2 < parent.fit.chi2 - s.chi2
+        return _refit(problem, parent, (*parent.effects, s.effect), s, memory, rival, start if better else None)
 
     if not problem.eager or len(new) < 2:
         grown: list[Candidate] = []
@@ -251,37 +256,37 @@ def _refit_all(
 
 def _refit(
     problem: Problem, parent: Candidate, effects: tuple[str, ...], scored: Score | None, memory: Memory,
-    rival: float = np.inf,
+    rival: float = np.inf, start: np.ndarray | None = None,
 ) -> Candidate:  # fmt: skip
-    """Refits from the parent with the new effect at its linear estimate, and from a third of it where that fails."""
+    """Refits from a start; without one from the parent with the new effect at its linear estimate, and from a third of
+    it where that fails."""
     free = problem.free(effects)
     found = memory.recall(problem, effects)
     if found is not None:
         value, se = gain(problem, parent.fit, found)
         return Candidate(effects, found, noise_test(problem, found), value, se)
     places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
-    scanned = _scan(problem, parent, places, scored)
-    if scanned is not None:
-        found = fit(problem, free, scanned, starts=1, certify=False, rival=rival)
+    if start is not None:
+        found = fit(problem, free, start, starts=1, certify=False, rival=rival)
     elif scored is not None and scored.columns is not None and not problem.cheap_jacobian:
         # The score has taken all derivatives at the parent's fit: the first step costs nothing.
         known = parent.fit.residual, _joined(problem, parent.fit, free, places, scored.columns)
         found = fit(problem, free, parent.fit.u, starts=1, certify=False, rival=rival, known=known)
     else:
         for share in (1.0, 0.3) if scored is not None else (0.0,):
-            start = parent.fit.u.copy()
+            near = parent.fit.u.copy()
             if scored is not None:
-                start[places] += share * np.clip(scored.amount, -3.0, 3.0)
-            trial = fit(problem, free, start, starts=1, certify=False, rival=rival)
+                near[places] += share * np.clip(scored.amount, -3.0, 3.0)
+            trial = fit(problem, free, near, starts=1, certify=False, rival=rival)
             if found is None or trial.chi2 < found.chi2:
                 found = trial
             if found.chi2 < parent.fit.chi2 and share != 1.0:
                 break
     if scored is not None and problem.cheap_jacobian:
         # A baseline that misfits may have gone far along a valley, from where the way back is long.
-        start = problem.origin()
-        start[places] += np.clip(scored.amount, -1.0, 1.0)
-        trial = fit(problem, free, start, starts=1, certify=False)
+        given = problem.origin()
+        given[places] += np.clip(scored.amount, -1.0, 1.0)
+        trial = fit(problem, free, given, starts=1, certify=False)
         if found is None or trial.chi2 < found.chi2:
             found = trial
     assert found is not None
@@ -290,29 +295,43 @@ def _refit(
     return Candidate(effects, found, noise_test(problem, found), value, se)
 
 
-def _scan(problem: Problem, parent: Candidate, places: Sequence[int], scored: Score | None) -> np.ndarray | None:
-    """(coordinates,) where an amount of a candidate does better than its derivative at the parent promises.
+def _scans(problem: Problem, parent: Candidate, new: Sequence[Score]) -> dict[str, tuple[float, np.ndarray]]:
+    """For each candidate the least chi-square (and where) that an amount of it reaches without any refit, all at once.
 
     Derivatives at the null say little about effects that act in jumps: a delay moves a held command past the next
     sample, or does nothing. And a model that misfits may have gone to where no effect can help, so that the model as it
-    was given is a start, too. For drives; tables are fitted from several starts.
+    was given is a start, too. For drives far from their data; tables are fitted from several starts.
     """
-    if scored is None or problem.cheap_jacobian or parent.fit.chi2 < _FAR * parent.fit.fitted.sum():
-        return None
-    if len(places) == 1:
-        low, high = problem.coordinates[places[0]].bounds()
-        tried = np.sign(scored.amount[0]) * _AMOUNTS
-        amounts = tried[(tried > low) & (tried < high), None]
-    else:
-        amounts = np.array([1.0, 0.3])[:, None] * np.clip(scored.amount, -3.0, 3.0)
+    if problem.cheap_jacobian or parent.fit.chi2 < _FAR * parent.fit.fitted.sum():
+        return {}
     given = problem.origin()
     for e in parent.effects:
         given[problem.candidates[e]] = parent.fit.u[problem.candidates[e]]
-    rows = np.repeat(np.stack([parent.fit.u, given]), len(amounts), axis=0)
-    rows[:, places] = np.tile(amounts, (2, 1))
-    _, chi2 = Objective(problem, problem.free(parent.effects), parent.fit.fitted).residuals(rows)
-    best = int(np.argmin(chi2)) if len(chi2) else 0
-    return rows[best] if len(chi2) and parent.fit.chi2 - chi2[best] > scored.chi2 else None
+    rows, owner = [], []
+    for s in new:
+        places = [i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude]
+        for start in (parent.fit.u, given):
+            for amount in _amounts(problem, places, s):
+                rows.append(start.copy())
+                rows[-1][places] = amount
+                owner.append(s.effect)
+    if not rows:
+        return {}
+    _, chi2 = Objective(problem, problem.free(parent.effects), parent.fit.fitted).residuals(np.array(rows))
+    best: dict[str, tuple[float, np.ndarray]] = {}
+    for effect, row, value in zip(owner, rows, chi2, strict=True):
+        if effect not in best or value < best[effect][0]:
+            best[effect] = float(value), row
+    return best
+
+
+def _amounts(problem: Problem, places: Sequence[int], s: Score) -> np.ndarray:
+    """(k, amplitudes) amounts to try: shares of the linear one; for one amplitude, multiples of its nominal size."""
+    if len(places) != 1:
+        return np.array([1.0, 0.3])[:, None] * np.clip(s.amount, -3.0, 3.0)
+    low, high = problem.coordinates[places[0]].bounds()
+    tried = np.sign(s.amount[0]) * _AMOUNTS
+    return tried[(tried > low) & (tried < high), None]
 
 
 def _joined(problem: Problem, parent: Fit, free: np.ndarray, places: Sequence[int], columns: np.ndarray) -> np.ndarray:
