@@ -1,0 +1,52 @@
+"""Amounts tried at once: only far from the data, and for the delay whose derivative at zero says nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from toy_problem import Linear, manoeuvres
+
+from lunar_mjx.criticism.fitting import fit
+from lunar_mjx.criticism.scan import scan
+from lunar_mjx.criticism.score import Score
+
+TIME = np.arange(400) * 0.01
+
+
+class Late(Linear):
+    """A ramped square wave, late by the effect's amount in tens of samples; whole samples only."""
+
+    cheap_jacobian = False
+
+    def predict(self, u):
+        u = np.atleast_2d(u)
+        shift = np.round(10.0 * u[:, 1:]).astype(int)
+        wave = 100.0 * np.clip(5.0 * np.sin(2.0 * TIME), -1.0, 1.0)
+        return u[:, :1] + wave[np.clip(np.arange(400)[None] - shift, 0, 399)]
+
+
+def problem(delay: float, noise: float = 1.0) -> Late:
+    rng = np.random.default_rng(0)
+    empty = manoeuvres(4, 100)
+    late = Late(np.ones((400, 1)), {"delay": np.zeros(400)}, empty)
+    value = late.predict(np.array([0.0, delay]))[0] + noise * rng.standard_normal(400)
+    late.observations = dataclasses.replace(empty, value=value)
+    return late
+
+
+def faint(sign: float) -> Score:
+    return Score("delay", np.zeros((400, 1)), 10.0, 1.0, np.array([sign * 1e-3]), 5.0, 3.0)
+
+
+def test_the_best_amount_is_found_where_the_derivative_is_silent():
+    late = problem(2.0)
+    base = fit(late, late.free(), starts=1, certify=False)
+    chi2, place = scan(late, base, (), [faint(1.0)])["delay"]
+    assert place[1] == 2.0 and chi2 < 0.01 * base.chi2
+
+
+def test_near_the_data_derivatives_are_trusted():
+    late = problem(0.0)
+    base = fit(late, late.free(), starts=1, certify=False)
+    assert scan(late, base, (), [faint(1.0)]) == {}
