@@ -1,8 +1,8 @@
 """The MJX engine: one physics step from MJX's public stages, for any rover; the reference for other engines.
 
 Contacts are off and the solver sees equality constraints only, so its problem is quadratic and one Newton iteration
-is exact. Matrix products keep all bits of float32, of which a GPU would else drop half. Kinematics run once per step
-and are fresh when the effects read them.
+is exact. Matrix products keep all bits of float32, on GPUs with TF32 too. Kinematics run once per step and are fresh
+when the effects read them.
 """
 
 # MuJoCo ships no type stubs for its compiled module.
