@@ -17,6 +17,7 @@ from lunar_mjx._quiet import without_warp_notices
 from lunar_mjx.agents.networks import make_actor, make_critics
 from lunar_mjx.agents.replay import Batch
 from lunar_mjx.agents.td3 import polyak
+from lunar_mjx.errors import bad_input
 from lunar_mjx.pytree import pytree
 
 with without_warp_notices():
@@ -39,6 +40,9 @@ class DDPGConfig:
       tau: share of the new parameters in the targets, per update.
       n_step: steps of a transition.
       reward_scale: factor on rewards before learning.
+      value_range: least and greatest return that the task can pay, after reward scaling; targets are clipped to it, as
+        in DDPG with hindsight replay (Andrychowicz et al. 2017, appendix A). One critic whose policy looks for its
+        errors overestimates without end otherwise.
     """
 
     actor_layers: tuple[int, ...] = (400, 300)
@@ -52,6 +56,13 @@ class DDPGConfig:
     tau: float = 0.005
     n_step: int = 1
     reward_scale: float = 1.0
+    value_range: tuple[float, float] = (-1e9, 1e9)
+
+    def __post_init__(self) -> None:
+        if self.n_step < 1:
+            raise bad_input("DDPGConfig", "n_step", self.n_step, "is below 1", "give at least 1")
+        if not self.value_range[0] < self.value_range[1]:
+            raise bad_input("DDPGConfig", "value_range", self.value_range, "is empty", "give the least return first")
 
 
 TUNED = DDPGConfig(
@@ -129,10 +140,10 @@ class DDPG:
         return new, {"critic_loss": critic_loss, "actor_loss": actor_loss, "target": jnp.mean(target)}
 
     def targets(self, state: DDPGState, batch: Batch) -> Any:
-        """r + discount Q'(s', pi'(s')), (batch,)."""
+        """r + discount Q'(s', pi'(s')) within `value_range`, (batch,)."""
         action = self.act(state.actor_target, batch.next_obs)
         value = self._value(state.critic_target, batch.next_obs, batch.next_privileged, action)
-        return self.config.reward_scale * batch.reward + batch.discount * value
+        return jnp.clip(self.config.reward_scale * batch.reward + batch.discount * value, *self.config.value_range)
 
     def critic_loss(self, critic: Any, batch: Batch, target: Any) -> Any:
         """Mean squared error."""

@@ -10,6 +10,7 @@ import pytest
 from lunar_mjx.agents.ddpg import DDPG, DDPGConfig
 from lunar_mjx.agents.replay import Batch
 from lunar_mjx.agents.td3 import TD3, TD3Config, project
+from lunar_mjx.errors import UserError
 
 RATE, TAU = 1e-2, 0.1
 
@@ -81,6 +82,17 @@ def test_ddpg(batch):
         for found, before, wanted in zip(linear(new.actor_target), hand.actor, actor, strict=True):
             np.testing.assert_allclose(found, 0.9 * before + 0.1 * wanted, **close)
         np.testing.assert_allclose(linear(new.critic_target)[0][0], 0.9 * hand.critic[0][0] + 0.1 * kernel, **close)
+
+
+def test_ddpg_clips_targets_to_what_the_task_can_pay(batch):
+    free = DDPG(DDPGConfig((), ()), 2, 1, 1)
+    state, b = free.init(jax.random.PRNGKey(0)), jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), batch)
+    targets = np.asarray(free.targets(state, b))
+    low, high = np.sort(targets)[[0, -1]] + [0.1, -0.1]
+    bounded = DDPG(DDPGConfig((), (), value_range=(low, high)), 2, 1, 1)
+    np.testing.assert_allclose(bounded.targets(state, b), np.clip(targets, low, high), rtol=1e-6)
+    with pytest.raises(UserError, match="value_range"):
+        DDPGConfig(value_range=(1.0, 1.0))
 
 
 def test_td3_takes_the_least_target_and_waits_with_the_policy(batch):
