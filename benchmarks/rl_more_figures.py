@@ -12,6 +12,8 @@ from lunar_mjx.agents.curves import mean_interval, moving_mean, new_figure
 
 LAST = 50
 """Episodes that a training is judged by at its end."""
+DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
+"""Variants of the paper's task that the figure shows; the table has all."""
 
 
 def percent(score: dict[str, Any]) -> str:
@@ -36,7 +38,7 @@ def first_good(run: dict[str, Any], share: float = 0.9) -> int | None:
 
 def plot_paper(record: dict[str, Any], path: Path) -> None:
     """Return by episode on the axes of the paper's Fig. 6 (above) and success (below), a column per variant."""
-    groups = variants(record)
+    groups = {v: found for v, found in variants(record).items() if v in DRAWN or v == record["variant"]}
     figure, above = new_figure(len(groups), 2.7, 5.0)
     for axes in above:
         axes.remove()

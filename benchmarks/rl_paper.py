@@ -24,15 +24,22 @@ VARIANTS: dict[str, tuple[int, dict[str, Any], dict[str, Any], tuple[str, ...]]]
     "scaled, slow actor": (4, _SIGNED, {"reward_scale": 0.01, "actor_rate": 1e-4}, TRAININGS[1:]),
     "scaled, layer norm, 3 steps": (4, _SIGNED, {"reward_scale": 0.01, "layer_norm": True, "n_step": 3},
                                     TRAININGS[1:]),
+    "steady": (5, _SIGNED, {"gamma": 0.95, "reward_scale": 0.01, "layer_norm": True, "n_step": 3, "actor_rate": 3e-4,
+                            "actor_layers": (256, 128), "critic_layers": (256, 128), "batch": 128,
+                            "value_range": (-7.0, 6.2)}, TRAININGS),
     "ahead": (4, {**_SIGNED, "start_yaw": 0.5}, {}, TRAININGS[1:]),
 }  # fmt: skip
 """Seeds, options of the environment, settings of the training, and the algorithms. `signed`: progress with its sign,
 one predefined start and destination as in section V, acted on at 5 Hz. `printed`: the reward as printed, likewise, at
 the task's 10 Hz; at 5 Hz and a discount of 0.99 driving on for ever would be worth more than arriving. `drawn`: start
 and destination drawn for every episode. The others are `signed` with settings that might help: rewards scaled, a slower
-actor, layer norm with returns of three steps, and a start that faces the destination within 0.5 rad."""
+actor, layer norm with returns of three steps, and a start that faces the destination within 0.5 rad. `steady`: a lone
+critic's errors pile up as 1 / (1 - discount); progress pays at every step, so that a horizon of 20 steps (4 s) will do,
+and targets stay below what arriving at once pays."""
 DEFAULT = ("signed", "printed", "drawn")
 MAIN = "signed"
+JUDGED_EVERY, JUDGED = 2500, 24
+"""Steps between scores of the policy without noise, and their episodes."""
 
 
 def paper_start(args: argparse.Namespace, seconds: float) -> list[dict[str, Any]]:
@@ -83,12 +90,14 @@ def paper_child(args: argparse.Namespace) -> None:
     seeds = range(args.first_seed, args.first_seed + args.together)
     records: list[dict[str, Any]] = [
         {"seed": seed, "train": plain(dataclasses.asdict(training.train)), "environment": plain(options),
-         "episodes": {name: [] for name in (*EPISODE, "step")}, "critic": {"step": [], "target": [], "loss": []}}
+         "episodes": {name: [] for name in (*EPISODE, "step")}, "critic": {"step": [], "target": [], "loss": []},
+         "without_noise": {"step": [], "success": []}}
         for seed in seeds
     ]  # fmt: skip
     # all seeds in one program, each with everything of its own
     epoch: Any = jax.jit(jax.vmap(learner._epoch, in_axes=(None, 0)), donate_argnums=1)
     state = jax.jit(jax.vmap(learner._init))(jnp.stack([jax.random.PRNGKey(seed) for seed in seeds]))
+    judge, judged_every = judge_of(learner), 100 if args.tiny else JUDGED_EVERY
     steps, saved = 0, time.monotonic()
     while steps < (200 if args.tiny else training.steps) and time.monotonic() - begin < args.seconds:
         state, (numbers, found) = epoch(learner.env.params, state)
@@ -101,10 +110,42 @@ def paper_child(args: argparse.Namespace) -> None:
             for name, value in (("step", steps), ("target", numbers["target"][i]), ("loss", numbers["critic_loss"][i])):
                 record["critic"][name].append(float(value))
         steps += training.train.epoch_steps
+        if steps % judged_every == 0:
+            shares = jax.device_get(judge(learner.env.params, state.agent.actor, state.statistics))
+            for record, share in zip(records, shares, strict=True):
+                record["without_noise"]["step"].append(steps)
+                record["without_noise"]["success"].append(float(share))
         if time.monotonic() - saved > 10.0 or steps == training.train.epoch_steps:
             saved = time.monotonic()
             keep(args.out / "record.json", records, steps, saved - begin)
     keep(args.out / "record.json", records, steps, time.monotonic() - begin)
+
+
+def judge_of(learner: Any) -> Any:
+    """A function of the environment's parameters, actors and statistics (leading axis: seed) to shares of successes."""
+    import jax
+    import jax.numpy as jnp
+
+    from lunar_mjx.agents.learner import normalised
+    from lunar_mjx.envs import split_keys
+
+    env = learner.env
+
+    def one(params: Any, actor: Any, statistics: Any) -> Any:
+        def step(carry: Any, _: Any) -> Any:
+            state, over, won = carry
+            obs = state.obs
+            if learner.config.normalise:
+                obs = normalised(obs, statistics.mean["obs"], statistics.std["obs"])
+            state = env.step(params, state, learner.agent.act(actor, obs))
+            won = won | (state.done & ~over & (state.metrics["success"] > 0.0))
+            return (state, over | state.done, won), None
+
+        no = jnp.zeros(JUDGED, bool)
+        begin = env.reset(params, split_keys(jax.random.PRNGKey(99), JUDGED))
+        return jnp.mean(jax.lax.scan(step, (begin, no, no), length=env.episode_steps)[0][2])
+
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))
 
 
 def keep(path: Path, records: list[dict[str, Any]], steps: int, elapsed: float) -> None:
