@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from lunar_mjx.dynamics.batch_last import batch_last
+from lunar_mjx.dynamics.computed_once import computed_once
 from lunar_mjx.dynamics.state import Params, State, Telemetry
 from lunar_mjx.errors import UserError
 
@@ -34,7 +35,7 @@ def step_batch(
     """One step of many rovers; see `System.step_batch`."""
 
     def step(params: Params, axes: list[int | None], state: State, control: Any) -> Any:
-        return batch_last(system.step, (axes, -1, -1))(params, state, control)
+        return _once(system, batch_last(system.step, (axes, -1, -1)))(params, state, control)
 
     return _in_chunks(step, params, params_axes, (state, control), chunk)
 
@@ -55,8 +56,15 @@ def rollout_batch(
     controls = jnp.asarray(controls)
 
     def drive(params: Params, axes: list[int | None], state: State, *own: Any) -> Any:
-        run = batch_last(system.step, (axes, -1, -1 if own else None))
+        step = batch_last(system.step, (axes, -1, -1 if own else None))
         engine = system.engine
+
+        def reporting(params: Params, now: State, control: Any) -> tuple[State, Any]:
+            new, telemetry = step(params, now, control)
+            return new, keep(telemetry)
+
+        run = _once(system, reporting)
+        silent = _once(system, lambda params, now, control: step(params, now, control)[0])
 
         def recast(change: Callable[..., Any], state: State) -> State:
             qpos, qvel = batch_last(change, (-1, -1))(state.qpos, state.qvel)
@@ -64,26 +72,30 @@ def rollout_batch(
 
         def hold_one(now: State, control: Any) -> tuple[State, Any]:
             def again(i: Any, carry: Any) -> Any:
-                new, telemetry = run(params, carry[0], control)
-                return new, jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), keep(telemetry), carry[1])
+                new, kept = run(params, carry[0], control)
+                return new, jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), kept, carry[1])
 
             blank = jax.tree.map(
                 lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: run(params, now, control)[1])
             )
-            return jax.lax.fori_loop(0, every, again, (now, keep(blank)))
+            return jax.lax.fori_loop(0, every, again, (now, blank))
 
         def hold(now: State, control: Any) -> tuple[State, Any]:
             if one_body:
                 return hold_one(now, control)
-            new, telemetry = run(params, now, control)
+            new, kept = run(params, now, control)
             if every > 1:
-                new = jax.lax.fori_loop(1, every, lambda _, s: run(params, s, control)[0], new)
-            return new, keep(telemetry)
+                new = jax.lax.fori_loop(1, every, lambda _, s: silent(params, s, control), new)
+            return new, kept
 
         end, kept = jax.lax.scan(hold, recast(engine.split, state), own[0] if own else controls)
         return recast(engine.join, end), kept
 
     return _in_chunks(drive, params, params_axes, (state, controls) if controls.ndim == 3 else (state,), chunk)
+
+
+def _once(system: System, function: Callable[..., Any]) -> Callable[..., Any]:
+    return computed_once(function) if system.engine.name == "structured" else function
 
 
 def _in_chunks(function: Callable[..., Any], params: Params, axes: Axes, varying: Any, chunk: int | None) -> Any:

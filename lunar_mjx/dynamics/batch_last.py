@@ -23,7 +23,7 @@ _ELEMENTWISE = {
     "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "real", "rem", "round", "rsqrt", "select_n",
     "sign", "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
 }  # fmt: skip
-_INLINE = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
+INLINE = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
 
 
 def batch_last(function: Callable[..., Any], in_axes: tuple[Any, ...]) -> Callable[..., Any]:
@@ -98,14 +98,14 @@ def _run(jaxpr: Any, consts: Any, args: list[_Value]) -> list[_Value]:
 
 def _apply(eqn: Any, operands: list[_Value]) -> list[_Value]:
     name = eqn.primitive.name
-    if name in _INLINE:
-        inner = eqn.params[_INLINE[name]]
+    if name in INLINE:
+        inner = eqn.params[INLINE[name]]
         return _run(inner.jaxpr, inner.consts, operands)
     if all(o.axis is None for o in operands):
-        out = _bind(eqn, [o.array for o in operands])
+        out = bind(eqn, [o.array for o in operands])
         return [_Value(x, None) for x in out]
     if name == "optimization_barrier":
-        out = _bind(eqn, [o.array for o in operands])
+        out = bind(eqn, [o.array for o in operands])
         return [_Value(x, o.axis) for x, o in zip(out, operands, strict=True)]
     if name == "reshape" and operands[0].axis == 0:
         x = operands[0].array
@@ -115,13 +115,13 @@ def _apply(eqn: Any, operands: list[_Value]) -> list[_Value]:
         done = rule(eqn, operands)
         if done is not None:
             return [_Value(done, -1)]
-    out = jax.vmap(lambda *x: _bind(eqn, x), in_axes=tuple(o.axis for o in operands), out_axes=-1)(
+    out = jax.vmap(lambda *x: bind(eqn, x), in_axes=tuple(o.axis for o in operands), out_axes=-1)(
         *(o.array for o in operands)
     )
     return [_Value(x, -1) for x in out]
 
 
-def _bind(eqn: Any, arrays: Any) -> list[Any]:
+def bind(eqn: Any, arrays: Any) -> list[Any]:
     """Binds an equation's primitive again, with whatever functions it holds (loops, custom derivatives)."""
     bound = eqn.primitive.get_bind_params(eqn.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)
@@ -144,7 +144,7 @@ def _elementwise(eqn: Any, operands: list[_Value]) -> Any:
     full = jnp.broadcast_shapes(*(jnp.shape(a) for a in arrays))
     # lax takes equal shapes (and plain scalars); broadcasts fuse away
     arrays = [a if jnp.shape(a) == full else jnp.broadcast_to(a, full) for a in arrays]
-    return _bind(eqn, arrays)[0]
+    return bind(eqn, arrays)[0]
 
 
 def _broadcast_in_dim(eqn: Any, operands: list[_Value]) -> Any:
@@ -179,7 +179,7 @@ def _gather(eqn: Any, operands: list[_Value]) -> Any:
     numbers = eqn.params["dimension_numbers"]
     if table.axis is not None or numbers.offset_dims or index.axis is None:
         return None
-    return _bind(eqn, [table.array, jnp.moveaxis(index.array, -1, -2)])[0]
+    return bind(eqn, [table.array, jnp.moveaxis(index.array, -1, -2)])[0]
 
 
 _RULES: dict[str, Callable[[Any, list[_Value]], Any]] = {
