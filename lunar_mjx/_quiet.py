@@ -25,3 +25,4 @@ def without_warp_notices() -> Iterator[None]:
 
 with without_warp_notices():
     from mujoco import mjx as mjx
+    from mujoco.mjx._src.smooth import solve_m as solve_m  # M^-1 x: not among MJX's public names

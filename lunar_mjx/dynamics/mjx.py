@@ -1,8 +1,10 @@
 """The MJX engine: one physics step from MJX's public stages, for any rover; the reference for other engines.
 
-Contacts are off and the solver sees equality constraints only, so its problem is quadratic and one Newton iteration
-is exact. Matrix products keep all bits of float32, on GPUs with TF32 too. Kinematics run once per step and are fresh
-when the effects read them.
+Contacts are off and the solver would see equality constraints only, so its problem is quadratic: it is solved at once
+for the constraint forces (MuJoCo's dual problem), whose matrix is far better conditioned in float32 than the Hessian of
+MJX's Newton iteration: there its Cholesky gave values that are not finite on a GPU. Nothing here calls LAPACK, whose
+batched Cholesky waited for ever for its own threads on a machine of two cores. Matrix products keep all of float32,
+on GPUs with TF32 too. Kinematics run once per step and are fresh when the effects read them.
 """
 
 # MuJoCo ships no type stubs for its compiled module.
@@ -17,7 +19,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from lunar_mjx._quiet import mjx
+from lunar_mjx._quiet import mjx, solve_m
 from lunar_mjx.dynamics.kinematics import Finish, Kinematics, wheel_feet
 from lunar_mjx.dynamics.ports import Forces
 from lunar_mjx.errors import UserError
@@ -106,7 +108,7 @@ class MjxEngine:
         d = mjx.fwd_velocity(m, d)
         d = self._apply(m, d, forces)
         d = mjx.fwd_acceleration(m, mjx.fwd_actuation(m, d))
-        d = d.replace(qacc=d.qacc_smooth) if m.neq == 0 else mjx.solve(m, d)
+        d = d.replace(qacc=d.qacc_smooth) if m.neq == 0 else _hold_equalities(m, d)
         d = mjx.euler(m, d)
         return d.qpos, d.qvel
 
@@ -151,6 +153,32 @@ class MjxEngine:
         return d.replace(xfrc_applied=xfrc, qfrc_applied=qfrc)
 
 
+def _hold_equalities(m: mjx.Model, d: mjx.Data) -> mjx.Data:
+    """What `mjx.solve` converges to for equality constraints alone: (J M^-1 J^T + R) f = a_ref - J a_smooth."""
+    implementation: Any = d._impl
+    jacobian = implementation.efc_J
+    moved = jax.vmap(lambda row: solve_m(m, d, row))(jacobian)  # M^-1 J^T, a row per constraint
+    matrix = jacobian @ moved.T + jnp.diag(1.0 / implementation.efc_D)
+    force = _solve_positive(matrix, implementation.efc_aref - jacobian @ d.qacc_smooth)
+    d = d.tree_replace({"_impl.efc_force": force})  # type: ignore[assignment]
+    return d.replace(qacc=d.qacc_smooth + force @ moved, qfrc_constraint=force @ jacobian)
+
+
+def _solve_positive(a: Any, b: Any) -> Any:
+    """Solves a x = b for a (n, n), symmetric and positive definite, by L D L^T with rows of L as vectors."""
+    n = len(b)
+    low, pivots = [], []
+    for j in range(n):
+        pivots.append(a[j, j])
+        low.append((a[:, j] / a[j, j]).at[: j + 1].set(0.0))
+        a = a - jnp.outer(low[j], a[j])
+        b = b - low[j] * b[j]
+    x = b / jnp.stack(pivots)
+    for j in reversed(range(n)):
+        x = x.at[j].add(-jnp.dot(low[j], x))
+    return x
+
+
 def _with_gravity(m: mjx.Model, gravity: Any) -> mjx.Model:
     zero = jnp.zeros_like(gravity)
     return m.replace(opt=m.opt.replace(gravity=jnp.stack([zero, zero, -gravity])))
@@ -170,7 +198,7 @@ def _point_inertia(mass: Any, r: Any) -> Any:
 
 
 def _check_options(model: mujoco.MjModel, rover: Rover) -> None:
-    """Refuses models for which one Newton iteration would not be exact."""
+    """Refuses models whose constraints are more than equalities; mass matrices are kept sparse."""
     disabled = model.opt.disableflags
     problems = []
     if not disabled & mujoco.mjtDisableBit.mjDSBL_CONTACT:
@@ -183,7 +211,4 @@ def _check_options(model: mujoco.MjModel, rover: Rover) -> None:
         problems.append('the integrator is not Euler (set integrator="Euler")')
     if problems:
         raise UserError(f"{rover.mjcf}: the solver must see equality constraints only, but {'; '.join(problems)}.")
-    model.opt.iterations = 1
-    model.opt.ls_iterations = 1
-    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
