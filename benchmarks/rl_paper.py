@@ -26,7 +26,7 @@ VARIANTS: dict[str, tuple[int, dict[str, Any], dict[str, Any], tuple[str, ...]]]
                                     TRAININGS[1:]),
     "steady": (5, _SIGNED, {"gamma": 0.95, "reward_scale": 0.01, "layer_norm": True, "n_step": 3, "actor_rate": 3e-4,
                             "actor_layers": (256, 128), "critic_layers": (256, 128), "batch": 128,
-                            "value_range": (-7.0, 6.2)}, TRAININGS),
+                            "buffer_steps": 60_000, "value_range": (-7.0, 6.2)}, TRAININGS),
     "ahead": (4, {**_SIGNED, "start_yaw": 0.5}, {}, TRAININGS[1:]),
 }  # fmt: skip
 """Seeds, options of the environment, settings of the training, and the algorithms. `signed`: progress with its sign,
