@@ -15,6 +15,8 @@ from typing import Any
 
 TRAININGS = ("paper-td3", "paper-ddpg")
 _SIGNED = {"task": "consistent", "places": 1, "decimation": 100}
+_STEADY = {"reward_scale": 0.01, "layer_norm": True, "n_step": 3, "actor_rate": 3e-4, "actor_layers": (256, 128),
+           "critic_layers": (256, 128), "batch": 128, "buffer_steps": 60_000, "value_range": (-7.0, 6.2)}  # fmt: skip
 VARIANTS: dict[str, tuple[int, dict[str, Any], dict[str, Any], tuple[str, ...]]] = {
     "signed": (5, _SIGNED, {}, TRAININGS),
     "printed": (5, {"places": 1}, {}, TRAININGS),
@@ -24,9 +26,9 @@ VARIANTS: dict[str, tuple[int, dict[str, Any], dict[str, Any], tuple[str, ...]]]
     "scaled, slow actor": (4, _SIGNED, {"reward_scale": 0.01, "actor_rate": 1e-4}, TRAININGS[1:]),
     "scaled, layer norm, 3 steps": (4, _SIGNED, {"reward_scale": 0.01, "layer_norm": True, "n_step": 3},
                                     TRAININGS[1:]),
-    "steady": (5, _SIGNED, {"gamma": 0.95, "reward_scale": 0.01, "layer_norm": True, "n_step": 3, "actor_rate": 3e-4,
-                            "actor_layers": (256, 128), "critic_layers": (256, 128), "batch": 128,
-                            "buffer_steps": 60_000, "value_range": (-7.0, 6.2)}, TRAININGS),
+    "steady": (5, _SIGNED, {**_STEADY, "gamma": 0.95}, TRAININGS),
+    "steady, discount 0.99": (3, _SIGNED, _STEADY, TRAININGS[1:]),
+    "scaled, discount 0.95": (3, _SIGNED, {"reward_scale": 0.01, "gamma": 0.95, "buffer_steps": 60_000}, TRAININGS[1:]),
     "ahead": (4, {**_SIGNED, "start_yaw": 0.5}, {}, TRAININGS[1:]),
 }  # fmt: skip
 """Seeds, options of the environment, settings of the training, and the algorithms. `signed`: progress with its sign,
@@ -35,7 +37,8 @@ the task's 10 Hz; at 5 Hz and a discount of 0.99 driving on for ever would be wo
 and destination drawn for every episode. The others are `signed` with settings that might help: rewards scaled, a slower
 actor, layer norm with returns of three steps, and a start that faces the destination within 0.5 rad. `steady`: a lone
 critic's errors pile up as 1 / (1 - discount); progress pays at every step, so that a horizon of 20 steps (4 s) will do,
-and targets stay below what arriving at once pays."""
+and targets stay below what arriving at once pays. The next two take that apart: the same with the long horizon, and the
+short horizon alone."""
 DEFAULT = ("signed", "printed", "drawn")
 MAIN = "signed"
 JUDGED_EVERY, JUDGED = 2500, 24
