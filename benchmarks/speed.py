@@ -1,11 +1,13 @@
 """Rover-steps per second of every engine, gated by parity in the same run; JSON, table and roofline numbers.
 
     python benchmarks/speed.py --rovers luvmi_x,viper --batches 4096,32768,65536,131072 --out benchmarks/speed_gpu.json
-    python benchmarks/speed.py --rovers luvmi_x --batches 1,512,2048 --threads 2 --out benchmarks/speed_cpu.json
+    python benchmarks/speed.py --batches 1,256 --only-full --skip-mjx --pool 1 --processes 2 --threads 2 \
+        --out benchmarks/speed_2cores.json
 
 Rows: the structured engine with all effects of the preset `consistent`, with the stress integral, with one map per
 rover, and without effects; MJX with all effects; bare `mjx.step`; native MuJoCo's batched stepper on the CPU.
 A row counts only where `parity` is true: one step of both engines from the same states, in the same process.
+With --processes, as many processes as stated also run each row at the same time, each pinned to a core of its own.
 """
 
 from __future__ import annotations
@@ -14,7 +16,9 @@ import argparse
 import dataclasses
 import json
 import os
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -84,6 +88,19 @@ def loop_parity(model: Model, states: int = 20) -> float:
     return gap
 
 
+MEETING: list[str] = []
+"""Folder and number of the processes that wait for each other before they time a row, if any."""
+
+
+def meet() -> None:
+    """Waits until every process has arrived."""
+    for place in MEETING:
+        folder, _, count = place.rpartition(":")
+        (Path(folder) / f"here.{os.getpid()}").touch()
+        while len(list(Path(folder).glob("here.*"))) < int(count):
+            time.sleep(0.01)
+
+
 def timed(function: Any, state: Any, steps: int, batch: int, repeats: int = 3) -> dict[str, Any]:
     """Compiles, warms up, and times `function(state) -> state` of `steps` steps."""
     begin = time.perf_counter()
@@ -95,6 +112,7 @@ def timed(function: Any, state: Any, steps: int, batch: int, repeats: int = 3) -
     best = cpu = float("inf")
     with alone():
         new = jax.block_until_ready(compiled(state))
+        meet()
         for _ in range(repeats):
             wall, process = time.perf_counter(), time.process_time()
             new = jax.block_until_ready(compiled(new))
@@ -156,6 +174,31 @@ def bare_mjx(model: Model, steps: int, batch: int) -> dict[str, Any]:
         return jax.lax.scan(lambda d, _: (step(d), None), data, None, length=steps)[0]
 
     return timed(run, data, steps, batch)
+
+
+def side_by_side(rover: str, batch: int, options: argparse.Namespace) -> dict[str, Any]:
+    """The sum of several processes that run the same batch at the same time, one on each core."""
+    cores = sorted(os.sched_getaffinity(0))
+    with tempfile.TemporaryDirectory() as folder:
+        meeting, command = Path(folder), [sys.executable, __file__, "--rovers", rover, "--batches", str(batch)]
+        # long enough to overlap
+        command += ["--only-full", "--skip-mjx", "--pool", "1", "--steps", str(20 * options.steps)]
+        children = [
+            subprocess.Popen([*command, "--meet", f"{meeting}:{options.processes}", "--out", str(meeting / f"{i}.json"),
+                              "--core", str(cores[i % len(cores)])], stdout=subprocess.DEVNULL)
+            for i in range(options.processes)
+        ]  # fmt: skip
+        if any(child.wait() for child in children):
+            raise SystemExit("speed.py: one of the processes ended with an error; run it with --processes 0.")
+        rows = [json.loads((meeting / f"{i}.json").read_text())["rows"][0] for i in range(options.processes)]
+    own = [row["process_cpu_ns_per_step"] for row in rows]
+    return {
+        "steps_per_s": sum(row["steps_per_s"] for row in rows),
+        "processes": options.processes,
+        "process_cpu_ns_per_step": float(np.mean(own)),
+        "parity": all(row["parity"] for row in rows),
+        "parity_gap": max(row["parity_gap"] for row in rows),
+    }
 
 
 def native_batch(model: Model, threads: int, batch: int, steps: int = 200) -> dict[str, Any]:
@@ -225,6 +268,8 @@ def rows_of(rover: str, options: argparse.Namespace, rows: list[dict[str, Any]],
                 slow = build(model, "mjx")
                 add("mjx", batch, timed(rollout(slow, options.mjx_steps, None), state, options.mjx_steps, batch))
                 add("bare mjx.step", batch, bare_mjx(model, options.mjx_steps, batch))
+        if options.processes:
+            add(f"structured, {options.processes} processes", batch, side_by_side(rover, batch, options))
     if options.threads:
         add("native rollout, no effects", 512, native_batch(model, options.threads, 512))
 
@@ -248,15 +293,24 @@ def main() -> None:
     parser.add_argument("--devices", type=numbers, default=[1], help="such as 1,2,4: with several, each takes a batch")
     parser.add_argument("--lock", type=Path, help="file that is locked while a row is timed; see backends.py")
     parser.add_argument("--threads", type=int, default=0, help="threads of native MuJoCo; 0: leave it out")
+    parser.add_argument("--processes", type=int, default=0, help="processes side by side, besides the one; 0: none")
+    parser.add_argument("--pool", type=int, default=0, help="threads of XLA on a CPU (NPROC); 0: one per core")
+    parser.add_argument("--core", type=int, default=-1, help="core to run on; -1: any")
+    parser.add_argument("--meet", help="folder:count, for processes that wait for each other")
     parser.add_argument("--skip-mjx", action="store_true")
     parser.add_argument("--only-full", action="store_true", help="leave out stress integral and no effects")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    if options.pool:
+        os.environ["NPROC"] = str(options.pool)  # read when JAX makes its CPU client, at the first use of a device
+    if options.core >= 0:
+        os.sched_setaffinity(0, {options.core})
+    MEETING[:] = [options.meet] if options.meet else []
     rows: list[dict[str, Any]] = []
     LOCK[:] = [options.lock] if options.lock else []
     about = {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "mujoco": mujoco.__version__,
              "cpu": cpu_name(), "cores": len(os.sched_getaffinity(0)), "steps": options.steps,
-             "chunk": options.chunk}  # fmt: skip
+             "chunk": options.chunk, "pool": options.pool}  # fmt: skip
 
     def save() -> None:
         if options.out:
