@@ -60,6 +60,10 @@ def test_the_page_quotes_the_papers_own_task():
     good = [first_good(r) for r in variants(record("paper"))["signed"]["TD3"]]
     assert ", ".join("never" if g is None else str(g) for g in good) in PAGE
 
+    steady = variants(record("paper"))["steady"]
+    assert all(len(runs) == 5 for runs in steady.values()) and set(steady) == {"TD3", "DDPG"}
+    assert all(np.mean(r["episodes"]["success"][-50:]) > 0.9 for runs in steady.values() for r in runs), "converged"
+
 
 def test_the_plainer_model_has_neither_heat_nor_soil():
     from rl_realism import THERMAL, plainer
