@@ -211,13 +211,17 @@ def native_batch(model: Model, threads: int, batch: int, steps: int = 200) -> di
     state = np.zeros((batch, size))
     mujoco.mj_getState(native, data[0], state[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
     state[:] = state[0]
-    best = float("inf")
+    best = cpu = float("inf")
     with native_rollout.Rollout(nthread=threads) as runner:
         for _ in range(3):
-            begin = time.perf_counter()
+            begin, process = time.perf_counter(), time.process_time()
             runner.rollout([native] * batch, data, state, nstep=steps)
-            best = min(best, time.perf_counter() - begin)
-    return {"steps_per_s": batch * steps / best, "threads": threads}
+            best, cpu = min(best, time.perf_counter() - begin), min(cpu, time.process_time() - process)
+    return {
+        "steps_per_s": batch * steps / best,
+        "process_cpu_ns_per_step": cpu / steps / batch * 1e9,
+        "threads": threads,
+    }
 
 
 def rows_of(rover: str, options: argparse.Namespace, rows: list[dict[str, Any]], save: Callable[[], None]) -> None:
