@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
 from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
 from lunar_mjx.criticism.drive_noise import channel_noise
@@ -58,6 +59,9 @@ NOT_MISSING = frozenset(
 
 SLIP_SPEED = 0.03
 """Speed of a wheel's rim below which a measured slip ratio is not compared, m/s."""
+SLIP_TIME = 0.25
+"""Nor within this time of such a speed, s: where a wheel reverses, the ratio jumps by hundreds of its noise with a
+millisecond."""
 
 
 class DriveProblem(Problem):
@@ -353,8 +357,17 @@ def _defined(log: Log, run: LogRun, channel: str, time: np.ndarray) -> np.ndarra
         if speed is None and run.model.modes["drive"] == "velocity":
             speed = log.channel(f"command_{name}_speed_rad_s")
         if speed is not None:
-            out &= np.abs(np.interp(time, *speed)) * wheel.radius > SLIP_SPEED
+            out &= np.interp(time, speed[0], _least(*speed)) * wheel.radius > SLIP_SPEED
     return out
+
+
+def _least(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """(n,) least |speed| within `SLIP_TIME` of every sample; zero where it changes its sign."""
+    size = np.abs(speed)
+    turns = np.flatnonzero(speed[:-1] * speed[1:] < 0.0)
+    size[turns] = size[turns + 1] = 0.0
+    reach = int(np.ceil(SLIP_TIME / max(float(np.median(np.diff(time))), 1e-6)))
+    return minimum_filter1d(size, 2 * reach + 1, mode="nearest")
 
 
 def _observations(

@@ -218,6 +218,15 @@ def _descents(
         near = found[0].u[None] + 0.3 * (others - origin[None])
         near[:, goal.free] = np.clip(near[:, goal.free], goal.low, goal.high)
         ends = chase(goal, found[0], near)
+        # A fixed Jacobian may lead a start astray that descends well with its own.
+        enough = found[0].chi2 + same_chi2(found[0].chi2, int(goal.fitted.sum()))
+        for i in np.argsort(ends):
+            if 1 + sum(e <= enough for e in ends) >= AGREEING:
+                break
+            if ends[i] > enough:
+                found.append(descend(goal, near[i]))
+                ends[i] = found[-1].chi2
+        ends = ends if len(found) == 1 else [e for e in ends if all(e != d.chi2 for d in found)]
     return min(found, key=lambda d: d.chi2), tuple(sorted([d.chi2 for d in found] + ends))
 
 

@@ -20,6 +20,8 @@ _RIVAL = 0.8
 """Share of what an effect takes off that score or scan must promise another to be refitted as its rival. (Of ten
 rivals of Coulomb friction in two campaigns eight took off what was promised within 3 % of that effect's share; gravity
 took off 14 % more, grousers nothing.)"""
+_MISFIT = 1.3
+"""Root mean square residual of a channel, over what noise allows it, from which a model is far beyond the noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,13 +115,15 @@ def search(
 ) -> Search:
     """Fits the baseline, scores every candidate, refits the best and adds effects while they earn it.
 
-    A baseline that passes for noise needs its certificate first: otherwise noise looks like physics. One far beyond the
-    noise may be where no descent converges; whether an effect brings it to the noise can be seen all the same.
+    A baseline that passes for noise, or nearly, needs its certificate first: else noise looks like physics. One far
+    beyond the noise, on fitted manoeuvres or on others, may be where no descent converges, or press against bounds;
+    whether an effect brings it to the noise, with a certificate of its own, can be seen all the same.
     """
     memory = memory or Memory()
     base_fit = fit_baseline(problem, settings, memory, progress)
     base = Candidate((), base_fit, noise_test(problem, base_fit), 0.0, 0.0)
-    if base_fit.problems and not slack_of(base_fit.chi2, int(base_fit.fitted.sum())):
+    far = slack_of(base_fit.chi2, int(base_fit.fitted.sum())) > 0.0 or base.noise.worst_ratio > _MISFIT
+    if base_fit.problems and not far:
         return Search(base, (), {}, (), base, ())
     progress("scoring", 0.0)
     scores = _scores(problem, base, settings)

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import lsq_linear
 from toy_problem import Decay, Linear, TwoMinima, manoeuvres
 
+from lunar_mjx.criticism import fitting
 from lunar_mjx.criticism.descent import Objective
 from lunar_mjx.criticism.fitting import Memory, fit
 
@@ -113,3 +114,13 @@ def test_a_step_that_meets_a_bound_is_the_best_within_it():
     np.testing.assert_allclose(step, best, atol=1e-4)
     dropped = goal.residuals(problem.origin()[None])[1][0] - goal.residuals(step[None])[1][0]
     assert goal.promise(problem.origin(), downhill, hessian) == pytest.approx(dropped, rel=1e-6)
+
+
+def test_starts_that_a_fixed_jacobian_leads_astray_descend_with_their_own(monkeypatch):
+    problem = decay()
+    problem.cheap_jacobian = False
+    monkeypatch.setattr(fitting, "chase", lambda goal, best, starts: [best.chi2 + 1e3 + i for i in range(len(starts))])
+    found = fit(problem, problem.free(), np.array([1.0, 0.2]), starts=4)
+    assert found.problems == ()
+    agreeing = [c for c in found.starts if c < found.chi2 + 1.0]
+    assert (len(found.starts), len(agreeing)) == (4, 3)  # as many as a certificate needs, and no more

@@ -24,6 +24,8 @@ CLIPPED_SHARE = 0.02
 
 FAR_FROM_AMBIENT = 200.0
 """K between a motor at the log's start and its surroundings: 273 is kelvin for Celsius, no motor is that hot."""
+_BY_CHANCE = 2.5
+"""Standard deviations by which a share of few cells may exceed `LOST_SHARE` by chance."""
 
 
 def check_values(log: Log) -> list[Finding]:
@@ -45,12 +47,14 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
     there = np.isfinite(values)
     if not there.any():
         return finding(None, "dropout", "is empty; leave the column out")
-    if (share := float(1.0 - there.mean())) > LOST_SHARE:
+    # a short table whose sensor loses fewer cells than that may still have lost more by chance
+    chance = _BY_CHANCE * np.sqrt(LOST_SHARE * (1.0 - LOST_SHARE) / len(there))
+    if (share := float(1.0 - there.mean())) > LOST_SHARE + chance:
         return finding(
             int(np.argmin(there)),
             "dropout",
             f"is empty in {100 * share:.0f} % of its rows (at most "
-            f"{100 * LOST_SHARE:.0f} % may be); record it anew or leave the column out",
+            f"{100 * (LOST_SHARE + chance):.0f} % may be); record it anew or leave the column out",
         )
     low, high, why = limits(name)
     beyond = there & ((values < low) | (values > high))

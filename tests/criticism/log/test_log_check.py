@@ -205,6 +205,17 @@ def test_a_spoilt_log_is_told(case: str, tmp_path: Path) -> None:
     assert matching[0].to_dict()["line"] == matching[0].line
 
 
+@pytest.mark.parametrize(("share", "bad"), [(0.35, False), (0.7, True)])
+def test_a_short_table_may_lose_a_few_more_cells_by_chance(share: float, bad: bool, tmp_path: Path) -> None:
+    def change(tables: Tables) -> None:
+        table = next(t for t in tables.values() if "winding_lf_drive_temperature_degC" in t)
+        lost = np.random.default_rng(0).permutation(len(table))[: round(share * len(table))]
+        table.loc[lost, "winding_lf_drive_temperature_degC"] = np.nan
+
+    found = check(make_log(tmp_path / "a", change, rates_hz={"drive": 20.0, "thermal": 1.0}))
+    assert is_bad(found) == bad, [f.message for f in found]
+
+
 def test_more_than_a_third_of_the_rows_lost(tmp_path: Path) -> None:
     def change(tables: Tables) -> None:
         rng = np.random.default_rng(0)
