@@ -28,6 +28,8 @@ EDGE = 1e-6
 _PROBE = 0.1
 _PATIENCE = 2
 """Steps in a row that may gain less than matters."""
+_CREEPING = 12
+"""The same at the noise, where the gradient still promises too much for a certificate."""
 _CREEP = 2.0
 """Drop of chi-square that does not matter where rows are dear: it takes 25 to name an effect."""
 _NEAR = np.array([0.003, 0.01, 0.03])
@@ -201,7 +203,9 @@ class _Walk:
     def hopeless(self, rival: float) -> bool:
         """Whether it creeps, or falls far short of a rival."""
         behind = self.taken >= _TRIED and self.fresh and self.dear and self.chi2 - _HOPE * self.promise > rival
-        return behind or self.slow >= _PATIENCE
+        # at the noise a fit needs its certificate, and creeps on while its gradient stands in the way of that
+        unsure = self.dear and self.enough == 0.0 and self.promise > 0.5 * SMALL_GRADIENT
+        return behind or self.slow >= (_CREEPING if unsure else _PATIENCE)
 
     def step(self, downhill: np.ndarray, hessian: np.ndarray) -> bool:
         """Tries all dampings at once, and goes where chi-square is least; False where it is nowhere less."""

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
-from toy_problem import Decay, Linear, TwoMinima, manoeuvres
+from toy_problem import Decay, Linear, TwoMinima, coordinate, manoeuvres
 
 from lunar_mjx.criticism import fitting
 from lunar_mjx.criticism.descent import Objective
@@ -124,3 +124,27 @@ def test_starts_that_a_fixed_jacobian_leads_astray_descend_with_their_own(monkey
     assert found.problems == ()
     agreeing = [c for c in found.starts if c < found.chi2 + 1.0]
     assert (len(found.starts), len(agreeing)) == (4, 3)  # as many as a certificate needs, and no more
+
+
+class Valley(TwoMinima):
+    """Rosenbrock's curved valley, with rows that are dear."""
+
+    cheap_jacobian = False
+
+    def __init__(self):
+        super().__init__()
+        self.coordinates, self.baseline = (coordinate("base", "u"), coordinate("base", "v")), np.arange(2)
+
+    def predict(self, u):
+        u = np.atleast_2d(u)
+        return np.column_stack([1.0 - u[:, 0], 10.0 * (u[:, 1] - u[:, 0] ** 2)])
+
+    def jacobian(self, u, which):
+        return np.array([[-1.0, 0.0], [-20.0 * u[0], 10.0]])[:, which]
+
+
+def test_a_fit_at_the_noise_goes_on_while_its_gradient_promises_more():
+    problem = Valley()
+    found = fit(problem, problem.free(), np.array([-1.2, 1.0]), starts=1)
+    assert found.gradient < 0.5
+    assert found.problems == ()
