@@ -2,9 +2,10 @@
 
 Contacts are off and the solver would see equality constraints only, so its problem is quadratic: it is solved at once
 for the constraint forces (MuJoCo's dual problem), whose matrix is far better conditioned in float32 than the Hessian of
-MJX's Newton iteration: there its Cholesky gave values that are not finite on a GPU. Nothing here calls LAPACK, whose
-batched Cholesky waited for ever for its own threads on a machine of two cores. Matrix products keep all of float32,
-on GPUs with TF32 too. Kinematics run once per step and are fresh when the effects read them.
+MJX's Newton iteration. With that iteration VIPER had values that are not finite on a GPU, and a batch of 64 never came
+back on a machine of two cores; without it, and without LAPACK, neither was seen again (its Cholesky is the suspect, not
+proven). Matrix products keep all of float32, on GPUs with TF32 too. Kinematics run once per step and are fresh when the
+effects read them.
 """
 
 # MuJoCo ships no type stubs for its compiled module.
