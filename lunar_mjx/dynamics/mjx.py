@@ -4,8 +4,9 @@ Contacts are off and the solver would see equality constraints only, so its prob
 for the constraint forces (MuJoCo's dual problem), whose matrix is far better conditioned in float32 than the Hessian of
 MJX's Newton iteration. With that iteration VIPER had values that are not finite on a GPU, and a batch of 64 never came
 back on a machine of two cores; without it, and without LAPACK, neither was seen again (its Cholesky is the suspect, not
-proven). Matrix products keep all of float32, on GPUs with TF32 too. Kinematics run once per step and are fresh when the
-effects read them.
+proven). MJX leaves out the loops' own acceleration at given speeds, J' v, which native MuJoCo takes away from the
+reference acceleration of a `connect`: it is added here. Matrix products keep all of float32, on GPUs with TF32 too. Kinematics run
+once per step and are fresh when the effects read them.
 """
 
 # MuJoCo ships no type stubs for its compiled module.
@@ -48,6 +49,7 @@ class MjxEngine:
         self._chassis = model.body(rover.chassis).id
         self._armature0 = np.array(model.dof_armature)
         self.wheel_feet = wheel_feet(model, self._wheels, self._chassis)
+        self._pins = _Pins(model)
         self._mjx = mjx.put_model(model)
         self._data = mjx.make_data(model)
 
@@ -109,7 +111,7 @@ class MjxEngine:
         d = mjx.fwd_velocity(m, d)
         d = self._apply(m, d, forces)
         d = mjx.fwd_acceleration(m, mjx.fwd_actuation(m, d))
-        d = d.replace(qacc=d.qacc_smooth) if m.neq == 0 else _hold_equalities(m, d)
+        d = d.replace(qacc=d.qacc_smooth) if m.neq == 0 else _hold_equalities(m, d, self._pins)
         d = mjx.euler(m, d)
         return d.qpos, d.qvel
 
@@ -154,13 +156,55 @@ class MjxEngine:
         return d.replace(xfrc_applied=xfrc, qfrc_applied=qfrc)
 
 
-def _hold_equalities(m: mjx.Model, d: mjx.Data) -> mjx.Data:
-    """What `mjx.solve` converges to for equality constraints alone: (J M^-1 J^T + R) f = a_ref - J a_smooth."""
+class _Pins:
+    """The two anchors of every `connect` constraint, whose rows come first in MJX's Jacobian."""
+
+    def __init__(self, model: mujoco.MjModel):
+        pins = np.nonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT)[0]
+        places = [_anchor(model, pin, end) for end in (0, 1) for pin in pins]
+        self.rows = 3 * len(pins)
+        self.pins = pins
+        self.bodies = np.array([body for body, _ in places], int)
+        self._anchors = np.array([anchor for _, anchor in places]).reshape(-1, 3)
+        self._root = model.body_rootid[self.bodies]
+        # the joints that move each of the bodies
+        self._moves = np.zeros((len(places), model.nv))
+        for row, body in enumerate(self.bodies):
+            while body:
+                first = model.body_dofadr[body]
+                self._moves[row, first : first + model.body_dofnum[body]] = 1.0
+                body = model.body_parentid[body]
+
+    def bias(self, d: mjx.Data) -> Any:
+        """J' v: how fast the anchors accelerate apart while the joints' speeds stay as they are, m/s2 (rows,)."""
+        bodies = self.bodies
+        place = d.xpos[bodies] + jnp.einsum("pij,pj->pi", d.xmat[bodies], jnp.asarray(self._anchors, d.qpos.dtype))
+        # cvel, and accelerations by cdof_dot, are taken at the centre of mass of the whole tree
+        arm = place - d.subtree_com[self._root]
+        spin = d.cvel[bodies, :3]
+        velocity = d.cvel[bodies, 3:] + jnp.cross(spin, arm)
+        rate = jnp.asarray(self._moves, d.qpos.dtype) @ (d.cdof_dot * d.qvel[:, None])
+        acceleration = rate[:, 3:] + jnp.cross(rate[:, :3], arm) + jnp.cross(spin, velocity)
+        first, second = acceleration.reshape(2, -1, 3)
+        return ((first - second) * d.eq_active[self.pins, None]).reshape(-1)
+
+
+def _anchor(model: mujoco.MjModel, pin: int, end: int) -> tuple[int, np.ndarray]:
+    """Body of one end of a `connect`, and the anchor in its frame (3,), m."""
+    thing = (model.eq_obj1id, model.eq_obj2id)[end][pin]
+    if model.eq_objtype[pin] == mujoco.mjtObj.mjOBJ_SITE:
+        return int(model.site_bodyid[thing]), np.array(model.site_pos[thing])
+    return int(thing), np.array(model.eq_data[pin, 3 * end : 3 * end + 3])
+
+
+def _hold_equalities(m: mjx.Model, d: mjx.Data, pins: _Pins) -> mjx.Data:
+    """What `mjx.solve` converges to for equality constraints alone: (J M^-1 J^T + R) f = a_ref - J' v - J a_smooth."""
     implementation: Any = d._impl
     jacobian = implementation.efc_J
     moved = jax.vmap(lambda row: solve_m(m, d, row))(jacobian)  # M^-1 J^T, a row per constraint
     matrix = jacobian @ moved.T + jnp.diag(1.0 / implementation.efc_D)
-    force = _solve_positive(matrix, implementation.efc_aref - jacobian @ d.qacc_smooth)
+    wanted = implementation.efc_aref.at[: pins.rows].add(-pins.bias(d))
+    force = _solve_positive(matrix, wanted - jacobian @ d.qacc_smooth)
     d = d.tree_replace({"_impl.efc_force": force})  # type: ignore[assignment]
     return d.replace(qacc=d.qacc_smooth + force @ moved, qfrc_constraint=force @ jacobian)
 
