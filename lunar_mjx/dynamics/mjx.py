@@ -5,8 +5,8 @@ for the constraint forces (MuJoCo's dual problem), whose matrix is far better co
 MJX's Newton iteration. With that iteration VIPER had values that are not finite on a GPU, and a batch of 64 never came
 back on a machine of two cores; without it, and without LAPACK, neither was seen again (its Cholesky is the suspect, not
 proven). MJX leaves out the loops' own acceleration at given speeds, J' v, which native MuJoCo takes away from the
-reference acceleration of a `connect`: it is added here. Matrix products keep all of float32, on GPUs with TF32 too. Kinematics run
-once per step and are fresh when the effects read them.
+reference acceleration of a `connect`: it is added here. Matrix products keep all of float32, on GPUs with TF32 too.
+Kinematics run once per step and are fresh when the effects read them.
 """
 
 # MuJoCo ships no type stubs for its compiled module.
@@ -189,7 +189,7 @@ class _Pins:
         return ((first - second) * d.eq_active[self.pins, None]).reshape(-1)
 
 
-def _anchor(model: mujoco.MjModel, pin: int, end: int) -> tuple[int, np.ndarray]:
+def _anchor(model: mujoco.MjModel, pin: Any, end: int) -> tuple[int, np.ndarray]:
     """Body of one end of a `connect`, and the anchor in its frame (3,), m."""
     thing = (model.eq_obj1id, model.eq_obj2id)[end][pin]
     if model.eq_objtype[pin] == mujoco.mjtObj.mjOBJ_SITE:
