@@ -29,6 +29,8 @@ def training_of(args: argparse.Namespace, more: list[str] | None = None) -> Any:
     training = get_training("large-td3")
     options = {**training.options, "rover": args.rover}
     unseen = dict(training.unseen)
+    if args.unseen_terrain:
+        unseen["terrain"] = args.unseen_terrain
     small = {}
     if args.tiny:
         options |= {"terrain": "flat", "goal_distance": (2.0, 4.0), "episode_time": 10.0, "places": 256}

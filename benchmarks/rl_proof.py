@@ -207,6 +207,8 @@ def main() -> None:
     parser.add_argument("--target", type=float, default=0.95)
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment")
+    parser.add_argument("--unseen-terrain", help="on which policies are scored, such as world:heldout_boulders")
+    parser.add_argument("--only", nargs="*", help="of part realism, such as 3/with 4/without (seed/effects)")
     parser.add_argument("--training", default="paper-td3", help="of part paper-child")
     parser.add_argument("--rows", nargs="*", help="of part rates, such as 17/5/65536 (numbers/decimation/rovers)")
     parser.add_argument("--variants", nargs="*", default=list(DEFAULT), choices=list(VARIANTS), help="of part paper")

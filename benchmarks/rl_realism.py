@@ -68,6 +68,8 @@ def realism(args: argparse.Namespace, clock: Clock) -> None:
     longest = 0.0
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         for name, learner in learners.items():
+            if args.only is not None and f"{seed}/{name}" not in args.only:
+                continue
             if clock.left < 1.1 * longest:
                 say("realism: no time for more")
                 return

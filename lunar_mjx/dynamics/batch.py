@@ -50,6 +50,7 @@ def rollout_batch(
     report: Callable[[Telemetry], Any] | None = None,
     chunk: int | None = None,
     one_body: bool = False,
+    last: bool = False,
 ) -> tuple[State, Any]:
     """Drives many rovers through a sequence of controls; see `System.rollout_batch`."""
     keep = report or (lambda telemetry: telemetry)
@@ -73,7 +74,7 @@ def rollout_batch(
         def hold_one(now: State, control: Any) -> tuple[State, Any]:
             def again(i: Any, carry: Any) -> Any:
                 new, kept = run(params, carry[0], control)
-                return new, jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), kept, carry[1])
+                return new, kept if last else jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), kept, carry[1])
 
             blank = jax.tree.map(
                 lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: run(params, now, control)[1])
@@ -84,6 +85,8 @@ def rollout_batch(
             if one_body:
                 return hold_one(now, control)
             new, kept = run(params, now, control)
+            if last:
+                return jax.lax.fori_loop(1, every, lambda _, carry: run(params, carry[0], control), (new, kept))
             if every > 1:
                 new = jax.lax.fori_loop(1, every, lambda _, s: silent(params, s, control), new)
             return new, kept

@@ -185,6 +185,7 @@ class System:
         report: Callable[[Telemetry], Any] | None = None,
         chunk: int | None = None,
         one_body: bool = False,
+        last: bool = False,
     ) -> tuple[State, Any]:
         """Drives many rovers through a sequence of controls.
 
@@ -196,11 +197,12 @@ class System:
           report: what to keep of a step's telemetry, elementwise; all of it if None.
           one_body: compile the step once, not once more for the steps without telemetry: half the compile time, for
             somewhat slower steps.
+          last: report the last step of every control, not its first.
 
         Returns:
           The final states, and what was kept, with leading axes (batch, time).
         """
-        return batch.rollout_batch(self, params, state, controls, every, params_axes, report, chunk, one_body)
+        return batch.rollout_batch(self, params, state, controls, every, params_axes, report, chunk, one_body, last)
 
     def _context(self, params: Params, state: State, k: Kinematics) -> Context:
         dtype = state.qpos.dtype

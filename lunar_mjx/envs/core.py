@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Array, Bool, Float, Int
 
 from lunar_mjx.pytree import AnyArray, pytree
@@ -87,3 +88,18 @@ def where(condition: Bool[Array, "env"], new: Any, old: Any) -> Any:
         return jnp.where(condition.reshape(-1, *([1] * (jnp.ndim(a) - 1))), a, b)
 
     return jax.tree.map(choose, new, old)
+
+
+def side_by_side(tree: Any, wanted: bool | None = None) -> Any:
+    """The same arrays; those of shape (env, n) with neighbouring environments side by side in a GPU's memory.
+
+    Shapes and values stay what they are. The physics wants this order inside, so that a loop over steps whose state
+    has it needs no transposing on the way in and out, and every kernel reads and writes whole cache lines.
+
+    Args:
+      tree: a pytree of arrays. wanted: whether to ask for it; only on GPUs if None.
+    """
+    if not (jax.default_backend() == "gpu" if wanted is None else wanted):
+        return tree
+    columns = Layout(major_to_minor=(1, 0))
+    return jax.tree.map(lambda a: with_layout_constraint(a, columns) if jnp.ndim(a) == 2 else a, tree)

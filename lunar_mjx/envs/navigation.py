@@ -16,7 +16,7 @@ from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.envs import kalman, randomise, rewards
 from lunar_mjx.envs.actions import action_map
 from lunar_mjx.envs.config import TASKS, NavigationConfig
-from lunar_mjx.envs.core import State
+from lunar_mjx.envs.core import State, side_by_side
 from lunar_mjx.envs.observations import Scene, observe
 from lunar_mjx.envs.places import draw_places
 from lunar_mjx.envs.view import SCAN_SCALE, Reader, View, goal_in_body, read
@@ -191,12 +191,12 @@ class NavigationEnv:
             # the successor of a state that is gone carries no value, but must not poison a batch
             final_obs, final_privileged = (jnp.nan_to_num(a, posinf=0.0, neginf=0.0) for a in
                                            (final_obs, final_privileged))  # fmt: skip
-        return self._restart(params, inner, State(
+        return side_by_side(self._restart(params, inner, State(
             final_obs, final_privileged, reward, terminated, truncated, final_obs, final_privileged, metrics,
             self._info(view), inner,
-        ))  # fmt: skip
+        )))  # fmt: skip
 
-    def _restart(self, params: NavigationParams, inner: Inner, state: State) -> State:
+    def _restart(self, params: NavigationParams, inner: Inner, state: State, group: int = _GROUP) -> State:
         """Begins anew where the episode ended, keeping the final observations.
 
         Few episodes end in a step, so that one rover of every group begins at a time, as often as it takes: fresh
@@ -204,7 +204,7 @@ class NavigationEnv:
         Every rover gets the same numbers as if all were made.
         """
         count = state.done.shape[0]
-        size = next(n for n in range(min(_GROUP, count), 0, -1) if count % n == 0)
+        size = next(n for n in range(min(group, count), 0, -1) if count % n == 0)
         groups = count // size
 
         def begin(carry: Any) -> Any:
@@ -220,9 +220,9 @@ class NavigationEnv:
                 at = chosen.reshape(groups, size, *[1] * (old.ndim - 1))
                 return jnp.where(at, part[:, None], old.reshape(groups, size, *old.shape[1:])).reshape(old.shape)
 
-            return waiting & ~chosen.reshape(-1), jax.tree.map(put, current, fresh)
+            return waiting & ~chosen.reshape(-1), side_by_side(jax.tree.map(put, current, fresh))
 
-        here = (state.obs, state.privileged, state.info, inner)
+        here = side_by_side((state.obs, state.privileged, state.info, inner))
         _, here = jax.lax.while_loop(lambda carry: carry[0].any(), begin, (state.done, here))
         obs, privileged, info, inner = here
         return dataclasses.replace(state, obs=obs, privileged=privileged, info=info, inner=inner)
@@ -232,11 +232,11 @@ class NavigationEnv:
         c = self.config
         system, axes = randomise.apply(params.system, inner.drawn)
         controls = self.actions.controls(action)
-        held = jnp.broadcast_to(controls[:, None], (controls.shape[0], c.decimation, controls.shape[1]))
         physics, (slip, sinkage) = self.system.rollout_batch(
-            system, inner.physics, held, 1, axes, lambda seen: (seen.slip, seen.sinkage)
-        )
-        return physics, slip[:, -1], sinkage[:, -1]
+            system, inner.physics, controls[:, None], c.decimation, axes, lambda seen: (seen.slip, seen.sinkage),
+            one_body=True, last=True,
+        )  # fmt: skip
+        return physics, slip[:, 0], sinkage[:, 0]
 
     def _advance(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Inner, View]:
         c = self.config

@@ -16,7 +16,14 @@ _ROCKS = 512
 """Numbers of rocks are filled up to a multiple of this, so that worlds of like abundance share one program."""
 
 
-def _world(seed: int, deviation: float, density: float, deepest: float, abundance: float, extent: float) -> Any:
+_ROVER_SIZED = {"abundance": 0.035, "smallest": 0.25, "largest": 1.2, "gap": 1.6}
+_BOULDERS = {"abundance": 0.07, "smallest": 0.5, "largest": 2.4, "gap": 3.2}
+"""Rocks for a small rover, and the same at twice the size for one twice as large, with the share of ground that they
+cover about the same (0.8 and 0.9 %)."""
+
+
+def _world(seed: int, deviation: float, density: float, deepest: float, abundance: float, extent: float,
+           rocks: dict[str, float] = _ROVER_SIZED) -> Any:  # fmt: skip
     return {
         "seed": seed,
         "surface": {
@@ -26,7 +33,7 @@ def _world(seed: int, deviation: float, density: float, deepest: float, abundanc
             "roughness": {"hurst": 0.8, "deviation": deviation, "baseline": 1.0},
             "craters": {"smallest": 0.5, "largest": 20.0, "density": density, "shallowest": 0.02, "deepest": deepest},
         },
-        "rocks": {"abundance": abundance, "smallest": 0.25, "largest": 1.2, "gap": 1.6},
+        "rocks": {**rocks, "abundance": abundance},
     }
 
 
@@ -34,9 +41,12 @@ WORLDS: dict[str, dict[str, Any]] = {
     "train": _world(101, 0.022, 0.05, 0.10, 0.035, 160.0),
     "heldout": _world(977, 0.025, 0.06, 0.11, 0.035, 160.0),
     "mild": _world(31, 0.015, 0.02, 0.06, 0.01, 80.0),
+    "train_boulders": _world(101, 0.022, 0.05, 0.10, 0.07, 160.0, _BOULDERS),
+    "heldout_boulders": _world(977, 0.025, 0.06, 0.11, 0.07, 160.0, _BOULDERS),
 }
 """Tables as of a `terrain.toml`. `train` and `heldout` share their size, so that one compiled program runs on both;
-the held-out ground is another draw, rougher and with more and deeper craters, and has rocks in other places."""
+the held-out ground is another draw, rougher and with more and deeper craters, and has rocks in other places. The two
+with boulders are the same grounds with rocks of twice the size at twice the distance, obstacles for VIPER too."""
 
 
 @functools.cache
