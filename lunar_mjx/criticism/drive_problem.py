@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
-from lunar_mjx.criticism.drive_noise import channel_noise
+from lunar_mjx.criticism.drive_noise import Noises
 from lunar_mjx.criticism.drive_nuisances import STEP_ERROR, direction, from_first, is_linear, nuisances
 from lunar_mjx.criticism.drive_program import Rows
 from lunar_mjx.criticism.drive_runs import Bench, LogRun
@@ -107,7 +107,9 @@ class DriveProblem(Problem):
         self._gather: Gather | None = None
         found = _baseline_coordinates(model, baseline)
         count = len(found)
-        self.observations = _observations(self.bench, self.logs, splits or {}, channels)
+        self._noises = Noises(self.logs)
+        self.observations = _observations(self.bench, self.logs, splits or {}, channels, self._noises)
+        self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self.observations.series)
         for number, run in enumerate(self.bench.runs):
             found += nuisances(number, run, self.observations)
         self.baseline = np.arange(len(found))
@@ -134,6 +136,7 @@ class DriveProblem(Problem):
         model = fitted_model(self, fit, model)
         other = DriveProblem(self.logs, model, candidates, self._splits, self._baseline_spec, self._channels,
                              self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+        other.observations, other.noise_unlearnt = self.observations, self.noise_unlearnt
         other._start = {self.coordinates[i].key: fit.u[i] for i in self._nuisance}
         return other
 
@@ -141,6 +144,10 @@ class DriveProblem(Problem):
         """The same model and logs with other candidates."""
         return DriveProblem(self.logs, self.model, candidates, self._splits, self._baseline_spec, self._channels,
                             self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+
+    def learn_noise(self, u: np.ndarray) -> None:
+        self.observations = self._noises.refined(self.observations, self.observations.value - self.predict(u[None])[0])
+        self.noise_unlearnt = False
 
     def origin(self) -> np.ndarray:
         return np.array([self._start.get(c.key, 0.0) for c in self.coordinates])
@@ -371,7 +378,7 @@ def _least(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
 
 
 def _observations(
-    bench: Bench, logs: Sequence[Log], splits: Mapping[str, str], channels: Sequence[str] | None
+    bench: Bench, logs: Sequence[Log], splits: Mapping[str, str], channels: Sequence[str] | None, noise: Noises
 ) -> Observations:
     value, series, unit, at = [], [], [], 0
     default = default_splits(logs)
@@ -387,7 +394,7 @@ def _observations(
             time, measured = time[inside], measured[inside]
             if len(time) < 2:
                 continue
-            white, coloured, tau = channel_noise(log, channel)
+            white, coloured, tau = noise(log, channel)
             series.append(Series(number, channel, at, at + len(time), time, white, coloured, tau))
             value.append(measured)
             unit.append(np.full(len(time), number))

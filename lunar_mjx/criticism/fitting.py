@@ -117,6 +117,20 @@ class Memory:
             extra=entry["extra"], problems=tuple(entry["problems"]),
         )  # fmt: skip
 
+    def place(self, problem: Problem, name: str) -> np.ndarray | None:
+        """(coordinates,) as kept under a name; None if unknown or of other coordinates."""
+        entry = self.entries.get(f"at {name}")
+        free = problem.free()
+        if entry is None or set(entry) != {problem.coordinates[i].key for i in free}:
+            return None
+        u = problem.origin()
+        u[free] = [entry[problem.coordinates[i].key] for i in free]
+        return u
+
+    def keep_place(self, problem: Problem, name: str, u: np.ndarray) -> None:
+        """Remembers the baseline's coordinates at a place."""
+        self._store(f"at {name}", {problem.coordinates[i].key: float(u[i]) for i in problem.free()})
+
     def keep(self, problem: Problem, effects: Sequence[str], found: Fit) -> None:
         """Remembers a fit."""
         entry = {
@@ -124,8 +138,11 @@ class Memory:
             "starts": list(found.starts), "at_bound": list(found.at_bound), "extra": dict(found.extra),
             "problems": list(found.problems), "chi2": found.chi2,
         }  # fmt: skip
+        self._store("+".join(effects), entry)
+
+    def _store(self, name: str, entry: Mapping[str, Any]) -> None:
         with self._lock:
-            self.entries["+".join(effects)] = entry
+            self.entries[name] = entry
             if self._save is not None:
                 self._save(dict(self.entries))
 

@@ -39,9 +39,11 @@ class Problem(abc.ABC):
       cheap_jacobian: whether every start of a fit can afford Jacobians of its own.
       eager: whether a hundred more rows cost no time, so that Jacobians are best taken before they are known to be
         needed.
+      noise_unlearnt: whether the noise's colour is known from little, so that `learn_noise` is to be called.
     """
 
     cheap_jacobian: bool = True
+    noise_unlearnt: bool = False
 
     observations: Observations
     coordinates: tuple[Coordinate, ...]
@@ -93,6 +95,14 @@ class Problem(abc.ABC):
         """Within it calls of so many threads may be joined; each calls what it yields when it makes no more."""
         del threads
         yield lambda: None
+
+    def learn_noise(self, u: np.ndarray) -> None:
+        """Takes the noise's colour anew from the residual at a fit.
+
+        Args:
+          u: (coordinates,) of the fit.
+        """
+        del u
 
     def origin(self) -> np.ndarray:
         """The model as given: every coordinate at zero."""

@@ -20,6 +20,8 @@ _RIVAL = 0.8
 """Share of what an effect takes off that score or scan must promise another to be refitted as its rival. (Of ten
 rivals of Coulomb friction in two campaigns eight took off what was promised within 3 % of that effect's share; gravity
 took off 14 % more, grousers nothing.)"""
+_NOISE = "noise"
+"""What the place is called at which the noise's colour was learnt."""
 _MISFIT = 1.3
 """Root mean square residual of a channel, over what noise allows it, from which a model is far beyond the noise."""
 
@@ -103,9 +105,16 @@ class Search:
 
 def fit_baseline(problem: Problem, settings: Settings, memory: Memory, progress: Progress = silent) -> Fit:
     """The model as it is, refitted, with its certificate; recalled where it has been done."""
+    start = None
+    if problem.noise_unlearnt:
+        start = memory.place(problem, _NOISE)
+        if start is None:
+            start = fit(problem, problem.free(), starts=1, certify=False, progress=progress).u
+            memory.keep_place(problem, _NOISE, start)
+        problem.learn_noise(start)
     found = memory.recall(problem, ())
     if found is None:
-        found = fit(problem, problem.free(), starts=settings.starts, seed=settings.seed, progress=progress)
+        found = fit(problem, problem.free(), start, settings.starts, settings.seed, progress=progress)
         memory.keep(problem, (), found)
     return found
 
