@@ -90,11 +90,19 @@ def where(condition: Bool[Array, "env"], new: Any, old: Any) -> Any:
     return jax.tree.map(choose, new, old)
 
 
+_WIDEST = 32
+
+
+def _narrow(array: Any) -> bool:
+    return jnp.ndim(array) == 2 and array.shape[1] <= _WIDEST
+
+
 def side_by_side(tree: Any, wanted: bool | None = None) -> Any:
     """The same arrays; those of shape (env, n) with neighbouring environments side by side in a GPU's memory.
 
     Shapes and values stay what they are. The physics wants this order inside, so that a loop over steps whose state
-    has it needs no transposing on the way in and out, and every kernel reads and writes whole cache lines.
+    has it needs no transposing on the way in and out, and every kernel reads and writes whole cache lines. Wide arrays
+    (height scans, and observations that hold them) keep the usual order: the scan's points lie together anyway.
 
     Args:
       tree: a pytree of arrays. wanted: whether to ask for it; only on GPUs if None.
@@ -102,4 +110,4 @@ def side_by_side(tree: Any, wanted: bool | None = None) -> Any:
     if not (jax.default_backend() == "gpu" if wanted is None else wanted):
         return tree
     columns = Layout(major_to_minor=(1, 0))
-    return jax.tree.map(lambda a: with_layout_constraint(a, columns) if jnp.ndim(a) == 2 else a, tree)
+    return jax.tree.map(lambda a: with_layout_constraint(a, columns) if _narrow(a) else a, tree)

@@ -345,8 +345,8 @@ def make_navigation(
     Args:
       task: name of a shipped task (`paper`, `consistent`, `large`), or a configuration.
       rover: name or folder.
-      terrain: anything `make_model` takes, or `world:train`, `world:heldout`, `world:mild`; by default `lunar_plain`,
-        for the task `large` `world:train`.
+      terrain: anything `make_model` takes, or `world:train`, `world:heldout` and others of `worlds.WORLDS`; by default
+        `lunar_plain`, for the task `large` `world:train`.
       preset: of the physics.
       model: a model or `model.toml` instead of rover, terrain and preset; a terrain given beside it takes its place.
       engine: of the physics.

@@ -37,6 +37,16 @@ def test_the_page_quotes_what_realism_is_worth():
     assert cells["with", "with"]["low"] > cells["without", "with"]["success"], "what the effects are worth is no chance"
 
 
+def test_the_page_quotes_what_boulders_are_to_viper():
+    from rl_more_figures import percent
+
+    found = record("large_viper_boulders")
+    policy, straight = found["seeds"][0]["final"], found["agents"]["scripted"]
+    assert f"| {percent(policy)} |" in PAGE and f"| {percent(straight)} |" in PAGE
+    assert policy["success"] >= 0.95 and all(a["success"] < 0.5 for a in found["agents"].values())
+    assert found["environment"]["unseen"]["terrain"] == "world:heldout_boulders"
+
+
 def test_the_page_quotes_the_rates():
     rows = {(r["observation"], r["decimation"], r["rovers"]): r for r in record("rates")["rows"]}
     for (_, decimation, rovers), row in rows.items():

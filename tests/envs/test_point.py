@@ -11,6 +11,7 @@ import pytest
 
 from lunar_mjx.envs import PointEnv, make, make_agent, register, registry, split_keys
 from lunar_mjx.envs.contract import check_environment
+from lunar_mjx.envs.core import side_by_side
 from lunar_mjx.errors import UserError
 
 
@@ -92,3 +93,11 @@ def test_refuses_unknown_names():
         make_agent("clever", PointEnv())
     with pytest.raises(UserError, match="episode_steps"):
         PointEnv(0)
+
+
+def test_neighbours_lie_side_by_side_in_narrow_arrays_only():
+    arrays = {"narrow": jnp.arange(24.0).reshape(8, 3), "wide": jnp.ones((8, 40)), "flat": jnp.ones(8)}
+    made = jax.jit(lambda t: side_by_side(jax.tree.map(lambda a: a + 1.0, t), wanted=True)).lower(arrays).compile()
+    assert "f32[8,3]{0,1}" in made.as_text() and "f32[8,40]{0,1}" not in made.as_text()
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a + 1.0, b), arrays, made(arrays))
+    assert side_by_side(arrays, wanted=False) is arrays
