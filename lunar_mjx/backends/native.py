@@ -33,6 +33,8 @@ class NativeBackend(NumpyBackend):
       hooks: functions that change the physics (hidden effects).
       rovers: how many to drive at once, on one terrain.
       threads: of MuJoCo; the forces are computed on one thread.
+      damped_within: whether joints are damped implicitly before the loops' forces are solved for, as in the other
+        engines, and not after it, as MuJoCo does; without loops it is the same.
 
     Raises:
       UserError: an effect that the NumPy physics does not implement.
@@ -40,9 +42,13 @@ class NativeBackend(NumpyBackend):
 
     name = "native"
 
-    def __init__(self, model: Model, hooks: Iterable[Hook] = (), rovers: int = 1, threads: int = 1) -> None:
+    def __init__(self, model: Model, hooks: Iterable[Hook] = (), rovers: int = 1, threads: int = 1,
+                 damped_within: bool = False) -> None:  # fmt: skip
         super().__init__(model, hooks, rovers)
         m = self._mj = native_model(model)
+        if damped_within:  # M + dt D in place of M, so that MuJoCo's own addition must go
+            m.dof_armature += model.timestep * m.dof_damping
+            m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
         self._wheels = np.array([m.body(w.body).id for w in model.rover.wheels])
         self._axles = np.array([m.jnt_axis[m.joint(w.drive).id] for w in model.rover.wheels])
         self._chassis = m.body(model.rover.chassis).id
@@ -56,6 +62,7 @@ class NativeBackend(NumpyBackend):
         self._at_rim = not m.body_ipos[self._wheels].any()
         self._carried = np.zeros((rovers, 7))
         self._fields: dict[str, np.ndarray] = {}
+        self._impedance: np.ndarray | None = None
         self._drawn_inertia = _inertia(m, self._chassis)
         self.reset()
 
@@ -85,6 +92,13 @@ class NativeBackend(NumpyBackend):
         c.rotation = turned[:, 0]
         c.wheel_axle = np.matmul(turned[:, 1:], self._axles[..., None])[..., 0]
         c.joint_angle, c.joint_speed = self._qpos.take(self._qadr, 1), self._qvel.take(self._dadr, 1)
+
+    def soften_loops(self, rover: int, share: float) -> None:
+        """Gives one rover's loops `share` times the compliance that its MJCF gives them."""
+        if self._impedance is None:
+            self._impedance = self._batch.expand("eq_solimp")
+        impedance = self._impedance[rover, :, :2]
+        impedance[:] = 1.0 / (1.0 + share * (1.0 / impedance - 1.0))
 
     def _push(self, c: Context) -> None:
         self._carry(c)
@@ -137,6 +151,29 @@ def native_model(model: Model) -> mujoco.MjModel:
         dofs = [int(m.jnt_dofadr[m.joint(j).id]) for j in model.rover.joints]
         m.dof_armature[dofs] = np.asarray(motor["rotor_inertia"]) * np.asarray(motor["gear_ratio"]) ** 2
     return m
+
+
+def close_loops(model: Model, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """States (rover, nq), (rover, nv) with their loops closed to rounding, by the least change of angles and speeds."""
+    m = native_model(model)
+    m.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    d = mujoco.MjData(m)
+    qpos, qvel = qpos.copy(), qvel.copy()
+    for q, v in zip(qpos, qvel, strict=True):
+        for _ in range(6):  # Newton, from loops that are open by micrometres
+            jacobian = _loops_at(m, d, q, v)[:, 6:]
+            # a pin holds two directions of a planar loop: the third row is nil
+            q[7:] -= np.linalg.pinv(jacobian, 1e-8) @ d.efc_pos
+        jacobian = _loops_at(m, d, q, v)
+        v[6:] -= np.linalg.pinv(jacobian[:, 6:], 1e-8) @ (jacobian @ v)
+    return qpos, qvel
+
+
+def _loops_at(m: mujoco.MjModel, d: mujoco.MjData, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """Jacobian of the loops' constraints at a state, (rows, nv); how far they are open is left in `d.efc_pos`."""
+    d.qpos[:], d.qvel[:] = qpos, qvel
+    mujoco.mj_forward(m, d)
+    return d.efc_J.reshape(d.nefc, m.nv).copy()
 
 
 def _inertia(m: mujoco.MjModel, body: int) -> tuple[float, np.ndarray, np.ndarray]:

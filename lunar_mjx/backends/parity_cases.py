@@ -133,13 +133,22 @@ QUANTITIES: dict[str, tuple[str, float]] = {
 }
 """Unit and typical size of every compared quantity."""
 
-RELATIVE = {"float64": 1e-9, "pybullet": 5e-6, "float32": 5e-4, "soft loop": 2e-3}
+SOFT_LOOP = "soft loop"
+
+RELATIVE = {"float64": 1e-9, "pybullet": 5e-6, "float32": 5e-4, SOFT_LOOP: 1e-5}
 """Relative tolerance by what separates two engines: float64 rounding through the equations; PyBullet, which keeps joint
-axes and frames to about 1e-8; float32; MuJoCo's compliant loop constraint against a loop that is closed exactly."""
+axes and frames to about 1e-8; float32; and in drives MuJoCo's loops, which give way, against loops closed exactly."""
+
+SOFT_STEP = {"acceleration": 0.1, "velocity": 1e-3, "joint_speed": 0.02, "position": 1e-6, "orientation": 1e-6,
+             "joint_angle": 1e-4}  # fmt: skip
+"""Relative tolerances of the quantities that a soft loop changes within a step that starts with closed loops; all
+others must agree as if there were no loop.
+
+Two causes, measured on VIPER apart from each other: MuJoCo damps the joints implicitly after it has solved for the
+loops' forces, the other engines within (2.9, 1.5 and 0.74 rad/s2 at time steps of 2, 1 and 0.5 ms, of a light pivot's
+66 rad/s2), and its constraint gives way (see `COMPLIANCE` in parity_record.py)."""
 
 EXCEPTIONS: dict[str, dict[str, float]] = {
-    # the constraint brings back within a few time steps what the loop has opened
-    "soft loop": {"acceleration": 0.1, "velocity": 0.1, "joint_speed": 0.1},
     "pybullet": {"wheel_force": 1e-4, "wheel_moment": 1e-4, "acceleration": 2e-4},
     # a height of some metres in float32 is off by 2e-7 m: 0.05 N on rock of 2e5 N/m
     "float32": {"wheel_force": 5e-3, "wheel_moment": 5e-3, "acceleration": 1e-2, "slip": 2e-3},
@@ -147,8 +156,9 @@ EXCEPTIONS: dict[str, dict[str, float]] = {
 """Quantities with another relative tolerance."""
 
 ABSOLUTE: dict[str, dict[str, float]] = {
-    # PyBullet keeps the frames of a URDF in float32: wheels lie up to 3e-8 m off, which is 0.006 N on rock of 2e5 N/m;
+    # PyBullet keeps the frames of a URDF in float32: LUVMI-X's wheels lie up to 3e-8 m off, which is 0.006 N on rock of
+    # 2e5 N/m, and VIPER's 6e-8 m, of which no more came (0.0040 N on boulders); the moment is that at its wheel's rim;
     # a step's change of speed is the tolerance of the acceleration, 2e-3 m/s2 or rad/s2, over 2 ms
-    "pybullet": {"wheel_force": 6e-3, "velocity": 4e-6, "joint_speed": 4e-6},
+    "pybullet": {"wheel_force": 6e-3, "wheel_moment": 1.5e-3, "velocity": 4e-6, "joint_speed": 4e-6},
 }
 """Least absolute tolerances, where a measured cause sets them."""

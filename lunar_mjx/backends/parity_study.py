@@ -8,8 +8,9 @@ from collections.abc import Collection, Sequence
 
 from lunar_mjx.backends.base import Observation
 from lunar_mjx.backends.native import NativeBackend
-from lunar_mjx.backends.parity import JaxRunner, Noise, Result, Runner, Samples, judge, judge_drive, record, tolerances
-from lunar_mjx.backends.parity_cases import RELATIVE, Case, cases, drive
+from lunar_mjx.backends.parity import JaxRunner, Result, Runner, judge, judge_drive, tolerances
+from lunar_mjx.backends.parity_cases import RELATIVE, SOFT_LOOP, Case, cases, drive
+from lunar_mjx.backends.parity_record import Noise, Samples, record
 from lunar_mjx.backends.pybullet import PyBulletBackend, import_pybullet
 from lunar_mjx.dynamics.state import Telemetry
 from lunar_mjx.errors import UserError, bad_input
@@ -63,8 +64,8 @@ class Study:
     noise: dict[str, Noise]
 
     def floor(self, pair: Pair, ground: str) -> Telemetry:
-        """The perturbed drive that a pair is held against; see `floor_of`."""
-        return floor_of((pair.first, pair.second), self.noise[ground])
+        """The drives that a pair is held against; see `floor_of`."""
+        return floor_of((pair.first, pair.second), pair.kind, self.noise[ground])
 
 
 def make_runner(engine: str, model: Model) -> Runner:
@@ -160,23 +161,22 @@ def _run(runner: Runner, used: list[Case], of: dict[str, Samples], commands: Com
 
 
 def kind_of(names: tuple[str, str], model: Model) -> str:
-    """What separates two engines: the key of their tolerance."""
+    """What separates two engines: keys of their tolerance, comma-separated."""
     kinds = ["float64"]
     for name in names:
         if name.endswith("float32"):
             kinds.append("float32")
         if name.startswith("pybullet"):
             kinds.append("pybullet")
+    rounding = max(kinds, key=lambda k: RELATIVE[k])
     exact = [name.startswith(("structured", "pybullet")) for name in names]
-    if model.rover.loops and exact[0] != exact[1]:
-        kinds.append("soft loop")
-    return max(kinds, key=lambda k: RELATIVE[k])
+    return f"{rounding}, {SOFT_LOOP}" if model.rover.loops and exact[0] != exact[1] else rounding
 
 
-def floor_of(names: tuple[str, str], noise: Noise) -> Telemetry:
-    """The reference perturbed as the engines are: PyBullet keeps frames in float32, so that it errs at every step."""
+def floor_of(names: tuple[str, str], kind: str, noise: Noise) -> Telemetry:
+    """The reference and its drives perturbed as the engines are: PyBullet keeps frames in float32, and errs so."""
     single = any(name.endswith("float32") or name.startswith("pybullet") for name in names)
-    return noise.held if single else noise.start
+    return noise.floor(single, SOFT_LOOP in kind)
 
 
 def _pair(model: Model, used: list[Case], a: Run, b: Run, of: dict[str, Samples], noise: dict[str, Noise]) -> Pair:
@@ -184,8 +184,8 @@ def _pair(model: Model, used: list[Case], a: Run, b: Run, of: dict[str, Samples]
     results = []
     for case in used:
         samples = dataclasses.replace(of[case.name], stages=a.steps[case.name][0], after=a.steps[case.name][1])
-        results += judge(case, samples, b.steps[case.name], tolerances(kind), model)
-        floor = floor_of((a.name, b.name), noise[case.name])
+        results += judge(case, samples, b.steps[case.name], tolerances(kind), model, SOFT_LOOP in kind)
+        floor = floor_of((a.name, b.name), kind, noise[case.name])
         results += judge_drive(case, a.drives[case.name], floor, b.drives[case.name],
                                tolerances(kind, drive=True), model)  # fmt: skip
     return Pair(a.name, b.name, kind, results, judged="own contact" not in b.name)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from lunar_mjx.backends import parity
-from lunar_mjx.backends.parity_cases import cases, drive
+from lunar_mjx.backends.parity_cases import SOFT_LOOP, cases, drive
+from lunar_mjx.backends.parity_record import record
 from lunar_mjx.model import make_model
 
 DURATION, SAMPLES = 4.0, 6
@@ -16,7 +17,7 @@ class Recorded:
         self.model = make_model(rover, "flat", preset)
         self.cases = cases(self.model.rover, grounds)
         self.commands = drive(self.model, duration)
-        self.of = {c.name: parity.record(self.model, c, self.commands, SAMPLES) for c in self.cases}
+        self.of = {c.name: record(self.model, c, self.commands, SAMPLES) for c in self.cases}
 
     def judge(self, runner: parity.Runner, kind: str) -> list[parity.Result]:
         """Levels 1 and 2 on all grounds."""
@@ -24,7 +25,8 @@ class Recorded:
         return [
             result
             for case in self.cases
+            for samples in (self.of[case.name][0],)
             for result in parity.judge(
-                case, self.of[case.name][0], runner.step_from(case, self.of[case.name][0]), wanted, self.model
+                case, samples, runner.step_from(case, samples), wanted, self.model, SOFT_LOOP in kind
             )
         ]
