@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.criticism import verbs
+from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.runs import SERIES_FILE, Run
-from lunar_mjx.criticism.search import Settings
 from lunar_mjx.criticism.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model

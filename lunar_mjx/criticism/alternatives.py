@@ -10,8 +10,8 @@ from lunar_mjx.criticism.build_problem import build_problem, candidate_effects
 from lunar_mjx.criticism.fitting import Progress, fit
 from lunar_mjx.criticism.held_out import errors, predictive_gain, predictive_residual
 from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.refit import Candidate
 from lunar_mjx.criticism.runs import Run
-from lunar_mjx.criticism.search import Candidate
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,8 +10,9 @@ import numpy as np
 from lunar_mjx.criticism.fitting import HALF_STEP, Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import errors
 from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.score import SEPARABLE, Score
-from lunar_mjx.criticism.search import Search, Settings, excess_explained, search, significant
+from lunar_mjx.criticism.search import Search, excess_explained, search, significant
 from lunar_mjx.criticism.verdict import Diagnosis, EffectEvidence, Verdict
 
 STEP_SHARE = 0.01

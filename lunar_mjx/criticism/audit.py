@@ -21,9 +21,10 @@ from lunar_mjx.criticism.build_problem import build_problem
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
 from lunar_mjx.criticism.observations import Observations
 from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.runs import FITS_FILE, MODEL_FILE, Run, folder_hash, load_run
 from lunar_mjx.criticism.score import SEPARABLE, score, signatures
-from lunar_mjx.criticism.search import Settings, fit_baseline
+from lunar_mjx.criticism.search import fit_baseline
 from lunar_mjx.criticism.verdict import Verdict
 from lunar_mjx.errors import bad_input
 

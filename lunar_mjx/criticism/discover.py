@@ -12,9 +12,10 @@ from lunar_mjx.criticism.drive_problem import DriveProblem
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
 from lunar_mjx.criticism.held_out import errors, gain, noise_test
 from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.refit import Candidate, Settings, refit_with
 from lunar_mjx.criticism.runs import VERDICT_FILE, Run, load_run
 from lunar_mjx.criticism.score import score, signatures
-from lunar_mjx.criticism.search import Candidate, Settings, fit_baseline, refit_with
+from lunar_mjx.criticism.search import fit_baseline
 from lunar_mjx.criticism.table_problem import TableProblem
 from lunar_mjx.criticism.terms import Term, effect_of, terms, with_amount
 from lunar_mjx.effects.base import PORTS

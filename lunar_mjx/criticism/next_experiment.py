@@ -20,9 +20,10 @@ from lunar_mjx.criticism.fitting import Memory, Progress, silent
 from lunar_mjx.criticism.log import SteadyLog
 from lunar_mjx.criticism.planned import planned_drives, planned_sweeps
 from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.runs import FITS_FILE, VERDICT_FILE, Run, load_run
 from lunar_mjx.criticism.score import SEPARABLE
-from lunar_mjx.criticism.search import Settings, fit_baseline
+from lunar_mjx.criticism.search import fit_baseline
 from lunar_mjx.errors import UserError
 
 NEXT_FILE = "next.json"

@@ -2,87 +2,26 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from lunar_mjx.criticism.complete import best_start, simpler, stands
 from lunar_mjx.criticism.descent import slack_of
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
-from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
+from lunar_mjx.criticism.held_out import gain, noise_test
 from lunar_mjx.criticism.localise import pattern
 from lunar_mjx.criticism.problem import Problem
-from lunar_mjx.criticism.scan import scan
+from lunar_mjx.criticism.refit import Candidate, Settings, refit, refit_all
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
 
-_RIVAL = 0.8
-"""Share of what an effect takes off that score or scan must promise another to be refitted as its rival. (Of ten
-rivals of Coulomb friction in two campaigns eight took off what was promised within 3 % of that effect's share; gravity
-took off 14 % more, grousers nothing.)"""
+_HOPELESS = 200.0
+"""Chi-square beyond an effect's from which another that may stand for it is left."""
 _NOISE = "noise"
 """What the place is called at which the noise's colour was learnt."""
 _MISFIT = 1.3
 """Root mean square residual of a channel, over what noise allows it, from which a model is far beyond the noise."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """How a diagnosis is made.
-
-    Attributes:
-      alpha: family-wise error rate of the score tests.
-      share: of the excess over the noise; a candidate that explains more of it is refitted whatever its score, because
-        the other missing effects of a model that fails badly drown every score. Held-out manoeuvres judge it.
-      chi2: least drop of chi-square by an effect that is named.
-      gain_se: held-out gain in standard errors that an effect must earn.
-      refits: effects refitted at each level. beam: models carried from level to level. most: effects named at most.
-      confounded: |cos| from which two effects count as near relatives.
-      same: differences of chi-square below which two effects explain the data alike.
-      pattern: log evidence of a smooth unknown input in the residual from which a model counts as failing, however
-        small the residual. Of 35 tables with the true model none left more than 4.8, at thrice the usual disturbance
-        14; three wrong models whose residual passed for noise left 30 to 78.
-      explained: share of the excess over the noise that the effects named must explain where they do not reach it.
-      starts: of the baseline fit. draws: of the bootstrap. seed: of both.
-    """
-
-    alpha: float = 0.01
-    share: float = 0.05
-    chi2: float = 25.0
-    gain_se: float = 2.0
-    refits: int = 4
-    beam: int = 2
-    most: int = 4
-    confounded: float = 0.9
-    same: float = 12.0
-    pattern: float = 20.0
-    explained: float = 0.995
-    starts: int = 4
-    draws: int = 2000
-    seed: int = 0
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Candidate:
-    """A refitted set of effects.
-
-    Attributes:
-      effects: names, in the order of adding. fit: the refit. noise: whether its residual is as small as the noise.
-      gain, gain_se: held-out gain over the parent set and its standard error.
-      patterned: whether what is left is small, but no noise: some smooth unknown input has it.
-    """
-
-    effects: tuple[str, ...]
-    fit: Fit
-    noise: NoiseTest
-    gain: float
-    gain_se: float
-    patterned: bool = False
-
-    @property
-    def at_noise(self) -> bool:
-        """Whether nothing is left but noise, as far as can be told."""
-        return self.noise.passes and not self.patterned
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -120,7 +59,7 @@ def fit_baseline(problem: Problem, settings: Settings, memory: Memory, progress:
 
 
 def search(
-    problem: Problem, settings: Settings = Settings(), progress: Progress = silent, memory: Memory | None = None
+    problem: Problem, settings: Settings | None = None, progress: Progress = silent, memory: Memory | None = None
 ) -> Search:
     """Fits the baseline, scores every candidate, refits the best and adds effects while they earn it.
 
@@ -128,7 +67,7 @@ def search(
     beyond the noise, on fitted manoeuvres or on others, may be where no descent converges, or press against bounds;
     whether an effect brings it to the noise, with a certificate of its own, can be seen all the same.
     """
-    memory = memory or Memory()
+    settings, memory = settings or Settings(), memory or Memory()
     base_fit = fit_baseline(problem, settings, memory, progress)
     base = Candidate((), base_fit, noise_test(problem, base_fit), 0.0, 0.0)
     far = slack_of(base_fit.chi2, int(base_fit.fitted.sum())) > 0.0 or base.noise.worst_ratio > _MISFIT
@@ -149,7 +88,9 @@ def search(
         grown = sorted((c for c in grown if np.isfinite(c.fit.chi2)), key=lambda c: c.fit.chi2)
         reached = _reaching(problem, base, grown, settings, tried)
         if reached is not None:
-            best = reached
+            best = (
+                reached if problem.cheap_jacobian else _completed(problem, reached, settings, tried, memory, progress)
+            )
             break
         grown = [tried[frozenset(c.effects)] for c in grown]
         better = [c for c in grown if _better(c, best, settings) and _earned(problem, best, c, settings)]
@@ -180,6 +121,35 @@ def _reaching(
             if looked.at_noise:
                 return looked
     return None
+
+
+def _completed(
+    problem: Problem, best: Candidate, settings: Settings, tried: dict[frozenset[str], Candidate], memory: Memory,
+    progress: Progress,
+) -> Candidate:  # fmt: skip
+    """A model at the noise with a simpler effect where one does the same, and with what is significant beside it."""
+    while True:
+        progress("looking for more", 0.0)
+        scores = _scores(problem, best, settings)
+        for stand in stands(problem, best.fit, best.effects, scores)[: settings.refits]:
+            if frozenset(stand.effects) in tried:
+                continue
+            with problem.focused(stand.effects):
+                start = best_start(problem, stand)
+                c = refit(problem, best, stand.effects, stand.scored, memory, best.fit.chi2 + _HOPELESS, start)
+            tried[frozenset(c.effects)] = c
+            if c.noise.passes and simpler(c.fit, best.fit):
+                return _completed(problem, c, settings, tried, memory, progress)
+        new = [s for s in scores if s.effect not in best.effects and significant(s, settings)][: settings.refits]
+        if not new or len(best.effects) >= settings.most:
+            return best
+        with problem.focused([*best.effects, *(s.effect for s in new)]):
+            grown = refit_all(problem, best, new, settings, memory)
+        tried.update({frozenset(c.effects): c for c in grown})
+        better = [c for c in grown if _better(c, best, settings) and _earned(problem, best, c, settings)]
+        if not better:
+            return best
+        best = max(better, key=lambda c: gain(problem, best.fit, c.fit)[0])
 
 
 def _looked_at(problem: Problem, c: Candidate, settings: Settings) -> Candidate:
@@ -227,106 +197,9 @@ def _grow(
             chosen.append(s)
     new = [s for s in chosen if frozenset((*parent.effects, s.effect)) not in tried]
     with problem.focused([*parent.effects, *(s.effect for s in new)]):
-        grown = _refit_all(problem, parent, new, settings, memory)
+        grown = refit_all(problem, parent, new, settings, memory)
     tried.update({frozenset(c.effects): c for c in grown})
     return grown
-
-
-def _refit_all(
-    problem: Problem, parent: Candidate, new: Sequence[Score], settings: Settings, memory: Memory
-) -> list[Candidate]:
-    """Refits the parent with each of the new effects.
-
-    Where rows are free, all refits share their batches. Where they are dear, the best is refitted first, and others
-    only as far as they may still rival it.
-    """
-
-    scans = scan(problem, parent.fit, parent.effects, new)
-    new = sorted(new, key=lambda s: scans[s.effect][0] if s.effect in scans else parent.fit.chi2 - s.chi2)
-
-    def one(s: Score, rival: float = np.inf) -> Candidate:
-        chi2, start = scans.get(s.effect, (np.inf, None))
-        better = chi2 < parent.fit.chi2 - s.chi2
-        return _refit(problem, parent, (*parent.effects, s.effect), s, memory, rival, start if better else None)
-
-    if not problem.eager or len(new) < 2:
-        grown: list[Candidate] = []
-        for s in new:
-            # What falls far short of one that reaches the noise is not refitted, or left soon.
-            reached = min((c.fit.chi2 for c in grown if c.noise.passes), default=np.inf)
-            promised = max(s.chi2, parent.fit.chi2 - scans.get(s.effect, (np.inf, None))[0])
-            if problem.cheap_jacobian or not promised < _RIVAL * (parent.fit.chi2 - reached):
-                grown.append(one(s, reached + settings.same))
-        return grown
-    with problem.together(len(new)) as leave:
-
-        def tracked(s: Score) -> Candidate:
-            try:
-                return one(s)
-            finally:
-                leave()
-
-        with concurrent.futures.ThreadPoolExecutor(len(new)) as pool:
-            return list(pool.map(tracked, new))
-
-
-def _refit(
-    problem: Problem, parent: Candidate, effects: tuple[str, ...], scored: Score | None, memory: Memory,
-    rival: float = np.inf, start: np.ndarray | None = None,
-) -> Candidate:  # fmt: skip
-    """Refits from a start; without one from the parent with the new effect at its linear estimate, and from a third of
-    it where that fails."""
-    free = problem.free(effects)
-    found = memory.recall(problem, effects)
-    if found is not None:
-        value, se = gain(problem, parent.fit, found)
-        return Candidate(effects, found, noise_test(problem, found), value, se)
-    places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
-    if start is not None:
-        found = fit(problem, free, start, starts=1, certify=False, rival=rival)
-    elif scored is not None and scored.columns is not None and not problem.cheap_jacobian:
-        # The score has taken all derivatives at the parent's fit: the first step costs nothing.
-        known = parent.fit.residual, _joined(problem, parent.fit, free, places, scored.columns)
-        found = fit(problem, free, parent.fit.u, starts=1, certify=False, rival=rival, known=known)
-    else:
-        for share in (1.0, 0.3) if scored is not None else (0.0,):
-            near = parent.fit.u.copy()
-            if scored is not None:
-                near[places] += share * np.clip(scored.amount, -3.0, 3.0)
-            trial = fit(problem, free, near, starts=1, certify=False, rival=rival)
-            if found is None or trial.chi2 < found.chi2:
-                found = trial
-            if found.chi2 < parent.fit.chi2 and share != 1.0:
-                break
-    if scored is not None and problem.cheap_jacobian:
-        # A baseline that misfits may have gone far along a valley, from where the way back is long.
-        given = problem.origin()
-        given[places] += np.clip(scored.amount, -1.0, 1.0)
-        trial = fit(problem, free, given, starts=1, certify=False)
-        if found is None or trial.chi2 < found.chi2:
-            found = trial
-    assert found is not None
-    memory.keep(problem, effects, found)
-    value, se = gain(problem, parent.fit, found)
-    return Candidate(effects, found, noise_test(problem, found), value, se)
-
-
-def _joined(problem: Problem, parent: Fit, free: np.ndarray, places: Sequence[int], columns: np.ndarray) -> np.ndarray:
-    """(n, free) Jacobian at the parent's fit, with the columns of a candidate; its shapes do nothing at its null."""
-    out = np.zeros((len(problem.observations), len(free)))
-    at = {int(i): k for k, i in enumerate(free)}
-    for k, i in enumerate(parent.free):
-        out[:, at[int(i)]] = parent.jacobian[:, k]
-    for k, i in enumerate(places):
-        out[:, at[int(i)]] = columns[:, k]
-    return out
-
-
-def refit_with(problem: Problem, base: Fit, effect: str, settings: Settings, memory: Memory) -> Fit:
-    """The model refitted with one candidate, from the candidate's linear estimate."""
-    parent = Candidate((), base, noise_test(problem, base), 0.0, 0.0)
-    scored = score(problem, base, signatures(problem, base, [effect]), settings.draws, settings.seed)
-    return _refit(problem, parent, (effect,), scored[0] if scored else None, memory).fit
 
 
 def _earned(problem: Problem, before: Candidate, c: Candidate, settings: Settings) -> bool:

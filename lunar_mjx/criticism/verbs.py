@@ -19,6 +19,7 @@ from lunar_mjx.criticism.held_out import errors, noise_test
 from lunar_mjx.criticism.log import check
 from lunar_mjx.criticism.log.findings import is_bad
 from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.runs import (
     COMPARISON_FILE,
     FITS_FILE,
@@ -29,7 +30,7 @@ from lunar_mjx.criticism.runs import (
     load_run,
     log_folders,
 )
-from lunar_mjx.criticism.search import Search, Settings, fit_baseline
+from lunar_mjx.criticism.search import Search, fit_baseline
 from lunar_mjx.criticism.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model
@@ -320,7 +321,7 @@ def add(folder: str | Path | Run, effect: str, out: str | Path, progress: Progre
         problem = build_problem(grown, campaign, [new.name], progress)
         memory = _memory(run)
         base = fit_baseline(problem, Settings(seed=run.seed), memory, progress)
-        from lunar_mjx.criticism.search import refit_with
+        from lunar_mjx.criticism.refit import refit_with
 
         fitted = refit_with(problem, base, new.name, Settings(seed=run.seed), memory)
         model = fitted_model(problem, fitted, model, held=values)

@@ -11,7 +11,7 @@ from lunar_mjx.criticism.attribute import diagnose
 from lunar_mjx.criticism.drive_problem import DriveProblem
 from lunar_mjx.criticism.log import check, read_campaign
 from lunar_mjx.criticism.log.findings import is_bad
-from lunar_mjx.criticism.search import Settings
+from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.verdict import Verdict
 from lunar_mjx.effects import catalogue
 from lunar_mjx.model import make_model

@@ -1,0 +1,75 @@
+"""What a model of drives at the noise still owes: a second effect below the noise, and a simpler one in its place."""
+
+import numpy as np
+import pytest
+from toy_problem import Linear, coordinate, manoeuvres
+
+from lunar_mjx.criticism.complete import best_start, simpler, stands
+from lunar_mjx.criticism.fitting import Memory, fit
+from lunar_mjx.criticism.refit import Settings
+from lunar_mjx.criticism.score import score, signatures
+from lunar_mjx.criticism.search import search
+
+LOGS, SAMPLES, WIDE = 6, 150, 7
+
+
+class Dear(Linear):
+    """A linear problem whose rows count as dear; `wide` has several parameters, `narrow` does what their sum does."""
+
+    cheap_jacobian = False
+
+    def __init__(self, rng: np.random.Generator):
+        count = LOGS * SAMPLES
+        wide = rng.normal(size=(count, WIDE))
+        matrix = {"small": rng.normal(size=count), "narrow": wide.sum(axis=1) / WIDE}
+        super().__init__(rng.normal(size=(count, 2)), matrix, manoeuvres(LOGS, SAMPLES))
+        first = self.matrix.shape[1]
+        self.matrix = np.column_stack([self.matrix, wide])
+        self.coordinates = (*self.coordinates, *(coordinate("wide", f"w{i}", True) for i in range(WIDE)))
+        self.candidates = {**self.candidates, "wide": np.arange(first, first + WIDE)}
+
+
+def measured(problem: Dear, rng: np.random.Generator, **amounts: float) -> Dear:
+    """The problem with measurements of these effects and unit noise."""
+    u = np.zeros(len(problem.coordinates))
+    for name, amount in amounts.items():
+        u[problem.candidates[name]] = amount
+    problem.observations.value[:] = problem.predict(u)[0] + rng.normal(size=len(problem.observations))
+    return problem
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
+
+
+@pytest.mark.parametrize(("amount", "named"), [(0.35, {"narrow", "small"}), (0.0, {"narrow"})])
+def test_a_second_effect_below_the_noise_is_found(rng, amount, named) -> None:
+    problem = measured(Dear(rng), rng, narrow=8.0, small=amount)
+    del problem.candidates["wide"]
+    found = search(problem, Settings(draws=500))
+    first = next(c for c in found.tried if c.effects == ("narrow",))
+    assert first.noise.passes
+    assert set(found.chosen.effects) == named
+
+
+def test_an_effect_with_many_parameters_gives_way_to_one_that_does_the_same(rng) -> None:
+    problem = measured(Dear(rng), rng, narrow=8.0)
+    wide = fit(problem, problem.free(["wide"]), starts=1, certify=False)
+    scores = score(problem, wide, signatures(problem, wide, ["narrow", "small"]), 100)
+    (stand,) = stands(problem, wide, ("wide",), scores)
+    assert stand.effects == ("narrow",)
+    start = best_start(problem, stand)
+    assert start[problem.candidates["narrow"]] == pytest.approx(8.0, rel=0.2)
+    assert not start[problem.candidates["wide"]].any()
+    narrow = fit(problem, problem.free(["narrow"]), start, starts=1, certify=False)
+    assert simpler(narrow, wide)
+    assert not simpler(wide, narrow)
+
+
+def test_an_effect_that_needs_its_parameters_keeps_its_name(rng) -> None:
+    problem = Dear(rng)
+    problem.observations.value[:] = 3.0 * problem.matrix[:, -1] - 2.0 * problem.matrix[:, -2]
+    problem.observations.value[:] += rng.normal(size=len(problem.observations))
+    found = search(problem, Settings(draws=500), memory=Memory())
+    assert found.chosen.effects == ("wide",)
