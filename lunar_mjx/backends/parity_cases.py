@@ -155,6 +155,13 @@ EXCEPTIONS: dict[str, dict[str, float]] = {
 }
 """Quantities with another relative tolerance."""
 
+DRIVE_EXCEPTIONS: dict[str, dict[str, float]] = {
+    # VIPER chatters on a slope of rock until it drives and PyBullet's comes to rest elsewhere, 6e-5 m away: slip then
+    # differs by up to 0.022. Set to the reference's state after that, it follows to 8e-6 for 0.6 s.
+    f"pybullet, {SOFT_LOOP}": {"slip": 2e-3, "joint_torque": 2e-3},
+}
+"""Quantities with another relative tolerance in drives, by all that separates two engines."""
+
 ABSOLUTE: dict[str, dict[str, float]] = {
     # PyBullet keeps the frames of a URDF in float32: LUVMI-X's wheels lie up to 3e-8 m off, which is 0.006 N on rock of
     # 2e5 N/m, and VIPER's 6e-8 m, of which no more came (0.0040 N on boulders); the moment is that at its wheel's rim;

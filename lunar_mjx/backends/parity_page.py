@@ -10,8 +10,8 @@ import numpy as np
 import plotly.graph_objects as go
 
 from lunar_mjx.backends.parity import first_failure, traces
-from lunar_mjx.backends.parity_cases import ABSOLUTE, EXCEPTIONS, QUANTITIES, RELATIVE, SOFT_STEP
-from lunar_mjx.backends.parity_record import COMPLIANCE, RUNS, SPREAD
+from lunar_mjx.backends.parity_cases import ABSOLUTE, DRIVE_EXCEPTIONS, EXCEPTIONS, QUANTITIES, RELATIVE, SOFT_STEP
+from lunar_mjx.backends.parity_record import COMPLIANCE, RUNS_DOUBLE, RUNS_SINGLE, SPREAD
 from lunar_mjx.backends.parity_study import Pair, Study
 from lunar_mjx.report import Figure, Section, Table, Text, write_page
 from lunar_mjx.report.style import INK, SERIES, VERMILION, finish
@@ -75,6 +75,7 @@ def _method(study: Study) -> list[str]:
     grounds = "; ".join(c.name for c in study.grounds)
     kinds = ", ".join(f"{k} {v:g}" for k, v in RELATIVE.items())
     but = "; ".join(f"{k}: {', '.join(f'{q} {v:g}' for q, v in own.items())}" for k, own in EXCEPTIONS.items())
+    apart = "; ".join(f"{k}: {', '.join(f'{q} {v:g}' for q, v in own.items())}" for k, own in DRIVE_EXCEPTIONS.items())
     least = "; ".join(f"{k}: {', '.join(f'{q} {v:g} {QUANTITIES[q][0]}' for q, v in own.items())}"
                       for k, own in ABSOLUTE.items())  # fmt: skip
     loops = ", ".join(f"{q} {v:g}" for q, v in SOFT_STEP.items())
@@ -84,13 +85,13 @@ def _method(study: Study) -> list[str]:
         "evaluates one state stage by stage, level 2 makes one step, both from states recorded along the reference's "
         "drive; level 3 lets every engine drive for itself.",
         "An error is |a - b|/(atol + rtol |a|); above 1 the engines disagree. rtol by what separates the engines: "
-        f"{kinds} (with exceptions, {but}), ten times that for drives; atol is rtol times the quantity's typical "
-        f"size (at least, {least}).",
+        f"{kinds} (with exceptions, {but}), ten times that for drives (there {apart}); atol is rtol times the "
+        f"quantity's typical size (at least, {least}).",
         "Drives may also depart by ten times the noise floor. That is the farthest of the reference's own drives, once "
-        f"with coordinates rounded to float32 at the start, and {RUNS} times with coordinates and speeds moved by "
-        f"chance within {SPREAD:g} units in the last place of float64 after every step; where an engine holds "
-        "coordinates or frames in float32, also in its last place, which makes the sinkage err as it was measured to "
-        "err in float32, by 4e-8 m.",
+        f"with coordinates rounded to float32 at the start, and {RUNS_DOUBLE} times with coordinates and speeds moved "
+        f"by chance within {SPREAD:g} units in the last place of float64 after every step; where an engine holds "
+        f"coordinates or frames in float32, also {RUNS_SINGLE} times in its last place, which makes the sinkage err "
+        "as it was measured to err in float32, by 4e-8 m. A slip of 2 and one of -2 are the same.",
         "MuJoCo's loops give way by a micrometre. Engines that close them exactly are compared with it from states "
         "whose loops are closed: there every stage before the acceleration must agree as if there were no loop, and "
         f"then with rtol {loops}. Their drives' noise floor also has the reference with {shares} times its loops' "
