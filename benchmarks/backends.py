@@ -126,7 +126,10 @@ def numpy_steps(job: tuple[str, str, int, float]) -> dict[str, Any]:
 
 
 def in_processes(engine: str, rover: str, rovers: int, processes: int, seconds: float) -> dict[str, Any]:
-    """The same in several processes at once, each on one thread; memory is that of all."""
+    """The same in processes of their own, each on one thread: in one, linear algebra would take every core.
+
+    Memory is that of all.
+    """
     os.environ |= dict.fromkeys(THREADS, "1") | {"JAX_PLATFORMS": "cpu"}  # which the processes inherit
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
         parts = pool.map(numpy_steps, [(engine, rover, rovers, seconds)] * processes, chunksize=1)
@@ -142,14 +145,14 @@ def rows_of(rover: str, options: argparse.Namespace, add: Callable[..., None]) -
             for threads in dict.fromkeys((1, cores)):
                 add("native, bare", 512, threads, native_batch(model, threads, 512, options.native_steps))
             for batch in options.numpy_batches:
-                add("native, NumPy effects", batch, 1, numpy_steps(("native", rover, batch, options.seconds)))
+                add("native, NumPy effects", batch, 1, in_processes("native", rover, batch, 1, options.seconds))
             largest = max(options.numpy_batches)
             if cores > 1:
                 add("native, NumPy effects", largest * cores, cores,
                     in_processes("native", rover, largest, cores, options.seconds))  # fmt: skip
         if "pybullet" in options.engines:
             try:
-                add("pybullet", 1, 1, numpy_steps(("pybullet", rover, 1, options.seconds)))
+                add("pybullet", 1, 1, in_processes("pybullet", rover, 1, 1, options.seconds))
                 if cores > 1:
                     add("pybullet", cores, cores, in_processes("pybullet", rover, 1, cores, options.seconds))
             except UserError as missing:
