@@ -23,6 +23,12 @@ _TAKEN = 0.45
 """Share of a candidate's signature that an effect in the model may leave of it: below, one can stand for the other."""
 _SHARES = np.array([0.5, 1.0, 1.5])
 """Of the amount that does what the effect in the model does: where a refit may start."""
+_MANY = 4
+"""Parameters of an effect from which amounts of simpler ones are tried in its place, where derivatives may mislead."""
+_AMOUNTS = np.array([0.1, 0.3, 1.0, 2.0, 3.0])
+"""What is tried, in terms of a candidate's nominal amount, with either sign."""
+_MOST = 0.5
+"""Share of what the effect takes off that such an amount must, without any refit."""
 _SIMPLER = 25.0
 """Chi-square, beyond ln n for each parameter, by which a simpler effect must be ahead to be named in its place."""
 
@@ -72,6 +78,43 @@ def stands(problem: Problem, fit: Fit, effects: Sequence[str], scores: Sequence[
     return [stand for alike, stand in sorted(found, key=lambda f: -f[0]) if alike**2 > 1.0 - _TAKEN**2]
 
 
+def tried_in_place(problem: Problem, fit: Fit, effects: Sequence[str], scores: Sequence[Score]) -> list[Stand]:
+    """Candidates of one amount that do most of what an effect of many parameters does, by simulation.
+
+    A delay of held commands has no derivative, and a clock that is late by a step of the course has a wrong one.
+
+    Args:
+      problem, fit, effects, scores: as for `stands`.
+    """
+    goal = Objective(problem, problem.free(effects), fit.fitted)
+    found: list[tuple[float, Stand]] = []
+    for effect in effects:
+        own = problem.candidates[effect]
+        if np.isin(fit.free[_felt(fit)], own).sum() < _MANY:
+            continue
+        without = fit.u.copy()
+        without[own] = 0.0
+        rows, owner = [without], [-1]
+        for n, s in enumerate(scores):
+            places = [i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude]
+            if len(places) != 1 or s.effect in effects:
+                continue
+            low, high = problem.bounds(np.array(places))
+            for amount in np.concatenate([-_AMOUNTS, _AMOUNTS]):
+                if low[0] < amount < high[0]:
+                    rows.append(without.copy())
+                    rows[-1][places] = amount
+                    owner.append(n)
+        _, chi2 = goal.residuals(np.array(rows))
+        rest = tuple(e for e in effects if e != effect)
+        for n in set(owner[1:]):
+            mine = np.flatnonzero(np.array(owner) == n)
+            k = mine[np.argmin(chi2[mine])]
+            if chi2[0] - chi2[k] > _MOST * (chi2[0] - fit.chi2):
+                found.append((float(chi2[k]), Stand((*rest, scores[n].effect), rows[k], scores[n])))
+    return [stand for _, stand in sorted(found, key=lambda f: f[0])]
+
+
 def _within(problem: Problem, places: Sequence[int], amount: np.ndarray) -> np.ndarray:
     low, high = problem.bounds(np.array(places, int))
     return np.clip(amount, low, high)
@@ -95,4 +138,8 @@ def simpler(one: Fit, other: Fit) -> bool:
 
 def _parameters(fit: Fit) -> int:
     """Parameters that the measurements feel."""
-    return int(np.sum(np.linalg.norm(fit.jacobian[fit.fitted], axis=0) > 1e-6))
+    return len(_felt(fit))
+
+
+def _felt(fit: Fit) -> np.ndarray:
+    return np.flatnonzero(np.linalg.norm(fit.jacobian[fit.fitted], axis=0) > 1e-6)

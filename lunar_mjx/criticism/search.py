@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lunar_mjx.criticism.complete import best_start, simpler, stands
+from lunar_mjx.criticism.complete import best_start, simpler, stands, tried_in_place
 from lunar_mjx.criticism.descent import slack_of
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import gain, noise_test
@@ -131,7 +131,9 @@ def _completed(
     while True:
         progress("looking for more", 0.0)
         scores = _scores(problem, best, settings)
-        for stand in stands(problem, best.fit, best.effects, scores)[: settings.refits]:
+        instead = stands(problem, best.fit, best.effects, scores)[: settings.refits]
+        instead += tried_in_place(problem, best.fit, best.effects, scores)[: settings.refits]
+        for stand in instead:
             if frozenset(stand.effects) in tried:
                 continue
             with problem.focused(stand.effects):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from toy_problem import Linear, coordinate, manoeuvres
 
-from lunar_mjx.criticism.complete import best_start, simpler, stands
+from lunar_mjx.criticism.complete import best_start, simpler, stands, tried_in_place
 from lunar_mjx.criticism.fitting import Memory, fit
 from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.score import score, signatures
@@ -73,3 +73,32 @@ def test_an_effect_that_needs_its_parameters_keeps_its_name(rng) -> None:
     problem.observations.value[:] += rng.normal(size=len(problem.observations))
     found = search(problem, Settings(draws=500), memory=Memory())
     assert found.chosen.effects == ("wide",)
+
+
+class Held(Dear):
+    """`narrow` acts in jumps of a half: its derivative is zero, as that of a delay of held commands."""
+
+    def predict(self, u):
+        u = np.array(np.atleast_2d(u), float)
+        place = self.candidates["narrow"]
+        u[:, place] = 8.0 * np.round(2.0 * u[:, place]) / 2.0
+        return super().predict(u)
+
+    def jacobian(self, u, which):
+        return np.where(np.isin(which, self.candidates["narrow"]), 0.0, super().jacobian(u, which))
+
+
+def test_an_effect_without_a_derivative_is_tried_in_place_of_one_with_many_parameters(rng) -> None:
+    problem = measured(Held(rng), rng, narrow=1.0)
+    wide = fit(problem, problem.free(["wide"]), starts=1, certify=False)
+    scores = score(problem, wide, signatures(problem, wide, ["narrow", "small"]), 100)
+    found = tried_in_place(problem, wide, ("wide",), scores)
+    assert [stand.effects for stand in found] == [("narrow",)]
+    assert found[0].start[problem.candidates["narrow"]] == pytest.approx(1.0)
+
+
+def test_nothing_is_tried_in_place_of_an_effect_of_one_parameter(rng) -> None:
+    problem = measured(Dear(rng), rng, small=3.0)
+    small = fit(problem, problem.free(["small"]), starts=1, certify=False)
+    scores = score(problem, small, signatures(problem, small, ["narrow"]), 100)
+    assert tried_in_place(problem, small, ("small",), scores) == []
