@@ -107,6 +107,8 @@ def search(
     if not best.effects:
         base = best = tried[frozenset()] = _looked_at(problem, base, settings)
     rivals = [c for c in tried.values() if c is not best and _alike(c, best, settings)]
+    if not problem.cheap_jacobian:
+        rivals = [c for c in rivals if not simpler(best.fit, c.fit)]
     return Search(base, tuple(scores), angles, tuple(tried.values()), best, tuple(rivals))
 
 
@@ -140,8 +142,11 @@ def _completed(
                 start = best_start(problem, stand)
                 c = refit(problem, best, stand.effects, stand.scored, memory, best.fit.chi2 + _HOPELESS, start)
             tried[frozenset(c.effects)] = c
-            if c.noise.passes and simpler(c.fit, best.fit):
-                return _completed(problem, c, settings, tried, memory, progress)
+        plain = [c for c in tried.values() if 0 < len(c.effects) <= len(best.effects) and c.noise.passes]
+        plain = [c for c in plain if simpler(c.fit, best.fit)]
+        if plain:
+            least = min(plain, key=lambda c: c.fit.chi2)
+            return _completed(problem, least, settings, tried, memory, progress)
         new = [s for s in scores if s.effect not in best.effects and significant(s, settings)][: settings.refits]
         if not new or len(best.effects) >= settings.most:
             return best
