@@ -157,8 +157,8 @@ EXCEPTIONS: dict[str, dict[str, float]] = {
 
 DRIVE_EXCEPTIONS: dict[str, dict[str, float]] = {
     # VIPER chatters on a slope of rock until it drives and PyBullet's comes to rest elsewhere, 6e-5 m away: slip then
-    # differs by up to 0.022 and a drive's torque by up to 0.8 N m of 278. Started from the reference's state after that,
-    # its slip stays within 8e-6 of the reference with stiff loops damped within.
+    # differs by up to 0.022 and a drive's torque by up to 0.8 N m of 278. Started from the reference's state after
+    # that, its slip stays within 8e-6 of the reference with stiff loops damped within.
     f"pybullet, {SOFT_LOOP}": {"slip": 2e-3, "joint_torque": 4e-3},
 }
 """Quantities with another relative tolerance in drives, by all that separates two engines."""
