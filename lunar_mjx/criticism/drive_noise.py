@@ -37,6 +37,8 @@ _EVIDENCE = 15.0
 """Twice the log-likelihood that a colour must gain over white noise: about one false colour in two thousand."""
 _OWN = 10.0
 """The same for a kind of instrument that departs from the colour that all have in common."""
+_JITTER, _UNEVEN = 0.05, 40
+"""Error of a segment's times, as a share of its length, that does not matter; sets of times that are looked at."""
 _SIZE = 1.2
 """Factor by which the variance at rest may differ from what is stated: within a second, slow noise of any size looks
 alike but for that."""
@@ -234,12 +236,18 @@ def _around(near: Colour) -> list[Colour]:
 
 
 def _by_times(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Times since the beginning (n,) and values (n, segments) of the segments that share them."""
+    """Times since the beginning (n,) and values (n, segments) of the segments that share them.
+
+    Clocks jitter: what is nearly even counts as even, and of uneven segments only so many are taken.
+    """
     groups: dict[bytes, tuple[np.ndarray, list[np.ndarray]]] = {}
     for t, v in parts:
-        since = np.round(t - t[0], 6)
+        step = float(f"{np.median(np.diff(t)):.2g}")
+        even = step * np.arange(len(t))
+        since = even if np.max(np.abs(t - t[0] - even)) < _JITTER * step * len(t) else np.round(t - t[0], 6)
         groups.setdefault(since.tobytes(), (since, []))[1].append(v)
-    return [(since, np.stack(values, axis=1)) for since, values in groups.values()]
+    found = sorted(groups.values(), key=lambda g: -len(g[1]))[:_UNEVEN]
+    return [(since, np.stack(values, axis=1)) for since, values in found]
 
 
 def _likelihood(groups: Sequence[tuple[np.ndarray, np.ndarray]], c: Colour, most: float) -> float:

@@ -129,5 +129,17 @@ def test_a_residual_refines_the_colour_despite_a_slow_misfit() -> None:
     assert np.mean(refined.whiten(residual) ** 2) == pytest.approx(1.0, abs=0.03)
 
 
+def test_times_that_jitter_are_one_set() -> None:
+    rng = np.random.default_rng(6)
+    logs = campaign(rng)
+    for log in logs:
+        for c in CHANNELS:
+            time, values = log.channels[c]
+            log.channels[c] = time + rng.uniform(0.0, 0.01, len(time)), values
+    found = Noises(logs).common
+    assert found.share == pytest.approx(SHARE, abs=0.2)
+    assert TAU / 2 < found.correlation_time < 2 * TAU
+
+
 def test_colours_of_nothing() -> None:
     assert colours({}) == (Colour(), {})
