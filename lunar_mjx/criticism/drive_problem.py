@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
-from scipy.ndimage import minimum_filter1d
 
 from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
 from lunar_mjx.criticism.drive_noise import Noises
 from lunar_mjx.criticism.drive_nuisances import STEP_ERROR, direction, from_first, is_linear, nuisances
 from lunar_mjx.criticism.drive_program import Rows
-from lunar_mjx.criticism.drive_runs import Bench, LogRun
+from lunar_mjx.criticism.drive_runs import Bench
 from lunar_mjx.criticism.fitted import fitted_model
 from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.gather import Gather
 from lunar_mjx.criticism.observations import Observations, Series
 from lunar_mjx.criticism.problem import NotTested, Problem
+from lunar_mjx.criticism.slip_samples import defined
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.presets import PRESETS
 from lunar_mjx.model import Model
@@ -55,13 +55,6 @@ NOT_MISSING = frozenset(
     {"parking_brake", "payload", "tether", "hard_surface", "surface_type", "soil_gradient", "boulders"}
 )
 """Effects that describe an arrangement of the test, which its user knows, and are never candidates by themselves."""
-
-
-SLIP_SPEED = 0.03
-"""Speed of a wheel's rim below which a measured slip ratio is not compared, m/s."""
-SLIP_TIME = 0.25
-"""Nor within this time of such a speed, s: where a wheel reverses, the ratio jumps by hundreds of its noise with a
-millisecond."""
 
 
 class DriveProblem(Problem):
@@ -351,32 +344,6 @@ def default_splits(logs: Sequence[Log]) -> list[str]:
     return out
 
 
-def _defined(log: Log, run: LogRun, channel: str, time: np.ndarray) -> np.ndarray:
-    """Where a channel means something: a slip ratio needs a wheel that turns; at rest it is noise over zero."""
-    out = np.ones(len(time), bool)
-    if not channel.endswith("_slip_ratio"):
-        return out
-    for wheel in run.model.rover.wheels:
-        if channel != f"wheel_{wheel.corner}_slip_ratio":
-            continue
-        name = f"{wheel.corner}_drive"
-        speed = log.channel(f"joint_{name}_speed_rad_s")
-        if speed is None and run.model.modes["drive"] == "velocity":
-            speed = log.channel(f"command_{name}_speed_rad_s")
-        if speed is not None:
-            out &= np.interp(time, speed[0], _least(*speed)) * wheel.radius > SLIP_SPEED
-    return out
-
-
-def _least(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """(n,) least |speed| within `SLIP_TIME` of every sample; zero where it changes its sign."""
-    size = np.abs(speed)
-    turns = np.flatnonzero(speed[:-1] * speed[1:] < 0.0)
-    size[turns] = size[turns + 1] = 0.0
-    reach = int(np.ceil(SLIP_TIME / max(float(np.median(np.diff(time))), 1e-6)))
-    return minimum_filter1d(size, 2 * reach + 1, mode="nearest")
-
-
 def _observations(
     bench: Bench, logs: Sequence[Log], splits: Mapping[str, str], channels: Sequence[str] | None, noise: Noises
 ) -> Observations:
@@ -390,7 +357,7 @@ def _observations(
             if found is None:
                 continue
             time, measured = found
-            inside = (time >= run.begin - 1e-9) & (time <= run.end + 1e-9) & _defined(log, run, channel, time)
+            inside = (time >= run.begin - 1e-9) & (time <= run.end + 1e-9) & defined(log, run, channel, time)
             time, measured = time[inside], measured[inside]
             if len(time) < 2:
                 continue

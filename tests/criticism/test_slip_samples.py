@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lunar_mjx.criticism.drive_problem import SLIP_TIME, _least
+from lunar_mjx.criticism.slip_samples import SLIP_TIME, least
 
 TIME = np.arange(0.0, 4.0, 0.05)
 
 
 @pytest.mark.parametrize("course", [np.where(TIME < 2.0, 1.0, -1.0), TIME - 2.01, np.where(TIME < 2.0, 1.0, 0.0)])
 def test_nothing_counts_around_a_reversal_or_a_rest(course):
-    least = _least(TIME, course)
+    smallest = least(TIME, course)
     zero = np.flatnonzero((np.abs(course) < 1e-9) | (np.abs(TIME - 2.0) < 0.051))
     near = np.min(np.abs(TIME[:, None] - TIME[zero]), axis=1) < SLIP_TIME - 0.06
-    assert np.all(least[near] <= 0.05)
-    assert np.all(least[TIME < 1.6] > 0.1)
+    assert np.all(smallest[near] <= 0.05)
+    assert np.all(smallest[TIME < 1.6] > 0.1)
 
 
 def test_a_steady_speed_stays_as_it_is():
-    np.testing.assert_array_equal(_least(TIME, np.full(len(TIME), -0.7)), 0.7)
+    np.testing.assert_array_equal(least(TIME, np.full(len(TIME), -0.7)), 0.7)
