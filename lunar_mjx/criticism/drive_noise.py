@@ -34,7 +34,8 @@ _SHORTEST_TIME, _LONGEST_TIME, _TIMES_APART = 0.7, 40.0, 1.6
 """What is tried: shares of the variance that are correlated; correlation times in sampling intervals, and the ratio
 of one to the next."""
 _EVIDENCE = 15.0
-"""Twice the log-likelihood that a colour must gain over white noise: about one false colour in two thousand."""
+"""Twice the log-likelihood that a colour must gain over white noise: a chi-square of two degrees exceeds it once in
+1,800 times."""
 _OWN = 10.0
 """The same for a kind of instrument that departs from the colour that all have in common."""
 _JITTER, _UNEVEN = 0.05, 40
