@@ -16,7 +16,7 @@ from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.envs import kalman, randomise, rewards
 from lunar_mjx.envs.actions import action_map
 from lunar_mjx.envs.config import TASKS, NavigationConfig
-from lunar_mjx.envs.core import State, side_by_side
+from lunar_mjx.envs.core import State, side_by_side, where
 from lunar_mjx.envs.observations import Scene, observe
 from lunar_mjx.envs.places import draw_places
 from lunar_mjx.envs.view import SCAN_SCALE, Reader, View, goal_in_body, read
@@ -27,8 +27,8 @@ from lunar_mjx.pytree import pytree
 
 ENDS = ("reached", "rolled_over", "stuck", "off_terrain", "diverged")
 """Ways in which an episode terminates; the first is success, the others bring the failure reward."""
-_GROUP = 16
-"""At most one in so many rovers begins anew at a time."""
+_USED = 0.125
+"""Share of the rovers that may be without a prepared episode before all are prepared anew."""
 
 
 @pytree
@@ -50,6 +50,20 @@ class NavigationParams:
 
 
 @pytree
+class Ready:
+    """The beginning of each rover's next episode, prepared; leading axis `env`.
+
+    Attributes:
+      obs, privileged, info: as in `State`. inner: with neither `ready` nor `used` of its own.
+    """
+
+    obs: Any
+    privileged: Any
+    info: dict[str, Any]
+    inner: Inner
+
+
+@pytree
 class Inner:
     """State of the task beyond the observation; leading axis `env`.
 
@@ -63,6 +77,7 @@ class Inner:
       last_action: as given.
       anchor: (2,) place that the rover last left by the stuck distance, m. waited: time since then, s.
       steps: control steps of the episode. total: its return.
+      ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
     """
 
     physics: Physics
@@ -78,6 +93,8 @@ class Inner:
     waited: Any
     steps: Any
     total: Any
+    ready: Ready | None = None
+    used: Any = None
 
 
 class NavigationEnv:
@@ -144,9 +161,11 @@ class NavigationEnv:
 
     def reset(self, params: NavigationParams, keys: Any) -> State:
         """Begins an episode in every environment; `keys` (env, 2) raw random keys."""
-        inner = self._fresh(params, keys)
-        view = self._view(inner)
-        obs, privileged = self._observe(params, inner, view)
+        # the first episode and the prepared one in one batch: half the program to compile
+        both = self._begin(params, jnp.concatenate([keys, _next(keys)]))
+        first, ready = (jax.tree.map(lambda a, p=part: a[p], both) for part in
+                        (slice(keys.shape[0]), slice(keys.shape[0], None)))  # fmt: skip
+        obs, privileged, inner = first.obs, first.privileged, first.inner
         zero, no = jnp.zeros(keys.shape[0], obs.dtype), jnp.zeros(keys.shape[0], bool)
         names = (
             "episode_return",
@@ -156,7 +175,8 @@ class NavigationEnv:
             *(f"reward_{n}" for n in self.config.weights),
         )
         metrics = dict.fromkeys(names, zero)
-        return State(obs, privileged, zero, no, no, obs, privileged, metrics, self._info(view), inner)
+        inner = dataclasses.replace(inner, ready=ready, used=no)
+        return State(obs, privileged, zero, no, no, obs, privileged, metrics, first.info, inner)
 
     def step(self, params: NavigationParams, state: State, action: Any) -> State:
         """Acts in every environment, `action` (env, action) in [-1, 1], and resets those whose episode ended."""
@@ -196,36 +216,33 @@ class NavigationEnv:
             self._info(view), inner,
         )))  # fmt: skip
 
-    def _restart(self, params: NavigationParams, inner: Inner, state: State, group: int = _GROUP) -> State:
+    def _restart(self, params: NavigationParams, inner: Inner, state: State) -> State:
         """Begins anew where the episode ended, keeping the final observations.
 
-        Few episodes end in a step, so that one rover of every group begins at a time, as often as it takes: fresh
-        rovers are few, and take their places by a selection, which costs no gathering and scattering of every array.
-        Every rover gets the same numbers as if all were made.
+        To begin takes many small kernels, to select few. So every rover keeps the beginning of its next episode; all
+        are prepared anew once some have been taken, or where an episode ends whose rover has none. Which episode comes
+        next depends on the rover's key alone, and not on when it was prepared.
         """
-        count = state.done.shape[0]
-        size = next(n for n in range(min(group, count), 0, -1) if count % n == 0)
-        groups = count // size
+        done, kept = state.done, side_by_side((inner.ready, inner.used))
+        alone = dataclasses.replace(inner, ready=None, used=None)
 
-        def begin(carry: Any) -> Any:
-            waiting, current = carry
-            rows = waiting.reshape(groups, size)
-            first = jnp.argmax(rows, axis=1)
-            chosen = rows & (jnp.arange(size) == first[:, None])
-            new = self._fresh(params, inner.key.reshape(groups, size, 2)[jnp.arange(groups), first])
-            view = self._view(new)
-            fresh = (*self._observe(params, new, view), self._info(view), new)
+        def prepare(carry: Any) -> Any:
+            _, (_, used) = carry
+            return jnp.zeros((), bool), side_by_side((self._begin(params, inner.key), jnp.zeros_like(used)))
 
-            def put(old: Any, part: Any) -> Any:
-                at = chosen.reshape(groups, size, *[1] * (old.ndim - 1))
-                return jnp.where(at, part[:, None], old.reshape(groups, size, *old.shape[1:])).reshape(old.shape)
-
-            return waiting & ~chosen.reshape(-1), side_by_side(jax.tree.map(put, current, fresh))
-
-        here = side_by_side((state.obs, state.privileged, state.info, inner))
-        _, here = jax.lax.while_loop(lambda carry: carry[0].any(), begin, (state.done, here))
-        obs, privileged, info, inner = here
+        short = (done & inner.used).any() | (inner.used.mean(dtype=jnp.float32) > _USED)
+        # a loop of no or one turn: unlike a conditional, it leaves what it does not change where it is
+        _, (ready, used) = jax.lax.while_loop(lambda carry: carry[0], prepare, (short, kept))
+        here = side_by_side((state.obs, state.privileged, state.info, alone))
+        obs, privileged, info, alone = where(done, (ready.obs, ready.privileged, ready.info, ready.inner), here)
+        inner = dataclasses.replace(alone, ready=ready, used=used | done)
         return dataclasses.replace(state, obs=obs, privileged=privileged, info=info, inner=inner)
+
+    def _begin(self, params: NavigationParams, keys: Any) -> Ready:
+        """New episodes with their first observations."""
+        inner = self._fresh(params, keys)
+        view = self._view(inner)
+        return Ready(*self._observe(params, inner, view), self._info(view), inner)
 
     def _drive(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Physics, Any, Any]:
         """The physics of one action: its state after, and slip and sinkage (env, wheel) of its last step."""
@@ -283,7 +300,7 @@ class NavigationEnv:
     def _fresh(self, params: NavigationParams, keys: Any) -> Inner:
         """New episodes, all at their beginning."""
         c, count = self.config, keys.shape[0]
-        split = jax.vmap(lambda k: jax.random.split(k, 4))(keys)
+        split = _split(keys)
         pick = jax.vmap(lambda k: jax.random.randint(k, (), 0, params.starts.shape[0]))(split[:, 1])
         start, goal = params.starts[pick], params.goals[pick]
         turn = jax.vmap(lambda k: jax.random.uniform(k, (), minval=-1.0, maxval=1.0))(split[:, 2])
@@ -329,6 +346,15 @@ class NavigationEnv:
             "joint_angle": view.joint_angle,
             "body_velocity": view.body_velocity,
         }
+
+
+def _split(keys: Any) -> Any:
+    """(env, 4, 2) keys of an episode; the first one is the next episode's."""
+    return jax.vmap(lambda k: jax.random.split(k, 4))(keys)
+
+
+def _next(keys: Any) -> Any:
+    return _split(keys)[:, 0]
 
 
 def make_navigation(

@@ -76,18 +76,33 @@ def test_observation_reward_and_end_follow_the_physics(env):
 def test_episodes_begin_anew_where_and_only_where_they_ended(env):
     own = env.unwrapped.env
     state = own.reset(own.params, split_keys(jax.random.PRNGKey(3), 40))
+    restart = jax.jit(own._restart)
     done = np.zeros(40, bool)
-    done[[0, 3, 4, 5, 19, 39]] = True
-    state = dataclasses.replace(state, terminated=jnp.asarray(done), final_obs=state.obs + 1.0)
-    made = jax.jit(own._restart)(own.params, state.inner, state)
-    anew = own.reset(own.params, state.inner.key)
-    for name in ("obs", "info", "inner"):
-        whole = [jax.tree.leaves(getattr(s, name)) for s in (made, anew, state)]
-        for got, fresh, old in zip(*whole, strict=True):
-            at = done.reshape(-1, *[1] * (got.ndim - 1))
-            np.testing.assert_allclose(got, np.where(at, fresh, old), rtol=1e-5, atol=1e-5)
-    np.testing.assert_array_equal(made.final_obs, state.final_obs)
-    assert not np.allclose(made.inner.goal[done], state.inner.goal[done])
+    done[[0, 3, 4, 5]] = True
+
+    def ended(state):
+        return dataclasses.replace(state, terminated=jnp.asarray(done), final_obs=state.obs + 1.0)
+
+    # taken from what is prepared; prepared anew because the same rovers end again; then because enough were taken
+    for turn in range(3):
+        if turn == 2:
+            done[[19, 39]] = True
+        state = ended(state)
+        made = restart(own.params, state.inner, state)
+        anew = own.reset(own.params, state.inner.key)
+        for name in ("obs", "info"):
+            _taken_where(done, *(getattr(s, name) for s in (made, anew, state)))
+        _taken_where(done, *(dataclasses.replace(s.inner, ready=None, used=None) for s in (made, anew, state)))
+        np.testing.assert_array_equal(made.final_obs, state.final_obs)
+        np.testing.assert_array_equal(made.inner.used, done)
+        assert not np.allclose(made.inner.goal[done], state.inner.goal[done])
+        state = made
+
+
+def _taken_where(done, made, anew, old):
+    for got, fresh, before in zip(*map(jax.tree.leaves, (made, anew, old)), strict=True):
+        at = done.reshape(-1, *[1] * (got.ndim - 1))
+        np.testing.assert_allclose(got, np.where(at, fresh, before), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.slow
