@@ -6,8 +6,11 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from lunar_mjx.criticism.build_problem import build_problem, candidate_effects
-from lunar_mjx.criticism.fitting import Progress, fit
+from lunar_mjx.criticism.drive_problem import DriveProblem
+from lunar_mjx.criticism.fitting import Fit, Progress, fit
 from lunar_mjx.criticism.held_out import errors, predictive_gain, predictive_residual
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Candidate
@@ -44,6 +47,9 @@ def alternatives(
 ) -> tuple[Alternative, ...]:
     """Refits the model with every effect that would replace some of its own, the most helpful first.
 
+    Each form is a program of its own. Where rows are dear, one descent starts where the model as it is has ended, all
+    rovers of a step in one batch, and is left once it is sure not to reach what that model does.
+
     Args:
       run: model and candidates. logs: of the run. problem, chosen: what the model as it is explains, and with what.
       progress: told of every refit.
@@ -55,12 +61,31 @@ def alternatives(
     for number, (name, effect) in enumerate(kinds.items()):
         progress(f"refitting with {name} instead", number / len(kinds))
         other = dataclasses.replace(run, model=run.model.add(effect, "alternative"))
-        mine = build_problem(other, logs, [e for e in chosen.effects if e in candidate_effects(other)])
-        free = mine.free([e for e in chosen.effects if e in mine.candidates])
-        refitted = fit(mine, free, starts=2 if mine.cheap_jacobian else 1, certify=False)
+        named = [e for e in chosen.effects if e in candidate_effects(other)]
+        if isinstance(problem, DriveProblem):
+            mine, refitted = _driven(problem, other, named, chosen.fit, progress)
+        else:
+            mine = build_problem(other, logs, named)
+            free = mine.free([e for e in named if e in mine.candidates])
+            refitted = fit(mine, free, starts=2, certify=False)
+        if not np.isfinite(refitted.chi2):
+            continue
         gain, se = predictive_gain(problem, chosen.fit, refitted, old, predictive_residual(mine, refitted))
         found.append(Alternative(
             name, tuple(e for e in effect.replaces if e in present), refitted.chi2, chosen.fit.chi2,
             errors(mine, refitted), gain, se,
         ))  # fmt: skip
     return tuple(sorted(found, key=lambda a: -a.held_out_gain))
+
+
+def _driven(
+    problem: DriveProblem, other: Run, named: Sequence[str], before: Fit, progress: Progress
+) -> tuple[DriveProblem, Fit]:
+    """Drives against the other model, refitted from where the model as it is ended; left where it cannot catch up."""
+    effects = candidate_effects(other)
+    mine = problem.instead(other.model, {e: effects[e] for e in named}, progress)
+    named = [e for e in named if e in mine.candidates]
+    at = {c.key: u for c, u in zip(problem.coordinates, before.u, strict=True)}
+    start = np.array([at.get(c.key, 0.0) for c in mine.coordinates])
+    with mine.focused(named):
+        return mine, fit(mine, mine.free(named), start, starts=1, certify=False, rival=before.chi2)

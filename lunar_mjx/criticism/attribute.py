@@ -40,6 +40,8 @@ def diagnose(
         "certificate": _certificate(base.fit),
         "noise_test_before": dataclasses.asdict(base.noise),
         "noise_test_after": dataclasses.asdict(chosen.noise),
+        "patterns": {"before": base.pattern.to_dict() if base.pattern else None,
+                     "after": chosen.pattern.to_dict() if chosen.pattern else None, "unlisted": found.unlisted},
         "seed": settings.seed, "alpha": settings.alpha,
         "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
     }  # fmt: skip

@@ -21,6 +21,7 @@ from lunar_mjx.criticism.drive_runs import Bench
 from lunar_mjx.criticism.fitted import fitted_model
 from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.gather import Gather
+from lunar_mjx.criticism.inputs import FOLLOWS, SMOOTH, amplitude, smooth_inputs
 from lunar_mjx.criticism.observations import Observations, Series
 from lunar_mjx.criticism.problem import NotTested, Problem
 from lunar_mjx.criticism.slip_samples import defined
@@ -112,7 +113,14 @@ class DriveProblem(Problem):
             mine = of_candidate(effect)
             self.candidates[name] = np.arange(len(found), len(found) + len(mine))
             found += mine
-        self.coordinates = tuple(found)
+        self._smooth = smooth_inputs(frozenset(port for e in model.effects for port in e.ports))
+        self.inputs = {}
+        own = {c.name: len(found) + k for k, c in enumerate(of_candidate(self._smooth))}
+        for label, quantities in FOLLOWS.items():
+            names = [amplitude(label, q) for q in quantities]
+            if names[0] in own:
+                self.inputs[label] = np.array([own[n] for n in names])
+        self.coordinates = (*found, *of_candidate(self._smooth))
         self._step_error: np.ndarray | None = None
 
     @property
@@ -137,6 +145,14 @@ class DriveProblem(Problem):
         """The same model and logs with other candidates."""
         return DriveProblem(self.logs, self.model, candidates, self._splits, self._baseline_spec, self._channels,
                             self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+
+    def instead(self, model: Model, candidates: Mapping[str, Effect], progress: Progress = silent) -> DriveProblem:
+        """The same logs, with the noise as it was learnt, against another model of the same rover."""
+        other = DriveProblem(self.logs, model, candidates, self._splits, self._baseline_spec, self._channels,
+                             self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+        other.observations, other.noise_unlearnt = self.observations, self.noise_unlearnt
+        other._step_error = self.step_error  # of the first order: hardly another, and it costs a program
+        return other
 
     def learn_noise(self, u: np.ndarray) -> None:
         self.observations = self._noises.refined(self.observations, self.observations.value - self.predict(u[None])[0])
@@ -205,6 +221,8 @@ class DriveProblem(Problem):
         """The bench whose model holds every candidate that leaves its null in some row, and few others."""
         null = np.zeros(len(self.coordinates))
         active = frozenset(e for e, places in self.candidates.items() if np.any(rows[:, places] != null[places]))
+        if any(np.any(rows[:, places] != 0.0) for places in self.inputs.values()):
+            active |= {SMOOTH}
         fitting = [e for e in self._benches if active <= e]
         best = min(fitting, key=len, default=None)
         if active <= self._focus and (best is None or len(best) > len(self._focus)):
@@ -213,9 +231,9 @@ class DriveProblem(Problem):
             best = active
         if best not in self._benches:
             union = self.model
-            for name in self.effects:
+            for name, effect in {**self.effects, SMOOTH: self._smooth}.items():
                 if name in best:
-                    union = union.add(self.effects[name], "criticism", **self.effects[name].null())
+                    union = union.add(effect, "criticism", **effect.null())
             self._benches[best] = Bench(union, self.logs, self.bench.chunk, self.bench.engine)
         return self._benches[best]
 

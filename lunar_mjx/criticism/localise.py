@@ -65,6 +65,10 @@ def localise(problem: Problem, found: Search, progress: Progress = silent, alway
     if not always and chosen.at_noise:
         return Localisation(None, "", {}, {}, {})
     at = base.fit if not chosen.effects or chosen.at_noise else chosen.fit
+    if chosen.patterned and chosen.pattern is not None:
+        # What is left is too small for inputs that differ from log to log.
+        ordered = {label: 0.5 * z * abs(z) for label, z in chosen.pattern.z.items()}
+        return Localisation(chosen.pattern.port, chosen.pattern.label, ordered, {}, dependence(problem, at))
     gains, ceiling = {}, {}
     for label, signature in port_columns(problem, at, progress).items():
         gains[label], ceiling[label] = evidence(problem, at, signature)
@@ -75,7 +79,7 @@ def localise(problem: Problem, found: Search, progress: Progress = silent, alway
 
 
 def pattern(problem: Problem, fit: Fit) -> float:
-    """Log evidence of the best smooth unknown input in what a fit to tables leaves; 0 for drives, where it is dear.
+    """Log evidence of the best smooth unknown input in what a fit to tables leaves; 0 for drives (see `patterns`).
 
     A root mean square at the noise may hide a small misfit that all manoeuvres share, most of all in coloured noise.
     """

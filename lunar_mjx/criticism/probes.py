@@ -6,127 +6,20 @@ steady-state tables it is a smooth function of slip, slip angle and load.
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.criticism.drive_problem import DriveProblem
 from lunar_mjx.criticism.fitting import Fit, Progress
+from lunar_mjx.criticism.inputs import PROBES, present, unknown_input
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.table_problem import TableProblem
-from lunar_mjx.effects.base import Effect, Parameter
 
 KNOTS = 8
 """Knots of an unknown input over the longest log."""
 _LENGTHS = (0.35, 25.0, 0.3)
 """Length scales of an unknown input over slip ratio, slip angle in deg, and relative load."""
-
-Act = Callable[[Any, Any, Any], Any]
-
-
-def _torque(ctx, a, value):
-    return value + jnp.where(ctx.rover.joint_group == 0, a, 0.0)
-
-
-def _current(ctx, a, value):
-    return dataclasses.replace(value, current=value.current + jnp.where(ctx.rover.joint_group == 0, a, 0.0))
-
-
-def _radius(ctx, a, value):
-    return dataclasses.replace(value, radius=value.radius * (1.0 + a))
-
-
-def _stiffness(ctx, a, value):
-    return dataclasses.replace(value, k_c=value.k_c * (1.0 + a), k_phi=value.k_phi * (1.0 + a))
-
-
-def _strength(ctx, a, value):
-    return dataclasses.replace(value, tan_phi=value.tan_phi * (1.0 + a), cohesion=value.cohesion * (1.0 + a))
-
-
-def _load(ctx, a, value):
-    return dataclasses.replace(value, load=value.load * (1.0 + a))
-
-
-def _resistance(ctx, a, value):
-    return dataclasses.replace(value, resistance=value.resistance + a * value.load)
-
-
-def _force_x(ctx, a, value):
-    return dataclasses.replace(value, force=value.force._replace(x=value.force.x + a * ctx.normal.load))
-
-
-def _force_y(ctx, a, value):
-    return dataclasses.replace(value, force=value.force._replace(y=value.force.y + a * ctx.normal.load))
-
-
-def _moment_y(ctx, a, value):
-    moment = value.moment.y + a * ctx.normal.load * ctx.geometry.radius
-    return dataclasses.replace(value, moment=value.moment._replace(y=moment))
-
-
-def _push(ctx, a, value):
-    forward = ctx.frame.forward
-    return dataclasses.replace(value, force=value.force + forward * a)
-
-
-def _tilt(ctx, a, value):
-    left = ctx.frame.left
-    return dataclasses.replace(value, moment=value.moment + left * a)
-
-
-def _winding(ctx, a, value):
-    return dataclasses.replace(value, winding=value.winding + jnp.where(ctx.rover.joint_group == 0, a, 0.0))
-
-
-def _housing(ctx, a, value):
-    return dataclasses.replace(value, housing=value.housing + jnp.where(ctx.rover.joint_group == 0, a, 0.0))
-
-
-PROBES: Mapping[str, tuple[str, Act, float, str]] = {
-    "command: motor current": ("command", _current, 0.05, "A"),
-    "motor_torque": ("motor_torque", _torque, 0.5, "N m"),
-    "geometry: wheel radius": ("geometry", _radius, 0.02, "1"),
-    "soil: stiffness": ("soil", _stiffness, 0.3, "1"),
-    "soil: shear strength": ("soil", _strength, 0.1, "1"),
-    "wheel_normal: load": ("wheel_normal", _load, 0.1, "1"),
-    "wheel_normal: resistance": ("wheel_normal", _resistance, 0.05, "1"),
-    "wheel_shear: longitudinal force": ("wheel_shear", _force_x, 0.05, "1"),
-    "wheel_shear: lateral force": ("wheel_shear", _force_y, 0.05, "1"),
-    "wheel_shear: driving moment": ("wheel_shear", _moment_y, 0.05, "1"),
-    "body_wrench: push": ("body_wrench", _push, 5.0, "N"),
-    "body_wrench: pitching moment": ("body_wrench", _tilt, 2.0, "N m"),
-    "heat: winding": ("heat", _winding, 0.5, "W"),
-    "heat: housing": ("heat", _housing, 0.5, "W"),
-}
-"""Unknown inputs: label -> port, what an amount does there, its size, its unit."""
-
-_ORDER = 1000
-
-
-@functools.cache
-def unknown_input(label: str, knots: int, span: float) -> Effect:
-    """An unknown input as an effect whose amplitudes are the knots of a course over time (one knot: constant)."""
-    port, act, size, unit = PROBES[label]
-
-    def function(ctx, p, x, value):
-        if knots == 1:
-            return act(ctx, p.knot_0, value)
-        place = ctx.time / span * (knots - 1)
-        weights = [jnp.maximum(0.0, 1.0 - jnp.abs(place - k)) for k in range(knots)]
-        return act(ctx, sum(w * getattr(p, f"knot_{k}") for k, w in enumerate(weights)), value)
-
-    source = "unknown input of a localisation"
-    amplitudes = {
-        f"knot_{k}": Parameter(size, 0.0, (-1e3 * size, 1e3 * size), unit, f"{label} at knot {k}", source)
-        for k in range(knots)
-    }
-    name = "probe_" + "".join(c if c.isalnum() else "_" for c in label)
-    return Effect(name=name, ports={port: function}, parameters=amplitudes, order=_ORDER, doc=source)
 
 
 def port_columns(problem: Problem, fit: Fit, progress: Progress) -> dict[str, np.ndarray]:
@@ -168,7 +61,8 @@ def _smooth_modes(place: np.ndarray | None) -> np.ndarray:
 def _drive_columns(problem: DriveProblem, fit: Fit, progress: Progress) -> dict[str, np.ndarray]:
     span = max(r.end - r.begin for r in problem.bench.runs)
     probes = {label: unknown_input(label, KNOTS, span) for label in PROBES}
-    usable = {label: p for label, p in probes.items() if _present(problem, label)}
+    ports = frozenset(port for e in problem.model.effects for port in e.ports)
+    usable = {label: p for label, p in probes.items() if present(label, ports)}
     other = problem.with_candidates({p.name: p for p in usable.values()}, fit, progress)
     observations = problem.observations
     which = np.concatenate([other.candidates[p.name] for p in usable.values()])
@@ -179,11 +73,6 @@ def _drive_columns(problem: DriveProblem, fit: Fit, progress: Progress) -> dict[
         found[label] = _walk(_by_log(problem, np.where(np.isfinite(columns), columns, 0.0)))
     found |= _sensor_columns(problem, span)
     return found
-
-
-def _present(problem: DriveProblem, label: str) -> bool:
-    ports = {port for e in problem.model.effects for port in e.ports}
-    return PROBES[label][0] in ports or PROBES[label][0] in ("geometry", "body_wrench")
 
 
 def _by_log(problem: DriveProblem, columns: np.ndarray) -> list[np.ndarray]:

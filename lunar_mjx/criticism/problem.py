@@ -10,6 +10,7 @@ import abc
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -39,6 +40,8 @@ class Problem(abc.ABC):
       cheap_jacobian: whether every start of a fit can afford Jacobians of its own.
       eager: whether a hundred more rows cost no time, so that Jacobians are best taken before they are known to be
         needed.
+      inputs: places of the amplitudes of unknown inputs that follow quantities of their ports, by label; in none of
+        the above.
       noise_unlearnt: whether the noise's colour is known from little, so that `learn_noise` is to be called.
     """
 
@@ -50,6 +53,7 @@ class Problem(abc.ABC):
     baseline: np.ndarray
     candidates: Mapping[str, np.ndarray]
     effects: Mapping[str, Effect]
+    inputs: Mapping[str, np.ndarray] = MappingProxyType({})
     not_tested: tuple[NotTested, ...]
 
     @property

@@ -10,6 +10,7 @@ import numpy as np
 
 from lunar_mjx.criticism.fitting import Fit, Memory, fit
 from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
+from lunar_mjx.criticism.patterns import Pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.scan import scan
 from lunar_mjx.criticism.score import Score, score, signatures
@@ -35,7 +36,9 @@ class Settings:
       same: differences of chi-square below which two effects explain the data alike.
       pattern: log evidence of a smooth unknown input in the residual from which a model counts as failing, however
         small the residual. Of 35 tables with the true model none left more than 4.8, at thrice the usual disturbance
-        14; three wrong models whose residual passed for noise left 30 to 78.
+        14; three wrong models whose residual passed for noise left 30 to 78. (For tables.)
+      pattern_p: family-wise p value of smooth unknown inputs below which the same holds of drives, if they explain
+        `chi2`, too.
       explained: share of the excess over the noise that the effects named must explain where they do not reach it.
       starts: of the baseline fit. draws: of the bootstrap. seed: of both.
     """
@@ -50,6 +53,7 @@ class Settings:
     confounded: float = 0.9
     same: float = 12.0
     pattern: float = 20.0
+    pattern_p: float = 0.001
     explained: float = 0.995
     starts: int = 4
     draws: int = 2000
@@ -64,6 +68,7 @@ class Candidate:
       effects: names, in the order of adding. fit: the refit. noise: whether its residual is as small as the noise.
       gain, gain_se: held-out gain over the parent set and its standard error.
       patterned: whether what is left is small, but no noise: some smooth unknown input has it.
+      pattern: what smooth unknown inputs explain of the residual of drives, where that was asked.
     """
 
     effects: tuple[str, ...]
@@ -72,6 +77,7 @@ class Candidate:
     gain: float
     gain_se: float
     patterned: bool = False
+    pattern: Pattern | None = None
 
     @property
     def at_noise(self) -> bool:

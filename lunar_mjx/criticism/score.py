@@ -7,7 +7,7 @@ Sources: Rao's score test; orthogonal discrepancy (Plumlee 2017); multiplier boo
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy import stats
@@ -115,6 +115,27 @@ def _correlation_time(residual: np.ndarray, time: np.ndarray) -> float:
     return 0.0 if lag <= 1 else lag * step
 
 
+def span(jacobian: np.ndarray, prior_scale: np.ndarray) -> np.ndarray:
+    """(n + p, rank) orthonormal basis of what a refit of the baseline moves, the priors counted as observations.
+
+    Args:
+      jacobian: (n, p) whitened. prior_scale: (p,) reciprocal prior standard deviations.
+    """
+    stacked = np.vstack([jacobian, np.diag(prior_scale)])
+    size = np.linalg.norm(stacked, axis=0)
+    stacked = stacked / np.where(size > 0.0, size, 1.0)
+    q, s, _ = np.linalg.svd(stacked, full_matrices=False)
+    return q[:, s > 1e-10 * s.max()] if len(s) else q
+
+
+def outside(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """(n + p, m): what a refit leaves of columns (n, m), given its basis (`span`), the rows of the priors below."""
+    extended = np.vstack([columns, np.zeros((len(basis) - len(columns), columns.shape[1]))])
+    for _ in range(2):  # once more, against cancellation
+        extended = extended - basis @ (basis.T @ extended)
+    return extended
+
+
 def project(columns: np.ndarray, jacobian: np.ndarray, prior_scale: np.ndarray) -> np.ndarray:
     """Columns less what a refit of the baseline takes of them, the priors counted as observations.
 
@@ -124,15 +145,7 @@ def project(columns: np.ndarray, jacobian: np.ndarray, prior_scale: np.ndarray) 
     Returns:
       (n + p, m): what is left, with the rows of the priors below.
     """
-    stacked = np.vstack([jacobian, np.diag(prior_scale)])
-    extended = np.vstack([columns, np.zeros((len(prior_scale), columns.shape[1]))])
-    size = np.linalg.norm(stacked, axis=0)
-    stacked = stacked / np.where(size > 0.0, size, 1.0)
-    q, s, _ = np.linalg.svd(stacked, full_matrices=False)
-    q = q[:, s > 1e-10 * s.max()] if len(s) else q
-    for _ in range(2):  # once more, against cancellation
-        extended = extended - q @ (q.T @ extended)
-    return extended
+    return outside(columns, span(jacobian, prior_scale))
 
 
 def leash(problem: Problem, fit: Fit) -> np.ndarray:
@@ -148,15 +161,22 @@ def leash(problem: Problem, fit: Fit) -> np.ndarray:
     return np.sqrt(prior**2 + excess / (high - low) ** 2)
 
 
-def signatures(problem: Problem, fit: Fit, names: list[str]) -> dict[str, np.ndarray]:
-    """(n, m) whitened derivative with respect to the amplitudes of every candidate, at the fit; secants where zero."""
+def signatures(problem: Problem, fit: Fit, names: Sequence[str], inputs: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """(n, m) whitened derivative with respect to the amplitudes of every candidate, at the fit; secants where zero.
+
+    Args:
+      problem: model and measurements. fit: where derivatives are taken. names: of the candidates.
+      inputs: labels of unknown inputs, whose derivatives are taken in the same batch.
+    """
     amplitudes = {e: [i for i in problem.candidates[e] if problem.coordinates[i].amplitude] for e in names}
-    which = np.array([i for e in names for i in amplitudes[e]], int)
+    amplitudes |= {label: list(problem.inputs[label]) for label in inputs}
+    which = np.array([i for places in amplitudes.values() for i in places], int)
     if not len(which):
         return {}
     columns = problem.jacobian(fit.u, which)
     columns = np.where(np.isfinite(columns), columns, 0.0)
-    dead = [k for k in range(len(which)) if np.linalg.norm(columns[:, k]) < _TINY]
+    tested = sum(len(amplitudes[e]) for e in names)
+    dead = [k for k in range(tested) if np.linalg.norm(columns[:, k]) < _TINY]
     if dead:
         rows = np.repeat(fit.u[None], len(dead) + 1, axis=0)
         for n, k in enumerate(dead):
@@ -168,9 +188,9 @@ def signatures(problem: Problem, fit: Fit, names: list[str]) -> dict[str, np.nda
             columns[:, k] = np.where(np.isfinite(difference), difference, 0.0)
     white = problem.observations.whiten(columns)
     out, at = {}, 0
-    for e in names:
-        out[e] = white[:, at : at + len(amplitudes[e])]
-        at += len(amplitudes[e])
+    for e, places in amplitudes.items():
+        out[e] = white[:, at : at + len(places)]
+        at += len(places)
     return out
 
 
@@ -186,19 +206,18 @@ def score(problem: Problem, fit: Fit, found: Mapping[str, np.ndarray], draws: in
     """
     keep = fit.fitted
     block = blocks(problem.observations, fit.residual, keep)[keep]
-    prior_scale = leash(problem, fit)
-    jacobian = fit.jacobian[keep]
+    basis = span(fit.jacobian[keep], leash(problem, fit))
     residual = fit.residual[keep]
     rows = []
     for name, columns in found.items():
-        signature = project(columns[keep], jacobian, prior_scale)[: len(residual)]
+        signature = outside(columns[keep], basis)[: len(residual)]
         raw, left = np.linalg.norm(columns[keep]), np.linalg.norm(signature)
         rows.append((name, signature, float(left), float(left / raw) if raw > 0.0 else 0.0))
     results, boots = [], []
     rng = np.random.default_rng(seed)
     weights = rng.choice([-1.0, 1.0], size=(draws, int(block.max(initial=0)) + 1))
     for name, signature, length, share in rows:
-        amount, chi2, z, boot = _test(signature, residual, block, weights)
+        amount, chi2, z, boot = evidence_of(signature, residual, block, weights)
         if length < SEPARABLE:
             z, boot = 0.0, None
         results.append(Score(name, signature, length, share, amount, chi2, z, columns=found[name]))
@@ -212,7 +231,7 @@ def score(problem: Problem, fit: Fit, found: Mapping[str, np.ndarray], draws: in
     return sorted(out, key=lambda s: -s.chi2)
 
 
-def _test(
+def evidence_of(
     signature: np.ndarray, residual: np.ndarray, block: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, float, float, np.ndarray]:
     """Best amount, its chi-square, its robust z, and z of every bootstrap draw."""

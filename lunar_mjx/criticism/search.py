@@ -11,7 +11,9 @@ from lunar_mjx.criticism.complete import best_start, simpler, stands, tried_in_p
 from lunar_mjx.criticism.descent import slack_of
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import gain, noise_test
+from lunar_mjx.criticism.inputs import SMOOTH
 from lunar_mjx.criticism.localise import pattern
+from lunar_mjx.criticism.patterns import find_pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Candidate, Settings, refit, refit_all
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
@@ -32,6 +34,8 @@ class Search:
       base: the baseline fit. scores: of every candidate at the base. cosines: between them.
       tried: every refitted set. chosen: the set that is named (the base's if empty). rivals: sets that explain the
         data alike.
+      unlisted: an unknown input, in words, at none of the ports of the one effect that is named, which explains the
+        data alike; empty if none.
     """
 
     base: Candidate
@@ -40,6 +44,7 @@ class Search:
     tried: tuple[Candidate, ...]
     chosen: Candidate
     rivals: tuple[Candidate, ...]
+    unlisted: str = ""
 
 
 def fit_baseline(problem: Problem, settings: Settings, memory: Memory, progress: Progress = silent) -> Fit:
@@ -74,7 +79,7 @@ def search(
     if base_fit.problems and not far:
         return Search(base, (), {}, (), base, ())
     progress("scoring", 0.0)
-    scores = _scores(problem, base, settings)
+    scores, base = _scores(problem, base, settings)
     angles = cosines([s for s in scores if s.length >= SEPARABLE])
     tried: dict[frozenset[str], Candidate] = {frozenset(): base}
     beam, best, patience = [base], base, 1
@@ -82,15 +87,16 @@ def search(
         grown = []
         for number, parent in enumerate(beam):
             progress(f"refitting with {level + 1} effect{'s' if level else ''}", number / len(beam))
-            found = scores if not parent.effects else _scores(problem, parent, settings)
+            found = scores if not parent.effects else _scores(problem, parent, settings)[0]
             near = angles if not parent.effects else cosines([s for s in found if s.length >= SEPARABLE])
             grown += _grow(problem, parent, found, near, settings, tried, memory)
         grown = sorted((c for c in grown if np.isfinite(c.fit.chi2)), key=lambda c: c.fit.chi2)
         reached = _reaching(problem, base, grown, settings, tried)
         if reached is not None:
-            best = (
-                reached if problem.cheap_jacobian else _completed(problem, reached, settings, tried, memory, progress)
-            )
+            best = reached
+            if not problem.cheap_jacobian:
+                best = _completed(problem, reached, settings, tried, memory, progress)
+                best = tried[frozenset(best.effects)] = _looked_at(problem, best, settings)
             break
         grown = [tried[frozenset(c.effects)] for c in grown]
         better = [c for c in grown if _better(c, best, settings) and _earned(problem, best, c, settings)]
@@ -109,7 +115,16 @@ def search(
     rivals = [c for c in tried.values() if c is not best and _alike(c, best, settings)]
     if not problem.cheap_jacobian:
         rivals = [c for c in rivals if not simpler(best.fit, c.fit)]
-    return Search(base, tuple(scores), angles, tuple(tried.values()), best, tuple(rivals))
+    unlisted = _unlisted(problem, base, best, settings)
+    return Search(base, tuple(scores), angles, tuple(tried.values()), best, tuple(rivals), unlisted)
+
+
+def _unlisted(problem: Problem, base: Candidate, best: Candidate, settings: Settings) -> str:
+    """An unknown input elsewhere that would explain as much as the one effect named, where linear scores hold."""
+    if base.pattern is None or len(best.effects) != 1:
+        return ""
+    label, quantity, chi2 = base.pattern.elsewhere(frozenset(problem.effects[best.effects[0]].ports))
+    return f"{label} with {quantity}" if chi2 > base.fit.chi2 - best.fit.chi2 - settings.same else ""
 
 
 def _reaching(
@@ -132,7 +147,8 @@ def _completed(
     """A model at the noise with a simpler effect where one does the same, and with what is significant beside it."""
     while True:
         progress("looking for more", 0.0)
-        scores = _scores(problem, best, settings)
+        scores, best = _scores(problem, best, settings)
+        tried[frozenset(best.effects)] = best
         instead = stands(problem, best.fit, best.effects, scores)[: settings.refits]
         instead += tried_in_place(problem, best.fit, best.effects, scores)[: settings.refits]
         for stand in instead:
@@ -160,14 +176,28 @@ def _completed(
 
 
 def _looked_at(problem: Problem, c: Candidate, settings: Settings) -> Candidate:
-    """Whether a residual that is small has a pattern, too."""
+    """Whether a residual that is small has a pattern, too; for drives only where scores were taken at the fit."""
     small = c.noise.passes and np.isfinite(c.fit.chi2)
-    return dataclasses.replace(c, patterned=small and pattern(problem, c.fit) > settings.pattern)
+    if not small or not problem.inputs:
+        return dataclasses.replace(c, patterned=small and pattern(problem, c.fit) > settings.pattern)
+    p = c.pattern
+    return dataclasses.replace(c, patterned=p is not None and p.p <= settings.pattern_p and p.chi2 >= settings.chi2)
 
 
-def _scores(problem: Problem, at: Candidate, settings: Settings) -> list[Score]:
+def _scores(problem: Problem, at: Candidate, settings: Settings) -> tuple[list[Score], Candidate]:
+    """Scores of all other effects; and the candidate with its pattern, if its residual is small.
+
+    Derivatives with respect to candidates and to unknown inputs are one batch of one program.
+    """
     names = [e for e in problem.candidates if e not in at.effects]
-    return score(problem, at.fit, signatures(problem, at.fit, names), settings.draws, settings.seed)
+    inputs = list(problem.inputs) if at.noise.passes and np.isfinite(at.fit.chi2) else []
+    with problem.focused([*problem.candidates, SMOOTH]):
+        columns = signatures(problem, at.fit, names, inputs)
+    if inputs and columns:
+        own = {label: columns.pop(label) for label in inputs}
+        found = find_pattern(problem, at.fit, own, settings.draws, settings.seed)
+        at = dataclasses.replace(at, pattern=found)
+    return score(problem, at.fit, columns, settings.draws, settings.seed), at
 
 
 def significant(s: Score, settings: Settings) -> bool:
@@ -254,4 +284,8 @@ def excess_explained(search_: Search, problem: Problem) -> float:
     keep = problem.observations.in_split("fit", "select")
     before = float(np.sum(search_.base.fit.residual[keep] ** 2)) - keep.sum()
     after = float(np.sum(search_.chosen.fit.residual[keep] ** 2)) - keep.sum()
+    if search_.chosen.patterned and search_.chosen.pattern is not None:
+        # At the noise chance hides what is left; the pattern is what shows of it.
+        left = max(after, search_.chosen.pattern.chi2)
+        before, after = max(before, before - after + left), left
     return 1.0 if before <= 0.0 else 1.0 - max(after, 0.0) / before

@@ -237,7 +237,7 @@ def why(
         port = place.port if diagnosis.verdict is Verdict.UNKNOWN else None
         sentence = diagnosis.sentence + (f" It acts at the port {' or '.join(place.alike)}." if port else "")
         others: list[dict[str, Any]] = []
-        if diagnosis.verdict is Verdict.UNKNOWN and only is None and problem.cheap_jacobian:
+        if diagnosis.verdict is Verdict.UNKNOWN and only is None:
             from lunar_mjx.criticism.alternatives import alternatives
 
             tried = alternatives(run, campaign, problem, found.chosen, progress)

@@ -1,0 +1,199 @@
+"""Unknown inputs of drives: something that nobody modelled acts at a port, over time or with the port's quantities."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+
+from lunar_mjx.effects.base import Effect, Parameter
+
+Act = Callable[[Any, Any, Any], Any]
+SOURCE = "unknown input of a localisation"
+SMOOTH = "smooth_inputs"
+"""Name of the effect that holds all inputs which follow quantities of their ports."""
+_ORDER = 1000
+
+
+def _torque(ctx, a, value):
+    return value + jnp.where(ctx.rover.joint_group == 0, a, 0.0)
+
+
+def _current(ctx, a, value):
+    return dataclasses.replace(value, current=value.current + jnp.where(ctx.rover.joint_group == 0, a, 0.0))
+
+
+def _radius(ctx, a, value):
+    return dataclasses.replace(value, radius=value.radius * (1.0 + a))
+
+
+def _stiffness(ctx, a, value):
+    return dataclasses.replace(value, k_c=value.k_c * (1.0 + a), k_phi=value.k_phi * (1.0 + a))
+
+
+def _strength(ctx, a, value):
+    return dataclasses.replace(value, tan_phi=value.tan_phi * (1.0 + a), cohesion=value.cohesion * (1.0 + a))
+
+
+def _load(ctx, a, value):
+    return dataclasses.replace(value, load=value.load * (1.0 + a))
+
+
+def _resistance(ctx, a, value):
+    return dataclasses.replace(value, resistance=value.resistance + a * value.load)
+
+
+def _force_x(ctx, a, value):
+    return dataclasses.replace(value, force=value.force._replace(x=value.force.x + a * ctx.normal.load))
+
+
+def _force_y(ctx, a, value):
+    return dataclasses.replace(value, force=value.force._replace(y=value.force.y + a * ctx.normal.load))
+
+
+def _moment_y(ctx, a, value):
+    moment = value.moment.y + a * ctx.normal.load * ctx.geometry.radius
+    return dataclasses.replace(value, moment=value.moment._replace(y=moment))
+
+
+def _push(ctx, a, value):
+    forward = ctx.frame.forward
+    return dataclasses.replace(value, force=value.force + forward * a)
+
+
+def _tilt(ctx, a, value):
+    left = ctx.frame.left
+    return dataclasses.replace(value, moment=value.moment + left * a)
+
+
+def _winding(ctx, a, value):
+    return dataclasses.replace(value, winding=value.winding + jnp.where(ctx.rover.joint_group == 0, a, 0.0))
+
+
+def _housing(ctx, a, value):
+    return dataclasses.replace(value, housing=value.housing + jnp.where(ctx.rover.joint_group == 0, a, 0.0))
+
+
+PROBES: Mapping[str, tuple[str, Act, float, str]] = {
+    "command: motor current": ("command", _current, 0.05, "A"),
+    "motor_torque": ("motor_torque", _torque, 0.5, "N m"),
+    "geometry: wheel radius": ("geometry", _radius, 0.02, "1"),
+    "soil: stiffness": ("soil", _stiffness, 0.3, "1"),
+    "soil: shear strength": ("soil", _strength, 0.1, "1"),
+    "wheel_normal: load": ("wheel_normal", _load, 0.1, "1"),
+    "wheel_normal: resistance": ("wheel_normal", _resistance, 0.05, "1"),
+    "wheel_shear: longitudinal force": ("wheel_shear", _force_x, 0.05, "1"),
+    "wheel_shear: lateral force": ("wheel_shear", _force_y, 0.05, "1"),
+    "wheel_shear: driving moment": ("wheel_shear", _moment_y, 0.05, "1"),
+    "body_wrench: push": ("body_wrench", _push, 5.0, "N"),
+    "body_wrench: pitching moment": ("body_wrench", _tilt, 2.0, "N m"),
+    "heat: winding": ("heat", _winding, 0.5, "W"),
+    "heat: housing": ("heat", _housing, 0.5, "W"),
+}
+"""Unknown inputs: label -> port, what an amount does there, its size, its unit."""
+
+
+def _wheel_speed(ctx):
+    return ctx.contact.rim_speed / ctx.geometry.radius
+
+
+QUANTITIES: Mapping[str, Callable[[Any, Any], Any]] = {
+    "constant": lambda ctx, value: 1.0,
+    "current": lambda ctx, value: value.current / 1.0,
+    "joint speed": lambda ctx, value: ctx.joint_speed / 2.0,
+    "wheel speed": lambda ctx, value: _wheel_speed(ctx) / 2.0,
+    "slip": lambda ctx, value: ctx.contact.slip / 0.3,
+    "signed slip": lambda ctx, value: value.slip_x / 0.3,
+    "lateral slip": lambda ctx, value: value.slip_y / 0.3,
+    "load": lambda ctx, value: value.load / 100.0,
+    "loss": lambda ctx, value: jnp.abs(ctx.command.current) / 1.0,
+    "travel speed": lambda ctx, value: ctx.velocity.dot(ctx.frame.forward) / 0.2,
+}
+"""Quantities that an unknown input may follow, each over a usual size: 1 A, 2 rad/s, 0.3 of slip, 100 N, 0.2 m/s."""
+
+FOLLOWS: Mapping[str, tuple[str, ...]] = {
+    "command: motor current": ("constant", "current", "joint speed"),
+    "motor_torque": ("constant", "joint speed"),
+    "geometry: wheel radius": ("constant",),
+    "soil: stiffness": ("constant", "slip", "wheel speed"),
+    "soil: shear strength": ("constant", "slip", "wheel speed"),
+    "wheel_normal: load": ("constant", "slip", "load"),
+    "wheel_normal: resistance": ("constant", "slip", "wheel speed"),
+    "wheel_shear: longitudinal force": ("constant", "signed slip", "wheel speed"),
+    "wheel_shear: lateral force": ("constant", "lateral slip"),
+    "wheel_shear: driving moment": ("constant", "signed slip", "wheel speed"),
+    "body_wrench: push": ("constant", "travel speed"),
+    "body_wrench: pitching moment": ("constant",),
+    "heat: winding": ("constant", "loss"),
+    "heat: housing": ("constant",),
+}
+"""What each input may follow: to first order, any smooth function of a port's own quantities. (A torque that follows
+the current is the motor's constant, which every refit moves.)"""
+
+
+def present(label: str, ports: frozenset[str]) -> bool:
+    """Whether an input can act on a model whose effects are at these ports."""
+    return PROBES[label][0] in ports or PROBES[label][0] in ("geometry", "body_wrench")
+
+
+@functools.cache
+def unknown_input(label: str, knots: int, span: float) -> Effect:
+    """An unknown input as an effect whose amplitudes are the knots of a course over time (one knot: constant)."""
+    port, act, size, unit = PROBES[label]
+
+    def function(ctx, p, x, value):
+        if knots == 1:
+            return act(ctx, p.knot_0, value)
+        place = ctx.time / span * (knots - 1)
+        weights = [jnp.maximum(0.0, 1.0 - jnp.abs(place - k)) for k in range(knots)]
+        return act(ctx, sum(w * getattr(p, f"knot_{k}") for k, w in enumerate(weights)), value)
+
+    amplitudes = {f"knot_{k}": _amplitude(size, unit, f"{label} at knot {k}") for k in range(knots)}
+    name = f"probe_{_word(label)}"
+    return Effect(name=name, ports={port: function}, parameters=amplitudes, order=_ORDER, doc=SOURCE)
+
+
+@functools.cache
+def smooth_inputs(ports: frozenset[str]) -> Effect:
+    """All inputs that follow quantities of their ports, as one effect; amplitudes are named by `amplitude`.
+
+    Args:
+      ports: at which the model's effects act.
+    """
+    labels = [label for label in PROBES if present(label, ports)]
+    amplitudes = {
+        amplitude(label, quantity): _amplitude(*PROBES[label][2:], f"{label} with {quantity}")
+        for label in labels
+        for quantity in FOLLOWS[label]
+    }
+
+    def at(port: str) -> Callable[..., Any]:
+        mine = [label for label in labels if PROBES[label][0] == port]
+
+        def function(ctx, p, x, value):
+            given = value
+            for label in mine:
+                amount = sum(getattr(p, amplitude(label, q)) * QUANTITIES[q](ctx, given) for q in FOLLOWS[label])
+                value = PROBES[label][1](ctx, amount, value)
+            return value
+
+        return function
+
+    own = dict.fromkeys(PROBES[label][0] for label in labels)
+    return Effect(SMOOTH, {port: at(port) for port in own}, amplitudes, order=_ORDER, doc=SOURCE)
+
+
+def amplitude(label: str, quantity: str) -> str:
+    """Name of the amplitude of an input that follows a quantity."""
+    return f"{_word(label)}__{_word(quantity)}"
+
+
+def _amplitude(size: float, unit: str, meaning: str) -> Parameter:
+    return Parameter(size, 0.0, (-1e3 * size, 1e3 * size), unit, meaning, SOURCE)
+
+
+def _word(label: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in label)
