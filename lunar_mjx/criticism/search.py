@@ -10,7 +10,7 @@ import numpy as np
 from lunar_mjx.criticism.complete import best_start, simpler, stands, tried_in_place
 from lunar_mjx.criticism.descent import slack_of
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
-from lunar_mjx.criticism.held_out import gain, noise_test
+from lunar_mjx.criticism.held_out import gain, gain_in_turn, noise_test
 from lunar_mjx.criticism.inputs import SMOOTH
 from lunar_mjx.criticism.localise import pattern
 from lunar_mjx.criticism.patterns import find_pattern
@@ -244,7 +244,12 @@ def _earned(problem: Problem, before: Candidate, c: Candidate, settings: Setting
     value, se = gain(problem, before.fit, c.fit)
     # Reaching the noise on all manoeuvres is evidence of its own.
     needed = 1.0 if c.at_noise and not before.at_noise else settings.gain_se
-    return bool(value > 0.5 * settings.chi2 and value > needed * se)
+    if value > 0.5 * settings.chi2 and value > needed * se:
+        return True
+    if not problem.cheap_jacobian or value <= 0.0:
+        return False
+    value, se = gain_in_turn(problem, before.fit, c.fit)
+    return bool(value > 0.5 * settings.chi2 and value > settings.gain_se * se)
 
 
 def _better(c: Candidate, best: Candidate, settings: Settings) -> bool:
