@@ -11,6 +11,7 @@ import numpy as np
 
 from .judge import NAMES
 from .noise import NOISES
+from .separable import SEPARABLE
 
 Row = Mapping[str, Any]
 _Z = 1.959964
@@ -64,6 +65,8 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
         "singles, wrong name": share(group("singles"), wrong),
         "singles at 5 times the noise": {"target": ">= 0.80", **share(group("singles_x5"), right)},
         "singles at 5 times the noise, wrong name": {"target": "<= 0.02", **share(group("singles_x5"), wrong)},
+        "singles at 5 times the noise, separable there": share(
+            [r for r in group("singles_x5") if r["separable"] >= SEPARABLE * r["scale"]], right),
         "nulls, false alarm": {"target": "<= 0.01", **share(nulls, lambda r: r["outcome"] == "false alarm")},
         "nulls, something named": share(nulls, wrong),
         "nulls, not answered": share(nulls, lambda r: r["outcome"] in ("refused", "crash")),
