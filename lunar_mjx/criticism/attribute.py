@@ -9,6 +9,7 @@ import numpy as np
 
 from lunar_mjx.criticism.fitting import HALF_STEP, Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import errors
+from lunar_mjx.criticism.patterns import Unlisted
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.score import SEPARABLE, Score
@@ -41,7 +42,8 @@ def diagnose(
         "noise_test_before": dataclasses.asdict(base.noise),
         "noise_test_after": dataclasses.asdict(chosen.noise),
         "patterns": {"before": base.pattern.to_dict() if base.pattern else None,
-                     "after": chosen.pattern.to_dict() if chosen.pattern else None, "unlisted": found.unlisted},
+                     "after": chosen.pattern.to_dict() if chosen.pattern else None,
+                     "unlisted": dataclasses.asdict(found.unlisted) if found.unlisted else None},
         "seed": settings.seed, "alpha": settings.alpha,
         "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
     }  # fmt: skip
@@ -134,12 +136,19 @@ def _verdict(found: Search, explained: float, settings: Settings) -> tuple[Verdi
             (f"{names} are missing; {', '.join(m for m in members if m not in common)} cannot be told apart here."),
         )
     if len(chosen.effects) == 1:
-        return (
-            Verdict.KNOWN,
-            chosen.effects,
-            (f"{names} is missing: consistent with these logs, and better than every listed alternative."),
-        )
+        return _single(names, found.unlisted)
     return Verdict.MULTIPLE, chosen.effects, f"{names} are missing, each significant given the others."
+
+
+def _single(name: str, unlisted: Unlisted | None) -> tuple[Verdict, tuple[str, ...], str]:
+    """One effect: known, unless an unlisted input of one amount elsewhere explains more than it does."""
+    if unlisted is not None and unlisted.ahead > 0.0:
+        sentence = f"{name} is missing, or {unlisted}: these logs cannot tell which."
+        return Verdict.KNOWN_CLASS, (name,), sentence
+    sentence = f"{name} is missing: consistent with these logs, and better than every listed alternative."
+    if unlisted is not None:
+        sentence += f" But {unlisted} would do nearly the same."
+    return Verdict.KNOWN, (name,), sentence
 
 
 def _evidence(problem: Problem, found: Search, settings: Settings) -> tuple[EffectEvidence, ...]:

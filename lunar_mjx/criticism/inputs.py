@@ -118,8 +118,8 @@ FOLLOWS: Mapping[str, tuple[str, ...]] = {
     "command: motor current": ("constant", "current", "joint speed"),
     "motor_torque": ("constant", "joint speed"),
     "geometry: wheel radius": ("constant",),
-    "soil: stiffness": ("constant", "slip", "wheel speed"),
-    "soil: shear strength": ("constant", "slip", "wheel speed"),
+    "soil: stiffness": ("slip", "wheel speed"),
+    "soil: shear strength": ("slip", "wheel speed"),
     "wheel_normal: load": ("constant", "slip", "load"),
     "wheel_normal: resistance": ("constant", "slip", "wheel speed"),
     "wheel_shear: longitudinal force": ("constant", "signed slip", "wheel speed"),
@@ -131,7 +131,7 @@ FOLLOWS: Mapping[str, tuple[str, ...]] = {
     "heat: housing": ("constant",),
 }
 """What each input may follow: to first order, any smooth function of a port's own quantities. (A torque that follows
-the current is the motor's constant, which every refit moves.)"""
+the current is the motor's constant, and other constants of the soil are its parameters: every refit moves these.)"""
 
 
 def present(label: str, ports: frozenset[str]) -> bool:

@@ -120,7 +120,7 @@ def _hypotheses(verdict: dict[str, Any], between: Sequence[str], candidates: set
                 raise UserError(f"next --between: {name!r} is no candidate here; use one of {', '.join(candidates)}.")
         return list(between) if len(between) > 1 else [*between, NOTHING]
     named = [e for e in verdict["effects"] if e in candidates]
-    if verdict["verdict"] == "KNOWN_CLASS":
+    if verdict["verdict"] == "KNOWN_CLASS" and len(named) > 1:
         return named[:_MOST]
     if verdict["verdict"] == "NOISE_ONLY":
         # What these logs could not have shown, the most nearly visible first.

@@ -19,6 +19,26 @@ from lunar_mjx.criticism.score import SEPARABLE, blocks, evidence_of, outside, s
 
 
 @dataclasses.dataclass(frozen=True)
+class Unlisted:
+    """An unknown input of one amount that explains what one effect of the catalogue does.
+
+    Attributes:
+      label, quantity: of the input, and what it follows. chi2: that it explains of the baseline's residual.
+      ahead: chi-square that it explains beyond what the effect does.
+    """
+
+    label: str
+    quantity: str
+    chi2: float
+    ahead: float
+
+    def __str__(self) -> str:
+        port, _, what = self.label.partition(": ")
+        follows = "" if self.quantity == "constant" else f" in proportion to {self.quantity}"
+        return f"something unlisted at the port {port} ({what or port.replace('_', ' ')}{follows})"
+
+
+@dataclasses.dataclass(frozen=True)
 class Pattern:
     """What smooth unknown inputs explain of a residual.
 

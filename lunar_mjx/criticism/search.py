@@ -13,7 +13,7 @@ from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
 from lunar_mjx.criticism.held_out import gain, gain_in_turn, noise_test
 from lunar_mjx.criticism.inputs import SMOOTH
 from lunar_mjx.criticism.localise import pattern
-from lunar_mjx.criticism.patterns import find_pattern
+from lunar_mjx.criticism.patterns import Unlisted, find_pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Candidate, Settings, refit, refit_all
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
@@ -34,8 +34,7 @@ class Search:
       base: the baseline fit. scores: of every candidate at the base. cosines: between them.
       tried: every refitted set. chosen: the set that is named (the base's if empty). rivals: sets that explain the
         data alike.
-      unlisted: an unknown input, in words, at none of the ports of the one effect that is named, which explains the
-        data alike; empty if none.
+      unlisted: an unknown input at none of the ports of the one effect that is named, which explains the data alike.
     """
 
     base: Candidate
@@ -44,7 +43,7 @@ class Search:
     tried: tuple[Candidate, ...]
     chosen: Candidate
     rivals: tuple[Candidate, ...]
-    unlisted: str = ""
+    unlisted: Unlisted | None = None
 
 
 def fit_baseline(problem: Problem, settings: Settings, memory: Memory, progress: Progress = silent) -> Fit:
@@ -119,12 +118,13 @@ def search(
     return Search(base, tuple(scores), angles, tuple(tried.values()), best, tuple(rivals), unlisted)
 
 
-def _unlisted(problem: Problem, base: Candidate, best: Candidate, settings: Settings) -> str:
+def _unlisted(problem: Problem, base: Candidate, best: Candidate, settings: Settings) -> Unlisted | None:
     """An unknown input elsewhere that would explain as much as the one effect named, where linear scores hold."""
     if base.pattern is None or len(best.effects) != 1:
-        return ""
+        return None
     label, quantity, chi2 = base.pattern.elsewhere(frozenset(problem.effects[best.effects[0]].ports))
-    return f"{label} with {quantity}" if chi2 > base.fit.chi2 - best.fit.chi2 - settings.same else ""
+    ahead = chi2 - (base.fit.chi2 - best.fit.chi2)
+    return Unlisted(label, quantity, chi2, ahead) if label and ahead > -settings.same else None
 
 
 def _reaching(

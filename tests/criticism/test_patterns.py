@@ -1,6 +1,7 @@
 """Small residuals of drives: smooth unknown inputs are seen where no candidate does, and noise is left alone."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ class Driven(Linear):
         count = LOGS * SAMPLES
         self.time = np.tile(np.arange(SAMPLES) * 0.1, LOGS)
         super().__init__(_smooth(rng, 2), {"listed": _smooth(rng, 1)[:, 0]}, manoeuvres(LOGS, SAMPLES, **noise))
+        self.effects = {"listed": types.SimpleNamespace(ports={"soil": None})}
         self.inputs, at = {}, self.matrix.shape[1]
         for label in labels:
             self.inputs[label] = np.arange(at, at + len(FOLLOWS[label]))
@@ -81,7 +83,7 @@ def _columns(problem: Driven) -> dict[str, np.ndarray]:
 )
 def test_noise_passes_for_a_pattern_as_rarely_as_stated(correlation_time, noise) -> None:
     rng = np.random.default_rng(5)
-    problem, alpha, trials = Driven(rng, **noise), 0.05, 200
+    problem, alpha, trials = Driven(rng, **noise), 0.05, 100
     columns, hits = _columns(problem), 0
     for _ in range(trials):
         hits += find_pattern(problem, _fitted(problem, rng, correlation_time), columns, 200).p <= alpha
@@ -137,12 +139,29 @@ def test_a_name_is_not_confirmed_where_a_pattern_is_left() -> None:
     problem = Driven(rng)
     _fitted(problem, rng, **{CURRENT: 0.25})
     problem.observations.value[:] += 0.3 * problem.matrix[:, problem.candidates["listed"][0]]
-    problem.effects = {"listed": type("Effect", (), {"ports": {"soil": None}})}
     diagnosis, found = diagnose(problem, SETTINGS)
     assert found.chosen.effects == ("listed",)
     assert found.chosen.noise.passes
     assert diagnosis.verdict is Verdict.UNKNOWN, diagnosis.sentence
     assert localise(problem, found).port == "command"
+
+
+@pytest.mark.parametrize(
+    ("listed", "hidden", "verdict"), [(0.0, 0.35, Verdict.KNOWN_CLASS), (0.35, 0.0, Verdict.KNOWN)]
+)
+def test_an_effect_counts_as_known_only_if_no_unlisted_input_explains_more(listed, hidden, verdict) -> None:
+    rng = np.random.default_rng(11)
+    problem = Driven(rng)
+    place, twin = problem.candidates["listed"][0], problem.inputs[CURRENT][1]
+    problem.matrix[:, place] = 0.97 * problem.matrix[:, twin] + 0.24 * problem.matrix[:, place]
+    noise = _noise(rng)
+    problem.observations.value[:] = noise + listed * problem.matrix[:, place] + hidden * problem.matrix[:, twin]
+    diagnosis, found = diagnose(problem, SETTINGS)
+    assert diagnosis.verdict is verdict, diagnosis.sentence
+    assert diagnosis.effects == ("listed",)
+    assert found.unlisted is not None
+    assert (found.unlisted.label, found.unlisted.quantity) == (CURRENT, "current")
+    assert "unlisted at the port command (motor current in proportion to current)" in diagnosis.sentence
 
 
 def test_every_input_has_a_size_and_follows_something() -> None:
