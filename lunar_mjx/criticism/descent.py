@@ -153,6 +153,21 @@ def _within(hessian: np.ndarray, downhill: np.ndarray, low: np.ndarray, high: np
     return found.x * size
 
 
+class Rival:
+    """Chi-square that another model reaches; refits beside this one may lower it meanwhile.
+
+    Args:
+      chi2: what is reached so far.
+    """
+
+    def __init__(self, chi2: float = np.inf):
+        self.chi2 = chi2
+
+    def lower(self, chi2: float) -> None:
+        """Another model has reached this."""
+        self.chi2 = min(self.chi2, chi2)
+
+
 @dataclasses.dataclass
 class Descent:
     u: np.ndarray
@@ -258,7 +273,7 @@ class _Walk:
 
 
 def descend(
-    goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, rival: float = np.inf,
+    goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, rival: Rival | float = np.inf,
     known: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Descent:  # fmt: skip
     """Levenberg-Marquardt from one start, all dampings of an iteration in one batch.
@@ -267,7 +282,7 @@ def descend(
     that falls far short of a rival's chi-square is left.
 
     Args:
-      goal: what is minimised. start: (coordinates,) where from. iterations: most steps. rival: chi-square to be caught.
+      goal: what is minimised. start: (coordinates,) where from. iterations: most steps. rival: what is to be caught.
       known: whitened residual (n,) and Jacobian (n, free) at the start, if they have been computed.
     """
     walk = _begin(goal, start, known)
@@ -276,7 +291,7 @@ def descend(
             break
         downhill, hessian = goal.quadratic(walk.u, walk.r, walk.j)
         walk.promise = goal.promise(walk.u, downhill, hessian)
-        if walk.hopeless(rival):
+        if walk.hopeless(rival.chi2 if isinstance(rival, Rival) else rival):
             break
         if walk.promise < max(0.2 * SMALL_GRADIENT, walk.enough):
             if walk.fresh:

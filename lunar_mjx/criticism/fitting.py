@@ -19,6 +19,7 @@ from lunar_mjx.criticism.descent import (
     SMALL_GRADIENT,
     Descent,
     Objective,
+    Rival,
     chase,
     descend,
     same_chi2,
@@ -178,7 +179,7 @@ def fit(
     splits: Sequence[str] = ("fit",),
     certify: bool = True,
     progress: Progress = silent,
-    rival: float = np.inf,
+    rival: Rival | float = np.inf,
     known: tuple[np.ndarray, np.ndarray] | None = None,
     half_step: float = HALF_STEP,
 ) -> Fit:
@@ -221,7 +222,7 @@ def fit(
 
 
 def _descents(
-    goal: Objective, origin: np.ndarray, others: np.ndarray, rival: float,
+    goal: Objective, origin: np.ndarray, others: np.ndarray, rival: Rival | float,
     known: tuple[np.ndarray, np.ndarray] | None, progress: Progress,
 ) -> tuple[Descent, tuple[float, ...]]:  # fmt: skip
     """The lowest descent, and the chi-square of every start; where rows are dear, other starts chase the first."""

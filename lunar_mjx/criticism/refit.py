@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lunar_mjx.criticism.descent import Rival
 from lunar_mjx.criticism.fitting import Fit, Memory, fit
 from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
 from lunar_mjx.criticism.patterns import Pattern
@@ -90,14 +91,14 @@ def refit_all(
 ) -> list[Candidate]:
     """Refits the parent with each of the new effects.
 
-    Where rows are free, all refits share their batches. Where they are dear, the best is refitted first, and others
-    only as far as they may still rival it.
+    Where rows are free, all refits share their batches, until one reaches the noise and others fall far short.
+    Where they are dear, the best is refitted first, and others only as far as they may still rival it.
     """
 
     scans = scan(problem, parent.fit, parent.effects, new)
     new = sorted(new, key=lambda s: scans[s.effect][0] if s.effect in scans else parent.fit.chi2 - s.chi2)
 
-    def one(s: Score, rival: float = np.inf) -> Candidate:
+    def one(s: Score, rival: Rival | float = np.inf) -> Candidate:
         chi2, start = scans.get(s.effect, (np.inf, None))
         better = chi2 < parent.fit.chi2 - s.chi2
         return refit(problem, parent, (*parent.effects, s.effect), s, memory, rival, start if better else None)
@@ -112,10 +113,14 @@ def refit_all(
                 grown.append(one(s, reached + settings.same))
         return grown
     with problem.together(len(new)) as leave:
+        rival = Rival()
 
         def tracked(s: Score) -> Candidate:
             try:
-                return one(s)
+                found = one(s, rival)
+                if found.noise.passes:
+                    rival.lower(found.fit.chi2 + settings.same)
+                return found
             finally:
                 leave()
 
@@ -125,7 +130,7 @@ def refit_all(
 
 def refit(
     problem: Problem, parent: Candidate, effects: tuple[str, ...], scored: Score | None, memory: Memory,
-    rival: float = np.inf, start: np.ndarray | None = None,
+    rival: Rival | float = np.inf, start: np.ndarray | None = None,
 ) -> Candidate:  # fmt: skip
     """Refits from a start; without one from the parent with the new effect at its linear estimate, and from a third of
     it where that fails."""

@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 from toy_problem import Decay, Linear, TwoMinima, coordinate, manoeuvres
 
 from lunar_mjx.criticism import fitting
-from lunar_mjx.criticism.descent import Objective
+from lunar_mjx.criticism.descent import Objective, Rival, descend
 from lunar_mjx.criticism.fitting import Memory, fit
 
 RNG = np.random.default_rng(0)
@@ -148,3 +148,36 @@ def test_a_fit_at_the_noise_goes_on_while_its_gradient_promises_more():
     found = fit(problem, problem.free(), np.array([-1.2, 1.0]), starts=1)
     assert found.gradient < 0.5
     assert found.problems == ()
+
+
+def test_a_descent_that_falls_far_short_is_left_once_a_rival_has_arrived():
+    """An optimum at chi-square 9, reached slowly; a rival arrives at 1 while the descent is under way."""
+
+    class Late(Valley):
+        calls = 0
+
+        def predict(self, u):
+            Late.calls += 1
+            if Late.calls == arrives:
+                rival.lower(1.0)
+            return np.column_stack([super().predict(u), np.full(len(np.atleast_2d(u)), 3.0)])
+
+        def jacobian(self, u, which):
+            return np.vstack([super().jacobian(u, np.arange(2)), np.zeros(2)])[:, which]
+
+    def steps(when: int) -> tuple[int, float]:
+        nonlocal rival, arrives
+        rival, arrives, Late.calls = Rival(), when, 0
+        problem = Late()
+        seen = dataclasses.replace(problem.observations, value=np.zeros(3), unit=np.zeros(3, int), series=(
+            dataclasses.replace(problem.observations.series[0], stop=3, time=np.arange(3.0)),))  # fmt: skip
+        problem.observations = seen
+        goal = Objective(problem, problem.free(), seen.in_split("fit"))
+        found = descend(goal, np.array([-1.2, 1.0]), rival=rival)
+        return Late.calls, found.chi2
+
+    rival, arrives = Rival(), 0
+    alone, chi2 = steps(10**6)
+    assert chi2 < 9.3
+    beaten, left_at = steps(8)
+    assert 8 <= beaten < 12 < alone and left_at > chi2 + 1.0
