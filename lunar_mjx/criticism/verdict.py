@@ -20,7 +20,7 @@ class Verdict(enum.Enum):
     KNOWN = ("KNOWN", 20)
     """One catalogue effect explains the error, separably."""
     KNOWN_CLASS = ("KNOWN_CLASS", 21)
-    """One of several effects that these logs cannot tell apart."""
+    """One of several effects that these logs cannot tell apart; where one is named, that or something unlisted."""
     MULTIPLE = ("MULTIPLE", 22)
     """Several effects, each significant given the others."""
     UNKNOWN = ("UNKNOWN", 30)
