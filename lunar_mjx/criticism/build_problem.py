@@ -23,7 +23,8 @@ NO_CANDIDATE = frozenset({
 """Effects that are an arrangement of the test which its user knows, an engine's substitute for physics, or without a
 derivative: they are never proposed as missing."""
 
-FINER_FORMS = frozenset({"slide_softening", "side_entry", "shear_softening", "skid_shear", "side_wall"})
+FINER_FORMS = frozenset({"slide_softening", "side_entry", "side_exit", "shear_softening", "skid_shear",
+                          "side_wall"})  # fmt: skip
 """Finer forms of slip_sinkage, angle_sinkage, bulldozing: only a bed that imposes slip and slip angle, against a model
 that integrates the stress, can tell them from these; elsewhere they would only be their twins."""
 

@@ -71,6 +71,7 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         slip_sinkage.angle_sinkage,
         sliding_contact.slide_softening,
         sliding_contact.side_entry,
+        sliding_contact.side_exit,
         sliding_contact.shear_softening,
         sliding_contact.skid_shear,
         sliding_contact.side_wall,

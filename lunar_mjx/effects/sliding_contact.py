@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.effects.base import Parameter, effect
-from lunar_mjx.effects.bulldozing import passive_pressure
 from lunar_mjx.effects.slip_sinkage import clipped_slip
 from lunar_mjx.effects.wheel import contact_with_soil, grounded, mean_decay, sin_difference
 from lunar_mjx.spatial import Vec3
@@ -104,13 +103,13 @@ def side_entry(ctx, p, x, normal):
 
     def factor(theta):
         place = r * jnp.sin(theta)
-        pressed = jnp.maximum(r * (jnp.cos(jnp.maximum(theta, 0.0)) - jnp.cos(theta_1)), 1e-9 * r)
+        now = jnp.maximum(r * (jnp.cos(theta) - jnp.cos(theta_1)), 1e-9 * r)
         node, weight = _first_axis(_ACROSS, place), _first_axis(_ACROSS_WEIGHTS, place)
         enters = place + 0.5 * (1.0 + node) * reach
         beside = enters < entrance * (1.0 - 1e-6)
         height = jnp.sqrt(jnp.where(beside, r * r - jnp.where(beside, enters, 0.0) ** 2, r * r))
         depth = jnp.where(beside, jnp.maximum(height - r * jnp.cos(theta_1), 0.0), 0.0)
-        left = 1.0 - (1.0 - p.kept) * jnp.minimum(depth / pressed, 1.0)
+        left = 1.0 - (1.0 - p.kept) * depth / now
         return 1.0 + jnp.sum(0.5 * weight * (jnp.maximum(left, 1e-9) ** soil.n - 1.0), axis=0)
 
     return scaled_stress(ctx, normal, factor)
@@ -152,6 +151,26 @@ def shear_softening(ctx, p, x, normal):
 
 
 @effect(
+    "wheel_normal",
+    order=4,
+    lost=Parameter(1.0, 0.0, (0.0, 1.0), "1", "share of the contact behind the axle lost by moving broadside",
+                   "1: the rim only rises away from soil that enters behind the axle"),
+)  # fmt: skip
+def side_exit(ctx, p, x, normal):
+    """Stress behind the axle times 1 - lambda |v_y|/max(r omega, V): broadside, a wheel loses its rear contact.
+
+    Contact behind the lowest point (Wong & Reece 1967) is soil that the rim has pressed and carries up after it. A
+    wheel that moves across its heading faster than it turns meets soil there that nothing has pressed, and rises away
+    from it; one that spins still feeds its rear with what it carries under itself. Acts with `stress_integral` where
+    `exit_angle` gives contact behind the axle. Reason stated here.
+    """
+    c = ctx.contact
+    fastest = jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + c.v_y**2 + _STILL**2))
+    gone = p.lost * jnp.abs(c.v_y) / fastest
+    return scaled_stress(ctx, normal, lambda theta: jnp.where(theta < 0.0, 1.0 - gone, 1.0))
+
+
+@effect(
     "wheel_shear",
     order=-8,
     share=Parameter(
@@ -177,22 +196,43 @@ def skid_shear(ctx, p, x, wheel):
     )
 
 
+def wall_bearing(tan_phi, tan_delta):
+    """Coulomb's passive earth pressure coefficient of an upright wall that rubs the soil downward, 1.
+
+    K = cos^2 phi/(cos delta (1 - sqrt(sin(phi + delta) sin phi/cos delta))^2): the friction of the wall weighs down the
+    wedge that has to rise, and a negative delta lifts it. Straight slip lines exaggerate a rough wall in strong soil,
+    so the root is held below 0.92, that of phi = delta = 41 deg.
+    """
+    phi, delta = jnp.arctan(tan_phi), jnp.arctan(tan_delta)
+    square = jnp.sin(phi + delta) * jnp.sin(phi) / jnp.cos(delta)
+    return (jnp.cos(phi) / (1.0 - jnp.sqrt(jnp.clip(square, 1e-12, 0.85)))) ** 2 / jnp.cos(delta)
+
+
 @effect(
     "wheel_shear",
-    order=6,
-    pressure=Parameter(1.0, 0.0, (0.0, 10.0), "1", "share of the passive earth pressure on the flank",
-                       "1: a long wall (Hegedus); short walls have more"),
-    friction=Parameter(1.0, None, (0.0, 2.0), "1", "friction of the flank over the soil's own", "rough wall"),
+    order=-9,
+    pressure=Parameter(1.4, 0.0, (0.0, 10.0), "1", "factor of Coulomb's passive earth pressure on the flank",
+                       "1: a long wall; walls not much longer than deep have 1.3 to 2 (McKyes 1985), measured 1.4"),
+    friction=Parameter(0.6667, None, (0.0, 1.0), "1", "friction of the flank over the soil's own",
+                       "steel on sand, two thirds"),
+    build_up=Parameter(4.0, None, (0.1, 50.0), "1", "sideways way over K_y at which 63 % of the pressure have built up",
+                       "choice: a wedge needs more way than a shear band"),
     density=Parameter(1600.0, None, (500.0, 5000.0), "kg/m3", "bulk density of the soil",
                       "Lunar Sourcebook: 1500 to 1700 near the surface"),
+    speed_scale=Parameter(2e-3, None, (1e-5, 1.0), "m/s", "speed of full friction on the flank",
+                          "choice: well below driving speed"),
 )  # fmt: skip
 def side_wall(ctx, p, x, wheel):
-    """The wheel's leading flank pushes soil aside along its whole buried length, and drags in it.
+    """The leading flank pushes a wedge of soil aside, which rises along it: a blade that the wheel's turning rubs.
 
-    Passive pressure D_1 (c h + D_2 rho g h^2/2) (Hegedus; Ishigami et al. 2007) over -r sin(theta_1) .. r sin(theta_1),
-    with h of the circle at each place (6 Gauss points), mobilised by the displacement slip_y (r sin(theta_1) - x) since
-    the soil met the flank. Coulomb friction of that pressure acts against the flank's own velocity at two thirds of h,
-    (v_x - omega (r - z + 2h/3), -omega x): it brakes a skidding wheel, and drives a spinning one.
+    Coulomb's passive pressure K gamma h^2/2 + 2 c sqrt(K) h over -r sin(theta_1) .. r sin(theta_1), with h of the
+    circle at each place (6 Gauss points). It builds up with the sideways way (r sin(theta_1) - x) |tan beta| that the
+    flank has made beside a piece of ground: soil beside a wheel passes at v_x, however fast the wheel turns. The wedge
+    slides aside on a plane at X_c = 45 deg - phi/2 and so rises at |v_y| tan(X_c); the flank moves in it at (v_x -
+    omega (r - z + 2h/3), -omega x - |v_y| tan X_c) at two thirds of h, and its friction acts against that. The downward
+    part of what the flank does to the wedge enters K: a locked wheel is borne by the rising soil and pushes two to
+    three times as hard as one that spins, whose turning has used up the friction (Coulomb 1776; McKyes 1985; reason for
+    the direction of the friction stated here).
     """
     contact, geometry, normal, soil = contact_with_soil(ctx), ctx.geometry, ctx.normal, ctx.soil
     r, weight = geometry.radius, p.density * ctx.gravity
@@ -203,13 +243,16 @@ def side_wall(ctx, p, x, wheel):
     ahead = jnp.where(wheel.direction < 0.0, -1.0, 1.0)
     along = length * _first_axis(_ALONG, length)
     h = jnp.maximum(jnp.sqrt(jnp.maximum(r * r - along * along, 1e-12 * r * r)) - axle, 0.0)
-    q = (length - along) * wheel.slip_y / soil.shear_modulus_y
-    wall = _first_axis(_ALONG_WEIGHTS, length) * length * passive_pressure(soil, weight, h, h * h)
-    push = p.pressure * soft * wall * q * mean_decay(jnp.abs(q))
+    q = (length - along) * _tangent_of_travel(contact, wheel, p.speed_scale) / (p.build_up * soil.shear_modulus_y)
     arm, place = axle + 2.0 / 3.0 * h, ahead * along
-    u_x, u_z = contact.v_x - turning * arm, -turning * place
-    speed = jnp.sqrt(u_x**2 + u_z**2 + (_YIELD * contact.v_y) ** 2 + _STILL**2)
-    drag = p.friction * soil.tan_phi * jnp.abs(push) / speed
+    rise = jnp.abs(contact.v_y) / (soil.tan_phi + jnp.sqrt(1.0 + soil.tan_phi**2))
+    u_x, u_z = contact.v_x - turning * arm, -turning * place - rise
+    speed = jnp.sqrt(u_x**2 + u_z**2 + (_SPREAD * contact.v_y) ** 2 + p.speed_scale**2)
+    tan_delta = p.friction * soil.tan_phi
+    bearing = wall_bearing(soil.tan_phi, -tan_delta * u_z / speed)
+    wall = h * (0.5 * bearing * weight * h + 2.0 * soil.cohesion * jnp.sqrt(bearing))
+    push = p.pressure * soft * _first_axis(_ALONG_WEIGHTS, length) * length * wall * q * mean_decay(jnp.abs(q))
+    drag = tan_delta * jnp.abs(push) / speed
     d_x, d_z = -drag * u_x, -drag * u_z
     force = Vec3(jnp.sum(d_x, axis=0), -jnp.sum(push, axis=0), jnp.sum(d_z, axis=0))
     moment = Vec3(-jnp.sum(arm * push, axis=0), -jnp.sum(arm * d_x + place * d_z, axis=0),
@@ -217,5 +260,12 @@ def side_wall(ctx, p, x, wheel):
     return dataclasses.replace(wheel, force=wheel.force + force, moment=wheel.moment + moment)
 
 
-_YIELD = 0.3
-"""Speed of the soil along the flank as it is pushed aside, over the lateral speed: it takes its share of friction."""
+def _tangent_of_travel(contact, wheel, still):
+    """v_y/|v_x| from the displacement across of eq. 11, which refers to the faster of rim and travel; kept at rest."""
+    fastest = jnp.maximum(jnp.abs(contact.rim_speed), jnp.abs(contact.v_x))
+    braking = jnp.clip(-jnp.sign(wheel.direction) * wheel.slip_x, 0.0, 1.0)
+    return wheel.slip_y / (1.0 + braking) * jnp.sqrt((fastest**2 + still**2) / (contact.v_x**2 + still**2))
+
+
+_SPREAD = 0.3
+"""Spread of the speed of the soil along the flank, over the lateral speed: friction turns over it, not at a point."""
