@@ -7,46 +7,96 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lunar_mjx.criticism.build_problem import build_problem
 from lunar_mjx.criticism.drive_problem import DriveProblem
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
+from lunar_mjx.criticism.formula_search import PENALTY, Trial, search_formulas
 from lunar_mjx.criticism.held_out import errors, gain, noise_test
 from lunar_mjx.criticism.problem import Problem
-from lunar_mjx.criticism.refit import Candidate, Settings, refit_with
+from lunar_mjx.criticism.refit import Settings, refit_with
 from lunar_mjx.criticism.runs import VERDICT_FILE, Run, load_run
 from lunar_mjx.criticism.score import score, signatures
 from lunar_mjx.criticism.search import fit_baseline
+from lunar_mjx.criticism.slots import WHEEL_PORTS, Slots
 from lunar_mjx.criticism.table_problem import TableProblem
+from lunar_mjx.criticism.targets import CONSTANTS
 from lunar_mjx.criticism.terms import Term, effect_of, terms, with_amount
 from lunar_mjx.effects.base import PORTS
 from lunar_mjx.errors import UserError, bad_input
 
 UNKNOWN_FILE = "unknown.json"
 REFITS = 5
-"""Best-scored formulas that are refitted."""
+"""Formulas that are suggested; where each is simulated by itself, the best-scored are refitted."""
+LISTED = 100
+"""Scores that are listed."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Suggestion:
-    """A formula.
+class Part:
+    """One formula of a suggestion.
 
     Attributes:
-      port, target, formula: where it acts, on what, and how. amount, std, unit: its fitted amount.
-      chi2: reduction of chi-square by the refit. held_out_gain, held_out_se: on manoeuvres left out.
-      error: root mean square residual in sigma by split with it. at_noise: whether the residual is at the noise.
+      port, target: where it acts, on what. formula, latex: the law, its amount called a, as text and for a report.
+      amount, std, unit: its fitted amount. constants: others in it that were fitted, with their units.
     """
 
     port: str
     target: str
     formula: str
+    latex: str
     amount: float
     std: float
     unit: str
+    constants: dict[str, tuple[float, str]] = dataclasses.field(default_factory=dict)
+
+    def text(self) -> str:
+        """Law and numbers in a line."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        more = "".join(f", {k} = {v:.3g}{'' if u == '1' else ' ' + u}" for k, (v, u) in self.constants.items())
+        return f"{self.target} ({self.port}): {self.formula} with a = {self.amount:.4g} +- {self.std:.1g}{unit}{more}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Suggestion:
+    """A formula, or two together.
+
+    Attributes:
+      port, target, formula: where it acts, on what, and how, in words. parts: the formulas with their numbers.
+      chi2: reduction of chi-square by the refit. held_out_gain, held_out_se: on manoeuvres left out.
+      error: root mean square residual in sigma by split with it. at_noise: whether the residual is at the noise.
+      length: operations and symbols in the formulas.
+    """
+
+    port: str
+    target: str
+    formula: str
+    parts: tuple[Part, ...]
     chi2: float
     held_out_gain: float
     held_out_se: float
     error: dict[str, float]
     at_noise: bool
+    length: int
+
+    def pays(self, chi2: float) -> bool:
+        """Whether it earns its place on manoeuvres left out."""
+        return self.held_out_gain > self.held_out_se and self.held_out_gain > 0.5 * chi2
+
+
+def _suggestion(
+    parts: Sequence[Part],
+    chi2: float,
+    gained: tuple[float, float],
+    error: dict[str, float],
+    at_noise: bool,
+    length: int,
+) -> Suggestion:
+    ports, targets = (list(dict.fromkeys(getattr(p, name) for p in parts)) for name in ("port", "target"))
+    formula = "; ".join(p.formula for p in parts)
+    return Suggestion(" and ".join(ports), " and ".join(targets), formula, tuple(parts), chi2, *gained, error, at_noise,
+                      length)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,18 +104,20 @@ class Discovery:
     """Suggested formulas, best first.
 
     Attributes:
-      port: that was searched. suggestions: refitted ones. scored: all formulas with their score's chi-square.
+      port: where the most evidence is, or that was asked for. suggestions: refitted ones.
+      scored: formulas with their score's chi-square, highest first (tables: the first hundred).
       ceiling: chi-square that any smooth input at the port explains; None where `why` has not been asked.
-      file: effect file of the best suggestion, or None where none pays on manoeuvres left out.
-      error_before: root mean square residual in sigma by split.
+      files: effect files of the best suggestion, one for each of its parts; none where nothing pays on manoeuvres left
+        out. error_before: root mean square residual in sigma by split. number: formulas scored.
     """
 
     port: str
     suggestions: tuple[Suggestion, ...]
     scored: tuple[tuple[str, float], ...]
     ceiling: float | None
-    file: str | None
+    files: tuple[str, ...]
     error_before: dict[str, float]
+    number: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers and names only."""
@@ -73,16 +125,16 @@ class Discovery:
 
     def text(self) -> str:
         """A few lines for a terminal."""
-        lines = [f"Port {self.port}:"]
+        lines = [f"Port {self.port}; {self.number} formulas scored:"]
         for i, s in enumerate(self.suggestions, 1):
-            amount = f"({s.amount:.3g} +- {s.std:.1g} {s.unit})"
-            lines.append(f"  {i}. {s.target} += {amount} {s.formula}   chi2 -{s.chi2:.0f}, "
-                         f"held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
+            lines.append(f"  {i}. " + "; and ".join(p.text() for p in s.parts))
+            lines.append(f"     chi2 -{s.chi2:.0f}, held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
                          + (", at the noise" if s.at_noise else ""))  # fmt: skip
         if self.ceiling is not None:
             lines.append(f"  any smooth input at this port explains chi2 of at most about {self.ceiling:.0f}")
-        if self.file:
-            lines.append(f"Effect file: {self.file}; look at it, then: lunar-mjx add RUN {self.file} -o run2")
+        if self.files:
+            lines.append(f"Effect file: {', '.join(self.files)}; look at it, then: lunar-mjx add RUN {self.files[0]} "
+                         "-o run2")  # fmt: skip
         else:
             lines.append("No formula pays on manoeuvres left out; none is written.")
         return "\n".join(lines)
@@ -98,7 +150,8 @@ def discover(
     """Suggests formulas for what is missing at a port, and writes the best as an effect file.
 
     Args:
-      folder: of the run. port: where to look; where `why` found the most evidence if None.
+      folder: of the run. port: where to look; if None, where `why` found the most evidence, and for tables at every
+        port of the wheel, because one signal may enter a bed at several.
       out: effect file to write; `suggested_<port>.py` in the run's folder if None.
       settings: thresholds. progress: told what is being done.
 
@@ -109,55 +162,94 @@ def discover(
     settings = settings or Settings(seed=run.seed)
     verdict = run.load(VERDICT_FILE) or {}
     place = (verdict.get("details") or {}).get("localise") or {}
-    port = port or place.get("port")
+    asked, port = port, port or place.get("port")
     if port is None:
         raise UserError(f"{run.folder}: no port shows anything unknown; run lunar-mjx why first, or give --port.")
     if port not in PORTS:
         raise bad_input("unknown", "port", port, "does not exist", f"use one of {', '.join(PORTS)}")
-    logs = run.campaign()
-    plain = build_problem(run, logs, [], progress)
-    problem, library = with_terms(plain, terms(port, sensor_kinds(plain)), progress)
-    base = fit_baseline(problem, settings, Memory(), progress)
-    found, scored = suggest(problem, base, library, settings, progress)
-    file = None
-    best = next((s for s, _, _ in found if s.held_out_gain > s.held_out_se and
-                 s.held_out_gain > 0.5 * settings.chi2), None)  # fmt: skip
+    plain = build_problem(run, run.campaign(), [], progress)
+    if isinstance(plain, TableProblem) and (asked is None or asked in WHEEL_PORTS):
+        problem, base, found, scored = _in_tables(plain, [asked] if asked else WHEEL_PORTS, settings, progress)
+    else:
+        problem, library = with_terms(plain, terms(port, sensor_kinds(plain)), progress)
+        base = fit_baseline(problem, settings, Memory(), progress)
+        found, scored = suggest(problem, base, library, settings, progress)
+    files: list[str] = []
+    best = next((row for row in found if row[0].pays(settings.chi2)), None)
     if best is not None:
-        term = next(t for s, t, _ in found if s is best)
-        target = Path(out) if out else run.folder / f"suggested_{port}.py"
         provenance = f"lunar-mjx unknown on {', '.join(p.name for p in run.logs)}"
-        target.write_text(with_amount(term, best.amount, f"suggested_{port}", provenance), encoding="utf-8")
-        file = str(target)
+        for k, (part, term) in enumerate(zip(best[0].parts, best[1], strict=True)):
+            name = f"suggested_{part.port}" + (f"_{k + 1}" if k else "")
+            path = Path(out) if out else run.folder / f"suggested_{part.port}.py"
+            path = path.with_stem(f"{path.stem}_{k + 1}") if k else path
+            values = {c: v for c, (v, _) in part.constants.items()}
+            path.write_text(with_amount(term, part.amount, name, provenance, values), encoding="utf-8")
+            files.append(str(path))
     ceiling = max((v for k, v in place.get("ceiling", {}).items() if k.partition(":")[0] == port), default=None)
-    result = Discovery(port, tuple(s for s, _, _ in found), tuple(scored), ceiling, file, errors(problem, base))
+    result = Discovery(port, tuple(s for s, _ in found), tuple(scored[:LISTED]), ceiling, tuple(files),
+                       errors(problem, base), len(scored))  # fmt: skip
     run.save(UNKNOWN_FILE, result.to_dict())
     return result
 
 
+Row = tuple[Suggestion, tuple[Term, ...]]
+"""A suggestion with the terms of its parts."""
+
+
+def _in_tables(
+    plain: TableProblem, ports: Sequence[str], settings: Settings, progress: Progress
+) -> tuple[Problem, Fit, list[Row], list[tuple[str, float]]]:
+    """Problem, its fit, suggestions and scores of all formulas of a wheel."""
+    empty = Slots(plain)
+    base = fit_baseline(empty.problem, settings, Memory(), progress)
+    found = search_formulas(empty, base, ports, settings, progress)
+    rows = [_of_trial(t, base) for t in found.trials[:REFITS]]
+    scored = [(c, chi2) for c, chi2 in found.scored]
+    named = [(f"{c.term.target}: {c.term.formula}", chi2) for c, chi2 in scored[:LISTED]]
+    return empty.problem, base, rows, named + [("", chi2) for _, chi2 in scored[LISTED:]]
+
+
+def _of_trial(trial: Trial, base: Fit) -> Row:
+    problem, parts = trial.slots.problem, []
+    root = np.sqrt(np.diag(trial.fit.covariance(problem)))
+    free = [int(i) for i in trial.fit.free]
+    for k, (choice, scale) in sorted(trial.slots.held.items()):
+        amount, *shape = trial.slots.own(k)
+        constants = {}
+        if choice.shape:
+            nominal, _, unit, *_ = CONSTANTS[choice.shape]
+            constants[choice.shape] = float(nominal * problem.coordinates[shape[0]].value(trial.fit.u[shape[0]])), unit
+        t = choice.term
+        parts.append(Part(t.port, t.target, t.formula, t.latex, float(scale * trial.fit.u[amount]),
+                          float(scale * root[free.index(amount)]), t.unit, constants))  # fmt: skip
+    suggestion = _suggestion(parts, base.chi2 - trial.fit.chi2, (trial.gain, trial.gain_se),
+                             errors(problem, trial.fit), trial.at_noise, trial.length)  # fmt: skip
+    return suggestion, tuple(c.term for _, (c, _) in sorted(trial.slots.held.items()))
+
+
 def suggest(
     problem: Problem, base: Fit, library: dict[str, Term], settings: Settings, progress: Progress = silent
-) -> tuple[list[tuple[Suggestion, Term, Candidate]], list[tuple[str, float]]]:
-    """Scores a library of formulas and refits the best.
+) -> tuple[list[Row], list[tuple[str, float]]]:
+    """Scores a library of formulas that are simulated one by one, and refits the best.
 
     Returns:
-      Suggestions with their terms and fits, best first; and all formulas with the chi-square of their score.
+      Suggestions with their terms, best first; and all formulas with the chi-square of their score.
     """
     scores = score(problem, base, signatures(problem, base, list(library)), settings.draws, settings.seed)
     scored = [(f"{library[s.effect].target}: {library[s.effect].formula}", s.chi2) for s in scores]
-    found = []
+    found: list[Row] = []
     for i, s in enumerate(scores[:REFITS]):
         progress("refitting formulas", i / REFITS)
         fitted = refit_with(problem, base, s.effect, settings, Memory())
-        value, se = gain(problem, base, fitted)
-        noise = noise_test(problem, fitted)
         place = next(i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude)
         c, k = problem.coordinates[place], list(fitted.free).index(place)
         std = c.std(fitted.u[place], float(fitted.covariance(problem)[k, k]) ** 0.5)
         t = library[s.effect]
-        suggestion = Suggestion(t.port, t.target, t.formula, float(c.value(fitted.u[place])), std, t.unit,
-                                base.chi2 - fitted.chi2, value, se, errors(problem, fitted), noise.passes)  # fmt: skip
-        found.append((suggestion, t, Candidate((s.effect,), fitted, noise, value, se)))
-    found.sort(key=lambda row: -row[0].chi2)
+        part = Part(t.port, t.target, t.formula, t.latex, float(c.value(fitted.u[place])), std, t.unit)
+        suggestion = _suggestion([part], base.chi2 - fitted.chi2, gain(problem, base, fitted), errors(problem, fitted),
+                                 noise_test(problem, fitted).passes, t.length)  # fmt: skip
+        found.append((suggestion, (t,)))
+    found.sort(key=lambda row: -(2.0 * row[0].held_out_gain - PENALTY * row[0].length))
     return found, scored
 
 

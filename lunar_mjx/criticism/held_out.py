@@ -18,7 +18,7 @@ CHANNEL_AT_NOISE = 1.05
 _SAMPLING = 3.5
 _KNOWN = 1e-2
 """Share of what is known about a direction from which the other manoeuvres count as knowing it."""
-_ENOUGH = 4
+ENOUGH = 4
 """Fitted manoeuvres from which leaving one out in turn is a fair judge."""
 _PIECES = 4
 """Pieces of a log that are left out in turn where there are too few manoeuvres."""
@@ -81,7 +81,7 @@ def predictive_gain(
       splits: that judge.
     """
     keep = problem.observations.in_split(*splits)
-    few = len(np.unique(problem.observations.unit[before.fitted])) < _ENOUGH
+    few = len(np.unique(problem.observations.unit[before.fitted])) < ENOUGH
     if few and problem.observations.in_split("select").any():
         # Leaving one of two or three groups out of a fit extrapolates too far; those never fitted judge alone.
         keep = problem.observations.in_split("select")
@@ -108,7 +108,7 @@ def gain_in_turn(problem: Problem, before: Fit, after: Fit) -> tuple[float, floa
       Gain and standard error; minus infinity where there are too few manoeuvres for it.
     """
     kept = problem.observations.in_split("fit", "select")
-    if len(np.unique(problem.observations.unit[kept])) <= _ENOUGH:
+    if len(np.unique(problem.observations.unit[kept])) <= ENOUGH:
         return -np.inf, np.inf
     old, new = (fit(problem, f.free, f.u, starts=1, splits=("fit", "select"), certify=False) for f in (before, after))
     return gain(problem, old, new)

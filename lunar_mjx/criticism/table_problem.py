@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -144,6 +145,29 @@ class TableProblem(Problem):
         for name in moved:
             bed = bed.with_effect(self.effects[name], **{**self.effects[name].null(), **values[name]})
         return bed.with_values({e: v for e, v in values.items() if e in bed.parameters})
+
+    @property
+    def union(self) -> WheelBed:
+        """The bed with all candidates."""
+        return self._union
+
+    @property
+    def tests(self) -> list[WheelTest]:
+        """What every table imposes."""
+        return self._given[2]
+
+    def merged(self, u: np.ndarray) -> dict[str, dict[str, Any]]:
+        """Values of all parameters of the union at a place."""
+        moved = self.values(u)
+        return {e: {**v, **moved.get(e, {})} for e, v in self._given[0].items()}
+
+    def with_constants(self, values: Mapping[str, Mapping[str, float]]) -> TableProblem:
+        """The same with other values of parameters that no fit moves; the compiled programs are shared."""
+        other, (given, *rest) = copy.copy(self), self._given
+        with jax.enable_x64(True):
+            changed = {e: {k: jnp.asarray(x, float) for k, x in v.items()} for e, v in values.items()}
+        other._given = ({e: {**v, **changed.get(e, {})} for e, v in given.items()}, *rest)
+        return other
 
     def predict(self, u: np.ndarray) -> np.ndarray:
         with jax.enable_x64(True):

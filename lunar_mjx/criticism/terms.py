@@ -1,40 +1,37 @@
-"""Formulas that might be missing at a port: products of what the port sees, each with one amount, as effect source."""
+"""Formulas that might be missing at a port, each with an amount and a null, as the source of an effect file."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
+from lunar_mjx.criticism import formula as f
+from lunar_mjx.criticism.targets import (
+    AGAINST,
+    ALONG,
+    CARRIED,
+    CONSTANTS,
+    DRIVE,
+    LEFT,
+    MODULUS,
+    RESIST,
+    SHEAR,
+    STIFFNESS,
+    STRENGTH,
+    Target,
+    carried,
+    known,
+)
 from lunar_mjx.effects.base import Effect
 
-_WHEEL = {
-    "s": ("ctx.contact.slip", "slip ratio"),
-    "abs_s": ("jnp.abs(ctx.contact.slip)", "|s|"),
-    "driving": ("jnp.maximum(ctx.contact.slip, 0.0)", "slip ratio when driving"),
-    "braking": ("jnp.maximum(-ctx.contact.slip, 0.0)", "slip ratio when braking"),
-    "side": ("jnp.abs(jnp.sin(ctx.contact.slip_angle))", "|sin beta|"),
-    "depth": ("ctx.contact.sinkage / ctx.geometry.radius", "z/r"),
-}
-"""Dimensionless quantities of a wheel: name -> code, meaning."""
-_WHEEL_PRODUCTS = (
-    (), ("s",), ("driving",), ("braking",), ("abs_s", "abs_s"), ("side",), ("side", "side"), ("depth",),
-    ("depth", "depth"), ("abs_s", "depth"), ("abs_s", "side"), ("side", "depth"),
-)  # fmt: skip
-_JOINT = {
-    "turning": ("jnp.tanh(ctx.joint_speed / p.smooth)", "sgn omega", "1"),
-    "omega": ("ctx.joint_speed", "omega", "rad/s"),
-    "abs_omega": ("jnp.abs(ctx.joint_speed)", "|omega|", "rad/s"),
-    "warm": ("(ctx.housing_temperature - 298.15 * p.kelvin) / (100.0 * p.kelvin)", "(T_S - 298 K)/100 K", "1"),
-    "wound": ("(ctx.winding_temperature - 298.15 * p.kelvin) / (100.0 * p.kelvin)", "(T_R - 298 K)/100 K", "1"),
-    "current": ("ctx.command.current", "I", "A"),
-    "abs_current": ("jnp.abs(ctx.command.current)", "|I|", "A"),
-}
-_SHAPES = {
-    "smooth": ("0.02", "(1e-4, 1.0)", "rad/s", "speed below which the sign fades"),
-    "kelvin": ("1.0", "(1.0, 1.0)", "K", "one kelvin"),
-}
+if TYPE_CHECKING:
+    from sympy import Expr
+
+_LEAST = "jnp.maximum({}, 0.01)"
+"""What a factor 1 + x never falls below."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,8 +39,9 @@ class Term:
     """One formula at a port.
 
     Attributes:
-      port: where it acts. target: what it changes there, in words. formula: in symbols, without the amount.
+      port: where it acts. target: what it changes there, in words. formula: the changed quantity, its amount called a.
       unit: of the amount. size: amount that would be clearly visible. source: complete effect file.
+      latex: the formula for a report. length: operations and symbols in it. factor: what the amount multiplies.
     """
 
     port: str
@@ -52,30 +50,42 @@ class Term:
     unit: str
     size: float
     source: str
+    latex: str = ""
+    length: int = 0
+    factor: str = ""
 
     @property
     def name(self) -> str:
         """Name of its effect."""
-        return "term_" + re.sub(r"\W+", "_", f"{self.port}_{self.target}_{self.formula}").strip("_")
+        return "term_" + re.sub(r"\W+", "_", f"{self.port}_{self.target}_{_words(self.formula)}").strip("_")
+
+
+def _words(text: str) -> str:
+    for mark, word in (("**", " to "), ("-", " minus "), ("/", " per "), ("+", " plus ")):
+        text = text.replace(mark, word)
+    return text
 
 
 def effect_of(term: Term) -> Effect:
     """The term's effect, made by running its source as a user's effect file would be."""
     module = types.ModuleType(term.name)
-    # The text is our own, made above.
+    # The text is our own, made below.
     exec(compile(term.source, f"<{term.name}>", "exec"), module.__dict__)
     return next(v for v in vars(module).values() if isinstance(v, Effect))
 
 
-def with_amount(term: Term, amount: float, name: str, provenance: str) -> str:
-    """The term's effect file with its fitted amount, another name and where it came from."""
+def with_amount(
+    term: Term, amount: float, name: str, provenance: str, constants: Mapping[str, float] | None = None
+) -> str:
+    """The term's effect file with its fitted amount and constants, another name and where it came from."""
     text = term.source.replace(f"def {term.name}(", f"def {name}(")
-    text = re.sub(r"amount=Parameter\([^,]+,", f"amount=Parameter({amount:.6g},", text)
+    for key, value in {"amount": amount, **(constants or {})}.items():
+        text = re.sub(rf"\b{key}=Parameter\([^,]+,", f"{key}=Parameter({value:.6g},", text)
     return text.replace('source="suggested"', f"source={provenance!r}")
 
 
 def terms(port: str, sensors: Sequence[str] = ()) -> list[Term]:
-    """All formulas at a port.
+    """Formulas at a port, few enough to be simulated one by one; tables are searched through `slots` for many more.
 
     Args:
       port: one of the ports but `command` states that need memory.
@@ -88,16 +98,54 @@ def terms(port: str, sensors: Sequence[str] = ()) -> list[Term]:
     return list(_sensor(sensors)) if port == "sensor" else list(makers[port]())
 
 
-def _file(
-    port: str, target: str, formula: str, unit: str, size: float, lines: Sequence[str], change: str, bound: float = 1e3
-) -> Term:
+def term(target: Target, factor: str | Expr, linear: bool = False) -> Term:
+    """The term that changes a target by amount times carrier times factor, or multiplies it by what grows with that.
+
+    Args:
+      target: what changes. factor: of what the port sees. linear: multiply by 1 + x in place of exp x.
+    """
+    names = known(target.port)
+    own = f.parsed(factor, names) if isinstance(factor, str) else factor
+    product = f.parsed(target.carrier, names) * own
+    amount, old = f.symbol("a"), f.symbol(target.symbol + ("_0" if target.multiplies else ""))
+    by = _factor(amount * product, linear) if target.multiplies else amount * product
+    whole = old * by if target.multiplies else by
+    unit = f.per(target.unit, f.unit_of(own, names))
+    used = [q for q in names if q.symbol in product.free_symbols]
+    if target.multiplies:
+        body = _LEAST.format(f.code(by)) if linear else f.code(by)
+        lines = [f"factor = {body}"]
+    else:
+        lines = [f"extra = {f.code(by)}"]
+    sign = "=" if target.multiplies else "+="
+    whole = f.without_floors(whole)
+    shown, latex = f"{target.symbol} {sign} {f.text(whole)}", f"{target.symbol} {sign} {f.latex(whole)}"
+    made = Term(target.port, target.words, shown, unit, target.size, "", latex, f.length(whole), f.text(own))
+    lines = ["a = p.amount", *(f"{q.name} = {q.code}" for q in used), *lines]
+    return _file(made, lines, target.change, target.bound, target.order)
+
+
+def _factor(grown: Expr, linear: bool) -> Expr:
+    """exp x, as a power where x holds the only logarithm, or 1 + x."""
+    import sympy
+
+    if linear:
+        return 1 + grown
+    logs = [a for a in sympy.Mul.make_args(grown) if isinstance(a, sympy.log)]
+    if len(logs) == 1:
+        return logs[0].args[0] ** (grown / logs[0])
+    return sympy.exp(grown)
+
+
+def _file(made: Term, lines: Sequence[str], change: str, bound: float = 1e3, order: int = 500) -> Term:
+    """The term with the effect file that these lines and the changed value make."""
     body = "\n".join(f"    {line}" for line in (*lines, f"return {change}"))
-    shapes = "".join(
-        f'    {name}=Parameter({n}, None, {b}, "{u}", "{m}", "choice"),\n'
-        for name, (n, b, u, m) in _SHAPES.items() if f"p.{name}" in body
+    given = "".join(
+        f'    {name}=Parameter({n!r}, None, {b!r}, "{u}", "{m}", "choice"),\n'
+        for name, (n, b, u, m, _) in CONSTANTS.items() if re.search(rf"\bp\.{name}\b", body)
     )  # fmt: skip
-    term = Term(port, target, formula, unit, size, "")
-    source = f'''"""Suggested by `lunar-mjx unknown`: {target} += amount * {formula}."""
+    limit = bound * made.size
+    source = f'''"""Suggested by `lunar-mjx unknown`: {made.target}, {made.formula}."""
 
 import dataclasses
 
@@ -107,148 +155,90 @@ from lunar_mjx.effects import Parameter, effect
 
 
 @effect(
-    "{port}",
-    order=500,
-    amount=Parameter({size!r}, 0.0, ({-bound * size!r}, {bound * size!r}), "{unit}", "amount", source="suggested"),
-{shapes})
-def {term.name}(ctx, p, x, value):
-    "{target} += amount * {formula}; an empirical form found in measurements, not a law."
+    "{made.port}",
+    order={order},
+    amount=Parameter({made.size!r}, 0.0, ({-limit!r}, {limit!r}), "{made.unit}", "amount a", source="suggested"),
+{given})
+def {made.name}(ctx, p, x, value):
+    "{made.formula}, with the amount a; an empirical form found in measurements, not a law."
 {body}
 '''
-    return dataclasses.replace(term, source=source)
+    return dataclasses.replace(made, source=source)
 
 
-def _products() -> Iterator[tuple[str, str, list[str]]]:
-    """Formula, code and definitions of every product of wheel quantities."""
-    for product in _WHEEL_PRODUCTS:
-        lines = [f"{name} = {_WHEEL[name][0]}" for name in dict.fromkeys(product)]
-        yield " ".join(_WHEEL[n][1] for n in product) or "1", " * ".join(product) or "1.0", lines
+_FEW = ("1", "s", "Max(s, 0)", "Max(-s, 0)", "s**2", "Abs(sin(beta))", "sin(beta)**2", "z/r", "z**2/r**2",
+        "Abs(s)*z/r", "Abs(s)*Abs(sin(beta))", "Abs(sin(beta))*z/r")  # fmt: skip
+"""Factors of a wheel's terms where each has to be simulated by itself."""
+_HEAVY = "log(Max(W/W_1, 1/1000))"
+"""Where a table holds one load only, such a term is a change of the soil."""
 
 
 def _soil() -> Iterator[Term]:
-    for formula, code, lines in _products():
-        if code == "1.0":
-            continue
-        grow = [*lines, f"factor = jnp.exp(p.amount * {code})"]
-        yield _file("soil", "log stiffness", formula, "1", 0.5, grow,
-                    "dataclasses.replace(value, k_c=value.k_c * factor, k_phi=value.k_phi * factor)", 20.0)  # fmt: skip
-        yield _file("soil", "log shear strength", formula, "1", 0.2, grow,
-                    "dataclasses.replace(value, cohesion=value.cohesion * factor, tan_phi=value.tan_phi * factor)",
-                    20.0)  # fmt: skip
-        yield _file("soil", "log shear modulus", formula, "1", 0.5, grow,
-                    "dataclasses.replace(value, shear_modulus_x=value.shear_modulus_x * factor, "
-                    "shear_modulus_y=value.shear_modulus_y * factor)", 20.0)  # fmt: skip
+    for target in (STIFFNESS, STRENGTH, MODULUS):
+        yield from (term(target, factor) for factor in _FEW[1:])
 
 
 def _normal() -> Iterator[Term]:
-    for formula, code, lines in _products():
-        yield _file("wheel_normal", "resistance", f"W {formula}", "1", 0.1,
-                    [*lines, f"extra = p.amount * value.load * {code}"],
-                    "dataclasses.replace(value, resistance=value.resistance + extra)")  # fmt: skip
-        if code != "1.0":
-            yield _file("wheel_normal", "load", f"W {formula}", "1", 0.2,
-                        [*lines, f"factor = 1.0 + p.amount * {code}"],
-                        "dataclasses.replace(value, load=value.load * factor, sigma_m=value.sigma_m * factor)",
-                        5.0)  # fmt: skip
-
-    yield _file("wheel_normal", "resistance", "1", "N", 5.0, [],
-                "dataclasses.replace(value, resistance=value.resistance + p.amount)")  # fmt: skip
-    yield _file("wheel_normal", "load", "W log(W/100 N)", "1", 0.2,
-                [f"factor = 1.0 + p.amount * {_HEAVY.format('value')}"],
-                "dataclasses.replace(value, load=value.load * factor, sigma_m=value.sigma_m * factor)",
-                5.0)  # fmt: skip
-
-
-_HEAVY = "jnp.log(jnp.maximum({}.load, 1.0) / 100.0)"
-"""Loads about 100 N; where a table holds one load only, such a term is a change of the soil."""
+    yield from (term(carried(RESIST, "W", {}), factor) for factor in _FEW)
+    yield from (term(CARRIED, factor, linear=True) for factor in _FEW[1:])
+    yield term(RESIST, "1")
+    yield term(CARRIED, _HEAVY)
 
 
 def _shear() -> Iterator[Term]:
     # what does not grow with the load: cables, seals, a wheel that is mounted askew
-    yield _file("wheel_shear", "longitudinal force", "1", "N", 5.0, ["extra = p.amount * value.direction"],
-                "dataclasses.replace(value, force=value.force._replace(x=value.force.x + extra))")  # fmt: skip
-    for formula, code, unit, size in (
-        ("1", "p.amount", "N", 5.0), ("W", "p.amount * ctx.normal.load", "1", 0.05),
-        ("-sgn(v_y)", "-p.amount * jnp.tanh(20.0 * value.slip_y)", "N", 5.0),
-    ):  # fmt: skip
-        yield _file("wheel_shear", "lateral force", formula, unit, size, [f"extra = {code}"],
-                    "dataclasses.replace(value, force=value.force._replace(y=value.force.y + extra))")  # fmt: skip
-    yield _file("wheel_shear", "driving torque", "1", "N m", 0.5, ["extra = -p.amount * value.direction"],
-                "dataclasses.replace(value, moment=value.moment._replace(y=value.moment.y + extra))")  # fmt: skip
-    yield _file("wheel_shear", "shear force", "F log(W/100 N)", "1", 0.2,
-                [f"factor = 1.0 + p.amount * {_HEAVY.format('ctx.normal')}",
-                 "force = value.force._replace(x=value.force.x * factor, y=value.force.y * factor)"],
-                "dataclasses.replace(value, force=force)", 5.0)  # fmt: skip
-    for formula, code, lines in _products():
-        yield _file("wheel_shear", "longitudinal force", f"W {formula}", "1", 0.1,
-                    [*lines, f"extra = p.amount * ctx.normal.load * value.direction * {code}"],
-                    "dataclasses.replace(value, force=value.force._replace(x=value.force.x + extra))")  # fmt: skip
-        yield _file("wheel_shear", "lateral force", f"-W sgn(v_y) {formula}", "1", 0.1,
-                    [*lines, "outward = jnp.tanh(20.0 * value.slip_y)",
-                     f"extra = -p.amount * ctx.normal.load * outward * {code}"],
-                    "dataclasses.replace(value, force=value.force._replace(y=value.force.y + extra))")  # fmt: skip
-        yield _file("wheel_shear", "driving torque", f"W r {formula}", "1", 0.05,
-                    [*lines, f"extra = -p.amount * ctx.normal.load * ctx.geometry.radius * value.direction * {code}"],
-                    "dataclasses.replace(value, moment=value.moment._replace(y=value.moment.y + extra))")  # fmt: skip
+    yield from (term(target, "1") for target in (ALONG, LEFT, carried(LEFT, "W", {"W": 0.05}), AGAINST, DRIVE))
+    yield term(SHEAR, _HEAVY)
+    for factor in _FEW:
+        yield term(carried(ALONG, "d*W", {}), factor)
+        yield term(carried(AGAINST, "-side*W", {}), factor)
+        yield term(carried(DRIVE, "d*W*r", {"d*W*r": 0.05}), factor)
 
 
-def _joint_terms(products: Sequence[tuple[str, ...]]) -> Iterator[tuple[str, str, str, list[str]]]:
-    for product in products:
-        lines = [f"{name} = {_JOINT[name][0]}" for name in dict.fromkeys(product)]
-        units = "*".join(f"({_JOINT[n][2]})" for n in product if _JOINT[n][2] != "1") or "1"
-        yield " ".join(_JOINT[n][1] for n in product) or "1", " * ".join(product) or "1.0", units, lines
-
-
+_SIGN = "tanh(omega/omega_0)"
+_WARM, _WOUND = "(T_S - T_0)/T_1", "(T_R - T_0)/T_1"
 _DRIVEN = "jnp.where(ctx.rover.joint_group == 0, {}, 0.0)"
 
 
+def _joints(port: str, words: str, symbol: str, unit: str, change: str, carrier: str = "1") -> Target:
+    return Target(port, words, symbol, unit, 0.3, carrier, change.replace("extra", _DRIVEN.format("extra")))
+
+
 def _motor() -> Iterator[Term]:
-    products = (("turning",), ("omega",), ("omega", "abs_omega"), ("turning", "abs_current"), ("current",),
-                ("current", "abs_current"), ("omega", "warm"), ("turning", "warm"), ("current", "warm"),
-                ("current", "wound"), ("current", "abs_omega"), ())  # fmt: skip
-    for formula, code, units, lines in _joint_terms(products):
-        size = 0.3 if "current" not in code else 3.0
-        unit = "N m" if units == "1" else f"N m/({units.strip('()') if units.count('(') == 1 else units})"
-        yield _file("motor_torque", "torque", f"-{formula}", unit, size,
-                    [*lines, f"extra = -p.amount * {_DRIVEN.format(code)}"], "value + extra")  # fmt: skip
+    target = _joints("motor_torque", "torque", "tau", "N m", "value + extra", "-1")
+    for factor in (_SIGN, "omega", "omega*Abs(omega)", f"{_SIGN}*Abs(I)", "I", "I*Abs(I)", f"omega*{_WARM}",
+                   f"{_SIGN}*{_WARM}", f"I*{_WARM}", f"I*{_WOUND}", "I*Abs(omega)", "1"):  # fmt: skip
+        yield term(dataclasses.replace(target, size=3.0 if "I" in factor else 0.3), factor)
 
 
 def _heat() -> Iterator[Term]:
-    products = ((), ("abs_omega",), ("omega", "omega"), ("abs_current",), ("current", "current"),
-                ("abs_current", "abs_omega"), ("warm",), ("wound",))  # fmt: skip
-    for formula, code, units, lines in _joint_terms(products):
-        unit = "W" if units == "1" else f"W/({units.strip('()') if units.count('(') == 1 else units})"
-        for node in ("winding", "housing"):
-            yield _file("heat", f"heat into the {node}", formula, unit, 0.3,
-                        [*lines, f"extra = p.amount * {_DRIVEN.format(code)}"],
-                        f"dataclasses.replace(value, {node}=value.{node} + extra)")  # fmt: skip
+    for node in ("winding", "housing"):
+        target = _joints("heat", f"heat into the {node}", "Q", "W", f"dataclasses.replace(value, {node}=value.{node} + "
+                         "extra)")  # fmt: skip
+        for factor in ("1", "Abs(omega)", "omega**2", "Abs(I)", "I**2", "Abs(I*omega)", _WARM, _WOUND):
+            yield term(target, factor)
 
 
 def _command() -> Iterator[Term]:
-    products = ((), ("abs_omega",), ("warm",), ("wound",))
-    for formula, code, units, lines in _joint_terms(products):
-        yield _file("command", "motor current", f"I {formula}", "1" if units == "1" else f"1/{units}", 0.05,
-                    [*lines, f"factor = 1.0 + p.amount * {_DRIVEN.format(code)}"],
-                    "dataclasses.replace(value, current=value.current * factor)")  # fmt: skip
+    target = Target("command", "motor current", "I", "1", 0.05, "I", "dataclasses.replace(value, current=value.current "
+                    f"+ {_DRIVEN.format('extra')})")  # fmt: skip
+    for factor in ("1", "Abs(omega)", _WARM, _WOUND):
+        yield term(target, factor)
 
 
 def _body() -> Iterator[Term]:
-    speed = "v = ctx.velocity.dot(ctx.frame.forward)"
-    for formula, code, unit, size in (("1", "1.0", "N", 5.0), ("v", "v", "N s/m", 20.0),
-                                      ("v |v|", "v * jnp.abs(v)", "N s2/m2", 50.0),
-                                      ("sin pitch", "-ctx.frame.forward.z", "N", 20.0)):  # fmt: skip
-        lines = [speed] if "v" in code.replace("jnp", "") and "frame" not in code else []
-        yield _file("body_wrench", "push forward", f"-{formula}", unit, size,
-                    [*lines, f"push = -p.amount * ({code})"],
-                    "dataclasses.replace(value, force=value.force + ctx.frame.forward * push)")  # fmt: skip
-    yield _file("body_wrench", "pitching moment", "1", "N m", 2.0, ["turn = p.amount"],
-                "dataclasses.replace(value, moment=value.moment + ctx.frame.left * turn)")  # fmt: skip
+    push = "dataclasses.replace(value, force=value.force + ctx.frame.forward * extra)"
+    for factor, size in (("1", 5.0), ("v", 20.0), ("v*Abs(v)", 50.0), ("climb", 20.0)):
+        yield term(Target("body_wrench", "push forward", "F", "N", size, "-1", push), factor)
+    turn = "dataclasses.replace(value, moment=value.moment + ctx.frame.left * extra)"
+    yield term(Target("body_wrench", "pitching moment", "M", "N m", 2.0, "1", turn), "1")
 
 
 def _geometry() -> Iterator[Term]:
-    yield _file("geometry", "wheel radius", "r", "1", 0.02, [],
-                "dataclasses.replace(value, radius=value.radius * (1.0 + p.amount))", 10.0)  # fmt: skip
-    yield _file("geometry", "toe", "1", "rad", 0.02, [], "dataclasses.replace(value, toe=value.toe + p.amount)", 10.0)
+    yield term(Target("geometry", "wheel radius", "r", "1", 0.02, "1", "dataclasses.replace(value, "
+                      "radius=value.radius * factor)", bound=10.0), "1", linear=True)  # fmt: skip
+    yield term(Target("geometry", "toe", "toe", "rad", 0.02, "1", "dataclasses.replace(value, toe=value.toe + extra)",
+                      bound=10.0), "1")  # fmt: skip
 
 
 def _sensor(kinds: Sequence[str]) -> Iterator[Term]:
@@ -257,15 +247,15 @@ def _sensor(kinds: Sequence[str]) -> Iterator[Term]:
         words = list(kind.split("_")[1:])
         test = " and ".join([f"name.startswith({first!r} + '_')", *(f"{('_' + w)!r} in name" for w in words)])
         pick = [f"chosen = [name for name in value.channels if {test}]"]
-        for formula, code, per, size in (
-            ("1", "jnp.ones_like(value.channels[name])", unit, 0.05), ("y", "value.channels[name]", "1", 0.02),
-            ("dy/dt", "slope(value.channels[name], value.time)", "s", 0.05),
-            ("t", "value.time", f"{unit}/s", 0.005),
+        for shown, code, per, size in (
+            ("a", "jnp.ones_like(value.channels[name])", unit, 0.05), ("a*y", "value.channels[name]", "1", 0.02),
+            ("a*dy/dt", "slope(value.channels[name], value.time)", "s", 0.05),
+            ("a*t", "value.time", f"{unit}/s", 0.005),
         ):  # fmt: skip
-            term = _file("sensor", kind, formula, per, size,
-                         [*pick, f"changed = {{name: value.channels[name] + p.amount * {code} for name in chosen}}"],
-                         "value.with_channels(changed)")  # fmt: skip
-            yield dataclasses.replace(term, source=term.source.replace(
+            made = Term("sensor", kind, f"y += {shown}", per, size, "", f"y += {shown}", len(shown), shown)
+            changed = f"changed = {{name: value.channels[name] + p.amount * {code} for name in chosen}}"
+            found = _file(made, [*pick, changed], "value.with_channels(changed)")
+            yield dataclasses.replace(found, source=found.source.replace(
                 "from lunar_mjx.effects import Parameter, effect",
                 "from lunar_mjx.effects import Parameter, effect\nfrom lunar_mjx.effects.channels import slope",
             ))  # fmt: skip
