@@ -26,11 +26,17 @@ PROFILES: tuple[Profile, ...] = (
 
 
 def drive_campaign(
-    folder: Path, hooks: Sequence[Hook] = (), seconds: float = 3.0, seed: int = 0, noise: float = 1.0
-) -> Path:
-    """Writes one log per profile under `folder`: commands, motion, motors, with white noise; returns the folder."""
+    folder: Path, hooks: Sequence[Hook] = (), seconds: float = 3.0, seed: int = 0, noise: float = 1.0,
+    forms: Sequence[str] = (),
+) -> Path:  # fmt: skip
+    """Writes one log per profile under `folder`: commands, motion, motors, with white noise; returns the folder.
+
+    `forms` names effects that take the place of some of the model's.
+    """
     rng = np.random.default_rng(seed)
     model = make_model("luvmi_x", terrain="flat", timestep=STEP)
+    for form in forms:
+        model = model.add(form)
     for number, profile in enumerate(PROFILES):
         frame = _drive(model, hooks, profile, seconds)
         stated = {}
