@@ -7,12 +7,16 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
+from lunar_mjx.criticism import WheelBed, verbs, wheel_test
 from lunar_mjx.criticism.discover import discover
+from lunar_mjx.criticism.log import Noise, write_steady_log
 from lunar_mjx.criticism.probes import PROBES, unknown_input
 from lunar_mjx.criticism.runs import VERDICT_FILE, Run
-from lunar_mjx.criticism.terms import effect_of, terms, with_amount
+from lunar_mjx.criticism.targets import STIFFNESS
+from lunar_mjx.criticism.terms import effect_of, term, terms, with_amount
 from lunar_mjx.effects import catalogue, probe
 from lunar_mjx.effects.base import PORTS
 from lunar_mjx.effects.contract import base_list
@@ -29,20 +33,20 @@ def test_every_formula_is_an_effect_with_a_null_at_its_port(port):
     assert library
     names = [t.name for t in library]
     assert len(set(names)) == len(names)
-    for term in library:
-        effect = effect_of(term)
+    for made in library:
+        effect = effect_of(made)
         assert tuple(effect.ports) == (port,)
         amount = effect.parameters["amount"]
         assert amount.null == 0.0
-        assert amount.unit == term.unit
+        assert amount.unit == made.unit
         assert amount.bounds[0] < 0.0 < amount.nominal < amount.bounds[1]
-        assert term.formula in effect.doc
+        assert made.formula in effect.doc
 
 
 def test_the_file_that_is_written_loads_with_its_amount(tmp_path):
-    term = next(t for t in LIBRARIES["wheel_normal"] if t.target == "resistance")
+    made = next(t for t in LIBRARIES["wheel_normal"] if t.target == "resistance")
     path = tmp_path / "found.py"
-    path.write_text(with_amount(term, 0.123456, "found", "lunar-mjx unknown on log1"))
+    path.write_text(with_amount(made, 0.123456, "found", "lunar-mjx unknown on log1"))
     effect = catalogue.get(f"{path}:found")
     assert effect.parameters["amount"].nominal == pytest.approx(0.123456)
     assert effect.parameters["amount"].source == "lunar-mjx unknown on log1"
@@ -73,8 +77,50 @@ def _felt(effects):
 
 @pytest.mark.parametrize("port", [p for p in PORTS if p != "sensor"])
 def test_every_formula_acts_on_a_rover(port):
-    assert "chassis_force" in _felt([effect_of(term) for term in LIBRARIES[port]])
+    assert "chassis_force" in _felt([effect_of(made) for made in LIBRARIES[port]])
 
 
 def test_every_unknown_input_acts_on_a_rover():
     assert "chassis_force" in _felt([unknown_input(label, 8, 10.0) for label in PROBES])
+
+
+HIDDEN_LAW, AMOUNT = "log(Max(1 - s, 1/50))", 0.35
+STD = {"drawbar_pull_N": 0.05, "side_force_N": 0.05, "driving_torque_Nm": 0.003, "sinkage_m": 5e-5}
+
+
+def _table(folder):
+    """A wheel's table with a law that no catalogue has: stiffness goes with a power of 1 - s."""
+    slip, angle, load = (
+        a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.7, 9), [0.0, 10.0, 20.0, 35.0], [8.0, 25.0])
+    )
+    law = effect_of(term(STIFFNESS, HIDDEN_LAW))
+    bed = WheelBed.of_preset("consistent").with_effect(law, amount=AMOUNT)
+    result = bed.run(wheel_test(slip, np.radians(angle), load, 0.0625, 0.05))
+    columns = (result.drawbar_pull, result.side_force, result.driving_torque, result.sinkage)
+    rng = np.random.default_rng(4)
+    frame = pd.DataFrame({"slip_ratio": slip, "slip_angle_deg": angle, "normal_load_N": load})
+    for (name, std), values in zip(STD.items(), columns, strict=True):
+        frame[name] = values + std * rng.standard_normal(len(frame))
+    write_steady_log(folder, frame, wheel={"radius_m": 0.0625, "width_m": 0.05}, slip_definition="wheel_frame",
+                     noise={c: Noise(s, "datasheet") for c, s in STD.items()})  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_law_that_no_catalogue_has_is_found_written_and_added(tmp_path):
+    _table(tmp_path / "log")
+    run = verbs.compare([tmp_path / "log"], make_model("luvmi_x", terrain="flat"), tmp_path / "run1")
+    found = discover(run, "soil")
+    assert found.number > 1000
+    best = found.suggestions[0]
+    assert best.formula == "k = k_0*(1 - s)**a"
+    assert best.at_noise
+    (part,) = best.parts
+    assert abs(part.amount - AMOUNT) < 4.0 * part.std
+    assert part.std < 0.1 * AMOUNT
+    assert best.formula in found.text()
+    (file,) = found.files
+    grown = verbs.add(run, file, tmp_path / "run2")
+    refitted = grown.load("comparison.json")["refitted"]["held_out"]
+    # the file does in a bed of its own what the search promised
+    assert refitted == pytest.approx(best.error["held_out"], abs=0.01)
+    assert refitted < 1.15
