@@ -169,11 +169,12 @@ def discover(
         raise bad_input("unknown", "port", port, "does not exist", f"use one of {', '.join(PORTS)}")
     plain = build_problem(run, run.campaign(), [], progress)
     if isinstance(plain, TableProblem) and (asked is None or asked in WHEEL_PORTS):
-        problem, base, found, scored = _in_tables(plain, [asked] if asked else WHEEL_PORTS, settings, progress)
+        problem, base, found, scored, number = _in_tables(plain, [asked] if asked else WHEEL_PORTS, settings, progress)
     else:
         problem, library = with_terms(plain, terms(port, sensor_kinds(plain)), progress)
         base = fit_baseline(problem, settings, Memory(), progress)
         found, scored = suggest(problem, base, library, settings, progress)
+        number = len(scored)
     files: list[str] = []
     best = next((row for row in found if row[0].pays(settings.chi2)), None)
     if best is not None:
@@ -187,7 +188,7 @@ def discover(
             files.append(str(path))
     ceiling = max((v for k, v in place.get("ceiling", {}).items() if k.partition(":")[0] == port), default=None)
     result = Discovery(port, tuple(s for s, _ in found), tuple(scored[:LISTED]), ceiling, tuple(files),
-                       errors(problem, base), len(scored))  # fmt: skip
+                       errors(problem, base), number)  # fmt: skip
     run.save(UNKNOWN_FILE, result.to_dict())
     return result
 
@@ -198,15 +199,14 @@ Row = tuple[Suggestion, tuple[Term, ...]]
 
 def _in_tables(
     plain: TableProblem, ports: Sequence[str], settings: Settings, progress: Progress
-) -> tuple[Problem, Fit, list[Row], list[tuple[str, float]]]:
-    """Problem, its fit, suggestions and scores of all formulas of a wheel."""
+) -> tuple[Problem, Fit, list[Row], list[tuple[str, float]], int]:
+    """Problem, its fit, suggestions, the best scores, and how many formulas of a wheel were scored."""
     empty = Slots(plain)
     base = fit_baseline(empty.problem, settings, Memory(), progress)
     found = search_formulas(empty, base, ports, settings, progress)
     rows = [_of_trial(t, base) for t in found.trials[:REFITS]]
-    scored = [(c, chi2) for c, chi2 in found.scored]
-    named = [(f"{c.term.target}: {c.term.formula}", chi2) for c, chi2 in scored[:LISTED]]
-    return empty.problem, base, rows, named + [("", chi2) for _, chi2 in scored[LISTED:]]
+    scored = [(f"{c.term.target}: {c.term.formula}", chi2) for c, chi2 in found.scored[:LISTED]]
+    return empty.problem, base, rows, scored, len(found.scored)
 
 
 def _of_trial(trial: Trial, base: Fit) -> Row:
