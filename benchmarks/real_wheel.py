@@ -308,11 +308,11 @@ def unknown(result: Mapping[str, Any], most: int = 5) -> dict[str, Any]:
     for name in sorted(ranked, key=lambda n: -ranked[n])[:most]:
         t, grown = library[name], Model(bench, [*model.free, *free[name]])
         place, better, _ = grown.fit(grown.place(flat(model.values(u))))
-        found = row(bench, f"+ {t.target} += {t.formula}", [*last["effects"], name], grown, place, chi2=better)
+        found = row(bench, f"+ {t.target}: {t.formula}", [*last["effects"], name], grown, place, chi2=better)
         suggestions.append({"port": t.port, "target": t.target, "formula": t.formula, "unit": t.unit,
                             "amount": found["values"][f"{name}.amount"], "score": ranked[name],
                             **{k: v for k, v in found.items() if k not in ("effects", "model")}})  # fmt: skip
-    listed = {f"{library[n].target} += {library[n].formula}": v for n, v in ranked.items()}
+    listed = {f"{library[n].target}: {library[n].formula}": v for n, v in ranked.items()}
     return {"of": base, "suggestions": sorted(suggestions, key=lambda r: r["chi2"]),
             "scored": dict(sorted(listed.items(), key=lambda r: -r[1]))}  # fmt: skip
 
