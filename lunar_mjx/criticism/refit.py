@@ -68,7 +68,8 @@ class Candidate:
     Attributes:
       effects: names, in the order of adding. fit: the refit. noise: whether its residual is as small as the noise.
       gain, gain_se: held-out gain over the parent set and its standard error.
-      patterned: whether what is left is small, but no noise: some smooth unknown input has it.
+      patterned: whether what is left is small, but no noise: some smooth unknown input has it. evidence: log evidence
+        of that input, for tables.
       pattern: what smooth unknown inputs explain of the residual of drives, where that was asked.
     """
 
@@ -78,6 +79,7 @@ class Candidate:
     gain: float
     gain_se: float
     patterned: bool = False
+    evidence: float = 0.0
     pattern: Pattern | None = None
 
     @property

@@ -108,7 +108,11 @@ def search(
         # The most promising by their fit and, where these differ, by manoeuvres left out.
         held = sorted(grown, key=lambda c: -gain(problem, base.fit, c.fit)[0])
         beam = list(dict.fromkeys([*better[:1], *grown[:1], *held[:1], *grown]))[: settings.beam]
-    best = _pruned(problem, best, settings, tried)
+    pruned = _pruned(problem, best, settings, tried)
+    if pruned is not best and pruned.effects:
+        # what was dropped may have stood for a pattern that shows now
+        pruned = tried[frozenset(pruned.effects)] = _looked_at(problem, pruned, settings)
+    best = pruned
     if not best.effects:
         base = best = tried[frozenset()] = _looked_at(problem, base, settings)
     rivals = [c for c in tried.values() if c is not best and _alike(c, best, settings)]
@@ -179,7 +183,8 @@ def _looked_at(problem: Problem, c: Candidate, settings: Settings) -> Candidate:
     """Whether a residual that is small has a pattern, too; for drives only where scores were taken at the fit."""
     small = c.noise.passes and np.isfinite(c.fit.chi2)
     if not small or not problem.inputs:
-        return dataclasses.replace(c, patterned=small and pattern(problem, c.fit) > settings.pattern)
+        gain_ = pattern(problem, c.fit) if small else 0.0
+        return dataclasses.replace(c, patterned=gain_ > settings.pattern, evidence=gain_)
     p = c.pattern
     return dataclasses.replace(c, patterned=p is not None and p.p <= settings.pattern_p and p.chi2 >= settings.chi2)
 
@@ -289,8 +294,9 @@ def excess_explained(search_: Search, problem: Problem) -> float:
     keep = problem.observations.in_split("fit", "select")
     before = float(np.sum(search_.base.fit.residual[keep] ** 2)) - keep.sum()
     after = float(np.sum(search_.chosen.fit.residual[keep] ** 2)) - keep.sum()
-    if search_.chosen.patterned and search_.chosen.pattern is not None:
+    if search_.chosen.patterned:
         # At the noise chance hides what is left; the pattern is what shows of it.
-        left = max(after, search_.chosen.pattern.chi2)
+        found = search_.chosen.pattern
+        left = max(after, found.chi2 if found is not None else 2.0 * search_.chosen.evidence)
         before, after = max(before, before - after + left), left
     return 1.0 if before <= 0.0 else 1.0 - max(after, 0.0) / before

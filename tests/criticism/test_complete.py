@@ -1,14 +1,20 @@
 """What a model of drives at the noise still owes: a second effect below the noise, and a simpler one in its place."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from toy_problem import Linear, coordinate, manoeuvres
 
+from lunar_mjx.criticism import search as searching
+from lunar_mjx.criticism.attribute import diagnose
 from lunar_mjx.criticism.complete import best_start, simpler, stands, tried_in_place
 from lunar_mjx.criticism.fitting import Memory, fit
-from lunar_mjx.criticism.refit import Settings
+from lunar_mjx.criticism.held_out import noise_test
+from lunar_mjx.criticism.refit import Candidate, Settings
 from lunar_mjx.criticism.score import score, signatures
 from lunar_mjx.criticism.search import search
+from lunar_mjx.criticism.verdict import Verdict
 
 LOGS, SAMPLES, WIDE = 6, 150, 7
 
@@ -102,3 +108,25 @@ def test_nothing_is_tried_in_place_of_an_effect_of_one_parameter(rng) -> None:
     small = fit(problem, problem.free(["small"]), starts=1, certify=False)
     scores = score(problem, small, signatures(problem, small, ["narrow"]), 100)
     assert tried_in_place(problem, small, ("small",), scores) == []
+
+
+def test_a_name_that_only_a_dropped_effect_kept_free_of_patterns_is_not_given(monkeypatch):
+    """Two effects together leave nothing, one of them is not worth its place, and without it a pattern shows."""
+    rng = np.random.default_rng(2)
+    base, one, two = rng.standard_normal((360, 3)), np.sin(np.arange(360) * 0.3), np.cos(np.arange(360) * 0.7)
+    value = 2.0 * one + 0.05 * two + rng.standard_normal(360)
+    problem = Linear(base, {"one": one, "two": two}, dataclasses.replace(manoeuvres(6, 60), value=value))
+
+    def with_both(problem, base, grown, settings, tried):
+        both = fit(problem, problem.free(["one", "two"]))
+        return Candidate(("one", "two"), both, noise_test(problem, both), 0.0, 0.0)
+
+    def verdict(left: float) -> tuple[Verdict, tuple[str, ...]]:
+        second = int(problem.candidates["two"][0])
+        monkeypatch.setattr(searching, "_reaching", with_both)
+        monkeypatch.setattr(searching, "pattern", lambda problem, f: left if second not in f.free else 0.0)
+        found, _ = diagnose(problem)
+        return found.verdict, found.effects
+
+    assert verdict(0.0) == (Verdict.KNOWN, ("one",))
+    assert verdict(60.0) == (Verdict.UNKNOWN, ("one",))
