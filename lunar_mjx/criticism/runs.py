@@ -14,6 +14,7 @@ import numpy as np
 
 from lunar_mjx import __version__
 from lunar_mjx.criticism.log import Log, SteadyLog, read_campaign
+from lunar_mjx.criticism.log.read import without_answers
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.model import Model
 from lunar_mjx.model_file import load_model, save_model
@@ -119,11 +120,12 @@ def load_run(folder: str | Path) -> Run:
 
 
 def log_folders(paths: Sequence[str | Path]) -> tuple[Path, ...]:
-    """Absolute paths of the logs, as given.
+    """Absolute paths of the logs, as given, without answers to sealed ones.
 
     Raises:
       UserError: none is given, or one does not exist.
     """
+    paths = without_answers(paths)
     if not paths:
         raise UserError("compare: no log is given; give at least one log folder.")
     found = tuple(Path(p).resolve() for p in paths)

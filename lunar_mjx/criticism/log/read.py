@@ -16,6 +16,8 @@ from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.toml_fields import Fields
 
 LOG_FILE = "log.toml"
+ANSWER = ".answer.toml"
+"""How the answer to a sealed log is called, after the log."""
 ENVIRONMENT = ("ambient_temperature_degC", "sun_azimuth_deg", "sun_elevation_deg")
 ROVER_CHANGES = ("payload_kg", "payload_position_m", "com_offset_m", "wheel_radius_offset_m")
 INITIAL = {
@@ -59,10 +61,12 @@ def read_log(folder: str | Path) -> Log | SteadyLog:
 def read_campaign(paths: str | Path | Sequence[str | Path]) -> list[Log | SteadyLog]:
     """Reads several logs: each path is a log, or a folder of logs (a campaign), in alphabetical order.
 
+    Answers to sealed logs are left out.
+
     Raises:
       UserError: a path holds no log, or a log cannot be read.
     """
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
+    given = without_answers([paths] if isinstance(paths, str | Path) else paths)
     if not given:
         raise UserError("read_campaign: no log is given; name at least one folder with a log.toml.")
     logs: list[Log | SteadyLog] = []
@@ -74,6 +78,11 @@ def read_campaign(paths: str | Path | Sequence[str | Path]) -> list[Log | Steady
             seen.add(folder.resolve())
             logs.append(read_log(folder))
     return logs
+
+
+def without_answers(paths: Sequence[str | Path]) -> list[str | Path]:
+    """The paths without answers to sealed logs, which lie beside these: `logs/*` is meant to name the logs."""
+    return [p for p in paths if not str(p).endswith(ANSWER)]
 
 
 def _log_folders(path: Path) -> list[Path]:

@@ -14,7 +14,7 @@ import pandas as pd
 import tomli_w
 
 from lunar_mjx.criticism.log.log import Log
-from lunar_mjx.criticism.log.read import LOG_FILE, read_log
+from lunar_mjx.criticism.log.read import ANSWER, LOG_FILE, read_log
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.toml_fields import Fields
@@ -58,7 +58,7 @@ class Answer:
 
 def answer_path(out: Path) -> Path:
     """Where the answer to the log `out` is kept: beside it, never in it."""
-    return out.with_name(out.name + ".answer.toml")
+    return out.with_name(out.name + ANSWER)
 
 
 def write_answer(answer: Answer, path: Path) -> None:

@@ -155,6 +155,11 @@ def test_campaigns(tmp_path: Path) -> None:
     logs = read_campaign(tmp_path / "campaign")
     assert [log.name for log in logs] == ["a", "b"]
     assert [log.name for log in read_campaign([tmp_path / "campaign" / "b", tmp_path / "campaign" / "a"])] == ["b", "a"]
+    answer = tmp_path / "campaign" / "a.answer.toml"
+    answer.write_text("")
+    assert [log.name for log in read_campaign([tmp_path / "campaign" / "a", answer])] == ["a"]
+    with pytest.raises(UserError, match="no log is given"):
+        read_campaign([answer])
     with pytest.raises(UserError, match="named twice"):
         read_campaign([tmp_path / "campaign", tmp_path / "campaign" / "a"])
     with pytest.raises(UserError, match=r"log\.toml"):
