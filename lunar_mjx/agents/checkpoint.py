@@ -59,7 +59,7 @@ class Checkpoints:
             reason = str(error).split("\n")[0][:200]
             raise UserError(
                 f"{self.folder}: the checkpoint does not fit these settings ({reason}); "
-                "train with the settings that made it, or into another folder."
+                "train with the settings and the version that made it, or into another folder."
             ) from error
         leaves = [
             # an empty array, too, must lie as the compiled step expects it

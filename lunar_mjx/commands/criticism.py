@@ -142,12 +142,13 @@ def unknown(
 ) -> None:
     """Suggest formulas for what no catalogue effect explains, and write the best as an effect file."""
     from lunar_mjx.criticism.discover import discover
+    from lunar_mjx.criticism.runs import plain
     from lunar_mjx.report.progress import console_progress
 
     keep_compiled()
     with console_progress() as progress:
         found = discover(run, port, out, progress=progress)
-    print(json.dumps(found.to_dict(), indent=2) if as_json else found.text())
+    print(json.dumps(plain(found.to_dict()), indent=2) if as_json else found.text())
 
 
 def report(

@@ -68,7 +68,8 @@ def alternatives(
             mine = build_problem(other, logs, named)
             free = mine.free([e for e in named if e in mine.candidates])
             refitted = fit(mine, free, starts=2, certify=False)
-        if not np.isfinite(refitted.chi2):
+        judged = problem.observations.in_split("fit", "select")
+        if not np.isfinite(refitted.chi2) or not np.isfinite(refitted.residual[judged]).all():
             continue
         gain, se = predictive_gain(problem, chosen.fit, refitted, old, predictive_residual(mine, refitted))
         found.append(Alternative(

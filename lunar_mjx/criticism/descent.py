@@ -6,6 +6,7 @@ Sources: Levenberg-Marquardt with geodesic acceleration (Transtrum & Sethna 2012
 from __future__ import annotations
 
 import dataclasses
+import threading
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -162,10 +163,12 @@ class Rival:
 
     def __init__(self, chi2: float = np.inf):
         self.chi2 = chi2
+        self._lock = threading.Lock()
 
     def lower(self, chi2: float) -> None:
         """Another model has reached this."""
-        self.chi2 = min(self.chi2, chi2)
+        with self._lock:
+            self.chi2 = min(self.chi2, chi2)
 
 
 @dataclasses.dataclass

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+import itertools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from lunar_mjx.criticism.search import fit_baseline
 from lunar_mjx.criticism.slots import WHEEL_PORTS, Slots
 from lunar_mjx.criticism.table_problem import TableProblem
 from lunar_mjx.criticism.targets import CONSTANTS
-from lunar_mjx.criticism.terms import Term, effect_of, terms, with_amount
+from lunar_mjx.criticism.terms import SUGGESTED, Term, effect_of, terms, with_amount
 from lunar_mjx.effects.base import PORTS
 from lunar_mjx.errors import UserError, bad_input
 
@@ -133,8 +135,10 @@ class Discovery:
         if self.ceiling is not None:
             lines.append(f"  any smooth input at this port explains chi2 of at most about {self.ceiling:.0f}")
         if self.files:
-            lines.append(f"Effect file: {', '.join(self.files)}; look at it, then: lunar-mjx add RUN {self.files[0]} "
-                         "-o run2")  # fmt: skip
+            runs = ["RUN", *(f"run{k + 2}" for k in range(len(self.files)))]
+            then = ", then ".join(f"lunar-mjx add {a} {file} -o {b}" for a, file, b in zip(runs, self.files, runs[1:],
+                                                                                           strict=False))  # fmt: skip
+            lines.append(f"Effect file: {', '.join(self.files)}; look at it, then: {then}")
         else:
             lines.append("No formula pays on manoeuvres left out; none is written.")
         return "\n".join(lines)
@@ -167,6 +171,8 @@ def discover(
         raise UserError(f"{run.folder}: no port shows anything unknown; run lunar-mjx why first, or give --port.")
     if port not in PORTS:
         raise bad_input("unknown", "port", port, "does not exist", f"use one of {', '.join(PORTS)}")
+    if out is not None and Path(out).exists() and not Path(out).read_text(encoding="utf-8").startswith(SUGGESTED):
+        raise bad_input("unknown", "--out", str(out), "exists, and is none of these suggestions", "name another file")
     plain = build_problem(run, run.campaign(), [], progress)
     if isinstance(plain, TableProblem) and (asked is None or asked in WHEEL_PORTS):
         problem, base, found, scored, number = _in_tables(plain, [asked] if asked else WHEEL_PORTS, settings, progress)
@@ -180,17 +186,27 @@ def discover(
     if best is not None:
         provenance = f"lunar-mjx unknown on {', '.join(p.name for p in run.logs)}"
         for k, (part, term) in enumerate(zip(best[0].parts, best[1], strict=True)):
-            name = f"suggested_{part.port}" + (f"_{k + 1}" if k else "")
-            path = Path(out) if out else run.folder / f"suggested_{part.port}.py"
-            path = path.with_stem(f"{path.stem}_{k + 1}") if k else path
             values = {c: v for c, (v, _) in part.constants.items()}
-            path.write_text(with_amount(term, part.amount, name, provenance, values), encoding="utf-8")
-            files.append(str(path))
+            text = functools.partial(with_amount, term, part.amount, provenance=provenance, constants=values)
+            files.append(str(_write(run, Path(out) if out else None, part.port, k, text)))
     ceiling = max((v for k, v in place.get("ceiling", {}).items() if k.partition(":")[0] == port), default=None)
     result = Discovery(port, tuple(s for s, _ in found), tuple(scored[:LISTED]), ceiling, tuple(files),
                        errors(problem, base), number)  # fmt: skip
     run.save(UNKNOWN_FILE, result.to_dict())
     return result
+
+
+def _write(run: Run, out: Path | None, port: str, part: int, text: Callable[..., str]) -> Path:
+    """Writes the effect file of a part under a name that the model lacks, beside what other models may refer to."""
+    for k in itertools.count(part + 1):
+        name = f"suggested_{port}" + (f"_{k}" if k > 1 else "")
+        path = run.folder / f"{name}.py" if out is None else out.with_stem(f"{out.stem}_{part + 1}") if part else out
+        made = text(name=name)
+        kept = out is None and path.is_file() and path.read_text(encoding="utf-8") != made
+        if name not in run.model.effect_names and not kept:
+            path.write_text(made, encoding="utf-8")
+            return path
+    raise AssertionError
 
 
 Row = tuple[Suggestion, tuple[Term, ...]]

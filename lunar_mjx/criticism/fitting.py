@@ -27,6 +27,8 @@ from lunar_mjx.criticism.descent import (
 )
 from lunar_mjx.criticism.problem import Problem
 
+_KEPT = 1e-3
+"""Share of chi-square by which a fit may be off that is recalled at its old place."""
 AGREEING = 3
 """Starts that must end at the same chi-square."""
 
@@ -110,7 +112,8 @@ class Memory:
             u[i] = entry["u"][problem.coordinates[i].key]
         goal = Objective(problem, free, problem.observations.in_split("fit"))
         residual, chi2 = goal.residuals(u[None])
-        if not np.isfinite(chi2[0]):
+        # elsewhere than it was: the physics is another by now, and the certificate is not its own
+        if not abs(chi2[0] - entry.get("chi2", np.nan)) <= 1.0 + _KEPT * abs(chi2[0]):
             return None
         return Fit(
             u=u, free=free, chi2=float(chi2[0]), residual=residual[0], jacobian=goal.jacobian(u), fitted=goal.fitted,

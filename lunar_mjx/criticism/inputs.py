@@ -112,7 +112,8 @@ QUANTITIES: Mapping[str, Callable[[Any, Any], Any]] = {
     "loss": lambda ctx, value: jnp.abs(ctx.command.current) / 1.0,
     "travel speed": lambda ctx, value: ctx.velocity.dot(ctx.frame.forward) / 0.2,
 }
-"""Quantities that an unknown input may follow, each over a usual size: 1 A, 2 rad/s, 0.3 of slip, 100 N, 0.2 m/s."""
+"""Quantities that an unknown input may follow, each over a usual size: 1 A, 2 rad/s, 0.3 of slip, 100 N, 0.2 m/s.
+(A loss that follows the square of the current is the winding's resistance, which every refit moves.)"""
 
 FOLLOWS: Mapping[str, tuple[str, ...]] = {
     "command: motor current": ("constant", "current", "joint speed"),

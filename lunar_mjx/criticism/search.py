@@ -111,6 +111,8 @@ def search(
     pruned = _pruned(problem, best, settings, tried)
     if pruned is not best and pruned.effects:
         # what was dropped may have stood for a pattern that shows now
+        if problem.inputs and pruned.noise.passes and pruned.pattern is None:
+            _, pruned = _scores(problem, pruned, settings)
         pruned = tried[frozenset(pruned.effects)] = _looked_at(problem, pruned, settings)
     best = pruned
     if not best.effects:

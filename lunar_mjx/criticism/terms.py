@@ -34,6 +34,10 @@ _LEAST = "jnp.maximum({}, 0.01)"
 """What a factor 1 + x never falls below."""
 
 
+SUGGESTED = '"""Suggested by `lunar-mjx unknown`'
+"""How every effect file begins that is made here."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Term:
     """One formula at a port.
@@ -80,7 +84,14 @@ def with_amount(
     """The term's effect file with its fitted amount and constants, another name and where it came from."""
     text = term.source.replace(f"def {term.name}(", f"def {name}(")
     for key, value in {"amount": amount, **(constants or {})}.items():
-        text = re.sub(rf"\b{key}=Parameter\([^,]+,", f"{key}=Parameter({value:.6g},", text)
+        found = re.search(rf"\b{key}=Parameter\(([^,]+), ([^,]+), \(([^,]+), ([^)]+)\)", text)
+        if found is None:
+            continue
+        # a search may end beyond the bounds that a term is given at first
+        low, high = (b(float(found[n]), value * s) for b, n, s in ((min, 3, 0.1 if value > 0.0 else 10.0),
+                                                                   (max, 4, 10.0 if value > 0.0 else 0.1)))  # fmt: skip
+        low, high = (min(low, -high), max(high, -low)) if found[2] == "0.0" else (low, high)
+        text = text.replace(found[0], f"{key}=Parameter({value:.6g}, {found[2]}, ({low!r}, {high!r})", 1)
     return text.replace('source="suggested"', f"source={provenance!r}")
 
 
@@ -145,7 +156,7 @@ def _file(made: Term, lines: Sequence[str], change: str, bound: float = 1e3, ord
         for name, (n, b, u, m, _) in CONSTANTS.items() if re.search(rf"\bp\.{name}\b", body)
     )  # fmt: skip
     limit = bound * made.size
-    source = f'''"""Suggested by `lunar-mjx unknown`: {made.target}, {made.formula}."""
+    source = f'''{SUGGESTED}: {made.target}, {made.formula}."""
 
 import dataclasses
 

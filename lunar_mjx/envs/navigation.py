@@ -179,7 +179,10 @@ class NavigationEnv:
         return State(obs, privileged, zero, no, no, obs, privileged, metrics, first.info, inner)
 
     def step(self, params: NavigationParams, state: State, action: Any) -> State:
-        """Acts in every environment, `action` (env, action) in [-1, 1], and resets those whose episode ended."""
+        """Acts in every environment, `action` (env, action) in [-1, 1], and resets those whose episode ended.
+
+        Next episodes are prepared with `params` as they were then: after another terrain or range, call `reset`.
+        """
         c, inner = self.config, state.inner
         action = jnp.clip(action, -1.0, 1.0).astype(inner.last_action.dtype)
         before = inner.goal - inner.physics.qpos[:, :2]

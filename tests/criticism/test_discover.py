@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from lunar_mjx.criticism import WheelBed, verbs, wheel_test
-from lunar_mjx.criticism.discover import discover
+from lunar_mjx.criticism.discover import _write, discover
 from lunar_mjx.criticism.log import Noise, write_steady_log
 from lunar_mjx.criticism.probes import PROBES, unknown_input
 from lunar_mjx.criticism.runs import VERDICT_FILE, Run
@@ -51,6 +51,33 @@ def test_the_file_that_is_written_loads_with_its_amount(tmp_path):
     assert effect.parameters["amount"].nominal == pytest.approx(0.123456)
     assert effect.parameters["amount"].source == "lunar-mjx unknown on log1"
     assert effect.name == "found"
+
+
+@pytest.mark.parametrize("amount", [-300.0, 1e-7, 40.0])
+def test_an_amount_beyond_the_first_bounds_can_be_loaded(tmp_path, amount):
+    made = term(STIFFNESS, "z/r")
+    path = tmp_path / "own.py"
+    path.write_text(with_amount(made, amount, "own", "a log"))
+    found = catalogue.get(f"{path}:own").parameters["amount"]
+    assert found.nominal == pytest.approx(amount) and found.bounds[0] < min(0.0, amount)
+    assert found.bounds[1] > max(0.0, amount)
+
+
+def test_a_second_suggestion_leaves_the_first_and_the_users_files_alone(tmp_path):
+    model = make_model("luvmi_x", terrain="flat")
+    run = Run(tmp_path, (), model)
+    first, second = (functools.partial(with_amount, term(STIFFNESS, f), 0.1, provenance="x") for f in ("z/r", "s"))
+    paths = [_write(run, None, "soil", 0, text) for text in (first, second, first)]
+    assert [p.name for p in paths] == ["suggested_soil.py", "suggested_soil_2.py", "suggested_soil.py"]
+    assert catalogue.get(f"{paths[1]}:suggested_soil_2").doc != catalogue.get(f"{paths[0]}:suggested_soil").doc
+    grown = Run(tmp_path / "run2", (), model.add(f"{paths[0]}:suggested_soil", "add"))
+    grown.folder.mkdir()
+    assert _write(grown, None, "soil", 0, second).name == "suggested_soil_2.py", "a model holds a name once"
+    mine = tmp_path / "mine.py"
+    mine.write_text("# of my own")
+    with pytest.raises(UserError, match="none of these suggestions"):
+        discover(run, "soil", mine)
+    assert mine.read_text() == "# of my own"
 
 
 def test_a_search_needs_a_port(tmp_path):

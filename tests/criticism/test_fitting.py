@@ -93,6 +93,8 @@ def test_a_memory_gives_back_the_fit_it_kept():
     np.testing.assert_array_equal(again.u, found.u)
     assert again.chi2 == pytest.approx(found.chi2)
     assert again.problems == found.problems
+    other = decay(noise=0.05)
+    assert Memory(written[-1]).recall(other, ()) is None, "where chi-square is another, so is the physics"
 
 
 def test_a_memory_of_other_coordinates_is_not_used():
