@@ -162,18 +162,13 @@ class NavigationEnv:
     def reset(self, params: NavigationParams, keys: Any) -> State:
         """Begins an episode in every environment; `keys` (env, 2) raw random keys."""
         # the first episode and the prepared one in one batch: half the program to compile
-        both = self._begin(params, jnp.concatenate([keys, _next(keys)]))
+        both = self._begin(params, jnp.concatenate([keys, _split(keys)[:, 0]]))
         first, ready = (jax.tree.map(lambda a, p=part: a[p], both) for part in
                         (slice(keys.shape[0]), slice(keys.shape[0], None)))  # fmt: skip
         obs, privileged, inner = first.obs, first.privileged, first.inner
         zero, no = jnp.zeros(keys.shape[0], obs.dtype), jnp.zeros(keys.shape[0], bool)
-        names = (
-            "episode_return",
-            "episode_length",
-            "success",
-            *ENDS[1:],
-            *(f"reward_{n}" for n in self.config.weights),
-        )
+        terms = (f"reward_{n}" for n in self.config.weights)
+        names = ("episode_return", "episode_length", "success", *ENDS[1:], *terms)
         metrics = dict.fromkeys(names, zero)
         inner = dataclasses.replace(inner, ready=ready, used=no)
         return State(obs, privileged, zero, no, no, obs, privileged, metrics, first.info, inner)
@@ -356,10 +351,6 @@ class NavigationEnv:
 def _split(keys: Any) -> Any:
     """(env, 4, 2) keys of an episode; the first one is the next episode's."""
     return jax.vmap(lambda k: jax.random.split(k, 4))(keys)
-
-
-def _next(keys: Any) -> Any:
-    return _split(keys)[:, 0]
 
 
 def make_navigation(
