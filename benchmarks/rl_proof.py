@@ -45,7 +45,8 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
     ground = {"terrain": "flat", "goal_distance": (2.0, 4.0), "places": 256} if args.tiny else {}
     few = {"observations": PAPER_OBSERVATION, "privileged": ()}
     plan = [("17 numbers", 5, 65536), ("all observations", 50, 65536), ("17 numbers", 5, 1024),
-            ("17 numbers", 5, 4096), ("17 numbers", 5, 16384), ("17 numbers", 50, 65536),
+            ("17 numbers", 5, 2048), ("17 numbers", 5, 4096), ("17 numbers", 5, 8192), ("17 numbers", 5, 16384),
+            ("17 numbers", 5, 32768), ("17 numbers", 50, 65536),
             ("all observations", 5, 65536), ("all observations", 50, 4096), ("17 numbers", 5, 262144)]  # fmt: skip
     plan = [row for row in plan if args.rows is None or f"{row[0][:2]}/{row[1]}/{row[2]}" in args.rows]
     plan = [("17 numbers", 5, 8)] if args.tiny else plan
