@@ -91,12 +91,15 @@ class Rate:
         decimation, key = env.config.decimation, jax.random.PRNGKey(0)
 
         def drive(params: Any, state: Any) -> Any:
-            def step(state: Any, key: Any) -> Any:
+            def step(carry: Any, key: Any) -> Any:
+                state, ended = carry
                 action = jax.random.uniform(key, (size, env.action_size), minval=-1.0)
                 state = env.step(params, state, action)
-                return state, jnp.sum(state.done)
+                # each rover counts: a sum over all, XLA fuses with the environment's last kernel, run by one block then
+                return (state, ended + state.done), None
 
-            state, ended = jax.lax.scan(step, state, jax.random.split(key, steps))
+            start = (state, jnp.zeros(size, jnp.int32))
+            (state, ended), _ = jax.lax.scan(step, start, jax.random.split(key, steps))
             return state, jnp.sum(ended)
 
         shares = jax.random.uniform(key, (steps, env.action_size), minval=-1.0)

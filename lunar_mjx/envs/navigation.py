@@ -228,9 +228,7 @@ class NavigationEnv:
             _, (_, used) = carry
             return jnp.zeros((), bool), side_by_side((self._begin(params, inner.key), jnp.zeros_like(used)))
 
-        # else XLA may fuse all that leads to `done` into these reductions, which one block of a GPU then computes
-        ended, taken = jax.lax.optimization_barrier((done, inner.used))
-        short = (ended & taken).any() | (taken.mean(dtype=jnp.float32) > _USED)
+        short = (done & inner.used).any() | (inner.used.mean(dtype=jnp.float32) > _USED)
         # a loop of no or one turn: unlike a conditional, it leaves what it does not change where it is
         _, (ready, used) = jax.lax.while_loop(lambda carry: carry[0], prepare, (short, kept))
         here = side_by_side((state.obs, state.privileged, state.info, alone))
