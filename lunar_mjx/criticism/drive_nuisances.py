@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lunar_mjx.criticism.coordinates import Coordinate
+from lunar_mjx.criticism.drive_program import SETTLE, STOOD
 from lunar_mjx.criticism.observations import Observations, Series
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ STEP_ERROR = "step_error"
 _ENCODER = re.compile(r"joint_\w*drive_angle_rad")
 _START = {"x": (0.01, 1.0), "y": (0.01, 1.0), "yaw": (0.01, 0.6), "temperature": (1.0, 100.0)}
 """Scale and reach of what is measured with noise at the start, m, rad, K."""
+_STOOD_SCALE, _STOOD_MOST = 0.5, 6.0
+"""Of the time for which a rover had stood, s."""
 
 
 def is_encoder(series: Series) -> bool:
@@ -30,8 +33,11 @@ def nuisances(number: int, run: LogRun, observations: Observations) -> list[Coor
     found = [
         Coordinate("initial", name, run.start[name], _START[name][0], run.start[name] - _START[name][1],
                    run.start[name] + _START[name][1], prior=10.0, log_index=number)
-        for name in run.unknown
+        for name in run.unknown if name in _START
     ]  # fmt: skip
+    if STOOD in run.unknown:
+        found.append(Coordinate("initial", STOOD, run.start[STOOD], _STOOD_SCALE, SETTLE, _STOOD_MOST, prior=10.0,
+                                physical=True, log_index=number))  # fmt: skip
     found.append(Coordinate("initial", STEP_ERROR, 0.0, 1.0, -2.0, 2.0, prior=1.0, physical=True, log_index=number))
     for s in observations.series:
         if s.log == number and is_encoder(s):

@@ -24,7 +24,11 @@ Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
 """(rows,) values by effect, parameter, log (-1 for all) and whether they are factors."""
 
 SETTLE = 1.0
-"""Time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
+"""Least time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
+PIECE = 0.5
+"""Length of the pieces in which logs are simulated, s. A time of standing between two of them is interpolated."""
+STOOD = "stood"
+"""Name of the time for which a rover had stood before a log, s."""
 
 
 class Program:
@@ -36,8 +40,8 @@ class Program:
         self.model, self.every, self.channels, self.imu = model, every, channels, imu
         with jax.enable_x64(True):
             self.system: System = build(model, engine)
-        # Pieces of one length, the first of which settles the rover: one program serves logs of any length.
-        self.segment = math.ceil(SETTLE / (every * self.system.dt) - 1e-9)
+        # Pieces of one length, the first of which settle the rover: one program serves logs of any length.
+        self.segment = math.ceil(PIECE / (every * self.system.dt) - 1e-9)
         self.compiled = False
         self._reset = jax.jit(self._reset_all)
         self._drive = jax.jit(self._drive_all, static_argnames="shared")
@@ -80,15 +84,40 @@ class Program:
         with jax.enable_x64(True):
             own, shared = (None, True) if logs.shared else (log, False)
             full, state = self._reset(params, start, logs.terrain, own)
-            settled, _ = self._drive(full, state, np.zeros_like(commands[:, : self.segment]), shared=shared)
+            stood = self._stand(full, state, np.zeros_like(commands[:, : self.segment]), start[STOOD], shared)
             # The clock and the heat begin with the log.
-            state = dataclasses.replace(settled, step=state.step, temperature=state.temperature)
+            state = dataclasses.replace(stood, step=state.step, temperature=state.temperature)
             seen = []
             for at in range(0, commands.shape[1], self.segment):
                 state, telemetry = self._drive(full, state, commands[:, at : at + self.segment], shared=shared)
                 seen.append(telemetry)
             whole = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *seen)
             return {c: np.asarray(v) for c, v in self._measure(full, whole, shared=shared).items()}
+
+    def _stand(self, params: Params, state: Any, still: np.ndarray, stood: np.ndarray, shared: bool) -> Any:
+        """Rovers that have stood for their own times (rovers,), s, at least `SETTLE`."""
+        pieces = stood / (self.segment * self.every * self.system.dt)
+        first = round(SETTLE / PIECE)
+        for _ in range(first):
+            state, _ = self._drive(params, state, still, shared=shared)
+        kept, now = state, state
+        for k in range(first, math.ceil(float(np.max(pieces)) - 1e-12)):
+            after, _ = self._drive(params, now, still, shared=shared)
+            kept, now = _between(kept, now, after, np.clip(pieces - k, 0.0, 1.0)), after
+        return kept
+
+
+@jax.jit
+def _between(kept: Any, before: Any, after: Any, share: Any) -> Any:
+    """`before` and `after` in a share (rovers,) of each; `kept` where the share is nothing."""
+
+    def blend(kept: Any, before: Any, after: Any) -> Any:
+        part = share.reshape(-1, *[1] * (jnp.ndim(after) - 1))
+        if not jnp.issubdtype(jnp.result_type(after), jnp.floating):
+            return jnp.where(part > 0.0, after, kept)
+        return jnp.where(part == 1.0, after, jnp.where(part > 0.0, before + part * (after - before), kept))
+
+    return jax.tree.map(blend, kept, before, after)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -139,7 +168,7 @@ def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun],
         ground = jax.device_put(ground)
     return Logs(
         program=program, numbers=tuple(numbers), params=jax.tree.map(lambda *a: np.stack(a), *bare),
-        start={n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature")},
+        start={n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature", STOOD)},
         terrain=ground, shared=shared,
         commands=np.stack([_padded(r.commands, length) for r in runs]),
     )  # fmt: skip

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
-from lunar_mjx.criticism.drive_program import Logs, Program, Rows, cores, stack_logs
+from lunar_mjx.criticism.drive_program import SETTLE, STOOD, Logs, Program, Rows, cores, stack_logs
 from lunar_mjx.criticism.fitting import Progress
 from lunar_mjx.criticism.observations import Observations
 from lunar_mjx.dynamics.state import Params
@@ -18,6 +19,7 @@ from lunar_mjx.dynamics.system import default_params
 from lunar_mjx.effects.channels import EULER
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import ZERO_CELSIUS, Model
+from lunar_mjx.terrain.heightfield import slope
 
 if TYPE_CHECKING:
     from lunar_mjx.criticism.log import Log
@@ -26,6 +28,8 @@ CHUNK = {"cpu": 16, "gpu": 2048}
 """Rovers simulated at once."""
 _FINEST = 0.01
 """Shortest interval of telemetry, s."""
+_LEVEL = math.radians(1.0)
+"""On a steeper slope a rover creeps for seconds, ever slower, so that how long it has stood shows in its currents."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,7 +40,7 @@ class LogRun:
       model: the union model under the log's conditions.
       commands: (time, joint). every: time steps per command.
       begin, end: common time of the first command and of the last telemetry, s.
-      start: x, y m, yaw rad, temperature K. unknown: which of these a fit must find.
+      start: x, y m, yaw rad, temperature K, time it had stood s. unknown: which of these a fit must find.
       imu_position: m.
     """
 
@@ -227,8 +231,8 @@ def log_run(log: Log, model: Model) -> LogRun:
 
 
 def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Pose and temperature at the first samples, and which of them are measured with noise and so must be fitted."""
-    start = {"x": 0.0, "y": 0.0, "yaw": 0.0, "temperature": float(model.ambient[0])}
+    """Pose, temperature and time of standing at the first samples, and which of them a fit must find."""
+    start = {"x": 0.0, "y": 0.0, "yaw": 0.0, "temperature": float(model.ambient[0]), STOOD: SETTLE}
     unknown = []
 
     def first(channel: str) -> float | None:
@@ -252,4 +256,7 @@ def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
     if known:
         start["temperature"] = float(np.mean(known)) + ZERO_CELSIUS
         unknown.append("temperature")
+    if float(slope(model.terrain.field, start["x"], start["y"])) > _LEVEL:
+        start[STOOD] = 2.0 * SETTLE
+        unknown.append(STOOD)
     return start, tuple(unknown)
