@@ -183,7 +183,9 @@ def _joined(problem: Problem, parent: Fit, free: np.ndarray, places: Sequence[in
 
 
 def refit_with(problem: Problem, base: Fit, effect: str, settings: Settings, memory: Memory) -> Fit:
-    """The model refitted with one candidate, from the candidate's linear estimate."""
+    """The model refitted with one candidate, as it would be among others."""
     parent = Candidate((), base, noise_test(problem, base), 0.0, 0.0)
     scored = score(problem, base, signatures(problem, base, [effect]), settings.draws, settings.seed)
-    return refit(problem, parent, (effect,), scored[0] if scored else None, memory).fit
+    if scored:
+        return refit_all(problem, parent, scored[:1], settings, memory)[0].fit
+    return refit(problem, parent, (effect,), None, memory).fit
