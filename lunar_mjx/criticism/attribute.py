@@ -11,7 +11,7 @@ from lunar_mjx.criticism.fitting import HALF_STEP, Fit, Memory, Progress, fit, s
 from lunar_mjx.criticism.held_out import errors
 from lunar_mjx.criticism.patterns import Unlisted
 from lunar_mjx.criticism.problem import Problem
-from lunar_mjx.criticism.refit import Settings
+from lunar_mjx.criticism.refit import Settings, with_own_step_error
 from lunar_mjx.criticism.score import SEPARABLE, Score
 from lunar_mjx.criticism.search import Search, excess_explained, search, significant
 from lunar_mjx.criticism.verdict import Diagnosis, EffectEvidence, Verdict
@@ -36,6 +36,9 @@ def diagnose(
     """
     settings = settings or Settings()
     found = search(problem, settings, progress, memory)
+    if found.chosen.effects:
+        progress("certifying", 0.0)
+        found = dataclasses.replace(found, chosen=with_own_step_error(problem, found.chosen))
     base, chosen = found.base, found.chosen
     details: dict[str, Any] = {
         "certificate": _certificate(base.fit),
@@ -52,7 +55,6 @@ def diagnose(
         sentence = f"The baseline fit has no certificate ({reason}), so nothing is said about physics."
         return Diagnosis(Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details), found
     if chosen.effects:
-        progress("certifying", 0.0)
         final = certify(problem, found, settings)
         details["certificate_after"] = _certificate(final)
         if final.problems:

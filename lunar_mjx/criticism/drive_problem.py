@@ -36,6 +36,9 @@ STEP = 1e-7
 """Difference quotient's step in scales. Predictions jump by hundredths of a sigma where a wheel at rest changes the
 sign of its slip; a step this short rarely meets a jump, and rounding spoils only the faintest derivatives."""
 
+STEP_CHI2 = 1.0
+"""Squared whitened change by halving the time step, beyond its nuisances, from which these are taken anew at a fit."""
+
 BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "soil": {
         "k_phi": (0.3, 2.0), "n": (0.1, 2.0), "cohesion": (0.3, 2.0), "friction_angle": (0.1, 2.0),
@@ -122,6 +125,7 @@ class DriveProblem(Problem):
                 self.inputs[label] = np.array([own[n] for n in names])
         self.coordinates = (*found, *of_candidate(self._smooth))
         self._step_error: np.ndarray | None = None
+        self._halved: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def eager(self) -> bool:
@@ -300,9 +304,31 @@ class DriveProblem(Problem):
     def certificate(self, u: np.ndarray, free: np.ndarray) -> Mapping[str, float]:
         """The change of chi-square by halving the time step, beyond what the nuisance of the step's error absorbs."""
         del free
+        keep, whiten = self.observations.in_split("fit"), self.observations.whiten
+        change = self._unabsorbed(self._halving(u))
+        coarse = self.observations.value - self.predict(u[None])[0]
+        chi2 = [np.sum(whiten(r)[keep] ** 2) for r in (coarse, coarse - change)]
+        return {"half_step_chi2": float(abs(chi2[0] - chi2[1]))}
+
+    def renew_step_error(self, u: np.ndarray) -> bool:
+        change = self._halving(u)
+        whitened = self.observations.whiten(self._unabsorbed(change))[self.observations.in_split("fit")]
+        if not float(whitened @ whitened) > STEP_CHI2:
+            return False
+        self._step_error = np.where(np.isfinite(change), 2.0 * change, 0.0)
+        return True
+
+    def _halving(self, u: np.ndarray) -> np.ndarray:
+        """(n,) the change of the predictions by halving the time step."""
+        if self._halved is None or not np.array_equal(self._halved[0], u):
+            bench = self._bench_for(u[None])
+            change = self._simulated(bench.halved(), u[None]) - self._simulated(bench, u[None])
+            self._halved = u.copy(), change
+        return self._halved[1].copy()
+
+    def _unabsorbed(self, change: np.ndarray) -> np.ndarray:
+        """(n,) what of a change the nuisances of the step's error cannot take up."""
         whiten = self.observations.whiten
-        bench = self._bench_for(u[None])
-        change = self._simulated(bench.halved(), u[None]) - self._simulated(bench, u[None])
         for c in self.coordinates:
             if c.name == STEP_ERROR:
                 mine, own = self._of_log(c.log_index), np.zeros(len(change))
@@ -310,11 +336,8 @@ class DriveProblem(Problem):
                 known = self._direction(c)
                 along = whiten(known)
                 size = float(along @ along)
-                change -= (float(along @ whiten(own)) / size if size > 0.0 else 0.0) * known
-        keep = self.observations.in_split("fit")
-        coarse = self.observations.value - self.predict(u[None])[0]
-        chi2 = [np.sum(whiten(r)[keep] ** 2) for r in (coarse, coarse - change)]
-        return {"half_step_chi2": float(abs(chi2[0] - chi2[1]))}
+                change = change - (float(along @ whiten(own)) / size if size > 0.0 else 0.0) * known
+        return change
 
 
 def _usable(model: Model, candidates: Mapping[str, Effect]) -> tuple[dict[str, Effect], tuple[NotTested, ...]]:

@@ -21,6 +21,9 @@ _RIVAL = 0.8
 rivals of Coulomb friction in two campaigns eight took off what was promised within 3 % of that effect's share; gravity
 took off 14 % more, grousers nothing.)"""
 
+_RENEWALS = 2
+"""Times that the error of the time step is taken anew at most: at a fit with an error of its own it is nearly right."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -171,6 +174,23 @@ def refit(
     return Candidate(effects, found, noise_test(problem, found), value, se)
 
 
+def with_own_step_error(problem: Problem, candidate: Candidate) -> Candidate:
+    """The set fitted with the error of the time step as it is with its effects, if that is another.
+
+    A delay moves commands to between the samples of a log, where a step's error is another: 88 ms were found as
+    90.84 +- 0.13 with the error of the model as given, and as 87.2 +- 0.6 with its own.
+    """
+    found = candidate.fit
+    for _ in range(_RENEWALS):
+        with problem.focused(candidate.effects):
+            if not problem.renew_step_error(found.u):
+                break
+            found = fit(problem, found.free, found.u, starts=1, certify=False)
+    if found is candidate.fit:
+        return candidate
+    return dataclasses.replace(candidate, fit=found, noise=noise_test(problem, found))
+
+
 def _joined(problem: Problem, parent: Fit, free: np.ndarray, places: Sequence[int], columns: np.ndarray) -> np.ndarray:
     """(n, free) Jacobian at the parent's fit, with the columns of a candidate; its shapes do nothing at its null."""
     out = np.zeros((len(problem.observations), len(free)))
@@ -187,5 +207,7 @@ def refit_with(problem: Problem, base: Fit, effect: str, settings: Settings, mem
     parent = Candidate((), base, noise_test(problem, base), 0.0, 0.0)
     scored = score(problem, base, signatures(problem, base, [effect]), settings.draws, settings.seed)
     if scored:
-        return refit_all(problem, parent, scored[:1], settings, memory)[0].fit
-    return refit(problem, parent, (effect,), None, memory).fit
+        found = refit_all(problem, parent, scored[:1], settings, memory)[0]
+    else:
+        found = refit(problem, parent, (effect,), None, memory)
+    return with_own_step_error(problem, found).fit
