@@ -70,7 +70,9 @@ def score(args: argparse.Namespace) -> None:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.with_suffix(".seed.json").write_text(json.dumps(drawn, indent=1) + "\n", encoding="utf-8")
     done = {row["case"] for row in runner.read_rows([args.out]) if row["seed"] == str(seed)}
-    left = [job for job in drives.waiting(args.folder) if f"{job[0]}-{job[1]:03d}" not in done]
+    first, last, of = args.share
+    mine = [job for place, job in enumerate(drives.waiting(args.folder)) if first <= place % of <= last]
+    left = [job for job in mine if f"{job[0]}-{job[1]:03d}" not in done]
     number = runner.work(solve.drive_row, left, args.out, seed, args.minutes, args.workers, folder=str(args.folder),
                          keep=str(args.keep) if args.keep else None)  # fmt: skip
     print(f"{number} campaigns done, {len(left) - number} left")
@@ -86,6 +88,16 @@ def summary(args: argparse.Namespace) -> None:
     seeds = [p.with_suffix(".seed.json") for p in args.results]
     drawn = [json.loads(p.read_text(encoding="utf-8")) for p in seeds if p.is_file()]
     print(tables.write(runner.read_rows(args.results), args.out, drawn))
+
+
+def share(text: str) -> tuple[int, int, int]:
+    """First and last share and their number."""
+    shares, _, of = text.partition("/")
+    first, _, last = shares.partition("-")
+    found = int(first), int(last or first), int(of)
+    if not 0 <= found[0] <= found[1] < found[2]:
+        raise argparse.ArgumentTypeError(f"{text!r} is no share; give one such as 0/4 or 1-3/4")
+    return found
 
 
 def parser() -> argparse.ArgumentParser:
@@ -115,6 +127,8 @@ def parser() -> argparse.ArgumentParser:
     scored.add_argument("--out", type=Path, required=True, help="JSON lines, one row per campaign")
     scored.add_argument("--minutes", type=float, default=9.0)
     scored.add_argument("--workers", type=int, default=1)
+    scored.add_argument("--share", type=share, default=(0, 0, 1), metavar="FIRST-LAST/NUMBER",
+                        help="of the campaigns, where several programs score one folder")  # fmt: skip
     scored.add_argument("--keep", type=Path, help="folder in which runs stay")
     scored.set_defaults(do=score)
     table = verbs.add_parser("summary", help="figures with intervals, and the confusion matrix")
