@@ -15,11 +15,13 @@ from lunar_mjx.criticism.inputs import SMOOTH
 from lunar_mjx.criticism.localise import pattern
 from lunar_mjx.criticism.patterns import Unlisted, find_pattern
 from lunar_mjx.criticism.problem import Problem
-from lunar_mjx.criticism.refit import Candidate, Settings, refit, refit_all
+from lunar_mjx.criticism.refit import Candidate, Settings, refit, refit_all, with_own_step_error
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
 
 _HOPELESS = 200.0
 """Chi-square beyond an effect's from which another that may stand for it is left."""
+_NEAR = 200.0
+"""The same from which another effect is no rival, whatever the error of the time step."""
 _NOISE = "noise"
 """What the place is called at which the noise's colour was learnt."""
 _MISFIT = 1.3
@@ -94,7 +96,8 @@ def search(
         if reached is not None:
             best = reached
             if not problem.cheap_jacobian:
-                best = _completed(problem, reached, settings, tried, memory, progress)
+                best = _in_own_steps(problem, reached, tried)
+                best = _completed(problem, best, settings, tried, memory, progress)
                 best = tried[frozenset(best.effects)] = _looked_at(problem, best, settings)
             break
         grown = [tried[frozenset(c.effects)] for c in grown]
@@ -144,6 +147,23 @@ def _reaching(
             if looked.at_noise:
                 return looked
     return None
+
+
+def _in_own_steps(problem: Problem, reached: Candidate, tried: dict[frozenset[str], Candidate]) -> Candidate:
+    """The one that reached the noise with the time step's error taken at its fit, and its rivals with the same.
+
+    Else what is left of that error looks like a second effect: beside Coulomb friction, like Stribeck's.
+    """
+    own = with_own_step_error(problem, reached)
+    if own is not reached:
+        rivals = [c for c in tried.values() if c.effects and c.fit.chi2 < reached.fit.chi2 + _NEAR]
+        for c in rivals:
+            if c.effects != reached.effects:
+                with problem.focused(c.effects):
+                    again = fit(problem, c.fit.free, c.fit.u, starts=1, certify=False)
+                tried[frozenset(c.effects)] = dataclasses.replace(c, fit=again, noise=noise_test(problem, again))
+    tried[frozenset(own.effects)] = own
+    return own
 
 
 def _completed(

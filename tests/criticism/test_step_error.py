@@ -11,6 +11,7 @@ from toy_problem import Linear, manoeuvres
 from lunar_mjx.criticism.fitting import fit
 from lunar_mjx.criticism.held_out import noise_test
 from lunar_mjx.criticism.refit import Candidate, with_own_step_error
+from lunar_mjx.criticism.search import _in_own_steps
 
 TIME = np.arange(400) * 0.01
 
@@ -75,3 +76,17 @@ def test_what_the_nuisance_absorbs_already_is_not_fitted_again():
     before = candidate(problem)
     assert with_own_step_error(problem, before) is before
     assert problem.renewed == 0
+
+
+def test_rivals_are_held_against_the_same_step_error():
+    problem = Stepped(1.0)
+    reached = candidate(problem)
+    worse = dataclasses.replace(reached.fit, chi2=reached.fit.chi2 + 1e4)
+    far = dataclasses.replace(reached, effects=("far",), fit=worse)
+    near = dataclasses.replace(reached, effects=("near",))
+    tried = {frozenset(c.effects): c for c in (reached, far, near)}
+    own = _in_own_steps(problem, reached, tried)
+    assert own.fit.chi2 < reached.fit.chi2
+    assert tried[frozenset(("delay",))] is own
+    assert tried[frozenset(("near",))].fit.chi2 == pytest.approx(own.fit.chi2, abs=0.1)
+    assert tried[frozenset(("far",))] is far
