@@ -23,6 +23,7 @@ import jax
 
 from benchmarks.hidden.drives import MANOEUVRES, Manoeuvre, generate
 from lunar_mjx.criticism import compare, read_campaign, why
+from lunar_mjx.criticism.drive_problem import SIMULATED
 from lunar_mjx.criticism.drive_program import cores
 from lunar_mjx.model import make_model
 
@@ -66,6 +67,7 @@ def main() -> None:
     }  # fmt: skip
     model = make_model(logs[0].rover, terrain="flat")
     for number in range(args.rounds):
+        SIMULATED.clear()  # else a round would find what the one before has simulated
         with tempfile.TemporaryDirectory() as folder:
             begun = time.perf_counter()
             run = compare(args.logs, model, Path(folder) / "run")

@@ -86,8 +86,12 @@ def certify(problem: Problem, found: Search, settings: Settings) -> Fit:
     without = [c.fit.chi2 for c in found.tried if set(c.effects) < set(chosen.effects)
                and len(c.effects) == len(chosen.effects) - 1]  # fmt: skip
     least = min(without, default=found.base.fit.chi2) - chosen.fit.chi2
+    free = problem.free(chosen.effects)
+    # what held-out logs' own nuisances have moved since is of no account: a step heeds the fitted logs alone
+    known = (chosen.fit.residual, chosen.fit.jacobian) if np.array_equal(free, chosen.fit.free) else None
     with problem.focused(chosen.effects):
-        return fit(problem, problem.free(chosen.effects), chosen.fit.u, settings.starts, settings.seed, spread=0.5,
+        return fit(problem, free, chosen.fit.u, settings.starts, settings.seed, spread=0.5,
+                   known=None if problem.cheap_jacobian else known,
                    half_step=max(HALF_STEP, STEP_SHARE * least))  # fmt: skip
 
 
@@ -157,9 +161,12 @@ def _evidence(problem: Problem, found: Search, settings: Settings) -> tuple[Effe
     singles = {c.effects[0]: c for c in found.tried if len(c.effects) == 1}
     rivals = {e for c in found.rivals for e in c.effects}
     rows = []
+    covariance: dict[int, np.ndarray] = {}
     for s in found.scores:
         own = found.chosen if s.effect in found.chosen.effects else singles.get(s.effect)
-        values, std = parameters(problem, own.fit, s.effect) if own else ({}, {})
+        if own and id(own) not in covariance:
+            covariance[id(own)] = own.fit.covariance(problem)
+        values, std = parameters(problem, own.fit, s.effect, covariance[id(own)]) if own else ({}, {})
         others = {e: v for e, v in found.cosines.get(s.effect, {}).items() if e != s.effect}
         nearest = max(others.items(), key=lambda item: item[1]) if others else ("", 0.0)
         status, reason = _status(s, found, rivals, settings)
@@ -186,9 +193,11 @@ def _status(s: Score, found: Search, rivals: set[str], settings: Settings) -> tu
     return "not significant", f"z = {s.z:.1f}, family-wise p = {s.p:.2g}"
 
 
-def parameters(problem: Problem, fitted: Fit, effect: str) -> tuple[dict[str, float], dict[str, float]]:
-    """Fitted values and standard deviations of an effect's coordinates, SI units."""
-    covariance = fitted.covariance(problem)
+def parameters(
+    problem: Problem, fitted: Fit, effect: str, covariance: np.ndarray | None = None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Fitted values and standard deviations of an effect's coordinates, SI units; of a covariance that is known."""
+    covariance = fitted.covariance(problem) if covariance is None else covariance
     values, std = {}, {}
     for k, i in enumerate(fitted.free):
         c = problem.coordinates[i]

@@ -14,7 +14,7 @@ import numpy as np
 
 from lunar_mjx.criticism.descent import Objective
 from lunar_mjx.criticism.fitting import Fit
-from lunar_mjx.criticism.score import SEPARABLE, Score, leash, project
+from lunar_mjx.criticism.score import SEPARABLE, Score, leash, outside, span
 
 if TYPE_CHECKING:
     from lunar_mjx.criticism.problem import Problem
@@ -58,12 +58,12 @@ def stands(problem: Problem, fit: Fit, effects: Sequence[str], scores: Sequence[
     for effect in effects:
         mine = np.isin(fit.free, problem.candidates[effect])
         others, prior = fit.jacobian[keep][:, ~mine], leash(problem, fit)[~mine]
-        does = fit.jacobian[keep][:, mine] @ fit.u[fit.free[mine]]
+        basis = span(others, prior)
+        does = outside((fit.jacobian[keep][:, mine] @ fit.u[fit.free[mine]])[:, None], basis)
         for s in scores:
             if s.columns is None or not s.columns.size:
                 continue
-            parts = project(np.column_stack([s.columns[keep], does]), others, prior)
-            signature, target = parts[:, :-1], parts[:, -1]
+            signature, target = outside(s.columns[keep], basis), does[:, 0]
             length = float(np.linalg.norm(signature))
             if length < SEPARABLE or s.length > _TAKEN * length:
                 continue

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -24,6 +25,8 @@ has to reach the noise. (Scores do not feel a fit that has not quite converged: 
 sensitivities, and that is projected out.)"""
 
 _DAMPINGS = np.array([1e-4, 1e-2, 1e-1, 1.0, 1e2])
+_WIDER = 1e2
+"""Factor on the damping after a failed step."""
 _ITERATIONS = 60
 EDGE = 1e-6
 _PROBE = 0.1
@@ -51,8 +54,9 @@ def whitened_residuals(problem: Problem, u: np.ndarray) -> np.ndarray:
 class Objective:
     """Chi-square of the fitted observations with the priors, and its quadratic model, over the free coordinates."""
 
-    def __init__(self, problem: Problem, free: np.ndarray, fitted: np.ndarray):
+    def __init__(self, problem: Problem, free: np.ndarray, fitted: np.ndarray, eager: bool = False):
         self.problem, self.free, self.fitted = problem, free, fitted
+        self.eager = eager or problem.eager
         self.low, self.high = problem.bounds(free)
 
     def residuals(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -71,13 +75,17 @@ class Objective:
         j = self.problem.observations.whiten(self.problem.jacobian(u, self.free))
         return np.where(np.isfinite(j), j, 0.0)
 
-    def linearise(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whitened residuals (k, n), chi-square (k,) and Jacobians (k, n, free) in one batch."""
+    def linearise(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, Callable[[int], np.ndarray]]:
+        """Whitened residuals (k, n), chi-square (k,), and Jacobians (n, free) by number, simulated in one batch."""
         observations = self.problem.observations
         predicted, jacobian = self.problem.linearise(u, self.free)
         r = observations.whiten((observations.value[None] - predicted).T).T
-        j = np.stack([observations.whiten(a) for a in jacobian])
-        return r, self.chi2(u, r), np.where(np.isfinite(j), j, 0.0)
+
+        def whitened(k: int) -> np.ndarray:
+            j = observations.whiten(jacobian(k))
+            return np.where(np.isfinite(j), j, 0.0)
+
+        return r, self.chi2(u, r), whitened
 
     def quadratic(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half the downhill gradient and the Gauss-Newton Hessian."""
@@ -107,8 +115,7 @@ class Objective:
           Their ends; and the probes by which the derivative was taken, with their residuals: steps as well, if short.
         """
         steps = (trials - u)[:, self.free]
-        probes = np.repeat(u[None], len(steps), axis=0)
-        probes[:, self.free] += _PROBE * steps
+        probes = self.probes(u, trials)
         ahead, _ = self.residuals(probes)
         out = trials.copy()
         for i, (step, damping) in enumerate(zip(steps, dampings, strict=True)):
@@ -122,6 +129,12 @@ class Objective:
             out[i, self.free] = np.clip(u[self.free] + step + bend, self.low, self.high)
         return out, probes, ahead
 
+    def probes(self, u: np.ndarray, trials: np.ndarray) -> np.ndarray:
+        """(k, coordinates) a short way towards each trial."""
+        out = np.repeat(u[None], len(trials), axis=0)
+        out[:, self.free] += _PROBE * (trials - u)[:, self.free]
+        return out
+
     def roughness(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> float:
         """Scatter of chi-square about its quadratic model over the first hundredths of a Gauss-Newton step.
 
@@ -129,11 +142,19 @@ class Objective:
         that open and close jumps; below these jumps there is nothing to be found.
         """
         downhill, hessian = self.quadratic(u, r, j)
-        step = self.steps(u, downhill, hessian, np.array([1e-8]))[0] - u
-        _, chi2 = self.residuals(u + np.concatenate([[0.0], _NEAR])[:, None] * step)
+        rows, step = self._near(u, downhill, hessian)
+        _, chi2 = self.residuals(rows)
         along = step[self.free]
         model = -2.0 * _NEAR * float(downhill @ along) + _NEAR**2 * float(along @ hessian @ along)
         return float(np.max(np.abs(chi2[1:] - chi2[0] - model)))
+
+    def foresee_roughness(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> None:
+        """`roughness` will be asked for."""
+        self.problem.foresee(self._near(u, *self.quadratic(u, r, j))[0])
+
+    def _near(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        step = self.steps(u, downhill, hessian, np.array([1e-8]))[0] - u
+        return u + np.concatenate([[0.0], _NEAR])[:, None] * step, step
 
     def promise(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> float:
         """Drop of chi-square that a full Gauss-Newton step within the bounds promises."""
@@ -152,6 +173,10 @@ def _within(hessian: np.ndarray, downhill: np.ndarray, low: np.ndarray, high: np
     rows = root[:, None] * axes.T
     found = lsq_linear(rows, (axes.T @ (size * downhill)) / root, (low / size - _ROOM, high / size + _ROOM), "bvls")
     return found.x * size
+
+
+class Outdone(Exception):
+    """A descent was left, since another model has reached what this one cannot."""
 
 
 class Rival:
@@ -214,6 +239,10 @@ class _Walk:
         """Drop of chi-square that does not matter where the model misfits."""
         return 0.2 * slack_of(self.chi2, int(self.goal.fitted.sum())) if self.dear else 0.0
 
+    def end(self) -> Descent:
+        """Where it is."""
+        return Descent(self.u, self.r, self.j, self.chi2, self.promise)
+
     def refresh(self) -> None:
         """Takes the Jacobian where the descent is."""
         self.j, self.fresh = self.goal.jacobian(self.u), True
@@ -232,9 +261,11 @@ class _Walk:
         if self.curved:
             bent, probes, ahead = goal.bent(self.u, self.r, self.j, hessian, trials, dampings)
             trials = np.concatenate([trials, bent])
-        jacobians: np.ndarray | tuple = ()
-        if goal.problem.eager:
-            residuals, chi2, jacobians = goal.linearise(trials)
+        jacobian, own = None, len(trials)
+        if goal.eager:
+            if not self.curved:
+                self._foresee_bending(downhill, hessian)
+            residuals, chi2, jacobian = goal.linearise(trials)
         else:
             residuals, chi2 = goal.residuals(trials)
         if len(probes):
@@ -243,7 +274,8 @@ class _Walk:
         k = int(np.argmin(chi2))
         if not chi2[k] < self.chi2:
             return False
-        self._take(trials[k], residuals[k], float(chi2[k]), jacobians[k] if k < len(jacobians) else None)
+        known = jacobian(k) if jacobian is not None and k < own else None
+        self._take(trials[k], residuals[k], float(chi2[k]), known)
         self.damping = float(np.clip(dampings[k % len(dampings)], 1e-4, 1e6))
         return True
 
@@ -257,10 +289,15 @@ class _Walk:
         self.u, self.r, self.chi2 = u, r, chi2
         if jacobian is not None:
             self.j = jacobian
-        elif self.dear and not self.goal.problem.eager and kept and np.isfinite(r).all():
+        elif self.dear and not self.goal.eager and kept and np.isfinite(r).all():
             self.j, self.fresh = _broyden(self.j, moved, before - r), False
         else:
             self.refresh()
+
+    def _foresee_bending(self, downhill: np.ndarray, hessian: np.ndarray) -> None:
+        """What a step asks for first if the one before has failed."""
+        trials = self.goal.steps(self.u, downhill, hessian, _WIDER * self.damping * _DAMPINGS)
+        self.goal.problem.foresee(self.goal.probes(self.u, trials))
 
     def try_again(self) -> bool:
         """After a failed step: a Jacobian of this place, then larger dampings; False where that is of no use."""
@@ -271,13 +308,13 @@ class _Walk:
         # where rows are dear, two rounds from Gauss-Newton to steepest descent are enough
         if self.damping > 1e8 or (self.failed > 1 and self.dear and self.damping >= 1.0):
             return False
-        self.damping, self.curved = self.damping * 1e2, True
+        self.damping, self.curved = self.damping * _WIDER, True
         return True
 
 
 def descend(
     goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, rival: Rival | float = np.inf,
-    known: tuple[np.ndarray, np.ndarray] | None = None,
+    known: tuple[np.ndarray, np.ndarray] | None = None, outdone: Callable[[Descent], bool] | None = None,
 ) -> Descent:  # fmt: skip
     """Levenberg-Marquardt from one start, all dampings of an iteration in one batch.
 
@@ -287,9 +324,15 @@ def descend(
     Args:
       goal: what is minimised. start: (coordinates,) where from. iterations: most steps. rival: what is to be caught.
       known: whitened residual (n,) and Jacobian (n, free) at the start, if they have been computed.
+      outdone: whether to leave, asked before every step with where it is.
+
+    Raises:
+      Outdone: it was left.
     """
     walk = _begin(goal, start, known)
     for _ in range(iterations):
+        if outdone is not None and outdone(walk.end()):
+            raise Outdone
         if not np.isfinite(walk.chi2):
             break
         downhill, hessian = goal.quadratic(walk.u, walk.r, walk.j)
@@ -306,7 +349,7 @@ def descend(
         walk.refresh()
     if np.isfinite(walk.chi2):
         walk.promise = goal.promise(walk.u, *goal.quadratic(walk.u, walk.r, walk.j))
-    return Descent(walk.u, walk.r, walk.j, walk.chi2, walk.promise)
+    return walk.end()
 
 
 def _begin(goal: Objective, start: np.ndarray, known: tuple[np.ndarray, np.ndarray] | None) -> _Walk:
@@ -314,9 +357,9 @@ def _begin(goal: Objective, start: np.ndarray, known: tuple[np.ndarray, np.ndarr
     u[goal.free] = np.clip(u[goal.free], goal.low, goal.high)
     if known is not None:
         return _Walk(goal, u, *known, float(goal.chi2(u[None], known[0][None])[0]))
-    if goal.problem.eager:
-        residuals, chi2, jacobians = goal.linearise(u[None])
-        return _Walk(goal, u, residuals[0], jacobians[0], float(chi2[0]))
+    if goal.eager:
+        residuals, chi2, jacobian = goal.linearise(u[None])
+        return _Walk(goal, u, residuals[0], jacobian(0), float(chi2[0]))
     residuals, chi2 = goal.residuals(u[None])
     finite = np.isfinite(chi2[0])
     j = goal.jacobian(u) if finite else np.zeros((residuals.shape[1], len(goal.free)))

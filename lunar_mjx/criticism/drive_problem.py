@@ -7,26 +7,28 @@ one batch, so that a Jacobian costs no program of its own (`jacfwd` through the 
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
-from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate, of_candidate
+from lunar_mjx.criticism.coordinates import Coordinate, of_candidate
+from lunar_mjx.criticism.drive_baseline import BASELINE, baseline_coordinates, usable
 from lunar_mjx.criticism.drive_noise import Noises
 from lunar_mjx.criticism.drive_nuisances import STEP_ERROR, direction, from_first, is_linear, nuisances
+from lunar_mjx.criticism.drive_observations import observations_of
 from lunar_mjx.criticism.drive_program import Rows
 from lunar_mjx.criticism.drive_runs import Bench
 from lunar_mjx.criticism.fitted import fitted_model
 from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.gather import Gather
 from lunar_mjx.criticism.inputs import FOLLOWS, SMOOTH, amplitude, smooth_inputs
-from lunar_mjx.criticism.observations import Observations, Series
-from lunar_mjx.criticism.problem import NotTested, Problem
-from lunar_mjx.criticism.slip_samples import defined
+from lunar_mjx.criticism.observations import Observations
+from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.simulated import Key, Simulated, keys_of_rows, stamp_of_observations
 from lunar_mjx.effects.base import Effect
-from lunar_mjx.effects.presets import PRESETS
 from lunar_mjx.model import Model
 
 if TYPE_CHECKING:
@@ -39,26 +41,8 @@ sign of its slip; a step this short rarely meets a jump, and rounding spoils onl
 STEP_CHI2 = 1.0
 """Squared whitened change by halving the time step, beyond its nuisances, from which these are taken anew at a fit."""
 
-BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
-    "soil": {
-        "k_phi": (0.3, 2.0), "n": (0.1, 2.0), "cohesion": (0.3, 2.0), "friction_angle": (0.1, 2.0),
-        "shear_modulus_x": (0.3, 2.0), "shear_modulus_y": (0.3, 2.0),
-    },
-    "penalty_contact": {"stiffness": (0.3, 2.0)},
-    "motor": {
-        "resistance": (0.05, 2.0), "torque_constant": (0.05, 2.0), "gear_efficiency": (0.1, 1.0),
-        "winding_capacity": (0.2, 2.0), "housing_capacity": (0.2, 2.0), "R_th1": (0.2, 2.0),
-    },
-    "housing_convection": {"R_th2": (0.3, 2.0)},
-    "housing_conduction": {"conductance": (0.3, 2.0)},
-}  # fmt: skip
-"""What a refit moves, by effect and parameter: scale as a share of the value, and prior standard deviation in scales:
-how well soil and motor are known before a drive."""
-
-NOT_MISSING = frozenset(
-    {"parking_brake", "payload", "tether", "hard_surface", "surface_type", "soil_gradient", "boulders"}
-)
-"""Effects that describe an arrangement of the test, which its user knows, and are never candidates by themselves."""
+SIMULATED = Simulated()
+"""What all problems of this process have simulated."""
 
 
 class DriveProblem(Problem):
@@ -94,18 +78,22 @@ class DriveProblem(Problem):
         self.logs, self.model = tuple(logs), model
         self._splits, self._baseline_spec, self._channels = dict(splits or {}), baseline, channels
         self._start: dict[str, float] = {}
-        self.effects, self.not_tested = _usable(model, candidates)
+        self.effects, self.not_tested = usable(model, candidates)
         self.progress = progress
         self.bench = Bench(model, self.logs, chunk, engine)
         self._batched = jax.default_backend() != "cpu"
+        self._together = max(1, self.bench.chunk // len(self.logs))
         # A program holds only the candidates that leave their null in it: fewer compile and run faster.
         self._benches: dict[frozenset[str], Bench] = {frozenset(): self.bench}
         self._focus: frozenset[str] = frozenset()
         self._gather: Gather | None = None
-        found = _baseline_coordinates(model, baseline)
+        self._foreseen: list[np.ndarray] = []
+        self._stamped: tuple[Observations | None, bytes] = None, b""
+        self._lock = threading.RLock()
+        found = baseline_coordinates(model, baseline)
         count = len(found)
         self._noises = Noises(self.logs)
-        self.observations = _observations(self.bench, self.logs, splits or {}, channels, self._noises)
+        self.observations = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
         self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self.observations.series)
         for number, run in enumerate(self.bench.runs):
             found += nuisances(number, run, self.observations)
@@ -167,7 +155,17 @@ class DriveProblem(Problem):
 
     def predict(self, u: np.ndarray) -> np.ndarray:
         rows = np.atleast_2d(u)
-        return self._predict(rows) if self._gather is None else self._gather(rows)
+        if self._gather is None:
+            return self._predict(rows)
+        with self._lock:
+            known = self._all_known(rows)
+        return self._predict(rows) if known else self._gather(rows)
+
+    def foresee(self, rows: np.ndarray, which: np.ndarray | None = None) -> None:
+        if self._batched:
+            blocks = [rows] if which is None else [self._difference_rows(row, which)[0] for row in rows]
+            with self._lock:
+                self._foreseen += blocks
 
     @contextlib.contextmanager
     def together(self, threads: int) -> Iterator[Callable[[], None]]:
@@ -178,16 +176,30 @@ class DriveProblem(Problem):
             self._gather = None
 
     def _predict(self, rows: np.ndarray) -> np.ndarray:
-        bench = self._bench_for(rows)
-        values = self._values(rows)
-        out = np.full((len(rows), len(self.observations)), np.nan)
-        for number, k, sampled in bench.run(len(rows), values, self.observations, self.progress):
-            out[k, self._of_log(number)] = sampled
-        out = from_first(out, self.observations)
+        with self._lock:
+            out = self._simulations(self._bench_for(rows), rows, self.progress)
         for i, c in enumerate(self.coordinates):
             if is_linear(c) and np.any(amount := c.value(rows[:, i])):
-                out += np.outer(amount, self._direction(c))
+                part = self._of_log(c.log_index)
+                out[:, part] += np.outer(amount, self._direction(c)[part])
         return out
+
+    def _all_known(self, rows: np.ndarray) -> bool:
+        """Whether nothing has to be simulated for these rows."""
+        return all(k in SIMULATED for k in self._keys(self._bench_for(rows), rows))
+
+    def _keys(self, bench: Bench, rows: np.ndarray) -> list[Key]:
+        """What a bench's simulation of each row depends on."""
+        acting = frozenset(e for params in bench.params for e in params.effects) | {"initial"}
+        which = [i for i, c in enumerate(self.coordinates) if c.effect in acting and not is_linear(c)]
+        names = [(c.effect, c.name, c.log_index, c.factor) for c in (self.coordinates[i] for i in which)]
+        table = np.stack([np.asarray(self.coordinates[i].value(rows[:, i]), float) for i in which], axis=1)
+        return keys_of_rows((*bench.stamp, self._sampled_at()), names, table)
+
+    def _sampled_at(self) -> bytes:
+        if self._stamped[0] is not self.observations:
+            self._stamped = self.observations, stamp_of_observations(self.observations)
+        return self._stamped[1]
 
     def _direction(self, c: Coordinate) -> np.ndarray:
         return direction(c, self.observations, self.step_error if c.name == STEP_ERROR else np.zeros(0))
@@ -208,10 +220,39 @@ class DriveProblem(Problem):
 
     def _simulated(self, bench: Bench, row: np.ndarray) -> np.ndarray:
         """(n,) what a bench predicts for one row of coordinates, without linear nuisances."""
-        out = np.full(len(self.observations), np.nan)
-        for number, _, sampled in bench.run(1, self._values(row), self.observations, silent):
-            out[self._of_log(number)] = sampled[0]
-        return from_first(out, self.observations)
+        with self._lock:
+            return self._simulations(bench, row, silent)[0]
+
+    def _simulations(self, bench: Bench, rows: np.ndarray, progress: Progress) -> np.ndarray:
+        """(k, n) what a bench predicts for rows of coordinates, without linear nuisances; simulated but once."""
+        keys = self._keys(bench, rows)
+        found = {k: row for k in dict.fromkeys(keys) if (row := SIMULATED.get(k)) is not None}
+        new = {k: n for n, k in enumerate(keys) if k not in found}
+        if new:
+            wanted = rows[list(new.values())]
+            for k, row in self._room_for(bench, wanted):
+                if k not in new and k not in SIMULATED:
+                    new[k] = len(wanted)
+                    wanted = np.concatenate([wanted, row[None]])
+            simulated = np.full((len(wanted), len(self.observations)), np.nan)
+            for number, k, sampled in bench.run(len(wanted), self._values(wanted), self.observations, progress):
+                simulated[k, self._of_log(number)] = sampled
+            simulated = from_first(simulated, self.observations)
+            for k, row in zip(new, simulated, strict=True):
+                SIMULATED.keep(k, row)
+                found[k] = row
+        return np.stack([found[k] for k in keys])
+
+    def _room_for(self, bench: Bench, rows: np.ndarray) -> Iterator[tuple[Key, np.ndarray]]:
+        """Foreseen rows, with their keys, that a bench simulates beside others at no cost; the others are forgotten."""
+        if bench not in self._benches.values():
+            return
+        room = -len(rows) % self._together
+        foreseen, self._foreseen = self._foreseen, []
+        for block in foreseen:
+            if len(block) <= room and self._active(block) <= frozenset(bench.model.effect_names):
+                room -= len(block)
+                yield from zip(self._keys(bench, block), block, strict=True)
 
     @contextlib.contextmanager
     def focused(self, effects: Sequence[str]) -> Iterator[None]:
@@ -223,10 +264,7 @@ class DriveProblem(Problem):
 
     def _bench_for(self, rows: np.ndarray) -> Bench:
         """The bench whose model holds every candidate that leaves its null in some row, and few others."""
-        null = np.zeros(len(self.coordinates))
-        active = frozenset(e for e, places in self.candidates.items() if np.any(rows[:, places] != null[places]))
-        if any(np.any(rows[:, places] != 0.0) for places in self.inputs.values()):
-            active |= {SMOOTH}
+        active = self._active(rows)
         fitting = [e for e in self._benches if active <= e]
         best = min(fitting, key=len, default=None)
         if active <= self._focus and (best is None or len(best) > len(self._focus)):
@@ -241,15 +279,22 @@ class DriveProblem(Problem):
             self._benches[best] = Bench(union, self.logs, self.bench.chunk, self.bench.engine)
         return self._benches[best]
 
-    def linearise(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _active(self, rows: np.ndarray) -> frozenset[str]:
+        """Candidates that leave their null in some row, with the unknown inputs as one."""
+        moved = {**self.candidates, SMOOTH: np.concatenate([np.zeros(0, int), *self.inputs.values()])}
+        return frozenset(e for e, places in moved.items() if np.any(rows[:, places] != 0.0))
+
+    def linearise(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, Callable[[int], np.ndarray]]:
         parts = [self._difference_rows(row, which) for row in u]
         values = self.predict(np.concatenate([rows for rows, _ in parts]))
         ends = np.cumsum([len(rows) for rows, _ in parts])
         pieces = np.split(values, ends[:-1])
-        return (
-            np.stack([p[0] for p in pieces]),
-            np.stack([self._quotients(p, which, steps) for p, (_, steps) in zip(pieces, parts, strict=True)]),
-        )
+        return np.stack([p[0] for p in pieces]), lambda k: self._quotients(pieces[k], which, parts[k][1])
+
+    def jacobian_and(self, u: np.ndarray, which: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        own, steps = self._difference_rows(u, which)
+        values = self.predict(np.concatenate([own, rows]))
+        return self._quotients(values[: len(own)], which, steps), values[len(own) :]
 
     def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
         """As in `Problem`; nuisances of different logs are perturbed together, since a log feels only its own."""
@@ -292,8 +337,7 @@ class DriveProblem(Problem):
         return out
 
     def _of_log(self, number: int) -> slice:
-        mine = [s for s in self.observations.series if s.log == number]
-        return slice(mine[0].start, mine[-1].stop) if mine else slice(0, 0)
+        return self.observations.of_log.get(number, slice(0, 0))
 
     def _values(self, rows: np.ndarray) -> Rows:
         return {
@@ -338,78 +382,3 @@ class DriveProblem(Problem):
                 size = float(along @ along)
                 change = change - (float(along @ whiten(own)) / size if size > 0.0 else 0.0) * known
         return change
-
-
-def _usable(model: Model, candidates: Mapping[str, Effect]) -> tuple[dict[str, Effect], tuple[NotTested, ...]]:
-    present = set(model.effect_names)
-    usable, refused = {}, []
-    for name, effect in candidates.items():
-        if name in present:
-            continue
-        if name in NOT_MISSING:
-            refused.append(NotTested(name, "describes the arrangement of a test, which its user knows"))
-        elif present & set(effect.replaces):
-            refused.append(NotTested(name, f"would replace {', '.join(sorted(present & set(effect.replaces)))}"))
-        elif all(p.null is None for p in effect.parameters.values()):
-            refused.append(NotTested(name, "has no null value"))
-        else:
-            usable[name] = effect
-    return usable, tuple(refused)
-
-
-def _baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[Coordinate]:
-    """Baseline parameters; one that differs between wheels or joints moves by a common factor."""
-    found = []
-    for effect in model.effects:
-        for name, (relative, prior) in baseline.get(effect.name, {}).items():
-            value = np.atleast_1d(np.asarray(model.parameters[effect.name][name], float))
-            p = effect.parameters[name]
-            if np.all(value > 0.0):
-                low, high = max(p.bounds[0] / value.min(), 1e-3), min(p.bounds[1] / value.max(), 1e3)
-                found.append(Coordinate(effect.name, name, 1.0, relative, low, high, True, prior, factor=True))
-        # Effects beyond the preset were added to explain measurements; they are refitted with the rest.
-        if effect.name not in PRESETS.get(model.preset, ()) and effect.name not in NOT_MISSING:
-            for name, p in effect.parameters.items():
-                value = np.asarray(model.parameters[effect.name][name], float)
-                if p.null is not None and value.ndim == 0:
-                    found.append(default_coordinate(effect, name, float(value), 0.3, 10.0))
-    return found
-
-
-def default_splits(logs: Sequence[Log]) -> list[str]:
-    """Splits of logs that state none: with four or more every fourth is held out, the first of these for selection."""
-    out = []
-    for i, log in enumerate(logs):
-        held = "select" if i % 8 == 3 else "test"
-        out.append(log.split or (held if len(logs) >= 4 and i % 4 == 3 else "fit"))
-    return out
-
-
-def _observations(
-    bench: Bench, logs: Sequence[Log], splits: Mapping[str, str], channels: Sequence[str] | None, noise: Noises
-) -> Observations:
-    value, series, unit, at = [], [], [], 0
-    default = default_splits(logs)
-    for number, (log, run) in enumerate(zip(logs, bench.runs, strict=True)):
-        for channel in bench.channels(number):
-            if channels is not None and channel not in channels:
-                continue
-            found = log.channel(channel)
-            if found is None:
-                continue
-            time, measured = found
-            inside = (time >= run.begin - 1e-9) & (time <= run.end + 1e-9) & defined(log, run, channel, time)
-            time, measured = time[inside], measured[inside]
-            if len(time) < 2:
-                continue
-            white, coloured, tau = noise(log, channel)
-            series.append(Series(number, channel, at, at + len(time), time, white, coloured, tau))
-            value.append(measured)
-            unit.append(np.full(len(time), number))
-            at += len(time)
-    names = tuple(log.name for log in logs)
-    split = tuple(splits.get(n, d) for n, d in zip(names, default, strict=True))
-    return Observations(
-        value=np.concatenate(value), series=tuple(series), logs=names, split=split,
-        unit=np.concatenate(unit), unit_split=split, unit_names=names,
-    )  # fmt: skip

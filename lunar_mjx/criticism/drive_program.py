@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,8 @@ SETTLE = 1.0
 """Least time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
 PIECE = 0.5
 """Length of the pieces in which logs are simulated, s. A time of standing between two of them is interpolated."""
+_FEWEST = 64
+"""Rovers that come back from the device at least; else the next power of two, for few programs."""
 STOOD = "stood"
 """Name of the time for which a rover had stood before a log, s."""
 
@@ -69,15 +72,18 @@ class Program:
             params, state, commands, self.every, self._axes(params, shared), chunk=commands.shape[0], one_body=True
         )
 
-    def _measure_all(self, params: Params, seen: Any, shared: bool) -> dict[str, Any]:
-        def channels(params: Params, seen: Any) -> dict[str, Any]:
+    def _measure_all(self, params: Params, seen: Any, shared: bool) -> Any:
+        def channels(params: Params, seen: Any) -> Any:
             found = measure(self.system, seen, params, self.imu if any(self.imu) else None).channels
-            return {c: found[c] for c in self.channels}
+            return jnp.stack([found[c] for c in self.channels])
 
         return jax.vmap(channels, (self._axes(params, shared), 0))(params, seen)
 
-    def __call__(self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows) -> dict[str, np.ndarray]:
-        """Channels (rovers, time) of rovers by their log (place in `logs`) and their row of `values`."""
+    def __call__(self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int) -> np.ndarray:
+        """(rovers, channels, time) of rovers by their log (place in `logs`) and their row of `values`.
+
+        The first `count` are wanted, and few beyond them come back from the device.
+        """
         params, start = logs.rovers(log, row, values)
         commands = logs.commands[log]
         self.compiled = True
@@ -92,7 +98,9 @@ class Program:
                 state, telemetry = self._drive(full, state, commands[:, at : at + self.segment], shared=shared)
                 seen.append(telemetry)
             whole = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *seen)
-            return {c: np.asarray(v) for c, v in self._measure(full, whole, shared=shared).items()}
+            found = self._measure(full, whole, shared=shared)
+            size = max(_FEWEST, 1 << (count - 1).bit_length())
+            return np.asarray(found if size >= len(log) else _first(found, size))
 
     def _stand(self, params: Params, state: Any, still: np.ndarray, stood: np.ndarray, shared: bool) -> Any:
         """Rovers that have stood for their own times (rovers,), s, at least `SETTLE`."""
@@ -105,6 +113,11 @@ class Program:
             after, _ = self._drive(params, now, still, shared=shared)
             kept, now = _between(kept, now, after, np.clip(pieces - k, 0.0, 1.0)), after
         return kept
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _first(found: Any, size: int) -> Any:
+    return found[:size]
 
 
 @jax.jit

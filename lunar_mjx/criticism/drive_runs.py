@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -14,8 +15,8 @@ import numpy as np
 from lunar_mjx.criticism.drive_program import SETTLE, STOOD, Logs, Program, Rows, cores, stack_logs
 from lunar_mjx.criticism.fitting import Progress
 from lunar_mjx.criticism.observations import Observations
-from lunar_mjx.dynamics.state import Params
-from lunar_mjx.dynamics.system import default_params
+from lunar_mjx.criticism.simulated import stamp
+from lunar_mjx.dynamics.state import Ambient, Params
 from lunar_mjx.effects.channels import EULER
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import ZERO_CELSIUS, Model
@@ -67,8 +68,7 @@ class Bench:
         self.logs, self.model, self.engine = tuple(logs), model, engine
         self.chunk = chunk or CHUNK.get(jax.default_backend(), 64)
         self.runs = _alike([log_run(log, model) for log in logs])
-        with jax.enable_x64(True):
-            self._params = [_nameless(default_params(run.model)) for run in self.runs]
+        self.params = [_params(run.model) for run in self.runs]
         self._stacked: list[Logs] | None = None
 
     def halved(self) -> Bench:
@@ -80,8 +80,14 @@ class Bench:
             dataclasses.replace(r, model=r.model.replace(timestep=0.5 * r.model.timestep), every=2 * r.every)
             for r in self.runs
         ]
-        other._params, other._stacked = self._params, None
+        other.params, other._stacked = self.params, None
         return other
+
+    @functools.cached_property
+    def stamp(self) -> tuple[Any, ...]:
+        """What all that it simulates depends on beside the rows: programs, and what the logs put into them."""
+        given = [(r.commands, dict(r.start), r.begin, r.end, r.every, r.imu_position) for r in self.runs]
+        return *(logs.program for logs in self._groups()), stamp(self.params, given)
 
     def channels(self, number: int) -> list[str]:
         """Channels of a log that the model gives, in a fixed order."""
@@ -91,7 +97,7 @@ class Bench:
     def _program(self, number: int) -> Program:
         run = self.runs[number]
         wanted = tuple(sorted({c for n in range(len(self.runs)) for c in self.channels(n)}))
-        shapes = tuple((a.shape, str(a.dtype)) for a in jax.tree.leaves(self._params[number].terrain))
+        shapes = tuple((a.shape, str(a.dtype)) for a in jax.tree.leaves(self.params[number].terrain))
         modes, gains = (tuple(sorted(d.items())) for d in (run.model.modes, run.model.gains))
         model = run.model
         key = (
@@ -112,15 +118,16 @@ class Bench:
                 program = self._program(number)
                 groups.setdefault((id(program), program.length(len(run.commands))), []).append(number)
             self._stacked = [
-                stack_logs(self._program(n[0]), n, [self.runs[i] for i in n], [self._params[i] for i in n])
+                stack_logs(self._program(n[0]), n, [self.runs[i] for i in n], [self.params[i] for i in n])
                 for n in groups.values()
             ]
         return self._stacked
 
     def run(
         self, rows: int, values: Rows, observations: Observations, progress: Progress
-    ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    ) -> Iterator[tuple[int, slice, np.ndarray]]:
         """Simulates all logs with all rows and yields (log, rows, (rows, samples) of the log's observations)."""
+        places = _places(self.runs, observations)
         done = 0
         for logs in self._groups():
             jobs = np.stack(np.meshgrid(np.arange(len(logs.numbers)), np.arange(rows), indexing="ij"), -1).reshape(
@@ -128,20 +135,23 @@ class Bench:
             )
             parts = [jobs[at : at + self.chunk] for at in range(0, len(jobs), self.chunk)]
             for part, signals in zip(parts, self._signals(logs, parts, values), strict=True):
-                for log in np.unique(part[:, 0]):
-                    mine = np.flatnonzero(part[:, 0] == log)
-                    number = logs.numbers[log]
-                    chosen = {c: v[mine] for c, v in signals.items()}
-                    yield number, part[mine, 1], self._sample(number, chosen, observations)
+                edges = np.searchsorted(part[:, 0], np.arange(len(logs.numbers) + 1))
+                for number, low, high in zip(logs.numbers, edges[:-1], edges[1:], strict=True):
+                    if low < high:
+                        sampled = _sample(signals[low:high], logs.program.channels, places[number], observations.value)
+                        yield number, slice(part[low, 1], part[high - 1, 1] + 1), sampled
                 done += len(part)
                 progress("simulating", done / (rows * len(self.runs)))
 
-    def _signals(self, logs: Logs, parts: Sequence[np.ndarray], values: Rows) -> Iterator[dict[str, np.ndarray]]:
-        """Channels of every part in turn; on a CPU one part per core at a time, as XLA runs a loop on one core."""
+    def _signals(self, logs: Logs, parts: Sequence[np.ndarray], values: Rows) -> Iterator[np.ndarray]:
+        """Signals (rovers, channels, time) of every part in turn.
 
-        def one(part: np.ndarray) -> dict[str, np.ndarray]:
+        On a CPU one part per core at a time, as XLA runs a loop on one core.
+        """
+
+        def one(part: np.ndarray) -> np.ndarray:
             full = np.concatenate([part, np.repeat(part[-1:], self.chunk - len(part), axis=0)])
-            return logs.program(logs, full[:, 0], full[:, 1], values)
+            return logs.program(logs, full[:, 0], full[:, 1], values, len(part))
 
         workers = cores() if jax.default_backend() == "cpu" else 1
         if workers < 2 or len(parts) < 2 or not logs.program.compiled:
@@ -151,26 +161,61 @@ class Bench:
             with concurrent.futures.ThreadPoolExecutor(max(workers, 1)) as pool:
                 yield from pool.map(one, parts)
 
-    def _sample(self, number: int, signals: Mapping[str, np.ndarray], observations: Observations) -> np.ndarray:
-        run = self.runs[number]
-        step = run.every * run.model.timestep
-        parts = []
-        for s in observations.series:
-            if s.log != number:
-                continue
-            values = signals[s.channel]
-            assert s.time is not None
-            place = (s.time - run.begin) / step
-            low = np.clip(np.floor(place).astype(int), 0, values.shape[1] - 2)
-            share = place - low
-            if s.channel in EULER:
-                values = np.rad2deg(np.unwrap(np.deg2rad(values), axis=1))
-            sampled = values[:, low] * (1.0 - share) + values[:, low + 1] * share
-            if s.channel in EULER:
-                measured = observations.value[s.start : s.stop]
-                sampled = measured + (sampled - measured + 180.0) % 360.0 - 180.0
-            parts.append(sampled)
-        return np.concatenate(parts, axis=1) if parts else np.zeros((len(next(iter(signals.values()))), 0))
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Place:
+    """Series of one log that are sampled at the same times.
+
+    Attributes:
+      channels: their names. euler: whether they are angles that jump.
+      low, share: (samples,) simulated sample before each time, and how far on towards the next one it is.
+      begin, parts: where the log's observations begin, and (start, stop) of each series among all observations.
+    """
+
+    channels: list[str]
+    euler: bool
+    low: np.ndarray
+    share: np.ndarray
+    begin: int
+    parts: list[tuple[int, int]]
+
+
+def _places(runs: Sequence[LogRun], observations: Observations) -> list[list[_Place]]:
+    """By log, where its observations lie among the simulated samples."""
+    found: list[dict[tuple[bytes, bool], _Place]] = [{} for _ in runs]
+    begin: dict[int, int] = {}
+    for s in observations.series:
+        assert s.time is not None
+        run, key = runs[s.log], (s.time.tobytes(), s.channel in EULER)
+        begin.setdefault(s.log, s.start)
+        if key not in found[s.log]:
+            # a logger's clock that ticks with the simulation's, but for rounding, meets samples and nothing between
+            place = np.round((s.time - run.begin) / (run.every * run.model.timestep), 9)
+            low = np.clip(np.floor(place).astype(int), 0, len(run.commands) - 1)
+            found[s.log][key] = _Place([], key[1], low, place - low, begin[s.log], [])
+        found[s.log][key].channels.append(s.channel)
+        found[s.log][key].parts.append((s.start, s.stop))
+    return [list(groups.values()) for groups in found]
+
+
+def _sample(signals: np.ndarray, names: Sequence[str], places: Sequence[_Place], measured: np.ndarray) -> np.ndarray:
+    """(rovers, samples) of one log's observations from its (rovers, channels, time) signals."""
+    count = sum(len(p.low) * len(p.channels) for p in places)
+    out = np.empty((len(signals), count))
+    for p in places:
+        values = signals[:, [names.index(c) for c in p.channels]]
+        if p.euler:
+            values = np.rad2deg(np.unwrap(np.deg2rad(values), axis=2))
+        sampled = values[:, :, p.low]
+        if np.any(p.share):
+            after = np.minimum(p.low + 1, values.shape[2] - 1)
+            sampled = sampled * (1.0 - p.share) + values[:, :, after] * p.share
+        for k, (start, stop) in enumerate(p.parts):
+            one = sampled[:, k]
+            if p.euler:
+                one = measured[start:stop] + (one - measured[start:stop] + 180.0) % 360.0 - 180.0
+            out[:, start - p.begin : stop - p.begin] = one
+    return out
 
 
 def _alike(runs: Sequence[LogRun]) -> list[LogRun]:
@@ -186,9 +231,20 @@ def _alike(runs: Sequence[LogRun]) -> list[LogRun]:
     return out
 
 
-def _nameless(params: Params) -> Params:
-    """Parameters whose terrain has no name, which would make programs of their own."""
-    return jax.tree.map(np.asarray, dataclasses.replace(params, terrain=dataclasses.replace(params.terrain, name="")))
+def _params(model: Model) -> Params:
+    """As `default_params`, in NumPy: a thousand single numbers, none of which is worth a way to a GPU and back.
+
+    The terrain has no name, which would make programs of their own.
+    """
+    effects = {e.name: {k: np.asarray(v, float) for k, v in model.parameters[e.name].items()} for e in model.effects}
+    terrain = jax.tree.map(_array, dataclasses.replace(model.terrain, name=""))
+    return Params(np.asarray(model.gravity, float), Ambient(*(np.asarray(v, float) for v in model.ambient)), effects,
+                  terrain)  # fmt: skip
+
+
+def _array(leaf: Any) -> np.ndarray:
+    array = np.asarray(leaf)
+    return array.astype(float) if np.issubdtype(array.dtype, np.floating) else array
 
 
 def _modelled(model: Model) -> frozenset[str]:

@@ -111,6 +111,7 @@ class Memory:
         for i in free:
             u[i] = entry["u"][problem.coordinates[i].key]
         goal = Objective(problem, free, problem.observations.in_split("fit"))
+        problem.foresee(u[None], free)
         residual, chi2 = goal.residuals(u[None])
         # elsewhere than it was: the physics is another by now, and the certificate is not its own
         if not abs(chi2[0] - entry.get("chi2", np.nan)) <= 1.0 + _KEPT * abs(chi2[0]):
@@ -153,23 +154,38 @@ class Memory:
 
 def _with_own_nuisances(goal: Objective, best: Descent) -> Descent:
     """Fits the starts of logs that are held out to these logs themselves; what all logs share stays where it is."""
+    u = _own_place(goal, best)
+    if u is None:
+        return best
+    residual = goal.residuals(u[None])[0][0]
+    return dataclasses.replace(best, u=u, residual=residual) if np.isfinite(residual).all() else best
+
+
+def foreseen_fit(goal: Objective, at: Descent) -> Fit:
+    """The fit that a descent would give here, held-out logs fitted to themselves by linear theory."""
+    u = _own_place(goal, at)
+    residual = at.residual if u is None else at.residual - at.jacobian @ (u - at.u)[goal.free]
+    return Fit(at.u if u is None else u, goal.free, at.chi2, residual, at.jacobian, goal.fitted, at.promise)
+
+
+def _own_place(goal: Objective, best: Descent) -> np.ndarray | None:
+    """(coordinates,) where that is; None where there is nothing to fit."""
     problem = goal.problem
     held = {n for n, split in enumerate(problem.observations.split) if split != "fit"}
     own = np.array([problem.coordinates[i].log_index in held for i in goal.free])
     if not own.any() or not np.isfinite(best.chi2):
-        return best
+        return None
     rows = ~goal.fitted
     prior, scale = problem.prior_rows(best.u, goal.free)
     j = best.jacobian[rows][:, own]
     r = best.residual[rows]
     if not np.isfinite(r).all():
-        return best
+        return None
     u = best.u.copy()
     at = goal.free[own]
     step = np.linalg.lstsq(j.T @ j + np.diag(scale[own] ** 2), j.T @ r - scale[own] * prior[own], rcond=None)[0]
     u[at] = np.clip(u[at] + step, goal.low[own], goal.high[own])
-    residual = goal.residuals(u[None])[0][0]
-    return dataclasses.replace(best, u=u, residual=residual) if np.isfinite(residual).all() else best
+    return u
 
 
 def fit(
@@ -185,6 +201,8 @@ def fit(
     rival: Rival | float = np.inf,
     known: tuple[np.ndarray, np.ndarray] | None = None,
     half_step: float = HALF_STEP,
+    eager: bool = False,
+    outdone: Callable[[Descent], bool] | None = None,
 ) -> Fit:
     """Fits coordinates to the observations of some splits.
 
@@ -201,20 +219,28 @@ def fit(
       rival: chi-square that another model reaches: a fit that cannot is left unfinished where fits are dear.
       known: whitened residual (n,) and Jacobian (n, free) at the start, if they have been computed.
       half_step: largest change of chi-square by halving the time step.
+      eager: takes Jacobians with the residuals, as where rows cost nothing.
+      outdone: whether to leave, asked before every step of the first descent with where it is.
 
     Returns:
       The best fit, with its certificate.
+
+    Raises:
+      Outdone: it was left.
     """
     fitted = problem.observations.in_split(*splits)
-    goal = Objective(problem, free, fitted)
+    goal = Objective(problem, free, fitted, eager)
     origin = problem.origin() if start is None else np.asarray(start, float)
+    progress("fitting", 0.0)
     others = _other_starts(problem, free, origin, starts - 1, seed, spread, goal)
-    lowest, chi2s = _descents(goal, origin, others, rival, known, progress)
+    first = descend(goal, origin, rival=rival, known=known, outdone=outdone)
+    _foresee_end(goal, first, certify)
+    lowest, chi2s = _lowest(goal, first, origin, others, progress)
     best = _with_own_nuisances(goal, lowest)
     edge = _at_bound(problem, goal, best)
     extra = dict(problem.certificate(best.u, free)) if certify and np.isfinite(best.chi2) else {}
     count = int(fitted.sum())
-    if certify and np.isfinite(best.chi2) and not problem.cheap_jacobian and best.promise > SMALL_GRADIENT:
+    if certify and _asks_roughness(goal, best):
         extra["roughness_chi2"] = goal.roughness(lowest.u, lowest.residual, lowest.jacobian)
     agreeing = sum(c <= best.chi2 + same_chi2(best.chi2, count) for c in chi2s)
     problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra, half_step)
@@ -224,13 +250,24 @@ def fit(
     )  # fmt: skip
 
 
-def _descents(
-    goal: Objective, origin: np.ndarray, others: np.ndarray, rival: Rival | float,
-    known: tuple[np.ndarray, np.ndarray] | None, progress: Progress,
-) -> tuple[Descent, tuple[float, ...]]:  # fmt: skip
+def _asks_roughness(goal: Objective, best: Descent) -> bool:
+    return np.isfinite(best.chi2) and not goal.problem.cheap_jacobian and best.promise > SMALL_GRADIENT
+
+
+def _foresee_end(goal: Objective, first: Descent, certify: bool) -> None:
+    """What will be asked for if no other start descends further."""
+    own = _own_place(goal, first) if goal.problem.eager else None
+    if own is not None:
+        goal.problem.foresee(own[None])
+    if goal.problem.eager and certify and _asks_roughness(goal, first):
+        goal.foresee_roughness(first.u, first.residual, first.jacobian)
+
+
+def _lowest(
+    goal: Objective, first: Descent, origin: np.ndarray, others: np.ndarray, progress: Progress
+) -> tuple[Descent, tuple[float, ...]]:
     """The lowest descent, and the chi-square of every start; where rows are dear, other starts chase the first."""
-    progress("fitting", 0.0)
-    found, ends = [descend(goal, origin, rival=rival, known=known)], []
+    found, ends = [first], []
     if goal.problem.cheap_jacobian:
         for i, other in enumerate(others):
             progress("fitting", (i + 1) / (len(others) + 1))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -85,6 +86,14 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.value)
+
+    @functools.cached_property
+    def of_log(self) -> Mapping[int, slice]:
+        """Where each log's observations lie."""
+        found: dict[int, slice] = {}
+        for s in self.series:
+            found[s.log] = slice(found[s.log].start if s.log in found else s.start, s.stop)
+        return found
 
     def in_split(self, *splits: str) -> np.ndarray:
         """(n,) which observations belong to one of the splits."""

@@ -84,9 +84,20 @@ class Problem(abc.ABC):
           (n, m), in the channels' units per unit of the coordinate.
         """
 
-    def linearise(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predictions (k, n) and Jacobians (k, n, m) at (k, coordinates) at once."""
-        return self.predict(u), np.stack([self.jacobian(row, which) for row in u])
+    def linearise(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, Callable[[int], np.ndarray]]:
+        """Predictions (k, n) at (k, coordinates), and the Jacobians (n, m) there by number, simulated at once."""
+        return self.predict(u), lambda k: self.jacobian(u[k], which)
+
+    def jacobian_and(self, u: np.ndarray, which: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives (n, m) at (coordinates,), and predictions (k, n) at (k, coordinates), simulated at once."""
+        return self.jacobian(u, which), self.predict(rows)
+
+    def foresee(self, rows: np.ndarray, which: np.ndarray | None = None) -> None:
+        """Rows (k, coordinates), with Jacobians if `which` is given, that will be asked for soon.
+
+        A problem whose rows cost nothing beside others takes them along with its next simulation.
+        """
+        del rows, which
 
     @contextlib.contextmanager
     def focused(self, effects: Sequence[str]) -> Iterator[None]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.descent import Rival
-from lunar_mjx.criticism.fitting import Fit, Memory, fit
+from lunar_mjx.criticism.descent import Descent, Objective, Outdone, Rival
+from lunar_mjx.criticism.fitting import Fit, Memory, fit, foreseen_fit
 from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
 from lunar_mjx.criticism.patterns import Pattern
 from lunar_mjx.criticism.problem import Problem
@@ -94,51 +95,63 @@ class Candidate:
 def refit_all(
     problem: Problem, parent: Candidate, new: Sequence[Score], settings: Settings, memory: Memory
 ) -> list[Candidate]:
-    """Refits the parent with each of the new effects.
+    """Refits the parent with each of the new effects, the best first; others only as far as they may still rival it.
 
-    Where rows are free, all refits share their batches, until one reaches the noise and others fall far short.
-    Where they are dear, the best is refitted first, and others only as far as they may still rival it.
+    Where rows are free, all refits begin together and share their batches. Only the best takes Jacobians with its
+    residuals: it is the one that may end the others.
     """
-
     scans = scan(problem, parent.fit, parent.effects, new)
     new = sorted(new, key=lambda s: scans[s.effect][0] if s.effect in scans else parent.fit.chi2 - s.chi2)
 
-    def one(s: Score, rival: Rival | float = np.inf) -> Candidate:
+    def one(s: Score, rival: Rival | float = np.inf, **how: Any) -> Candidate:
         chi2, start = scans.get(s.effect, (np.inf, None))
         better = chi2 < parent.fit.chi2 - s.chi2
-        return refit(problem, parent, (*parent.effects, s.effect), s, memory, rival, start if better else None)
+        return refit(problem, parent, (*parent.effects, s.effect), s, memory, rival, start if better else None, **how)
+
+    def beaten(s: Score, reached: float) -> bool:
+        """Whether an effect falls far short of one that reaches the noise."""
+        promised = max(s.chi2, parent.fit.chi2 - scans.get(s.effect, (np.inf, None))[0])
+        return promised < _RIVAL * (parent.fit.chi2 - reached)
 
     if not problem.eager or len(new) < 2:
         grown: list[Candidate] = []
         for s in new:
-            # What falls far short of one that reaches the noise is not refitted, or left soon.
             reached = min((c.fit.chi2 for c in grown if c.noise.passes), default=np.inf)
-            promised = max(s.chi2, parent.fit.chi2 - scans.get(s.effect, (np.inf, None))[0])
-            if problem.cheap_jacobian or not promised < _RIVAL * (parent.fit.chi2 - reached):
+            if problem.cheap_jacobian or not beaten(s, reached):
                 grown.append(one(s, reached + settings.same))
         return grown
     with problem.together(len(new)) as leave:
         rival = Rival()
 
-        def tracked(s: Score) -> Candidate:
+        def lead(at: Descent) -> bool:
+            goal = Objective(problem, problem.free((*parent.effects, new[0].effect)), parent.fit.fitted)
+            if noise_test(problem, foreseen_fit(goal, at)).passes:
+                rival.lower(at.chi2 + settings.same)
+            return False
+
+        def tracked(s: Score) -> Candidate | None:
+            first = s is new[0]
             try:
-                found = one(s, rival)
+                outdone = lead if first else lambda _: beaten(s, rival.chi2 - settings.same)
+                found = one(s, rival, eager=first, outdone=outdone)
                 if found.noise.passes:
                     rival.lower(found.fit.chi2 + settings.same)
                 return found
+            except Outdone:
+                return None
             finally:
                 leave()
 
         with concurrent.futures.ThreadPoolExecutor(len(new)) as pool:
-            return list(pool.map(tracked, new))
+            return [c for c in pool.map(tracked, new) if c is not None]
 
 
 def refit(
     problem: Problem, parent: Candidate, effects: tuple[str, ...], scored: Score | None, memory: Memory,
-    rival: Rival | float = np.inf, start: np.ndarray | None = None,
+    rival: Rival | float = np.inf, start: np.ndarray | None = None, **how: Any,
 ) -> Candidate:  # fmt: skip
     """Refits from a start; without one from the parent with the new effect at its linear estimate, and from a third of
-    it where that fails."""
+    it where that fails; `how` are further arguments of `fit`."""
     free = problem.free(effects)
     found = memory.recall(problem, effects)
     if found is not None:
@@ -146,11 +159,11 @@ def refit(
         return Candidate(effects, found, noise_test(problem, found), value, se)
     places = [i for i in problem.candidates[effects[-1]] if problem.coordinates[i].amplitude]
     if start is not None:
-        found = fit(problem, free, start, starts=1, certify=False, rival=rival)
+        found = fit(problem, free, start, starts=1, certify=False, rival=rival, **how)
     elif scored is not None and scored.columns is not None and not problem.cheap_jacobian:
         # The score has taken all derivatives at the parent's fit: the first step costs nothing.
         known = parent.fit.residual, _joined(problem, parent.fit, free, places, scored.columns)
-        found = fit(problem, free, parent.fit.u, starts=1, certify=False, rival=rival, known=known)
+        found = fit(problem, free, parent.fit.u, starts=1, certify=False, rival=rival, known=known, **how)
     else:
         for share in (1.0, 0.3) if scored is not None else (0.0,):
             near = parent.fit.u.copy()

@@ -173,16 +173,16 @@ def signatures(problem: Problem, fit: Fit, names: Sequence[str], inputs: Sequenc
     which = np.array([i for places in amplitudes.values() for i in places], int)
     if not len(which):
         return {}
-    columns = problem.jacobian(fit.u, which)
+    tested = which[: sum(len(amplitudes[e]) for e in names)]
+    if problem.eager:
+        columns, values = problem.jacobian_and(fit.u, which, _secant_rows(problem, fit, tested))
+    else:
+        columns, values = problem.jacobian(fit.u, which), None
     columns = np.where(np.isfinite(columns), columns, 0.0)
-    tested = sum(len(amplitudes[e]) for e in names)
-    dead = [k for k in range(tested) if np.linalg.norm(columns[:, k]) < _TINY]
+    dead = [k for k in range(len(tested)) if np.linalg.norm(columns[:, k]) < _TINY]
     if dead:
-        rows = np.repeat(fit.u[None], len(dead) + 1, axis=0)
-        for n, k in enumerate(dead):
-            low, high = problem.coordinates[which[k]].bounds()
-            rows[n + 1, which[k]] = 1.0 if high >= 1.0 else max(-1.0, low)
-        values = problem.predict(rows)
+        rows = _secant_rows(problem, fit, tested[dead])
+        values = problem.predict(rows) if values is None else values[[0, *(k + 1 for k in dead)]]
         for n, k in enumerate(dead):
             difference = (values[n + 1] - values[0]) / rows[n + 1, which[k]]
             columns[:, k] = np.where(np.isfinite(difference), difference, 0.0)
@@ -192,6 +192,15 @@ def signatures(problem: Problem, fit: Fit, names: Sequence[str], inputs: Sequenc
         out[e] = white[:, at : at + len(places)]
         at += len(places)
     return out
+
+
+def _secant_rows(problem: Problem, fit: Fit, which: np.ndarray) -> np.ndarray:
+    """(1 + m, coordinates) the fit, and each of some amplitudes there at its nominal size."""
+    rows = np.repeat(fit.u[None], len(which) + 1, axis=0)
+    for n, i in enumerate(which):
+        low, high = problem.coordinates[i].bounds()
+        rows[n + 1, i] = 1.0 if high >= 1.0 else max(-1.0, low)
+    return rows
 
 
 def score(problem: Problem, fit: Fit, found: Mapping[str, np.ndarray], draws: int = 2000, seed: int = 0) -> list[Score]:

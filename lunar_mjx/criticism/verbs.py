@@ -83,6 +83,7 @@ def _compare(run: Run, progress: Progress) -> Run:
     # All candidates are in the problem from the start: `why` then shares the program that is compiled here.
     problem = build_problem(run, campaign, progress=progress)
     memory = _memory(run)
+    problem.foresee(problem.origin()[None], problem.free())
     start = whitened_residuals(problem, problem.origin()[None])[0]
     fitted = fit_baseline(problem, Settings(seed=run.seed), memory, progress)
     run.save(COMPARISON_FILE, comparison(problem, start, fitted))
@@ -155,8 +156,9 @@ def _parameter_table(problem: Problem, fitted: Fit) -> dict[str, Any]:
     """Fitted values and standard deviations by effect and name, with units and the values that the model came with."""
     moved = [problem.coordinates[i] for i in fitted.free if problem.coordinates[i].log_index < 0]
     table: dict[str, Any] = {}
+    covariance = fitted.covariance(problem)
     for effect in dict.fromkeys(c.effect for c in moved):
-        value, std = parameters(problem, fitted, effect)
+        value, std = parameters(problem, fitted, effect, covariance)
         mine = [c for c in moved if c.effect == effect]
         table[effect] = {
             "value": value, "std": std, "given": {c.name: c.start for c in mine},
@@ -189,8 +191,9 @@ def _save_signatures(run: Run, found: Search) -> None:
 
 def _save_series(run: Run, problem: Problem, start: np.ndarray, fits: Mapping[str, Fit]) -> None:
     """Measured and predicted series for the report, as `series.npz` (arrays only, no pickle)."""
-    rows = [problem.origin(), *(f.u for f in fits.values())]
-    predicted = problem.predict(np.array(rows))
+    rows = np.array([problem.origin(), *(f.u for f in fits.values())])
+    # those of drives have been simulated, each with the effects that it has
+    predicted = problem.predict(rows) if problem.cheap_jacobian else np.concatenate([problem.predict(r) for r in rows])
     observations = problem.observations
     place = observations.place if observations.place is not None else np.zeros((0, 3))
     time = np.concatenate(
@@ -229,6 +232,7 @@ def why(
     except BadData as bad:
         return bad.diagnosis
     problem = build_problem(run, campaign, only, progress)
+    problem.foresee(problem.origin()[None])
     diagnosis, found = diagnose(problem, settings, progress, _memory(run))
     if diagnosis.verdict is not Verdict.BAD_FIT:
         from lunar_mjx.criticism.localise import localise

@@ -108,3 +108,31 @@ def test_z_of_overwhelming_evidence_is_a_number():
     z = _to_z(np.array([4.0, 500.0, 1e3, 1e4, 1e8]), 2)
     assert np.all(np.isfinite(z)) and np.all(np.diff(z) > 0.0)
     assert z[-1] == pytest.approx(1e4, rel=1e-3)
+
+
+class _Bent(Linear):
+    """One candidate that acts by its square."""
+
+    def predict(self, u):
+        u = np.atleast_2d(u).copy()
+        u[:, 1] = u[:, 1] ** 2
+        return super().predict(u)
+
+    def jacobian(self, u, which):
+        return self.matrix[:, which] * np.where(np.array(which) == 1, 2.0 * u[1], 1.0)
+
+
+class _Eager(_Bent):
+    eager = True
+
+
+def test_secants_are_the_same_whether_taken_beside_the_derivatives_or_after():
+    x = np.linspace(0.0, 1.0, 60)
+    found = []
+    for kind in (_Bent, _Eager):
+        problem = kind(np.ones((60, 1)), {"square": x, "plain": x**2}, manoeuvres(3, 20))
+        base = fit(problem, problem.free(), starts=1)
+        found.append(signatures(problem, base, ["square", "plain"]))
+    assert np.array_equal(found[0]["square"][:, 0], x)
+    for name, columns in found[0].items():
+        assert np.array_equal(columns, found[1][name])
