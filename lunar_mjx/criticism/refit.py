@@ -22,6 +22,8 @@ _RIVAL = 0.8
 rivals of Coulomb friction in two campaigns eight took off what was promised within 3 % of that effect's share; gravity
 took off 14 % more, grousers nothing.)"""
 
+_MOSTLY = 0.5
+"""Share of the excess over the noise that a refit leaves at most which explains most of it."""
 _RENEWALS = 2
 """Times that the error of the time step is taken anew at most: at a fit with an error of its own it is nearly right."""
 
@@ -182,9 +184,27 @@ def refit(
         if found is None or trial.chi2 < found.chi2:
             found = trial
     assert found is not None
+    if not problem.cheap_jacobian and _strayed(parent.fit, found, rival):
+        given = problem.origin()
+        for e in effects:
+            given[problem.candidates[e]] = found.u[problem.candidates[e]]
+        trial = fit(problem, free, given, starts=1, certify=False, rival=rival)
+        if trial.chi2 < found.chi2:
+            found = trial
     memory.keep(problem, effects, found)
     value, se = gain(problem, parent.fit, found)
     return Candidate(effects, found, noise_test(problem, found), value, se)
+
+
+def _strayed(parent: Fit, found: Fit, rival: Rival | float) -> bool:
+    """Whether a refit that explains most ended where it has no certificate, and may do better.
+
+    A baseline that misfits may have gone far along a valley, from where the way back is long.
+    """
+    count = float(found.fitted.sum())
+    explains = found.chi2 - count < _MOSTLY * max(parent.chi2 - count, 0.0)
+    reached = rival.chi2 if isinstance(rival, Rival) else rival
+    return bool(found.problems) and explains and found.chi2 - 4.0 * found.gradient < reached
 
 
 def with_own_step_error(problem: Problem, candidate: Candidate) -> Candidate:
