@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -101,7 +102,10 @@ def simulate(
     rover: Annotated[str, typer.Option(help="Name of a shipped rover, or folder of one.")] = "viper",
     manoeuvre: Annotated[str, typer.Option(help="Canned manoeuvre, or TOML file of one.")] = "speed_staircase",
     effect: Annotated[
-        list[str] | None, typer.Option(help="Hidden effect, as NAME or NAME:parameter=value,parameter=value.")
+        list[str] | None,
+        typer.Option(
+            help="Hidden effect, as NAME or NAME:parameter=value,parameter=value; NAME may be my_effects.py:name."
+        ),
     ] = None,
     effects: Annotated[
         list[str] | None, typer.Option(help="Hidden effect from your own file, as my_effects.py:name.")
@@ -139,8 +143,9 @@ def simulate(
 
 
 def _effect(text: str) -> tuple[str, dict[str, float]]:
-    """NAME:parameter=value,... as a name and its values."""
-    name, _, rest = text.partition(":")
+    """NAME:parameter=value,... or my_effects.py:name:parameter=value,... as a name and its values."""
+    own = re.fullmatch(r"(.+\.py:\w+)(?::(.*))?", text)
+    name, rest = (own[1], own[2] or "") if own else text.partition(":")[::2]
     return name, _numbers("--effect", rest.split(",") if rest else [])
 
 

@@ -11,6 +11,7 @@ import pytest
 from cli_harness import Run
 from log_files import make_log
 
+from lunar_mjx.commands.log import _effect
 from lunar_mjx.criticism.log import check, new_log, read_log
 from lunar_mjx.criticism.log import simulate as module
 
@@ -124,3 +125,16 @@ def test_seal_and_unseal(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_the_list_of_manoeuvres(run: Run) -> None:
     result = run("log", "manoeuvres")
     assert result.status == 0 and "speed_staircase" in result.out and "crab_and_plough" in result.out
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "values"),
+    [
+        ("iron_loss", "iron_loss", {}),
+        ("iron_loss:coefficient=1e-6", "iron_loss", {"coefficient": 1e-6}),
+        ("mine.py:churn", "mine.py:churn", {}),
+        ("a folder/mine.py:churn:amount=8,speed=0.5", "a folder/mine.py:churn", {"amount": 8.0, "speed": 0.5}),
+    ],
+)
+def test_a_hidden_effect_may_be_a_users_own_with_values(text: str, name: str, values: dict[str, float]) -> None:
+    assert _effect(text) == (name, values)
