@@ -261,6 +261,8 @@ class _Walk:
         if self.curved:
             bent, probes, ahead = goal.bent(self.u, self.r, self.j, hessian, trials, dampings)
             trials = np.concatenate([trials, bent])
+            if goal.eager and np.min(short := goal.chi2(probes, ahead)) < self.chi2:
+                goal.problem.foresee(probes[[int(np.argmin(short))]], goal.free)
         jacobian, own = None, len(trials)
         if goal.eager:
             if not self.curved:
