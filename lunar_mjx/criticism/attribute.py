@@ -87,8 +87,9 @@ def certify(problem: Problem, found: Search, settings: Settings) -> Fit:
                and len(c.effects) == len(chosen.effects) - 1]  # fmt: skip
     least = min(without, default=found.base.fit.chi2) - chosen.fit.chi2
     free = problem.free(chosen.effects)
+    same = np.array_equal(free, chosen.fit.free) and problem.kept_step_error() is chosen.fit.step_error
     # what held-out logs' own nuisances have moved since is of no account: a step heeds the fitted logs alone
-    known = (chosen.fit.residual, chosen.fit.jacobian) if np.array_equal(free, chosen.fit.free) else None
+    known = (chosen.fit.residual, chosen.fit.jacobian) if same else None
     with problem.focused(chosen.effects):
         return fit(problem, free, chosen.fit.u, settings.starts, settings.seed, spread=0.5,
                    known=None if problem.cheap_jacobian else known,

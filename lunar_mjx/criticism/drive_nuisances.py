@@ -16,11 +16,19 @@ if TYPE_CHECKING:
 
 STEP_ERROR = "step_error"
 """Name of the nuisance by which a log differs from what steps of finite length predict."""
+_COUNTED = re.compile(r"position|angle|yaw")
+"""What another pose at the start moves as a whole."""
 _ENCODER = re.compile(r"joint_\w*drive_angle_rad")
 _START = {"x": (0.01, 1.0), "y": (0.01, 1.0), "yaw": (0.01, 0.6), "temperature": (1.0, 100.0)}
 """Scale and reach of what is measured with noise at the start, m, rad, K."""
 _STOOD_SCALE, _STOOD_MOST = 0.5, 6.0
 """Of the time for which a rover had stood, s."""
+STANDING = (SETTLE, 3.0 * SETTLE)
+"""Times of standing that are compared, s."""
+_SHOWS = 500.0
+"""Squared difference between them, in sigma, from which the time is fitted. Where it matters less, its jumps (wheels at
+rest that change the sign of their slip) cost descents more than it gives: four drives of VIPER on a slope show
+thousands, six of LUVMI-X some fifty."""
 
 
 def is_encoder(series: Series) -> bool:
@@ -28,14 +36,27 @@ def is_encoder(series: Series) -> bool:
     return _ENCODER.fullmatch(series.channel) is not None
 
 
-def nuisances(number: int, run: LogRun, observations: Observations) -> list[Coordinate]:
-    """Coordinates of one log's nuisances; those of `is_linear` need no simulation."""
+def standing_shows(change: np.ndarray, number: int, observations: Observations) -> bool:
+    """Whether a change (n,) of the predictions by another time of standing is more than another pose at the start."""
+    total, sigma = 0.0, observations.sigma()
+    for s in observations.series:
+        if s.log == number:
+            own = change[s.start : s.stop] / sigma[s.start : s.stop]
+            total += float(np.sum((own - own.mean() if _COUNTED.search(s.channel) else own) ** 2))
+    return total > _SHOWS
+
+
+def nuisances(number: int, run: LogRun, observations: Observations, stood: bool) -> list[Coordinate]:
+    """Coordinates of one log's nuisances; those of `is_linear` need no simulation.
+
+    `stood` tells whether the time for which the rover had stood is one.
+    """
     found = [
         Coordinate("initial", name, run.start[name], _START[name][0], run.start[name] - _START[name][1],
                    run.start[name] + _START[name][1], prior=10.0, log_index=number)
         for name in run.unknown if name in _START
     ]  # fmt: skip
-    if STOOD in run.unknown:
+    if stood:
         found.append(Coordinate("initial", STOOD, run.start[STOOD], _STOOD_SCALE, SETTLE, _STOOD_MOST, prior=10.0,
                                 physical=True, log_index=number))  # fmt: skip
     found.append(Coordinate("initial", STEP_ERROR, 0.0, 1.0, -2.0, 2.0, prior=1.0, physical=True, log_index=number))

@@ -17,9 +17,17 @@ import numpy as np
 from lunar_mjx.criticism.coordinates import Coordinate, of_candidate
 from lunar_mjx.criticism.drive_baseline import BASELINE, baseline_coordinates, usable
 from lunar_mjx.criticism.drive_noise import Noises
-from lunar_mjx.criticism.drive_nuisances import STEP_ERROR, direction, from_first, is_linear, nuisances
+from lunar_mjx.criticism.drive_nuisances import (
+    STANDING,
+    STEP_ERROR,
+    direction,
+    from_first,
+    is_linear,
+    nuisances,
+    standing_shows,
+)
 from lunar_mjx.criticism.drive_observations import observations_of
-from lunar_mjx.criticism.drive_program import Rows
+from lunar_mjx.criticism.drive_program import STOOD, Rows
 from lunar_mjx.criticism.drive_runs import Bench
 from lunar_mjx.criticism.fitted import fitted_model
 from lunar_mjx.criticism.fitting import Fit, Progress, silent
@@ -95,8 +103,9 @@ class DriveProblem(Problem):
         self._noises = Noises(self.logs)
         self.observations = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
         self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self.observations.series)
+        shows = self._standing_shows()
         for number, run in enumerate(self.bench.runs):
-            found += nuisances(number, run, self.observations)
+            found += nuisances(number, run, self.observations, number in shows)
         self.baseline = np.arange(len(found))
         self._nuisance = np.arange(count, len(found))
         self.candidates = {}
@@ -119,6 +128,17 @@ class DriveProblem(Problem):
     def eager(self) -> bool:
         """On a GPU a Jacobian costs as little as a residual; not, though, for many refits at once."""
         return self._batched and self._gather is None
+
+    def _standing_shows(self) -> frozenset[int]:
+        """Logs on a slope whose predictions depend on how long the rover had stood before."""
+        sloped = [n for n, run in enumerate(self.bench.runs) if STOOD in run.unknown]
+        if not sloped:
+            return frozenset()
+        values = {("initial", STOOD, n, False): np.array(STANDING) for n in sloped}
+        seen = np.full((2, len(self.observations)), np.nan)
+        for number, rows, sampled in self.bench.run(2, values, self.observations, silent):
+            seen[rows, self._of_log(number)] = sampled
+        return frozenset(n for n in sloped if standing_shows(seen[1] - seen[0], n, self.observations))
 
     def with_candidates(self, candidates: Mapping[str, Effect], fit: Fit, progress: Progress = silent) -> DriveProblem:
         """The same logs against the fitted model, with other candidates; its origin is the fit."""
@@ -193,7 +213,8 @@ class DriveProblem(Problem):
         acting = frozenset(e for params in bench.params for e in params.effects) | {"initial"}
         which = [i for i, c in enumerate(self.coordinates) if c.effect in acting and not is_linear(c)]
         names = [(c.effect, c.name, c.log_index, c.factor) for c in (self.coordinates[i] for i in which)]
-        table = np.stack([np.asarray(self.coordinates[i].value(rows[:, i]), float) for i in which], axis=1)
+        columns = [np.asarray(self.coordinates[i].value(rows[:, i]), float) for i in which]
+        table = np.stack(columns, axis=1) if columns else np.zeros((len(rows), 0))
         return keys_of_rows((*bench.stamp, self._sampled_at()), names, table)
 
     def _sampled_at(self) -> bytes:
@@ -354,12 +375,23 @@ class DriveProblem(Problem):
         chi2 = [np.sum(whiten(r)[keep] ** 2) for r in (coarse, coarse - change)]
         return {"half_step_chi2": float(abs(chi2[0] - chi2[1]))}
 
+    def kept_step_error(self) -> np.ndarray | None:
+        return self.step_error
+
+    def use_step_error(self, kept: np.ndarray | None) -> None:
+        if kept is not None:
+            self._step_error = kept
+
     def renew_step_error(self, u: np.ndarray) -> bool:
         change = self._halving(u)
+        for number in range(len(self.logs)):
+            part = self._of_log(number)
+            if not np.isfinite(change[part]).all():
+                change[part] = 0.0
         whitened = self.observations.whiten(self._unabsorbed(change))[self.observations.in_split("fit")]
         if not float(whitened @ whitened) > STEP_CHI2:
             return False
-        self._step_error = np.where(np.isfinite(change), 2.0 * change, 0.0)
+        self._step_error = 2.0 * change
         return True
 
     def _halving(self, u: np.ndarray) -> np.ndarray:
@@ -372,7 +404,7 @@ class DriveProblem(Problem):
 
     def _unabsorbed(self, change: np.ndarray) -> np.ndarray:
         """(n,) what of a change the nuisances of the step's error cannot take up."""
-        whiten = self.observations.whiten
+        whiten, change = self.observations.whiten, change.copy()
         for c in self.coordinates:
             if c.name == STEP_ERROR:
                 mine, own = self._of_log(c.log_index), np.zeros(len(change))
@@ -380,5 +412,5 @@ class DriveProblem(Problem):
                 known = self._direction(c)
                 along = whiten(known)
                 size = float(along @ along)
-                change = change - (float(along @ whiten(own)) / size if size > 0.0 else 0.0) * known
+                change[mine] -= (float(along @ whiten(own)) / size if size > 0.0 else 0.0) * known[mine]
         return change

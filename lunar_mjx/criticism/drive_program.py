@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -34,6 +35,9 @@ STOOD = "stood"
 """Name of the time for which a rover had stood before a log, s."""
 
 
+_NUMBERS = itertools.count()
+
+
 class Program:
     """One compiled simulation of a chunk of rovers, from rest to the measured channels."""
 
@@ -41,6 +45,7 @@ class Program:
         self, model: Model, every: int, channels: tuple[str, ...], imu: tuple[float, float, float], engine: str
     ):
         self.model, self.every, self.channels, self.imu = model, every, channels, imu
+        self.number = next(_NUMBERS)
         with jax.enable_x64(True):
             self.system: System = build(model, engine)
         # Pieces of one length, the first of which settle the rover: one program serves logs of any length.

@@ -30,7 +30,7 @@ CHUNK = {"cpu": 16, "gpu": 2048}
 _FINEST = 0.01
 """Shortest interval of telemetry, s."""
 _LEVEL = math.radians(1.0)
-"""On a steeper slope a rover creeps for seconds, ever slower, so that how long it has stood shows in its currents."""
+"""On a steeper slope a rover creeps for seconds, ever slower: how long it has stood may show in its currents."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class Bench:
     def stamp(self) -> tuple[Any, ...]:
         """What all that it simulates depends on beside the rows: programs, and what the logs put into them."""
         given = [(r.commands, dict(r.start), r.begin, r.end, r.every, r.imu_position) for r in self.runs]
-        return *(logs.program for logs in self._groups()), stamp(self.params, given)
+        return *(logs.program.number for logs in self._groups()), stamp(self.params, given)
 
     def channels(self, number: int) -> list[str]:
         """Channels of a log that the model gives, in a fixed order."""

@@ -61,6 +61,7 @@ class Fit:
       gradient: drop of chi-square that one more step promises. starts: chi-square that each start ended with.
       at_bound: names of parameters at a bound that is not physics. extra: other figures of the certificate.
       problems: why there is no certificate; empty where there is.
+      step_error: (n,) what was taken for the error of the time step, for drives.
     """
 
     u: np.ndarray
@@ -74,6 +75,7 @@ class Fit:
     at_bound: tuple[str, ...] = ()
     extra: Mapping[str, float] = dataclasses.field(default_factory=dict)
     problems: tuple[str, ...] = ()
+    step_error: np.ndarray | None = None
 
     def covariance(self, problem: Problem) -> np.ndarray:
         """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
@@ -119,7 +121,7 @@ class Memory:
         return Fit(
             u=u, free=free, chi2=float(chi2[0]), residual=residual[0], jacobian=goal.jacobian(u), fitted=goal.fitted,
             gradient=entry["gradient"], starts=tuple(entry["starts"]), at_bound=tuple(entry["at_bound"]),
-            extra=entry["extra"], problems=tuple(entry["problems"]),
+            extra=entry["extra"], problems=tuple(entry["problems"]), step_error=problem.kept_step_error(),
         )  # fmt: skip
 
     def place(self, problem: Problem, name: str) -> np.ndarray | None:
@@ -247,6 +249,7 @@ def fit(
     return Fit(
         u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual, jacobian=best.jacobian,
         fitted=fitted, gradient=best.promise, starts=chi2s, at_bound=edge, extra=extra, problems=problems,
+        step_error=problem.kept_step_error(),
     )  # fmt: skip
 
 
@@ -303,7 +306,7 @@ def _faults(
     # A model that misfits presses its parameters against bounds; they count once it is at the noise.
     if edge and not slack:
         problems.append(f"{', '.join(edge)} ended at a bound")
-    if extra.get("half_step_chi2", 0.0) > max(half_step, slack):
+    if not extra.get("half_step_chi2", 0.0) <= max(half_step, slack):
         problems.append(f"halving the time step changes chi-square by {extra['half_step_chi2']:.2g}")
     return tuple(problems)
 

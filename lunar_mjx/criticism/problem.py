@@ -137,6 +137,14 @@ class Problem(abc.ABC):
         """Places of the baseline's coordinates and of those of some candidates."""
         return np.concatenate([self.baseline, *(self.candidates[e] for e in effects)]).astype(int)
 
+    def kept_step_error(self) -> np.ndarray | None:
+        """What predictions take for the error of the time step."""
+        return None
+
+    def use_step_error(self, kept: np.ndarray | None) -> None:
+        """Takes the error of the time step that a fit was made with."""
+        del kept
+
     def renew_step_error(self, u: np.ndarray) -> bool:
         """Takes the time step's error at a fit rather than at the model as given; whether that changes anything."""
         del u

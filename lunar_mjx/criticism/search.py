@@ -150,20 +150,17 @@ def _reaching(
 
 
 def _in_own_steps(problem: Problem, reached: Candidate, tried: dict[frozenset[str], Candidate]) -> Candidate:
-    """The one that reached the noise with the time step's error taken at its fit, and its rivals with the same.
+    """The best of those at the noise, each with the error of the time step at its own fit, which then stays.
 
-    Else what is left of that error looks like a second effect: beside Coulomb friction, like Stribeck's.
+    Else what is left of that error looks like a second effect (beside Coulomb friction, like Stribeck's), or another
+    effect like a better one.
     """
-    own = with_own_step_error(problem, reached)
-    if own is not reached:
-        rivals = [c for c in tried.values() if c.effects and c.fit.chi2 < reached.fit.chi2 + _NEAR]
-        for c in rivals:
-            if c.effects != reached.effects:
-                with problem.focused(c.effects):
-                    again = fit(problem, c.fit.free, c.fit.u, starts=1, certify=False)
-                tried[frozenset(c.effects)] = dataclasses.replace(c, fit=again, noise=noise_test(problem, again))
-    tried[frozenset(own.effects)] = own
-    return own
+    near = [c for c in tried.values() if c.effects and c.fit.chi2 < reached.fit.chi2 + _NEAR]
+    owns = [with_own_step_error(problem, c) for c in dict.fromkeys([reached, *near])]
+    tried.update({frozenset(c.effects): c for c in owns})
+    best = min((c for c in owns if c.noise.passes), key=lambda c: c.fit.chi2, default=owns[0])
+    problem.use_step_error(best.fit.step_error)
+    return best
 
 
 def _completed(

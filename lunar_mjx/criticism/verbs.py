@@ -192,8 +192,15 @@ def _save_signatures(run: Run, found: Search) -> None:
 def _save_series(run: Run, problem: Problem, start: np.ndarray, fits: Mapping[str, Fit]) -> None:
     """Measured and predicted series for the report, as `series.npz` (arrays only, no pickle)."""
     rows = np.array([problem.origin(), *(f.u for f in fits.values())])
-    # those of drives have been simulated, each with the effects that it has
-    predicted = problem.predict(rows) if problem.cheap_jacobian else np.concatenate([problem.predict(r) for r in rows])
+    if problem.cheap_jacobian:
+        predicted = problem.predict(rows)
+    else:
+        # those of drives have been simulated, each with the effects that it has
+        parts = []
+        for row, step_error in zip(rows, [None, *(f.step_error for f in fits.values())], strict=True):
+            problem.use_step_error(step_error)
+            parts.append(problem.predict(row))
+        predicted = np.concatenate(parts)
     observations = problem.observations
     place = observations.place if observations.place is not None else np.zeros((0, 3))
     time = np.concatenate(

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from toy_problem import manoeuvres
 
+from lunar_mjx.criticism.drive_nuisances import standing_shows
 from lunar_mjx.criticism.drive_problem import DriveProblem
 from lunar_mjx.criticism.drive_program import PIECE, SETTLE, STOOD, Program, _between
+from lunar_mjx.criticism.drive_runs import Bench
 from lunar_mjx.criticism.log import read_log, simulate_log, write_log
 from lunar_mjx.criticism.log.instruments import Recording
 from lunar_mjx.criticism.log.log import Noise
@@ -44,16 +49,37 @@ def test_standing_takes_as_many_pieces_as_the_rover_that_stood_longest():
     assert drives == [(4, 50, 3)] * 4
 
 
-@pytest.mark.parametrize(("terrain", "unknown"), [("flat", False), ("slope:10deg", True)])
-def test_it_is_a_nuisance_where_the_ground_is_inclined(tmp_path, terrain, unknown):
+@pytest.mark.parametrize(("terrain", "asked"), [("flat", False), ("slope:10deg", True)])
+@pytest.mark.parametrize("shows", [False, True])
+def test_it_is_a_nuisance_where_the_ground_is_inclined_and_it_shows(tmp_path, monkeypatch, terrain, asked, shows):
     model = make_model("luvmi_x", terrain=terrain)
     time = 0.1 * np.arange(20)
     still = dict.fromkeys((*command_channels(model), "position_x_m"), np.zeros(20))
     tables, noise = {"drive": pd.DataFrame({"time_s": time, **still})}, {"position_x_m": Noise(0.01, "rest")}
     log = write_log(tmp_path / "log", tables, rover="luvmi_x", noise=noise, manoeuvre="still",
                     gravity_m_s2=model.gravity, terrain=terrain)  # fmt: skip
+    runs = []
+
+    def run(self, rows, values, observations, progress):
+        runs.append(values)
+        change = (0.0, 10.0 if shows else 0.001)
+        yield 0, slice(0, rows), np.outer(change, np.arange(len(observations)))
+
+    monkeypatch.setattr(Bench, "run", run)
     problem = DriveProblem([read_log(log)], model, {})
-    assert any(c.name == STOOD for c in problem.coordinates) is unknown
+    assert any(c.name == STOOD for c in problem.coordinates) is (asked and shows)
+    assert len(runs) == asked
+
+
+def test_what_another_pose_at_the_start_does_is_not_counted():
+    level, ramp = np.full(100, 50.0), np.linspace(0.0, 10.0, 100)
+    seen = manoeuvres(1, 100)
+    position = dataclasses.replace(seen, series=(dataclasses.replace(seen.series[0], channel="position_x_m"),))
+    current = dataclasses.replace(seen, series=(dataclasses.replace(seen.series[0], channel="motor_lf_current_A"),))
+    assert standing_shows(level, 0, current)
+    assert not standing_shows(level, 0, position)
+    assert standing_shows(ramp, 0, position)
+    assert not standing_shows(0.1 * ramp, 0, position)
 
 
 @pytest.mark.slow

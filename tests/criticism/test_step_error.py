@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from toy_problem import Linear, manoeuvres
 
-from lunar_mjx.criticism.fitting import fit
+from lunar_mjx.criticism.fitting import Memory, fit
 from lunar_mjx.criticism.held_out import noise_test
-from lunar_mjx.criticism.refit import Candidate, with_own_step_error
+from lunar_mjx.criticism.refit import Candidate, Settings, refit_with, with_own_step_error
 from lunar_mjx.criticism.search import _in_own_steps
 
 TIME = np.arange(400) * 0.01
@@ -47,6 +47,12 @@ class Stepped(Linear):
         rows = u + e * np.eye(2)
         return ((self.predict(rows) - self.predict(u)) / e).T[:, which]
 
+    def kept_step_error(self):
+        return self.error
+
+    def use_step_error(self, kept):
+        self.error = kept
+
     def renew_step_error(self, u):
         error = self._error(float(u[1]))
         if np.linalg.norm(error - self.error) < 1.0:
@@ -78,15 +84,30 @@ def test_what_the_nuisance_absorbs_already_is_not_fitted_again():
     assert problem.renewed == 0
 
 
-def test_rivals_are_held_against_the_same_step_error():
+def test_every_one_at_the_noise_is_judged_with_the_step_error_at_its_own_fit():
     problem = Stepped(1.0)
-    reached = candidate(problem)
-    worse = dataclasses.replace(reached.fit, chi2=reached.fit.chi2 + 1e4)
-    far = dataclasses.replace(reached, effects=("far",), fit=worse)
-    near = dataclasses.replace(reached, effects=("near",))
-    tried = {frozenset(c.effects): c for c in (reached, far, near)}
-    own = _in_own_steps(problem, reached, tried)
-    assert own.fit.chi2 < reached.fit.chi2
-    assert tried[frozenset(("delay",))] is own
-    assert tried[frozenset(("near",))].fit.chi2 == pytest.approx(own.fit.chi2, abs=0.1)
+    given, delayed = problem.error, candidate(problem)
+    worse = dataclasses.replace(delayed.fit, chi2=delayed.fit.chi2 + 1e4)
+    far = dataclasses.replace(delayed, effects=("far",), fit=worse)
+    # reached the noise first, with a step error that is that of the model as given
+    first = candidate(Stepped(0.0))
+    first = dataclasses.replace(first, effects=("other",), fit=dataclasses.replace(
+        first.fit, chi2=delayed.fit.chi2 - 1.0, u=np.array([0.5, 0.0]), step_error=given))  # fmt: skip
+    tried = {frozenset(c.effects): c for c in (first, delayed, far)}
+    best = _in_own_steps(problem, first, tried)
+    assert best.effects == ("delay",)
+    assert best.fit.u[1] == pytest.approx(1.0, abs=1e-3)
+    assert problem.error is best.fit.step_error is not given
+    assert tried[frozenset(("delay",))] is best
+    assert tried[frozenset(("other",))] is first
     assert tried[frozenset(("far",))] is far
+
+
+def test_a_refit_on_demand_leaves_the_step_error_as_it_was():
+    problem = Stepped(1.0)
+    base = fit(problem, problem.free(), starts=1, certify=False)
+    first = refit_with(problem, base, "delay", Settings(), Memory())
+    again = refit_with(problem, base, "delay", Settings(), Memory())
+    assert problem.error is base.step_error
+    assert again.chi2 == pytest.approx(first.chi2, rel=1e-9)
+    assert first.step_error is not base.step_error
