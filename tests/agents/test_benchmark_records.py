@@ -55,6 +55,7 @@ def test_the_page_quotes_the_rates():
             said = [f"{row[k] / 1e6:.{digits}f}" for k in ("env_steps_per_s", "bare_steps_per_s")]
             assert f"| {decimation} | {rovers:,} | {said[0]} | {said[1]} | {row['ratio']:.2f} |" in PAGE
     assert max(r["env_steps_per_s"] for r in rows.values()) > 30e6
+    assert all(r["ratio"] >= 0.7 for r in rows.values())
     two = record("scaling")["rows"][1]
     assert f"{100 * two['efficiency']:.0f} % of twice as much" in PAGE and two["efficiency"] > 0.85
 
