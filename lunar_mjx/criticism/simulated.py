@@ -1,4 +1,4 @@
-"""Rows of drives that have been simulated lately, so that none is simulated twice."""
+"""Rows of drives that have been simulated lately, so that a program simulates none of them twice."""
 
 from __future__ import annotations
 
