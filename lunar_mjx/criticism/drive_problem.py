@@ -245,7 +245,7 @@ class DriveProblem(Problem):
             return self._simulations(bench, row, silent)[0]
 
     def _simulations(self, bench: Bench, rows: np.ndarray, progress: Progress) -> np.ndarray:
-        """(k, n) what a bench predicts for rows of coordinates, without linear nuisances; kept ones are not simulated."""
+        """(k, n) what a bench predicts for rows of coordinates, without linear nuisances, kept or simulated."""
         keys = self._keys(bench, rows)
         found = {k: row for k in dict.fromkeys(keys) if (row := SIMULATED.get(k)) is not None}
         new = {k: n for n, k in enumerate(keys) if k not in found}
