@@ -58,8 +58,22 @@ def _coincidences(log: SteadyLog) -> float:
 
     number, whole = pairs([group]), pairs([group, *log.table.measured.values()])
     # a copied row must not count as proof that instruments repeat themselves
-    shares = [(pairs([group, values]) - whole) / max(number, 1.0) for values in log.table.measured.values()]
+    shares = [max((pairs([group, values]) - whole) / max(number, 1.0), _agree(values, group))
+              for values in log.table.measured.values()]  # fmt: skip
     return number * float(np.prod(shares))
+
+
+def _agree(values: np.ndarray, group: np.ndarray) -> float:
+    """Chance that two replicates of one quantity agree, by the steps of its instrument and their scatter."""
+    steps = np.diff(np.unique(values))
+    _, group = np.unique(group, return_inverse=True)
+    count = np.bincount(group)
+    deviation = values - (np.bincount(group, values) / count)[group]
+    freedom = len(values) - len(count)
+    scatter = np.sqrt(float(deviation @ deviation) / freedom) if freedom else 0.0
+    if not len(steps) or not scatter > 0.0:
+        return 0.0
+    return float(min(1.0, steps.min() / (2.0 * np.sqrt(np.pi) * scatter)))
 
 
 def _ranges(log: SteadyLog) -> list[Finding]:

@@ -57,6 +57,19 @@ def test_replicates_that_agree_in_few_digits_are_no_copies(tmp_path: Path) -> No
     assert agreeing > 0
 
 
+def test_two_replicates_of_a_short_table_may_agree_where_no_others_do(tmp_path: Path) -> None:
+    agreeing = 0
+    for seed in range(40):
+        frame = points(seed)[lambda f: f["slip_angle_deg"] == 0.0].iloc[:9]
+        for column, std in STD.items():
+            frame[column] = std * np.round(frame[column] / std)
+        copies = int(frame.duplicated(list(STD)).sum())
+        if copies == 1:
+            agreeing += 1
+            assert not [f for f in check(make(tmp_path / str(seed), frame)) if f.kind == "copy"]
+    assert agreeing > 0
+
+
 def test_a_quantity_whose_noise_nobody_knows_is_told(tmp_path: Path) -> None:
     once = points(0)[lambda f: f["trial"] == 1].drop(columns="trial")
     frame = once.assign(driving_torque_Nm=0.1 + 0.2 * once["slip_ratio"])
