@@ -114,12 +114,9 @@ class DriveProblem(Problem):
             self.candidates[name] = np.arange(len(found), len(found) + len(mine))
             found += mine
         self._smooth = smooth_inputs(frozenset(port for e in model.effects for port in e.ports))
-        self.inputs = {}
         own = {c.name: len(found) + k for k, c in enumerate(of_candidate(self._smooth))}
-        for label, quantities in FOLLOWS.items():
-            names = [amplitude(label, q) for q in quantities]
-            if names[0] in own:
-                self.inputs[label] = np.array([own[n] for n in names])
+        amplitudes = {label: [amplitude(label, q) for q in quantities] for label, quantities in FOLLOWS.items()}
+        self.inputs = {k: np.array([own[n] for n in names]) for k, names in amplitudes.items() if names[0] in own}
         self.coordinates = (*found, *of_candidate(self._smooth))
         self._step_error: np.ndarray | None = None
         self._halved: tuple[np.ndarray, np.ndarray] | None = None

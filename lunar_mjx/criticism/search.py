@@ -96,7 +96,7 @@ def search(
         if reached is not None:
             best = reached
             if not problem.cheap_jacobian:
-                best = _in_own_steps(problem, reached, tried)
+                best = _in_own_steps(problem, base, reached, settings, tried)
                 best = _completed(problem, best, settings, tried, memory, progress)
                 best = tried[frozenset(best.effects)] = _looked_at(problem, best, settings)
             break
@@ -149,7 +149,9 @@ def _reaching(
     return None
 
 
-def _in_own_steps(problem: Problem, reached: Candidate, tried: dict[frozenset[str], Candidate]) -> Candidate:
+def _in_own_steps(
+    problem: Problem, base: Candidate, reached: Candidate, settings: Settings, tried: dict[frozenset[str], Candidate]
+) -> Candidate:
     """The best of those at the noise, each with the error of the time step at its own fit, which then stays.
 
     Else what is left of that error looks like a second effect (beside Coulomb friction, like Stribeck's), or another
@@ -158,7 +160,9 @@ def _in_own_steps(problem: Problem, reached: Candidate, tried: dict[frozenset[st
     near = [c for c in tried.values() if c.effects and c.fit.chi2 < reached.fit.chi2 + _NEAR]
     owns = [with_own_step_error(problem, c) for c in dict.fromkeys([reached, *near])]
     tried.update({frozenset(c.effects): c for c in owns})
-    best = min((c for c in owns if c.noise.passes), key=lambda c: c.fit.chi2, default=owns[0])
+    # who takes its place must have earned it on manoeuvres left out, as it had
+    fit_to_lead = [owns[0], *(c for c in owns[1:] if c.at_noise and _earned(problem, base, c, settings))]
+    best = min(fit_to_lead, key=lambda c: c.fit.chi2)
     problem.use_step_error(best.fit.step_error)
     return best
 

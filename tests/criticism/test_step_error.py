@@ -94,7 +94,9 @@ def test_every_one_at_the_noise_is_judged_with_the_step_error_at_its_own_fit():
     first = dataclasses.replace(first, effects=("other",), fit=dataclasses.replace(
         first.fit, chi2=delayed.fit.chi2 - 1.0, u=np.array([0.5, 0.0]), step_error=given))  # fmt: skip
     tried = {frozenset(c.effects): c for c in (first, delayed, far)}
-    best = _in_own_steps(problem, first, tried)
+    base = fit(problem, problem.free(), starts=1, certify=False)
+    nothing = Candidate((), base, noise_test(problem, base), 0.0, 0.0)
+    best = _in_own_steps(problem, nothing, first, Settings(), tried)
     assert best.effects == ("delay",)
     assert best.fit.u[1] == pytest.approx(1.0, abs=1e-3)
     assert problem.error is best.fit.step_error is not given
