@@ -17,6 +17,8 @@ from .bed import Points, Soil, measure
 from .noise import Recipe, ar1, rounded, smooth
 
 QUANTITIES = ("drawbar_pull_N", "side_force_N", "driving_torque_Nm", "sinkage_m")
+DECAY = 0.8
+"""Correlation of coloured noise between neighbours of a sweep."""
 DEEPEST = 0.6
 """Sinkage over radius at which an operator stops the run."""
 
@@ -103,7 +105,7 @@ def record(truth: Truth, recipe: Recipe, rng: np.random.Generator, replicates: i
             if recipe.kind == "coloured":
                 for k in range(sweep.max() + 1):
                     mine = np.flatnonzero(sweep == k)
-                    noise[mine[np.argsort(p.slip[mine])]] = ar1(rng, len(mine), 0.8)
+                    noise[mine[np.argsort(p.slip[mine])]] = ar1(rng, len(mine), DECAY)
             row[q] = clean[q] + truth.sigma[q] * (recipe.scale * noise + dirt[q])
         parts.append(pd.DataFrame(row | {"trial": trial}))
     frame = pd.concat(parts, ignore_index=True)

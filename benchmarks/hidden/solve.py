@@ -25,6 +25,7 @@ from lunar_mjx.model import Model, make_model
 from . import bed_effects, bed_logs, cases, drive_effects, drives
 from .judge import outcome
 from .separable import left_over
+from .told import Observed, told, true_values
 
 _95 = 1.959964
 
@@ -140,14 +141,32 @@ def _twins(truth: bed_logs.Truth, name: str) -> float:
 
 
 def _physics(case: cases.Case, found: Diagnosis, run: Path) -> dict[str, Any]:
-    values = _values(case.truth.effects, found)
-    held, floor = held_out(case.truth, run)
-    return {
+    row = {
         "port": found.port, "ports": dict(found.ports), "true_ports": _ports(case.truth.effects),
-        "error_before": dict(found.error_before), "error_after": dict(found.error_after), "floor": floor,
-        "over_floor": held / floor if held and floor else None, "parameters": values,
-        "undecidable": list(found.undecidable),
+        "error_before": dict(found.error_before), "error_after": dict(found.error_after),
+        "parameters": _values(case.truth.effects, found), "undecidable": list(found.undecidable),
+        "floor": None, "over_floor": None, "told": None,
     }  # fmt: skip
+    if (run / SERIES_FILE).is_file():
+        seen, sigma, predicted = _seen(case.truth, run)
+        held = ~seen.fitted
+        if held.any():
+            away = [((seen.value - v) / sigma)[held] for v in (predicted, true_values(case.truth, seen))]
+            error, floor = (float(np.sqrt(np.mean(a**2))) for a in away)
+            row |= {"floor": floor, "over_floor": error / floor if floor else None}
+        if case.truth.effects and case.group != "undecidable":
+            row["told"] = told(case.truth, case.recipe, seen)
+    return row
+
+
+def _seen(truth: bed_logs.Truth, run: Path) -> tuple[Observed, np.ndarray, np.ndarray]:
+    """The tool's observations, with its sigma (n,) and the predictions (n,) of its last model."""
+    with np.load(run / SERIES_FILE) as data:
+        at = data["place"]
+        points = dataclasses.replace(truth.points, slip=at[:, 0], angle=np.radians(at[:, 1]), load=at[:, 2])
+        channel = np.repeat(data["series_channel"], np.diff([*data["series_start"], len(at)]))
+        fitted = data["split"][data["unit"]] == "fit"
+        return Observed(channel, points, data["measured"], fitted), data["sigma"], data["predicted"][-1]
 
 
 def _ports(effects: Mapping[str, Any]) -> list[str]:
@@ -166,31 +185,6 @@ def _values(effects: Mapping[str, Mapping[str, float]], found: Diagnosis) -> lis
                 rows.append({"effect": e.effect, "name": name, "truth": true, "value": value, "std": std,
                              "error": away / abs(true), "covered": away <= _95 * std})  # fmt: skip
     return rows
-
-
-def held_out(truth: bed_logs.Truth, run: Path) -> tuple[float | None, float | None]:
-    """Error of the tool's last model over the held-out points, and that of the truth itself, which nobody beats.
-
-    Returns:
-      Root mean squares of measured less predicted and of measured less true values, in the tool's sigma.
-    """
-    path = run / SERIES_FILE
-    if not path.is_file():
-        return None, None
-    with np.load(path) as data:
-        held = np.isin(data["split"][data["unit"]], ("select", "test"))
-        at = data["place"]
-        points = dataclasses.replace(truth.points, slip=at[:, 0], angle=np.radians(at[:, 1]), load=at[:, 2])
-        clean = dataclasses.replace(truth, points=points).clean()
-        ends = [*data["series_start"][1:], len(at)]
-        true = np.empty(len(at))
-        for channel, start, stop in zip(data["series_channel"], data["series_start"], ends, strict=True):
-            true[start:stop] = clean[str(channel)][start:stop]
-        away = [((data["measured"] - values) / data["sigma"])[held] for values in (data["predicted"][-1], true)]
-    if not held.any():
-        return None, None
-    error, floor = (float(np.sqrt(np.mean(a**2))) for a in away)
-    return error, floor
 
 
 def _suggestions(run: Path) -> list[dict[str, Any]]:

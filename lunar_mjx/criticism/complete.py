@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lunar_mjx.criticism.descent import Objective
 from lunar_mjx.criticism.fitting import Fit
+from lunar_mjx.criticism.objective import Objective
+from lunar_mjx.criticism.scan import AMOUNTS
 from lunar_mjx.criticism.score import SEPARABLE, Score, leash, outside, span
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ _SHARES = np.array([0.5, 1.0, 1.5])
 """Of the amount that does what the effect in the model does: where a refit may start."""
 _MANY = 4
 """Parameters of an effect from which amounts of simpler ones are tried in its place, where derivatives may mislead."""
-_AMOUNTS = np.array([0.1, 0.3, 1.0, 2.0, 3.0])
-"""What is tried, in terms of a candidate's nominal amount, with either sign."""
 _MOST = 0.5
 """Share of what the effect takes off that such an amount must, without any refit."""
 _SIMPLER = 25.0
@@ -100,7 +99,7 @@ def tried_in_place(problem: Problem, fit: Fit, effects: Sequence[str], scores: S
             if len(places) != 1 or s.effect in effects:
                 continue
             low, high = problem.bounds(np.array(places))
-            for amount in np.concatenate([-_AMOUNTS, _AMOUNTS]):
+            for amount in np.concatenate([-AMOUNTS, AMOUNTS]):
                 if low[0] < amount < high[0]:
                     rows.append(without.copy())
                     rows[-1][places] = amount

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from lunar_mjx.criticism.coordinates import Coordinate, default_coordinate
-from lunar_mjx.criticism.problem import NotTested
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.presets import PRESETS
 from lunar_mjx.model import Model
@@ -34,22 +33,10 @@ NOT_MISSING = frozenset(
 """Effects that describe an arrangement of the test, which its user knows, and are never candidates by themselves."""
 
 
-def usable(model: Model, candidates: Mapping[str, Effect]) -> tuple[dict[str, Effect], tuple[NotTested, ...]]:
-    """Candidates that can enter, and those that cannot."""
-    present = set(model.effect_names)
-    found, refused = {}, []
-    for name, effect in candidates.items():
-        if name in present:
-            continue
-        if name in NOT_MISSING:
-            refused.append(NotTested(name, "describes the arrangement of a test, which its user knows"))
-        elif present & set(effect.replaces):
-            refused.append(NotTested(name, f"would replace {', '.join(sorted(present & set(effect.replaces)))}"))
-        elif all(p.null is None for p in effect.parameters.values()):
-            refused.append(NotTested(name, "has no null value"))
-        else:
-            found[name] = effect
-    return found, tuple(refused)
+def unfit(name: str, effect: Effect) -> str:
+    """Why an effect is no candidate for drives, or ""."""
+    del effect
+    return "describes the arrangement of a test, which its user knows" if name in NOT_MISSING else ""
 
 
 def baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[Coordinate]:

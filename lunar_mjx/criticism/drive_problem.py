@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
+from lunar_mjx.criticism.candidates import usable
 from lunar_mjx.criticism.coordinates import Coordinate, of_candidate
-from lunar_mjx.criticism.drive_baseline import BASELINE, baseline_coordinates, usable
+from lunar_mjx.criticism.differences import Differences
+from lunar_mjx.criticism.drive_baseline import BASELINE, baseline_coordinates, unfit
 from lunar_mjx.criticism.drive_noise import Noises
 from lunar_mjx.criticism.drive_nuisances import (
     STANDING,
@@ -41,10 +43,6 @@ from lunar_mjx.model import Model
 
 if TYPE_CHECKING:
     from lunar_mjx.criticism.log import Log
-
-STEP = 1e-7
-"""Difference quotient's step in scales. Predictions jump by hundredths of a sigma where a wheel at rest changes the
-sign of its slip; a step this short rarely meets a jump, and rounding spoils only the faintest derivatives."""
 
 STEP_CHI2 = 1.0
 """Squared whitened change by halving the time step, beyond its nuisances, from which these are taken anew at a fit."""
@@ -86,7 +84,7 @@ class DriveProblem(Problem):
         self.logs, self.model = tuple(logs), model
         self._splits, self._baseline_spec, self._channels = dict(splits or {}), baseline, channels
         self._start: dict[str, float] = {}
-        self.effects, self.not_tested = usable(model, candidates)
+        self.effects, self.not_tested = usable(model.effects, candidates, unfit)
         self.progress = progress
         self.bench = Bench(model, self.logs, chunk, engine)
         self._batched = jax.default_backend() != "cpu"
@@ -119,23 +117,26 @@ class DriveProblem(Problem):
         self.inputs = {k: np.array([own[n] for n in names]) for k, names in amplitudes.items() if names[0] in own}
         self.coordinates = (*found, *of_candidate(self._smooth))
         self._step_error: np.ndarray | None = None
-        self._halved: tuple[np.ndarray, np.ndarray] | None = None
+        self._halved: tuple[frozenset[str], np.ndarray, np.ndarray] | None = None
 
     @property
     def eager(self) -> bool:
         """On a GPU a Jacobian costs as little as a residual; not, though, for many refits at once."""
-        return self._batched and self._gather is None
+        return self._batched and (self._gather is None or self._gather.parties < 2)
 
     def _standing_shows(self) -> frozenset[int]:
         """Logs on a slope whose predictions depend on how long the rover had stood before."""
         sloped = [n for n, run in enumerate(self.bench.runs) if STOOD in run.unknown]
         if not sloped:
             return frozenset()
-        values = {("initial", STOOD, n, False): np.array(STANDING) for n in sloped}
-        seen = np.full((2, len(self.observations)), np.nan)
-        for number, rows, sampled in self.bench.run(2, values, self.observations, silent):
-            seen[rows, self._of_log(number)] = sampled
-        return frozenset(n for n in sloped if standing_shows(seen[1] - seen[0], n, self.observations))
+        keys = [(*self.bench.stamp, self._sampled_at(), STOOD, time) for time in STANDING]
+        known = [SIMULATED.get(k) for k in keys]
+        if any(row is None for row in known):
+            values = {("initial", STOOD, n, False): np.array(STANDING) for n in sloped}
+            known = list(self._run(self.bench, len(keys), values, silent))
+            for k, row in zip(keys, known, strict=True):
+                SIMULATED.keep(k, row)
+        return frozenset(n for n in sloped if standing_shows(known[1] - known[0], n, self.observations))
 
     def with_candidates(self, candidates: Mapping[str, Effect], fit: Fit, progress: Progress = silent) -> DriveProblem:
         """The same logs against the fitted model, with other candidates; its origin is the fit."""
@@ -180,7 +181,7 @@ class DriveProblem(Problem):
 
     def foresee(self, rows: np.ndarray, which: np.ndarray | None = None) -> None:
         if self._batched:
-            blocks = [rows] if which is None else [self._difference_rows(row, which)[0] for row in rows]
+            blocks = [rows] if which is None else [Differences(self.coordinates, which).rows(row) for row in rows]
             with self._lock:
                 self._foreseen += blocks
 
@@ -252,14 +253,20 @@ class DriveProblem(Problem):
                 if k not in new and k not in SIMULATED:
                     new[k] = len(wanted)
                     wanted = np.concatenate([wanted, row[None]])
-            simulated = np.full((len(wanted), len(self.observations)), np.nan)
-            for number, k, sampled in bench.run(len(wanted), self._values(wanted), self.observations, progress):
-                simulated[k, self._of_log(number)] = sampled
-            simulated = from_first(simulated, self.observations)
+            simulated = from_first(self._run(bench, len(wanted), self._values(wanted), progress), self.observations)
             for k, row in zip(new, simulated, strict=True):
                 SIMULATED.keep(k, row)
                 found[k] = row
+            if list(new)[: len(keys)] == keys:
+                return simulated[: len(keys)]
         return np.stack([found[k] for k in keys])
+
+    def _run(self, bench: Bench, rows: int, values: Rows, progress: Progress) -> np.ndarray:
+        """(rows, n) what a bench simulates."""
+        out = np.full((rows, len(self.observations)), np.nan)
+        for number, k, sampled in bench.run(rows, values, self.observations, progress):
+            out[k, self._of_log(number)] = sampled
+        return out
 
     def _room_for(self, bench: Bench, rows: np.ndarray) -> Iterator[tuple[Key, np.ndarray]]:
         """Foreseen rows, with their keys, that a bench simulates beside others at no cost; the others are forgotten."""
@@ -294,7 +301,7 @@ class DriveProblem(Problem):
             for name, effect in {**self.effects, SMOOTH: self._smooth}.items():
                 if name in best:
                     union = union.add(effect, "criticism", **effect.null())
-            self._benches[best] = Bench(union, self.logs, self.bench.chunk, self.bench.engine)
+            self._benches[best] = Bench(union, self.logs, self.bench.chunk, self.bench.engine, self.bench)
         return self._benches[best]
 
     def _active(self, rows: np.ndarray) -> frozenset[str]:
@@ -303,56 +310,21 @@ class DriveProblem(Problem):
         return frozenset(e for e, places in moved.items() if np.any(rows[:, places] != 0.0))
 
     def linearise(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, Callable[[int], np.ndarray]]:
-        parts = [self._difference_rows(row, which) for row in u]
-        values = self.predict(np.concatenate([rows for rows, _ in parts]))
-        ends = np.cumsum([len(rows) for rows, _ in parts])
-        pieces = np.split(values, ends[:-1])
-        return np.stack([p[0] for p in pieces]), lambda k: self._quotients(pieces[k], which, parts[k][1])
+        differences = Differences(self.coordinates, which)
+        parts = [differences.rows(row) for row in u]
+        values = np.split(self.predict(np.concatenate(parts)), np.cumsum([len(rows) for rows in parts])[:-1])
+        jacobian = lambda k: differences.jacobian(u[k], values[k], self.observations, self._direction)  # noqa: E731
+        return np.stack([v[0] for v in values]), jacobian
 
     def jacobian_and(self, u: np.ndarray, which: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        own, steps = self._difference_rows(u, which)
+        differences = Differences(self.coordinates, which)
+        own = differences.rows(u)
         values = self.predict(np.concatenate([own, rows]))
-        return self._quotients(values[: len(own)], which, steps), values[len(own) :]
+        jacobian = differences.jacobian(u, values[: len(own)], self.observations, self._direction)
+        return jacobian, values[len(own) :]
 
     def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """As in `Problem`; nuisances of different logs are perturbed together, since a log feels only its own."""
-        rows, steps = self._difference_rows(u, which)
-        return self._quotients(self.predict(rows), which, steps)
-
-    def _kinds(self, which: np.ndarray) -> tuple[list[int], list[int], list[str]]:
-        """Nuisances, shared coordinates, and the names of the nuisances."""
-        own = [int(i) for i in which if self.coordinates[i].log_index >= 0 and not is_linear(self.coordinates[i])]
-        shared = [int(i) for i in which if self.coordinates[i].log_index < 0]
-        return own, shared, sorted({self.coordinates[i].name for i in own})
-
-    def _difference_rows(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        own, shared, kinds = self._kinds(which)
-        rows = np.repeat(u[None], 1 + len(shared) + len(kinds), axis=0)
-        steps = np.empty(len(shared))
-        for k, i in enumerate(shared):
-            high = self.coordinates[i].bounds()[1]
-            steps[k] = STEP if u[i] + STEP <= high else -STEP
-            rows[1 + k, i] += steps[k]
-        for k, kind in enumerate(kinds):
-            same = [i for i in own if self.coordinates[i].name == kind]
-            rows[1 + len(shared) + k, same] += STEP
-        return rows, steps
-
-    def _quotients(self, values: np.ndarray, which: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        _, shared, kinds = self._kinds(which)
-        difference = values[1:] - values[:1]
-        out = np.zeros((len(self.observations), len(which)))
-        for column, i in enumerate(which):
-            c = self.coordinates[i]
-            if is_linear(c):
-                out[:, column] = c.scale * self._direction(c)
-            elif c.log_index < 0:
-                k = shared.index(int(i))
-                out[:, column] = difference[k] / steps[k]
-            else:
-                part = self._of_log(c.log_index)
-                out[part, column] = difference[len(shared) + kinds.index(c.name), part] / STEP
-        return out
+        return self.jacobian_and(u, which, np.zeros((0, len(u))))[0]
 
     def _of_log(self, number: int) -> slice:
         return self.observations.of_log.get(number, slice(0, 0))
@@ -392,12 +364,19 @@ class DriveProblem(Problem):
         return True
 
     def _halving(self, u: np.ndarray) -> np.ndarray:
-        """(n,) the change of the predictions by halving the time step."""
-        if self._halved is None or not np.array_equal(self._halved[0], u):
-            bench = self._bench_for(u[None])
-            change = self._simulated(bench.halved(), u[None]) - self._simulated(bench, u[None])
-            self._halved = u.copy(), change
-        return self._halved[1].copy()
+        """(n,) the change of the predictions by halving the time step, here or where they are less than a sigma away.
+
+        Within that the change is the same but for a small share of itself, and fits end where they do not move at all.
+        """
+        bench = self._bench_for(u[None])
+        coarse, active = self._simulated(bench, u[None]), self._active(u[None])
+        if self._halved is not None and self._halved[0] == active:
+            moved = self.observations.whiten(coarse - self._halved[1])
+            if float(moved @ moved) < STEP_CHI2:
+                return self._halved[2].copy()
+        change = self._simulated(bench.halved(), u[None]) - coarse
+        self._halved = active, coarse, change
+        return change.copy()
 
     def _unabsorbed(self, change: np.ndarray) -> np.ndarray:
         """(n,) what of a change the nuisances of the step's error cannot take up."""

@@ -77,7 +77,9 @@ class Program:
             params, state, commands, self.every, self._axes(params, shared), chunk=commands.shape[0], one_body=True
         )
 
-    def _measure_all(self, params: Params, seen: Any, shared: bool) -> Any:
+    def _measure_all(self, params: Params, pieces: Sequence[Any], shared: bool) -> Any:
+        seen = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *pieces)
+
         def channels(params: Params, seen: Any) -> Any:
             found = measure(self.system, seen, params, self.imu if any(self.imu) else None).channels
             return jnp.stack([found[c] for c in self.channels])
@@ -102,8 +104,7 @@ class Program:
             for at in range(0, commands.shape[1], self.segment):
                 state, telemetry = self._drive(full, state, commands[:, at : at + self.segment], shared=shared)
                 seen.append(telemetry)
-            whole = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *seen)
-            found = self._measure(full, whole, shared=shared)
+            found = self._measure(full, seen, shared=shared)
             size = max(_FEWEST, 1 << (count - 1).bit_length())
             return np.asarray(found if size >= len(log) else _first(found, size))
 

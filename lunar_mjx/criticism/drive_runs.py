@@ -62,12 +62,23 @@ _MOST_PROGRAMS = 32
 
 
 class Bench:
-    """All logs of a campaign, grouped by what one program can run."""
+    """All logs of a campaign, grouped by what one program can run.
 
-    def __init__(self, model: Model, logs: Sequence[Log], chunk: int | None, engine: str):
+    Args:
+      model: under no log's conditions. logs: of one rover. chunk: rovers simulated at once. engine: of the dynamics.
+      like: bench of a model with the same time step, whose commands and starts are the same.
+    """
+
+    def __init__(self, model: Model, logs: Sequence[Log], chunk: int | None, engine: str, like: Bench | None = None):
         self.logs, self.model, self.engine = tuple(logs), model, engine
         self.chunk = chunk or CHUNK.get(jax.default_backend(), 64)
-        self.runs = _alike([log_run(log, model) for log in logs])
+        from lunar_mjx.criticism.log import log_model
+
+        if like is None:
+            runs = [log_run(log, model) for log in logs]
+        else:
+            runs = [dataclasses.replace(r, model=log_model(log, model)) for r, log in zip(like.runs, logs, strict=True)]
+        self.runs = _alike(runs)
         self.params = [_params(run.model) for run in self.runs]
         self._stacked: list[Logs] | None = None
 
@@ -203,19 +214,22 @@ def _sample(signals: np.ndarray, names: Sequence[str], places: Sequence[_Place],
     count = sum(len(p.low) * len(p.channels) for p in places)
     out = np.empty((len(signals), count))
     for p in places:
-        values = signals[:, [names.index(c) for c in p.channels]]
-        if p.euler:
-            values = np.rad2deg(np.unwrap(np.deg2rad(values), axis=2))
-        sampled = values[:, :, p.low]
-        if np.any(p.share):
-            after = np.minimum(p.low + 1, values.shape[2] - 1)
-            sampled = sampled * (1.0 - p.share) + values[:, :, after] * p.share
-        for k, (start, stop) in enumerate(p.parts):
-            one = sampled[:, k]
+        at, after = _run_of(p.low), _run_of(np.minimum(p.low + 1, signals.shape[2] - 1))
+        for channel, (start, stop) in zip(p.channels, p.parts, strict=True):
+            one = signals[:, names.index(channel)]
+            if p.euler:
+                one = np.rad2deg(np.unwrap(np.deg2rad(one), axis=1))
+            one = one[:, at] * (1.0 - p.share) + one[:, after] * p.share if np.any(p.share) else one[:, at]
             if p.euler:
                 one = measured[start:stop] + (one - measured[start:stop] + 180.0) % 360.0 - 180.0
             out[:, start - p.begin : stop - p.begin] = one
     return out
+
+
+def _run_of(places: np.ndarray) -> np.ndarray | slice:
+    """Places as a slice, which copies nothing, where they follow each other."""
+    first, last = int(places[0]), int(places[-1])
+    return slice(first, last + 1) if np.array_equal(places, np.arange(first, last + 1)) else places
 
 
 def _alike(runs: Sequence[LogRun]) -> list[LogRun]:

@@ -16,15 +16,16 @@ from scipy.stats import qmc
 
 from lunar_mjx.criticism.descent import (
     EDGE,
+    SAME_CHI2,
     SMALL_GRADIENT,
     Descent,
-    Objective,
     Rival,
     chase,
     descend,
     same_chi2,
     slack_of,
 )
+from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.problem import Problem
 
 _KEPT = 1e-3
@@ -35,6 +36,8 @@ AGREEING = 3
 HALF_STEP = 25.0
 """Largest change of chi-square by halving the time step: below what would name an effect."""
 
+_NEARER = 0.3
+"""Share of the box of starts within which others begin, about the first fit, where rows are dear."""
 
 ROUGH = 4.0
 """Times the jumps of a rough chi-square that its gradient may promise."""
@@ -235,6 +238,7 @@ def fit(
     origin = problem.origin() if start is None else np.asarray(start, float)
     progress("fitting", 0.0)
     others = _other_starts(problem, free, origin, starts - 1, seed, spread, goal)
+    problem.foresee(_near(goal, origin, origin, others), free)
     first = descend(goal, origin, rival=rival, known=known, outdone=outdone)
     _foresee_end(goal, first, certify)
     lowest, chi2s = _lowest(goal, first, origin, others, progress)
@@ -276,8 +280,9 @@ def _lowest(
             progress("fitting", (i + 1) / (len(others) + 1))
             found.append(descend(goal, other))
     elif len(others) and not slack_of(found[0].chi2, int(goal.fitted.sum())):
-        near = found[0].u[None] + 0.3 * (others - origin[None])
-        near[:, goal.free] = np.clip(near[:, goal.free], goal.low, goal.high)
+        # where the first gained nothing that matters, the others have been simulated beside it
+        gained = float(goal.residuals(origin[None])[1][0]) - found[0].chi2
+        near = _near(goal, origin if gained < SAME_CHI2 else found[0].u, origin, others)
         ends = chase(goal, found[0], near)
         # A fixed Jacobian may lead a start astray that descends well with its own.
         enough = found[0].chi2 + same_chi2(found[0].chi2, int(goal.fitted.sum()))
@@ -289,6 +294,13 @@ def _lowest(
                 ends[i] = found[-1].chi2
         ends = ends if len(found) == 1 else [e for e in ends if all(e != d.chi2 for d in found)]
     return min(found, key=lambda d: d.chi2), tuple(sorted([d.chi2 for d in found] + ends))
+
+
+def _near(goal: Objective, centre: np.ndarray, origin: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Starts (k, coordinates) drawn about an origin as they lie, nearer, about another centre."""
+    out = centre[None] + _NEARER * (others - origin[None])
+    out[:, goal.free] = np.clip(out[:, goal.free], goal.low, goal.high)
+    return out
 
 
 def _faults(

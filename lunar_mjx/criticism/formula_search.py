@@ -12,9 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from lunar_mjx.criticism import formula as f
-from lunar_mjx.criticism.descent import Objective, descend
+from lunar_mjx.criticism.descent import descend
 from lunar_mjx.criticism.fitting import Fit, Progress, fit, silent
 from lunar_mjx.criticism.held_out import ENOUGH, noise_test, predictive_gain, predictive_residual
+from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.refit import Settings
 from lunar_mjx.criticism.score import leash, project
 from lunar_mjx.criticism.slots import Choice, Slots, features, library, targets

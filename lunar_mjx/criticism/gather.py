@@ -14,10 +14,13 @@ class Gather:
     Args:
       function: of (k, coordinates) rows, returning (k, n).
       parties: threads that take part; each must call `leave` when it is done.
+
+    Attributes:
+      parties: threads that still take part.
     """
 
     def __init__(self, function: Callable[[np.ndarray], np.ndarray], parties: int):
-        self._function, self._parties = function, parties
+        self._function, self.parties = function, parties
         self._condition = threading.Condition()
         self._waiting: list[_Call] = []
 
@@ -36,11 +39,11 @@ class Gather:
     def leave(self) -> None:
         """A thread makes no more calls."""
         with self._condition:
-            self._parties -= 1
+            self.parties -= 1
             self._run_if_complete()
 
     def _run_if_complete(self) -> None:
-        if not self._waiting or len(self._waiting) < self._parties:
+        if not self._waiting or len(self._waiting) < self.parties:
             return
         calls, self._waiting = self._waiting, []
         try:

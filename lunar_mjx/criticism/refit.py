@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.descent import Descent, Objective, Outdone, Rival
+from lunar_mjx.criticism.descent import Descent, Outdone, Rival
 from lunar_mjx.criticism.fitting import Fit, Memory, fit, foreseen_fit
 from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
+from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.patterns import Pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.scan import scan

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lunar_mjx.criticism.descent import Objective
 from lunar_mjx.criticism.fitting import Fit
+from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.score import Score
 
-_AMOUNTS = np.array([0.1, 0.3, 1.0, 2.0, 3.0])
+AMOUNTS = np.array([0.1, 0.3, 1.0, 2.0, 3.0])
 """Amounts of a candidate, in terms of its nominal one, that are tried where derivatives may mislead."""
 _FAR = 4.0
 """Chi-square per observation from which a model is so far from the data that derivatives may mislead."""
@@ -61,5 +61,5 @@ def _amounts(problem: Problem, places: Sequence[int], s: Score) -> np.ndarray:
     if len(places) != 1:
         return np.array([1.0, 0.3])[:, None] * np.clip(s.amount, -3.0, 3.0)
     low, high = problem.coordinates[places[0]].bounds()
-    tried = np.sign(s.amount[0]) * _AMOUNTS
+    tried = np.sign(s.amount[0]) * AMOUNTS
     return tried[(tried > low) & (tried < high), None]

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lunar_mjx.criticism.candidates import usable
 from lunar_mjx.criticism.coordinates import WIDE, Coordinate, of_candidate
 from lunar_mjx.criticism.observations import Chain, Observations, Series
-from lunar_mjx.criticism.problem import NotTested, Problem
+from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.single_wheel import PORTS, WheelBed, WheelTest
 from lunar_mjx.criticism.table import QUANTITIES, SteadyStateTable, average
 from lunar_mjx.criticism.table_noise import scatter, sweeps
@@ -113,13 +114,12 @@ class TableProblem(Problem):
           extra_sigma: a model's own known discrepancy by quantity, SI units, added to the noise.
         """
         self.logs, self.splits, self.extra_sigma = tuple(logs), dict(splits or {}), dict(extra_sigma or {})
-        usable, refused = _usable(bed, candidates)
-        self.effects, self.not_tested = usable, refused
+        self.effects, self.not_tested = usable(bed.effects, candidates, _unfit)
         union = bed
-        for effect in usable.values():
+        for effect in self.effects.values():
             union = union.with_effect(effect, **effect.null())
         self.bed, self._union = bed, union
-        self.coordinates, self.baseline, self.candidates = _coordinates(bed, usable, baseline, values or {})
+        self.coordinates, self.baseline, self.candidates = _coordinates(bed, self.effects, baseline, values or {})
         self.observations, tests = _observations(self.logs, splits or {}, extra_sigma or {})
         layout = tuple((c.effect, c.name, c.log) for c in self.coordinates)
         self._run, self._slope = _programs(union, layout, tuple(tuple(q) for _, q in tests))
@@ -217,27 +217,16 @@ def _programs(
     return _PROGRAMS[key][1:]
 
 
-def _usable(bed: WheelBed, candidates: Mapping[str, Effect]) -> tuple[dict[str, Effect], tuple[NotTested, ...]]:
-    """Candidates that a steady-state bed can hold beside the model's own effects."""
-    present = {e.name for e in bed.effects}
-    usable, refused = {}, []
-    for name, effect in candidates.items():
-        if name in present:
-            continue
-        if effect.transient or not any(port in PORTS for port in effect.ports):
-            refused.append(NotTested(name, "does not act on a wheel in steady state"))
-        elif present & set(effect.replaces):
-            refused.append(NotTested(name, f"would replace {', '.join(sorted(present & set(effect.replaces)))}"))
-        elif all(p.null is None for p in effect.parameters.values()):
-            refused.append(NotTested(name, "has no null value"))
-        else:
-            usable[name] = effect
-    return usable, tuple(refused)
+def _unfit(name: str, effect: Effect) -> str:
+    """Why a steady-state bed cannot hold an effect beside the model's own, or ""."""
+    del name
+    held = not effect.transient and any(port in PORTS for port in effect.ports)
+    return "" if held else "does not act on a wheel in steady state"
 
 
 def _coordinates(
     bed: WheelBed,
-    usable: Mapping[str, Effect],
+    effects: Mapping[str, Effect],
     baseline: Mapping[str, Mapping[str, tuple[float, float, float, float]]],
     values: Mapping[str, Mapping[str, float]],
 ) -> tuple[tuple[Coordinate, ...], np.ndarray, dict[str, np.ndarray]]:
@@ -259,7 +248,7 @@ def _coordinates(
                 physical = p.null in p.bounds
                 found.append(Coordinate(effect.name, name, at, 0.3 * scale, *p.bounds, False, WIDE, physical, p.unit))
     count, places = len(found), {}
-    for name, effect in usable.items():
+    for name, effect in effects.items():
         mine = of_candidate(effect, values.get(name))
         places[name] = np.arange(len(found), len(found) + len(mine))
         found += mine

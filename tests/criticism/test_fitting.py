@@ -10,8 +10,9 @@ from scipy.optimize import lsq_linear
 from toy_problem import Decay, Linear, TwoMinima, coordinate, manoeuvres
 
 from lunar_mjx.criticism import fitting
-from lunar_mjx.criticism.descent import Objective, Rival, descend
+from lunar_mjx.criticism.descent import Rival, descend
 from lunar_mjx.criticism.fitting import Memory, fit
+from lunar_mjx.criticism.objective import Objective
 
 RNG = np.random.default_rng(0)
 BASE = RNG.standard_normal((120, 3))

@@ -11,7 +11,7 @@ import pytest
 from toy_problem import manoeuvres
 
 from lunar_mjx.criticism.drive_nuisances import standing_shows
-from lunar_mjx.criticism.drive_problem import DriveProblem
+from lunar_mjx.criticism.drive_problem import SIMULATED, DriveProblem
 from lunar_mjx.criticism.drive_program import PIECE, SETTLE, STOOD, Program, _between
 from lunar_mjx.criticism.drive_runs import Bench
 from lunar_mjx.criticism.log import read_log, simulate_log, write_log
@@ -66,6 +66,7 @@ def test_it_is_a_nuisance_where_the_ground_is_inclined_and_it_shows(tmp_path, mo
         yield 0, slice(0, rows), np.outer(change, np.arange(len(observations)))
 
     monkeypatch.setattr(Bench, "run", run)
+    SIMULATED.clear()
     problem = DriveProblem([read_log(log)], model, {})
     assert any(c.name == STOOD for c in problem.coordinates) is (asked and shows)
     assert len(runs) == asked
