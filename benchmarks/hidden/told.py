@@ -42,7 +42,7 @@ def told(truth: Truth, recipe: Recipe, seen: Observed, replicates: int = 3) -> d
 
     Returns:
       `over_floor`: root mean square over the observations left out, over that of the truth itself (None if there are
-      none); `parameters`: relative error of each hidden one, and whether its 95 % interval covers the truth.
+      none); `parameters`: relative error of each hidden one that shows, and whether its 95 % interval covers the truth.
     """
     names = [(effect, key) for effect, values in truth.effects.items() for key in values]
     sigma = np.array([truth.sigma[c] for c in seen.channel]) * recipe.scale / np.sqrt(replicates)
@@ -51,15 +51,17 @@ def told(truth: Truth, recipe: Recipe, seen: Observed, replicates: int = 3) -> d
                for e in _STEP * np.eye(len(_SOIL) + len(names))]  # fmt: skip
     jacobian, noise, fitted = np.stack(columns, axis=1), seen.value / sigma - clean, seen.fitted
     known = np.linalg.inv(_correlation(seen, recipe)[np.ix_(fitted, fitted)])
-    size = 1.0 / np.sqrt(np.diag(jacobian[fitted].T @ known @ jacobian[fitted]))
+    information = np.diag(jacobian[fitted].T @ known @ jacobian[fitted])
+    felt = information > 0.0  # a number of grousers beyond which another adds nothing is not
+    size = np.where(felt, 1.0 / np.sqrt(np.where(felt, information, 1.0)), 0.0)
     scaled = jacobian * size
     covariance = np.linalg.pinv(scaled[fitted].T @ known @ scaled[fitted], rcond=_RANK, hermitian=True)
     away = covariance @ scaled[fitted].T @ known @ noise[fitted]
     left = (noise - scaled @ away)[~fitted]
     std = size * np.sqrt(np.diag(covariance))
-    ends = zip(names, (size * away)[len(_SOIL) :], std[len(_SOIL) :], strict=True)
+    ends = zip(names, (size * away)[len(_SOIL) :], std[len(_SOIL) :], felt[len(_SOIL) :], strict=True)
     rows = [{"effect": effect, "name": key, "error": float(abs(a)), "covered": bool(abs(a) <= _95 * s)}
-            for (effect, key), a, s in ends]  # fmt: skip
+            for (effect, key), a, s, shows in ends if shows]  # fmt: skip
     floor = np.sqrt(np.mean(noise[~fitted] ** 2)) if left.size else 0.0
     return {"over_floor": float(np.sqrt(np.mean(left**2)) / floor) if floor else None, "parameters": rows}
 

@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 from toy_problem import Decay, Linear, TwoMinima, coordinate, manoeuvres
 
 from lunar_mjx.criticism import fitting
-from lunar_mjx.criticism.descent import Rival, descend
+from lunar_mjx.criticism.descent import Rival, chase, descend
 from lunar_mjx.criticism.fitting import Memory, fit
 from lunar_mjx.criticism.objective import Objective
 
@@ -144,6 +144,50 @@ class Valley(TwoMinima):
 
     def jacobian(self, u, which):
         return np.array([[-1.0, 0.0], [-20.0 * u[0], 10.0]])[:, which]
+
+
+class Free(Valley):
+    """The same, where rows cost nothing; keeps what is asked for and foreseen."""
+
+    eager = True
+
+    def __init__(self):
+        super().__init__()
+        self.asked, self.foreseen = [], []
+
+    def predict(self, u):
+        self.asked.append(np.atleast_2d(u).copy())
+        return super().predict(u)
+
+    def foresee(self, rows, which=None):
+        self.foreseen += list(rows)
+
+
+def test_where_rows_are_free_other_starts_take_their_own_jacobian_first():
+    at = np.array([1.0, 1.0])
+    starts = np.array([[1.2, 1.3], [0.7, 0.6]])
+    rounds = {}
+    for kind in (Valley, Free):
+        problem = kind()
+        calls = []
+        plain = problem.predict
+        problem.predict = lambda u, plain=plain, calls=calls: (calls.append(len(u)), plain(u))[1]
+        goal = Objective(problem, problem.free(), np.ones(2, bool))
+        best = descend(goal, at)
+        calls.clear()
+        ends = chase(goal, best, starts)
+        assert max(ends) < best.chi2 + 1.0
+        rounds[kind] = len(calls)
+    assert rounds[Free] <= rounds[Valley]
+
+
+@pytest.mark.parametrize(("start", "beside"), [((1.0, 1.0), True), ((-1.2, 1.0), False)])
+def test_starts_are_simulated_beside_a_first_fit_that_has_nothing_to_gain(start, beside):
+    problem = Free()
+    fit(problem, problem.free(), np.array(start), starts=4, spread=0.5)
+    others = [row for rows in problem.asked if len(rows) == 3 for row in rows][:3]
+    assert len(problem.foreseen) >= 3
+    assert all(any(np.array_equal(o, f) for f in problem.foreseen) for o in others) is beside
 
 
 def test_a_fit_at_the_noise_goes_on_while_its_gradient_promises_more():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -121,6 +123,32 @@ def test_foreseen_rows_are_taken_along_where_rows_cost_nothing(logs, runs):
     jacobian = problem.jacobian(origin, which)
     assert len(runs) == 2
     assert np.array_equal(jacobian, _problem(logs).jacobian(origin, which))
+
+
+def test_the_step_is_not_halved_again_within_a_sigma(logs, runs):
+    problem = _problem(logs)
+    halved = 0.5 * problem.model.timestep
+    origin = problem.origin()
+    place = problem.baseline[0]
+    away = [origin.copy() for _ in range(3)]
+    away[1][place], away[2][place] = 1e-4, 1.0  # a hundredth of a sigma per row of its factor, and a hundred
+    changes = [problem._halving(u) for u in away]
+    assert sum(c[1] == halved for c in runs) == 2
+    assert np.array_equal(changes[0], changes[1])
+    rubbing = origin.copy()
+    rubbing[problem.candidates["coulomb_friction"]] = 1e-9
+    problem._halving(rubbing)
+    assert sum(c[1] == halved for c in runs) == 3  # what acts is another
+
+
+def test_how_long_a_rover_had_stood_is_asked_once(logs, runs, monkeypatch):
+    monkeypatch.setattr(drive_problem, "standing_shows", lambda change, number, observations: False)
+    slope = make_model("luvmi_x", terrain="slope:10deg")
+    inclined = [dataclasses.replace(log, terrain="slope:10deg") for log in logs]
+    _problem(inclined, slope)
+    assert [c[2] for c in runs] == [2]
+    _problem(inclined, slope)
+    assert len(runs) == 1
 
 
 def test_old_rows_go_first_when_memory_is_spent():
