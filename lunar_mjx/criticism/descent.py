@@ -248,8 +248,8 @@ def same_chi2(chi2: float, observations: int) -> float:
     return max(SAME_CHI2, 1e-4 * chi2, slack_of(chi2, observations))
 
 
-def chase(goal: Objective, best: Descent, starts: np.ndarray, rounds: int = 8) -> list[float]:
-    """Chi-square that other starts reach with the best start's Jacobian, all starts in one batch.
+def chase(goal: Objective, best: Descent, starts: np.ndarray, rounds: int = 8) -> tuple[np.ndarray, list[float]]:
+    """Places (k, coordinates) that other starts reach with the best start's Jacobian, and chi-square there, in one batch.
 
     The fixed Jacobian (chord method) converges linearly to the same optimum where there is one. Where rows are free,
     the first step is taken with a Jacobian of the start's own.
@@ -278,4 +278,4 @@ def chase(goal: Objective, best: Descent, starts: np.ndarray, rounds: int = 8) -
         better = new_chi2 < chi2
         share = np.where(better, np.minimum(1.0, 2.0 * share), 0.4 * share)
         u[better], residual[better], chi2 = trial[better], new_residual[better], np.minimum(chi2, new_chi2)
-    return [float(c) for c in chi2]
+    return u, [float(c) for c in chi2]

@@ -36,6 +36,8 @@ AGREEING = 3
 HALF_STEP = 25.0
 """Largest change of chi-square by halving the time step: below what would name an effect."""
 
+_AGAIN = 3
+"""Times that other starts begin about a fit, each lower than the one before."""
 _NEARER = 0.3
 """Share of the box of starts within which others begin, about the first fit, where rows are dear."""
 
@@ -273,27 +275,50 @@ def _foresee_end(goal: Objective, first: Descent, certify: bool) -> None:
 def _lowest(
     goal: Objective, first: Descent, origin: np.ndarray, others: np.ndarray, progress: Progress
 ) -> tuple[Descent, tuple[float, ...]]:
-    """The lowest descent, and the chi-square of every start; where rows are dear, other starts chase the first."""
-    found, ends = [first], []
+    """The lowest descent, and the chi-square of every start.
+
+    Where rows are dear, other starts chase the first. One that ends lower is what has to be agreed upon, and the others
+    begin again about it.
+    """
     if goal.problem.cheap_jacobian:
+        found = [first]
         for i, other in enumerate(others):
             progress("fitting", (i + 1) / (len(others) + 1))
             found.append(descend(goal, other))
-    elif len(others) and not slack_of(found[0].chi2, int(goal.fitted.sum())):
-        # where the first gained nothing that matters, the others have been simulated beside it
-        gained = float(goal.residuals(origin[None])[1][0]) - found[0].chi2
-        near = _near(goal, origin if gained < SAME_CHI2 else found[0].u, origin, others)
-        ends = chase(goal, found[0], near)
-        # A fixed Jacobian may lead a start astray that descends well with its own.
-        enough = found[0].chi2 + same_chi2(found[0].chi2, int(goal.fitted.sum()))
-        for i in np.argsort(ends):
-            if 1 + sum(e <= enough for e in ends) >= AGREEING:
-                break
-            if ends[i] > enough:
-                found.append(descend(goal, near[i]))
-                ends[i] = found[-1].chi2
-        ends = ends if len(found) == 1 else [e for e in ends if all(e != d.chi2 for d in found)]
-    return min(found, key=lambda d: d.chi2), tuple(sorted([d.chi2 for d in found] + ends))
+        return min(found, key=lambda d: d.chi2), tuple(sorted(d.chi2 for d in found))
+    if not len(others) or slack_of(first.chi2, int(goal.fitted.sum())):
+        return first, (first.chi2,)
+    # where the first gained nothing that matters, the others have been simulated beside it
+    gained = float(goal.residuals(origin[None])[1][0]) - first.chi2
+    lowest, centre, ends = first, origin if gained < SAME_CHI2 else first.u, [first.chi2]
+    for _ in range(_AGAIN):
+        caught = lowest
+        more, ends = _chased(goal, caught, _near(goal, centre, origin, others))
+        ends = [caught.chi2, *ends]
+        lowest = min([caught, *more], key=lambda d: d.chi2)
+        if lowest.chi2 >= caught.chi2 - same_chi2(caught.chi2, int(goal.fitted.sum())):
+            break
+        centre = lowest.u
+    return lowest, tuple(sorted(ends))
+
+
+def _chased(goal: Objective, first: Descent, near: np.ndarray) -> tuple[list[Descent], list[float]]:
+    """Descents of their own, and the chi-square of every start (k, coordinates) near a fit that is to be confirmed."""
+    places, ends = chase(goal, first, near)
+    found = []
+    same = same_chi2(first.chi2, int(goal.fitted.sum()))
+    enough = first.chi2 + same
+    # A fixed Jacobian may lead a start astray that descends well with its own, and one that went lower has not arrived.
+    for i in np.argsort(ends):
+        if ends[i] < first.chi2 - same:
+            found.append(descend(goal, places[i]))
+            return found, [found[-1].chi2]
+        if 1 + sum(e <= enough for e in ends) >= AGREEING:
+            break
+        if ends[i] > enough:
+            found.append(descend(goal, near[i]))
+            ends[i] = found[-1].chi2
+    return found, ends
 
 
 def _near(goal: Objective, centre: np.ndarray, origin: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from lunar_mjx.criticism.localise import pattern
 from lunar_mjx.criticism.patterns import Unlisted, find_pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Candidate, Settings, refit, refit_all, with_own_step_error
+from lunar_mjx.criticism.scan import overlooked
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
 
 _HOPELESS = 200.0
@@ -260,6 +261,8 @@ def _grow(
     for s in good[refits:]:
         if near.get(good[0].effect, {}).get(s.effect, 0.0) >= settings.confounded and len(chosen) < 2 * settings.refits:
             chosen.append(s)
+    with problem.focused([*problem.candidates, SMOOTH]):
+        chosen += overlooked(problem, parent.fit, parent.effects, [s for s in scores if s not in chosen])
     new = [s for s in chosen if frozenset((*parent.effects, s.effect)) not in tried]
     with problem.focused([*parent.effects, *(s.effect for s in new)]):
         grown = refit_all(problem, parent, new, settings, memory)

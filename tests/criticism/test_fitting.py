@@ -122,11 +122,39 @@ def test_a_step_that_meets_a_bound_is_the_best_within_it():
 def test_starts_that_a_fixed_jacobian_leads_astray_descend_with_their_own(monkeypatch):
     problem = decay()
     problem.cheap_jacobian = False
-    monkeypatch.setattr(fitting, "chase", lambda goal, best, starts: [best.chi2 + 1e3 + i for i in range(len(starts))])
+    astray = lambda goal, best, starts: (starts, [best.chi2 + 1e3 + i for i in range(len(starts))])  # noqa: E731
+    monkeypatch.setattr(fitting, "chase", astray)
     found = fit(problem, problem.free(), np.array([1.0, 0.2]), starts=4)
     assert found.problems == ()
     agreeing = [c for c in found.starts if c < found.chi2 + 1.0]
     assert (len(found.starts), len(agreeing)) == (4, 3)  # as many as a certificate needs, and no more
+
+
+class Steps(TwoMinima):
+    """Rows are dear, and the worse minimum, near which it starts, is no worse than noise may be."""
+
+    cheap_jacobian = False
+
+    def origin(self):
+        return np.array([-1.05])
+
+    def predict(self, u):
+        return super().predict(u) * [1.0, 0.5]
+
+    def jacobian(self, u, which):
+        return super().jacobian(u, which) * [[1.0], [0.5]]
+
+
+def test_starts_begin_again_about_a_lower_fit_that_one_of_them_found():
+    problem = Steps()
+    goal = Objective(problem, problem.free(), np.ones(2, bool))
+    first = descend(goal, problem.origin())
+    assert first.u[0] < 0.0
+    others = problem.origin() + np.array([[0.3], [7.5], [7.0]])
+    lowest, chi2s = fitting._lowest(goal, first, problem.origin(), others, fitting.silent)
+    assert lowest.u[0] == pytest.approx(1.0, abs=0.01)
+    assert lowest.chi2 == pytest.approx(min(chi2s))
+    assert sum(c < lowest.chi2 + 1.0 for c in chi2s) >= 3
 
 
 class Valley(TwoMinima):
@@ -175,7 +203,7 @@ def test_where_rows_are_free_other_starts_take_their_own_jacobian_first():
         goal = Objective(problem, problem.free(), np.ones(2, bool))
         best = descend(goal, at)
         calls.clear()
-        ends = chase(goal, best, starts)
+        _, ends = chase(goal, best, starts)
         assert max(ends) < best.chi2 + 1.0
         rounds[kind] = len(calls)
     assert rounds[Free] <= rounds[Valley]

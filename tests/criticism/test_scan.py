@@ -8,7 +8,7 @@ import numpy as np
 from toy_problem import Linear, manoeuvres
 
 from lunar_mjx.criticism.fitting import fit
-from lunar_mjx.criticism.scan import scan
+from lunar_mjx.criticism.scan import overlooked, scan
 from lunar_mjx.criticism.score import Score
 
 TIME = np.arange(400) * 0.01
@@ -50,3 +50,22 @@ def test_near_the_data_derivatives_are_trusted():
     late = problem(0.0)
     base = fit(late, late.free(), starts=1, certify=False)
     assert scan(late, base, (), [faint(1.0)]) == {}
+
+
+def test_what_scores_rank_low_is_refitted_where_a_usual_amount_takes_off_most():
+    late = problem(1.0)
+    base = fit(late, late.free(), starts=1, certify=False)
+    asked = faint(1.0)
+    assert overlooked(late, base, (), [asked]) == [asked]
+    assert overlooked(late, base, (), []) == []
+    wrong = faint(-1.0)  # an amount on the wrong side
+    assert overlooked(late, base, (), [wrong]) == []
+
+
+def test_near_the_data_and_in_tables_scores_are_trusted():
+    late = problem(0.0)
+    assert overlooked(late, fit(late, late.free(), starts=1, certify=False), (), [faint(1.0)]) == []
+    far = problem(1.0)
+    base = fit(far, far.free(), starts=1, certify=False)
+    far.cheap_jacobian = True
+    assert overlooked(far, base, (), [faint(1.0)]) == []
