@@ -249,7 +249,7 @@ def same_chi2(chi2: float, observations: int) -> float:
 
 
 def chase(goal: Objective, best: Descent, starts: np.ndarray, rounds: int = 8) -> tuple[np.ndarray, list[float]]:
-    """Places (k, coordinates) that other starts reach with the best start's Jacobian, and chi-square there, in one batch.
+    """Places (k, coordinates) that other starts reach with the best start's Jacobian, and chi-square there, in one go.
 
     The fixed Jacobian (chord method) converges linearly to the same optimum where there is one. Where rows are free,
     the first step is taken with a Jacobian of the start's own.
