@@ -46,7 +46,7 @@ def scan(
     for s in new:
         places = [i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude]
         for start in (fit.u, given):
-            for amount in _amounts(problem, places, s, AMOUNTS):
+            for amount in _amounts(problem, places, s):
                 rows.append(start.copy())
                 rows[-1][places] = amount
                 owner.append(s.effect)
@@ -63,8 +63,9 @@ def scan(
 def overlooked(problem: Problem, fit: Fit, effects: Sequence[str], others: Sequence[Score]) -> list[Score]:
     """Candidates that scores far from the data have ranked too low: a usual amount of one takes off most of chi-square.
 
-    (A delay of 119 ms was not among the eight best scores of a baseline at 38 sigma, which had moved far to make up for
-    it; 100 ms of it in the model as given leave 7 % of chi-square.)
+    Those with several amplitudes have no usual amount, and are left to their scores. (A delay of 119 ms was not among
+    the eight best scores of a baseline at 38 sigma, which had moved far to make up for it; 100 ms of it in the model as
+    given leave 7 % of chi-square.)
 
     Args:
       problem: model and measurements. fit: of the model with some effects. effects: their names.
@@ -72,19 +73,33 @@ def overlooked(problem: Problem, fit: Fit, effects: Sequence[str], others: Seque
     """
     if not _misleading(problem, fit):
         return []
-    given = _given(problem, fit, effects)
-    rows, owner = [], []
-    for s in others:
-        places = [i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude]
-        for amount in _amounts(problem, places, s, _USUAL):
-            rows.append(given.copy())
-            rows[-1][places] = amount
-            owner.append(s)
-    if not rows:
+    blocks = [_usual(problem, fit, effects, s.effect, (float(np.sign(s.amount[0])),)) for s in others]
+    owner = [s for s, block in zip(others, blocks, strict=True) for _ in block]
+    if not owner:
         return []
-    _, chi2 = Objective(problem, problem.free(effects), fit.fitted).residuals(np.array(rows))
+    _, chi2 = Objective(problem, problem.free(effects), fit.fitted).residuals(np.concatenate(blocks))
     ahead = [(float(c), k) for k, c in enumerate(chi2) if c < _MOSTLY * fit.chi2]
     return list(dict.fromkeys(owner[k] for _, k in sorted(ahead)))[:_FEW]
+
+
+def foresee_overlooked(problem: Problem, fit: Fit, effects: Sequence[str], names: Sequence[str]) -> None:
+    """`overlooked` may be asked for these candidates."""
+    if _misleading(problem, fit):
+        for name in names:
+            problem.foresee(_usual(problem, fit, effects, name, (1.0, -1.0)))
+
+
+def _usual(problem: Problem, fit: Fit, effects: Sequence[str], name: str, signs: Sequence[float]) -> np.ndarray:
+    """(k, coordinates) usual amounts of a candidate, if it has one amplitude, in the model as it was given."""
+    places = [i for i in problem.candidates[name] if problem.coordinates[i].amplitude]
+    if len(places) != 1:
+        return np.zeros((0, len(fit.u)))
+    low, high = problem.coordinates[places[0]].bounds()
+    tried = np.concatenate([sign * _USUAL for sign in signs])
+    tried = tried[(tried > low) & (tried < high)]
+    rows = np.repeat(_given(problem, fit, effects)[None], len(tried), axis=0)
+    rows[:, places[0]] = tried
+    return rows
 
 
 def _misleading(problem: Problem, fit: Fit) -> bool:
@@ -99,10 +114,10 @@ def _given(problem: Problem, fit: Fit, effects: Sequence[str]) -> np.ndarray:
     return given
 
 
-def _amounts(problem: Problem, places: Sequence[int], s: Score, amounts: np.ndarray) -> np.ndarray:
+def _amounts(problem: Problem, places: Sequence[int], s: Score) -> np.ndarray:
     """(k, amplitudes) amounts to try: shares of the linear one; for one amplitude, multiples of its nominal size."""
     if len(places) != 1:
         return np.array([1.0, 0.3])[:, None] * np.clip(s.amount, -3.0, 3.0)
     low, high = problem.coordinates[places[0]].bounds()
-    tried = np.sign(s.amount[0]) * amounts
+    tried = np.sign(s.amount[0]) * AMOUNTS
     return tried[(tried > low) & (tried < high), None]

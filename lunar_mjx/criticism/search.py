@@ -16,7 +16,7 @@ from lunar_mjx.criticism.localise import pattern
 from lunar_mjx.criticism.patterns import Unlisted, find_pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Candidate, Settings, refit, refit_all, with_own_step_error
-from lunar_mjx.criticism.scan import overlooked
+from lunar_mjx.criticism.scan import foresee_overlooked, overlooked
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
 
 _HOPELESS = 200.0
@@ -220,6 +220,7 @@ def _scores(problem: Problem, at: Candidate, settings: Settings) -> tuple[list[S
     """
     names = [e for e in problem.candidates if e not in at.effects]
     inputs = list(problem.inputs) if at.noise.passes and np.isfinite(at.fit.chi2) else []
+    foresee_overlooked(problem, at.fit, at.effects, names)
     with problem.focused([*problem.candidates, SMOOTH]):
         columns = signatures(problem, at.fit, names, inputs)
     if inputs and columns:

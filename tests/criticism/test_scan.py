@@ -8,7 +8,7 @@ import numpy as np
 from toy_problem import Linear, manoeuvres
 
 from lunar_mjx.criticism.fitting import fit
-from lunar_mjx.criticism.scan import overlooked, scan
+from lunar_mjx.criticism.scan import foresee_overlooked, overlooked, scan
 from lunar_mjx.criticism.score import Score
 
 TIME = np.arange(400) * 0.01
@@ -60,6 +60,21 @@ def test_what_scores_rank_low_is_refitted_where_a_usual_amount_takes_off_most():
     assert overlooked(late, base, (), []) == []
     wrong = faint(-1.0)  # an amount on the wrong side
     assert overlooked(late, base, (), [wrong]) == []
+
+
+def test_what_may_be_asked_for_is_foreseen_with_either_sign():
+    late, foreseen = problem(1.0), []
+    late.foresee = lambda rows, which=None: foreseen.extend(rows[:, 1])
+    base = fit(late, late.free(), starts=1, certify=False)
+    foresee_overlooked(late, base, (), ["delay"])
+    assert foreseen == [1.0, 2.0, -1.0, -2.0]
+    several, late.coordinates = late.coordinates, (*late.coordinates, late.coordinates[1])
+    late.candidates["delay"] = np.array([1, 2])
+    base = dataclasses.replace(base, u=np.zeros(3))
+    foreseen.clear()
+    foresee_overlooked(late, base, (), ["delay"])
+    late.coordinates = several
+    assert foreseen == []  # no amount is usual where there are several amplitudes
 
 
 def test_near_the_data_and_in_tables_scores_are_trusted():
