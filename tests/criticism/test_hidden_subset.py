@@ -27,7 +27,7 @@ from lunar_mjx.simulate import joint_channels
 
 SEED = 20261
 DRIVE_KINDS = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
-NULLS, SINGLES = 12, len(bed_effects.KNOWN)
+NULLS = 12
 
 
 def rows(group: str, count: int) -> list[dict[str, Any]]:
@@ -38,25 +38,12 @@ def told(found: list[dict[str, Any]]) -> list[str]:
     return [f"{r['case']}: {r['outcome']}, {r['sentence']}" for r in found if not r["right"]]
 
 
-@pytest.mark.slow
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
     """White, coloured and quantised noise by turns, with a little unmodelled dirt."""
     found = rows("nulls", NULLS)
     assert {r["noise"] for r in found} == {"white", "coloured", "quantised"}
     assert not any(r["wrong_name"] for r in found), told(found)
     assert all(r["outcome"] == "quiet" for r in found), told(found)
-
-
-@pytest.mark.slow
-def test_every_single_effect_is_named() -> None:
-    found = rows("singles", SINGLES)
-    assert {n for r in found for n in r["truth"]["effects"]} == set(bed_effects.KNOWN)
-    assert not any(r["wrong_name"] for r in found), told(found)
-    assert sum(r["right"] for r in found) >= SINGLES - 1, told(found)
-    over = [r["over_floor"] for r in found if r["right"]]
-    assert np.median(over) <= 1.01 and max(over) <= 1.05
-    values = [p for r in found for p in r["parameters"]]
-    assert np.median([p["error"] for p in values]) <= 0.05
 
 
 def test_sabotaged_tables_are_bad_data(tmp_path: Path) -> None:
