@@ -130,13 +130,13 @@ class DriveProblem(Problem):
         if not sloped:
             return frozenset()
         keys = [(*self.bench.stamp, self._sampled_at(), STOOD, time) for time in STANDING]
-        known = [SIMULATED.get(k) for k in keys]
-        if any(row is None for row in known):
+        seen = [row for k in keys if (row := SIMULATED.get(k)) is not None]
+        if len(seen) < len(keys):
             values = {("initial", STOOD, n, False): np.array(STANDING) for n in sloped}
-            known = list(self._run(self.bench, len(keys), values, silent))
-            for k, row in zip(keys, known, strict=True):
+            seen = list(self._run(self.bench, len(keys), values, silent))
+            for k, row in zip(keys, seen, strict=True):
                 SIMULATED.keep(k, row)
-        return frozenset(n for n in sloped if standing_shows(known[1] - known[0], n, self.observations))
+        return frozenset(n for n in sloped if standing_shows(seen[1] - seen[0], n, self.observations))
 
     def with_candidates(self, candidates: Mapping[str, Effect], fit: Fit, progress: Progress = silent) -> DriveProblem:
         """The same logs against the fitted model, with other candidates; its origin is the fit."""
