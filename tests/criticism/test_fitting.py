@@ -153,7 +153,7 @@ def test_starts_begin_again_about_a_lower_fit_that_one_of_them_found():
     others = problem.origin() + np.array([[0.3], [7.5], [7.0]])
     lowest, chi2s = fitting._lowest(goal, first, problem.origin(), others, fitting.silent)
     assert lowest.u[0] == pytest.approx(1.0, abs=0.01)
-    assert lowest.chi2 == pytest.approx(min(chi2s))
+    assert lowest.chi2 < 1.0 < first.chi2
     assert sum(c < lowest.chi2 + 1.0 for c in chi2s) >= 3
 
 

@@ -23,6 +23,7 @@ def singles() -> list[dict[str, Any]]:
     return [table_row("singles", n, SEED) for n in range(len(bed_effects.KNOWN))]
 
 
+@pytest.mark.slow
 def test_every_single_effect_is_named(singles: list[dict[str, Any]]) -> None:
     missed = [f"{r['case']}: {r['outcome']}, {r['sentence']}" for r in singles if not r["right"]]
     assert {n for r in singles for n in r["truth"]["effects"]} == set(bed_effects.KNOWN)
@@ -30,6 +31,7 @@ def test_every_single_effect_is_named(singles: list[dict[str, Any]]) -> None:
     assert len(missed) <= 1, missed
 
 
+@pytest.mark.slow
 def test_it_is_fitted_nearly_as_well_as_by_who_was_told(singles: list[dict[str, Any]]) -> None:
     right = [r for r in singles if r["right"]]
     over = [r["over_floor"] for r in right]
