@@ -27,7 +27,7 @@ from lunar_mjx.simulate import joint_channels
 
 SEED = 20261
 DRIVE_KINDS = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
-NULLS = 12
+NULLS = 6
 
 
 def rows(group: str, count: int) -> list[dict[str, Any]]:
