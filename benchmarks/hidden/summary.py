@@ -1,6 +1,6 @@
 """The benchmark's table: every row with counts, Wilson 95 % intervals and its target; and the confusion matrix.
 
-"Who was told" is told what is hidden and how the noise is correlated (`told`): the least that anybody could reach.
+"Who was told" is told what is hidden and how the noise is correlated (`told`), but has no priors.
 """
 
 from __future__ import annotations
