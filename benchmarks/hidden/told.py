@@ -1,6 +1,7 @@
 """How well a table could be fitted by someone who was told what is hidden and how the noise is correlated.
 
-Weighted least squares by the generator's own physics, linear about the truth: no unbiased estimate without priors does better.
+Weighted least squares by the generator's own physics, linear about the truth: no unbiased estimate
+without priors does better.
 """
 
 from __future__ import annotations
