@@ -46,7 +46,7 @@ def _torque(name: str, loss: Callable[[Any, Numbers], np.ndarray]) -> Callable[[
 
 def _slip_sinkage(p: Numbers, drive: np.ndarray) -> Hook:
     def soil(ctx: Any, state: dict[str, Any], value: dict[str, np.ndarray]) -> None:
-        s, r = np.clip(ctx.contact["slip"], -1.0, 1.0), ctx.geometry["radius"]
+        s, r = ctx.contact["soil_slip"], ctx.geometry["radius"]
         more = p["driving"] * np.maximum(s, 0.0) + p["skid"] * np.maximum(-s, 0.0)
         for key in ("k_c", "k_phi"):
             value[key] = value[key] * r**-more

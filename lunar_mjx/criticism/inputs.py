@@ -105,7 +105,7 @@ QUANTITIES: Mapping[str, Callable[[Any, Any], Any]] = {
     "current": lambda ctx, value: value.current / 1.0,
     "joint speed": lambda ctx, value: ctx.joint_speed / 2.0,
     "wheel speed": lambda ctx, value: _wheel_speed(ctx) / 2.0,
-    "slip": lambda ctx, value: ctx.contact.slip / 0.3,
+    "slip": lambda ctx, value: ctx.contact.soil_slip / 0.3,
     "signed slip": lambda ctx, value: value.slip_x / 0.3,
     "lateral slip": lambda ctx, value: value.slip_y / 0.3,
     "load": lambda ctx, value: value.load / 100.0,

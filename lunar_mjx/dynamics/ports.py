@@ -112,11 +112,12 @@ def wheel_contact(ctx: Context) -> Contact:
     rim_speed = geometry.radius * ctx.wheel_angular_velocity.dot(ctx.wheel_axle)
     roll = jnp.where(jnp.abs(rim_speed) > jnp.abs(v_x), rim_speed, v_x)
     heading = jnp.where(roll < 0.0, -1.0, 1.0)
+    slip = heading * (rim_speed - v_x) / jnp.maximum(jnp.abs(roll), SLIP_SPEED_FLOOR)
     travel = jnp.maximum(jnp.abs(v_x), SLIP_SPEED_FLOOR)
     return Contact(
         sinkage=sinkage,
         sinkage_rate=-ctx.wheel_velocity.dot(normal),
-        slip=heading * (rim_speed - v_x) / jnp.maximum(jnp.abs(roll), SLIP_SPEED_FLOOR),
+        slip=slip,
         slip_angle=jnp.arctan2(v_y, travel),
         v_x=v_x,
         v_y=v_y,
@@ -125,6 +126,7 @@ def wheel_contact(ctx: Context) -> Contact:
         left=left,
         normal=normal,
         inside=inside(ctx.terrain.field, place.x, place.y),
+        soil_slip=jnp.clip(slip, -1.0, 1.0),
     )
 
 
@@ -153,9 +155,22 @@ def initial_wheel(contact: Contact) -> WheelForce:
     )
 
 
+def _remembered(contact: Contact, state: EffectState) -> Contact:
+    """A contact with the slip that the soil remembers, where an effect keeps it.
+
+    The slip of a wheel that creeps changes within a millimetre per second from none to full. Soil that answered to it
+    at once would shake a parked rover for ever; it is displaced over a contact length instead.
+    """
+    for kept in state.values():
+        if {"slip_x", "direction"} <= kept.keys():
+            return dataclasses.replace(contact, soil_slip=jnp.clip(kept["direction"] * kept["slip_x"], -1.0, 1.0))
+    return contact
+
+
 def wheel_ports(pipeline: Pipeline, ctx: Context, state: EffectState) -> tuple[Context, EffectState]:
     """The ports soil, wheel_normal and wheel_shear, for a context that already has its contact."""
-    contact: Contact = ctx.contact  # type: ignore[assignment]
+    contact: Contact = _remembered(ctx.contact, state)  # type: ignore[arg-type]
+    ctx = dataclasses.replace(ctx, contact=contact)
     soil, state = pipeline.run("soil", ctx, state, initial_soil(contact.sinkage))
     ctx = dataclasses.replace(ctx, soil=soil)
     normal, state = pipeline.run("wheel_normal", ctx, state, initial_normal(contact.sinkage))

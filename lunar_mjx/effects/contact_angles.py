@@ -8,7 +8,6 @@ import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Parameter, effect
 from lunar_mjx.effects.context import Arc
-from lunar_mjx.effects.slip_sinkage import clipped_slip
 from lunar_mjx.effects.stress_integral import integrate
 from lunar_mjx.effects.wheel import (
     contact_with_soil,
@@ -49,7 +48,7 @@ def exit_angle(ctx, p, x, normal):
     on the stress integral; theta_m stays within [0.05, 0.95] theta_1 and theta_2 within [-0.95, 0] theta_1.
     """
     contact, geometry = contact_with_soil(ctx), ctx.geometry
-    slip, theta_1 = clipped_slip(contact), normal.entrance
+    slip, theta_1 = contact.soil_slip, normal.entrance
     # The shares of theta_1 beyond those of the model without this effect, so that nothing is rounded at their null.
     ahead = jnp.clip((p.c1 - 0.5) + p.c2 * slip, -0.45, 0.45)
     behind = p.c3 + p.c4 * slip

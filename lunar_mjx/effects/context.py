@@ -63,6 +63,8 @@ class Contact:
       rim_speed: r times the wheel's angular velocity, m/s.
       forward, left, normal: axes of the wheel frame (heading, left, ground normal), in world coordinates.
       inside: whether the wheel is over the terrain's grid.
+      soil_slip: the slip as the soil remembers it, within [-1, 1]: its shear displacement over the contact length. It
+        tends to the slip while the wheel rolls on and stays when it stops; the slip itself where no effect keeps it.
     """
 
     sinkage: Float[Array, "wheel"]
@@ -76,6 +78,7 @@ class Contact:
     left: Vec3
     normal: Vec3
     inside: Array
+    soil_slip: Float[Array, "wheel"]
 
 
 @pytree

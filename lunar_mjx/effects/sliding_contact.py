@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.effects.base import Parameter, effect
-from lunar_mjx.effects.slip_sinkage import clipped_slip
 from lunar_mjx.effects.wheel import contact_with_soil, grounded, mean_decay, sin_difference
 from lunar_mjx.spatial import Vec3
 
@@ -68,7 +67,9 @@ def slide_softening(ctx, p, x, ground):
     """
     c = ctx.contact
     fastest = jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + c.v_y**2 + _STILL**2))
-    along, across = (c.rim_speed - c.v_x) / fastest, c.v_y / fastest
+    # eq. 8 has the larger of rim and forward speed below
+    along = c.soil_slip * jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + _STILL**2)) / fastest
+    across = c.v_y / fastest
     sliding = jnp.sqrt(along**2 + across**2 + _FLAT**2) - _FLAT
     factor = 1.0 / (1.0 + p.softening * sliding)
     return dataclasses.replace(ground, k_c=ground.k_c * factor, k_phi=ground.k_phi * factor)
@@ -135,7 +136,7 @@ def shear_softening(ctx, p, x, normal):
     the arc, with the displacements of Janosi & Hanamoto 1961 for the time that soil is under the wheel.
     """
     contact, soil, r = contact_with_soil(ctx), ctx.soil, ctx.geometry.radius
-    slip = clipped_slip(contact)
+    slip = contact.soil_slip
     slip_x = slip / (1.0 + _LONGEST * jnp.minimum(slip, 0.0))
     rim, travel = jnp.abs(contact.rim_speed), jnp.abs(contact.v_x)
     pace = rim + (1.0 - _LONGEST) * jnp.maximum(travel - rim, 0.0)

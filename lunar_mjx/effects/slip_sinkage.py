@@ -12,11 +12,6 @@ _FLAT = 1e-3
 """Slip below which the root of two squares is rounded off."""
 
 
-def clipped_slip(contact):
-    """Slip ratio of eq. 8 within [-1, 1], positive when driving, negative when skidding, in either direction."""
-    return jnp.clip(contact.slip, -1.0, 1.0)
-
-
 def with_exponent(ctx, ground, change):
     """The soil with its sinkage exponent raised by `change`, pressure unaltered at a sinkage of one wheel radius.
 
@@ -39,10 +34,11 @@ _SOFTER = (0.0, 5.0)
 def slip_sinkage(ctx, p, x, ground):
     """n = n_0 + n_1 s when driving, n_0 + n_2 |s| when skidding: the sheared soil is carried out from under the wheel.
 
-    Ding et al. 2010 and the seed paper's n_0 + n_1 |s|, with the sinkage normalised by the
+    s is the slip as the soil remembers it: sheared soil is displaced over a contact length, and stays so under a wheel
+    that stops. Ding et al. 2010 and the seed paper's n_0 + n_1 |s|, with the sinkage normalised by the
     wheel's radius, p = p_0 (z/r)^(n - n_0), so that the moduli keep their meaning whatever the exponent.
     """
-    slip = clipped_slip(ctx.contact)
+    slip = ctx.contact.soil_slip
     change = p.driving * jnp.maximum(slip, 0.0) + p.skid * jnp.maximum(-slip, 0.0)
     return with_exponent(ctx, ground, change)
 
@@ -69,6 +65,6 @@ def angle_sinkage(ctx, p, x, ground):
     speed: slip-sinkage of the total sliding (Lyasko 2010 explains it by the shear displacement, which
     has no preferred direction), less the share along the wheel that `slip_sinkage` holds.
     """
-    s_x, s_y = clipped_slip(ctx.contact), lateral_slip(ctx.contact)
+    s_x, s_y = ctx.contact.soil_slip, lateral_slip(ctx.contact)
     along = jnp.sqrt(s_x**2 + _FLAT**2)
     return with_exponent(ctx, ground, p.lateral * (jnp.sqrt(s_x**2 + s_y**2 + _FLAT**2) - along))

@@ -119,6 +119,12 @@ def mean_decay(q):
     return jnp.where(small, series, -jnp.expm1(-safe) / safe)
 
 
+_SHORTEST = 0.05
+"""Least contact length that remembers its shear, in radii: reached half a hundredth of a radius deep. A shorter one would
+lean fully within the first step of a touchdown, and by whether that step began a micrometre above the ground or below
+it a rover would stand differently for seconds."""
+
+
 def contact_length(ctx, normal):
     """Length of soil sheared between the entrance and the angle of maximum stress, m."""
     return ctx.geometry.radius * sin_difference(normal.entrance, normal.theta_m)
@@ -148,7 +154,7 @@ def shear_state(ctx, p, x, wheel):
     """
     contact = ctx.contact
     rock = ctx.soil.rock > 0.5
-    length = jnp.maximum(contact_length(ctx, ctx.normal), 1e-3 * ctx.geometry.radius)
+    length = jnp.maximum(contact_length(ctx, ctx.normal), _SHORTEST * ctx.geometry.radius)
     length = jnp.where(rock, p.rock_length, length)
     roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
     # share of the way to the steady value, over the time that it would take at the first rate

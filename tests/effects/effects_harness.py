@@ -100,6 +100,7 @@ def _compiled(names: tuple[str | Effect, ...]) -> Callable[..., tuple[WheelForce
         contact = Contact(
             s.sinkage, s.sinkage_rate, jnp.sign(roll) * s.slip_x, jnp.arctan2(motion["v_y"], jnp.abs(motion["v_x"])),
             motion["v_x"], motion["v_y"], motion["rim_speed"], nil, nil, nil, zero == 0,
+            jnp.clip(jnp.sign(roll) * s.slip_x, -1.0, 1.0),
         )  # fmt: skip
         soil = Soil(
             s.k_c, s.k_phi, s.n, s.cohesion, s.tan_phi, s.shear_modulus_x, s.shear_modulus_y, rock + zero

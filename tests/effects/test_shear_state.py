@@ -29,7 +29,7 @@ COUNT = 1000
 def _step(dt: Any, v_x: Any, v_y: Any, rim: Any, sinkage: Any, rock: Any, state: Any, damping_time: Any) -> Any:
     zero = jnp.zeros_like(v_x)
     nil = Vec3(zero, zero, zero)
-    contact = Contact(sinkage, zero, zero, zero, v_x, v_y, rim, nil, nil, nil, zero == 0)
+    contact = Contact(sinkage, zero, zero, zero, v_x, v_y, rim, nil, nil, nil, zero == 0, zero)
     normal = initial_normal(v_x)
     normal = functools.partial(type(normal), THETA_1 + zero, zero, THETA_1 / 2 + zero)(zero, zero, zero, zero)
     soil = dataclasses.replace(initial_soil(v_x), rock=rock)

@@ -45,7 +45,7 @@ def blade(degrees: Array, rim: Array, **values: float) -> Array:
         zero = jnp.zeros(s.sinkage.shape)
         nil = Vec3(zero, zero, zero)
         contact = Contact(s.sinkage, zero, s.slip_x, zero, motion["v_x"], motion["v_y"], motion["rim_speed"], nil, nil,
-                          nil, zero == 0)  # fmt: skip
+                          nil, zero == 0, s.slip_x)  # fmt: skip
         normal = initial_normal(zero)
         normal = dataclasses.replace(normal, entrance=entrance_angle(s.sinkage, s.radius))
         ctx = bare_context(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lunar_mjx.backends.physics.context import Context, Values
-from lunar_mjx.backends.physics.vectors import cross, dot
+from lunar_mjx.backends.physics.vectors import clamp, cross, dot
 
 SLOW = 2e-3
 """m/s; smallest denominator of the slip ratio."""
@@ -41,10 +41,12 @@ def wheel_contact(
     fastest = faster(rim, v_x)
     speed = np.maximum(np.abs(fastest), SLOW)
     heading = 1.0 - 2.0 * (fastest < 0.0)
+    slip = heading * (rim - v_x) / speed
     return {
         "sinkage": sinkage,
         "sinkage_rate": -dot(c.wheel_velocity, normal),
-        "slip": heading * (rim - v_x) / speed,
+        "slip": slip,
+        "soil_slip": clamp(slip, -1.0, 1.0),
         "slip_angle": np.arctan2(v_y, np.maximum(np.abs(v_x), SLOW)),
         "v_x": v_x,
         "v_y": v_y,
@@ -68,7 +70,7 @@ def side_speed(contact: Values) -> np.ndarray:
     if not braking.any():
         return v_y
     ratio = np.divide(rim, v_x, out=np.ones_like(rim), where=braking)
-    return v_y * (2.0 - np.minimum(np.maximum(ratio, -1.0), 1.0))
+    return v_y * (2.0 - clamp(ratio, -1.0, 1.0))
 
 
 def momentary_slip(contact: Values) -> Values:
@@ -78,5 +80,5 @@ def momentary_slip(contact: Values) -> Values:
     return {
         "slip_x": (contact["rim_speed"] - contact["v_x"]) / speed,
         "slip_y": side_speed(contact) / speed,
-        "direction": np.minimum(np.maximum(fastest / SLOW, -1.0), 1.0),
+        "direction": clamp(fastest / SLOW, -1.0, 1.0),
     }

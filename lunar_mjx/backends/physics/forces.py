@@ -13,6 +13,7 @@ from lunar_mjx.backends.physics.contact import momentary_slip, wheel_contact
 from lunar_mjx.backends.physics.context import Context, Values
 from lunar_mjx.backends.physics.ground import Ground
 from lunar_mjx.backends.physics.parameters import Numbers
+from lunar_mjx.backends.physics.vectors import clamp
 
 EffectState = dict[str, Values]
 
@@ -157,6 +158,9 @@ class ForceModel:
 
     def _wheels(self, c: Context, state: EffectState, new: EffectState) -> None:
         effects, hooks = self.numbers.effects, self.hooks
+        if "shear_state" in effects:  # the soil remembers its shear displacement, which a standing wheel keeps
+            kept = state["shear_state"]
+            c.contact["soil_slip"] = clamp(kept["direction"] * kept["slip_x"], -1.0, 1.0)
         c.soil = soil.local_soil(c, self._uniform, self._soil)
         if "soil" in hooks:
             c.soil = hooks.call("soil", c, {k: v.copy() for k, v in c.soil.items()})

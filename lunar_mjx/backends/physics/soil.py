@@ -14,6 +14,8 @@ from lunar_mjx.backends.physics.context import Context, Values
 
 SHALLOW, DEEP = 1e-9, 1.5
 """Sinkage over radius is followed within these bounds (up to an entrance angle of 120 deg)."""
+SHORTEST = 0.05
+"""Contact length, in radii, below which soil is too little touched to remember by how far it was sheared."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 
@@ -92,7 +94,7 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     """
     contact, r = c.contact, c.geometry["radius"]
     theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
-    length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), 1e-3 * r)
+    length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), SHORTEST * r)
     length = np.where(c.soil["rock"] > 0.5, p.rock_length, length)
     roll = faster(contact["rim_speed"], contact["v_x"])
     speed = np.abs(roll)

@@ -1,0 +1,36 @@
+"""The slip that soil effects see: what the soil under the wheel remembers."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import pytest
+from effects_harness import bare_context
+
+from lunar_mjx.dynamics.ports import wheel_ports
+from lunar_mjx.effects.context import Contact
+from lunar_mjx.spatial import Vec3
+
+
+class _Seen:
+    """A pipeline that keeps what the port `soil` is shown."""
+
+    def run(self, port, ctx, state, value):
+        if port == "soil":
+            self.contact = ctx.contact
+        return value, state
+
+
+@pytest.mark.parametrize(
+    ("slip_x", "direction", "expected"), [(0.3, 1.0, 0.3), (-0.3, -1.0, 0.3), (0.3, -0.5, -0.15), (4.0, 1.0, 1.0)]
+)
+def test_soil_remembers_the_slip_where_an_effect_keeps_it(slip_x, direction, expected):
+    """The kept shear displacement in the direction of rolling; without one the slip of the moment, as in a test bed."""
+    one = jnp.ones(1)
+    nil = Vec3(0 * one, 0 * one, 0 * one)
+    contact = Contact(0.01 * one, 0 * one, 0.7 * one, 0 * one, one, 0 * one, one, nil, nil, nil, one == 1, 0.7 * one)
+    ctx = bare_context(contact=contact)
+    seen = _Seen()
+    wheel_ports(seen, ctx, {"other": {"depth": one}})
+    assert float(seen.contact.soil_slip[0]) == pytest.approx(0.7)
+    wheel_ports(seen, ctx, {"shear": {"slip_x": slip_x * one, "direction": direction * one}})
+    assert float(seen.contact.soil_slip[0]) == pytest.approx(expected)
