@@ -120,9 +120,9 @@ def mean_decay(q):
 
 
 _SHORTEST = 0.05
-"""Least contact length that remembers its shear, in radii: reached half a hundredth of a radius deep. A shorter one would
-lean fully within the first step of a touchdown, and by whether that step began a micrometre above the ground or below
-it a rover would stand differently for seconds."""
+"""Least contact length that remembers its shear, in radii; it is reached half a hundredth of a radius deep. A shorter one
+would lean fully within the first step of a touchdown, and whether that step began a micrometre above the ground or
+below it would show in how a rover stands for seconds."""
 
 
 def contact_length(ctx, normal):
