@@ -120,8 +120,8 @@ def mean_decay(q):
 
 
 _SHORTEST = 0.05
-"""Least contact length that remembers its shear, in radii; it is reached half a hundredth of a radius deep. Less
-of it would lean fully within the first step of a touchdown, and whether that step began a micrometre above the ground or
+"""Least contact length that remembers its shear, in radii; it is reached half a hundredth of a radius deep. Less of it
+would lean fully within the first step of a touchdown, and whether that step began a micrometre above the ground or
 below it would show in how a rover stands for seconds."""
 
 
