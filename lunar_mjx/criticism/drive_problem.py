@@ -16,7 +16,7 @@ import numpy as np
 
 from lunar_mjx.criticism.candidates import usable
 from lunar_mjx.criticism.coordinates import Coordinate, of_candidate
-from lunar_mjx.criticism.differences import Differences
+from lunar_mjx.criticism.differences import STEP, WIDE, Differences
 from lunar_mjx.criticism.drive_baseline import BASELINE, baseline_coordinates, unfit
 from lunar_mjx.criticism.drive_noise import Noises
 from lunar_mjx.criticism.drive_nuisances import (
@@ -316,8 +316,10 @@ class DriveProblem(Problem):
         jacobian = lambda k: differences.jacobian(u[k], values[k], self.observations, self._direction)  # noqa: E731
         return np.stack([v[0] for v in values]), jacobian
 
-    def jacobian_and(self, u: np.ndarray, which: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        differences = Differences(self.coordinates, which)
+    def jacobian_and(
+        self, u: np.ndarray, which: np.ndarray, rows: np.ndarray, step: float = STEP
+    ) -> tuple[np.ndarray, np.ndarray]:
+        differences = Differences(self.coordinates, which, step)
         own = differences.rows(u)
         values = self.predict(np.concatenate([own, rows]))
         jacobian = differences.jacobian(u, values[: len(own)], self.observations, self._direction)
@@ -325,6 +327,12 @@ class DriveProblem(Problem):
 
     def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
         return self.jacobian_and(u, which, np.zeros((0, len(u))))[0]
+
+    def wide_jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
+        return self.jacobian_and(u, which, np.zeros((0, len(u))), WIDE)[0]
+
+    def foresee_wide(self, u: np.ndarray, which: np.ndarray) -> None:
+        self.foresee(Differences(self.coordinates, which, WIDE).rows(u))
 
     def _of_log(self, number: int) -> slice:
         return self.observations.of_log.get(number, slice(0, 0))

@@ -61,7 +61,7 @@ class Fit:
       u: (coordinates,) where every coordinate stands. free: places of those that moved.
       chi2: over the fitted observations and the priors.
       residual: (n,) whitened residual of all observations (measured less predicted), in sigma.
-      jacobian: (n, free) whitened sensitivities.
+      jacobian: (n, free) whitened sensitivities, those for intervals where there is a certificate.
       fitted: (n,) which observations were fitted.
       gradient: drop of chi-square that one more step promises. starts: chi-square that each start ended with.
       at_bound: names of parameters at a bound that is not physics. extra: other figures of the certificate.
@@ -250,12 +250,13 @@ def fit(
     count = int(fitted.sum())
     if certify and _asks_roughness(goal, best):
         extra["roughness_chi2"] = goal.roughness(lowest.u, lowest.residual, lowest.jacobian)
+    wide = certify and np.isfinite(best.chi2) and not problem.cheap_jacobian
     agreeing = sum(c <= best.chi2 + same_chi2(best.chi2, count) for c in chi2s)
     problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra, half_step)
     return Fit(
-        u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual, jacobian=best.jacobian,
-        fitted=fitted, gradient=best.promise, starts=chi2s, at_bound=edge, extra=extra, problems=problems,
-        step_error=problem.kept_step_error(),
+        u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual,
+        jacobian=goal.wide_jacobian(best.u) if wide else best.jacobian, fitted=fitted, gradient=best.promise,
+        starts=chi2s, at_bound=edge, extra=extra, problems=problems, step_error=problem.kept_step_error(),
     )  # fmt: skip
 
 
@@ -265,11 +266,15 @@ def _asks_roughness(goal: Objective, best: Descent) -> bool:
 
 def _foresee_end(goal: Objective, first: Descent, certify: bool) -> None:
     """What will be asked for if no other start descends further."""
-    own = _own_place(goal, first) if goal.problem.eager else None
+    if not goal.problem.eager:
+        return
+    own = _own_place(goal, first)
     if own is not None:
         goal.problem.foresee(own[None])
-    if goal.problem.eager and certify and _asks_roughness(goal, first):
-        goal.foresee_roughness(first.u, first.residual, first.jacobian)
+    if certify:
+        goal.problem.foresee_wide(first.u if own is None else own, goal.free)
+        if _asks_roughness(goal, first):
+            goal.foresee_roughness(first.u, first.residual, first.jacobian)
 
 
 def _lowest(

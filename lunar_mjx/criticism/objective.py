@@ -50,7 +50,14 @@ class Objective:
         return np.where(np.isfinite(chi2), chi2, np.inf)
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
-        j = self.problem.observations.whiten(self.problem.jacobian(u, self.free))
+        return self._whitened(self.problem.jacobian(u, self.free))
+
+    def wide_jacobian(self, u: np.ndarray) -> np.ndarray:
+        """The same for intervals."""
+        return self._whitened(self.problem.wide_jacobian(u, self.free))
+
+    def _whitened(self, jacobian: np.ndarray) -> np.ndarray:
+        j = self.problem.observations.whiten(jacobian)
         return np.where(np.isfinite(j), j, 0.0)
 
     def linearise(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, Callable[[int], np.ndarray]]:
@@ -60,8 +67,7 @@ class Objective:
         r = observations.whiten((observations.value[None] - predicted).T).T
 
         def whitened(k: int) -> np.ndarray:
-            j = observations.whiten(jacobian(k))
-            return np.where(np.isfinite(j), j, 0.0)
+            return self._whitened(jacobian(k))
 
         return r, self.chi2(u, r), whitened
 

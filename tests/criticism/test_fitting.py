@@ -256,3 +256,29 @@ def test_a_descent_that_falls_far_short_is_left_once_a_rival_has_arrived():
     assert chi2 < 9.3
     beaten, left_at = steps(8)
     assert 8 <= beaten < 12 < alone and left_at > chi2 + 1.0
+
+
+class Edge(Linear):
+    """Its minimum lies at the edge of a jump, where the first derivative is steep over a short step alone."""
+
+    cheap_jacobian = False
+
+    def jacobian(self, u, which):
+        return self.matrix[:, which] * np.array([20.0, 1.0, 1.0])[which]
+
+    def wide_jacobian(self, u, which):
+        return self.matrix[:, which]
+
+
+def test_intervals_are_those_of_wide_steps():
+    truth = np.array([0.3, -0.2, 0.1])
+    observations = dataclasses.replace(manoeuvres(3, 40), value=BASE @ truth)
+    stds = {}
+    for kind in (Linear, Edge):
+        problem = kind(BASE, {}, observations)
+        found = fit(problem, problem.free(), truth, starts=1)
+        stds[kind] = np.sqrt(np.diag(found.covariance(problem)))
+    np.testing.assert_allclose(stds[Edge], stds[Linear], rtol=1e-9)
+    problem = Edge(BASE, {}, observations)
+    rough = fit(problem, problem.free(), truth, starts=1, certify=False)
+    assert np.sqrt(np.diag(rough.covariance(problem)))[0] < 0.1 * stds[Linear][0]
