@@ -48,7 +48,7 @@ def _parked():
 
 
 def test_soil_that_softens_with_slip_does_not_shake_a_parked_rover():
-    """With the slip of the moment in place of the soil's own, wheels go up and down at up to 21 and 17 mm/s for ever."""
+    """With the slip of the moment in place of the soil's own, wheels go up and down at 21 and 17 mm/s for ever."""
     vertical, _ = _parked()
     late = np.abs(vertical[:3, round(0.8 * vertical.shape[1]) :]).max(axis=(1, 2))
     assert (late < 2e-3).all(), late
