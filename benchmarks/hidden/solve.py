@@ -120,6 +120,7 @@ def drive_row(group: str, number: int, seed: int, folder: str, keep: str | None 
             "noise": answer["recipe"]["kind"], "scale": answer["recipe"]["scale"], "dirt": answer["recipe"]["dirt"],
             "verdict": found.verdict.label if found else "REFUSED", "named": list(found.effects) if found else [],
             "sentence": found.sentence if found else refused, "seconds": round(seconds, 2),
+            "half_step_chi2": _half_steps(found),
         }  # fmt: skip
         if found is not None and found.verdict not in (Verdict.BAD_DATA, Verdict.BAD_FIT):
             kinds = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
@@ -133,6 +134,12 @@ def drive_row(group: str, number: int, seed: int, folder: str, keep: str | None 
     finally:
         if not keep:
             shutil.rmtree(place, ignore_errors=True)
+
+
+def _half_steps(found: Diagnosis | None) -> list[float | None]:
+    """Changes of chi-square by halving the time step, of the baseline and of the model that is named."""
+    details = found.details if found else {}
+    return [details.get(c, {}).get("half_step_chi2") for c in ("certificate", "certificate_after")]
 
 
 def _twins(truth: bed_logs.Truth, name: str) -> float:

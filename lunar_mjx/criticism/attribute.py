@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.fitting import HALF_STEP, Fit, Memory, Progress, fit, silent
+from lunar_mjx.criticism.fitting import HALF_STEP, Fit, Memory, Progress, silent
 from lunar_mjx.criticism.held_out import errors
 from lunar_mjx.criticism.patterns import Unlisted
 from lunar_mjx.criticism.problem import Problem
-from lunar_mjx.criticism.refit import Settings, with_own_step_error
+from lunar_mjx.criticism.refit import Settings, fit_in_own_step, with_own_step_error
 from lunar_mjx.criticism.score import SEPARABLE, Score
 from lunar_mjx.criticism.search import Search, excess_explained, search, significant
 from lunar_mjx.criticism.verdict import Diagnosis, EffectEvidence, Verdict
@@ -91,9 +91,9 @@ def certify(problem: Problem, found: Search, settings: Settings) -> Fit:
     # what held-out logs' own nuisances have moved since is of no account: a step heeds the fitted logs alone
     known = (chosen.fit.residual, chosen.fit.jacobian) if same else None
     with problem.focused(chosen.effects):
-        return fit(problem, free, chosen.fit.u, settings.starts, settings.seed, spread=0.5,
-                   known=None if problem.cheap_jacobian else known,
-                   half_step=max(HALF_STEP, STEP_SHARE * least))  # fmt: skip
+        return fit_in_own_step(problem, free, chosen.fit.u, starts=settings.starts, seed=settings.seed, spread=0.5,
+                               known=None if problem.cheap_jacobian else known,
+                               half_step=max(HALF_STEP, STEP_SHARE * least))  # fmt: skip
 
 
 def _certificate(found: Fit) -> dict[str, Any]:

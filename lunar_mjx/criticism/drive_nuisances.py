@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -85,6 +86,25 @@ def direction(c: Coordinate, observations: Observations, step_error: np.ndarray)
             elif c.name == s.channel:
                 out[part] = 1.0
     return out
+
+
+def unabsorbed(
+    change: np.ndarray, coordinates: Sequence[Coordinate], observations: Observations,
+    along: Callable[[Coordinate], np.ndarray],
+) -> np.ndarray:  # fmt: skip
+    """(n,) what of a change of the predictions the nuisances of the step's error cannot take up.
+
+    `along` gives the directions of these.
+    """
+    whiten, change = observations.whiten, change.copy()
+    for c in coordinates:
+        if c.name == STEP_ERROR:
+            mine, own, known = observations.of_log.get(c.log_index, slice(0, 0)), np.zeros(len(change)), along(c)
+            own[mine] = change[mine]
+            step = whiten(known)
+            size = float(step @ step)
+            change[mine] -= (float(step @ whiten(own)) / size if size > 0.0 else 0.0) * known[mine]
+    return change
 
 
 def from_first(predicted: np.ndarray, observations: Observations) -> np.ndarray:

@@ -27,6 +27,7 @@ from lunar_mjx.criticism.drive_nuisances import (
     is_linear,
     nuisances,
     standing_shows,
+    unabsorbed,
 )
 from lunar_mjx.criticism.drive_observations import observations_of
 from lunar_mjx.criticism.drive_program import STOOD, Rows
@@ -55,6 +56,7 @@ class DriveProblem(Problem):
     """Drive logs against a model."""
 
     cheap_jacobian = False
+    has_windows = True
 
     def __init__(
         self,
@@ -92,6 +94,7 @@ class DriveProblem(Problem):
         # A program holds only the candidates that leave their null in it: fewer compile and run faster.
         self._benches: dict[frozenset[str], Bench] = {frozenset(): self.bench}
         self._focus: frozenset[str] = frozenset()
+        self._windows = False
         self._gather: Gather | None = None
         self._foreseen: list[np.ndarray] = []
         self._stamped: tuple[Observations | None, bytes] = None, b""
@@ -213,7 +216,7 @@ class DriveProblem(Problem):
         names = [(c.effect, c.name, c.log_index, c.factor) for c in (self.coordinates[i] for i in which)]
         columns = [np.asarray(self.coordinates[i].value(rows[:, i]), float) for i in which]
         table = np.stack(columns, axis=1) if columns else np.zeros((len(rows), 0))
-        return keys_of_rows((*bench.stamp, self._sampled_at()), names, table)
+        return keys_of_rows((*bench.stamp, self._windows, self._sampled_at()), names, table)
 
     def _sampled_at(self) -> bytes:
         if self._stamped[0] is not self.observations:
@@ -264,7 +267,7 @@ class DriveProblem(Problem):
     def _run(self, bench: Bench, rows: int, values: Rows, progress: Progress) -> np.ndarray:
         """(rows, n) what a bench simulates."""
         out = np.full((rows, len(self.observations)), np.nan)
-        for number, k, sampled in bench.run(rows, values, self.observations, progress):
+        for number, k, sampled in bench.run(rows, values, self.observations, progress, self._windows):
             out[k, self._of_log(number)] = sampled
         return out
 
@@ -286,6 +289,15 @@ class DriveProblem(Problem):
             yield
         finally:
             self._focus = before
+
+    @contextlib.contextmanager
+    def in_windows(self) -> Iterator[None]:
+        self.use_step_error(self.step_error)  # that of whole rollouts
+        self._windows = True
+        try:
+            yield
+        finally:
+            self._windows = False
 
     def _bench_for(self, rows: np.ndarray) -> Bench:
         """The bench whose model holds every candidate that leaves its null in some row, and few others."""
@@ -371,6 +383,9 @@ class DriveProblem(Problem):
         self._step_error = 2.0 * change
         return True
 
+    def _unabsorbed(self, change: np.ndarray) -> np.ndarray:
+        return unabsorbed(change, self.coordinates, self.observations, self._direction)
+
     def _halving(self, u: np.ndarray) -> np.ndarray:
         """(n,) the change of the predictions by halving the time step, here or where they are less than a sigma away.
 
@@ -385,16 +400,3 @@ class DriveProblem(Problem):
         change = self._simulated(bench.halved(), u[None]) - coarse
         self._halved = active, coarse, change
         return change.copy()
-
-    def _unabsorbed(self, change: np.ndarray) -> np.ndarray:
-        """(n,) what of a change the nuisances of the step's error cannot take up."""
-        whiten, change = self.observations.whiten, change.copy()
-        for c in self.coordinates:
-            if c.name == STEP_ERROR:
-                mine, own = self._of_log(c.log_index), np.zeros(len(change))
-                own[mine] = change[mine]
-                known = self._direction(c)
-                along = whiten(known)
-                size = float(along @ along)
-                change[mine] -= (float(along @ whiten(own)) / size if size > 0.0 else 0.0) * known[mine]
-        return change

@@ -14,13 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lunar_mjx.criticism.measured_states import begin_at, measured_states
 from lunar_mjx.dynamics import System, build
-from lunar_mjx.dynamics.signals import measure
+from lunar_mjx.dynamics.signals import joint_channels, measure
 from lunar_mjx.dynamics.state import Params
 from lunar_mjx.model import Model
 
 if TYPE_CHECKING:
     from lunar_mjx.criticism.drive_runs import LogRun
+    from lunar_mjx.criticism.log import Log
 
 Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
 """(rows,) values by effect, parameter, log (-1 for all) and whether they are factors."""
@@ -29,6 +31,8 @@ SETTLE = 1.0
 """Least time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
 PIECE = 0.5
 """Length of the pieces in which logs are simulated, s. A time of standing between two of them is interpolated."""
+WINDOW = 4
+"""Pieces of a window that begins at the measured state: short beside a drive, long beside a wheel's time to settle."""
 _FEWEST = 64
 """Rovers that come back from the device at least; else the next power of two, for few programs."""
 STOOD = "stood"
@@ -54,6 +58,7 @@ class Program:
         self._reset = jax.jit(self._reset_all)
         self._drive = jax.jit(self._drive_all, static_argnames="shared")
         self._measure = jax.jit(self._measure_all, static_argnames="shared")
+        self._begin_anew = jax.jit(self._begin_all_anew, static_argnames="shared")
 
     def length(self, commands: int) -> int:
         """Number of commands rounded up to whole pieces."""
@@ -86,10 +91,16 @@ class Program:
 
         return jax.vmap(channels, (self._axes(params, shared), 0))(params, seen)
 
-    def __call__(self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int) -> np.ndarray:
+    def _begin_all_anew(self, params: Params, state: Any, measured: Mapping[str, Any], shared: bool) -> Any:
+        return jax.vmap(begin_at, (self._axes(params, shared), 0, 0))(params, state, measured)
+
+    def __call__(
+        self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int, windows: bool = False
+    ) -> np.ndarray:
         """(rovers, channels, time) of rovers by their log (place in `logs`) and their row of `values`.
 
-        The first `count` are wanted, and few beyond them come back from the device.
+        The first `count` are wanted, and few beyond them come back from the device. With `windows` rovers begin anew at
+        the measured state after every few pieces.
         """
         params, start = logs.rovers(log, row, values)
         commands = logs.commands[log]
@@ -102,6 +113,9 @@ class Program:
             state = dataclasses.replace(stood, step=state.step, temperature=state.temperature)
             seen = []
             for at in range(0, commands.shape[1], self.segment):
+                if windows and at and at % (WINDOW * self.segment) == 0:
+                    edge = {name: a[log, at // self.segment] for name, a in logs.measured.items()}
+                    state = self._begin_anew(full, state, edge, shared=shared)
                 state, telemetry = self._drive(full, state, commands[:, at : at + self.segment], shared=shared)
                 seen.append(telemetry)
             found = self._measure(full, seen, shared=shared)
@@ -148,6 +162,7 @@ class Logs:
       params: with a leading axis of logs, but for the ground. start: (logs,) by name.
       terrain: the ground, with a leading axis of logs unless `shared` by all of them.
       commands: (logs, time, joint), the last ones repeated up to whole pieces.
+      measured: what was measured of the state at the beginning of every piece, (logs, pieces, ...) by name.
     """
 
     program: Program
@@ -157,6 +172,7 @@ class Logs:
     terrain: Any
     shared: bool
     commands: np.ndarray
+    measured: Mapping[str, np.ndarray]
 
     def rovers(self, log: np.ndarray, row: np.ndarray, values: Rows) -> tuple[Params, dict[str, np.ndarray]]:
         """Parameters (but for the ground) and starts of rovers: the logs' conditions with rows of values put in."""
@@ -175,7 +191,9 @@ class Logs:
         return params, start
 
 
-def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun], params: Sequence[Params]) -> Logs:
+def stack_logs(
+    program: Program, numbers: Sequence[int], logs: Sequence[Log], runs: Sequence[LogRun], params: Sequence[Params]
+) -> Logs:
     """Makes logs of one program and one length ready."""
     length = program.length(max(len(r.commands) for r in runs))
     terrains = [p.terrain for p in params]
@@ -189,8 +207,16 @@ def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun],
         program=program, numbers=tuple(numbers), params=jax.tree.map(lambda *a: np.stack(a), *bare),
         start={n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature", STOOD)},
         terrain=ground, shared=shared,
-        commands=np.stack([_padded(r.commands, length) for r in runs]),
+        commands=np.stack([_padded(r.commands, length) for r in runs]), measured=_measured(program, logs, runs, length),
     )  # fmt: skip
+
+
+def _measured(program: Program, logs: Sequence[Log], runs: Sequence[LogRun], length: int) -> dict[str, np.ndarray]:
+    """What logs tell of the state at the beginning of every piece, stacked."""
+    place = np.arange(0, length, program.segment) * program.every * program.system.dt
+    joints = joint_channels(program.model.rover)
+    found = [measured_states(log, joints, run.begin + place) for log, run in zip(logs, runs, strict=True)]
+    return {name: np.stack([f[name] for f in found]) for name in found[0]}
 
 
 def cores() -> int:

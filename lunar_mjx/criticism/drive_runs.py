@@ -129,15 +129,18 @@ class Bench:
                 program = self._program(number)
                 groups.setdefault((id(program), program.length(len(run.commands))), []).append(number)
             self._stacked = [
-                stack_logs(self._program(n[0]), n, [self.runs[i] for i in n], [self.params[i] for i in n])
+                stack_logs(self._program(n[0]), n, *([of[i] for i in n] for of in (self.logs, self.runs, self.params)))
                 for n in groups.values()
             ]
         return self._stacked
 
     def run(
-        self, rows: int, values: Rows, observations: Observations, progress: Progress
+        self, rows: int, values: Rows, observations: Observations, progress: Progress, windows: bool = False
     ) -> Iterator[tuple[int, slice, np.ndarray]]:
-        """Simulates all logs with all rows and yields (log, rows, (rows, samples) of the log's observations)."""
+        """Simulates all logs with all rows and yields (log, rows, (rows, samples) of the log's observations).
+
+        With `windows`, drives begin anew at the measured state from time to time.
+        """
         places = _places(self.runs, observations)
         done = 0
         for logs in self._groups():
@@ -145,7 +148,7 @@ class Bench:
                 -1, 2
             )
             parts = [jobs[at : at + self.chunk] for at in range(0, len(jobs), self.chunk)]
-            for part, signals in zip(parts, self._signals(logs, parts, values), strict=True):
+            for part, signals in zip(parts, self._signals(logs, parts, values, windows), strict=True):
                 edges = np.searchsorted(part[:, 0], np.arange(len(logs.numbers) + 1))
                 for number, low, high in zip(logs.numbers, edges[:-1], edges[1:], strict=True):
                     if low < high:
@@ -154,7 +157,7 @@ class Bench:
                 done += len(part)
                 progress("simulating", done / (rows * len(self.runs)))
 
-    def _signals(self, logs: Logs, parts: Sequence[np.ndarray], values: Rows) -> Iterator[np.ndarray]:
+    def _signals(self, logs: Logs, parts: Sequence[np.ndarray], values: Rows, windows: bool) -> Iterator[np.ndarray]:
         """Signals (rovers, channels, time) of every part in turn.
 
         On a CPU one part per core at a time, as XLA runs a loop on one core.
@@ -162,7 +165,7 @@ class Bench:
 
         def one(part: np.ndarray) -> np.ndarray:
             full = np.concatenate([part, np.repeat(part[-1:], self.chunk - len(part), axis=0)])
-            return logs.program(logs, full[:, 0], full[:, 1], values, len(part))
+            return logs.program(logs, full[:, 0], full[:, 1], values, len(part), windows)
 
         workers = cores() if jax.default_backend() == "cpu" else 1
         if workers < 2 or len(parts) < 2 or not logs.program.compiled:

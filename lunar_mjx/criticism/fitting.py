@@ -33,14 +33,16 @@ _KEPT = 1e-3
 AGREEING = 3
 """Starts that must end at the same chi-square."""
 
-HALF_STEP = 25.0
-"""Largest change of chi-square by halving the time step: below what would name an effect."""
+HALF_STEP = 1.0
+"""Largest change of chi-square by halving the time step."""
 
 _AGAIN = 3
 """Times that other starts begin about a fit, each lower than the one before."""
 _NEARER = 0.3
 """Share of the box of starts within which others begin, about the first fit, where rows are dear."""
 
+_ROUGHEST = 25.0
+"""Jumps of chi-square that are put up with at most: below what would name an effect."""
 ROUGH = 4.0
 """Times the jumps of a rough chi-square that its gradient may promise."""
 
@@ -66,7 +68,8 @@ class Fit:
       gradient: drop of chi-square that one more step promises. starts: chi-square that each start ended with.
       at_bound: names of parameters at a bound that is not physics. extra: other figures of the certificate.
       problems: why there is no certificate; empty where there is.
-      step_error: (n,) what was taken for the error of the time step, for drives.
+      step_error: (n,) what was taken for the error of the time step, for drives. own_step_error: whether it was taken
+        anew near this fit.
     """
 
     u: np.ndarray
@@ -81,6 +84,7 @@ class Fit:
     extra: Mapping[str, float] = dataclasses.field(default_factory=dict)
     problems: tuple[str, ...] = ()
     step_error: np.ndarray | None = None
+    own_step_error: bool = False
 
     def covariance(self, problem: Problem) -> np.ndarray:
         """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
@@ -109,7 +113,10 @@ class Memory:
         self._save = save
 
     def recall(self, problem: Problem, effects: Sequence[str]) -> Fit | None:
-        """The fit with these effects at its old place, its residual and Jacobian computed anew; None if unknown."""
+        """The fit with these effects at its old place, its residual and Jacobian computed anew; None if unknown.
+
+        One that was made with an error of the time step of its own is recalled with that.
+        """
         entry = self.entries.get("+".join(effects))
         free = problem.free(effects)
         if entry is None or set(entry["u"]) != {problem.coordinates[i].key for i in free}:
@@ -117,6 +124,8 @@ class Memory:
         u = problem.origin()
         for i in free:
             u[i] = entry["u"][problem.coordinates[i].key]
+        if entry.get("own_step_error"):
+            problem.renew_step_error(u)
         goal = Objective(problem, free, problem.observations.in_split("fit"))
         problem.foresee(u[None], free)
         residual, chi2 = goal.residuals(u[None])
@@ -127,6 +136,7 @@ class Memory:
             u=u, free=free, chi2=float(chi2[0]), residual=residual[0], jacobian=goal.jacobian(u), fitted=goal.fitted,
             gradient=entry["gradient"], starts=tuple(entry["starts"]), at_bound=tuple(entry["at_bound"]),
             extra=entry["extra"], problems=tuple(entry["problems"]), step_error=problem.kept_step_error(),
+            own_step_error=bool(entry.get("own_step_error")),
         )  # fmt: skip
 
     def place(self, problem: Problem, name: str) -> np.ndarray | None:
@@ -148,7 +158,7 @@ class Memory:
         entry = {
             "u": {problem.coordinates[i].key: float(found.u[i]) for i in found.free}, "gradient": found.gradient,
             "starts": list(found.starts), "at_bound": list(found.at_bound), "extra": dict(found.extra),
-            "problems": list(found.problems), "chi2": found.chi2,
+            "problems": list(found.problems), "chi2": found.chi2, "own_step_error": found.own_step_error,
         }  # fmt: skip
         self._store("+".join(effects), entry)
 
@@ -260,6 +270,12 @@ def fit(
     )  # fmt: skip
 
 
+def step_too_long(found: Fit, half_step: float = HALF_STEP) -> bool:
+    """Whether a fit at the noise depends on the length of the time step."""
+    slack = slack_of(found.chi2, int(found.fitted.sum()))
+    return not found.extra.get("half_step_chi2", 0.0) <= max(half_step, slack)
+
+
 def _asks_roughness(goal: Objective, best: Descent) -> bool:
     return np.isfinite(best.chi2) and not goal.problem.cheap_jacobian and best.promise > SMALL_GRADIENT
 
@@ -340,7 +356,7 @@ def _faults(
     problems = []
     if not np.isfinite(best.chi2):
         return ("every start diverged",)
-    rough = ROUGH * min(extra.get("roughness_chi2", 0.0), HALF_STEP)
+    rough = ROUGH * min(extra.get("roughness_chi2", 0.0), _ROUGHEST)
     if best.promise > max(SMALL_GRADIENT, slack, rough):
         problems.append(f"the gradient still promises a drop of chi-square of {best.promise:.2g}")
     if starts >= AGREEING and agreeing < AGREEING and not slack:

@@ -42,10 +42,12 @@ class Problem(abc.ABC):
         needed.
       inputs: places of the amplitudes of unknown inputs that follow quantities of their ports, by label; in none of
         the above.
+      has_windows: whether predictions may begin anew at measured states.
       noise_unlearnt: whether the noise's colour is known from little, so that `learn_noise` is to be called.
     """
 
     cheap_jacobian: bool = True
+    has_windows: bool = False
     noise_unlearnt: bool = False
 
     observations: Observations
@@ -111,6 +113,11 @@ class Problem(abc.ABC):
     def focused(self, effects: Sequence[str]) -> Iterator[None]:
         """Within it only these candidates leave their null, which a problem may use to simulate fewer effects."""
         del effects
+        yield
+
+    @contextlib.contextmanager
+    def in_windows(self) -> Iterator[None]:
+        """Within it predictions begin anew at the measured state from time to time, where `has_windows`."""
         yield
 
     @contextlib.contextmanager

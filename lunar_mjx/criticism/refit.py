@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.criticism.descent import Descent, Outdone, Rival
-from lunar_mjx.criticism.fitting import Fit, Memory, fit, foreseen_fit
+from lunar_mjx.criticism.fitting import Fit, Memory, fit, foreseen_fit, step_too_long
 from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
 from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.patterns import Pattern
@@ -227,6 +227,15 @@ def with_own_step_error(problem: Problem, candidate: Candidate) -> Candidate:
     if found is candidate.fit:
         return candidate
     return dataclasses.replace(candidate, fit=found, noise=noise_test(problem, found))
+
+
+def fit_in_own_step(problem: Problem, free: np.ndarray, start: np.ndarray | None, **how: Any) -> Fit:
+    """`fit`, once more with the error of the time step as it is there if halving the step would change chi-square."""
+    found = fit(problem, free, start, **how)
+    if step_too_long(found) and problem.renew_step_error(found.u):
+        again = {k: v for k, v in how.items() if k != "known"}
+        found = dataclasses.replace(fit(problem, free, found.u, **again), own_step_error=True)
+    return found
 
 
 def _joined(problem: Problem, parent: Fit, free: np.ndarray, places: Sequence[int], columns: np.ndarray) -> np.ndarray:

@@ -15,9 +15,10 @@ from lunar_mjx.criticism.inputs import SMOOTH
 from lunar_mjx.criticism.localise import pattern
 from lunar_mjx.criticism.patterns import Unlisted, find_pattern
 from lunar_mjx.criticism.problem import Problem
-from lunar_mjx.criticism.refit import Candidate, Settings, refit, refit_all, with_own_step_error
+from lunar_mjx.criticism.refit import Candidate, Settings, fit_in_own_step, refit, refit_all, with_own_step_error
 from lunar_mjx.criticism.scan import foresee_overlooked, overlooked
 from lunar_mjx.criticism.score import SEPARABLE, Score, cosines, score, signatures
+from lunar_mjx.criticism.shooting import shoot
 
 _HOPELESS = 200.0
 """Chi-square beyond an effect's from which another that may stand for it is left."""
@@ -50,17 +51,22 @@ class Search:
 
 
 def fit_baseline(problem: Problem, settings: Settings, memory: Memory, progress: Progress = silent) -> Fit:
-    """The model as it is, refitted, with its certificate; recalled where it has been done."""
-    start = None
+    """The model as it is, refitted, with its certificate; recalled where it has been done.
+
+    Windows are fitted first where the model is far off, whole rollouts last.
+    """
+    start, free = None, problem.free()
     if problem.noise_unlearnt:
         start = memory.place(problem, _NOISE)
         if start is None:
-            start = fit(problem, problem.free(), starts=1, certify=False, progress=progress).u
+            start = shoot(problem, free, problem.origin(), progress)
+            start = fit(problem, free, start, starts=1, certify=False, progress=progress).u
             memory.keep_place(problem, _NOISE, start)
         problem.learn_noise(start)
     found = memory.recall(problem, ())
     if found is None:
-        found = fit(problem, problem.free(), start, settings.starts, settings.seed, progress=progress)
+        start = shoot(problem, free, problem.origin(), progress) if start is None else start
+        found = fit_in_own_step(problem, free, start, starts=settings.starts, seed=settings.seed, progress=progress)
         memory.keep(problem, (), found)
     return found
 

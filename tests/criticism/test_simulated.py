@@ -42,7 +42,7 @@ def runs(monkeypatch):
     """What is simulated: (effects, time step, rows) of every call; predictions are a sum over what acts."""
     calls = []
 
-    def run(self, rows, values, observations, progress):
+    def run(self, rows, values, observations, progress, windows=False):
         acting = {**dict.fromkeys(self.model.effect_names, 1.0), "initial": 1.0}
         total = sum(np.asarray(v) * acting.get(k[0], 0.0) for k, v in values.items())
         given = sum(float(np.sum(p.effects["motor"]["resistance"])) for p in self.params)
@@ -50,7 +50,8 @@ def runs(monkeypatch):
         for number in range(len(self.runs)):
             part = observations.of_log[number]
             rising = np.arange(part.stop - part.start)
-            yield number, slice(0, rows), (total + given + self.model.timestep)[:, None] + rising
+            error = self.model.timestep * (1.0 + 7.0 * windows)
+            yield number, slice(0, rows), (total + given + error)[:, None] + rising
 
     monkeypatch.setattr(Bench, "run", run)
     monkeypatch.setattr(drive_problem, "SIMULATED", Simulated())
@@ -93,6 +94,17 @@ def test_another_model_or_bench_or_time_step_is_not_answered_from_what_is_known(
     assert problem.step_error == pytest.approx(-model.timestep)
     assert runs[-1][1:] == (0.5 * model.timestep, 1)
     assert len(runs) == 4
+
+
+def test_windows_are_another_simulation_and_the_error_of_the_step_is_that_of_whole_drives(logs, runs):
+    problem, plain = _problem(logs), _problem(logs)
+    origin = problem.origin()[None]
+    first = problem.predict(origin)
+    with problem.in_windows():
+        assert problem.predict(origin) == pytest.approx(first + 7.0 * problem.model.timestep)
+        windowed = problem.step_error
+    assert np.array_equal(problem.predict(origin), first)
+    assert windowed == pytest.approx(plain.step_error) and problem.step_error == pytest.approx(windowed)
 
 
 def test_what_only_adds_to_the_predictions_is_not_simulated(logs, runs):

@@ -60,7 +60,7 @@ def test_it_is_a_nuisance_where_the_ground_is_inclined_and_it_shows(tmp_path, mo
                     gravity_m_s2=model.gravity, terrain=terrain)  # fmt: skip
     runs = []
 
-    def run(self, rows, values, observations, progress):
+    def run(self, rows, values, observations, progress, windows=False):
         runs.append(values)
         change = (0.0, 10.0 if shows else 0.001)
         yield 0, slice(0, rows), np.outer(change, np.arange(len(observations)))
