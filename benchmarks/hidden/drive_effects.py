@@ -147,7 +147,8 @@ KNOWN: Mapping[str, DriveKind] = {
     "slip_sinkage": DriveKind(lambda g: {"driving": float(g.uniform(0.5, 1.5)), "skid": float(g.uniform(0.3, 0.8))},
                               ("soil",), _slip_sinkage),
     "iron_loss": DriveKind(_one("coefficient", 5e-7, 2e-6), ("heat", "motor_torque"), _iron_loss),
-    "actuator_delay": DriveKind(_one("delay", 0.03, 0.12), ("command",), _delay),
+    # in whole steps of the generator, which delays by whole steps
+    "actuator_delay": DriveKind(lambda g: {"delay": round(float(g.uniform(0.03, 0.12)), 3)}, ("command",), _delay),
     "rolling_resistance": DriveKind(_one("coefficient", 0.03, 0.08), ("wheel_shear",), _rolling_resistance),
     "wheel_radius_error": DriveKind(_signed("offset", 0.002, 0.006), ("geometry",), _geometry(
         "wheel_radius_error", "radius", lambda r, p: r + p["offset"])),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -162,7 +163,9 @@ def _physics(case: cases.Case, found: Diagnosis, run: Path) -> dict[str, Any]:
             error, floor = (float(np.sqrt(np.mean(a**2))) for a in away)
             row |= {"floor": floor, "over_floor": error / floor if floor else None}
         if case.truth.effects and case.group != "undecidable":
-            row["told"] = told(case.truth, case.recipe, seen)
+            # LAPACK may fail on a matrix of hardly felt parameters; that is no answer of the tool's
+            with contextlib.suppress(np.linalg.LinAlgError):
+                row["told"] = told(case.truth, case.recipe, seen)
     return row
 
 

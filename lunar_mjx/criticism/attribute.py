@@ -7,17 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.fitting import HALF_STEP, Fit, Memory, Progress, silent
-from lunar_mjx.criticism.held_out import errors
+from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
+from lunar_mjx.criticism.held_out import errors, noise_test
 from lunar_mjx.criticism.patterns import Unlisted
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Settings, fit_in_own_step, with_own_step_error
 from lunar_mjx.criticism.score import SEPARABLE, Score
 from lunar_mjx.criticism.search import Search, excess_explained, search, significant
 from lunar_mjx.criticism.verdict import Diagnosis, EffectEvidence, Verdict
-
-STEP_SHARE = 0.01
-"""Share of what an effect explains that the error of the time step may amount to."""
 
 
 def diagnose(
@@ -63,6 +60,10 @@ def diagnose(
             return Diagnosis(
                 Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details
             ), found
+        # values and intervals are those of the fit that has the certificate
+        chosen = dataclasses.replace(chosen, fit=final, noise=noise_test(problem, final))
+        details["noise_test_after"] = dataclasses.asdict(chosen.noise)
+        found = dataclasses.replace(found, chosen=chosen)
     evidence = _evidence(problem, found, settings)
     undecidable = tuple(e.effect for e in evidence if e.status == "not tested")
     explained = excess_explained(found, problem)
@@ -77,23 +78,15 @@ def diagnose(
 
 
 def certify(problem: Problem, found: Search, settings: Settings) -> Fit:
-    """The chosen model fitted once more from several starts, with its own certificate.
-
-    The error of the time step must not be what an effect explains: it may change chi-square by a hundredth of what the
-    least of the effects does, where that is more than would name one.
-    """
+    """The chosen model fitted once more from several starts, with its own certificate."""
     chosen = found.chosen
-    without = [c.fit.chi2 for c in found.tried if set(c.effects) < set(chosen.effects)
-               and len(c.effects) == len(chosen.effects) - 1]  # fmt: skip
-    least = min(without, default=found.base.fit.chi2) - chosen.fit.chi2
     free = problem.free(chosen.effects)
     same = np.array_equal(free, chosen.fit.free) and problem.kept_step_error() is chosen.fit.step_error
     # what held-out logs' own nuisances have moved since is of no account: a step heeds the fitted logs alone
     known = (chosen.fit.residual, chosen.fit.jacobian) if same else None
     with problem.focused(chosen.effects):
         return fit_in_own_step(problem, free, chosen.fit.u, starts=settings.starts, seed=settings.seed, spread=0.5,
-                               known=None if problem.cheap_jacobian else known,
-                               half_step=max(HALF_STEP, STEP_SHARE * least))  # fmt: skip
+                               known=None if problem.cheap_jacobian else known)  # fmt: skip
 
 
 def _certificate(found: Fit) -> dict[str, Any]:

@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     from lunar_mjx.criticism.log import Log
 
 STEP_CHI2 = 1.0
-"""Squared whitened change by halving the time step, beyond its nuisances, from which these are taken anew at a fit."""
+"""Squared whitened change by halving the time step, beyond its nuisances, from which these are taken anew at a fit that
+has a certificate."""
 
 SIMULATED = Simulated()
 """What all problems of this process have simulated."""
@@ -371,14 +372,14 @@ class DriveProblem(Problem):
         if kept is not None:
             self._step_error = kept
 
-    def renew_step_error(self, u: np.ndarray) -> bool:
+    def renew_step_error(self, u: np.ndarray, least: float = STEP_CHI2) -> bool:
         change = self._halving(u)
         for number in range(len(self.logs)):
             part = self._of_log(number)
             if not np.isfinite(change[part]).all():
                 change[part] = 0.0
         whitened = self.observations.whiten(self._unabsorbed(change))[self.observations.in_split("fit")]
-        if not float(whitened @ whitened) > STEP_CHI2:
+        if not float(whitened @ whitened) > least:
             return False
         self._step_error = 2.0 * change
         return True

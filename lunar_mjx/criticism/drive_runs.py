@@ -128,10 +128,10 @@ class Bench:
             for number, run in enumerate(self.runs):
                 program = self._program(number)
                 groups.setdefault((id(program), program.length(len(run.commands))), []).append(number)
-            self._stacked = [
-                stack_logs(self._program(n[0]), n, *([of[i] for i in n] for of in (self.logs, self.runs, self.params)))
-                for n in groups.values()
-            ]
+            self._stacked = []
+            for n in groups.values():
+                logs, runs, params = [self.logs[i] for i in n], [self.runs[i] for i in n], [self.params[i] for i in n]
+                self._stacked.append(stack_logs(self._program(n[0]), n, logs, runs, params))
         return self._stacked
 
     def run(

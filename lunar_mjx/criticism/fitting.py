@@ -125,7 +125,7 @@ class Memory:
         for i in free:
             u[i] = entry["u"][problem.coordinates[i].key]
         if entry.get("own_step_error"):
-            problem.renew_step_error(u)
+            problem.renew_step_error(u, 0.0)
         goal = Objective(problem, free, problem.observations.in_split("fit"))
         problem.foresee(u[None], free)
         residual, chi2 = goal.residuals(u[None])
@@ -217,7 +217,6 @@ def fit(
     progress: Progress = silent,
     rival: Rival | float = np.inf,
     known: tuple[np.ndarray, np.ndarray] | None = None,
-    half_step: float = HALF_STEP,
     eager: bool = False,
     outdone: Callable[[Descent], bool] | None = None,
 ) -> Fit:
@@ -235,7 +234,6 @@ def fit(
       progress: told of every start.
       rival: chi-square that another model reaches: a fit that cannot is left unfinished where fits are dear.
       known: whitened residual (n,) and Jacobian (n, free) at the start, if they have been computed.
-      half_step: largest change of chi-square by halving the time step.
       eager: takes Jacobians with the residuals, as where rows cost nothing.
       outdone: whether to leave, asked before every step of the first descent with where it is.
 
@@ -262,7 +260,7 @@ def fit(
         extra["roughness_chi2"] = goal.roughness(lowest.u, lowest.residual, lowest.jacobian)
     wide = certify and np.isfinite(best.chi2) and not problem.cheap_jacobian
     agreeing = sum(c <= best.chi2 + same_chi2(best.chi2, count) for c in chi2s)
-    problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra, half_step)
+    problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra)
     return Fit(
         u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual,
         jacobian=goal.wide_jacobian(best.u) if wide else best.jacobian, fitted=fitted, gradient=best.promise,
@@ -270,10 +268,10 @@ def fit(
     )  # fmt: skip
 
 
-def step_too_long(found: Fit, half_step: float = HALF_STEP) -> bool:
+def step_too_long(found: Fit) -> bool:
     """Whether a fit at the noise depends on the length of the time step."""
     slack = slack_of(found.chi2, int(found.fitted.sum()))
-    return not found.extra.get("half_step_chi2", 0.0) <= max(half_step, slack)
+    return not found.extra.get("half_step_chi2", 0.0) <= max(HALF_STEP, slack)
 
 
 def _asks_roughness(goal: Objective, best: Descent) -> bool:
@@ -351,7 +349,6 @@ def _near(goal: Objective, centre: np.ndarray, origin: np.ndarray, others: np.nd
 
 def _faults(
     best: Descent, slack: float, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float],
-    half_step: float,
 ) -> tuple[str, ...]:  # fmt: skip
     problems = []
     if not np.isfinite(best.chi2):
@@ -364,7 +361,7 @@ def _faults(
     # A model that misfits presses its parameters against bounds; they count once it is at the noise.
     if edge and not slack:
         problems.append(f"{', '.join(edge)} ended at a bound")
-    if not extra.get("half_step_chi2", 0.0) <= max(half_step, slack):
+    if not extra.get("half_step_chi2", 0.0) <= max(HALF_STEP, slack):
         problems.append(f"halving the time step changes chi-square by {extra['half_step_chi2']:.2g}")
     return tuple(problems)
 

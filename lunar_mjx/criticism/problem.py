@@ -160,9 +160,13 @@ class Problem(abc.ABC):
         """Takes the error of the time step that a fit was made with."""
         del kept
 
-    def renew_step_error(self, u: np.ndarray) -> bool:
-        """Takes the time step's error at a fit rather than at the model as given; whether that changes anything."""
-        del u
+    def renew_step_error(self, u: np.ndarray, least: float = 1.0) -> bool:
+        """Takes the time step's error at a fit rather than at the model as given, if they differ by so much chi-square.
+
+        Returns:
+          Whether it did.
+        """
+        del u, least
         return False
 
     def certificate(self, u: np.ndarray, free: np.ndarray) -> Mapping[str, float]:

@@ -230,10 +230,13 @@ def with_own_step_error(problem: Problem, candidate: Candidate) -> Candidate:
 
 
 def fit_in_own_step(problem: Problem, free: np.ndarray, start: np.ndarray | None, **how: Any) -> Fit:
-    """`fit`, once more with the error of the time step as it is there if halving the step would change chi-square."""
+    """`fit`, again with the error of the time step as it is there while halving the step would change chi-square."""
     found = fit(problem, free, start, **how)
-    if step_too_long(found) and problem.renew_step_error(found.u):
-        again = {k: v for k, v in how.items() if k != "known"}
+    again = {k: v for k, v in how.items() if k != "known"}
+    for _ in range(_RENEWALS):
+        # beside what a missing effect leaves, even a change far below the noise counts
+        if not (step_too_long(found) and problem.renew_step_error(found.u, 0.0)):
+            break
         found = dataclasses.replace(fit(problem, free, found.u, **again), own_step_error=True)
     return found
 

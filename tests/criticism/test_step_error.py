@@ -53,7 +53,7 @@ class Stepped(Linear):
     def use_step_error(self, kept):
         self.error = kept
 
-    def renew_step_error(self, u):
+    def renew_step_error(self, u, least=1.0):
         error = self._error(float(u[1]))
         if np.linalg.norm(error - self.error) < 1.0:
             return False

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.dynamics import State, System, Telemetry, build
+from lunar_mjx.dynamics import Params, State, System, Telemetry, build
 from lunar_mjx.model import make_model
 from lunar_mjx.terrain import Terrain, inclined, stack
 
@@ -41,7 +41,13 @@ class Bench:
         return np.array(values)
 
     def drive(
-        self, terrains: list[Terrain], states: State, controls: np.ndarray, every: int, brake: bool = False
+        self,
+        terrains: list[Terrain],
+        states: State,
+        controls: np.ndarray,
+        every: int,
+        brake: bool = False,
+        gravity: float | None = None,
     ) -> tuple[State, Telemetry]:
         """Runs a batch, one terrain per rover, from batched states; controls (time, joint) or (rover, time, joint).
 
@@ -55,21 +61,23 @@ class Bench:
         ground = jax.tree.map(jnp.asarray, stack([*terrains, *([terrains[-1]] * len(spare))]))
         states = jax.tree.map(lambda a: a[rows], states)
         run = self._runs.setdefault(every, self._compile(every))
+        settings = jnp.asarray(float(brake)), jnp.asarray(self.model.gravity if gravity is None else gravity)
         pieces = []
         for piece in np.split(controls[rows], controls.shape[1] // COMMANDS, axis=1):
-            states, seen = run(ground, states, jnp.asarray(piece), jnp.asarray(float(brake)))
+            states, seen = run(ground, states, jnp.asarray(piece), *settings)
             pieces.append(jax.device_get(seen))
         whole = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:n], *pieces)
         return jax.tree.map(lambda a: np.asarray(a)[:n], states), whole
 
     def _compile(self, every: int):
+        each = Params(gravity=None, ambient=None, effects=None, terrain=0)  # type: ignore[arg-type]
+
         @jax.jit
-        @functools.partial(jax.vmap, in_axes=(0, 0, 0, None))
-        def run(ground, state, controls, engaged):
+        def run(ground, state, controls, engaged, gravity):
             effects = self.system.params.effects
             effects = {**effects, "parking_brake": {**effects["parking_brake"], "engaged": engaged}}
-            params = dataclasses.replace(self.system.params, terrain=ground, effects=effects)
-            return self.system.rollout(params, state, controls, every)
+            params = dataclasses.replace(self.system.params, gravity=gravity, terrain=ground, effects=effects)
+            return self.system.rollout_batch(params, state, controls, every, each, one_body=True)
 
         return run
 
@@ -96,5 +104,8 @@ def rover(request: pytest.FixtureRequest) -> str:
 
 
 def plane(degrees: float, direction_deg: float = 0.0) -> Terrain:
-    """A plane that rises by `degrees` toward `direction_deg`, on the grid that every plane of these tests shares."""
-    return inclined(np.deg2rad(degrees), 200.0, np.deg2rad(direction_deg))
+    """A plane that rises by `degrees` toward `direction_deg`, on the grid that every plane of these tests shares.
+
+    One name for all of them: it is part of the compiled structure, and each slope would else be a program of its own.
+    """
+    return dataclasses.replace(inclined(np.deg2rad(degrees), 200.0, np.deg2rad(direction_deg)), name="plane")

@@ -1,5 +1,7 @@
 """Native MuJoCo in float64 as the reference for the structured engine: one step under the same forces."""
 
+import copy
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -28,10 +30,25 @@ class Reference:
         self.wheels = [m.body(w.body).id for w in rover.wheels]
         self.chassis = m.body(rover.chassis).id
         self.dofs = [int(m.jnt_dofadr[m.joint(j).id]) for j in rover.joints]
-        self.step = jax.jit(jax.vmap(self._step))
 
-    def _step(self, qpos, qvel, f):
-        kinematics, finish = self.engine.forward(SimpleNamespace(gravity=GRAVITY, effects={}), qpos, qvel)
+    def step(self, qpos, qvel, forces):
+        """What the engine sees, and its next state, operation by operation: compiling a step takes far longer."""
+        return jax.vmap(self._step, in_axes=(None, 0, 0, 0))(self.engine.timestep, qpos, qvel, forces)
+
+    @functools.cached_property
+    def fly(self):
+        """A compiled function from time step, number of steps and one state to the state after them without forces."""
+        nil = {k: jnp.zeros(f.shape[1:]) for k, f in self.random(1)[2].items()}
+
+        def one(dt, now):
+            return self._step(dt, *now, nil)[1]
+
+        return jax.jit(lambda dt, count, *state: jax.lax.fori_loop(0, count, lambda _, now: one(dt, now), state))
+
+    def _step(self, dt, qpos, qvel, f):
+        engine = copy.copy(self.engine)
+        engine.timestep = dt
+        kinematics, finish = engine.forward(SimpleNamespace(gravity=GRAVITY, effects={}), qpos, qvel)
         nil, none = jnp.zeros(()), jnp.zeros(len(self.rover.wheels))
         geometry = Geometry(none, none, none, nil, Vec3(nil, nil, nil), Vec3(nil, nil, nil))
         world = (Vec3(*f[k]) for k in ("wheel_force", "wheel_moment", "chassis_force", "chassis_moment"))

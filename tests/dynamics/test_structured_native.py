@@ -109,11 +109,12 @@ def test_native_mujoco_tends_to_the_engine_as_its_loops_stiffen(name, tmp_path):
         qpos, qvel, forces = reference.random(1)
         forces = {k: 0.1 * f for k, f in forces.items()}
         qpos, qvel = reference.closed(qpos * [1, 1, 1, 1, 1, 1, 1, *[0.5] * (m.nq - 7)], 0.3 * qvel)
+        step = jax.jit(reference.step)
         q, v = qpos, qvel
         d = reference.data
         d.qpos[:], d.qvel[:] = qpos[0], qvel[0]
         for _ in range(round(0.01 / dt)):
-            _, (q, v) = reference.step(q, v, forces)
+            _, (q, v) = step(q, v, forces)
             reference.native(d.qpos.copy(), d.qvel.copy(), {k: f[0] for k, f in forces.items()})
         gaps.append(np.abs(np.asarray(q[0]) - d.qpos).max())
     assert gaps[1] < 0.6 * gaps[0] and gaps[2] < 0.6 * gaps[1]
@@ -123,21 +124,18 @@ def test_native_mujoco_tends_to_the_engine_as_its_loops_stiffen(name, tmp_path):
 def test_free_flight_keeps_momentum_and_energy(tmp_path):
     """Without springs, dampers or forces: momentum exact to the integrator's order, energy too."""
     drifts = []
+    rover = made.fourbar(tmp_path, "lower", damping=0.0)
+    text = rover.mjcf.read_text().replace('stiffness="80"', "").replace('stiffness="20"', "")
+    rover.mjcf.write_text(text)
+    reference = Reference(rover)
+    m, d = reference.model, reference.data
+    m.opt.gravity[:] = 0.0
+    qpos, qvel, _ = reference.random(1, seed=2)
+    qpos, qvel = (a[0] for a in reference.closed(qpos, 0.5 * qvel))
+    start = _momentum(m, d, qpos, qvel)
     for dt in (2e-4, 1e-4):
-        rover = made.fourbar(tmp_path, "lower", damping=0.0)
-        text = rover.mjcf.read_text().replace('stiffness="80"', "").replace('stiffness="20"', "")
-        rover.mjcf.write_text(text)
-        reference = Reference(rover, dt)
-        m, d = reference.model, reference.data
-        m.opt.gravity[:] = 0.0
-        qpos, qvel, forces = reference.random(1, seed=2)
-        qpos, qvel = reference.closed(qpos, 0.5 * qvel)
-        nil = {k: 0.0 * f for k, f in forces.items()}
-        start = _momentum(m, d, qpos[0], qvel[0])
-        q, v = qpos, qvel
-        for _ in range(round(0.1 / dt)):
-            _, (q, v) = reference.step(q, v, nil)
-        end = _momentum(m, d, np.asarray(q[0]), np.asarray(v[0]))
+        q, v = reference.fly(dt, round(0.1 / dt), qpos, qvel)
+        end = _momentum(m, d, np.asarray(q), np.asarray(v))
         fallen = np.array([0.0, 0.0, -m.body_subtreemass[0] * 1.625 * 0.1])
         assert np.abs(end["linear"] - start["linear"] - fallen).max() < 1e-2 * np.abs(start["linear"]).max()
         assert np.abs(end["spin"] - start["spin"]).max() < 1e-2 * np.abs(start["spin"]).max()

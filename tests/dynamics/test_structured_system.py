@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import structured_models as made
 
-from lunar_mjx.dynamics import Params, build
+from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics.engines import make_engine
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
@@ -58,8 +59,9 @@ def test_one_step_agrees_with_mjx_in_float32():
     new = {}
     for engine in ("structured", "mjx"):
         system = build(model, engine)
-        state = jax.jit(system.reset)(system.params, 0.0, 0.0)
-        new[engine] = jax.jit(system.step)(system.params, state, _controls(system, 3)[1])
+        # MJX compiles faster than it runs operation by operation, the structured engine does not
+        step = jax.jit(system.step) if engine == "mjx" else system.step
+        new[engine] = step(system.params, system.reset(system.params), _controls(system, 3)[1])
     for a, b in zip(*(jax.tree.leaves(v) for v in new.values()), strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4 * max(1.0, float(jnp.abs(b).max())))
 
@@ -86,13 +88,34 @@ def test_batches_equal_single_rovers(chunk):
         start, controls
     )
     step, _ = jax.jit(lambda s, c: system.step_batch(params, s, c, axes, chunk))(start, controls[:, 0])
-    single = jax.jit(lambda p, s, c: (system.rollout(p, s, c, every=2), system.step(p, s, c[0])[0]))
+    single = jax.jit(system.step)
     for i in (0, 5, 7):
         own = jax.tree.map(lambda a, mine, i=i: a[i] if mine else a, params, per_rover)
-        alone = single(own, jax.tree.map(lambda a, i=i: a[i], start), controls[i])
+        states, reports = [jax.tree.map(lambda a, i=i: a[i], start)], []
+        for control in np.repeat(controls[i], 2, axis=0):
+            new, report = single(own, states[-1], control)
+            states.append(new)
+            reports.append(report)
+        alone = (states[-1], jax.tree.map(lambda *rows: jnp.stack(rows), *reports[::2])), states[1]
         together = jax.tree.map(lambda a, i=i: a[i], ((end, seen), step))
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4 * max(1.0, float(jnp.abs(b).max())))
+
+
+def test_rollout_holds_controls_and_reports_their_first_step():
+    """What the test above asks of batches, for one rover: the reference there goes step by step."""
+
+    def step(params, state, control):
+        return params * state + control, (state, control)
+
+    controls = jnp.array([1.0, 5.0, 2.0])
+    for every in (1, 3):
+        end, seen = System.rollout(SimpleNamespace(step=step), 0.5, jnp.asarray(8.0), controls, every)
+        states = [8.0]
+        for control in np.repeat(controls, every):
+            states.append(0.5 * states[-1] + float(control))
+        assert float(end) == states[-1]
+        np.testing.assert_array_equal(seen, (states[:-1:every], controls))
 
 
 def test_batches_refuse_axes_that_differ():

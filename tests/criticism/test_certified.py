@@ -1,0 +1,76 @@
+"""What a diagnosis reports is the fit that has the certificate, with the derivatives that intervals are taken from."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from toy_problem import Linear, manoeuvres
+
+from lunar_mjx.criticism.attribute import diagnose
+from lunar_mjx.criticism.fitting import HALF_STEP, Memory
+from lunar_mjx.criticism.refit import Settings
+from lunar_mjx.criticism.search import fit_baseline
+from lunar_mjx.criticism.verdict import Verdict
+
+SHARE = 0.25
+"""Of the short steps' derivatives that those over wide steps are: as where a fit ends at the edge of a jump."""
+
+
+class Edged(Linear):
+    """A problem of dear rows whose derivatives over short steps promise too much."""
+
+    cheap_jacobian = False
+
+    def wide_jacobian(self, u, which):
+        return SHARE * self.jacobian(u, which)
+
+
+class Coarse(Linear):
+    """A problem in which halving the time step changes chi-square until the step's error is taken at the fit."""
+
+    cheap_jacobian = False
+    renewed_at = None
+
+    def certificate(self, u, free):
+        own = self.renewed_at is not None and abs(self.renewed_at[0] - u[0]) < 1.0
+        return {"half_step_chi2": 0.0 if own else 2.0 * HALF_STEP}
+
+    def renew_step_error(self, u, least=1.0):
+        if least > 0.0:
+            return False
+        self.renewed_at = u.copy()
+        return True
+
+
+@pytest.fixture
+def columns():
+    rng = np.random.default_rng(5)
+    return rng.normal(size=(600, 2)), rng.normal(size=600), rng.standard_normal(600)
+
+
+def test_intervals_are_those_of_the_certified_fit(columns):
+    base, one, noise = columns
+    observed = dataclasses.replace(manoeuvres(6, 100), value=3.0 * one + noise)
+    plain, edged = (diagnose(kind(base, {"one": one}, observed), Settings(draws=200))[0] for kind in (Linear, Edged))
+    assert plain.verdict is edged.verdict is Verdict.KNOWN
+    std = [d.evidence[0].std["amount"] for d in (plain, edged)]
+    assert std[1] == pytest.approx(std[0] / SHARE, rel=1e-3)
+    assert edged.evidence[0].values["amount"] == pytest.approx(3.0, abs=0.2)
+
+
+def test_the_step_error_is_taken_at_the_fit_where_halving_the_step_changes_chi_square(columns):
+    base, one, noise = columns
+    problem = Coarse(base, {"one": one}, dataclasses.replace(manoeuvres(6, 100), value=base[:, 0] * 4.0 + noise))
+    memory = Memory()
+    found = fit_baseline(problem, Settings(), memory)
+    assert not found.problems and found.own_step_error and problem.renewed_at[0] == pytest.approx(4.0, abs=0.2)
+    again = Coarse(base, {"one": one}, problem.observations)
+    recalled = fit_baseline(again, Settings(), Memory(memory.entries))
+    assert recalled.own_step_error and again.renewed_at[0] == pytest.approx(found.u[0])
+
+
+def test_without_that_there_is_no_certificate(columns, monkeypatch):
+    base, one, noise = columns
+    monkeypatch.setattr(Coarse, "renew_step_error", lambda self, u, least=1.0: False)
+    problem = Coarse(base, {"one": one}, dataclasses.replace(manoeuvres(6, 100), value=base[:, 0] * 4.0 + noise))
+    assert "halving the time step" in fit_baseline(problem, Settings(), Memory()).problems[0]
