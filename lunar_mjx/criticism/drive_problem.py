@@ -46,8 +46,7 @@ if TYPE_CHECKING:
     from lunar_mjx.criticism.log import Log
 
 STEP_CHI2 = 1.0
-"""Squared whitened change by halving the time step, beyond its nuisances, from which these are taken anew at a fit that
-has a certificate."""
+"""Squared whitened change by halving the time step, beyond its nuisances, from which these are taken anew at a fit."""
 
 SIMULATED = Simulated()
 """What all problems of this process have simulated."""
