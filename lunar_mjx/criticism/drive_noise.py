@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Hashable, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
@@ -255,17 +256,27 @@ def _likelihood(groups: Sequence[tuple[np.ndarray, np.ndarray]], c: Colour, most
     """Restricted log-likelihood of a colour, its size at its best within a factor of the stated one."""
     square, freedom, logarithms = 0.0, 0, 0.0
     for since, v in groups:
-        line = np.stack([np.ones_like(since), since - since.mean()], axis=1)
-        correlation = (1.0 - c.share) * np.eye(len(since))
-        if c.share > 0.0:
-            correlation += c.share * np.exp(-np.abs(since[:, None] - since) / c.correlation_time)
-        factor = cho_factor(correlation, lower=True)
-        solved = cho_solve(factor, line)
-        inner = line.T @ solved
-        rest = v - line @ np.linalg.solve(inner, solved.T @ v)
-        square += float(np.sum(rest * cho_solve(factor, rest)))
+        weight, determinant = _about_a_line(since.tobytes(), c)
+        square += float(np.sum(v * (weight @ v)))
         freedom += v.shape[1] * (len(since) - 2)
-        determinant = 2.0 * np.sum(np.log(np.diag(factor[0]))) + np.linalg.slogdet(inner)[1]
-        logarithms += v.shape[1] * float(determinant)
+        logarithms += v.shape[1] * determinant
     size = float(np.clip(square / freedom, 1.0 / most, most))
     return -0.5 * (freedom * np.log(size) + square / size + logarithms)
+
+
+@functools.lru_cache(maxsize=512)
+def _about_a_line(times: bytes, c: Colour) -> tuple[np.ndarray, float]:
+    """Inverse covariance (n, n) of what is left about a line, for values at some times, and the log determinant.
+
+    Kinds of noise that are sampled alike share them.
+    """
+    since = np.frombuffer(times)
+    line = np.stack([np.ones_like(since), since - since.mean()], axis=1)
+    correlation = (1.0 - c.share) * np.eye(len(since))
+    if c.share > 0.0:
+        correlation += c.share * np.exp(-np.abs(since[:, None] - since) / c.correlation_time)
+    factor = cho_factor(correlation, lower=True)
+    solved = cho_solve(factor, line)
+    inner = line.T @ solved
+    weight = cho_solve(factor, np.eye(len(since))) - solved @ np.linalg.solve(inner, solved.T)
+    return weight, 2.0 * float(np.sum(np.log(np.diag(factor[0])))) + float(np.linalg.slogdet(inner)[1])

@@ -162,7 +162,7 @@ class Logs:
       params: with a leading axis of logs, but for the ground. start: (logs,) by name.
       terrain: the ground, with a leading axis of logs unless `shared` by all of them.
       commands: (logs, time, joint), the last ones repeated up to whole pieces.
-      measured: what was measured of the state at the beginning of every piece, (logs, pieces, ...) by name.
+      logs: as recorded. begin: (logs,) when the simulations begin on their clocks, s.
     """
 
     program: Program
@@ -172,7 +172,17 @@ class Logs:
     terrain: Any
     shared: bool
     commands: np.ndarray
-    measured: Mapping[str, np.ndarray]
+    logs: tuple[Log, ...]
+    begin: tuple[float, ...]
+
+    @functools.cached_property
+    def measured(self) -> dict[str, np.ndarray]:
+        """What was measured of the state at the beginning of every piece, (logs, pieces, ...) by name."""
+        program = self.program
+        place = np.arange(0, self.commands.shape[1], program.segment) * program.every * program.system.dt
+        joints = joint_channels(program.model.rover)
+        found = [measured_states(log, joints, begin + place) for log, begin in zip(self.logs, self.begin, strict=True)]
+        return {name: np.stack([f[name] for f in found]) for name in found[0]}
 
     def rovers(self, log: np.ndarray, row: np.ndarray, values: Rows) -> tuple[Params, dict[str, np.ndarray]]:
         """Parameters (but for the ground) and starts of rovers: the logs' conditions with rows of values put in."""
@@ -207,16 +217,9 @@ def stack_logs(
         program=program, numbers=tuple(numbers), params=jax.tree.map(lambda *a: np.stack(a), *bare),
         start={n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature", STOOD)},
         terrain=ground, shared=shared,
-        commands=np.stack([_padded(r.commands, length) for r in runs]), measured=_measured(program, logs, runs, length),
+        commands=np.stack([_padded(r.commands, length) for r in runs]),
+        logs=tuple(logs), begin=tuple(r.begin for r in runs),
     )  # fmt: skip
-
-
-def _measured(program: Program, logs: Sequence[Log], runs: Sequence[LogRun], length: int) -> dict[str, np.ndarray]:
-    """What logs tell of the state at the beginning of every piece, stacked."""
-    place = np.arange(0, length, program.segment) * program.every * program.system.dt
-    joints = joint_channels(program.model.rover)
-    found = [measured_states(log, joints, run.begin + place) for log, run in zip(logs, runs, strict=True)]
-    return {name: np.stack([f[name] for f in found]) for name in found[0]}
 
 
 def cores() -> int:

@@ -69,7 +69,7 @@ class Fit:
       at_bound: names of parameters at a bound that is not physics. extra: other figures of the certificate.
       problems: why there is no certificate; empty where there is.
       step_error: (n,) what was taken for the error of the time step, for drives. own_step_error: whether it was taken
-        anew near this fit.
+        anew near this fit. wide: whether the Jacobian is by the wide steps of intervals.
     """
 
     u: np.ndarray
@@ -85,6 +85,7 @@ class Fit:
     problems: tuple[str, ...] = ()
     step_error: np.ndarray | None = None
     own_step_error: bool = False
+    wide: bool = False
 
     def covariance(self, problem: Problem) -> np.ndarray:
         """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
@@ -127,16 +128,20 @@ class Memory:
         if entry.get("own_step_error"):
             problem.renew_step_error(u, 0.0)
         goal = Objective(problem, free, problem.observations.in_split("fit"))
-        problem.foresee(u[None], free)
+        if entry.get("wide"):
+            problem.foresee_wide(u, free)
+        else:
+            problem.foresee(u[None], free)
         residual, chi2 = goal.residuals(u[None])
         # elsewhere than it was: the physics is another by now, and the certificate is not its own
         if not abs(chi2[0] - entry.get("chi2", np.nan)) <= 1.0 + _KEPT * abs(chi2[0]):
             return None
         return Fit(
-            u=u, free=free, chi2=float(chi2[0]), residual=residual[0], jacobian=goal.jacobian(u), fitted=goal.fitted,
+            u=u, free=free, chi2=float(chi2[0]), residual=residual[0],
+            jacobian=goal.wide_jacobian(u) if entry.get("wide") else goal.jacobian(u), fitted=goal.fitted,
             gradient=entry["gradient"], starts=tuple(entry["starts"]), at_bound=tuple(entry["at_bound"]),
             extra=entry["extra"], problems=tuple(entry["problems"]), step_error=problem.kept_step_error(),
-            own_step_error=bool(entry.get("own_step_error")),
+            own_step_error=bool(entry.get("own_step_error")), wide=bool(entry.get("wide")),
         )  # fmt: skip
 
     def place(self, problem: Problem, name: str) -> np.ndarray | None:
@@ -159,6 +164,7 @@ class Memory:
             "u": {problem.coordinates[i].key: float(found.u[i]) for i in found.free}, "gradient": found.gradient,
             "starts": list(found.starts), "at_bound": list(found.at_bound), "extra": dict(found.extra),
             "problems": list(found.problems), "chi2": found.chi2, "own_step_error": found.own_step_error,
+            "wide": found.wide,
         }  # fmt: skip
         self._store("+".join(effects), entry)
 
@@ -265,6 +271,7 @@ def fit(
         u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual,
         jacobian=goal.wide_jacobian(best.u) if wide else best.jacobian, fitted=fitted, gradient=best.promise,
         starts=chi2s, at_bound=edge, extra=extra, problems=problems, step_error=problem.kept_step_error(),
+        wide=wide,
     )  # fmt: skip
 
 

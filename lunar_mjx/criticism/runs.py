@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx import __version__
-from lunar_mjx.criticism.log import Log, SteadyLog, read_campaign
+from lunar_mjx.criticism.log import Finding, Log, SteadyLog, check, read_campaign
 from lunar_mjx.criticism.log.read import without_answers
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.model import Model
@@ -57,6 +58,16 @@ class Run:
             raise UserError(f"{self.logs[0]}: drive logs and steady-state tables do not go into one run; compare them "
                             "in two.")  # fmt: skip
         return logs  # type: ignore[return-value]
+
+    @functools.cached_property
+    def checked(self) -> tuple[list[Log] | list[SteadyLog], tuple[Finding, ...]]:
+        """The logs and what the gate finds in them, read once.
+
+        Raises:
+          UserError: as `campaign`.
+        """
+        logs = self.campaign()
+        return logs, tuple(check(logs))
 
     def write(self) -> None:
         """Writes `run.json` and `model.toml`; earlier looks at the test split stay on record."""

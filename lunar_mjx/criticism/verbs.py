@@ -15,7 +15,6 @@ from lunar_mjx.criticism.build_problem import build_problem
 from lunar_mjx.criticism.fitted import fitted_model
 from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
 from lunar_mjx.criticism.held_out import errors, noise_test
-from lunar_mjx.criticism.log import check
 from lunar_mjx.criticism.log.findings import is_bad
 from lunar_mjx.criticism.objective import whitened_residuals
 from lunar_mjx.criticism.problem import Problem
@@ -98,8 +97,7 @@ def gate(run: Run) -> list[Any]:
     Raises:
       BadData: they are not fit to be used.
     """
-    logs = run.campaign()
-    findings = check(logs)
+    logs, findings = run.checked
     if is_bad(findings):
         bad = [f for f in findings if f.severity == "bad_data"]
         sentence = f"{bad[0].where}: {bad[0].message}" + (f" ({len(bad) - 1} more)" if len(bad) > 1 else "")

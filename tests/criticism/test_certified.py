@@ -58,6 +58,16 @@ def test_intervals_are_those_of_the_certified_fit(columns):
     assert edged.evidence[0].values["amount"] == pytest.approx(3.0, abs=0.2)
 
 
+def test_a_baseline_recalled_has_the_derivatives_that_it_was_certified_with(columns):
+    base, one, noise = columns
+    problem = Edged(base, {"one": one}, dataclasses.replace(manoeuvres(6, 100), value=noise))
+    memory = Memory()
+    found = fit_baseline(problem, Settings(), memory)
+    recalled = fit_baseline(problem, Settings(), Memory(memory.entries))
+    assert found.wide and recalled.wide
+    np.testing.assert_allclose(recalled.jacobian, found.jacobian, rtol=1e-12)
+
+
 def test_the_step_error_is_taken_at_the_fit_where_halving_the_step_changes_chi_square(columns):
     base, one, noise = columns
     problem = Coarse(base, {"one": one}, dataclasses.replace(manoeuvres(6, 100), value=base[:, 0] * 4.0 + noise))
