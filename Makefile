@@ -9,16 +9,27 @@ PIP := $(BIN)/pip --disable-pip-version-check
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/build/jax-cache
 export MUJOCO_GL ?= disable
 
-.PHONY: demo test test-all lint docs clean
+# Modules are byte-compiled as they are imported: most of what is installed never is.
+export PIP_NO_COMPILE ?= 1
+
+# Tests compile far more than they run; these take half the time of the usual ones. (Tests marked `optimised` do not, and
+# test-all does not.)
+FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$(XLA_FLAGS) --xla_cpu_use_fusion_emitters=false"
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+.PHONY: demo test fast-tests test-all lint docs clean
 
 demo: $(VENV)/run.stamp
 	$(BIN)/lunar-mjx demo -o runs/demo
 
-test: lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
+test: $(VENV)/dev.stamp
+	@$(MAKE) --no-print-directory --jobs=2 lint fast-tests
+
+fast-tests: $(VENV)/dev.stamp
+	$(FAST_COMPILE) $(PYTEST) -m "not slow"
 
 test-all: lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

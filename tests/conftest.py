@@ -1,13 +1,24 @@
-"""The command as a fixture."""
+"""The command as a fixture, and how tests compile."""
 
 from __future__ import annotations
 
+import os
 import sys
 
+import jax
 import pytest
 from cli_harness import Result, Run
 
 from lunar_mjx import cli
+
+
+FAST_COMPILE = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0").lower() in ("1", "true", "yes", "on")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """`make test` compiles with few optimisations, which takes half the time; tests marked `optimised` do not."""
+    jax.config.update("jax_disable_most_optimizations", FAST_COMPILE and not item.get_closest_marker("optimised"))
 
 
 @pytest.fixture

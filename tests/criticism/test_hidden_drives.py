@@ -15,6 +15,7 @@ SHORT = drives.MANOEUVRES[:3]
 ASKED = ("coulomb_friction", "iron_loss", "rolling_resistance")
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("group", "number", "verdict", "named"),
     [

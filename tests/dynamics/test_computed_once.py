@@ -33,6 +33,7 @@ def test_results_are_equal_at_a_fraction_of_the_arithmetic(inputs):
     assert once.cost_analysis()["flops"] < 0.5 * plain.cost_analysis()["flops"]
 
 
+@pytest.mark.optimised
 def test_derivatives_and_maps_are_those_of_the_function(inputs):
     x, table = inputs
 

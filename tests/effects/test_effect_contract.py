@@ -200,6 +200,7 @@ def assert_alike(got: dict[str, Array], expected: dict[str, Array]) -> None:
         assert (difference <= 4 * np.spacing(largest[key])).all(), key
 
 
+@pytest.mark.optimised
 def test_all_that_vanishes_vanishes_together() -> None:
     """As compiled for a simulation: `consistent` with every such effect at null, and without any of them."""
     without = tuple(n for n in LISTS["consistent"] if n not in VANISHING)
