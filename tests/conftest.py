@@ -11,7 +11,6 @@ from cli_harness import Result, Run
 
 from lunar_mjx import cli
 
-
 FAST_COMPILE = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0").lower() in ("1", "true", "yes", "on")
 
 

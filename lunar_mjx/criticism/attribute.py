@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
+from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.held_out import errors, noise_test
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.patterns import Unlisted
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Settings, fit_in_own_step, with_own_step_error

@@ -18,7 +18,8 @@ import numpy as np
 from lunar_mjx import __version__
 from lunar_mjx.criticism.attribute import diagnose
 from lunar_mjx.criticism.build_problem import build_problem
-from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
+from lunar_mjx.criticism.fitting import Fit, Progress, silent
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.observations import Observations
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Settings

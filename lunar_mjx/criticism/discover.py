@@ -13,9 +13,10 @@ import numpy as np
 
 from lunar_mjx.criticism.build_problem import build_problem
 from lunar_mjx.criticism.drive_problem import DriveProblem
-from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
+from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.formula_search import PENALTY, Trial, search_formulas
 from lunar_mjx.criticism.held_out import errors, gain, noise_test
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Settings, refit_with
 from lunar_mjx.criticism.runs import VERDICT_FILE, Run, load_run

@@ -329,7 +329,7 @@ class DriveProblem(Problem):
         return np.stack([v[0] for v in values]), jacobian
 
     def jacobian_and(
-        self, u: np.ndarray, which: np.ndarray, rows: np.ndarray, step: float = STEP
+        self, u: np.ndarray, which: np.ndarray, rows: np.ndarray, step: float | np.ndarray = STEP
     ) -> tuple[np.ndarray, np.ndarray]:
         differences = Differences(self.coordinates, which, step)
         own = differences.rows(u)
@@ -340,11 +340,11 @@ class DriveProblem(Problem):
     def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
         return self.jacobian_and(u, which, np.zeros((0, len(u))))[0]
 
-    def wide_jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
-        return self.jacobian_and(u, which, np.zeros((0, len(u))), WIDE)[0]
+    def wide_jacobian(self, u: np.ndarray, which: np.ndarray, std: np.ndarray) -> np.ndarray:
+        return self.jacobian_and(u, which, np.zeros((0, len(u))), np.clip(std, *WIDE))[0]
 
-    def foresee_wide(self, u: np.ndarray, which: np.ndarray) -> None:
-        self.foresee(Differences(self.coordinates, which, WIDE).rows(u))
+    def foresee_wide(self, u: np.ndarray, which: np.ndarray, std: np.ndarray) -> None:
+        self.foresee(Differences(self.coordinates, which, np.clip(std, *WIDE)).rows(u))
 
     def _of_log(self, number: int) -> slice:
         return self.observations.of_log.get(number, slice(0, 0))

@@ -7,9 +7,7 @@ said about physics without a certificate (small gradient, starts that agree, no 
 from __future__ import annotations
 
 import dataclasses
-import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -28,8 +26,6 @@ from lunar_mjx.criticism.descent import (
 from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.problem import Problem
 
-_KEPT = 1e-3
-"""Share of chi-square by which a fit may be off that is recalled at its old place."""
 AGREEING = 3
 """Starts that must end at the same chi-square."""
 
@@ -43,6 +39,8 @@ _NEARER = 0.3
 
 _ROUGHEST = 25.0
 """Jumps of chi-square that are put up with at most: below what would name an effect."""
+_WIDER, _WIDENED = 1.5, 3
+"""Times the step from which standard errors are taken by wider steps, and how often they are taken at most."""
 ROUGH = 4.0
 """Times the jumps of a rough chi-square that its gradient may promise."""
 
@@ -69,7 +67,7 @@ class Fit:
       at_bound: names of parameters at a bound that is not physics. extra: other figures of the certificate.
       problems: why there is no certificate; empty where there is.
       step_error: (n,) what was taken for the error of the time step, for drives. own_step_error: whether it was taken
-        anew near this fit. wide: whether the Jacobian is by the wide steps of intervals.
+        anew near this fit. wide: (free,) standard errors that the steps of the Jacobian are, for intervals.
     """
 
     u: np.ndarray
@@ -85,94 +83,15 @@ class Fit:
     problems: tuple[str, ...] = ()
     step_error: np.ndarray | None = None
     own_step_error: bool = False
-    wide: bool = False
+    wide: np.ndarray | None = None
 
     def covariance(self, problem: Problem) -> np.ndarray:
         """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
-        j = self.jacobian[self.fitted]
-        _, scale = problem.prior_rows(self.u, self.free)
-        return np.linalg.pinv(j.T @ j + np.diag(scale**2), hermitian=True)
+        return Objective(problem, self.free, self.fitted).covariance(self.u, self.jacobian)
 
     def rms(self, keep: np.ndarray) -> float:
         """Root mean square residual of some observations, in sigma."""
         return float(np.sqrt(np.mean(self.residual[keep] ** 2))) if keep.any() else float("nan")
-
-
-class Memory:
-    """Finished fits by the names of their effects, so that a diagnosis that was stopped goes on where it was.
-
-    Args:
-      entries: as `entries` of an earlier memory; plain data.
-      save: called with all entries after every fit.
-    """
-
-    def __init__(
-        self, entries: Mapping[str, Any] | None = None, save: Callable[[Mapping[str, Any]], None] | None = None
-    ):
-        self.entries = dict(entries or {})
-        self._lock = threading.Lock()
-        self._save = save
-
-    def recall(self, problem: Problem, effects: Sequence[str]) -> Fit | None:
-        """The fit with these effects at its old place, its residual and Jacobian computed anew; None if unknown.
-
-        One that was made with an error of the time step of its own is recalled with that.
-        """
-        entry = self.entries.get("+".join(effects))
-        free = problem.free(effects)
-        if entry is None or set(entry["u"]) != {problem.coordinates[i].key for i in free}:
-            return None
-        u = problem.origin()
-        for i in free:
-            u[i] = entry["u"][problem.coordinates[i].key]
-        if entry.get("own_step_error"):
-            problem.renew_step_error(u, 0.0)
-        goal = Objective(problem, free, problem.observations.in_split("fit"))
-        if entry.get("wide"):
-            problem.foresee_wide(u, free)
-        else:
-            problem.foresee(u[None], free)
-        residual, chi2 = goal.residuals(u[None])
-        # elsewhere than it was: the physics is another by now, and the certificate is not its own
-        if not abs(chi2[0] - entry.get("chi2", np.nan)) <= 1.0 + _KEPT * abs(chi2[0]):
-            return None
-        return Fit(
-            u=u, free=free, chi2=float(chi2[0]), residual=residual[0],
-            jacobian=goal.wide_jacobian(u) if entry.get("wide") else goal.jacobian(u), fitted=goal.fitted,
-            gradient=entry["gradient"], starts=tuple(entry["starts"]), at_bound=tuple(entry["at_bound"]),
-            extra=entry["extra"], problems=tuple(entry["problems"]), step_error=problem.kept_step_error(),
-            own_step_error=bool(entry.get("own_step_error")), wide=bool(entry.get("wide")),
-        )  # fmt: skip
-
-    def place(self, problem: Problem, name: str) -> np.ndarray | None:
-        """(coordinates,) as kept under a name; None if unknown or of other coordinates."""
-        entry = self.entries.get(f"at {name}")
-        free = problem.free()
-        if entry is None or set(entry) != {problem.coordinates[i].key for i in free}:
-            return None
-        u = problem.origin()
-        u[free] = [entry[problem.coordinates[i].key] for i in free]
-        return u
-
-    def keep_place(self, problem: Problem, name: str, u: np.ndarray) -> None:
-        """Remembers the baseline's coordinates at a place."""
-        self._store(f"at {name}", {problem.coordinates[i].key: float(u[i]) for i in problem.free()})
-
-    def keep(self, problem: Problem, effects: Sequence[str], found: Fit) -> None:
-        """Remembers a fit."""
-        entry = {
-            "u": {problem.coordinates[i].key: float(found.u[i]) for i in found.free}, "gradient": found.gradient,
-            "starts": list(found.starts), "at_bound": list(found.at_bound), "extra": dict(found.extra),
-            "problems": list(found.problems), "chi2": found.chi2, "own_step_error": found.own_step_error,
-            "wide": found.wide,
-        }  # fmt: skip
-        self._store("+".join(effects), entry)
-
-    def _store(self, name: str, entry: Mapping[str, Any]) -> None:
-        with self._lock:
-            self.entries[name] = entry
-            if self._save is not None:
-                self._save(dict(self.entries))
 
 
 def _with_own_nuisances(goal: Objective, best: Descent) -> Descent:
@@ -264,12 +183,14 @@ def fit(
     count = int(fitted.sum())
     if certify and _asks_roughness(goal, best):
         extra["roughness_chi2"] = goal.roughness(lowest.u, lowest.residual, lowest.jacobian)
-    wide = certify and np.isfinite(best.chi2) and not problem.cheap_jacobian
+    jacobian, wide = best.jacobian, None
+    if certify and np.isfinite(best.chi2) and not problem.cheap_jacobian:
+        jacobian, wide = _for_intervals(goal, best)
     agreeing = sum(c <= best.chi2 + same_chi2(best.chi2, count) for c in chi2s)
     problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra)
     return Fit(
         u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual,
-        jacobian=goal.wide_jacobian(best.u) if wide else best.jacobian, fitted=fitted, gradient=best.promise,
+        jacobian=jacobian, fitted=fitted, gradient=best.promise,
         starts=chi2s, at_bound=edge, extra=extra, problems=problems, step_error=problem.kept_step_error(),
         wide=wide,
     )  # fmt: skip
@@ -279,6 +200,21 @@ def step_too_long(found: Fit) -> bool:
     """Whether a fit at the noise depends on the length of the time step."""
     slack = slack_of(found.chi2, int(found.fitted.sum()))
     return not found.extra.get("half_step_chi2", 0.0) <= max(HALF_STEP, slack)
+
+
+def _for_intervals(goal: Objective, best: Descent) -> tuple[np.ndarray, np.ndarray]:
+    """The Jacobian (n, free) by short steps and by some of about the standard errors (free,), and these.
+
+    Where what both tell leaves much larger errors, they are the next steps.
+    """
+    jacobian, std = best.jacobian, goal.standard_errors(best.u, best.jacobian)
+    for _ in range(_WIDENED):
+        jacobian = goal.without_jumps(jacobian, goal.wide_jacobian(best.u, std))
+        told = goal.standard_errors(best.u, jacobian)
+        if np.all(told <= _WIDER * std):
+            break
+        std = np.maximum(std, told)
+    return jacobian, std
 
 
 def _asks_roughness(goal: Objective, best: Descent) -> bool:
@@ -293,7 +229,10 @@ def _foresee_end(goal: Objective, first: Descent, certify: bool) -> None:
     if own is not None:
         goal.problem.foresee(own[None])
     if certify:
-        goal.problem.foresee_wide(first.u if own is None else own, goal.free)
+        std = goal.standard_errors(first.u, first.jacobian)
+        end = first.u if own is None else own
+        goal.problem.foresee_wide(end, goal.free, std)
+        goal.problem.foresee(end[None], goal.free)  # to recall the fit
         if _asks_roughness(goal, first):
             goal.foresee_roughness(first.u, first.residual, first.jacobian)
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from lunar_mjx.criticism.build_problem import build_problem, candidate_effects, table_problem
 from lunar_mjx.criticism.drive_problem import DriveProblem
-from lunar_mjx.criticism.fitting import Memory, Progress, silent
+from lunar_mjx.criticism.fitting import Progress, silent
 from lunar_mjx.criticism.log import SteadyLog
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.planned import planned_drives, planned_sweeps
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Settings

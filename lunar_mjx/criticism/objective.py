@@ -52,9 +52,27 @@ class Objective:
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         return self._whitened(self.problem.jacobian(u, self.free))
 
-    def wide_jacobian(self, u: np.ndarray) -> np.ndarray:
-        """The same for intervals."""
-        return self._whitened(self.problem.wide_jacobian(u, self.free))
+    def wide_jacobian(self, u: np.ndarray, std: np.ndarray) -> np.ndarray:
+        """The same for intervals, over steps of about the standard errors (free,)."""
+        return self._whitened(self.problem.wide_jacobian(u, self.free, std))
+
+    def without_jumps(self, *jacobians: np.ndarray) -> np.ndarray:
+        """(n, free) of Jacobians over different steps, of every column the one that tells least.
+
+        A jump within a step adds to a derivative what looks like knowledge, and never takes any away.
+        """
+        told = np.array([np.sum(j[self.fitted] ** 2, axis=0) for j in jacobians])
+        return np.take_along_axis(np.stack(jacobians), np.argmin(told, axis=0)[None, None], axis=0)[0]
+
+    def covariance(self, u: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
+        j = j[self.fitted]
+        _, scale = self.problem.prior_rows(u, self.free)
+        return np.linalg.pinv(j.T @ j + np.diag(scale**2), hermitian=True)
+
+    def standard_errors(self, u: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """(free,) square roots of its diagonal."""
+        return np.sqrt(np.maximum(np.diag(self.covariance(u, j)), 0.0))
 
     def _whitened(self, jacobian: np.ndarray) -> np.ndarray:
         j = self.problem.observations.whiten(jacobian)

@@ -86,13 +86,14 @@ class Problem(abc.ABC):
           (n, m), in the channels' units per unit of the coordinate.
         """
 
-    def wide_jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """The same for intervals, over steps that single jumps of the predictions do not show in."""
+    def wide_jacobian(self, u: np.ndarray, which: np.ndarray, std: np.ndarray) -> np.ndarray:
+        """The same for intervals, over steps of about the standard errors (m,), scales, in which jumps hardly show."""
+        del std
         return self.jacobian(u, which)
 
-    def foresee_wide(self, u: np.ndarray, which: np.ndarray) -> None:
+    def foresee_wide(self, u: np.ndarray, which: np.ndarray, std: np.ndarray) -> None:
         """`wide_jacobian` may be asked for."""
-        del u, which
+        del u, which, std
 
     def linearise(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, Callable[[int], np.ndarray]]:
         """Predictions (k, n) at (k, coordinates), and the Jacobians (n, m) there by number, simulated at once."""

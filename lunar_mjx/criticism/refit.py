@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.criticism.descent import Descent, Outdone, Rival
-from lunar_mjx.criticism.fitting import Fit, Memory, fit, foreseen_fit, step_too_long
+from lunar_mjx.criticism.fitting import Fit, fit, foreseen_fit, step_too_long
 from lunar_mjx.criticism.held_out import NoiseTest, gain, noise_test
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.patterns import Pattern
 from lunar_mjx.criticism.problem import Problem

@@ -60,14 +60,14 @@ class Run:
         return logs  # type: ignore[return-value]
 
     @functools.cached_property
-    def checked(self) -> tuple[list[Log] | list[SteadyLog], tuple[Finding, ...]]:
+    def checked(self) -> tuple[list[Log] | list[SteadyLog], list[Finding]]:
         """The logs and what the gate finds in them, read once.
 
         Raises:
           UserError: as `campaign`.
         """
         logs = self.campaign()
-        return logs, tuple(check(logs))
+        return logs, check(logs)
 
     def write(self) -> None:
         """Writes `run.json` and `model.toml`; earlier looks at the test split stay on record."""

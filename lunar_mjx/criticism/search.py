@@ -9,10 +9,11 @@ import numpy as np
 
 from lunar_mjx.criticism.complete import best_start, simpler, stands, tried_in_place
 from lunar_mjx.criticism.descent import slack_of
-from lunar_mjx.criticism.fitting import Fit, Memory, Progress, fit, silent
+from lunar_mjx.criticism.fitting import Fit, Progress, fit, silent
 from lunar_mjx.criticism.held_out import gain, gain_in_turn, noise_test
 from lunar_mjx.criticism.inputs import SMOOTH
 from lunar_mjx.criticism.localise import pattern
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.patterns import Unlisted, find_pattern
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Candidate, Settings, fit_in_own_step, refit, refit_all, with_own_step_error

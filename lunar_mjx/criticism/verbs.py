@@ -13,9 +13,10 @@ import numpy as np
 from lunar_mjx.criticism.attribute import diagnose, parameters
 from lunar_mjx.criticism.build_problem import build_problem
 from lunar_mjx.criticism.fitted import fitted_model
-from lunar_mjx.criticism.fitting import Fit, Memory, Progress, silent
+from lunar_mjx.criticism.fitting import Fit, Progress, silent
 from lunar_mjx.criticism.held_out import errors, noise_test
 from lunar_mjx.criticism.log.findings import is_bad
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.objective import whitened_residuals
 from lunar_mjx.criticism.problem import Problem
 from lunar_mjx.criticism.refit import Settings

@@ -9,8 +9,9 @@ from toy_problem import Linear, coordinate, manoeuvres
 from lunar_mjx.criticism import search as searching
 from lunar_mjx.criticism.attribute import diagnose
 from lunar_mjx.criticism.complete import best_start, simpler, stands, tried_in_place
-from lunar_mjx.criticism.fitting import Memory, fit
+from lunar_mjx.criticism.fitting import fit
 from lunar_mjx.criticism.held_out import noise_test
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.refit import Candidate, Settings
 from lunar_mjx.criticism.score import score, signatures
 from lunar_mjx.criticism.search import search

@@ -18,7 +18,7 @@ def predictions(rows):
     return np.stack([3.0 * rows[:, 0] + jump + 0.5 * rows[:, 1]] * 4, axis=1)
 
 
-@pytest.mark.parametrize(("step", "slope"), [(STEP, 3.0 + JUMP / STEP), (WIDE, 3.0 + JUMP / WIDE)])
+@pytest.mark.parametrize(("step", "slope"), [(STEP, 3.0 + JUMP / STEP), (WIDE[0], 3.0 + JUMP / WIDE[0])])
 def test_a_jump_counts_by_the_step(step, slope):
     observations = manoeuvres(1, 4)
     u, which = np.zeros(2), np.arange(2)
@@ -28,3 +28,12 @@ def test_a_jump_counts_by_the_step(step, slope):
     np.testing.assert_allclose(found[:, 0], slope, rtol=1e-6)
     np.testing.assert_allclose(found[:, 1], 0.5, rtol=1e-6)  # one that stands at its bound is moved the other way
     assert rows[2, 1] == pytest.approx(-step)
+
+
+def test_every_coordinate_has_its_own_step():
+    u, which = np.zeros(2), np.arange(2)
+    differences = Differences(COORDINATES, which, np.array([0.25, 0.5]))
+    rows = differences.rows(u)
+    np.testing.assert_array_equal(rows, [[0.0, 0.0], [0.25, 0.0], [0.0, -0.5]])
+    found = differences.jacobian(u, predictions(rows), manoeuvres(1, 4), lambda c: np.zeros(4))
+    np.testing.assert_allclose(found, [[3.0 + JUMP / 0.25, 0.5]] * 4, rtol=1e-9)

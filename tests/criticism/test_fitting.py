@@ -11,7 +11,8 @@ from toy_problem import Decay, Linear, TwoMinima, coordinate, manoeuvres
 
 from lunar_mjx.criticism import fitting
 from lunar_mjx.criticism.descent import Rival, chase, descend
-from lunar_mjx.criticism.fitting import Memory, fit
+from lunar_mjx.criticism.fitting import fit
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.objective import Objective
 
 RNG = np.random.default_rng(0)
@@ -266,7 +267,7 @@ class Edge(Linear):
     def jacobian(self, u, which):
         return self.matrix[:, which] * np.array([20.0, 1.0, 1.0])[which]
 
-    def wide_jacobian(self, u, which):
+    def wide_jacobian(self, u, which, std):
         return self.matrix[:, which]
 
 
@@ -282,3 +283,22 @@ def test_intervals_are_those_of_wide_steps():
     problem = Edge(BASE, {}, observations)
     rough = fit(problem, problem.free(), truth, starts=1, certify=False)
     assert np.sqrt(np.diag(rough.covariance(problem)))[0] < 0.1 * stds[Linear][0]
+
+
+class Jumpy(Edge):
+    """One with a jump that shows in derivatives over steps that are not far wider than it, and one over wide steps."""
+
+    def wide_jacobian(self, u, which, std):
+        return self.matrix[:, which] * (1.0 + np.array([0.02, 0.0, 0.0])[which] / np.maximum(std, 0.01)) * [1, 1, 5]
+
+
+def test_steps_for_intervals_widen_while_a_jump_shows_in_them():
+    truth = np.array([0.3, -0.2, 0.1])
+    observations = dataclasses.replace(manoeuvres(3, 40), value=BASE @ truth)
+    problem, smooth = Jumpy(BASE, {}, observations), Edge(BASE, {}, observations)
+    found, expected = (fit(p, p.free(), truth, starts=1) for p in (problem, smooth))
+    std, real = (np.sqrt(np.diag(f.covariance(smooth))) for f in (found, expected))
+    at_first = real[0] / 20.0
+    assert at_first < 0.01, "the first step is the least"
+    assert std[0] > 0.6 * real[0] > 1.5 * real[0] / (1.0 + 0.02 / 0.01), "by that step alone it would be a third"
+    np.testing.assert_allclose(std[1:], real[1:], rtol=1e-6)

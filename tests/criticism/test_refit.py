@@ -13,7 +13,8 @@ from toy_problem import Linear, manoeuvres
 
 from lunar_mjx.criticism import refit as refits
 from lunar_mjx.criticism.descent import Descent, Outdone
-from lunar_mjx.criticism.fitting import Memory, fit
+from lunar_mjx.criticism.fitting import fit
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.refit import Settings, refit_all
 from lunar_mjx.criticism.score import Score
 

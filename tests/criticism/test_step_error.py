@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from toy_problem import Linear, manoeuvres
 
-from lunar_mjx.criticism.fitting import Memory, fit
+from lunar_mjx.criticism.fitting import fit
 from lunar_mjx.criticism.held_out import noise_test
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.refit import Candidate, Settings, refit_with, with_own_step_error
 from lunar_mjx.criticism.search import _in_own_steps
 

@@ -9,8 +9,9 @@ import pytest
 from toy_problem import Linear, manoeuvres
 
 from lunar_mjx.criticism.descent import Rival
-from lunar_mjx.criticism.fitting import Fit, Memory, fit
+from lunar_mjx.criticism.fitting import Fit, fit
 from lunar_mjx.criticism.held_out import noise_test
+from lunar_mjx.criticism.memory import Memory
 from lunar_mjx.criticism.refit import Candidate, _strayed, refit
 
 UNSURE = ("the gradient still promises a drop of chi-square of 21",)

@@ -35,7 +35,7 @@ def test_without_noise_nothing_is_missed():
     assert max(p["error"] for p in found["parameters"]) < 1e-9
 
 
-@pytest.mark.parametrize("kind", ["white", "coloured"])
+@pytest.mark.parametrize("kind", ["white", pytest.param("coloured", marks=pytest.mark.slow)])
 def test_intervals_cover_where_the_noise_is_as_told(kind):
     covered, over, recipe = [], [], Recipe(kind, dirt=0.0)
     for seed in range(15):

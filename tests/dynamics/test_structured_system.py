@@ -67,7 +67,12 @@ def test_one_step_agrees_with_mjx_in_float32():
 
 
 @pytest.mark.parametrize(
-    "chunk", [pytest.param(None, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow), 3]
+    "chunk",
+    [
+        pytest.param(None, marks=pytest.mark.slow),
+        pytest.param(4, marks=pytest.mark.slow),
+        pytest.param(3, marks=pytest.mark.slow),
+    ],
 )
 def test_batches_equal_single_rovers(chunk):
     """Batch last inside, chunks that do and do not divide the batch, terrains and parameters per rover."""
