@@ -53,16 +53,18 @@ class Objective:
         return self._whitened(self.problem.jacobian(u, self.free))
 
     def wide_jacobian(self, u: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """The same for intervals, over steps of about the standard errors (free,)."""
-        return self._whitened(self.problem.wide_jacobian(u, self.free, std))
+        """The same for intervals, over steps of about the standard errors (free,); not finite where a step fails."""
+        return self.problem.observations.whiten(self.problem.wide_jacobian(u, self.free, std))
 
     def without_jumps(self, *jacobians: np.ndarray) -> np.ndarray:
-        """(n, free) of Jacobians over different steps, of every column the one that tells least.
+        """(n, free) of Jacobians over different steps, of every finite column the one that tells least.
 
-        A jump within a step adds to a derivative what looks like knowledge, and never takes any away.
+        A jump within a step adds to a derivative what looks like knowledge, and seldom takes any away.
         """
         told = np.array([np.sum(j[self.fitted] ** 2, axis=0) for j in jacobians])
-        return np.take_along_axis(np.stack(jacobians), np.argmin(told, axis=0)[None, None], axis=0)[0]
+        least = np.argmin(np.where(np.isfinite(told), told, np.inf), axis=0)
+        j = np.take_along_axis(np.stack(jacobians), least[None, None], axis=0)[0]
+        return np.where(np.isfinite(j), j, 0.0)
 
     def covariance(self, u: np.ndarray, j: np.ndarray) -> np.ndarray:
         """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""

@@ -292,6 +292,21 @@ class Jumpy(Edge):
         return self.matrix[:, which] * (1.0 + np.array([0.02, 0.0, 0.0])[which] / np.maximum(std, 0.01)) * [1, 1, 5]
 
 
+class Failing(Edge):
+    """One that a wide step of its second parameter takes to where nothing is finite."""
+
+    def wide_jacobian(self, u, which, std):
+        return np.where(which == 1, np.nan, self.matrix[:, which])
+
+
+def test_a_wide_step_that_fails_leaves_the_short_one():
+    truth = np.array([0.3, -0.2, 0.1])
+    observations = dataclasses.replace(manoeuvres(3, 40), value=BASE @ truth)
+    failing, edge = Failing(BASE, {}, observations), Edge(BASE, {}, observations)
+    found, expected = (fit(p, p.free(), truth, starts=1) for p in (failing, edge))
+    np.testing.assert_allclose(found.covariance(failing), expected.covariance(edge), rtol=1e-9)
+
+
 def test_steps_for_intervals_widen_while_a_jump_shows_in_them():
     truth = np.array([0.3, -0.2, 0.1])
     observations = dataclasses.replace(manoeuvres(3, 40), value=BASE @ truth)
