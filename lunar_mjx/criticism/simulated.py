@@ -15,7 +15,7 @@ from lunar_mjx.criticism.observations import Observations
 
 MOST_BYTES = 2**30
 """Memory that simulated rows may take; those not asked for longest go first. (A diagnosis of eight drives of 10 s
-simulates 1,300 to 1,700 rows on a GPU, 0.4 to 0.6 GB: under 0.5 GB it simulated its first rows twice.)"""
+simulates 1,300 to 1,700 rows on a GPU, 0.4 GB and more; with half of this one simulated its first rows once more.)"""
 
 Key = tuple[Any, ...]
 
