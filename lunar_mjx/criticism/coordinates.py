@@ -11,6 +11,8 @@ import numpy as np
 
 from lunar_mjx.effects.base import Effect, Parameter
 
+NUISANCE = "initial"
+"""Effect of the coordinates that belong to logs."""
 WIDE = 10.0
 """Prior standard deviation, in scales, of a coordinate that the data alone should settle."""
 
@@ -20,14 +22,14 @@ class Coordinate:
     """One parameter on a scale of its own: value = start exp(scale u) where `log`, else start + scale u.
 
     Attributes:
-      effect, name: whose parameter it is; nuisances such as a log's initial pose have the effect "initial".
+      effect, name: whose parameter it is; nuisances such as a log's initial pose have the effect `NUISANCE`.
       start: value at u = 0, SI units. scale: change per unit of u (relative where `log`).
       low, high: bounds of the value.
       log: whether the logarithm moves.
-      prior: standard deviation of u; infinite for none.
+      prior: standard deviation of u; infinite for none. centre: the value of u that it is centred on.
       physical: whether resting on a bound is physics (such as zero friction) and not a failed fit.
       unit: of the value.
-      log_index: the log that a nuisance belongs to, or -1.
+      log_index: the log that a nuisance belongs to, or -1 where all share it.
       amplitude: whether the value has a null at which its effect vanishes.
       factor: whether the value is a factor on the model's own, which may differ between wheels or joints.
     """
@@ -45,6 +47,12 @@ class Coordinate:
     log_index: int = -1
     amplitude: bool = False
     factor: bool = False
+    centre: float = 0.0
+
+    @property
+    def nuisance(self) -> bool:
+        """Whether it belongs to the measurements and not to the model."""
+        return self.effect == NUISANCE
 
     @property
     def key(self) -> str:

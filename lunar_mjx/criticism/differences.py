@@ -33,7 +33,7 @@ class Differences:
         self._coordinates, self._which = coordinates, which
         self._size = {int(i): float(s) for i, s in zip(which, np.broadcast_to(step, len(which)), strict=True)}
         self._own = [int(i) for i in which if coordinates[i].log_index >= 0 and not is_linear(coordinates[i])]
-        self._shared = [int(i) for i in which if coordinates[i].log_index < 0]
+        self._shared = [int(i) for i in which if coordinates[i].log_index < 0 and not is_linear(coordinates[i])]
         self._kinds = sorted({coordinates[i].name for i in self._own})
 
     def rows(self, u: np.ndarray) -> np.ndarray:

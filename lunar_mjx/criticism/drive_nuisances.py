@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lunar_mjx.criticism.coordinates import Coordinate
+from lunar_mjx.criticism.coordinates import NUISANCE, Coordinate
 from lunar_mjx.criticism.drive_program import SETTLE, STOOD
 from lunar_mjx.criticism.observations import Observations, Series
 
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
     from lunar_mjx.criticism.drive_runs import LogRun
 
 STEP_ERROR = "step_error"
-"""Name of the nuisance by which a log differs from what steps of finite length predict."""
+"""Name of the nuisance by which logs differ from what steps of finite length predict."""
 _COUNTED = re.compile(r"position|angle|yaw")
 """What another pose at the start moves as a whole."""
 _ENCODER = re.compile(r"joint_\w*drive_angle_rad")
@@ -47,39 +46,44 @@ def standing_shows(change: np.ndarray, number: int, observations: Observations) 
     return total > _SHOWS
 
 
+def step_error_share() -> Coordinate:
+    """How much of the step's error all logs contain: all where a rover was measured, nothing where steps of the same
+    length recorded it."""
+    return Coordinate(NUISANCE, STEP_ERROR, 0.0, 1.0, -2.0, 2.0, prior=0.5, centre=0.5, physical=True)
+
+
 def nuisances(number: int, run: LogRun, observations: Observations, stood: bool) -> list[Coordinate]:
     """Coordinates of one log's nuisances; those of `is_linear` need no simulation.
 
     `stood` tells whether the time for which the rover had stood is one.
     """
     found = [
-        Coordinate("initial", name, run.start[name], _START[name][0], run.start[name] - _START[name][1],
+        Coordinate(NUISANCE, name, run.start[name], _START[name][0], run.start[name] - _START[name][1],
                    run.start[name] + _START[name][1], prior=10.0, log_index=number)
         for name in run.unknown if name in _START
     ]  # fmt: skip
     if stood:
-        found.append(Coordinate("initial", STOOD, run.start[STOOD], _STOOD_SCALE, SETTLE, _STOOD_MOST, prior=10.0,
+        found.append(Coordinate(NUISANCE, STOOD, run.start[STOOD], _STOOD_SCALE, SETTLE, _STOOD_MOST, prior=10.0,
                                 physical=True, log_index=number))  # fmt: skip
-    found.append(Coordinate("initial", STEP_ERROR, 0.0, 1.0, -2.0, 2.0, prior=1.0, physical=True, log_index=number))
     for s in observations.series:
         if s.log == number and is_encoder(s):
             first = float(np.mean(observations.value[s.start : s.stop][:5]))
             scale = 3.0 * float(observations.sigma()[s.start])
-            found.append(Coordinate("initial", s.channel, first, scale, first - 30.0 * scale, first + 30.0 * scale,
+            found.append(Coordinate(NUISANCE, s.channel, first, scale, first - 30.0 * scale, first + 30.0 * scale,
                                     prior=10.0, log_index=number))  # fmt: skip
     return found
 
 
 def is_linear(c: Coordinate) -> bool:
     """Whether a coordinate adds a known vector to the predictions, whatever the others are."""
-    return c.log_index >= 0 and (c.name == STEP_ERROR or _ENCODER.fullmatch(c.name) is not None)
+    return c.nuisance and (c.name == STEP_ERROR or _ENCODER.fullmatch(c.name) is not None)
 
 
 def direction(c: Coordinate, observations: Observations, step_error: np.ndarray) -> np.ndarray:
     """(n,) what one unit of a linear nuisance's value adds to the predictions."""
     out = np.zeros(len(observations))
     for s in observations.series:
-        if s.log == c.log_index:
+        if c.log_index in (s.log, -1):
             part = slice(s.start, s.stop)
             if c.name == STEP_ERROR:
                 out[part] = step_error[part]
@@ -88,23 +92,12 @@ def direction(c: Coordinate, observations: Observations, step_error: np.ndarray)
     return out
 
 
-def unabsorbed(
-    change: np.ndarray, coordinates: Sequence[Coordinate], observations: Observations,
-    along: Callable[[Coordinate], np.ndarray],
-) -> np.ndarray:  # fmt: skip
-    """(n,) what of a change of the predictions the nuisances of the step's error cannot take up.
-
-    `along` gives the directions of these.
-    """
-    whiten, change = observations.whiten, change.copy()
-    for c in coordinates:
-        if c.name == STEP_ERROR:
-            mine, own, known = observations.of_log.get(c.log_index, slice(0, 0)), np.zeros(len(change)), along(c)
-            own[mine] = change[mine]
-            step = whiten(known)
-            size = float(step @ step)
-            change[mine] -= (float(step @ whiten(own)) / size if size > 0.0 else 0.0) * known[mine]
-    return change
+def unabsorbed(change: np.ndarray, step_error: np.ndarray, observations: Observations) -> np.ndarray:
+    """(n,) what of a change of the predictions some amount of the step's error does not take up, by the fitted logs."""
+    keep = observations.in_split("fit")
+    step, moved = (observations.whiten(v)[keep] for v in (step_error, change))
+    size = float(step @ step)
+    return change - (float(step @ moved) / size if size > 0.0 else 0.0) * step_error
 
 
 def from_first(predicted: np.ndarray, observations: Observations) -> np.ndarray:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from lunar_mjx.criticism.candidates import usable
-from lunar_mjx.criticism.coordinates import Coordinate, of_candidate
+from lunar_mjx.criticism.coordinates import NUISANCE, Coordinate, of_candidate
 from lunar_mjx.criticism.differences import STEP, WIDE, Differences
 from lunar_mjx.criticism.drive_baseline import BASELINE, baseline_coordinates, unfit
 from lunar_mjx.criticism.drive_noise import Noises
@@ -27,6 +27,7 @@ from lunar_mjx.criticism.drive_nuisances import (
     is_linear,
     nuisances,
     standing_shows,
+    step_error_share,
     unabsorbed,
 )
 from lunar_mjx.criticism.drive_observations import observations_of
@@ -105,6 +106,7 @@ class DriveProblem(Problem):
         self.observations = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
         self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self.observations.series)
         shows = self._standing_shows()
+        found.append(step_error_share())
         for number, run in enumerate(self.bench.runs):
             found += nuisances(number, run, self.observations, number in shows)
         self.baseline = np.arange(len(found))
@@ -135,7 +137,7 @@ class DriveProblem(Problem):
         keys = [(*self.bench.stamp, self._sampled_at(), STOOD, time) for time in STANDING]
         seen = [row for k in keys if (row := SIMULATED.get(k)) is not None]
         if len(seen) < len(keys):
-            values = {("initial", STOOD, n, False): np.array(STANDING) for n in sloped}
+            values = {(NUISANCE, STOOD, n, False): np.array(STANDING) for n in sloped}
             seen = list(self._run(self.bench, len(keys), values, silent))
             for k, row in zip(keys, seen, strict=True):
                 SIMULATED.keep(k, row)
@@ -201,7 +203,7 @@ class DriveProblem(Problem):
             out = self._simulations(self._bench_for(rows), rows, self.progress)
         for i, c in enumerate(self.coordinates):
             if is_linear(c) and np.any(amount := c.value(rows[:, i])):
-                part = self._of_log(c.log_index)
+                part = self._of_log(c.log_index) if c.log_index >= 0 else slice(None)
                 out[:, part] += np.outer(amount, self._direction(c)[part])
         return out
 
@@ -211,7 +213,7 @@ class DriveProblem(Problem):
 
     def _keys(self, bench: Bench, rows: np.ndarray) -> list[Key]:
         """What a bench's simulation of each row depends on."""
-        acting = frozenset(e for params in bench.params for e in params.effects) | {"initial"}
+        acting = frozenset(e for params in bench.params for e in params.effects) | {NUISANCE}
         which = [i for i, c in enumerate(self.coordinates) if c.effect in acting and not is_linear(c)]
         names = [(c.effect, c.name, c.log_index, c.factor) for c in (self.coordinates[i] for i in which)]
         columns = [np.asarray(self.coordinates[i].value(rows[:, i]), float) for i in which]
@@ -230,8 +232,8 @@ class DriveProblem(Problem):
     def step_error(self) -> np.ndarray:
         """(n,) what a vanishing time step would add to the predictions of the model as given, to first order.
 
-        The step's error leads joints by a step or so, which an encoder sees. How much of it a log contains is a
-        nuisance of the log: all where a rover was measured, nothing where a simulator with the same step recorded it.
+        The step's error leads joints by a step or so, which an encoder sees. How much of it logs contain is a
+        nuisance: all where a rover was measured, nothing where a simulator with the same step recorded it.
         """
         if self._step_error is None:
             origin = self.origin()[None] * 0.0
@@ -359,7 +361,7 @@ class DriveProblem(Problem):
         """The change of chi-square by halving the time step, beyond what the nuisance of the step's error absorbs."""
         del free
         keep, whiten = self.observations.in_split("fit"), self.observations.whiten
-        change = self._unabsorbed(self._halving(u))
+        change = unabsorbed(self._halving(u), self.step_error, self.observations)
         coarse = self.observations.value - self.predict(u[None])[0]
         chi2 = [np.sum(whiten(r)[keep] ** 2) for r in (coarse, coarse - change)]
         return {"half_step_chi2": float(abs(chi2[0] - chi2[1]))}
@@ -377,14 +379,13 @@ class DriveProblem(Problem):
             part = self._of_log(number)
             if not np.isfinite(change[part]).all():
                 change[part] = 0.0
-        whitened = self.observations.whiten(self._unabsorbed(change))[self.observations.in_split("fit")]
+        whitened = self.observations.whiten(unabsorbed(change, self.step_error, self.observations))[
+            self.observations.in_split("fit")
+        ]
         if not float(whitened @ whitened) > least:
             return False
         self._step_error = 2.0 * change
         return True
-
-    def _unabsorbed(self, change: np.ndarray) -> np.ndarray:
-        return unabsorbed(change, self.coordinates, self.observations, self._direction)
 
     def _halving(self, u: np.ndarray) -> np.ndarray:
         """(n,) the change of the predictions by halving the time step, here or where they are less than a sigma away.

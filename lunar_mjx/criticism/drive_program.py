@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lunar_mjx.criticism.coordinates import NUISANCE
 from lunar_mjx.criticism.measured_states import begin_at, measured_states
 from lunar_mjx.dynamics import System, build
 from lunar_mjx.dynamics.signals import joint_channels, measure
@@ -191,7 +192,7 @@ class Logs:
         number = np.asarray(self.numbers)[log]
         for (effect, name, own, factor), column in values.items():
             value = column[row]
-            if effect == "initial":
+            if effect == NUISANCE:
                 if name in start:
                     start[name] = np.where(number == own, value, start[name])
             elif effect in params.effects:  # else a candidate at its null, which this program does without

@@ -16,7 +16,7 @@ def fitted_model(problem: Problem, fitted: Fit, model: Model, held: Mapping[str,
     """A model with the fitted values of everything that moved."""
     for i in fitted.free:
         c = problem.coordinates[i]
-        if c.log_index >= 0 or c.effect not in model.effect_names or c.name in (held or {}):
+        if c.nuisance or c.effect not in model.effect_names or c.name in (held or {}):
             continue
         value = float(c.value(fitted.u[i]))
         old = model.parameters[c.effect][c.name]

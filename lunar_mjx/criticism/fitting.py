@@ -25,6 +25,7 @@ from lunar_mjx.criticism.descent import (
 )
 from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.problem import Problem
+from lunar_mjx.criticism.slow_disturbance import inflated
 
 AGREEING = 3
 """Starts that must end at the same chi-square."""
@@ -86,8 +87,12 @@ class Fit:
     wide: np.ndarray | None = None
 
     def covariance(self, problem: Problem) -> np.ndarray:
-        """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
-        return Objective(problem, self.free, self.fitted).covariance(self.u, self.jacobian)
+        """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors.
+
+        Wider where the residual is slower than the noise (see `slow_disturbance`).
+        """
+        known = Objective(problem, self.free, self.fitted).covariance(self.u, self.jacobian)
+        return inflated(problem.observations, self.fitted, self.residual, self.jacobian, known)
 
     def rms(self, keep: np.ndarray) -> float:
         """Root mean square residual of some observations, in sigma."""

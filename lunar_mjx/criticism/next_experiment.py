@@ -161,7 +161,7 @@ class _Knowledge:
         jacobian = np.where(np.isfinite(jacobian), jacobian, 0.0)[problem.observations.in_split("fit", "select")]
         _, scale = problem.prior_rows(base.u, free)
         hessian = jacobian.T @ jacobian + np.diag(scale**2)
-        own = np.array([problem.coordinates[i].log_index >= 0 for i in free])
+        own = np.array([problem.coordinates[i].nuisance for i in free])
         self.keys = [problem.coordinates[i].key for i, mine in zip(free, own, strict=True) if not mine]
         across = hessian[np.ix_(~own, own)]
         inner = np.linalg.pinv(hessian[np.ix_(own, own)], hermitian=True)
@@ -173,7 +173,7 @@ def _rank(problem: Problem, known: _Knowledge, names: Sequence[str], plans: Sequ
     rows = np.repeat(problem.origin()[None], len(names), axis=0)
     for row, name in zip(rows, names, strict=True):
         for key, value in known.place[name].items():
-            if key in keys and problem.coordinates[keys[key]].log_index < 0:
+            if key in keys and not problem.coordinates[keys[key]].nuisance:
                 row[keys[key]] = value
     white = problem.observations.whiten(problem.predict(rows).T).T
     effects = [n for n in names if n != NOTHING]

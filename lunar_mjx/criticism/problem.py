@@ -142,7 +142,7 @@ class Problem(abc.ABC):
     def prior_rows(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residual and diagonal Jacobian of the priors of some coordinates, in sigma."""
         scale = np.array([1.0 / self.coordinates[i].prior for i in which])
-        return u[which] * scale, scale
+        return (u[which] - np.array([self.coordinates[i].centre for i in which])) * scale, scale
 
     def bounds(self, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of some coordinates."""

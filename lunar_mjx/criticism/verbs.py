@@ -153,7 +153,7 @@ def _rms(values: np.ndarray) -> float:
 
 def _parameter_table(problem: Problem, fitted: Fit) -> dict[str, Any]:
     """Fitted values and standard deviations by effect and name, with units and the values that the model came with."""
-    moved = [problem.coordinates[i] for i in fitted.free if problem.coordinates[i].log_index < 0]
+    moved = [c for c in (problem.coordinates[i] for i in fitted.free) if not c.nuisance]
     table: dict[str, Any] = {}
     covariance = fitted.covariance(problem)
     for effect in dict.fromkeys(c.effect for c in moved):

@@ -119,6 +119,22 @@ def test_what_only_adds_to_the_predictions_is_not_simulated(logs, runs):
     assert added - plain == pytest.approx(error)
 
 
+def test_all_logs_share_one_amount_of_the_steps_error_and_half_of_it_is_expected(logs, runs):
+    """Either every log was measured, or every one was recorded by steps of the same length."""
+    problem = _problem(logs)
+    (place,) = [i for i, c in enumerate(problem.coordinates) if c.name == STEP_ERROR]
+    assert place in problem.baseline
+    u = problem.origin()
+    assert problem.coordinates[place].value(u[place]) == 0.0
+    u[place] = 1.0
+    moved = problem.predict(np.stack([problem.origin(), u]))
+    assert moved[1] - moved[0] == pytest.approx(problem.step_error)
+    assert len(problem.observations.of_log) == 2
+    assert all(np.any(problem.step_error[part]) for part in problem.observations.of_log.values())
+    priors = [problem.prior_rows(np.full(len(u), v), np.array([place])) for v in (0.0, 0.5, 1.0)]
+    assert [float(p[0][0]) for p in priors] == [-1.0, 0.0, 1.0] and priors[0][1] == 2.0
+
+
 def test_foreseen_rows_are_taken_along_where_rows_cost_nothing(logs, runs):
     problem = _problem(logs)
     origin, which = problem.origin(), problem.baseline[:3]
