@@ -11,12 +11,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy import stats
 from scipy.fft import dct
 
 from lunar_mjx.criticism.observations import Observations
 
 _FEWEST = 20.0
 """Degrees of freedom of a band; fewer are pooled with the next one."""
+_CHANCE = 0.01
+"""How often white noise may pass for more in a band."""
 
 
 def inflated(
@@ -43,7 +46,7 @@ def inflated(
 
 
 def density(band: np.ndarray, rate: np.ndarray, power: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """(bands,) spectral density of what is not white noise, in a sample's variance times s; none is negative.
+    """(bands,) spectral density of what is not white noise, in a sample's variance times s; 0 where chance would do.
 
     Args:
       band: (m,) of every mode. rate: (m,) samples per s of its series: the more, the more a disturbance counts.
@@ -56,7 +59,8 @@ def density(band: np.ndarray, rate: np.ndarray, power: np.ndarray, freedom: np.n
     for end in range(1, count + 1):
         part = slice(begin, end)
         if number[part].sum() >= _FEWEST:
-            out[part] = max(float(over[part].sum() / weight[part].sum()), 0.0)
+            if over[part].sum() > stats.chi2.isf(_CHANCE, number[part].sum()) - number[part].sum():
+                out[part] = over[part].sum() / weight[part].sum()
             begin = end
     return out
 
