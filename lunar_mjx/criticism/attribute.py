@@ -52,26 +52,35 @@ def diagnose(
         reason = "; ".join(base.fit.problems)
         sentence = f"The baseline fit has no certificate ({reason}), so nothing is said about physics."
         return Diagnosis(Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details), found
+    unsure = ""
     if chosen.effects:
+        named = chosen.at_noise or excess_explained(found, problem) >= settings.explained
         final = certify(problem, found, settings)
         details["certificate_after"] = _certificate(final)
-        if final.problems:
-            reason = "; ".join(final.problems)
-            sentence = f"The fit with {', '.join(chosen.effects)} has no certificate ({reason}), so nothing is said."
-            return Diagnosis(
-                Verdict.BAD_FIT, (), sentence, error_before=errors(problem, base.fit), details=details
-            ), found
-        # values and intervals are those of the fit that has the certificate
-        chosen = dataclasses.replace(chosen, fit=final, noise=noise_test(problem, final))
-        details["noise_test_after"] = dataclasses.asdict(chosen.noise)
-        found = dataclasses.replace(found, chosen=chosen)
+        if not final.problems:
+            # values and intervals are those of the fit that has the certificate
+            chosen = dataclasses.replace(chosen, fit=final, noise=noise_test(problem, final))
+            details["noise_test_after"] = dataclasses.asdict(chosen.noise)
+            found = dataclasses.replace(found, chosen=chosen)
+        else:
+            reason = f"the fit with {', '.join(chosen.effects)} has no certificate ({'; '.join(final.problems)})"
+            if named or base.fit.problems or base.at_noise:
+                sentence = f"{reason[0].upper()}{reason[1:]}, so nothing is said."
+                before = errors(problem, base.fit)
+                return Diagnosis(Verdict.BAD_FIT, (), sentence, error_before=before, details=details), found
+            # it would have been said to help; that something is missing stands without it
+            unsure = f" ({reason[0].upper()}{reason[1:]}.)"
+            problem.use_step_error(base.fit.step_error)
+            chosen = base
+            details["noise_test_after"] = dataclasses.asdict(base.noise)
+            found = dataclasses.replace(found, chosen=base, rivals=(), unlisted=None)
     evidence = _evidence(problem, found, settings)
     undecidable = tuple(e.effect for e in evidence if e.status == "not tested")
     explained = excess_explained(found, problem)
     details["excess_explained"] = explained
     verdict, effects, sentence = _verdict(found, explained, settings)
     diagnosis = Diagnosis(
-        verdict=verdict, effects=effects, sentence=sentence, evidence=evidence,
+        verdict=verdict, effects=effects, sentence=sentence + unsure, evidence=evidence,
         error_before=errors(problem, base.fit), error_after=errors(problem, chosen.fit),
         isolability=found.cosines, undecidable=undecidable, details=details,
     )  # fmt: skip

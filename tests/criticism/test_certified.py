@@ -85,3 +85,29 @@ def test_without_that_there_is_no_certificate(columns, monkeypatch):
     monkeypatch.setattr(Coarse, "renew_step_error", lambda self, u, least=1.0: False)
     problem = Coarse(base, {"one": one}, dataclasses.replace(manoeuvres(6, 100), value=base[:, 0] * 4.0 + noise))
     assert "halving the time step" in fit_baseline(problem, Settings(), Memory()).problems[0]
+
+
+class Uncertain(Linear):
+    """A problem in which no fit with a candidate earns its certificate."""
+
+    def certificate(self, u, free):
+        return {"half_step_chi2": 1e9 if np.any(np.isin(free, self.candidates["one"])) else 0.0}
+
+
+def test_what_would_only_help_and_has_no_certificate_is_left_out(columns):
+    """That something is missing stands on the baseline; only the helper is not to be told."""
+    base, one, noise = columns
+    hidden = np.random.default_rng(6).normal(size=600)
+    problem = Uncertain(base, {"one": one}, dataclasses.replace(manoeuvres(6, 100), value=3.0 * (one + hidden) + noise))
+    found, search = diagnose(problem, Settings(draws=200))
+    assert found.verdict is Verdict.UNKNOWN and not found.effects and search.chosen is search.base
+    assert "The fit with one has no certificate (halving the time step" in found.sentence
+    assert found.error_after == found.error_before
+    assert next(e for e in found.evidence if e.effect == "one").status != "accepted"
+
+
+def test_what_explains_all_and_has_no_certificate_is_not_named(columns):
+    base, one, noise = columns
+    problem = Uncertain(base, {"one": one}, dataclasses.replace(manoeuvres(6, 100), value=3.0 * one + noise))
+    found = diagnose(problem, Settings(draws=200))[0]
+    assert found.verdict is Verdict.BAD_FIT and not found.effects
