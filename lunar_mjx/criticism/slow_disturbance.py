@@ -40,7 +40,7 @@ def inflated(
         return covariance
     band, rate, power, slopes = (np.concatenate([m[k] for m in modes]) for k in range(4))
     # what the fit has left of white noise
-    freedom = np.clip(1.0 - np.einsum("ij,jk,ik->i", slopes, covariance, slopes), 0.0, 1.0)
+    freedom = np.clip(1.0 - np.sum(slopes @ covariance * slopes, axis=1), 0.0, 1.0)
     excess = rate * density(band, rate, power**2, freedom)[band]
     return covariance + covariance @ (slopes.T @ (excess[:, None] * slopes)) @ covariance
 

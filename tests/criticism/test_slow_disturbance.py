@@ -47,7 +47,7 @@ def test_white_noise_leaves_standard_errors_alone():
 
 
 def test_a_slow_disturbance_widens_what_it_moves_and_nothing_else():
-    runs = [_errors(100, 1.0, k) for k in range(300)]
+    runs = [_errors(60, 1.0, k) for k in range(200)]
     found = np.array([f for f, _, _ in runs])
     plain, wider = (np.sqrt(np.mean([np.diag(r[k]) for r in runs], axis=0)) for k in (1, 2))
     assert found[:, 0].std() > 1.25 * plain[0]  # the mean of a channel is farther off than white noise allows
@@ -59,7 +59,7 @@ def test_a_slow_disturbance_widens_what_it_moves_and_nothing_else():
 
 def test_channels_that_are_sampled_seldom_do_not_hide_it():
     """They hardly feel a disturbance: as many of them as of others must not halve what it is taken for."""
-    alone, beside = (np.mean([_errors(60, 1.0, k, slow_channels=n)[2][0, 0] for k in range(60)]) for n in (0, 60))
+    alone, beside = (np.mean([_errors(100, 1.0, k, slow_channels=n)[2][0, 0] for k in range(40)]) for n in (0, 100))
     assert beside == pytest.approx(alone, rel=0.08)
 
 
