@@ -77,6 +77,7 @@ class _Walk:
     Attributes:
       u, r, j, chi2: place, whitened residual, Jacobian, chi-square. damping: of the last step taken.
       promise: drop of chi-square that a Gauss-Newton step promises. fresh: whether the Jacobian was taken here.
+      wide: whether it was taken over wide steps, too.
       curved: whether steps are to be bent. slow: steps in a row that gained little. failed: rounds without a better
         step. taken: steps.
     """
@@ -89,6 +90,7 @@ class _Walk:
     damping: float = 1e-2
     promise: float = np.inf
     fresh: bool = True
+    wide: bool = False
     curved: bool = False
     slow: int = 0
     failed: int = 0
@@ -110,14 +112,29 @@ class _Walk:
 
     def refresh(self) -> None:
         """Takes the Jacobian where the descent is."""
-        self.j, self.fresh = self.goal.jacobian(self.u), True
+        self.j, self.fresh, self.wide = self.goal.jacobian(self.u), True, False
 
-    def hopeless(self, rival: float) -> bool:
-        """Whether it creeps, or falls far short of a rival."""
-        behind = self.taken >= _TRIED and self.fresh and self.dear and self.chi2 - _HOPE * self.promise > rival
-        # at the noise a fit needs its certificate, and creeps on while its gradient stands in the way of that
-        unsure = self.dear and self.enough == 0.0 and self.promise > 0.5 * SMALL_GRADIENT
-        return behind or self.slow >= (_CREEPING if unsure else _PATIENCE)
+    def widen(self) -> None:
+        """Takes it over wide steps, too.
+
+        A descent slides to the edge of a jump, over which every short step may lead: derivatives are ten thousand
+        times too large there, and no step goes anywhere.
+        """
+        std = self.goal.standard_errors(self.u, self.j)
+        self.j, self.wide = self.goal.without_jumps(self.j, self.goal.wide_jacobian(self.u, std)), True
+
+    @property
+    def unsure(self) -> bool:
+        """Whether it is at the noise, where a fit needs its certificate, and its gradient stands in the way of that."""
+        return self.dear and self.enough == 0.0 and self.promise > 0.5 * SMALL_GRADIENT
+
+    def behind(self, rival: float) -> bool:
+        """Whether it falls far short of a rival."""
+        return self.taken >= _TRIED and self.fresh and self.dear and self.chi2 - _HOPE * self.promise > rival
+
+    def creeps(self) -> bool:
+        """Whether its steps gain too little to go on."""
+        return self.slow >= (_CREEPING if self.unsure else _PATIENCE)
 
     def step(self, downhill: np.ndarray, hessian: np.ndarray) -> bool:
         """Tries all dampings at once, and goes where chi-square is least; False where it is nowhere less."""
@@ -153,7 +170,7 @@ class _Walk:
         kept = self.chi2 - chi2 > 0.5 * self.promise
         self.curved, self.failed, self.taken = not kept, 0, self.taken + 1
         moved, before = u[self.goal.free] - self.u[self.goal.free], self.r
-        self.u, self.r, self.chi2 = u, r, chi2
+        self.u, self.r, self.chi2, self.wide = u, r, chi2, False
         if jacobian is not None:
             self.j = jacobian
         elif self.dear and not self.goal.eager and kept and np.isfinite(r).all():
@@ -167,9 +184,13 @@ class _Walk:
         self.goal.problem.foresee(self.goal.probes(self.u, trials))
 
     def try_again(self) -> bool:
-        """After a failed step: a Jacobian of this place, then larger dampings; False where that is of no use."""
+        """After a failed step: a Jacobian of this place, one over wide steps, then larger dampings; False where that is
+        of no use."""
         if not self.fresh:
             self.refresh()
+            return True
+        if self.dear and not self.wide:
+            self.widen()
             return True
         self.failed += 1
         # where rows are dear, two rounds from Gauss-Newton to steepest descent are enough
@@ -204,9 +225,14 @@ def descend(
             break
         downhill, hessian = goal.quadratic(walk.u, walk.r, walk.j)
         walk.promise = goal.promise(walk.u, downhill, hessian)
-        if walk.hopeless(rival.chi2 if isinstance(rival, Rival) else rival):
+        if walk.behind(rival.chi2 if isinstance(rival, Rival) else rival):
             break
-        if walk.promise < max(0.2 * SMALL_GRADIENT, walk.enough):
+        if walk.creeps():
+            if walk.wide or not (walk.fresh and walk.unsure):
+                break
+            walk.widen()
+            walk.slow = _CREEPING - _PATIENCE
+        elif walk.promise < max(0.2 * SMALL_GRADIENT, walk.enough):
             if walk.fresh:
                 break
             walk.refresh()
@@ -216,6 +242,9 @@ def descend(
         walk.refresh()
     if np.isfinite(walk.chi2):
         walk.promise = goal.promise(walk.u, *goal.quadratic(walk.u, walk.r, walk.j))
+        if walk.unsure and not walk.wide:
+            walk.widen()
+            walk.promise = goal.promise(walk.u, *goal.quadratic(walk.u, walk.r, walk.j))
     return walk.end()
 
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from toy_problem import Linear, manoeuvres
 
-from lunar_mjx.criticism.descent import Rival
+from lunar_mjx.criticism.descent import SMALL_GRADIENT, Rival, descend
 from lunar_mjx.criticism.fitting import Fit, fit
 from lunar_mjx.criticism.held_out import noise_test
 from lunar_mjx.criticism.memory import Memory
+from lunar_mjx.criticism.objective import Objective
 from lunar_mjx.criticism.refit import Candidate, _strayed, refit
 
 UNSURE = ("the gradient still promises a drop of chi-square of 21",)
@@ -62,3 +63,37 @@ def made(chi2: float, problems: tuple[str, ...], gradient: float = 21.0) -> Fit:
 )
 def test_only_what_explains_most_without_a_certificate_has_strayed(chi2, problems, rival, strayed):
     assert _strayed(made(2000.0, ()), made(chi2, problems), rival) is strayed
+
+
+class AtAnEdge(Linear):
+    """Dear rows that jump where a coordinate passes zero: just before that no short step tells a derivative."""
+
+    cheap_jacobian = False
+    jumps = 0.03 * np.random.default_rng(12).normal(size=(3, 600))
+
+    def predict(self, u):
+        return super().predict(u) + (np.atleast_2d(u) > 0.0) @ self.jumps
+
+    def _quotients(self, u, which, step):
+        rows = u + np.eye(len(u))[which] * step
+        return ((self.predict(rows) - self.predict(u)) / step).T
+
+    def jacobian(self, u, which):
+        return self._quotients(u, which, 1e-7)
+
+    def wide_jacobian(self, u, which, std):
+        return self._quotients(u, which, 0.05)
+
+
+def test_a_descent_leaves_the_edge_of_a_jump():
+    rng = np.random.default_rng(11)
+    base = rng.normal(size=(600, 3))
+    true = np.array([0.3, -0.2, 0.1])
+    value = base @ true + rng.standard_normal(600)
+    problem = AtAnEdge(base, {}, dataclasses.replace(manoeuvres(6, 100), value=value))
+    goal = Objective(problem, problem.free(), np.ones(600, bool))
+    start = np.full(3, -1e-8)
+    assert np.all(np.abs(problem.jacobian(start, problem.free())).max(axis=0) > 1e5)
+    found = descend(goal, start)
+    assert found.u == pytest.approx(true, abs=0.15)
+    assert found.promise < SMALL_GRADIENT
