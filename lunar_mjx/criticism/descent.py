@@ -123,18 +123,12 @@ class _Walk:
         std = self.goal.standard_errors(self.u, self.j)
         self.j, self.wide = self.goal.without_jumps(self.j, self.goal.wide_jacobian(self.u, std)), True
 
-    @property
-    def unsure(self) -> bool:
-        """Whether it is at the noise, where a fit needs its certificate, and its gradient stands in the way of that."""
-        return self.dear and self.enough == 0.0 and self.promise > 0.5 * SMALL_GRADIENT
-
-    def behind(self, rival: float) -> bool:
-        """Whether it falls far short of a rival."""
-        return self.taken >= _TRIED and self.fresh and self.dear and self.chi2 - _HOPE * self.promise > rival
-
-    def creeps(self) -> bool:
-        """Whether its steps gain too little to go on."""
-        return self.slow >= (_CREEPING if self.unsure else _PATIENCE)
+    def hopeless(self, rival: float) -> bool:
+        """Whether it creeps, or falls far short of a rival."""
+        behind = self.taken >= _TRIED and self.fresh and self.dear and self.chi2 - _HOPE * self.promise > rival
+        # at the noise a fit needs its certificate, and creeps on while its gradient stands in the way of that
+        unsure = self.dear and self.enough == 0.0 and self.promise > 0.5 * SMALL_GRADIENT
+        return behind or self.slow >= (_CREEPING if unsure else _PATIENCE)
 
     def step(self, downhill: np.ndarray, hessian: np.ndarray) -> bool:
         """Tries all dampings at once, and goes where chi-square is least; False where it is nowhere less."""
@@ -225,14 +219,9 @@ def descend(
             break
         downhill, hessian = goal.quadratic(walk.u, walk.r, walk.j)
         walk.promise = goal.promise(walk.u, downhill, hessian)
-        if walk.behind(rival.chi2 if isinstance(rival, Rival) else rival):
+        if walk.hopeless(rival.chi2 if isinstance(rival, Rival) else rival):
             break
-        if walk.creeps():
-            if walk.wide or not (walk.fresh and walk.unsure):
-                break
-            walk.widen()
-            walk.slow = _CREEPING - _PATIENCE
-        elif walk.promise < max(0.2 * SMALL_GRADIENT, walk.enough):
+        if walk.promise < max(0.2 * SMALL_GRADIENT, walk.enough):
             if walk.fresh:
                 break
             walk.refresh()
@@ -242,9 +231,6 @@ def descend(
         walk.refresh()
     if np.isfinite(walk.chi2):
         walk.promise = goal.promise(walk.u, *goal.quadratic(walk.u, walk.r, walk.j))
-        if walk.unsure and not walk.wide:
-            walk.widen()
-            walk.promise = goal.promise(walk.u, *goal.quadratic(walk.u, walk.r, walk.j))
     return walk.end()
 
 
