@@ -34,6 +34,8 @@ _CREEPING = 12
 """The same at the noise, where the gradient still promises too much for a certificate."""
 _CREEP = 2.0
 """Drop of chi-square that does not matter where rows are dear: it takes 25 to name an effect."""
+_JUMP = 1e5
+"""Sensitivity, sigma per scale, that only a jump within a short step has: no logs know a coordinate to 1e-5 scales."""
 _TRIED = 3
 """Steps that a descent may take before it is compared with a rival."""
 _HOPE = 4.0
@@ -114,12 +116,13 @@ class _Walk:
         """Takes the Jacobian where the descent is."""
         self.j, self.fresh, self.wide = self.goal.jacobian(self.u), True, False
 
-    def widen(self) -> None:
-        """Takes it over wide steps, too.
+    @property
+    def at_a_jump(self) -> bool:
+        """Whether it has slid to the edge of a jump, over which short steps lead: no step goes anywhere from there."""
+        return float(np.max(np.sum(self.j[self.goal.fitted] ** 2, axis=0), initial=0.0)) > _JUMP**2
 
-        A descent slides to the edge of a jump, over which every short step may lead: derivatives are ten thousand
-        times too large there, and no step goes anywhere.
-        """
+    def widen(self) -> None:
+        """Takes the Jacobian over wide steps, too."""
         std = self.goal.standard_errors(self.u, self.j)
         self.j, self.wide = self.goal.without_jumps(self.j, self.goal.wide_jacobian(self.u, std)), True
 
@@ -178,12 +181,15 @@ class _Walk:
         self.goal.problem.foresee(self.goal.probes(self.u, trials))
 
     def try_again(self) -> bool:
-        """After a failed step: a Jacobian of this place, one over wide steps, then larger dampings; False where that is
-        of no use."""
+        """After a failed step: a Jacobian of this place, at a jump one over wide steps, then larger dampings.
+
+        Returns:
+          False where that is of no use.
+        """
         if not self.fresh:
             self.refresh()
             return True
-        if self.dear and not self.wide:
+        if self.dear and not self.wide and self.at_a_jump:
             self.widen()
             return True
         self.failed += 1
