@@ -150,21 +150,21 @@ class DriveProblem(Problem):
             if np.any(fit.u[places] != 0.0):
                 model = model.add(self.effects[name], "criticism", **self.effects[name].null())
         model = fitted_model(self, fit, model)
-        other = DriveProblem(self.logs, model, candidates, self._splits, self._baseline_spec, self._channels,
-                             self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+        other = self.with_effects(candidates, progress, model)
         other.observations, other.noise_unlearnt = self.observations, self.noise_unlearnt
         other._start = {self.coordinates[i].key: fit.u[i] for i in self._nuisance}
         return other
 
-    def with_effects(self, candidates: Mapping[str, Effect], progress: Progress = silent) -> DriveProblem:
-        """The same model and logs with other candidates."""
-        return DriveProblem(self.logs, self.model, candidates, self._splits, self._baseline_spec, self._channels,
-                            self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+    def with_effects(
+        self, candidates: Mapping[str, Effect], progress: Progress = silent, model: Model | None = None
+    ) -> DriveProblem:
+        """The same logs with other candidates, against another model if one is given."""
+        return DriveProblem(self.logs, model or self.model, candidates, self._splits, self._baseline_spec,
+                            self._channels, self.bench.chunk, self.bench.engine, progress)  # fmt: skip
 
     def instead(self, model: Model, candidates: Mapping[str, Effect], progress: Progress = silent) -> DriveProblem:
         """The same logs, with the noise as it was learnt, against another model of the same rover."""
-        other = DriveProblem(self.logs, model, candidates, self._splits, self._baseline_spec, self._channels,
-                             self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+        other = self.with_effects(candidates, progress, model)
         other.observations, other.noise_unlearnt = self.observations, self.noise_unlearnt
         other._step_error = self.step_error  # of the first order: hardly another, and it costs a program
         return other
@@ -379,9 +379,8 @@ class DriveProblem(Problem):
             part = self._of_log(number)
             if not np.isfinite(change[part]).all():
                 change[part] = 0.0
-        whitened = self.observations.whiten(unabsorbed(change, self.step_error, self.observations))[
-            self.observations.in_split("fit")
-        ]
+        left = unabsorbed(change, self.step_error, self.observations)
+        whitened = self.observations.whiten(left)[self.observations.in_split("fit")]
         if not float(whitened @ whitened) > least:
             return False
         self._step_error = 2.0 * change

@@ -1,7 +1,7 @@
 """Standard errors where residuals are slower than the noise that logs state.
 
-A small smooth disturbance, a hundredth of the noise's variance, is hidden in every sample of a channel and yet, over
-seconds, moves a mean as much as all the noise does. No channel shows it; all of them together do. So the power of the
+A smooth disturbance far below the noise of a sample does not average out: over many samples it moves a mean as much as
+all the noise does. One channel may not show it; all of them together do. So the power of the
 residuals is taken by frequency over all channels at once, and where it exceeds white noise the covariance of a fit is
 that of an estimate made without knowing so (White 1980, "sandwich").
 """
