@@ -1,0 +1,176 @@
+"""The linear-Gaussian evidence against dense Gaussians, numerical integration and drawn truths."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from lunar_mjx.inference import evidence
+from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize, infer
+
+N, OWN, EACH = 60, 3, 8
+FIELDS = (Field("a", 0.5), Field("b", 0.2))
+NOISES = (NoiseSize("stated", 0.3), NoiseSize("replicates", freedom=20.0))
+
+
+@pytest.fixture
+def drawn():
+    rng = np.random.default_rng(3)
+    columns = rng.normal(size=(N, OWN + 2 * EACH))
+    field = np.repeat([-1, 0, 1], [OWN, EACH, EACH])
+    std = np.concatenate([[2.0, 5.0, 0.3], rng.uniform(0.5, 1.5, 2 * EACH)])
+    mean = np.zeros(len(std))
+    mean[:OWN] = 0.4, -1.0, 0.0
+    group = rng.integers(0, 2, N)
+    sizes = np.append([0.4, 0.1], 1.0)[field]
+    truth = mean + std * sizes * rng.normal(size=len(std))
+    residual = columns @ truth + np.array([1.1, 0.8])[group] * rng.normal(size=N)
+    return columns, residual, group, Amplitudes.of(std, field, mean)
+
+
+def dense(columns, residual, group, amplitudes, tau, noise):
+    """Log density by the measurements' own covariance."""
+    scale = amplitudes.std * np.append(tau, 1.0)[amplitudes.field]
+    covariance = (columns * scale**2) @ columns.T + np.diag(np.asarray(noise)[group] ** 2)
+    return stats.multivariate_normal.logpdf(residual, columns @ amplitudes.mean, covariance)
+
+
+def priors(tau, noise):
+    """Log prior density of the logarithms of the sizes."""
+    total = sum(stats.halfnorm.logpdf(t, scale=f.usual) + math.log(t) for t, f in zip(tau, FIELDS, strict=True))
+    total += stats.norm.logpdf(math.log(noise[0]), scale=0.3)
+    v = NOISES[1].freedom
+    variance = noise[1] ** 2
+    return total + stats.invgamma.logpdf(variance, v / 2, scale=v / 2) + math.log(2.0 * variance)
+
+
+def test_density_at_given_sizes_is_that_of_the_dense_gaussian(drawn):
+    columns, residual, group, amplitudes = drawn
+    gram = Gram.of(columns, residual, group, 2)
+    for tau, noise in (([0.4, 0.1], [1.0, 0.9]), ([3.0, 1e-3], [0.5, 2.0])):
+        tau, noise = np.array(tau), np.array(noise)
+        x = np.log(np.concatenate([tau, noise]))
+        found = evidence._density(x, gram, amplitudes, np.array([f.usual for f in FIELDS]), NOISES)
+        wanted = dense(columns, residual, group, amplitudes, tau, noise) + priors(tau, noise)
+        assert found.value == pytest.approx(wanted, abs=1e-8)
+
+
+def test_gradient_and_hessian_are_derivatives(drawn):
+    columns, residual, group, amplitudes = drawn
+    gram = Gram.of(columns, residual, group, 2)
+    usual = np.array([f.usual for f in FIELDS])
+    x = np.log([0.6, 0.15, 1.2, 0.9])
+
+    def at(y):
+        return evidence._density(y, gram, amplitudes, usual, NOISES)
+
+    step = 1e-5 * np.eye(4)
+    slope = np.array([(at(x + h).value - at(x - h).value) / 2e-5 for h in step])
+    bend = np.array([(at(x - h).gradient - at(x + h).gradient) / 2e-5 for h in step])
+    np.testing.assert_allclose(at(x).gradient, slope, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(at(x).hessian, bend, rtol=1e-5, atol=1e-5)
+
+
+def test_posterior_is_that_of_the_dense_gaussian(drawn):
+    columns, residual, group, amplitudes = drawn
+    found = infer(Gram.of(columns, residual, group, 2), amplitudes, FIELDS, NOISES)
+    scale = amplitudes.std * np.append(found.tau, 1.0)[amplitudes.field]
+    noise = np.diag(found.noise[group] ** 2)
+    inverse = np.linalg.inv((columns * scale**2) @ columns.T + noise)
+    gain = (scale**2)[:, None] * columns.T @ inverse
+    mean = amplitudes.mean + gain @ (residual - columns @ amplitudes.mean)
+    np.testing.assert_allclose(found.mean, mean, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, np.diag(scale**2) - gain @ columns * scale**2, atol=1e-9)
+
+
+def test_accumulated_parts_and_chosen_columns_are_the_whole(drawn):
+    columns, residual, group, amplitudes = drawn
+    whole = Gram.of(columns, residual, group, 2)
+    parts = Gram.of(columns[:20], residual[:20], group[:20], 2) + Gram.of(columns[20:], residual[20:], group[20:], 2)
+    np.testing.assert_allclose(parts.matrix, whole.matrix, atol=1e-12)
+    keep = np.array([0, 2, 5, 12])
+    few = infer(whole.select(keep), amplitudes.select(keep), FIELDS, NOISES)
+    same = infer(Gram.of(columns[:, keep], residual, group, 2), amplitudes.select(keep), FIELDS, NOISES)
+    assert few.log_evidence == pytest.approx(same.log_evidence, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_laplace_over_sizes_agrees_with_quadrature(seed):
+    rng = np.random.default_rng(seed)
+    columns = rng.normal(size=(40, 12)) * 2.0
+    residual = columns @ (0.3 * (seed % 2) * rng.normal(size=12)) + rng.normal(size=40)
+    amplitudes = Amplitudes.of(np.ones(12), np.zeros(12, int))
+    gram = Gram.of(columns, residual)
+    field, noise = (Field("a", 0.2),), (NoiseSize("n", 0.3),)
+    found = infer(gram, amplitudes, field, noise)
+
+    def density(log_s, log_tau):
+        x = np.array([log_tau, log_s])
+        return math.exp(evidence._density(x, gram, amplitudes, np.array([0.2]), noise).value - found.log_evidence)
+
+    # tau below 1e-4 changes nothing: its prior mass there is negligible
+    ratio = integrate.dblquad(density, math.log(1e-4), math.log(2.0), -1.5, 1.5, epsabs=1e-3)[0]
+    # a size that the data do not show has a long tail towards none, which Laplace's normal lacks: a fifth of a nat
+    assert -0.05 < math.log(ratio) < 0.25
+
+
+def test_predictive_score_is_the_conditional_density(drawn):
+    columns, residual, group, amplitudes = drawn
+    fit, held = np.arange(N) < 40, np.arange(N) >= 40
+    found = infer(Gram.of(columns[fit], residual[fit], group[fit], 2), amplitudes, FIELDS, NOISES)
+    score = found.log_score(Gram.of(columns[held], residual[held], group[held], 2))
+    mean = columns[held] @ found.mean
+    covariance = columns[held] @ found.covariance @ columns[held].T + np.diag(found.noise[group[held]] ** 2)
+    assert score == pytest.approx(stats.multivariate_normal.logpdf(residual[held], mean, covariance), abs=1e-7)
+
+
+def test_truncated_prior_of_one_amplitude_is_exact():
+    rng = np.random.default_rng(0)
+    column = rng.normal(size=(30, 1))
+    residual = 0.2 * column[:, 0] + rng.normal(size=30)
+    noises = (NoiseSize("n", 1e-4),)
+    found = infer(Gram.of(column, residual), Amplitudes.of(np.array([0.7])), (), noises)
+
+    def density(a):
+        return math.exp(
+            float(np.sum(stats.norm.logpdf(residual, column[:, 0] * a))) + stats.norm.logpdf(a, 0.0, 0.7)
+            - found.log_evidence
+        ) / (stats.norm.cdf(1.0, 0.0, 0.7) - 0.5)  # fmt: skip
+
+    wanted = math.log(integrate.quad(density, 0.0, 1.0)[0])
+    assert found.log_inside(np.array([0.0]), np.array([1.0])) == pytest.approx(wanted, abs=1e-3)
+
+
+def test_sizes_are_found_again():
+    rng = np.random.default_rng(1)
+    columns = rng.normal(size=(3000, 200)) * 5.0
+    residual = columns @ (0.07 * rng.normal(size=200)) + 1.3 * rng.normal(size=3000)
+    found = infer(Gram.of(columns, residual), Amplitudes.of(np.ones(200), np.zeros(200, int)), (Field("a", 0.05),),
+                  (NoiseSize("n", 0.3),))  # fmt: skip
+    assert found.tau[0] == pytest.approx(0.07, rel=0.15)
+    assert found.noise[0] == pytest.approx(1.3, rel=0.05)
+
+
+def test_one_right_parameter_beats_a_field_of_many():
+    rng = np.random.default_rng(2)
+    shape = np.linspace(-1.0, 1.0, 80)
+    modes = np.stack([shape**i for i in range(8)], axis=1)
+    columns = np.column_stack([shape**2 - 0.3, modes]) * 10.0
+    residual = 3.0 * (shape**2 - 0.3) + rng.normal(size=80)
+    gram = Gram.of(columns, residual)
+    amplitudes = Amplitudes.of(np.ones(9), np.append(-1, np.zeros(8, int)))
+    field, noise = (Field("a", 0.05),), (NoiseSize("n", 0.3),)
+    both = infer(gram, amplitudes, field, noise).log_evidence
+    rest = np.arange(1, 9)
+    alone = infer(gram.select(rest), amplitudes.select(rest), field, noise).log_evidence
+    wide = infer(gram.select(rest), amplitudes.select(rest), (Field("a", 0.5),), noise).log_evidence
+    assert both > alone + 3.0
+    assert both > wide + 3.0
+
+
+def test_values_that_are_not_finite_are_refused():
+    with pytest.raises(EvidenceError, match="not finite"):
+        Gram.of(np.array([[np.nan]]), np.zeros(1))
