@@ -123,7 +123,7 @@ def refits(problem: Any) -> list[Refit]:
 
 def at_noise(problem: Any, residual: np.ndarray, free: np.ndarray, *splits: str) -> bool:
     """Our noise test of a residual (n,) in sigma, lent to the other tools."""
-    from lunar_mjx.criticism.held_out import noise_test
+    from lunar_mjx.inference.held_out import noise_test
 
     fit = types.SimpleNamespace(residual=residual, free=free, fitted=problem.observations.in_split("fit"))
     return noise_test(problem, fit, splits).passes  # type: ignore[arg-type]

@@ -95,9 +95,9 @@ def row(group: str, number: int, seed: int) -> dict[str, Any]:
     """Asks all tools about one case, opens the seal, and judges."""
     from benchmarks.hidden import cases, solve
     from benchmarks.hidden.judge import outcome
-    from lunar_mjx.criticism.build_problem import build_problem
-    from lunar_mjx.criticism.log import read_log
-    from lunar_mjx.criticism.runs import Run
+    from lunar_mjx.diagnosis.build_problem import build_problem
+    from lunar_mjx.diagnosis.runs import Run
+    from lunar_mjx.logs import read_log
 
     ours = solve.table_row(group, number, seed, suggest=True)
     case = cases.make(group, number, seed)

@@ -2,7 +2,7 @@
 
     python benchmarks/cmu_figures.py path/to/smooth_wheel_trials.csv
 
-writes `lunar_mjx/criticism/data/cmu_smooth_wheel.csv` (mean and scatter over the replicates of every slip angle and rim
+writes `lunar_mjx/wheel_bed/data/cmu_smooth_wheel.csv` (mean and scatter over the replicates of every slip angle and rim
 speed) and `cmu_smooth_wheel.toml` (what they are, and the scatter of single runs pooled over all points).
 """
 
@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 import tomli_w
 
-from lunar_mjx.criticism.data_files import replicate_column
-from lunar_mjx.criticism.table import QUANTITIES, average, read_table, replicate_groups
+from lunar_mjx.wheel_bed.data_files import replicate_column
+from lunar_mjx.wheel_bed.table import QUANTITIES, average, read_table, replicate_groups
 
 RADIUS, WIDTH = 0.0625, 0.05
-FOLDER = Path(__file__).resolve().parent.parent / "lunar_mjx" / "criticism" / "data"
+FOLDER = Path(__file__).resolve().parent.parent / "lunar_mjx" / "wheel_bed" / "data"
 SOURCE = {
     "who": "C. Pavlov, Carnegie Mellon University",
     "citation": "Processed results of a single-wheel test bed published with the code of 3d-terramechanics "

@@ -25,9 +25,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lunar_mjx.criticism import WheelBed, WheelTest, load_figures
-from lunar_mjx.criticism.score import project
-from lunar_mjx.criticism.terms import effect_of, terms
+from lunar_mjx.diagnosis.formulas.terms import effect_of, terms
 from lunar_mjx.effects.base import Effect
+from lunar_mjx.inference.score import project
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT, FIGURE = ROOT / "benchmarks" / "real_wheel.json", ROOT / "docs" / "figures" / "real_wheel.svg"

@@ -126,7 +126,8 @@ soils of the training: {percent(kept["train_score"])}.
 Ends of this policy's episodes: {json.dumps({k: round(v, 4) for k, v in seed["final"]["ends"].items()})}.
 
 **Limits.** Trained in simulation only, with the model's effects and the spread of soils and motors of
-`lunar_mjx.envs.config.SOIL_RANGES`. It sees exact poses and a height map without noise. It has driven no real rover.
+`lunar_mjx.envs.navigation.config.SOIL_RANGES`. It sees exact poses and a height map without noise. It has driven no
+real rover.
 """
 
 

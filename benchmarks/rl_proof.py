@@ -40,7 +40,7 @@ PERIOD = {"all": 535.0, "large": 300.0, "rates": 200.0, "paper": 400.0, "scaling
 def rates(args: argparse.Namespace, clock: Clock) -> None:
     """Compiles every row in threads, waits for quiet if told to, and measures."""
     from lunar_mjx.envs import make_navigation
-    from lunar_mjx.envs.observations import PAPER_OBSERVATION
+    from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION
 
     ground = {"terrain": "flat", "goal_distance": (2.0, 4.0), "places": 256} if args.tiny else {}
     few = {"observations": PAPER_OBSERVATION, "privileged": ()}

@@ -28,9 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.backends.pybullet import PyBulletBackend
-from lunar_mjx.effects.motor import REFERENCE_TEMPERATURE
+from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
 from lunar_mjx.envs import NavigationEnv, make, split_keys
-from lunar_mjx.envs.navigation import ENDS, NavigationParams
+from lunar_mjx.envs.navigation.env import ENDS, NavigationParams
 from lunar_mjx.pytree import pytree
 
 

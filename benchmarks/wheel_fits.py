@@ -11,8 +11,8 @@ import json
 from pathlib import Path
 
 from lunar_mjx.criticism import WheelBed, fit, load_figures
-from lunar_mjx.criticism.fit import BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
-from lunar_mjx.criticism.steady_state import compare
+from lunar_mjx.wheel_bed.comparison import compare
+from lunar_mjx.wheel_bed.soil_fit import BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
 
 
 def main() -> None:

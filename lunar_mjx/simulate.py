@@ -15,7 +15,7 @@ import pandas as pd
 
 from lunar_mjx.dynamics import System, Telemetry, build
 from lunar_mjx.dynamics.signals import joint_channels, measure
-from lunar_mjx.effects.motor import MODES
+from lunar_mjx.effects.joint.motor import MODES
 from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
 from lunar_mjx.model import Model, check_effects
 

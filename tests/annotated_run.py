@@ -25,13 +25,12 @@ sys.modules["strict_checker"] = CHECKER
 install_import_hook("lunar_mjx", "strict_checker.check")
 
 from lunar_mjx.criticism import WheelBed, load_figures
-from lunar_mjx.criticism.steady_state import compare
 from lunar_mjx.dynamics import build
 from lunar_mjx.dynamics.state import Temperature
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.experiments import hot_motor
 from lunar_mjx.model import make_model
-from lunar_mjx.model_file import load_model, save_model
+from lunar_mjx.model.file import load_model, save_model
+from lunar_mjx.paper import hot_motor
 from lunar_mjx.rover import convert
 from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import (
@@ -47,6 +46,7 @@ from lunar_mjx.terrain import (
     stack,
     to_mesh,
 )
+from lunar_mjx.wheel_bed.comparison import compare
 
 SURFACE = {"width": 20.0, "height": 20.0, "cell": 0.5, "roughness": {}, "craters": {}}
 DETAILED = {"surface": SURFACE, "detail": {"cell": 0.25, "roughness": {}}, "rocks": {}, "soil": {"rock_fraction": 0.2}}

@@ -7,9 +7,9 @@ import sys
 
 import jax
 import pytest
-from cli_harness import Result, Run
 
 from lunar_mjx import cli
+from tests.cli_harness import Result, Run
 
 FAST_COMPILE = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0").lower() in ("1", "true", "yes", "on")
 

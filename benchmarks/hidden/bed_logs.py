@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.criticism.log import write_steady_log
-from lunar_mjx.criticism.log.log import Noise
+from lunar_mjx.logs import write_steady_log
+from lunar_mjx.logs.log import Noise
 
 from . import bed_effects
 from .bed import Points, Soil, measure

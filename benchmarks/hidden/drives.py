@@ -19,8 +19,8 @@ import numpy as np
 import pandas as pd
 
 from lunar_mjx.backends import NativeBackend
-from lunar_mjx.criticism.log import write_log
-from lunar_mjx.criticism.log.log import Noise
+from lunar_mjx.logs import write_log
+from lunar_mjx.logs.log import Noise
 from lunar_mjx.model import Model, make_model
 from lunar_mjx.simulate import Commands, joint_channels
 

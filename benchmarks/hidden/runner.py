@@ -145,6 +145,6 @@ def guarded(solve: Solve, group: str, number: int, seed: int, options: Mapping[s
 
 
 def _plain(value: Any) -> Any:
-    from lunar_mjx.criticism.runs import plain
+    from lunar_mjx.diagnosis.runs import plain
 
     return plain(value)

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.criticism import verbs
-from lunar_mjx.criticism.refit import Settings
-from lunar_mjx.criticism.runs import SERIES_FILE, Run
-from lunar_mjx.criticism.verdict import Diagnosis, Verdict
+from lunar_mjx.diagnosis import verbs
+from lunar_mjx.diagnosis.refit import Settings
+from lunar_mjx.diagnosis.runs import SERIES_FILE, Run
+from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
 
@@ -199,8 +199,8 @@ def _values(effects: Mapping[str, Mapping[str, float]], found: Diagnosis) -> lis
 
 def _suggestions(run: Path) -> list[dict[str, Any]]:
     """The tool's first formulas at the port that it named."""
-    from lunar_mjx.criticism.discover import discover
-    from lunar_mjx.criticism.runs import load_run
+    from lunar_mjx.diagnosis.formulas.discover import discover
+    from lunar_mjx.diagnosis.runs import load_run
 
     loaded: Run = load_run(run)
     try:

@@ -8,10 +8,10 @@ from typing import Any
 
 from lunar_mjx.effects.base import PORTS, Effect
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.effects.motor import WINDINGS
-from lunar_mjx.effects.paper import REGULARISATIONS
+from lunar_mjx.effects.joint.motor import WINDINGS
 from lunar_mjx.effects.presets import FLAWS, PRESETS, UNSAID
-from lunar_mjx.effects.soil import SOILS
+from lunar_mjx.effects.soil.ground import SOILS
+from lunar_mjx.effects.wheel.paper import REGULARISATIONS
 
 
 def on_config(config: Any) -> Any:

@@ -41,7 +41,7 @@ assert 0.1 < climb < 1.5 * 0.1 * seen.time[-1]
 # %%
 from pathlib import Path
 
-from lunar_mjx.model_file import save_model
+from lunar_mjx.model.file import save_model
 
 table = channels(system, seen, commands)
 Path("climb").mkdir()

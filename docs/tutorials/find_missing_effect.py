@@ -36,7 +36,7 @@ print(table.iloc[::5].round(4).to_string(index=False))
 
 # %%
 from lunar_mjx.criticism import check, read_campaign
-from lunar_mjx.criticism.log import Noise, write_steady_log
+from lunar_mjx.logs import Noise, write_steady_log
 
 log = write_steady_log(
     "bed",

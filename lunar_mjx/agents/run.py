@@ -18,7 +18,7 @@ from lunar_mjx.agents.learner import Learner, TrainState, normalised
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.train import Result, RunConfig, plain, train
 from lunar_mjx.envs import NavigationEnv, make
-from lunar_mjx.envs.config import UNSEEN_SOIL
+from lunar_mjx.envs.navigation.config import UNSEEN_SOIL
 
 
 def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
@@ -29,7 +29,7 @@ def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
     """
     if not isinstance(env, NavigationEnv):
         return env.params
-    from lunar_mjx.envs.worlds import PREFIX, world
+    from lunar_mjx.envs.navigation.worlds import PREFIX, world
 
     model, terrain = env.model, options.get("terrain")
     if terrain is not None:

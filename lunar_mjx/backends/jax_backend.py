@@ -18,7 +18,7 @@ import numpy as np
 from lunar_mjx.backends.base import Backend, BackendState, Observation, observation, whole_steps
 from lunar_mjx.dynamics import Params, State, System, Telemetry, build
 from lunar_mjx.dynamics.state import Temperature
-from lunar_mjx.effects.motor import REFERENCE_TEMPERATURE
+from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
 from lunar_mjx.errors import bad_input
 from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands

@@ -20,8 +20,8 @@ def effect_test(
     seed: Annotated[int, typer.Option(help="Of the random rovers.")] = 0,
 ) -> None:
     """Check an effect's contract: null value, derivatives, units, cost. Exit status 1 where it is broken."""
+    from lunar_mjx.effect_contract.promises import check_effect
     from lunar_mjx.effects.catalogue import get, load_file
-    from lunar_mjx.effects.contract import check_effect
 
     effects = list(load_file(spec).values()) if spec.endswith(".py") else [get(spec)]
     broken = []

@@ -33,7 +33,7 @@ def new(
     steady: Annotated[bool, typer.Option(help="For a single-wheel test bed.")] = False,
 ) -> None:
     """Write a commented template of a log: fill in its tables, then check it."""
-    from lunar_mjx.criticism.log import new_log
+    from lunar_mjx.logs import new_log
 
     print(new_log(folder, rover, manoeuvre, steady))
 
@@ -44,7 +44,7 @@ def import_(
     mapping: Annotated[Path, typer.Option("--map", help="TOML file: which field of which topic is which channel.")],
 ) -> None:
     """Make a log from a recording of ROS or MCAP; check it next."""
-    from lunar_mjx.criticism.log import import_log
+    from lunar_mjx.logs import import_log
 
     print(import_log(recording, out, mapping))
 
@@ -57,9 +57,9 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print findings as JSON.")] = False,
 ) -> None:
     """Check logs before anything else uses them; exit status 10 where data are unusable."""
-    from lunar_mjx.criticism.log import check as check_logs
-    from lunar_mjx.criticism.log import read_campaign
-    from lunar_mjx.criticism.log.findings import is_bad
+    from lunar_mjx.logs import check as check_logs
+    from lunar_mjx.logs import read_campaign
+    from lunar_mjx.logs.findings import is_bad
 
     read = read_campaign(logs)
     found = check_logs(read, _numbers("--slowest", slowest))
@@ -75,8 +75,8 @@ def check(
 def _print_findings(logs: list[Any], found: list[Any]) -> None:
     from rich.markup import escape
 
-    from lunar_mjx.criticism.log import SteadyLog
-    from lunar_mjx.describe import make_console, make_table
+    from lunar_mjx.logs import SteadyLog
+    from lunar_mjx.model.describe import make_console, make_table
 
     console = make_console()
     for log in logs:
@@ -126,10 +126,10 @@ def simulate(
     seal: Annotated[bool, typer.Option(help="Commit to the answer, so that it can be shown later.")] = False,
 ) -> None:
     """Record a log from the simulator, with any hidden effect and any noise."""
-    from lunar_mjx.criticism.log import Recording, simulate_log
-    from lunar_mjx.criticism.log.instruments import parse_noise
-    from lunar_mjx.criticism.log.seal import answer_path
-    from lunar_mjx.model_file import load_model
+    from lunar_mjx.logs import Recording, simulate_log
+    from lunar_mjx.logs.recorder.instruments import parse_noise
+    from lunar_mjx.logs.seal import answer_path
+    from lunar_mjx.model.file import load_model
 
     recording = Recording(parse_noise(noise), coloured, quantise=quantise, dropouts=dropouts,
                           bias=_numbers("--bias", bias), forces=forces)  # fmt: skip
@@ -169,7 +169,7 @@ def unseal(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Open the answer to a sealed log, and compare it with a verdict."""
-    from lunar_mjx.criticism.log import unseal as open_answer
+    from lunar_mjx.logs import unseal as open_answer
 
     result = open_answer(answer, log, verdict)
     if as_json:
@@ -188,8 +188,8 @@ def unseal(
 
 def manoeuvres() -> None:
     """List the canned manoeuvres: what each is and which effects it tells apart."""
-    from lunar_mjx.describe import make_console, make_table
     from lunar_mjx.manoeuvres import MANOEUVRES, load_manoeuvre
+    from lunar_mjx.model.describe import make_console, make_table
 
     table = make_table("manoeuvre", "s", "what", "tells apart")
     for name in MANOEUVRES:

@@ -20,15 +20,15 @@ def parity(
     samples: Annotated[int, typer.Option(help="states per ground for the comparison of single steps")] = 16,
 ) -> None:  # fmt: skip
     """Compare the engines with native MuJoCo: one state stage by stage, single steps, and drives; write a page."""
-    from lunar_mjx.cli import check_finite, check_folder, make_folder
+    from lunar_mjx.commands.options import check_finite, check_folder, make_folder
     from lunar_mjx.errors import bad_input
 
     check_folder(out)
     check_finite(duration=duration)
     if not 1 <= samples <= 1000:
         raise bad_input("lunar-mjx parity", "--samples", samples, "is outside [1, 1000]", "give about 16")
-    from lunar_mjx.backends.parity_page import verdict, write_parity_page
-    from lunar_mjx.backends.parity_study import DEFAULT_ENGINES, available, run_study
+    from lunar_mjx.backends.parity.page import verdict, write_parity_page
+    from lunar_mjx.backends.parity.study import DEFAULT_ENGINES, available, run_study
     from lunar_mjx.report import console_progress
 
     named = [e.strip() for e in engines.split(",") if e.strip()]

@@ -38,7 +38,7 @@ def preview(
     _check_file(out, (".png", ".svg", ".pdf"))
     import jax
 
-    from lunar_mjx.cli import open_terrain
+    from lunar_mjx.commands.options import open_terrain
     from lunar_mjx.visual.plots import save, terrain_preview
 
     print(save(terrain_preview(jax.device_get(open_terrain(spec, dem, seed))), out))
@@ -58,7 +58,7 @@ def render(
     sun: Annotated[str, typer.Option(help="azimuth,elevation of the Sun, deg")] = "135,15",
 ) -> None:  # fmt: skip
     """Make a video of a drive, with path, slip and temperature."""
-    from lunar_mjx.cli import check_finite
+    from lunar_mjx.commands.options import check_finite
 
     path = out or run / "drive.mp4"
     _check_file(path, (".mp4", ".webp", ".gif"))
@@ -99,13 +99,13 @@ def view(
     ] = "auto",
 ) -> None:  # fmt: skip
     """Drive a rover by keyboard: in a window, or without a screen on a web page that only this machine can open."""
-    from lunar_mjx.cli import check_finite
+    from lunar_mjx.commands.options import check_finite
 
     check_finite(speed=speed, x=x, y=y, yaw_deg=yaw_deg)
     azimuth, elevation = _numbers("--sun", sun, ",", float)
     from lunar_mjx.cameras import Sun
     from lunar_mjx.model import make_model
-    from lunar_mjx.model_file import load_model
+    from lunar_mjx.model.file import load_model
     from lunar_mjx.viewer.drive import LiveDrive
     from lunar_mjx.viewer.server import Viewer, check_port
     from lunar_mjx.viewer.window import has_screen, show_window
@@ -144,7 +144,7 @@ def _refuse(option: str, text: str, between: str) -> list:
 
 def _check_file(path: Path, endings: tuple[str, ...]) -> None:
     """Refuses, before any work is done, a file of another kind or one that cannot be made."""
-    from lunar_mjx.cli import check_folder
+    from lunar_mjx.commands.options import check_folder
 
     if path.suffix.lower() not in endings:
         raise bad_input("lunar-mjx", "--out", str(path), "is of no known kind", f"end it in {', '.join(endings)}")

@@ -63,7 +63,7 @@ def train(
     device: DeviceOption = "auto",
 ) -> None:
     """Train a policy; resumes from the folder's newest checkpoint."""
-    from lunar_mjx.cli import check_finite, check_folder, make_folder, select_device
+    from lunar_mjx.commands.options import check_finite, check_folder, make_folder, select_device
 
     check_folder(out)
     limits = {"time_limit": time_limit, "target": target, "eval_every": eval_every}
@@ -114,7 +114,7 @@ def evaluate(
     device: DeviceOption = "auto",
 ) -> None:
     """Score an agent: success rate with its 95 % interval, on unseen ground, goals and soil."""
-    from lunar_mjx.cli import select_device
+    from lunar_mjx.commands.options import select_device
 
     select_device(device)
     from lunar_mjx.agents.evaluate import Evaluator
@@ -150,7 +150,7 @@ def play(
     device: DeviceOption = "auto",
 ) -> None:
     """Drive one episode and write a video of it."""
-    from lunar_mjx.cli import check_folder, make_folder, select_device
+    from lunar_mjx.commands.options import check_folder, make_folder, select_device
 
     check_folder(out)
     select_device(device)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lunar_mjx.dynamics import System, Telemetry, build
-from lunar_mjx.effects.motor import VELOCITY
+from lunar_mjx.effects.joint.motor import VELOCITY
 from lunar_mjx.model import make_model
 from lunar_mjx.terrain import Terrain, sample
 

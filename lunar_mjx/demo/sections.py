@@ -11,14 +11,14 @@ import numpy as np
 
 from lunar_mjx import __version__
 from lunar_mjx.criticism import SteadyStateTable
-from lunar_mjx.criticism.fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, held_out_rms
-from lunar_mjx.criticism.steady_state import as_bed
-from lunar_mjx.criticism.table import QUANTITIES
 from lunar_mjx.demo.drive import Drive
 from lunar_mjx.demo.figures import ROVERS, history_figure, paths_figure, wheel_figure
 from lunar_mjx.demo.wheel import Case
 from lunar_mjx.report.page import Facts, Figure, Section, Table, Text
 from lunar_mjx.terrain import Terrain
+from lunar_mjx.wheel_bed.comparison import as_bed
+from lunar_mjx.wheel_bed.soil_fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, held_out_rms
+from lunar_mjx.wheel_bed.table import QUANTITIES
 
 _UPSET = 60.0
 """Roll or pitch beyond which a rover counts as rolled over, deg."""

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 
 from lunar_mjx.criticism import Comparison, SteadyStateTable, WheelBed, WheelFit, fit, load_figures
-from lunar_mjx.criticism.fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
-from lunar_mjx.criticism.single_wheel import wheel_test
-from lunar_mjx.criticism.steady_state import compare
+from lunar_mjx.wheel_bed.bed import wheel_test
+from lunar_mjx.wheel_bed.comparison import compare
+from lunar_mjx.wheel_bed.soil_fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
 
 
 class Case(NamedTuple):

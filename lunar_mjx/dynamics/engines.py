@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 
 from lunar_mjx.dynamics.mjx import MjxEngine
-from lunar_mjx.dynamics.structured import StructuredEngine
-from lunar_mjx.dynamics.suitability import UnsuitableError
+from lunar_mjx.dynamics.structured.engine import StructuredEngine
+from lunar_mjx.dynamics.structured.suitability import UnsuitableError
 from lunar_mjx.errors import UserError
 from lunar_mjx.rover import Rover
 

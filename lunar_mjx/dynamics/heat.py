@@ -6,9 +6,9 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from lunar_mjx.dynamics.ports import EffectState, Pipeline, heat_flow
 from lunar_mjx.dynamics.state import Temperature, compensated_add
 from lunar_mjx.effects.context import Context, Heat
+from lunar_mjx.effects.ports import EffectState, Pipeline, heat_flow
 
 
 def step_heat(

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from lunar_mjx.dynamics.ports import Forces
+from lunar_mjx.effects.ports import Forces
 from lunar_mjx.spatial import Frame, Vec3
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from lunar_mjx._quiet import mjx, solve_m
 from lunar_mjx.dynamics.kinematics import Finish, Kinematics, wheel_feet
-from lunar_mjx.dynamics.ports import Forces
+from lunar_mjx.effects.ports import Forces
 from lunar_mjx.errors import UserError
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Frame, Vec3

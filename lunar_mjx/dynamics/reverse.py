@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lunar_mjx.dynamics.computed_once import computed_once
+from lunar_mjx.dynamics.batching.computed_once import computed_once
 
 
 def reversible(function: Callable[..., Any]) -> Callable[..., Any]:

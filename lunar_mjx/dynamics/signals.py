@@ -15,7 +15,7 @@ from jaxtyping import Float
 from lunar_mjx.dynamics.quaternions import rotation
 from lunar_mjx.dynamics.state import Params, Telemetry
 from lunar_mjx.effects.base import Effect
-from lunar_mjx.effects.channels import (
+from lunar_mjx.effects.sensor.channels import (
     EULER,
     QUATERNION,
     SensorContext,

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lunar_mjx.effects.motor import REFERENCE_TEMPERATURE
+from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
+from lunar_mjx.model.ambient import Ambient
 from lunar_mjx.pytree import AnyArray, pytree
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import Terrain
-
-SYNODIC_DAY = 29.530588 * 86400.0
-"""From noon to noon on the Moon, s."""
 
 
 @pytree
@@ -61,28 +58,6 @@ class State:
     qvel: Float[Array, "*batch nv"]
     temperature: Temperature
     effects: dict[str, dict[str, Any]]
-
-
-@pytree
-class Ambient:
-    """Ambient temperature: constant, or following the Sun over a lunar day.
-
-    T_A = T_night + (T_noon - T_night) max(0, cos(2 pi (t - t_noon)/P))^(1/4): the equilibrium of a surface under the
-    Sun; constant where T_noon = T_night.
-
-    Attributes:
-      noon, night: temperatures, K. noon_time: when the Sun culminates, s. period: length of the day, s.
-    """
-
-    noon: Any
-    night: Any
-    noon_time: Any
-    period: Any
-
-    def at(self, time: Any) -> Any:
-        sun = jnp.cos(2.0 * jnp.pi * (time - self.noon_time) / self.period)
-        up = jnp.where(sun > 0.0, jnp.where(sun > 0.0, sun, 1.0) ** 0.25, 0.0)
-        return self.night + (self.noon - self.night) * up
 
 
 @pytree

@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.dynamics import batch
+from lunar_mjx.dynamics.batching import batch
 from lunar_mjx.dynamics.engines import make_engine
 from lunar_mjx.dynamics.heat import step_heat
 from lunar_mjx.dynamics.indexing import select
 from lunar_mjx.dynamics.kinematics import Kinematics, chassis_boxes
-from lunar_mjx.dynamics.ports import Pipeline, apply_effects
 from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperature
 from lunar_mjx.effects.context import Context, Heat, RoverInfo
-from lunar_mjx.effects.motor import MODES, REFERENCE_TEMPERATURE, constant_at, winding_resistance
+from lunar_mjx.effects.joint.motor import MODES, REFERENCE_TEMPERATURE, constant_at, winding_resistance
+from lunar_mjx.effects.ports import Pipeline, apply_effects
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import sample

@@ -7,31 +7,27 @@ import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from lunar_mjx.effects import (
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.effects.body import chassis, suspension
+from lunar_mjx.effects.heat import paths as thermal
+from lunar_mjx.effects.heat import sources as heat_sources
+from lunar_mjx.effects.joint import driveline, electrical, friction
+from lunar_mjx.effects.joint import motor as motor_module
+from lunar_mjx.effects.sensor import channel_errors as sensors
+from lunar_mjx.effects.soil import ground as soil
+from lunar_mjx.effects.soil import multipass, slip_sinkage
+from lunar_mjx.effects.soil import variation as soil_variation
+from lunar_mjx.effects.wheel import (
     bulldozing,
-    chassis,
     contact_angles,
-    driveline,
-    electrical,
-    friction,
     friction_circle,
     grousers,
-    heat_sources,
-    multipass,
     paper,
     rock,
-    sensors,
     sliding_contact,
-    slip_sinkage,
-    soil,
-    soil_variation,
     stress_integral,
-    suspension,
-    thermal,
-    wheel,
 )
-from lunar_mjx.effects import motor as motor_module
-from lunar_mjx.effects.base import Effect
+from lunar_mjx.effects.wheel import closed_form as wheel
 from lunar_mjx.errors import UserError, require_file
 
 

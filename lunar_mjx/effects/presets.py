@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from lunar_mjx.effects.motor import WINDINGS
-from lunar_mjx.effects.soil import SOILS
+from lunar_mjx.effects.joint.motor import WINDINGS
+from lunar_mjx.effects.soil.ground import SOILS
 
 PRESETS: Mapping[str, tuple[str, ...]] = {
     "consistent": (

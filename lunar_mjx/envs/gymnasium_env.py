@@ -134,7 +134,7 @@ class NavigationGymEnv(SingleEnv):
     | 12-14 | Kalman-filtered acceleration, world axes | m/s2 |
     | 15-16 | goal from the start, world axes | m |
 
-    `observations=(...)` names other blocks: `lunar_mjx.envs.observations.BLOCKS`.
+    `observations=(...)` names other blocks: `lunar_mjx.envs.navigation.observations.BLOCKS`.
 
     ## Rewards
     Per action: 20 times the metres come nearer to the goal (`task="paper"`: as printed, the length of the way, which

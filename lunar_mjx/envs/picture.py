@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.envs.core import State
-from lunar_mjx.envs.navigation import NavigationEnv
+from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.envs.render import Camera, TopView
 from lunar_mjx.errors import UserError, bad_input
 

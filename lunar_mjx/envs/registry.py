@@ -13,7 +13,7 @@ from lunar_mjx.errors import UserError, bad_input, require_file
 
 
 def _navigation(**options: Any) -> Environment:
-    from lunar_mjx.envs.navigation import make_navigation
+    from lunar_mjx.envs.navigation.env import make_navigation
 
     return make_navigation(**options)
 

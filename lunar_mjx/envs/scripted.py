@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from lunar_mjx.envs.core import Environment, State
-from lunar_mjx.envs.navigation import NavigationEnv
+from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.errors import bad_input
 
 Agent = Callable[[State, Any], Any]

@@ -1,1 +1,1 @@
-"""Inference that knows nothing of rovers: evidence of hypotheses that share a discrepancy, and the search over them."""
+"""Fits, evidence and tests for any model with parameters: names no rover, joint, port or channel."""

@@ -19,7 +19,7 @@ from lunar_mjx.cameras.texture import Track
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.model import Model
-from lunar_mjx.model_file import load_model
+from lunar_mjx.model.file import load_model
 from lunar_mjx.terrain import Terrain, gradient, inside
 
 TABLE, MODEL = "drive.csv", "model.toml"

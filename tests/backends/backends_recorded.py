@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from lunar_mjx.backends import parity
-from lunar_mjx.backends.parity_cases import SOFT_LOOP, cases, drive
-from lunar_mjx.backends.parity_record import record
+from lunar_mjx.backends.parity import compare as parity
+from lunar_mjx.backends.parity.cases import SOFT_LOOP, cases, drive
+from lunar_mjx.backends.parity.record import record
 from lunar_mjx.model import make_model
 
 DURATION, SAMPLES = 4.0, 6

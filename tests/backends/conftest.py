@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from backends_recorded import Recorded
 
-from lunar_mjx.backends import parity
+from lunar_mjx.backends.parity import compare as parity
 
 
 @pytest.fixture(scope="session")

@@ -10,10 +10,11 @@ import pytest
 from backends_faults import FAULTS
 from backends_recorded import Recorded
 
-from lunar_mjx.backends import NativeBackend, parity
-from lunar_mjx.backends.parity_page import verdict, write_parity_page
-from lunar_mjx.backends.parity_record import evaluate
-from lunar_mjx.backends.parity_study import kind_of, make_runner, run_study
+from lunar_mjx.backends import NativeBackend
+from lunar_mjx.backends.parity import compare as parity
+from lunar_mjx.backends.parity.page import verdict, write_parity_page
+from lunar_mjx.backends.parity.record import evaluate
+from lunar_mjx.backends.parity.study import kind_of, make_runner, run_study
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 
@@ -122,7 +123,7 @@ def test_what_sets_viper_apart_from_native_mujoco():
 
 
 def test_page_says_where_engines_part(tmp_path, luvmi, monkeypatch):
-    from lunar_mjx.backends import parity_study
+    from lunar_mjx.backends.parity import study as parity_study
 
     hook = FAULTS["lateral force"][0]
     monkeypatch.setattr(parity_study, "make_runner",

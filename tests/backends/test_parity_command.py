@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from backends_faults import FAULTS
 
-from lunar_mjx.backends import parity, parity_study
+from lunar_mjx.backends.parity import compare as parity
+from lunar_mjx.backends.parity import study as parity_study
 
 
 @pytest.mark.parametrize("fault", [None, "wheel radius"])

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from backends_recorded import Recorded
 
-from lunar_mjx.backends import Hook, NativeBackend, parity
-from lunar_mjx.backends.parity_study import available, make_runner
+from lunar_mjx.backends import Hook, NativeBackend
+from lunar_mjx.backends.parity import compare as parity
+from lunar_mjx.backends.parity.study import available, make_runner
 from lunar_mjx.backends.pybullet import PyBulletBackend, import_pybullet, urdf_of
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from lunar_mjx.dynamics.ports import Forces
-from lunar_mjx.dynamics.structured import StructuredEngine
+from lunar_mjx.dynamics.structured.engine import StructuredEngine
 from lunar_mjx.effects.context import Geometry
+from lunar_mjx.effects.ports import Forces
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Vec3
 

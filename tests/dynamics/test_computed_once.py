@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.dynamics.computed_once import computed_once
+from lunar_mjx.dynamics.batching.computed_once import computed_once
 from lunar_mjx.dynamics.reverse import reversible
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.dynamics import build
-from lunar_mjx.effects.soil import SOILS
+from lunar_mjx.effects.soil.ground import SOILS
 from lunar_mjx.model import make_model
 from tests.dynamics.conftest import bench, plane
 

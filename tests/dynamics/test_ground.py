@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from lunar_mjx.dynamics import Ambient, build
-from lunar_mjx.dynamics.state import SYNODIC_DAY, compensated_add
+from lunar_mjx.dynamics.state import compensated_add
 from lunar_mjx.model import make_model
+from lunar_mjx.model.ambient import SYNODIC_DAY
 from lunar_mjx.terrain import SoilMap, build_rocks, flat
 
 EVERY = 50

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.dynamics import build
-from lunar_mjx.dynamics.computed_once import computed_once
+from lunar_mjx.dynamics.batching.computed_once import computed_once
 from lunar_mjx.dynamics.reverse import reversible
 from lunar_mjx.model import make_model
 from lunar_mjx.terrain import inclined

@@ -7,8 +7,8 @@ import pytest
 import structured_models as made
 from structured_reference import Reference
 
-from lunar_mjx.dynamics.structured import StructuredEngine
-from lunar_mjx.dynamics.suitability import UnsuitableError
+from lunar_mjx.dynamics.structured.engine import StructuredEngine
+from lunar_mjx.dynamics.structured.suitability import UnsuitableError
 from lunar_mjx.rover import load_rover
 
 OPEN = ("luvmi_x", "three_legs", "six_legs", "mixed")

@@ -11,14 +11,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from effects_reference import WheelState
 
-from lunar_mjx.dynamics.ports import Pipeline, initial_normal, nominal_geometry
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.context import Contact, Context, Normal, RoverInfo, Soil, WheelForce
-from lunar_mjx.effects.soil import SOILS
+from lunar_mjx.effects.ports import Pipeline, initial_normal, nominal_geometry
+from lunar_mjx.effects.soil.ground import SOILS
 from lunar_mjx.spatial import Vec3
+from tests.effects.effects_reference import WheelState
 
 Array = Any
 STATES = 100_000

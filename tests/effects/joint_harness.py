@@ -10,12 +10,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from effects_harness import bare_context, effects_named, parameters, rover_info
 
-from lunar_mjx.dynamics.ports import Pipeline, heat_flow
 from lunar_mjx.effects.context import Command
-from lunar_mjx.effects.motor import CURRENT, POSITION, TORQUE, VELOCITY
+from lunar_mjx.effects.joint.motor import CURRENT, POSITION, TORQUE, VELOCITY
+from lunar_mjx.effects.ports import Pipeline, heat_flow
 from lunar_mjx.spatial import Frame, Vec3
+from tests.effects.effects_harness import bare_context, effects_named, parameters, rover_info
 
 Array = Any
 DT = 0.002

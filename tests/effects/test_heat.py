@@ -11,16 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_harness import bare_context, effects_named, parameters
 
 from lunar_mjx.dynamics.heat import step_heat
-from lunar_mjx.dynamics.ports import Pipeline
 from lunar_mjx.dynamics.state import Temperature
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Parameter, effect
 from lunar_mjx.effects.context import Command
-from lunar_mjx.effects.motor import REFERENCE_TEMPERATURE
+from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
+from lunar_mjx.effects.ports import Pipeline
 from lunar_mjx.effects.presets import PRESETS
+from tests.effects.effects_harness import bare_context, effects_named, parameters
 
 Array = Any
 POWERS = np.array([0.05, 0.2, 0.5, 2.0, 10.0, 50.0])

@@ -10,7 +10,7 @@ import pytest
 
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.context import Geometry
-from lunar_mjx.effects.multipass import PLACES
+from lunar_mjx.effects.soil.multipass import PLACES
 from lunar_mjx.spatial import Vec3
 
 WHEELS = 2

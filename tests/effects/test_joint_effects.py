@@ -6,7 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from joint_harness import (
+
+from lunar_mjx.effects.joint.electrical import limit_of, voltage_of
+from lunar_mjx.effects.joint.motor import CURRENT, POSITION, VELOCITY
+from tests.effects.joint_harness import (
     AMBIENT,
     DT,
     ETA,
@@ -21,9 +24,6 @@ from joint_harness import (
     many,
     scene,
 )
-
-from lunar_mjx.effects.electrical import limit_of, voltage_of
-from lunar_mjx.effects.motor import CURRENT, POSITION, VELOCITY
 
 Array = Any
 SIGMA = 5.670374419e-8
@@ -261,10 +261,10 @@ def test_a_cold_saturated_motor_comes_to_rest_at_its_idle_speed() -> None:
     """Windings at -190 degC brake faster than a step of 2 ms follows; the speed settles where V = V_bus, no chatter."""
     import jax
     import jax.numpy as jnp
-    from effects_harness import bare_context, effects_named, parameters, rover_info
 
-    from lunar_mjx.dynamics.ports import Pipeline
     from lunar_mjx.effects.context import Command
+    from lunar_mjx.effects.ports import Pipeline
+    from tests.effects.effects_harness import bare_context, effects_named, parameters, rover_info
 
     names = ("joint_control", "motor", "voltage_saturation")
     with jax.enable_x64(True):

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_harness import bare_context, effects_named, parameters, rover_info
 
-from lunar_mjx.dynamics.ports import Pipeline, heat_flow
 from lunar_mjx.effects.context import Command
-from lunar_mjx.effects.motor import CURRENT, POSITION, TORQUE, VELOCITY, WINDINGS
+from lunar_mjx.effects.joint.motor import CURRENT, POSITION, TORQUE, VELOCITY, WINDINGS
+from lunar_mjx.effects.ports import Pipeline, heat_flow
+from tests.effects.effects_harness import bare_context, effects_named, parameters, rover_info
 
 Array = Any
 MOTOR = ("joint_control", "thermal_cutoff", "motor")

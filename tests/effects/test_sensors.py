@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.effects import catalogue
-from lunar_mjx.effects.channels import FAMILIES, SensorContext, Signals, family
+from lunar_mjx.effects.sensor.channels import FAMILIES, SensorContext, Signals, family
 
 Array = Any
 TIMES = np.linspace(0.0, 6.0, 121)

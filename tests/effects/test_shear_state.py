@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_harness import bare_context, rover_info
 
-from lunar_mjx.dynamics.ports import initial_normal, initial_soil, initial_wheel, nominal_geometry
 from lunar_mjx.effects.context import Contact
-from lunar_mjx.effects.wheel import mean_decay, shear_state
+from lunar_mjx.effects.ports import initial_normal, initial_soil, initial_wheel, nominal_geometry
+from lunar_mjx.effects.wheel.closed_form import mean_decay, shear_state
 from lunar_mjx.spatial import Vec3
+from tests.effects.effects_harness import bare_context, rover_info
 
 Array = Any
 RADIUS, THETA_1 = 0.25, 0.6

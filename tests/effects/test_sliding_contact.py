@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_harness import bare_context, parameters, rover_info, wheel_forces
-from effects_reference import WheelState
 
-from lunar_mjx.dynamics.ports import initial_normal, nominal_geometry
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.context import Contact, Soil, WheelForce
-from lunar_mjx.effects.sliding_contact import wall_bearing
-from lunar_mjx.effects.wheel import entrance_angle
+from lunar_mjx.effects.ports import initial_normal, nominal_geometry
+from lunar_mjx.effects.wheel.closed_form import entrance_angle
+from lunar_mjx.effects.wheel.sliding_contact import wall_bearing
 from lunar_mjx.spatial import Vec3
+from tests.effects.effects_harness import bare_context, parameters, rover_info, wheel_forces
+from tests.effects.effects_reference import WheelState
 
 R, B, Z = 0.0625, 0.05, 0.045
 PHI, COHESION, K_Y, GRAVITY = np.radians(32.0), 200.0, 0.02, 9.81

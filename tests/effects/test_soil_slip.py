@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import pytest
-from effects_harness import bare_context
 
-from lunar_mjx.dynamics.ports import wheel_ports
 from lunar_mjx.effects.context import Contact
+from lunar_mjx.effects.ports import wheel_ports
 from lunar_mjx.spatial import Vec3
+from tests.effects.effects_harness import bare_context
 
 
 class _Seen:

@@ -8,11 +8,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_harness import bare_context, parameters
 
-from lunar_mjx.dynamics.ports import Pipeline
 from lunar_mjx.effects import catalogue
+from lunar_mjx.effects.ports import Pipeline
 from lunar_mjx.errors import UserError
+from tests.effects.effects_harness import bare_context, parameters
 
 FRICTION = """import jax.numpy as jnp
 from lunar_mjx.effects import Parameter, effect

@@ -8,11 +8,11 @@ from typing import Any
 import effects_reference as ref
 import numpy as np
 import pytest
-from effects_harness import STATES, random_wheels, wheel_forces
 from scipy.optimize import brentq
 
 from lunar_mjx.effects.context import WheelForce
-from lunar_mjx.effects.stress_integral import NODES_PER_SIDE
+from lunar_mjx.effects.wheel.stress_integral import NODES_PER_SIDE
+from tests.effects.effects_harness import STATES, random_wheels, wheel_forces
 
 FLOAT64, FLOAT32 = 1e-9, 1e-4
 Array = Any

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from effects_harness import random_wheels, wheel_forces
-from effects_reference import WheelState
+
+from tests.effects.effects_harness import random_wheels, wheel_forces
+from tests.effects.effects_reference import WheelState
 
 Array = Any
 COUNT = 5000

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.envs import kalman
-from lunar_mjx.envs.kalman import KalmanConfig
+from lunar_mjx.envs.navigation import kalman
+from lunar_mjx.envs.navigation.kalman import KalmanConfig
 from lunar_mjx.errors import UserError
 
 DT = 0.1

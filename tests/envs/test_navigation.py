@@ -15,14 +15,15 @@ from lunar_mjx.agents.evaluate import Evaluator
 from lunar_mjx.agents.play import shipped_policy
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.agents.run import unseen_params
-from lunar_mjx.envs import make_agent, make_navigation, rewards, split_keys
-from lunar_mjx.envs.actions import action_map
-from lunar_mjx.envs.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
+from lunar_mjx.envs import make_agent, make_navigation, split_keys
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
-from lunar_mjx.envs.places import draw_places
-from lunar_mjx.envs.randomise import Range, check_ranges
-from lunar_mjx.envs.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_REACH
-from lunar_mjx.envs.worlds import WORLDS, world
+from lunar_mjx.envs.navigation import rewards
+from lunar_mjx.envs.navigation.actions import action_map
+from lunar_mjx.envs.navigation.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
+from lunar_mjx.envs.navigation.places import draw_places
+from lunar_mjx.envs.navigation.randomise import Range, check_ranges
+from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_REACH
+from lunar_mjx.envs.navigation.worlds import WORLDS, world
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 from lunar_mjx.terrain import load_terrain, surface

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.envs import rewards
-from lunar_mjx.envs.rewards import TERMS, Transition
+from lunar_mjx.envs.navigation import rewards
+from lunar_mjx.envs.navigation.rewards import TERMS, Transition
 
 
 @pytest.fixture

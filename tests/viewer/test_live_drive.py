@@ -10,12 +10,12 @@ import time
 
 import numpy as np
 import pytest
-from cli_harness import MAIN
 
 from lunar_mjx.model import make_model
 from lunar_mjx.viewer import window
 from lunar_mjx.viewer.drive import LiveDrive, Pace
 from lunar_mjx.viewer.pilot import Pilot, drivable
+from tests.cli_harness import MAIN
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,8 @@ import sys
 import time
 
 import pytest
-from cli_harness import MAIN
+
+from tests.cli_harness import MAIN
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no Xvfb is installed")]
 

@@ -12,7 +12,7 @@ from lunar_mjx.backends.native import NativeBackend
 from lunar_mjx.cameras.gl import BACKENDS, context_class
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
-from lunar_mjx.model_file import save_model
+from lunar_mjx.model.file import save_model
 from lunar_mjx.simulate import constant_commands
 
 

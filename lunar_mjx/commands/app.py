@@ -1,0 +1,273 @@
+"""The command `lunar-mjx`. A user's mistake is one sentence on standard error and exit status 2, never a traceback."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from lunar_mjx import __version__
+from lunar_mjx.commands import diagnosis as criticism_commands
+from lunar_mjx.commands import effect_test, usage
+from lunar_mjx.commands import log as log_commands
+from lunar_mjx.commands import parity as parity_commands
+from lunar_mjx.commands import seeing as seeing_commands
+from lunar_mjx.commands import train as train_commands
+from lunar_mjx.commands.compiled import keep_compiled
+from lunar_mjx.commands.options import (
+    DemOption,
+    DeviceOption,
+    OutOption,
+    PresetOption,
+    RoverOption,
+    SeedOption,
+    SpecArgument,
+    TerrainOption,
+    check_finite,
+    check_folder,
+    make_folder,
+    open_terrain,
+    select_device,
+)
+from lunar_mjx.errors import EXIT_STATUS, UserError, bad_input
+
+INTERRUPTED = 130
+
+
+class _Interrupted(BaseException):
+    """Control-C, kept from Typer, which would exit without a word."""
+
+
+class _Commands(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise _Interrupted from None
+
+
+app = typer.Typer(
+    name="lunar-mjx",
+    cls=_Commands,
+    help="Lunar rovers on MuJoCo MJX: simulate thousands, hold the model against measurements.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+terrain_app = typer.Typer(help="Look at terrains and DEMs, and export them as meshes.", no_args_is_help=True)
+app.add_typer(terrain_app, name="terrain")
+effect_app = typer.Typer(help="List and explain the physical effects.", no_args_is_help=True)
+app.add_typer(effect_app, name="effect")
+
+
+@app.command()
+def demo(out: OutOption = Path("runs/demo"), device: DeviceOption = "auto") -> None:
+    """Drive VIPERs and LUVMI-Xs over lunar terrain, and hold the wheel model against a measured wheel."""
+    check_folder(out)
+    select_device(device)
+    from lunar_mjx.demo import run_demo
+
+    page = run_demo(make_folder(out))
+    print(page)
+
+
+@app.command()
+def convert(
+    urdf: Annotated[Path, typer.Argument(help="URDF of a four-wheeled rover.")],
+    out: OutOption,
+    description: Annotated[
+        Path | None, typer.Option(help="Description file; <stem>.rover.toml beside the URDF if left out.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the rover; the URDF's if left out.")] = None,
+) -> None:
+    """Convert a URDF (and the loop closures that it cannot express) into an MJCF rover folder."""
+    check_folder(out)
+    from lunar_mjx.rover import convert as convert_urdf
+
+    rover = convert_urdf(urdf, out, description, name)
+    print(f"{rover.name}: {rover.mass:g} kg, {len(rover.wheels)} wheels, {len(rover.joints)} motors, "
+          f"{len(rover.loops)} loops")  # fmt: skip
+    for note in rover.notes:
+        print(f"note: {note}")
+    print(rover.mjcf)
+
+
+@app.command()
+def simulate(
+    out: OutOption = Path("runs/drive"),
+    model: Annotated[Path | None, typer.Option(help="model.toml; overrides --rover, --terrain and --preset.")] = None,
+    rover: RoverOption = "viper",
+    terrain: TerrainOption = "lunar_plain",
+    preset: PresetOption = "consistent",
+    effects: Annotated[
+        list[str] | None, typer.Option(help="Effect to add: catalogue name, my_effects.py or my_effects.py:name.")
+    ] = None,
+    commands: Annotated[Path | None, typer.Option(help="CSV of commands; overrides --drive and --steer.")] = None,
+    drive: Annotated[float, typer.Option(help="Command of every drive joint, in its mode's unit.")] = 0.4,
+    steer: Annotated[float, typer.Option(help="Command of every front steering joint, rad.")] = 0.0,
+    duration: Annotated[float, typer.Option(help="s")] = 20.0,
+    x: Annotated[float, typer.Option(help="start, m")] = 0.0,
+    y: Annotated[float, typer.Option(help="start, m")] = 0.0,
+    yaw_deg: Annotated[float, typer.Option(help="start heading, deg")] = 0.0,
+    device: DeviceOption = "auto",
+) -> None:
+    """Drive one rover and write its telemetry as a table of log channels."""
+    check_folder(out)
+    check_finite(drive=drive, steer=steer, duration=duration, x=x, y=y, yaw_deg=yaw_deg)
+    select_device(device)
+    from lunar_mjx.model import make_model
+    from lunar_mjx.model.file import load_model, save_model
+    from lunar_mjx.simulate import channels, constant_commands, front_steering, read_commands
+    from lunar_mjx.simulate import simulate as run
+
+    built = load_model(model) if model else make_model(rover, terrain, preset)
+    for effect in effects or []:
+        built = built.add(effect, "--effects")
+    if commands:
+        wanted = read_commands(commands, built)
+    else:
+        wanted = front_steering(built, constant_commands(built, duration, drive=drive), steer)
+    keep_compiled()
+    if sys.stderr.isatty():
+        print("compiling and driving; the first time can take a minute", file=sys.stderr)
+    system, seen = run(built, wanted, x, y, math.radians(yaw_deg))
+    folder = make_folder(out)
+    table = channels(system, seen, wanted)
+    path = folder / "drive.csv"
+    table.to_csv(path, index=False, float_format="%.9g")
+    save_model(built, folder / "model.toml")
+    first, last = table.iloc[0], table.iloc[-1]  # on a slope the chassis leans away from where its wheels were put
+    way = math.hypot(last.position_x_m - first.position_x_m, last.position_y_m - first.position_y_m)
+    print(f"{built.rover.name} drove {way:.3f} m "
+          f"in {last.time_s:.1f} s")  # fmt: skip
+    print(path)
+
+
+@app.command()
+def preset(
+    name: Annotated[str, typer.Argument(help="consistent or paper")],
+    rover: RoverOption = "viper",
+    save: Annotated[Path | None, typer.Option(help="Write the preset as a model.toml.")] = None,
+) -> None:
+    """Print a preset: its effects with every value and source, and for `paper` what it leaves unsaid or undefined."""
+    from lunar_mjx.model import make_model
+    from lunar_mjx.model.describe import make_console, print_preset
+    from lunar_mjx.model.file import save_model
+
+    model = make_model(rover, "flat", name)
+    written = save_model(model, save) if save else None
+    print_preset(model, make_console())
+    if written:
+        print(written)
+
+
+@app.command()
+def figures(
+    out: OutOption = Path("runs/figures"),
+    only: Annotated[str, typer.Option(help="all, or some of 1,2,3,4,5,6,slope")] = "all",
+    training: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder that `train` wrote, for Fig. 6; may be repeated. Kept records if left out."),
+    ] = None,
+    device: DeviceOption = "auto",
+) -> None:
+    """Make the counterparts of the paper's Figs. 1 to 6, and the slope check; 1 and 4 need OpenGL."""
+    check_folder(out)
+    select_device(device)
+    from lunar_mjx.paper.figures import FIGURES, available_figures, make_figures
+
+    names = available_figures(training or ()) if only == "all" else only.split(",")
+    for name in names:
+        if name not in FIGURES:
+            raise bad_input("figures", "--only", name, "does not exist", f"use all or some of {', '.join(FIGURES)}")
+    for path in make_figures(names, make_folder(out), training or ()):
+        print(path)
+
+
+@terrain_app.command("info")
+def terrain_info(spec: SpecArgument, dem: DemOption = None, seed: SeedOption = None) -> None:
+    """Print a terrain's extent, heights, slopes and rocks."""
+    from lunar_mjx.model.describe import make_console, print_terrain
+
+    print_terrain(open_terrain(spec, dem, seed), make_console())
+
+
+@terrain_app.command("export")
+def terrain_export(
+    spec: SpecArgument,
+    path: Annotated[Path, typer.Argument(help="Mesh file: .stl, .obj or .ply.")],
+    dem: DemOption = None,
+    seed: SeedOption = None,
+) -> None:
+    """Write a terrain with its rocks as a triangle mesh."""
+    from lunar_mjx.terrain import export_mesh
+
+    print(export_mesh(open_terrain(spec, dem, seed), path))
+
+
+@effect_app.command("list")
+def effect_list() -> None:
+    """List the catalogue of effects."""
+    from lunar_mjx.effects.catalogue import CATALOGUE
+    from lunar_mjx.effects.presets import PRESETS
+    from lunar_mjx.model.describe import make_console, make_table
+
+    table = make_table("effect", "ports", *PRESETS, "what")
+    for effect in CATALOGUE.values():
+        marks = ["x" if effect.name in names else "" for names in PRESETS.values()]
+        table.add_row(effect.name, ", ".join(effect.ports), *marks, effect.doc.split("\n")[0])
+    make_console().print(table)
+
+
+@effect_app.command("show")
+def effect_show(name: Annotated[str, typer.Argument(help="Catalogue name, or my_effects.py:name.")]) -> None:
+    """Print an effect's equation, parameters, bounds and sources."""
+    from lunar_mjx.effects.catalogue import get
+    from lunar_mjx.model.describe import make_console, print_effect
+
+    print_effect(get(name), make_console())
+
+
+train_commands.register(app)
+parity_commands.register(app)
+seeing_commands.register(app, terrain_app)
+log_commands.register(app)
+criticism_commands.register(app)
+effect_test.register(effect_app)
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    print(__version__)
+
+
+def main() -> None:
+    """Entry point of the command."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    try:
+        status = app(prog_name="lunar-mjx", standalone_mode=False)
+    except usage.UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # Typer has printed the help
+            sys.exit(EXIT_STATUS)
+        _fail(usage.describe(error, sys.argv[1:]), EXIT_STATUS)
+    except UserError as error:
+        _fail(str(error), EXIT_STATUS)
+    except OSError as error:  # unreadable, unwritable, disk full
+        if error.filename is None:
+            raise
+        _fail(f"{error.filename}: {error.strerror or error}; check the path and its permissions.", EXIT_STATUS)
+    except (_Interrupted, KeyboardInterrupt):
+        _fail("interrupted", INTERRUPTED)
+    else:
+        sys.exit(status if isinstance(status, int) else 0)
+
+
+def _fail(sentence: str, status: int) -> None:
+    line = " ".join(sentence.splitlines()).removeprefix("lunar-mjx: ").removeprefix("lunar-mjx ")
+    print(f"lunar-mjx: {line}", file=sys.stderr)
+    sys.exit(status)

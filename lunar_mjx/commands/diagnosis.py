@@ -1,0 +1,291 @@
+"""`lunar-mjx compare | why | next | add | unknown | report | improve`: criticism, verb by verb, on run folders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lunar_mjx.commands.compiled import keep_compiled
+from lunar_mjx.errors import UserError, bad_input
+
+if TYPE_CHECKING:
+    from lunar_mjx.diagnosis.verdict import Diagnosis
+    from lunar_mjx.model import Model
+
+RunArgument = Annotated[Path, typer.Argument(help="Run folder that `compare` or `add` wrote.")]
+LogsArgument = Annotated[list[Path], typer.Argument(help="Logs, or folders of logs; all drives or all wheel tables.")]
+ModelOption = Annotated[Path | None, typer.Option(help="model.toml; by default the preset on the logs' rover.")]
+PresetOption = Annotated[str, typer.Option(help="consistent or paper, where no --model is given.")]
+EffectsOption = Annotated[
+    list[str] | None, typer.Option("--effects", help="Your own effects to consider too, as my_effects.py:name.")
+]
+SplitOption = Annotated[
+    list[str] | None, typer.Option("--split", help="Split of a log (or group of points), as NAME=fit|select|test.")
+]
+SeedOption = Annotated[int, typer.Option(help="Seed of all random starts.")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+DiscrepancyOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--discrepancy", help="Known unexplained error of the model, as drawbar_pull=2.5 (SI), added to the noise."
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the verbs to the application."""
+    for name, function in (
+        ("compare", compare), ("why", why), ("next", next_), ("add", add), ("unknown", unknown), ("report", report),
+        ("improve", improve),
+    ):  # fmt: skip
+        app.command(name)(function)
+
+
+def compare(
+    logs: LogsArgument,
+    out: OutOption = Path("run1"),
+    model: ModelOption = None,
+    preset: PresetOption = "consistent",
+    effects: EffectsOption = None,
+    split: SplitOption = None,
+    discrepancy: DiscrepancyOption = None,
+    seed: SeedOption = 0,
+) -> None:
+    """Hold a model against logs: where it fails, and by how many sigma."""
+    from lunar_mjx.diagnosis import verbs
+    from lunar_mjx.report.progress import console_progress
+
+    keep_compiled()
+    try:
+        with console_progress() as progress:
+            run = verbs.compare(logs, _model(model, preset, logs), out, effects or (), _pairs("--split", split), seed,
+                                _numbers("--discrepancy", discrepancy), progress)  # fmt: skip
+    except verbs.BadData as bad:
+        _finish(bad.diagnosis, False)
+    _print_comparison(run)
+    _write_report([out], out / "report.html")
+
+
+def why(
+    run: RunArgument,
+    explain: Annotated[str | None, typer.Option(help="Evidence for and against one effect.")] = None,
+    only: Annotated[list[str] | None, typer.Option(help="Consider only these effects.")] = None,
+    audit: Annotated[
+        float, typer.Option(help="Minutes to spend on simulated logs like these: how often is it wrong?")
+    ] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Say which effect is missing, where, or that nobody can tell; the exit status is the verdict."""
+    from lunar_mjx.diagnosis import verbs
+    from lunar_mjx.report.progress import console_progress
+
+    keep_compiled()
+    with console_progress() as progress:
+        diagnosis = verbs.why(run, only, progress=progress)
+        if audit > 0:
+            from lunar_mjx.diagnosis.audit import audit as run_audit
+
+            run_audit(run, 60.0 * audit, progress=progress)
+    _write_report([run], run / "report.html")
+    if explain is not None:
+        diagnosis = verbs.explain(diagnosis, explain)
+    _finish(diagnosis, as_json)
+
+
+def next_(
+    run: RunArgument,
+    between: Annotated[
+        list[str] | None, typer.Option(help="Effects to tell apart; else those that the verdict leaves open.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Longest drive to plan, s.", min=1.0)] = 30.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Name the manoeuvre that best separates the effects that survive."""
+    from lunar_mjx.diagnosis.next_experiment import next_experiment
+    from lunar_mjx.report.progress import console_progress
+
+    keep_compiled()
+    with console_progress() as progress:
+        found = next_experiment(run, between or (), seconds, progress)
+    print(json.dumps(found.to_dict(), indent=2) if as_json else found.sentence)
+
+
+def add(
+    run: RunArgument,
+    effect: Annotated[str, typer.Argument(help="Catalogue name, or my_effects.py:name.")],
+    out: OutOption = Path("run2"),
+) -> None:
+    """Add an effect to the model, refit, and compare again."""
+    from lunar_mjx.diagnosis import verbs
+    from lunar_mjx.report.progress import console_progress
+
+    keep_compiled()
+    try:
+        with console_progress() as progress:
+            grown = verbs.add(run, effect, out, progress)
+    except verbs.BadData as bad:
+        _finish(bad.diagnosis, False)
+    _print_comparison(grown)
+    _write_report([run, out], out / "report.html")
+
+
+def unknown(
+    run: RunArgument,
+    port: Annotated[str | None, typer.Option(help="Port to look at; by default where `why` found evidence.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Effect file to write.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Suggest formulas for what no catalogue effect explains, and write the best as an effect file."""
+    from lunar_mjx.diagnosis.formulas.discover import discover
+    from lunar_mjx.diagnosis.runs import plain
+    from lunar_mjx.report.progress import console_progress
+
+    keep_compiled()
+    with console_progress() as progress:
+        found = discover(run, port, out, progress=progress)
+    print(json.dumps(plain(found.to_dict()), indent=2) if as_json else found.text())
+
+
+def report(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, in the order in which effects were added.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
+) -> None:
+    """Write one offline page: the error falls."""
+    _write_report(runs, out)
+    print(out)
+
+
+def improve(
+    logs: LogsArgument,
+    out: OutOption = Path("runs"),
+    model: ModelOption = None,
+    preset: PresetOption = "consistent",
+    effects: EffectsOption = None,
+    split: SplitOption = None,
+    discrepancy: DiscrepancyOption = None,
+    keep_going: Annotated[
+        bool, typer.Option(help="Go on through UNKNOWN while an effect earns its place on held-out manoeuvres.")
+    ] = False,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the whole loop unattended; the exit status is the last verdict."""
+    from lunar_mjx.diagnosis import verbs
+    from lunar_mjx.report.progress import console_progress
+
+    keep_compiled()
+    with console_progress() as progress:
+        diagnosis, runs = verbs.improve(
+            logs, _model(model, preset, logs), out, effects or (), _pairs("--split", split), seed,
+            keep_going=keep_going, discrepancy=_numbers("--discrepancy", discrepancy), progress=progress,
+        )  # fmt: skip
+    if runs:
+        _write_report([r.folder for r in runs], out / "report.html")
+    _finish(diagnosis, as_json)
+
+
+def _model(path: Path | None, preset: str, logs: Sequence[Path]) -> Model:
+    """The model to compare: a file's, or the preset on the rover that the first log names."""
+    from lunar_mjx.logs import Log, read_campaign
+    from lunar_mjx.model import make_model
+    from lunar_mjx.model.file import load_model
+
+    if path is not None:
+        return load_model(path)
+    first = read_campaign(logs)[0]
+    if isinstance(first, Log):
+        return make_model(first.rover, terrain="flat", preset=preset)
+    return make_model("luvmi_x", terrain="flat", preset=preset)
+
+
+def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
+    out = {}
+    for item in given or ():
+        name, mark, value = item.rpartition("=")
+        if not mark or not name:
+            raise bad_input("lunar-mjx", option, item, "is not NAME=VALUE", "give both")
+        out[name] = value
+    for value in out.values() if option == "--split" else ():
+        if value not in ("fit", "select", "test", "apart"):
+            raise bad_input("lunar-mjx", option, value, "is no split", "use fit, select, test or apart")
+    return out
+
+
+def _numbers(option: str, given: Sequence[str] | None) -> dict[str, float]:
+    out = {}
+    for name, value in _pairs(option, given).items():
+        try:
+            out[name] = float(value)
+        except ValueError:
+            raise bad_input("lunar-mjx", option, f"{name}={value}", "is not a number", "give a number") from None
+    return out
+
+
+def _print_comparison(run: Any) -> None:
+    from lunar_mjx.diagnosis.runs import COMPARISON_FILE
+    from lunar_mjx.model.describe import make_console, make_table
+
+    found = run.load(COMPARISON_FILE)
+    console = make_console()
+    table = make_table("error in sigma", *found["refitted"])
+    for label in ("as_given", "refitted"):
+        table.add_row(label.replace("_", " "), *(_shown(found[label].get(k)) for k in found["refitted"]))
+    console.print(table)
+    worst = sorted(found["by_channel"], key=lambda row: -(row["refitted"] or 0.0))[:8]
+    table = make_table("manoeuvre", "split", "channel", "as given", "refitted")
+    for row in worst:
+        table.add_row(row["manoeuvre"], row["split"], row["channel"], _shown(row["as_given"]), _shown(row["refitted"]))
+    console.print(table)
+    problems = found["certificate"]["problems"]
+    console.print("Certificate of the fit: " + ("; ".join(problems) if problems else "complete"), highlight=False)
+    console.print(f"{run.folder}", highlight=False)
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _finish(diagnosis: Diagnosis, as_json: bool) -> None:
+    """Prints a diagnosis and ends with its exit status."""
+    from lunar_mjx.diagnosis.runs import plain
+    from lunar_mjx.model.describe import make_console, make_table
+
+    if as_json:
+        print(json.dumps(plain(diagnosis.to_dict()), indent=1))
+        raise typer.Exit(diagnosis.verdict.exit_status)
+    console = make_console()
+    effects = f" {', '.join(diagnosis.effects)}" if diagnosis.effects else ""
+    console.print(f"{diagnosis.verdict.label}{effects}", style="bold", highlight=False)
+    console.print(diagnosis.sentence, highlight=False)
+    tested = [e for e in diagnosis.evidence if e.status != "not tested"]
+    if tested:
+        table = make_table("effect", "status", "separable", "chi2", "p", "gain", names=6)
+        for e in tested[:15]:
+            gain = "-" if e.held_out_gain != e.held_out_gain else f"{e.held_out_gain:.0f} +- {e.held_out_se:.0f}"
+            table.add_row(e.effect, e.status, f"{e.separable_sigma:.1f}", f"{e.chi2:.0f}", f"{e.p:.2g}", gain)
+        console.print(table)
+    for e in tested:
+        if e.values:
+            fitted = ", ".join(f"{k} {v:.3g} +- {e.std.get(k, 0.0):.1g}" for k, v in e.values.items())
+            near = f"; nearest {e.nearest[0]}, cosine {e.nearest[1]:.2f}" if e.nearest[0] else ""
+            console.print(f"fitted {e.effect}: {fitted}{near}", highlight=False)
+    if untested := [e.effect for e in diagnosis.evidence if e.status == "not tested"]:
+        console.print(f"not tested, no separable signal here: {', '.join(untested)}", highlight=False)
+    for finding in diagnosis.details.get("findings", [])[:20]:
+        console.print(f"  {finding['message']}", highlight=False)
+    raise typer.Exit(diagnosis.verdict.exit_status)
+
+
+def _write_report(runs: Sequence[Path], out: Path) -> None:
+    from lunar_mjx.diagnosis.report import write_report
+    from lunar_mjx.diagnosis.runs import RUN_FILE
+
+    for run in runs:
+        if not (run / RUN_FILE).is_file():
+            raise UserError(f"{run}: is no run folder; make one with lunar-mjx compare.")
+    write_report(runs, out)

@@ -1,0 +1,87 @@
+"""Options that several commands take, and the checks of their values."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lunar_mjx.errors import bad_input
+
+RoverOption = Annotated[str, typer.Option(help="Name of a shipped rover, or folder that `convert` wrote.")]
+TerrainOption = Annotated[str, typer.Option(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")]
+PresetOption = Annotated[str, typer.Option(help="consistent or paper.")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")]
+DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+
+
+def select_device(device: str) -> None:
+    """Makes JAX use `device`.
+
+    Raises:
+      UserError: unknown name, or CUDA asked for where JAX sees none.
+    """
+    if device not in ("auto", "cpu", "cuda"):
+        raise bad_input("lunar-mjx", "--device", device, "does not exist", "use auto, cpu or cuda")
+    if device == "auto":
+        return
+    import jax
+
+    if device == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+        return
+    try:
+        found = jax.devices("cuda")
+    except RuntimeError:
+        found = []
+    if not found:
+        raise bad_input(
+            "lunar-mjx", "--device", device, "is not here: JAX sees no CUDA device",
+            "install the extra lunar-mjx[gpu] on a machine with an NVIDIA GPU, or use --device cpu",
+        )  # fmt: skip
+
+
+def check_folder(out: Path) -> None:
+    """Refuses, before any work is done, an output folder that is a file or lies in one."""
+    for path in (out, *out.parents):
+        if path.exists():
+            if not path.is_dir():
+                raise bad_input("lunar-mjx", "--out", str(out), f"is not a folder: {path} is a file", "name a folder")
+            return
+
+
+def make_folder(out: Path) -> Path:
+    """Makes the output folder."""
+    check_folder(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise bad_input(
+            "lunar-mjx", "--out", str(out), f"cannot be made ({error.strerror})", "name another folder"
+        ) from error
+    return out
+
+
+def check_finite(**options: float) -> None:
+    """Refuses numbers such as nan and inf, which the command line takes for numbers."""
+    for name, value in options.items():
+        if not math.isfinite(value):
+            raise bad_input("lunar-mjx", f"--{name.replace('_', '-')}", value, "is not finite", "give a finite number")
+
+
+SpecArgument = Annotated[str, typer.Argument(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")]
+DemOption = Annotated[Path | None, typer.Option(help="DEM file that takes the place of the configuration's.")]
+SeedOption = Annotated[int | None, typer.Option(min=0, help="Seed that takes the place of the configuration's.")]
+
+
+def open_terrain(spec: str, dem: Path | None, seed: int | None) -> Any:
+    """Loads a terrain; refuses a DEM or seed for one that takes none."""
+    from lunar_mjx.terrain import load_terrain
+
+    if spec.startswith("slope") or Path(spec).suffix not in ("", ".toml"):
+        for option, value in (("--dem", dem), ("--seed", seed)):
+            if value is not None:
+                raise bad_input("lunar-mjx", option, value, f"does not go with {spec}", "name a configured terrain")
+    return load_terrain(spec, dem=dem, seed=seed)

@@ -1,0 +1,1 @@
+"""Run folders, and the verbs that work on them: compare, why, add, improve, next experiment, audit, report."""

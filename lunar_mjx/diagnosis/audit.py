@@ -1,0 +1,205 @@
+"""How often the tool is wrong on logs like these: simulated nulls and single effects through the whole diagnosis.
+
+The simulated logs have the inputs, rates and noise of the real ones. They come from the model itself, so the error
+rates are those of the method where the rest of the model is true: a lower bound.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import hashlib
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx import __version__
+from lunar_mjx.diagnosis.attribute import diagnose
+from lunar_mjx.diagnosis.build_problem import build_problem
+from lunar_mjx.diagnosis.refit import Settings
+from lunar_mjx.diagnosis.runs import FITS_FILE, MODEL_FILE, Run, folder_hash, load_run
+from lunar_mjx.diagnosis.search import fit_baseline
+from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.errors import bad_input
+from lunar_mjx.inference.fit_store import Memory
+from lunar_mjx.inference.fitting import Fit, Progress, silent
+from lunar_mjx.inference.observations import Observations
+from lunar_mjx.inference.problem import Problem
+from lunar_mjx.inference.score import SEPARABLE, score, signatures
+
+AUDIT_FILE = "audit.json"
+NULL = "nothing"
+_MARGIN = 3.0
+"""Separable signals are tested at this multiple of the least one that counts, where the nominal size gives less."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Audit:
+    """What the simulated logs gave.
+
+    Attributes:
+      cases: one row each: truth, amount (in nominal sizes), verdict, effects named, outcome.
+      rates: by outcome: count, of how many, and its Wilson 95 % interval.
+      sentence: all of that.
+    """
+
+    cases: tuple[dict[str, Any], ...]
+    rates: dict[str, dict[str, float]]
+    sentence: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Numbers and names only."""
+        return dataclasses.asdict(self)
+
+
+def audit(
+    folder: str | Path | Run, seconds: float, progress: Progress = silent, settings: Settings | None = None
+) -> Audit:
+    """Diagnoses simulated logs like those of a run until the time is spent; writes `audit.json`.
+
+    Nulls and single effects take turns. Earlier cases of the same model and logs are kept and added to.
+
+    Args:
+      folder: of the run. seconds: to spend; the case in progress is finished, and two are diagnosed at least.
+      progress: told what is being done. settings: thresholds and effort of the diagnoses.
+
+    Raises:
+      UserError: a time that is not positive.
+    """
+    if not seconds > 0.0:
+        raise bad_input("why", "--audit", seconds, "is not a time", "give minutes above 0")
+    run = folder if isinstance(folder, Run) else load_run(folder)
+    settings = settings or Settings(seed=run.seed)
+    key = _key(run, settings)
+    stored = run.load(AUDIT_FILE) or {}
+    cases: list[dict[str, Any]] = list(stored.get("cases", [])) if stored.get("key") == key else []
+    end = time.monotonic() + seconds
+    problem = build_problem(run)
+    base = fit_baseline(problem, settings, Memory(run.load(FITS_FILE)), progress)
+    sizes = _sizes(problem, base, settings)
+    begun = time.monotonic()
+    done = 0
+    while done < 2 or time.monotonic() < end:
+        done += 1
+        progress(f"auditing, case {len(cases) + 1}", min(1.0, (time.monotonic() - begun) / max(end - begun, 1e-9)))
+        cases.append(_case(problem, base, sizes, len(cases), settings))
+        found = _summary(cases)
+        run.save(AUDIT_FILE, {"key": key, "version": __version__, **found.to_dict()})
+    return _summary(cases)
+
+
+def _key(run: Run, settings: Settings) -> str:
+    """Of the model and the campaign that an audit belongs to, and of the tool that was audited."""
+    digest = hashlib.sha256((run.folder / MODEL_FILE).read_bytes())
+    for log in run.logs:
+        digest.update(folder_hash(log).encode())
+    digest.update(repr((run.candidates, sorted(run.splits.items()), sorted(run.discrepancy.items()))).encode())
+    digest.update(repr((__version__, dataclasses.astuple(settings))).encode())
+    return digest.hexdigest()
+
+
+def _sizes(problem: Problem, base: Fit, settings: Settings) -> dict[str, float]:
+    """Amount, in nominal sizes, of every effect that these logs can show: the nominal one, or what is just visible."""
+    found = score(problem, base, signatures(problem, base, list(problem.candidates)), 2, settings.seed)
+    sizes = {}
+    for s in found:
+        if s.length < SEPARABLE:
+            continue
+        low, high = problem.bounds(problem.candidates[s.effect])
+        wanted = max(1.0, _MARGIN * SEPARABLE / s.length)
+        sizes[s.effect] = float(np.clip(wanted, 0.0, np.min(np.maximum(high, -low))))
+    return sizes
+
+
+def _case(problem: Problem, base: Fit, sizes: dict[str, float], number: int, settings: Settings) -> dict[str, Any]:
+    rng = np.random.default_rng([settings.seed, number])
+    truth, u, amount = NULL, base.u.copy(), 0.0
+    if number % 2 and sizes:
+        names = sorted(sizes)
+        truth = names[int(rng.integers(len(names)))]
+        amount = sizes[truth]
+        places = [i for i in problem.candidates[truth] if problem.coordinates[i].amplitude]
+        low, high = problem.bounds(np.array(places))
+        sign = rng.choice([-1.0, 1.0], size=len(places))
+        u[places] = np.clip(np.where((sign > 0.0) & (high > 0.0) | (low >= 0.0), amount, -amount), low, high)
+    clean = problem.predict(u[None])[0]
+    case: dict[str, Any] = {"truth": truth, "amount": amount}
+    if not np.isfinite(clean).all():
+        return {**case, "verdict": "", "effects": [], "outcome": "diverged"}
+    simulated = copy.copy(problem)
+    measured = clean + draw_noise(problem.observations, rng)
+    simulated.observations = dataclasses.replace(problem.observations, value=measured)
+    diagnosis, _ = diagnose(simulated, settings)
+    return {**case, "verdict": diagnosis.verdict.label, "effects": list(diagnosis.effects),
+            "outcome": _outcome(truth, diagnosis.verdict, diagnosis.effects)}  # fmt: skip
+
+
+def draw_noise(observations: Observations, rng: np.random.Generator) -> np.ndarray:
+    """(n,) noise of the stated kind: white, and Ornstein-Uhlenbeck where a series has a coloured part."""
+    out = np.empty(len(observations))
+    for s in observations.series:
+        part = slice(s.start, s.stop)
+        out[part] = s.white * rng.standard_normal(s.stop - s.start)
+        if s.time is None or s.coloured <= 0.0:
+            continue
+        slow = np.empty(s.stop - s.start)
+        slow[0] = rng.standard_normal()
+        keep = np.exp(-np.diff(s.time) / max(s.correlation_time, 1e-9))
+        for i, k in enumerate(keep):
+            slow[i + 1] = k * slow[i] + np.sqrt(1.0 - k**2) * rng.standard_normal()
+        out[part] += s.coloured * slow
+    return out
+
+
+def _outcome(truth: str, verdict: Verdict, effects: tuple[str, ...]) -> str:
+    if verdict is Verdict.BAD_FIT:
+        return "no certificate"
+    if truth == NULL:
+        return "silent, rightly" if verdict is Verdict.NOISE_ONLY else "false alarm"
+    if verdict is Verdict.KNOWN and effects == (truth,):
+        return "named"
+    if verdict is Verdict.KNOWN_CLASS and truth in effects:
+        return "in its class"
+    if verdict is Verdict.NOISE_ONLY:
+        return "missed"
+    return "unknown" if verdict is Verdict.UNKNOWN else "wrongly named"
+
+
+def wilson(count: int, of: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's 95 % interval of a rate (Wilson 1927)."""
+    if of == 0:
+        return 0.0, 1.0
+    p = count / of
+    middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
+    half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
+    return float(max(0.0, middle - half)), float(min(1.0, middle + half))
+
+
+def _summary(cases: list[dict[str, Any]]) -> Audit:
+    used = [c for c in cases if c["outcome"] != "diverged"]
+    nulls = [c for c in used if c["truth"] == NULL]
+    singles = [c for c in used if c["truth"] != NULL]
+    rates = {}
+    for label, group, outcomes in (
+        ("false alarms", nulls, ("false alarm",)),
+        ("right", singles, ("named", "in its class")),
+        ("wrongly named", singles, ("wrongly named",)),
+        ("missed", singles, ("missed",)),
+        ("unknown", singles, ("unknown",)),
+        ("no certificate", used, ("no certificate",)),
+    ):
+        count = sum(c["outcome"] in outcomes for c in group)
+        low, high = wilson(count, len(group))
+        rates[label] = {"count": count, "of": len(group), "low": low, "high": high}
+
+    def said(label: str) -> str:
+        r = rates[label]
+        return f"{r['count']} of {r['of']} (95 % interval {100 * r['low']:.0f} to {100 * r['high']:.0f} %)"
+
+    sentence = (
+        f"On simulated logs like these, false alarms: {said('false alarms')}; single effects named, or put into their "
+        f"class: {said('right')}; wrongly named: {said('wrongly named')}."
+    )
+    return Audit(tuple(cases), rates, sentence)

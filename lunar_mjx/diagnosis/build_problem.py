@@ -1,0 +1,82 @@
+"""Makes the problem of a run: its logs, its model, and every effect that might be missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lunar_mjx.diagnosis.drives.problem import DriveProblem
+from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.tables.problem import TableProblem
+from lunar_mjx.effects import catalogue
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.errors import UserError
+from lunar_mjx.inference.fitting import Progress, silent
+from lunar_mjx.inference.problem import Problem
+from lunar_mjx.logs import SteadyLog
+from lunar_mjx.wheel_bed.bed import EARTH_GRAVITY, WheelBed
+
+NO_CANDIDATE = frozenset({
+    "parking_brake", "payload", "tether", "hard_surface", "surface_type", "soil_gradient", "boulders",
+    "engine_friction", "joint_limits", "chassis_contact", "encoder_quantisation",
+})  # fmt: skip
+"""Effects that are an arrangement of the test which its user knows, an engine's substitute for physics, or without a
+derivative: they are never proposed as missing."""
+
+FINER_FORMS = frozenset({"slide_softening", "side_entry", "side_exit", "shear_softening", "skid_shear",
+                          "side_wall"})  # fmt: skip
+"""Finer forms of slip_sinkage, angle_sinkage, bulldozing: only a bed that imposes slip and slip angle, against a model
+that integrates the stress, can tell them from these; elsewhere they would only be their twins."""
+
+
+def candidate_effects(run: Run) -> dict[str, Effect]:
+    """Every effect that may be proposed: the catalogue's, and the user's own."""
+    found = {n: e for n, e in catalogue.CATALOGUE.items() if n not in NO_CANDIDATE}
+    for spec in run.candidates:
+        effect = catalogue.get(spec)
+        found[effect.name] = effect
+    return found
+
+
+def build_problem(
+    run: Run, logs: Sequence[Any] | None = None, only: Sequence[str] | None = None, progress: Progress = silent
+) -> Problem:
+    """The problem of a run.
+
+    Args:
+      run: logs and model.
+      logs: the run's logs, if they are read already.
+      only: candidates to include; all if None.
+      progress: told of simulations.
+
+    Raises:
+      UserError: a candidate that does not exist, or logs that do not fit the model.
+    """
+    logs = run.campaign() if logs is None else logs
+    candidates = candidate_effects(run)
+    if only is not None:
+        for name in only:
+            if name not in candidates:
+                raise UserError(f"effect {name!r} is no candidate here; use one of {', '.join(candidates)}.")
+        candidates = {n: candidates[n] for n in only}
+    finer = isinstance(logs[0], SteadyLog) and "stress_integral" in run.model.effect_names
+    if only is None and not finer:
+        candidates = {n: e for n, e in candidates.items() if n not in FINER_FORMS}
+    if isinstance(logs[0], SteadyLog):
+        return table_problem(run, logs, candidates)
+    return DriveProblem(logs, run.model, candidates, run.splits, progress=progress)  # type: ignore[arg-type]
+
+
+def table_problem(run: Run, logs: Sequence[SteadyLog], candidates: Mapping[str, Effect]) -> TableProblem:
+    """The problem of steady-state tables: the model's wheel under the test bed's gravity."""
+    gravities = {float(log.gravity_m_s2 or EARTH_GRAVITY) for log in logs}
+    if len(gravities) > 1:
+        raise UserError(f"{logs[0].folder}: tables of different gravity do not go into one run; compare them apart.")
+    model = run.model
+    bed = WheelBed(model.effects, {name: _single(values) for name, values in model.parameters.items()}, gravities.pop())
+    return TableProblem(logs, bed, candidates, run.splits, extra_sigma=run.discrepancy)
+
+
+def _single(values: Mapping[str, Any]) -> dict[str, float]:
+    """One value per parameter: the first where a model has one per wheel or joint."""
+    return {k: float(v[0]) if isinstance(v, tuple | list) else v for k, v in values.items()}

@@ -1,0 +1,32 @@
+"""Which effects can be candidates beside those that a model holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.inference.problem import NotTested
+
+
+def usable(
+    effects: Iterable[Effect], candidates: Mapping[str, Effect], unfit: Callable[[str, Effect], str]
+) -> tuple[dict[str, Effect], tuple[NotTested, ...]]:
+    """Candidates that can enter, and those that cannot; what the model holds is neither.
+
+    Args:
+      effects: of the model. candidates: by name. unfit: why a candidate is none for such measurements, or "".
+    """
+    present = {e.name for e in effects}
+    found, refused = {}, []
+    for name, effect in candidates.items():
+        if name in present:
+            continue
+        replaced = ", ".join(sorted(present & set(effect.replaces)))
+        reason = unfit(name, effect) or (f"would replace {replaced}" if replaced else "")
+        if not reason and all(p.null is None for p in effect.parameters.values()):
+            reason = "has no null value"
+        if reason:
+            refused.append(NotTested(name, reason))
+        else:
+            found[name] = effect
+    return found, tuple(refused)

@@ -1,0 +1,1 @@
+"""Logs of whole rovers as a problem of inference."""

@@ -1,0 +1,59 @@
+"""What a refit of drives may move of a model, and which effects may be missing in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lunar_mjx.diagnosis.effect_coordinates import default_coordinate
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.effects.presets import PRESETS
+from lunar_mjx.inference.coordinates import Coordinate
+from lunar_mjx.model import Model
+
+BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "soil": {
+        "k_phi": (0.3, 2.0), "n": (0.1, 2.0), "cohesion": (0.3, 2.0), "friction_angle": (0.1, 2.0),
+        "shear_modulus_x": (0.3, 2.0), "shear_modulus_y": (0.3, 2.0),
+    },
+    "penalty_contact": {"stiffness": (0.3, 2.0)},
+    "motor": {
+        "resistance": (0.05, 2.0), "torque_constant": (0.05, 2.0), "gear_efficiency": (0.1, 1.0),
+        "winding_capacity": (0.2, 2.0), "housing_capacity": (0.2, 2.0), "R_th1": (0.2, 2.0),
+    },
+    "housing_convection": {"R_th2": (0.3, 2.0)},
+    "housing_conduction": {"conductance": (0.3, 2.0)},
+}  # fmt: skip
+"""What a refit moves, by effect and parameter: scale as a share of the value, and prior standard deviation in scales:
+how well soil and motor are known before a drive."""
+
+NOT_MISSING = frozenset(
+    {"parking_brake", "payload", "tether", "hard_surface", "surface_type", "soil_gradient", "boulders"}
+)
+"""Effects that describe an arrangement of the test, which its user knows, and are never candidates by themselves."""
+
+
+def unfit(name: str, effect: Effect) -> str:
+    """Why an effect is no candidate for drives, or ""."""
+    del effect
+    return "describes the arrangement of a test, which its user knows" if name in NOT_MISSING else ""
+
+
+def baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[Coordinate]:
+    """Baseline parameters; one that differs between wheels or joints moves by a common factor."""
+    found = []
+    for effect in model.effects:
+        for name, (relative, prior) in baseline.get(effect.name, {}).items():
+            value = np.atleast_1d(np.asarray(model.parameters[effect.name][name], float))
+            p = effect.parameters[name]
+            if np.all(value > 0.0):
+                low, high = max(p.bounds[0] / value.min(), 1e-3), min(p.bounds[1] / value.max(), 1e3)
+                found.append(Coordinate(effect.name, name, 1.0, relative, low, high, True, prior, factor=True))
+        # Effects beyond the preset were added to explain measurements; they are refitted with the rest.
+        if effect.name not in PRESETS.get(model.preset, ()) and effect.name not in NOT_MISSING:
+            for name, p in effect.parameters.items():
+                value = np.asarray(model.parameters[effect.name][name], float)
+                if p.null is not None and value.ndim == 0:
+                    found.append(default_coordinate(effect, name, float(value), 0.3, 10.0))
+    return found

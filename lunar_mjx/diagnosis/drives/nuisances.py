@@ -1,0 +1,108 @@
+"""What nobody knows exactly of a log: its start, the zero of its encoders, how its time compares with finite steps."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lunar_mjx.diagnosis.drives.log_run import SETTLE, STOOD
+from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
+from lunar_mjx.inference.observations import Observations, Series
+
+if TYPE_CHECKING:
+    from lunar_mjx.diagnosis.drives.rollouts import LogRun
+
+STEP_ERROR = "step_error"
+"""Name of the nuisance by which logs differ from what steps of finite length predict."""
+_COUNTED = re.compile(r"position|angle|yaw")
+"""What another pose at the start moves as a whole."""
+_ENCODER = re.compile(r"joint_\w*drive_angle_rad")
+_START = {"x": (0.01, 1.0), "y": (0.01, 1.0), "yaw": (0.01, 0.6), "temperature": (1.0, 100.0)}
+"""Scale and reach of what is measured with noise at the start, m, rad, K."""
+_STOOD_SCALE, _STOOD_MOST = 0.5, 6.0
+"""Of the time for which a rover had stood, s."""
+STANDING = (SETTLE, 3.0 * SETTLE)
+"""Times of standing that are compared, s."""
+_SHOWS = 500.0
+"""Squared difference between them, in sigma, from which the time is fitted. Where it matters less, its jumps (wheels at
+rest that change the sign of their slip) cost descents more than it gives: four drives of VIPER on a slope show
+thousands, six of LUVMI-X some fifty."""
+
+
+def is_encoder(series: Series) -> bool:
+    """Whether a channel counts a wheel's turns from a zero of its own."""
+    return _ENCODER.fullmatch(series.channel) is not None
+
+
+def standing_shows(change: np.ndarray, number: int, observations: Observations) -> bool:
+    """Whether a change (n,) of the predictions by another time of standing is more than another pose at the start."""
+    total, sigma = 0.0, observations.sigma()
+    for s in observations.series:
+        if s.log == number:
+            own = change[s.start : s.stop] / sigma[s.start : s.stop]
+            total += float(np.sum((own - own.mean() if _COUNTED.search(s.channel) else own) ** 2))
+    return total > _SHOWS
+
+
+def step_error_share() -> Coordinate:
+    """How much of the step's error all logs contain: all where a rover was measured, nothing where steps of the same
+    length recorded it."""
+    return Coordinate(NUISANCE, STEP_ERROR, 0.0, 1.0, -2.0, 2.0, prior=0.5, centre=0.5, physical=True)
+
+
+def nuisances(number: int, run: LogRun, observations: Observations, stood: bool) -> list[Coordinate]:
+    """Coordinates of one log's nuisances; those of `is_linear` need no simulation.
+
+    `stood` tells whether the time for which the rover had stood is one.
+    """
+    found = [
+        Coordinate(NUISANCE, name, run.start[name], _START[name][0], run.start[name] - _START[name][1],
+                   run.start[name] + _START[name][1], prior=10.0, log_index=number)
+        for name in run.unknown if name in _START
+    ]  # fmt: skip
+    if stood:
+        found.append(Coordinate(NUISANCE, STOOD, run.start[STOOD], _STOOD_SCALE, SETTLE, _STOOD_MOST, prior=10.0,
+                                physical=True, log_index=number))  # fmt: skip
+    for s in observations.series:
+        if s.log == number and is_encoder(s):
+            first = float(np.mean(observations.value[s.start : s.stop][:5]))
+            scale = 3.0 * float(observations.sigma()[s.start])
+            found.append(Coordinate(NUISANCE, s.channel, first, scale, first - 30.0 * scale, first + 30.0 * scale,
+                                    prior=10.0, log_index=number))  # fmt: skip
+    return found
+
+
+def is_linear(c: Coordinate) -> bool:
+    """Whether a coordinate adds a known vector to the predictions, whatever the others are."""
+    return c.nuisance and (c.name == STEP_ERROR or _ENCODER.fullmatch(c.name) is not None)
+
+
+def direction(c: Coordinate, observations: Observations, step_error: np.ndarray) -> np.ndarray:
+    """(n,) what one unit of a linear nuisance's value adds to the predictions."""
+    out = np.zeros(len(observations))
+    for s in observations.series:
+        if c.log_index in (s.log, -1):
+            part = slice(s.start, s.stop)
+            if c.name == STEP_ERROR:
+                out[part] = step_error[part]
+            elif c.name == s.channel:
+                out[part] = 1.0
+    return out
+
+
+def unabsorbed(change: np.ndarray, step_error: np.ndarray, observations: Observations) -> np.ndarray:
+    """(n,) what of a change of the predictions some amount of the step's error does not take up, by the fitted logs."""
+    keep = observations.in_split("fit")
+    step, moved = (observations.whiten(v)[keep] for v in (step_error, change))
+    size = float(step @ step)
+    return change - (float(step @ moved) / size if size > 0.0 else 0.0) * step_error
+
+
+def from_first(predicted: np.ndarray, observations: Observations) -> np.ndarray:
+    """Predictions (..., n) with the angles of encoders counted from their first sample."""
+    for s in observations.series:
+        if is_encoder(s):
+            predicted[..., s.start : s.stop] -= predicted[..., s.start : s.start + 1]
+    return predicted

@@ -1,0 +1,228 @@
+"""The compiled simulation of a chunk of rovers that differ in parameters, starts, commands and ground."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.diagnosis.drives.log_run import SETTLE, STOOD, LogRun
+from lunar_mjx.diagnosis.drives.measured_states import begin_at, measured_states
+from lunar_mjx.dynamics import System, build
+from lunar_mjx.dynamics.signals import joint_channels, measure
+from lunar_mjx.dynamics.state import Params
+from lunar_mjx.inference.coordinates import NUISANCE
+from lunar_mjx.model import Model
+
+if TYPE_CHECKING:
+    from lunar_mjx.logs import Log
+
+Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
+"""(rows,) values by effect, parameter, log (-1 for all) and whether they are factors."""
+
+PIECE = 0.5
+"""Length of the pieces in which logs are simulated, s. A time of standing between two of them is interpolated."""
+WINDOW = 4
+"""Pieces of a window that begins at the measured state: short beside a drive, long beside a wheel's time to settle."""
+_FEWEST = 64
+"""Rovers that come back from the device at least; else the next power of two, for few programs."""
+
+
+_NUMBERS = itertools.count()
+
+
+class Program:
+    """One compiled simulation of a chunk of rovers, from rest to the measured channels."""
+
+    def __init__(
+        self, model: Model, every: int, channels: tuple[str, ...], imu: tuple[float, float, float], engine: str
+    ):
+        self.model, self.every, self.channels, self.imu = model, every, channels, imu
+        self.number = next(_NUMBERS)
+        with jax.enable_x64(True):
+            self.system: System = build(model, engine)
+        # Pieces of one length, the first of which settle the rover: one program serves logs of any length.
+        self.segment = math.ceil(PIECE / (every * self.system.dt) - 1e-9)
+        self.compiled = False
+        self._reset = jax.jit(self._reset_all)
+        self._drive = jax.jit(self._drive_all, static_argnames="shared")
+        self._measure = jax.jit(self._measure_all, static_argnames="shared")
+        self._begin_anew = jax.jit(self._begin_all_anew, static_argnames="shared")
+
+    def length(self, commands: int) -> int:
+        """Number of commands rounded up to whole pieces."""
+        return self.segment * math.ceil(commands / self.segment)
+
+    def _axes(self, params: Params, shared: bool) -> Any:
+        axes = jax.tree.map(lambda _: 0, params)
+        return dataclasses.replace(axes, terrain=None) if shared else axes
+
+    def _reset_all(self, params: Params, start: Mapping[str, Any], terrain: Any, log: Any) -> tuple[Params, Any]:
+        """Parameters with their ground, and states at the start."""
+        shared = log is None
+        if not shared:
+            terrain = jax.tree.map(lambda a: a[log], terrain)
+        params = dataclasses.replace(params, terrain=terrain)
+        one = lambda p, s: self.system.reset(p, s["x"], s["y"], s["yaw"], s["temperature"])  # noqa: E731
+        return params, jax.vmap(one, (self._axes(params, shared), 0))(params, start)
+
+    def _drive_all(self, params: Params, state: Any, commands: Any, shared: bool) -> tuple[Any, Any]:
+        return self.system.rollout_batch(
+            params, state, commands, self.every, self._axes(params, shared), chunk=commands.shape[0], one_body=True
+        )
+
+    def _measure_all(self, params: Params, pieces: Sequence[Any], shared: bool) -> Any:
+        seen = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *pieces)
+
+        def channels(params: Params, seen: Any) -> Any:
+            found = measure(self.system, seen, params, self.imu if any(self.imu) else None).channels
+            return jnp.stack([found[c] for c in self.channels])
+
+        return jax.vmap(channels, (self._axes(params, shared), 0))(params, seen)
+
+    def _begin_all_anew(self, params: Params, state: Any, measured: Mapping[str, Any], shared: bool) -> Any:
+        return jax.vmap(begin_at, (self._axes(params, shared), 0, 0))(params, state, measured)
+
+    def __call__(
+        self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int, windows: bool = False
+    ) -> np.ndarray:
+        """(rovers, channels, time) of rovers by their log (place in `logs`) and their row of `values`.
+
+        The first `count` are wanted, and few beyond them come back from the device. With `windows` rovers begin anew at
+        the measured state after every few pieces.
+        """
+        params, start = logs.rovers(log, row, values)
+        commands = logs.commands[log]
+        self.compiled = True
+        with jax.enable_x64(True):
+            own, shared = (None, True) if logs.shared else (log, False)
+            full, state = self._reset(params, start, logs.terrain, own)
+            stood = self._stand(full, state, np.zeros_like(commands[:, : self.segment]), start[STOOD], shared)
+            # The clock and the heat begin with the log.
+            state = dataclasses.replace(stood, step=state.step, temperature=state.temperature)
+            seen = []
+            for at in range(0, commands.shape[1], self.segment):
+                if windows and at and at % (WINDOW * self.segment) == 0:
+                    edge = {name: a[log, at // self.segment] for name, a in logs.measured.items()}
+                    state = self._begin_anew(full, state, edge, shared=shared)
+                state, telemetry = self._drive(full, state, commands[:, at : at + self.segment], shared=shared)
+                seen.append(telemetry)
+            found = self._measure(full, seen, shared=shared)
+            size = max(_FEWEST, 1 << (count - 1).bit_length())
+            return np.asarray(found if size >= len(log) else _first(found, size))
+
+    def _stand(self, params: Params, state: Any, still: np.ndarray, stood: np.ndarray, shared: bool) -> Any:
+        """Rovers that have stood for their own times (rovers,), s, at least `SETTLE`."""
+        pieces = stood / (self.segment * self.every * self.system.dt)
+        first = round(SETTLE / PIECE)
+        for _ in range(first):
+            state, _ = self._drive(params, state, still, shared=shared)
+        kept, now = state, state
+        for k in range(first, math.ceil(float(np.max(pieces)) - 1e-12)):
+            after, _ = self._drive(params, now, still, shared=shared)
+            kept, now = _between(kept, now, after, np.clip(pieces - k, 0.0, 1.0)), after
+        return kept
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _first(found: Any, size: int) -> Any:
+    return found[:size]
+
+
+@jax.jit
+def _between(kept: Any, before: Any, after: Any, share: Any) -> Any:
+    """`before` and `after` in a share (rovers,) of each; `kept` where the share is nothing."""
+
+    def blend(kept: Any, before: Any, after: Any) -> Any:
+        part = share.reshape(-1, *[1] * (jnp.ndim(after) - 1))
+        if not jnp.issubdtype(jnp.result_type(after), jnp.floating):
+            return jnp.where(part > 0.0, after, kept)
+        return jnp.where(part == 1.0, after, jnp.where(part > 0.0, before + part * (after - before), kept))
+
+    return jax.tree.map(blend, kept, before, after)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Logs:
+    """Logs that one program runs, stacked, so that a rover is a pair of indices.
+
+    Attributes:
+      program: which runs them. numbers: of the logs in the campaign.
+      params: with a leading axis of logs, but for the ground. start: (logs,) by name.
+      terrain: the ground, with a leading axis of logs unless `shared` by all of them.
+      commands: (logs, time, joint), the last ones repeated up to whole pieces.
+      logs: as recorded. begin: (logs,) when the simulations begin on their clocks, s.
+    """
+
+    program: Program
+    numbers: tuple[int, ...]
+    params: Params
+    start: Mapping[str, np.ndarray]
+    terrain: Any
+    shared: bool
+    commands: np.ndarray
+    logs: tuple[Log, ...]
+    begin: tuple[float, ...]
+
+    @functools.cached_property
+    def measured(self) -> dict[str, np.ndarray]:
+        """What was measured of the state at the beginning of every piece, (logs, pieces, ...) by name."""
+        program = self.program
+        place = np.arange(0, self.commands.shape[1], program.segment) * program.every * program.system.dt
+        joints = joint_channels(program.model.rover)
+        found = [measured_states(log, joints, begin + place) for log, begin in zip(self.logs, self.begin, strict=True)]
+        return {name: np.stack([f[name] for f in found]) for name in found[0]}
+
+    def rovers(self, log: np.ndarray, row: np.ndarray, values: Rows) -> tuple[Params, dict[str, np.ndarray]]:
+        """Parameters (but for the ground) and starts of rovers: the logs' conditions with rows of values put in."""
+        params = jax.tree.map(lambda a: a[log], self.params)
+        start = {name: column[log].copy() for name, column in self.start.items()}
+        number = np.asarray(self.numbers)[log]
+        for (effect, name, own, factor), column in values.items():
+            value = column[row]
+            if effect == NUISANCE:
+                if name in start:
+                    start[name] = np.where(number == own, value, start[name])
+            elif effect in params.effects:  # else a candidate at its null, which this program does without
+                old = params.effects[effect][name]
+                spread = value.reshape(-1, *[1] * (old.ndim - 1))
+                params.effects[effect][name] = old * spread if factor else np.broadcast_to(spread, old.shape)
+        return params, start
+
+
+def stack_logs(
+    program: Program, numbers: Sequence[int], logs: Sequence[Log], runs: Sequence[LogRun], params: Sequence[Params]
+) -> Logs:
+    """Makes logs of one program and one length ready."""
+    length = program.length(max(len(r.commands) for r in runs))
+    terrains = [p.terrain for p in params]
+    leaves = [jax.tree.leaves(t) for t in terrains]
+    shared = all(np.array_equal(a, b) for other in leaves[1:] for a, b in zip(leaves[0], other, strict=True))
+    bare = [dataclasses.replace(p, terrain=None) for p in params]  # type: ignore[arg-type]
+    with jax.enable_x64(True):
+        ground = terrains[0] if shared else jax.tree.map(lambda *a: np.stack(a), *terrains)
+        ground = jax.device_put(ground)
+    return Logs(
+        program=program, numbers=tuple(numbers), params=jax.tree.map(lambda *a: np.stack(a), *bare),
+        start={n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature", STOOD)},
+        terrain=ground, shared=shared,
+        commands=np.stack([_padded(r.commands, length) for r in runs]),
+        logs=tuple(logs), begin=tuple(r.begin for r in runs),
+    )  # fmt: skip
+
+
+def cores() -> int:
+    """Cores that this process may use, which may be fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _padded(commands: np.ndarray, length: int) -> np.ndarray:
+    return np.concatenate([commands, np.repeat(commands[-1:], length - len(commands), axis=0)])

@@ -1,0 +1,251 @@
+"""Simulating many hypotheses of many logs at once: rows of parameters times logs, in chunks of one size."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from lunar_mjx.diagnosis.drives.log_run import LogRun, log_run
+from lunar_mjx.diagnosis.drives.program import Logs, Program, Rows, cores, stack_logs
+from lunar_mjx.diagnosis.drives.simulated_rows import stamp
+from lunar_mjx.dynamics.state import Ambient, Params
+from lunar_mjx.effects.sensor.channels import EULER
+from lunar_mjx.inference.fitting import Progress
+from lunar_mjx.inference.observations import Observations
+from lunar_mjx.model import Model
+
+if TYPE_CHECKING:
+    from lunar_mjx.logs import Log
+
+CHUNK = {"cpu": 16, "gpu": 2048}
+"""Rovers simulated at once."""
+
+_PROGRAMS: dict[Any, Program] = {}
+"""Programs take every number as an argument, so that campaigns of one rover share them; a program keeps its model, so
+that no other effect takes the identity of one of its own."""
+_MOST_PROGRAMS = 32
+
+
+class Bench:
+    """All logs of a campaign, grouped by what one program can run.
+
+    Args:
+      model: under no log's conditions. logs: of one rover. chunk: rovers simulated at once. engine: of the dynamics.
+      like: bench of a model with the same time step, whose commands and starts are the same.
+    """
+
+    def __init__(self, model: Model, logs: Sequence[Log], chunk: int | None, engine: str, like: Bench | None = None):
+        self.logs, self.model, self.engine = tuple(logs), model, engine
+        self.chunk = chunk or CHUNK.get(jax.default_backend(), 64)
+        from lunar_mjx.logs import log_model
+
+        if like is None:
+            runs = [log_run(log, model) for log in logs]
+        else:
+            runs = [dataclasses.replace(r, model=log_model(log, model)) for r, log in zip(like.runs, logs, strict=True)]
+        self.runs = _alike(runs)
+        self.params = [_params(run.model) for run in self.runs]
+        self._stacked: list[Logs] | None = None
+
+    def halved(self) -> Bench:
+        """The same with half the time step."""
+        other = Bench.__new__(Bench)
+        other.logs, other.engine, other.chunk = self.logs, self.engine, self.chunk
+        other.model = self.model.replace(timestep=0.5 * self.model.timestep)
+        other.runs = [
+            dataclasses.replace(r, model=r.model.replace(timestep=0.5 * r.model.timestep), every=2 * r.every)
+            for r in self.runs
+        ]
+        other.params, other._stacked = self.params, None
+        return other
+
+    @functools.cached_property
+    def stamp(self) -> tuple[Any, ...]:
+        """What all that it simulates depends on beside the rows: programs, and what the logs put into them."""
+        given = [(r.commands, dict(r.start), r.begin, r.end, r.every, r.imu_position) for r in self.runs]
+        return *(logs.program.number for logs in self._groups()), stamp(self.params, given)
+
+    def channels(self, number: int) -> list[str]:
+        """Channels of a log that the model gives, in a fixed order."""
+        known = _modelled(self.runs[number].model)
+        return [c for c in self.logs[number].channel_names if c in known and not c.startswith("quaternion")]
+
+    def _program(self, number: int) -> Program:
+        run = self.runs[number]
+        wanted = tuple(sorted({c for n in range(len(self.runs)) for c in self.channels(n)}))
+        shapes = tuple((a.shape, str(a.dtype)) for a in jax.tree.leaves(self.params[number].terrain))
+        modes, gains = (tuple(sorted(d.items())) for d in (run.model.modes, run.model.gains))
+        model = run.model
+        key = (
+            str(model.rover.folder), model.timestep, model.thermal_integrator, tuple(id(e) for e in model.effects),
+            self.engine, modes, gains, shapes, run.every, run.imu_position, wanted,
+        )  # fmt: skip
+        if key not in _PROGRAMS:
+            while len(_PROGRAMS) >= _MOST_PROGRAMS:
+                _PROGRAMS.pop(next(iter(_PROGRAMS)))
+            _PROGRAMS[key] = Program(run.model, run.every, wanted, run.imu_position, self.engine)
+        return _PROGRAMS[key]
+
+    def _groups(self) -> list[Logs]:
+        """Logs by the program and the length that they share."""
+        if self._stacked is None:
+            groups: dict[Any, list[int]] = {}
+            for number, run in enumerate(self.runs):
+                program = self._program(number)
+                groups.setdefault((id(program), program.length(len(run.commands))), []).append(number)
+            self._stacked = []
+            for n in groups.values():
+                logs, runs, params = [self.logs[i] for i in n], [self.runs[i] for i in n], [self.params[i] for i in n]
+                self._stacked.append(stack_logs(self._program(n[0]), n, logs, runs, params))
+        return self._stacked
+
+    def run(
+        self, rows: int, values: Rows, observations: Observations, progress: Progress, windows: bool = False
+    ) -> Iterator[tuple[int, slice, np.ndarray]]:
+        """Simulates all logs with all rows and yields (log, rows, (rows, samples) of the log's observations).
+
+        With `windows`, drives begin anew at the measured state from time to time.
+        """
+        places = _places(self.runs, observations)
+        done = 0
+        for logs in self._groups():
+            jobs = np.stack(np.meshgrid(np.arange(len(logs.numbers)), np.arange(rows), indexing="ij"), -1).reshape(
+                -1, 2
+            )
+            parts = [jobs[at : at + self.chunk] for at in range(0, len(jobs), self.chunk)]
+            for part, signals in zip(parts, self._signals(logs, parts, values, windows), strict=True):
+                edges = np.searchsorted(part[:, 0], np.arange(len(logs.numbers) + 1))
+                for number, low, high in zip(logs.numbers, edges[:-1], edges[1:], strict=True):
+                    if low < high:
+                        sampled = _sample(signals[low:high], logs.program.channels, places[number], observations.value)
+                        yield number, slice(part[low, 1], part[high - 1, 1] + 1), sampled
+                done += len(part)
+                progress("simulating", done / (rows * len(self.runs)))
+
+    def _signals(self, logs: Logs, parts: Sequence[np.ndarray], values: Rows, windows: bool) -> Iterator[np.ndarray]:
+        """Signals (rovers, channels, time) of every part in turn.
+
+        On a CPU one part per core at a time, as XLA runs a loop on one core.
+        """
+
+        def one(part: np.ndarray) -> np.ndarray:
+            full = np.concatenate([part, np.repeat(part[-1:], self.chunk - len(part), axis=0)])
+            return logs.program(logs, full[:, 0], full[:, 1], values, len(part), windows)
+
+        workers = cores() if jax.default_backend() == "cpu" else 1
+        if workers < 2 or len(parts) < 2 or not logs.program.compiled:
+            yield one(parts[0])
+            parts = parts[1:]
+        if parts:
+            with concurrent.futures.ThreadPoolExecutor(max(workers, 1)) as pool:
+                yield from pool.map(one, parts)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Place:
+    """Series of one log that are sampled at the same times.
+
+    Attributes:
+      channels: their names. euler: whether they are angles that jump.
+      low, share: (samples,) simulated sample before each time, and how far on towards the next one it is.
+      begin, parts: where the log's observations begin, and (start, stop) of each series among all observations.
+    """
+
+    channels: list[str]
+    euler: bool
+    low: np.ndarray
+    share: np.ndarray
+    begin: int
+    parts: list[tuple[int, int]]
+
+
+def _places(runs: Sequence[LogRun], observations: Observations) -> list[list[_Place]]:
+    """By log, where its observations lie among the simulated samples."""
+    found: list[dict[tuple[bytes, bool], _Place]] = [{} for _ in runs]
+    begin: dict[int, int] = {}
+    for s in observations.series:
+        assert s.time is not None
+        run, key = runs[s.log], (s.time.tobytes(), s.channel in EULER)
+        begin.setdefault(s.log, s.start)
+        if key not in found[s.log]:
+            # a logger's clock that ticks with the simulation's, but for rounding, meets samples and nothing between
+            place = np.round((s.time - run.begin) / (run.every * run.model.timestep), 9)
+            low = np.clip(np.floor(place).astype(int), 0, len(run.commands) - 1)
+            found[s.log][key] = _Place([], key[1], low, place - low, begin[s.log], [])
+        found[s.log][key].channels.append(s.channel)
+        found[s.log][key].parts.append((s.start, s.stop))
+    return [list(groups.values()) for groups in found]
+
+
+def _sample(signals: np.ndarray, names: Sequence[str], places: Sequence[_Place], measured: np.ndarray) -> np.ndarray:
+    """(rovers, samples) of one log's observations from its (rovers, channels, time) signals."""
+    count = sum(len(p.low) * len(p.channels) for p in places)
+    out = np.empty((len(signals), count))
+    for p in places:
+        at, after = _run_of(p.low), _run_of(np.minimum(p.low + 1, signals.shape[2] - 1))
+        for channel, (start, stop) in zip(p.channels, p.parts, strict=True):
+            one = signals[:, names.index(channel)]
+            if p.euler:
+                one = np.rad2deg(np.unwrap(np.deg2rad(one), axis=1))
+            one = one[:, at] * (1.0 - p.share) + one[:, after] * p.share if np.any(p.share) else one[:, at]
+            if p.euler:
+                one = measured[start:stop] + (one - measured[start:stop] + 180.0) % 360.0 - 180.0
+            out[:, start - p.begin : stop - p.begin] = one
+    return out
+
+
+def _run_of(places: np.ndarray) -> np.ndarray | slice:
+    """Places as a slice, which copies nothing, where they follow each other."""
+    first, last = int(places[0]), int(places[-1])
+    return slice(first, last + 1) if np.array_equal(places, np.arange(first, last + 1)) else places
+
+
+def _alike(runs: Sequence[LogRun]) -> list[LogRun]:
+    """Runs whose models all hold what the conditions of some log add, at its null elsewhere: one program for all."""
+    extra = {e.name: e for r in runs for e in r.model.effects if any(e.name not in o.model.effect_names for o in runs)}
+    out = []
+    for run in runs:
+        model = run.model
+        for name, effect in extra.items():
+            if name not in model.effect_names and any(p.null is not None for p in effect.parameters.values()):
+                model = model.add(effect, "criticism", **effect.null())
+        out.append(dataclasses.replace(run, model=model))
+    return out
+
+
+def _params(model: Model) -> Params:
+    """As `default_params`, in NumPy: a thousand single numbers, none of which is worth a way to a GPU and back.
+
+    The terrain has no name, which would make programs of their own.
+    """
+    effects = {e.name: {k: np.asarray(v, float) for k, v in model.parameters[e.name].items()} for e in model.effects}
+    terrain = jax.tree.map(_array, dataclasses.replace(model.terrain, name=""))
+    return Params(np.asarray(model.gravity, float), Ambient(*(np.asarray(v, float) for v in model.ambient)), effects,
+                  terrain)  # fmt: skip
+
+
+def _array(leaf: Any) -> np.ndarray:
+    array = np.asarray(leaf)
+    return array.astype(float) if np.issubdtype(array.dtype, np.floating) else array
+
+
+def _modelled(model: Model) -> frozenset[str]:
+    from lunar_mjx.dynamics.signals import joint_channels
+
+    joints, corners = joint_channels(model.rover), [w.corner for w in model.rover.wheels]
+    names = [f"position_{a}_m" for a in "xyz"]
+    names += [f"{f}_velocity_{a}_m_s" for f in ("world", "body") for a in "xyz"]
+    names += [*EULER, *(f"gyro_{a}_rad_s" for a in "xyz"), *(f"accelerometer_{a}_m_s2" for a in "xyz")]
+    for j in joints:
+        names += [f"joint_{j}_angle_rad", f"joint_{j}_speed_rad_s", f"motor_{j}_torque_Nm", f"motor_{j}_current_A"]
+        names += [f"motor_{j}_voltage_V", f"winding_{j}_temperature_degC", f"housing_{j}_temperature_degC"]
+    for c in corners:
+        names += [f"wheel_{c}_sinkage_m", f"wheel_{c}_slip_ratio"]
+        names += [f"wheel_{c}_force_{a}_N" for a in "xyz"] + [f"wheel_{c}_moment_{a}_Nm" for a in "xyz"]
+    return frozenset(names)

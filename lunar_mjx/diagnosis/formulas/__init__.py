@@ -1,0 +1,1 @@
+"""Formulas that might be missing at a port, searched where no effect of the catalogue is."""

@@ -1,0 +1,288 @@
+"""Effects that nobody listed: formulas at the failing port, scored through the simulator like catalogue effects."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.diagnosis.build_problem import build_problem
+from lunar_mjx.diagnosis.drives.problem import DriveProblem
+from lunar_mjx.diagnosis.formulas.search import PENALTY, Trial, search_formulas
+from lunar_mjx.diagnosis.formulas.slots import WHEEL_PORTS, Slots
+from lunar_mjx.diagnosis.formulas.targets import CONSTANTS
+from lunar_mjx.diagnosis.formulas.terms import SUGGESTED, Term, effect_of, terms, with_amount
+from lunar_mjx.diagnosis.refit import Settings, refit_with
+from lunar_mjx.diagnosis.runs import VERDICT_FILE, Run, load_run
+from lunar_mjx.diagnosis.search import fit_baseline
+from lunar_mjx.diagnosis.tables.problem import TableProblem
+from lunar_mjx.effects.base import PORTS
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.inference.fit_store import Memory
+from lunar_mjx.inference.fitting import Fit, Progress, silent
+from lunar_mjx.inference.held_out import errors, gain, noise_test
+from lunar_mjx.inference.problem import Problem
+from lunar_mjx.inference.score import score, signatures
+
+UNKNOWN_FILE = "unknown.json"
+REFITS = 5
+"""Formulas that are suggested; where each is simulated by itself, the best-scored are refitted."""
+LISTED = 100
+"""Scores that are listed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One formula of a suggestion.
+
+    Attributes:
+      port, target: where it acts, on what. formula, latex: the law, its amount called a, as text and for a report.
+      amount, std, unit: its fitted amount. constants: others in it that were fitted, with their units.
+    """
+
+    port: str
+    target: str
+    formula: str
+    latex: str
+    amount: float
+    std: float
+    unit: str
+    constants: dict[str, tuple[float, str]] = dataclasses.field(default_factory=dict)
+
+    def text(self) -> str:
+        """Law and numbers in a line."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        more = "".join(f", {k} = {v:.3g}{'' if u == '1' else ' ' + u}" for k, (v, u) in self.constants.items())
+        return f"{self.target} ({self.port}): {self.formula} with a = {self.amount:.4g} +- {self.std:.1g}{unit}{more}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Suggestion:
+    """A formula, or two together.
+
+    Attributes:
+      port, target, formula: where it acts, on what, and how, in words. parts: the formulas with their numbers.
+      chi2: reduction of chi-square by the refit. held_out_gain, held_out_se: on manoeuvres left out.
+      error: root mean square residual in sigma by split with it. at_noise: whether the residual is at the noise.
+      length: operations and symbols in the formulas.
+    """
+
+    port: str
+    target: str
+    formula: str
+    parts: tuple[Part, ...]
+    chi2: float
+    held_out_gain: float
+    held_out_se: float
+    error: dict[str, float]
+    at_noise: bool
+    length: int
+
+    def pays(self, chi2: float) -> bool:
+        """Whether it earns its place on manoeuvres left out."""
+        return self.held_out_gain > self.held_out_se and self.held_out_gain > 0.5 * chi2
+
+
+def _suggestion(
+    parts: Sequence[Part],
+    chi2: float,
+    gained: tuple[float, float],
+    error: dict[str, float],
+    at_noise: bool,
+    length: int,
+) -> Suggestion:
+    ports, targets = (list(dict.fromkeys(getattr(p, name) for p in parts)) for name in ("port", "target"))
+    formula = "; ".join(p.formula for p in parts)
+    return Suggestion(" and ".join(ports), " and ".join(targets), formula, tuple(parts), chi2, *gained, error, at_noise,
+                      length)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Discovery:
+    """Suggested formulas, best first.
+
+    Attributes:
+      port: where the most evidence is, or that was asked for. suggestions: refitted ones.
+      scored: formulas with their score's chi-square, highest first (tables: the first hundred).
+      ceiling: chi-square that any smooth input at the port explains; None where `why` has not been asked.
+      files: effect files of the best suggestion, one for each of its parts; none where nothing pays on manoeuvres left
+        out. error_before: root mean square residual in sigma by split. number: formulas scored.
+    """
+
+    port: str
+    suggestions: tuple[Suggestion, ...]
+    scored: tuple[tuple[str, float], ...]
+    ceiling: float | None
+    files: tuple[str, ...]
+    error_before: dict[str, float]
+    number: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Numbers and names only."""
+        return dataclasses.asdict(self)
+
+    def text(self) -> str:
+        """A few lines for a terminal."""
+        lines = [f"Port {self.port}; {self.number} formulas scored:"]
+        for i, s in enumerate(self.suggestions, 1):
+            lines.append(f"  {i}. " + "; and ".join(p.text() for p in s.parts))
+            lines.append(f"     chi2 -{s.chi2:.0f}, held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
+                         + (", at the noise" if s.at_noise else ""))  # fmt: skip
+        if self.ceiling is not None:
+            lines.append(f"  any smooth input at this port explains chi2 of at most about {self.ceiling:.0f}")
+        if self.files:
+            runs = ["RUN", *(f"run{k + 2}" for k in range(len(self.files)))]
+            then = ", then ".join(f"lunar-mjx add {a} {file} -o {b}" for a, file, b in zip(runs, self.files, runs[1:],
+                                                                                           strict=False))  # fmt: skip
+            lines.append(f"Effect file: {', '.join(self.files)}; look at it, then: {then}")
+        else:
+            lines.append("No formula pays on manoeuvres left out; none is written.")
+        return "\n".join(lines)
+
+
+def discover(
+    folder: str | Path | Run,
+    port: str | None = None,
+    out: str | Path | None = None,
+    settings: Settings | None = None,
+    progress: Progress = silent,
+) -> Discovery:
+    """Suggests formulas for what is missing at a port, and writes the best as an effect file.
+
+    Args:
+      folder: of the run. port: where to look; if None, where `why` found the most evidence, and for tables at every
+        port of the wheel, because one signal may enter a bed at several.
+      out: effect file to write; `suggested_<port>.py` in the run's folder if None.
+      settings: thresholds. progress: told what is being done.
+
+    Raises:
+      UserError: no such port, or `why` has not been asked and no port is given.
+    """
+    run = folder if isinstance(folder, Run) else load_run(folder)
+    settings = settings or Settings(seed=run.seed)
+    verdict = run.load(VERDICT_FILE) or {}
+    place = (verdict.get("details") or {}).get("localise") or {}
+    asked, port = port, port or place.get("port")
+    if port is None:
+        raise UserError(f"{run.folder}: no port shows anything unknown; run lunar-mjx why first, or give --port.")
+    if port not in PORTS:
+        raise bad_input("unknown", "port", port, "does not exist", f"use one of {', '.join(PORTS)}")
+    if out is not None and Path(out).exists() and not Path(out).read_text(encoding="utf-8").startswith(SUGGESTED):
+        raise bad_input("unknown", "--out", str(out), "exists, and is none of these suggestions", "name another file")
+    plain = build_problem(run, run.campaign(), [], progress)
+    if isinstance(plain, TableProblem) and (asked is None or asked in WHEEL_PORTS):
+        problem, base, found, scored, number = _in_tables(plain, [asked] if asked else WHEEL_PORTS, settings, progress)
+    else:
+        problem, library = with_terms(plain, terms(port, sensor_kinds(plain)), progress)
+        base = fit_baseline(problem, settings, Memory(), progress)
+        found, scored = suggest(problem, base, library, settings, progress)
+        number = len(scored)
+    files: list[str] = []
+    best = next((row for row in found if row[0].pays(settings.chi2)), None)
+    if best is not None:
+        provenance = f"lunar-mjx unknown on {', '.join(p.name for p in run.logs)}"
+        for k, (part, term) in enumerate(zip(best[0].parts, best[1], strict=True)):
+            values = {c: v for c, (v, _) in part.constants.items()}
+            text = functools.partial(with_amount, term, part.amount, provenance=provenance, constants=values)
+            files.append(str(_write(run, Path(out) if out else None, part.port, k, text)))
+    ceiling = max((v for k, v in place.get("ceiling", {}).items() if k.partition(":")[0] == port), default=None)
+    result = Discovery(port, tuple(s for s, _ in found), tuple(scored[:LISTED]), ceiling, tuple(files),
+                       errors(problem, base), number)  # fmt: skip
+    run.save(UNKNOWN_FILE, result.to_dict())
+    return result
+
+
+def _write(run: Run, out: Path | None, port: str, part: int, text: Callable[..., str]) -> Path:
+    """Writes the effect file of a part under a name that the model lacks, beside what other models may refer to."""
+    for k in itertools.count(part + 1):
+        name = f"suggested_{port}" + (f"_{k}" if k > 1 else "")
+        path = run.folder / f"{name}.py" if out is None else out.with_stem(f"{out.stem}_{part + 1}") if part else out
+        made = text(name=name)
+        kept = out is None and path.is_file() and path.read_text(encoding="utf-8") != made
+        if name not in run.model.effect_names and not kept:
+            path.write_text(made, encoding="utf-8")
+            return path
+    raise AssertionError
+
+
+Row = tuple[Suggestion, tuple[Term, ...]]
+"""A suggestion with the terms of its parts."""
+
+
+def _in_tables(
+    plain: TableProblem, ports: Sequence[str], settings: Settings, progress: Progress
+) -> tuple[Problem, Fit, list[Row], list[tuple[str, float]], int]:
+    """Problem, its fit, suggestions, the best scores, and how many formulas of a wheel were scored."""
+    empty = Slots(plain)
+    base = fit_baseline(empty.problem, settings, Memory(), progress)
+    found = search_formulas(empty, base, ports, settings, progress)
+    rows = [_of_trial(t, base) for t in found.trials[:REFITS]]
+    scored = [(f"{c.term.target}: {c.term.formula}", chi2) for c, chi2 in found.scored[:LISTED]]
+    return empty.problem, base, rows, scored, len(found.scored)
+
+
+def _of_trial(trial: Trial, base: Fit) -> Row:
+    problem, parts = trial.slots.problem, []
+    root = np.sqrt(np.diag(trial.fit.covariance(problem)))
+    free = [int(i) for i in trial.fit.free]
+    for k, (choice, scale) in sorted(trial.slots.held.items()):
+        amount, *shape = trial.slots.own(k)
+        constants = {}
+        if choice.shape:
+            nominal, _, unit, *_ = CONSTANTS[choice.shape]
+            constants[choice.shape] = float(nominal * problem.coordinates[shape[0]].value(trial.fit.u[shape[0]])), unit
+        t = choice.term
+        parts.append(Part(t.port, t.target, t.formula, t.latex, float(scale * trial.fit.u[amount]),
+                          float(scale * root[free.index(amount)]), t.unit, constants))  # fmt: skip
+    suggestion = _suggestion(parts, base.chi2 - trial.fit.chi2, (trial.gain, trial.gain_se),
+                             errors(problem, trial.fit), trial.at_noise, trial.length)  # fmt: skip
+    return suggestion, tuple(c.term for _, (c, _) in sorted(trial.slots.held.items()))
+
+
+def suggest(
+    problem: Problem, base: Fit, library: dict[str, Term], settings: Settings, progress: Progress = silent
+) -> tuple[list[Row], list[tuple[str, float]]]:
+    """Scores a library of formulas that are simulated one by one, and refits the best.
+
+    Returns:
+      Suggestions with their terms, best first; and all formulas with the chi-square of their score.
+    """
+    scores = score(problem, base, signatures(problem, base, list(library)), settings.draws, settings.seed)
+    scored = [(f"{library[s.effect].target}: {library[s.effect].formula}", s.chi2) for s in scores]
+    found: list[Row] = []
+    for i, s in enumerate(scores[:REFITS]):
+        progress("refitting formulas", i / REFITS)
+        fitted = refit_with(problem, base, s.effect, settings, Memory())
+        place = next(i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude)
+        c, k = problem.coordinates[place], list(fitted.free).index(place)
+        std = c.std(fitted.u[place], float(fitted.covariance(problem)[k, k]) ** 0.5)
+        t = library[s.effect]
+        part = Part(t.port, t.target, t.formula, t.latex, float(c.value(fitted.u[place])), std, t.unit)
+        suggestion = _suggestion([part], base.chi2 - fitted.chi2, gain(problem, base, fitted), errors(problem, fitted),
+                                 noise_test(problem, fitted).passes, t.length)  # fmt: skip
+        found.append((suggestion, (t,)))
+    found.sort(key=lambda row: -(2.0 * row[0].held_out_gain - PENALTY * row[0].length))
+    return found, scored
+
+
+def with_terms(plain: Problem, library: Sequence[Term], progress: Progress) -> tuple[Problem, dict[str, Term]]:
+    """The problem with formulas as candidates, and the formulas by the names of their effects."""
+    effects = {t.name: effect_of(t) for t in library}
+    if isinstance(plain, TableProblem):
+        problem: Problem = TableProblem(plain.logs, plain.bed, effects, plain.splits, extra_sigma=plain.extra_sigma)
+    else:
+        assert isinstance(plain, DriveProblem)
+        problem = plain.with_effects(effects, progress)
+    return problem, {t.name: t for t in library if t.name in problem.candidates}
+
+
+def sensor_kinds(problem: Problem) -> list[str]:
+    """Kinds of measured channels: their names without corners."""
+    corners = ("lf", "rf", "lm", "rm", "lr", "rr")
+    kinds = ["_".join(w for w in s.channel.split("_") if w not in corners) for s in problem.observations.series]
+    return list(dict.fromkeys(kinds))

@@ -1,0 +1,289 @@
+"""The search for formulas in steady-state tables: all are scored, the best refitted, judged by what was left out.
+
+A score is linear at one fit, and a model that lacks something is fitted in the wrong place. So the best formula's fit
+becomes the next place at which all are scored, until none does better; then pairs, where one leaves a rest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from lunar_mjx.diagnosis.formulas import expression as f
+from lunar_mjx.diagnosis.formulas.slots import Choice, Slots, features, library, targets
+from lunar_mjx.diagnosis.formulas.targets import known
+from lunar_mjx.diagnosis.refit import Settings
+from lunar_mjx.inference.descent import descend
+from lunar_mjx.inference.fitting import Fit, Progress, fit, silent
+from lunar_mjx.inference.held_out import ENOUGH, noise_test, predictive_gain, predictive_residual
+from lunar_mjx.inference.objective import Objective
+from lunar_mjx.inference.score import leash, project
+
+PENALTY = 5.0
+"""Chi-square that every operation and symbol of a formula must earn: choosing one of ten costs 4.6."""
+_FIRST, _NEXT, _ROUNDS = 16, 12, 3
+"""Formulas refitted at the model as it is, in each later round, and later rounds."""
+_STEPS, _FINISHED = 10, 6
+"""Steps of a descent that sorts formulas out, and formulas whose descent is finished."""
+_SEEDS, _SECONDS = 2, 8
+"""Single formulas beside which a second is sought, and how many of these are refitted."""
+_ALIKE = (0.97, 0.999)
+"""|cos| of projected signatures from which only the better scored of two is refitted: in the first round, later."""
+_SAME = 1.0
+"""Squared difference of two fits' predictions, in sigma, below which they are one."""
+_FAR = 30.0
+"""Amounts beyond so many visible ones are no linear estimate."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trial:
+    """A refitted formula, or two.
+
+    Attributes:
+      choices: the formulas. slots: the problem that holds them. fit: the refit.
+      gain, gain_se: on manoeuvres left out. drop: of the squared residual over fitted and select manoeuvres, fitted
+        ones left out in turn where there are enough. at_noise: whether the residual is at the noise.
+    """
+
+    choices: tuple[Choice, ...]
+    slots: Slots
+    fit: Fit
+    gain: float
+    gain_se: float
+    drop: float
+    at_noise: bool
+
+    @property
+    def length(self) -> int:
+        """Operations and symbols."""
+        return sum(long(c) for c in self.choices)
+
+    @property
+    def merit(self) -> float:
+        """What they are ordered by: how far the squared residual falls, less what their length costs."""
+        return self.drop - PENALTY * self.length
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Found:
+    """What a search has found: the model as it is, trials best first, and all scores at it, highest first."""
+
+    empty: Slots
+    base: Fit
+    trials: tuple[Trial, ...]
+    scored: tuple[tuple[Choice, float], ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Scores:
+    """Of a library at a fit: chi-square, amount in visible ones, signature, scale of the factor, and the baseline's
+    columns beside it."""
+
+    choices: Sequence[Choice]
+    chi2: np.ndarray
+    amount: np.ndarray
+    signature: np.ndarray
+    column: np.ndarray
+    scale: np.ndarray
+
+    def order(self) -> np.ndarray:
+        """Places, best first."""
+        return np.argsort(-(self.chi2 - PENALTY * np.array([long(c) for c in self.choices])), kind="stable")
+
+
+_LENGTHS: dict[tuple[int, int, int], int] = {}
+
+
+def long(choice: Choice) -> int:
+    """Operations and symbols of a formula."""
+    key = (choice.target, choice.first, choice.second)
+    if key not in _LENGTHS:
+        of, target = features(choice.port), targets()[choice.target]
+        carrier = f.parsed(target.carrier, known(target.port))
+        _LENGTHS[key] = f.length(f.without_floors(f.symbol("a") * carrier * of[choice.first] * of[choice.second]))
+    return _LENGTHS[key]
+
+
+def search_formulas(
+    empty: Slots, base: Fit, ports: Sequence[str], settings: Settings, progress: Progress = silent
+) -> Found:
+    """Looks for what is missing at some ports of a wheel.
+
+    Args:
+      empty: the table's problem with slots. base: its fit. ports: where. settings: thresholds.
+      progress: told what is being done.
+    """
+    choices = library(tuple(ports))
+    search = _Search(empty, base, settings)
+    progress("scoring formulas", 0.0)
+    first = search.scores(empty, base, choices)
+    at = first.order()
+    scored = tuple((first.choices[i], float(first.chi2[i])) for i in at)
+    trials = search.refit(empty, base, first, _FIRST, _ALIKE[0])
+    for k in range(_ROUNDS):
+        best = max(trials, key=lambda t: t.merit, default=None)
+        if best is None:
+            break
+        progress("refitting formulas", (k + 1) / (_ROUNDS + 2))
+        (only,) = best.slots.held
+        again = search.scores(best.slots, best.fit, choices, only)
+        new = search.refit(best.slots, best.fit, again, _NEXT, _ALIKE[1], only)
+        trials += new
+        if not any(t.merit > best.merit for t in new):
+            break
+    trials += search.linear(trials)
+    trials = search.finished(trials)
+    progress("refitting pairs of formulas", _ROUNDS / (_ROUNDS + 2))
+    trials += search.pairs(trials, choices)
+    trials = search.finished(trials)
+    return Found(empty, base, tuple(told_apart(sorted(trials, key=lambda t: -t.merit))), scored)
+
+
+def told_apart(trials: Sequence[Trial]) -> list[Trial]:
+    """Trials without those whose predictions these data cannot tell from an earlier one's, nor 1 + x from exp x."""
+    kept: list[Trial] = []
+    for t in trials:
+        laws = {dataclasses.replace(c, linear=False) for c in t.choices}
+        if not any(
+            laws == {dataclasses.replace(c, linear=False) for c in k.choices}
+            or float(np.sum((t.fit.residual - k.fit.residual)[t.fit.fitted] ** 2)) < _SAME
+            for k in kept
+        ):
+            kept.append(t)
+    return kept
+
+
+class _Search:
+    """Scores and refits at any fit."""
+
+    def __init__(self, empty: Slots, base: Fit, settings: Settings):
+        self.empty, self.base, self.settings = empty, base, settings
+        self.before = predictive_residual(empty.problem, base)
+        self.tried: set[frozenset[Choice]] = set()
+
+    def scores(self, slots: Slots, at: Fit, choices: Sequence[Choice], dropped: int | None = None) -> _Scores:
+        """Scores formulas at a fit.
+
+        Args:
+          slots: what the fit holds. at: the fit. choices: formulas.
+          dropped: slot whose formula is taken out, in linear approximation.
+        """
+        residual, jacobian, prior = self._without(slots, at, dropped)
+        keep, observations = at.fitted, slots.problem.observations
+        wanted = sorted({c.target for c in choices})
+        probes = slots.probes(at.u, wanted)
+        out = []
+        for k in wanted:
+            mine = [c for c in choices if c.target == k]
+            seen = slots.factors(at.u, targets()[k].port)
+            product = seen[:, [c.first for c in mine]] * seen[:, [c.second for c in mine]]
+            size = np.sqrt(np.mean(product[keep] ** 2, axis=0))
+            scale = 1.0 / np.where(size > 0.0, size, 1.0)
+            column = observations.whiten(np.nan_to_num(probes[k])[:, None] * product * scale)
+            signature = project(column[keep], jacobian[keep], prior)[: int(keep.sum())]
+            out.append((mine, signature, column, scale))
+        signature = np.concatenate([o[1] for o in out], axis=1)
+        power = np.sum(signature**2, axis=0)
+        amount = signature.T @ residual[keep] / np.where(power > 1e-6, power, np.inf)
+        chi2 = np.where(np.abs(amount) < _FAR, amount**2 * power, 0.0)
+        return _Scores([c for o in out for c in o[0]], chi2, amount, signature,
+                       np.concatenate([o[2] for o in out], axis=1), np.concatenate([o[3] for o in out]))  # fmt: skip
+
+    def _without(self, slots: Slots, at: Fit, dropped: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residual, and the columns and the leash of all that moves, of a fit without one of its formulas."""
+        prior = leash(slots.problem, at)
+        if dropped is None:
+            return at.residual, at.jacobian, prior
+        place = slots.place(dropped)
+        stay = np.isin(at.free, self._left(slots, at, dropped))
+        column = at.jacobian[:, list(at.free).index(place)]
+        return at.residual + column * at.u[place], at.jacobian[:, stay], prior[stay]
+
+    def _left(self, slots: Slots, at: Fit, dropped: int | None) -> list[int]:
+        """Places that a fit moves without one of its formulas."""
+        own = slots.own(dropped) if dropped is not None else []
+        return [int(i) for i in at.free if i not in own]
+
+    def refit(
+        self, slots: Slots, at: Fit, scores: _Scores, most: int, alike: float, dropped: int | None = None
+    ) -> list[Trial]:
+        """Refits the best-scored formulas that are not tried yet, and do not look the same in these data."""
+        held = {k: v for k, v in slots.held.items() if k != dropped}
+        kept = frozenset(c for c, _ in held.values())
+        unit = scores.signature / np.maximum(np.linalg.norm(scores.signature, axis=0), 1e-12)
+        chosen: list[int] = []
+        for i in scores.order():
+            if len(chosen) == most:
+                break
+            new = kept | {scores.choices[i]}
+            if scores.chi2[i] < self.settings.chi2 or len(new) == len(kept) or new in self.tried:
+                continue
+            if not chosen or np.max(np.abs(unit[:, chosen].T @ unit[:, i])) < alike:
+                chosen.append(int(i))
+        left, number = self._left(slots, at, dropped), slots.spare
+        residual, jacobian, prior = self._without(slots, at, dropped)
+        rows = np.vstack([jacobian[at.fitted], np.diag(prior)])
+        trials = []
+        for i in chosen:
+            choice, amount = scores.choices[i], scores.amount[i]
+            grown = slots.holding({**held, number: (choice, targets()[choice.target].size * scores.scale[i])})
+            rest = (residual - scores.column[:, i] * amount)[at.fitted]
+            step = np.linalg.lstsq(rows, np.concatenate([rest, np.zeros(len(prior))]), rcond=1e-8)[0]
+            start = np.zeros_like(at.u)
+            start[left] = at.u[left] + step
+            start[grown.place(number)] = amount
+            trials.append(self._trial(grown, start))
+        return [t for t in trials if t is not None]
+
+    def _trial(self, slots: Slots, start: np.ndarray) -> Trial | None:
+        choices = tuple(c for c, _ in slots.held.values())
+        self.tried.add(frozenset(choices))
+        goal = Objective(slots.problem, slots.free, self.base.fitted)
+        down = descend(goal, start, iterations=_STEPS)
+        if not np.isfinite(down.chi2):
+            return None
+        found = Fit(down.u, slots.free, down.chi2, down.residual, down.jacobian, self.base.fitted, down.promise)
+        return self._judged(choices, slots, found)
+
+    def _judged(self, choices: tuple[Choice, ...], slots: Slots, found: Fit) -> Trial:
+        after = predictive_residual(slots.problem, found)
+        gain, se = predictive_gain(slots.problem, self.base, found, self.before, after)
+        # Where fitted groups are too few to be left out in turn, they count as they are: how well a formula does on two
+        # groups alone decides nothing between neighbours.
+        observations, fitted = slots.problem.observations, self.base.fitted
+        few = len(np.unique(observations.unit[fitted])) < ENOUGH
+        old = np.where(fitted & few, self.base.residual, self.before)
+        new = np.where(fitted & few, found.residual, after)
+        change = (old**2 - new**2)[observations.in_split("fit", "select")]
+        drop = float(np.sum(change[np.isfinite(change)]))
+        return Trial(choices, slots, found, gain, se, drop, noise_test(slots.problem, found).passes)
+
+    def linear(self, trials: Sequence[Trial], most: int = 5) -> list[Trial]:
+        """The best that multiply by exp x once more with 1 + x."""
+        out = []
+        for t in sorted(trials, key=lambda t: -t.merit)[:most]:
+            ((k, (choice, scale)),) = t.slots.held.items()
+            other = dataclasses.replace(choice, linear=True)
+            if targets()[choice.target].multiplies and not choice.linear and frozenset((other,)) not in self.tried:
+                out.append(self._trial(t.slots.holding({k: (other, scale)}), t.fit.u))
+        return [t for t in out if t is not None]
+
+    def finished(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The best with their descents at an end, and the others."""
+        ordered = sorted(trials, key=lambda t: -t.merit)
+        done = []
+        for t in ordered[:_FINISHED]:
+            found = fit(t.slots.problem, t.slots.free, t.fit.u, starts=1, certify=False)
+            done.append(self._judged(t.choices, t.slots, found) if found.chi2 <= t.fit.chi2 else t)
+        return done + ordered[_FINISHED:]
+
+    def pairs(self, trials: Sequence[Trial], choices: Sequence[Choice]) -> list[Trial]:
+        """The best singles with a second formula, where they leave a rest."""
+        out: list[Trial] = []
+        for t in sorted(trials, key=lambda t: -t.merit)[:_SEEDS]:
+            if not t.at_noise:
+                more = self.scores(t.slots, t.fit, choices)
+                out += self.refit(t.slots, t.fit, more, _SECONDS, _ALIKE[0])
+        return out

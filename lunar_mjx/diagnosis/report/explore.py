@@ -1,0 +1,259 @@
+"""Where a model fails, to look at: channels by manoeuvre, what residuals follow, shapes of missing effects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from lunar_mjx.diagnosis.report.figures import SHADES
+from lunar_mjx.diagnosis.report.read import Result, Traces
+from lunar_mjx.diagnosis.report.words import channel_label, plot_text, shown
+from lunar_mjx.inference.observations import Observations
+from lunar_mjx.report.page import Block, Explorer, Figure
+from lunar_mjx.report.style import BLUE, INK, MEASURED, MUTED, ORANGE, SERIES, finish
+
+_MOST_VALUES = 250_000
+"""Numbers in the panels of one page; longer series are thinned."""
+_BINS, _LEAST = 16, 8
+"""Bins of a covariate; observations that make a bin."""
+_FEW = 4
+"""Observations that make a shape."""
+_LINES = 5
+"""Channels drawn over a covariate."""
+_SHAPES = 6
+"""Effects in the gallery."""
+
+
+def panels(result: Result) -> list[Block]:
+    """Heat map of the refitted model's residual, channel by manoeuvre; a click shows the traces."""
+    traces = result.traces
+    if traces is None or not len(traces.observations):
+        return []
+    row = _baseline(traces)
+    o, residual = traces.observations, traces.residual[row]
+    cells = {(c, u): at for c, u, at in _cells(o) if np.isfinite(residual[at]).any()}
+    if not cells:
+        return []
+    channels, units = list(dict.fromkeys(c for c, _ in cells)), sorted({u for _, u in cells})
+    rms = {key: float(np.sqrt(np.nanmean(residual[at] ** 2))) for key, at in cells.items()}
+    z = [[rms.get((c, u)) for u in units] for c in channels]
+    figure = go.Figure(go.Heatmap(
+        x=[plot_text(o.unit_names[u], 30) for u in units], y=[plot_text(channel_label(c)) for c in channels],
+        z=[[None if v is None else float(np.log10(max(v, 0.3))) for v in line] for line in z],
+        text=[[shown(v) if v is not None else "" for v in line] for line in z], texttemplate="%{text}",
+        customdata=[[_key(c, u) for u in units] for c in channels], colorscale=SHADES, zmin=np.log10(0.7),
+        zmax=max(np.log10(3.0), np.log10(max(rms.values()))), showscale=False, xgap=1, ygap=1,
+        hovertemplate="%{y}, %{x}: %{text} sigma<extra></extra>",
+    ))  # fmt: skip
+    finish(figure, 170 + 22 * len(channels), margin={"l": 270, "r": 16, "t": 36, "b": 110})
+    figure.update_yaxes(autorange="reversed", showgrid=False, type="category")
+    figure.update_xaxes(tickangle=-35, showgrid=False, type="category")
+    thin = max(1, int(np.ceil(len(o) * 5 / _MOST_VALUES)))
+    worst = sorted(cells, key=lambda key: -rms[key])
+    found = {_key(*key): _panel(traces, *key, cells[key][::thin]) for key in worst}
+    caption = (
+        f"Root mean square residual of the model {traces.labels[row]}, in sigma: 1 is the noise. Click a field, or "
+        "choose from the list, to see what was measured, what the models say, and what they leave."
+    )
+    return [Explorer(figure, _detail(traces), found, caption)]
+
+
+def dependence(result: Result) -> list[Block]:
+    """Mean residual over what it might follow: slip, angle and load, or time, place, speed, slope and temperature."""
+    traces = result.traces
+    if traces is None:
+        return []
+    residual = traces.residual[-1]
+    known = {name: v for name, v in _covariates(traces).items() if _spread(v)}
+    if not known:
+        return []
+    o = traces.observations
+    size: dict[str, float] = {}
+    for s in o.series:
+        size[s.channel] = size.get(s.channel, 0.0) + float(np.nansum(residual[s.start : s.stop] ** 2))
+    worst = sorted(size, key=lambda c: -size[c])[:_LINES]
+    columns = min(3, len(known))
+    rows = -(-len(known) // columns)
+    figure = make_subplots(rows, columns, shared_yaxes=True, horizontal_spacing=0.03, vertical_spacing=0.3 / rows)
+    for n, (name, covariate) in enumerate(known.items()):
+        at: dict[str, Any] = {"row": n // columns + 1, "col": n % columns + 1}
+        for look, channel in zip(SERIES, worst, strict=False):
+            mine = np.concatenate([np.arange(s.start, s.stop) for s in o.series if s.channel == channel])
+            x, mean, error = _binned(covariate[mine], residual[mine])
+            figure.add_scatter(
+                x=x, y=mean, error_y={"type": "data", "array": error, "thickness": 1, "width": 2}, mode="lines+markers",
+                name=plot_text(channel_label(channel)), legendgroup=channel, showlegend=n == 0,
+                line={"color": look.colour, "dash": look.dash}, marker={"color": look.colour, "symbol": look.symbol},
+                hovertemplate="%{x:.3g}: %{y:.3g} sigma<extra></extra>", **at,
+            )  # fmt: skip
+        figure.update_xaxes(title_text=name, **at)
+    finish(figure, 120 + 260 * rows, margin={"l": 62, "r": 16, "t": 70, "b": 52})
+    figure.update_yaxes(title_text="mean residual, sigma", col=1)
+    figure.add_hline(y=0.0, line={"color": MUTED, "width": 1})
+    caption = (
+        f"What the model {traces.labels[-1]} leaves in its {len(worst)} worst channels, averaged in bins with 95 % "
+        "intervals: noise would scatter about zero whatever it is drawn over."
+    )
+    return [Figure(figure, caption)]
+
+
+def gallery(result: Result) -> list[Block]:
+    """The residual beside the shape that each of the best-scored effects would give it, where that shape is largest."""
+    traces = result.traces
+    if traces is None or not result.signatures:
+        return []
+    o, residual = traces.observations, traces.residual[_baseline(traces)]
+    fitted = np.flatnonzero(o.in_split("fit"))
+    shapes = {}
+    for e in (result.verdict or {}).get("evidence") or []:
+        signature = result.signatures.get(e["effect"])
+        if e.get("status") != "not tested" and signature is not None and len(signature) == len(fitted):
+            shapes[e["effect"]] = np.zeros(len(o))
+            shapes[e["effect"]][fitted] = signature
+    chosen = sorted(shapes, key=lambda e: -float(np.linalg.norm(shapes[e])))[:_SHAPES]
+    drawn = {e: found for e in chosen if (found := _largest(o, shapes[e])) is not None}
+    if not drawn:
+        return []
+    columns = min(2, len(drawn))
+    rows = -(-len(drawn) // columns)
+    titles = [f"{plot_text(e)}<br>{plot_text(channel_label(c))}, {plot_text(o.unit_names[u], 30)}"
+              for e, (c, u, _) in drawn.items()]  # fmt: skip
+    figure = make_subplots(rows, columns, subplot_titles=titles, vertical_spacing=0.42 / rows, horizontal_spacing=0.08)
+    for n, (effect, (_, _, at)) in enumerate(drawn.items()):
+        x, name = _abscissa(traces, at)
+        place: dict[str, Any] = {"row": n // columns + 1, "col": n % columns + 1}
+        figure.add_scatter(x=x, y=residual[at], mode="markers", name="residual of the refitted model",
+                           marker={"color": INK, "size": 4}, showlegend=n == 0, legendgroup="r", **place)  # fmt: skip
+        figure.add_scatter(
+            x=x, y=shapes[effect][at], mode="lines" if o.place is None else "markers", name="the effect alone",
+            line={"color": ORANGE, "width": 2.5}, marker={"color": ORANGE, "size": 8, "symbol": "triangle-up-open"},
+            showlegend=n == 0, legendgroup="s", **place,
+        )  # fmt: skip
+        figure.update_xaxes(title_text=name, **place)
+    finish(figure, 110 + 300 * rows, margin={"l": 62, "r": 16, "t": 110, "b": 52},
+           legend={"orientation": "h", "x": 0.0, "y": 1.0 + 0.22 / rows, "yanchor": "bottom"})  # fmt: skip
+    figure.update_yaxes(title_text="sigma", col=1)
+    caption = (
+        "Shapes of missing effects: what the simulator says each would add at the amount that fits best, less what a "
+        "refit of the model absorbs, in the channel and manoeuvre where it shows most."
+    )
+    return [Figure(figure, caption)]
+
+
+def _baseline(traces: Traces) -> int:
+    """The row of the refitted model."""
+    return traces.labels.index("refitted") if "refitted" in traces.labels else len(traces.labels) - 1
+
+
+def _cells(o: Observations) -> Iterator[tuple[str, int, np.ndarray]]:
+    """Channel, manoeuvre, and places of its observations."""
+    found: dict[tuple[str, int], list[np.ndarray]] = {}
+    for s in o.series:
+        part = np.arange(s.start, s.stop)
+        for unit in np.unique(o.unit[part]):
+            found.setdefault((s.channel, int(unit)), []).append(part[o.unit[part] == unit])
+    for (channel, unit), parts in found.items():
+        yield channel, unit, np.concatenate(parts)
+
+
+def _key(channel: str, unit: int) -> str:
+    return f"{unit} {channel}"
+
+
+def _abscissa(traces: Traces, at: np.ndarray) -> tuple[np.ndarray, str]:
+    place = traces.observations.place
+    return (place[at, 0], "slip ratio") if place is not None else (traces.time[at], "time, s")
+
+
+def _panel(traces: Traces, channel: str, unit: int, at: np.ndarray) -> dict[str, Any]:
+    x, x_title = _abscissa(traces, at)
+    order = np.argsort(x, kind="stable")
+    at, x = at[order], x[order]
+    o, row = traces.observations, _baseline(traces)
+    models = [row, len(traces.labels) - 1] if row < len(traces.labels) - 1 else [row]
+    y = [o.value[at], *(traces.predicted[m][at] for m in models), *([] for _ in range(2 - len(models))),
+         *(traces.residual[m][at] for m in models), *([] for _ in range(2 - len(models)))]  # fmt: skip
+    name = f"{channel_label(channel)}: {o.unit_names[unit]}"
+    return {"label": name, "title": plot_text(name, 100), "x": _plain(x), "y": [_plain(v) for v in y],
+            "x_title": x_title, "y_title": plot_text(channel_label(channel))}  # fmt: skip
+
+
+def _plain(values: np.ndarray | list) -> list[float | None]:
+    return [float(f"{v:.5g}") if np.isfinite(v) else None for v in values]
+
+
+def _detail(traces: Traces) -> go.Figure:
+    """Measured and predicted above, residuals below; the panels fill it."""
+    figure = make_subplots(2, 1, shared_xaxes=True, row_heights=[0.64, 0.36], vertical_spacing=0.06)
+    table = traces.observations.place is not None
+    improved = traces.labels[-1] if _baseline(traces) < len(traces.labels) - 1 else "-"
+    looks = [("measured", MEASURED.colour, "circle", "solid"), (traces.labels[_baseline(traces)], ORANGE, "triangle-up",
+             "dot"), (improved, BLUE, "square", "solid")]  # fmt: skip
+    for n, (name, colour, symbol, dash) in enumerate(looks):
+        figure.add_scatter(
+            x=[], y=[], name=plot_text(name), mode="markers" if n == 0 or table else "lines", showlegend=name != "-",
+            marker={"color": colour, "symbol": symbol, "size": 5}, line={"color": colour, "dash": dash, "width": 2},
+            row=1, col=1,
+        )  # fmt: skip
+    for name, colour, symbol, _ in looks[1:]:
+        figure.add_scatter(x=[], y=[], name=plot_text(f"residual, {name}"), mode="markers", showlegend=False,
+                           marker={"color": colour, "symbol": symbol, "size": 4}, row=2, col=1)  # fmt: skip
+    finish(figure, 480, margin={"l": 70, "r": 16, "t": 90, "b": 52},
+           title={"x": 0.0, "xanchor": "left", "font": {"size": 14}})  # fmt: skip
+    figure.update_yaxes(title_text="residual, sigma", row=2, col=1)
+    return figure
+
+
+def _covariates(traces: Traces) -> Mapping[str, np.ndarray]:
+    """Name with unit, and value at every observation; NaN where it is not known."""
+    o = traces.observations
+    if o.place is not None:
+        return dict(zip(("slip ratio", "slip angle, deg", "load, N"), o.place.T, strict=False))
+    wanted = {
+        "speed of the wheels, rad/s": ("joint_", "drive_speed_rad_s"), "pitch, deg": ("pitch_deg", ""),
+        "winding temperature, °C": ("winding_", "_degC"), "position x, m": ("position_x_m", ""),
+    }  # fmt: skip
+    out = {"time, s": traces.time}
+    for name, (begin, end) in wanted.items():
+        out[name] = _along(o, begin, end)
+    return out
+
+
+def _along(o: Observations, begin: str, end: str) -> np.ndarray:
+    """Mean of the measured channels of a kind, at the times of all observations of the same log."""
+    out = np.full(len(o), np.nan)
+    for log in range(len(o.logs)):
+        mine = [s for s in o.series if s.log == log and s.time is not None and len(s.time)]
+        kind = [s for s in mine if s.channel.startswith(begin) and s.channel.endswith(end)]
+        for s in mine if kind else ():
+            values = [np.interp(np.asarray(s.time), np.asarray(k.time), o.value[k.start : k.stop]) for k in kind]
+            out[s.start : s.stop] = np.mean(values, axis=0)
+    return out
+
+
+def _spread(values: np.ndarray) -> bool:
+    known = values[np.isfinite(values)]
+    return len(known) >= 2 * _LEAST and bool(np.ptp(known) > 1e-6 * max(float(np.abs(known).max()), 1e-12))
+
+
+def _binned(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float], list[float]]:
+    """Centres of bins of equal counts, means, and the half widths of their 95 % intervals."""
+    keep = np.isfinite(x) & np.isfinite(y)
+    x, y = x[keep], y[keep]
+    rows = []
+    for part in np.array_split(np.argsort(x, kind="stable"), min(_BINS, max(1, len(x) // _LEAST))):
+        if len(part) >= 2:
+            rows.append((x[part].mean(), y[part].mean(), 1.96 * y[part].std(ddof=1) / np.sqrt(len(part))))
+    centres, means, errors = zip(*rows, strict=True) if rows else ((), (), ())
+    return [*map(float, centres)], [*map(float, means)], [*map(float, errors)]
+
+
+def _largest(o: Observations, shape: np.ndarray) -> tuple[str, int, np.ndarray] | None:
+    """Channel, manoeuvre and observations where a shape has most of its length."""
+    cells = [(c, u, at) for c, u, at in _cells(o) if len(at) >= _FEW]
+    best = max(cells, key=lambda cell: float(np.sum(shape[cell[2]] ** 2)), default=None)
+    return best if best is not None and np.any(shape[best[2]]) else None

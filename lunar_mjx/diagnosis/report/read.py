@@ -1,0 +1,154 @@
+"""Reads run folders for the report: whatever has been written so far, without the logs themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.diagnosis.runs import (
+    COMPARISON_FILE,
+    FITS_FILE,
+    FORMAT,
+    RUN_FILE,
+    SERIES_FILE,
+    SIGNATURES_FILE,
+    VERDICT_FILE,
+)
+from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.inference.observations import Observations, Series
+
+AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE = "audit.json", "unknown.json", "next.json"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Traces:
+    """Measurements and predictions of one run.
+
+    Attributes:
+      observations: the measurements with their noise taken as white (enough for blocks and places).
+      labels: names of the models, in the order of fitting.
+      predicted: (models, n), in the channels' units. residual: (models, n), whitened, measured less predicted.
+      time: (n,) s, NaN for points of tables.
+    """
+
+    observations: Observations
+    labels: tuple[str, ...]
+    predicted: np.ndarray
+    residual: np.ndarray
+    time: np.ndarray
+
+    @property
+    def channel(self) -> np.ndarray:
+        """(n,) number of each observation's channel among `channels`."""
+        names = self.channels
+        out = np.empty(len(self.observations), int)
+        for s in self.observations.series:
+            out[s.start : s.stop] = names.index(s.channel)
+        return out
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels, in the order of the logs."""
+        return list(dict.fromkeys(s.channel for s in self.observations.series))
+
+    @property
+    def is_table(self) -> bool:
+        """Whether these are points of steady-state tables."""
+        return self.observations.place is not None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Result:
+    """What a run folder holds.
+
+    Attributes:
+      name: of the folder. run: contents of `run.json`.
+      comparison, verdict, fits, audit, unknown, next: contents of the other files, None where not written.
+      traces: measurements and predictions, None where not written.
+      signatures: whitened signature of each effect that was scored, over the fitted observations, in sigma.
+    """
+
+    name: str
+    run: dict[str, Any]
+    comparison: dict[str, Any] | None
+    verdict: dict[str, Any] | None
+    fits: dict[str, Any] | None
+    audit: dict[str, Any] | None
+    unknown: dict[str, Any] | None
+    next: dict[str, Any] | None
+    traces: Traces | None
+    signatures: dict[str, np.ndarray]
+
+
+def read_result(folder: Path) -> Result:
+    """Reads a run folder.
+
+    Raises:
+      UserError: it is none, or one of its files is damaged.
+    """
+    path = require_file(folder / RUN_FILE, "the run (made by `lunar-mjx compare`)")
+    run = _json(path)
+    if run is None or run.get("format") != FORMAT:
+        raise bad_input(path, "format", (run or {}).get("format"), "is not known", f"give a run of format {FORMAT}")
+    names = (COMPARISON_FILE, VERDICT_FILE, FITS_FILE, AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE)
+    return Result(folder.resolve().name, run, *(_json(folder / n) for n in names),
+                  traces=_traces(folder / SERIES_FILE), signatures=_signatures(folder / SIGNATURES_FILE))  # fmt: skip
+
+
+def _json(path: Path) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UserError(f"{path}: is not JSON ({error}); delete it and make it anew.") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: holds no table of names and values; delete it and make it anew.")
+    return content
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        return {}
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: cannot be read ({error}); make it anew with lunar-mjx why.") from None
+
+
+def _signatures(path: Path) -> dict[str, np.ndarray]:
+    found = _arrays(path)
+    return dict(zip(map(str, found["names"]), found["signatures"], strict=True)) if found else {}
+
+
+def _traces(path: Path) -> Traces | None:
+    found = _arrays(path)
+    if not found:
+        return None
+    try:
+        starts = [*found["series_start"].tolist(), len(found["measured"])]
+        independent = np.isnan(found["time"])
+        series = []
+        for i, (channel, log) in enumerate(zip(found["series_channel"], found["series_log"], strict=True)):
+            a, b = starts[i], starts[i + 1]
+            time = None if b > a and independent[a] else found["time"][a:b]
+            series.append(Series(int(log), str(channel), a, b, time, found["sigma"][a:b]))
+        observations = Observations(
+            value=found["measured"],
+            series=tuple(series),
+            logs=tuple(map(str, found["logs"])),
+            split=(),
+            unit=found["unit"],
+            unit_split=tuple(map(str, found["split"])),
+            unit_names=tuple(map(str, found["unit_names"])),
+            place=found["place"] if len(found["place"]) else None,
+        )
+        labels = tuple(map(str, found["labels"]))
+        return Traces(observations, labels, found["predicted"], found["residual"], found["time"])
+    except KeyError as error:
+        raise UserError(f"{path}: lacks {error}; make it anew with lunar-mjx compare.") from None

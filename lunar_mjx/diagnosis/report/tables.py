@@ -1,0 +1,192 @@
+"""Tables of the report: effects, parameters, runs, provenance."""
+
+from __future__ import annotations
+
+import platform
+from collections import Counter
+from collections.abc import Sequence
+from importlib import metadata
+from typing import Any
+
+from lunar_mjx import __version__
+from lunar_mjx.diagnosis.report.read import Result
+from lunar_mjx.diagnosis.report.steps import Error, Step
+from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, shown
+from lunar_mjx.report.page import Block, Facts, Table, Text
+
+_MOST_ROWS = 30
+
+
+def plus_minus(value: Any, std: Any, unit: str = "") -> str:
+    """A value with its standard deviation and unit."""
+    text = shown(value) if std is None else f"{shown(value)} ± {shown(std, 2)}"
+    return f"{text} {unit}".rstrip() if unit not in ("", "1") else text
+
+
+def error_rows(steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[Error | None], measure: str) -> Table:
+    """The numbers of the waterfall."""
+    rows = []
+    for i, (step, now, fit) in enumerate(zip(steps, judged, fitted, strict=True)):
+        change = "" if i == 0 else f"{100.0 * (now.value / judged[i - 1].value - 1.0):+.0f} %"
+        rows.append([step.label, step.run, _with_interval(now), change, _with_interval(fit), str(now.blocks)])
+    note = (
+        "95 % intervals by a bootstrap over blocks of at least five correlation times (of neighbouring points in "
+        "tables); the last column counts the blocks."
+    )
+    header = ["model", "run", f"{measure}, sigma", "change", "fitted, sigma", "blocks"]
+    return Table("Error of each model", header, rows, note, texts=2)
+
+
+def _with_interval(e: Error | None) -> str:
+    if e is None:
+        return "-"
+    return f"{shown(e.value)} ({shown(e.low)} to {shown(e.high)})"
+
+
+def effects(result: Result) -> list[Block]:
+    """What the logs say for and against every effect of the catalogue."""
+    verdict = result.verdict or {}
+    tested, silent = [], []
+    for e in verdict.get("evidence") or []:
+        near = e.get("nearest") or ("", 0.0)
+        nearest = f"{near[0]} ({near[1]:.2f})" if near[0] else "-"
+        if e.get("status") == "not tested":
+            silent.append([e["effect"], f"cannot be tested with these logs: {e.get('reason', '')}"])
+            continue
+        values = "; ".join(
+            f"{k} {plus_minus(v, (e.get('std') or {}).get(k))}" for k, v in (e.get("values") or {}).items()
+        )
+        gain = e.get("held_out_gain")
+        share = e.get("separable_share")
+        tested.append([
+            e["effect"], e.get("status", ""), e.get("reason", ""), shown(e.get("separable_sigma")),
+            "-" if share is None else f"{100.0 * share:.1f}", shown(e.get("z")), shown(e.get("chi2")),
+            shown(e.get("p"), 2), "-" if gain is None else plus_minus(gain, e.get("held_out_se")),
+            values or "-", nearest,
+        ])  # fmt: skip
+    blocks: list[Block] = []
+    if tested:
+        blocks.append(Table(
+            "Every effect that these logs can test",
+            ["effect", "status", "because", "separable, sigma", "of its signal, %", "score z", "chi-square taken off",
+             "family-wise p", "held-out gain", "parameters, SI", "nearest confounder (|cos|)"],
+            tested,
+            "Separable: length of the effect's signature at nominal size that a refit of the model cannot absorb. "
+            "Score and p: robust score test, the largest over all effects by bootstrap. Held-out gain: expected log "
+            "density on manoeuvres left out, with its standard error. Parameters with one standard deviation.",
+            texts=3,
+        ))  # fmt: skip
+    by_reason: dict[str, list[str]] = {}
+    for n in (verdict.get("details") or {}).get("not_tested") or []:
+        by_reason.setdefault(str(n.get("reason", "")), []).append(str(n.get("effect", "")))
+    silent += [[", ".join(names), f"cannot be tested with these logs: {reason}"] for reason, names in by_reason.items()]
+    if silent:
+        blocks.append(Table("Effects that these logs cannot test", ["effect", "why"], silent, texts=2))
+    return blocks
+
+
+def parameters(first: Result, last: Result) -> list[Block]:
+    """Baseline parameters before and after, with the bias that the missing effects had caused."""
+    before = (first.comparison or {}).get("parameters") or {}
+    proposed = ((last.verdict or {}).get("details") or {}).get("parameters")
+    after = proposed or (last.comparison or {}).get("parameters") or {}
+    rows = []
+    for effect, found in {**before, **after}.items():
+        old, new = before.get(effect) or {}, after.get(effect) or {}
+        for name in found.get("value") or {}:
+            a, b = ((t.get("value") or {}).get(name) for t in (old, new))
+            sa, sb = ((t.get("std") or {}).get(name) for t in (old, new))
+            unit = (found.get("unit") or {}).get(name, "")
+            given = (old.get("given") or {}).get(name)
+            bias, strength = "-", "-"
+            if a is not None and b is not None and a != b:
+                bias = shown(a - b) + (f" ({100.0 * (a / b - 1.0):+.0f} %)" if b else "")
+                strength = shown(abs(a - b) / sa, 2) if sa else "-"
+            rows.append([f"{effect}.{name}", unit, shown(given), plus_minus(a, sa), plus_minus(b, sb), bias, strength])
+    if not rows:
+        return []
+    note = (
+        "Bias: the refitted value before less the value with the effects named, that is, what the parameter had taken "
+        "up for the missing physics; the last column is its size in standard deviations of the value before. Standard "
+        "deviations are those of the noise alone: while the residual is above the noise they are too small. The unit "
+        "factor marks a factor on the model's own values, which differ between wheels or joints."
+    )
+    header = ["parameter", "unit", "as given", "refitted, before", "with the effects", "bias before", "bias, std"]
+    return [Table("Parameters before and after", header, rows, note, texts=2)]
+
+
+def by_channel(result: Result) -> list[Block]:
+    """The worst channels and manoeuvres in numbers."""
+    rows = (result.comparison or {}).get("by_channel") or []
+    worst = sorted(rows, key=lambda r: -(r.get("refitted") or 0.0))[:_MOST_ROWS]
+    if not worst:
+        return []
+    return [Table(
+        f"Worst channels and manoeuvres of {result.name}, root mean square residual in sigma",
+        ["manoeuvre", "split", "channel", "samples", "as given", "refitted"],
+        [[str(r["manoeuvre"]), str(SPLIT_NAMES.get(r["split"], r["split"])), channel_label(r["channel"]),
+          str(r["samples"]),
+          shown(r["as_given"]), shown(r["refitted"])] for r in worst],
+        f"The {len(worst)} worst of {len(rows)}." if len(rows) > len(worst) else "", texts=3,
+    )]  # fmt: skip
+
+
+def findings(result: Result) -> list[Block]:
+    """What is wrong with the logs."""
+    found = ((result.verdict or {}).get("details") or {}).get("findings") or []
+    rows = [[str(f.get("severity", "")), str(f.get("where", "")), str(f.get("message", ""))] for f in found]
+    return [Table("Findings of the gate", ["severity", "where", "finding"], rows, texts=3)] if rows else []
+
+
+def provenance(results: Sequence[Result]) -> list[Block]:
+    """Hashes, seeds, versions, splits, and how often the test split was opened."""
+    blocks: list[Block] = []
+    rows = []
+    for r in results:
+        for path, digest in (r.run.get("hashes") or {}).items():
+            rows.append([r.name, path, str(digest)])
+    blocks.append(Table("Logs, by SHA-256 over their files", ["run", "log", "SHA-256"], rows, texts=3))
+    rows = []
+    for r in results:
+        test = (r.comparison or {}).get("certificate") or {}
+        chosen = ", ".join(f"{k} = {v}" for k, v in (r.run.get("splits") or {}).items()) or "default"
+        details = (r.verdict or {}).get("details") or {}
+        problems = "; ".join(test.get("problems") or []) or ("complete" if test else "-")
+        added = ", ".join(r.run.get("added") or []) or "-"
+        rows.append([r.name, str(r.run.get("version")), str(r.run.get("seed")), added, chosen, problems,
+                     shown(details.get("alpha"))])  # fmt: skip
+    header = ["run", "version", "seed", "effects added", "splits by the user", "certificate of the fit", "alpha"]
+    blocks.append(Table("Runs", header, rows, texts=6))
+    blocks += [*_splits(results[-1]), *_openings(results)]
+    versions = [(name, metadata.version(name)) for name in ("jax", "mujoco", "numpy", "scipy", "plotly")]
+    blocks.append(Facts([("report by lunar-mjx", __version__), *versions, ("Python", platform.python_version())]))
+    return blocks
+
+
+def _splits(result: Result) -> list[Block]:
+    if result.traces is None:
+        return []
+    o = result.traces.observations
+    groups: dict[str, list[str]] = {}
+    for name, split in zip(o.unit_names, o.unit_split, strict=True):
+        groups.setdefault(split, []).append(name)
+    rows = [[SPLIT_NAMES.get(k, k), str(int(o.in_split(k).sum())), ", ".join(v)] for k, v in groups.items()]
+    return [Table("Splits", ["split", "observations", "manoeuvres or groups of points"], rows, texts=3)]
+
+
+def _openings(results: Sequence[Result]) -> list[Block]:
+    rows = []
+    for r in results:
+        seen: dict[str, Counter[str]] = {}
+        for entry in r.run.get("test_opened") or []:
+            seen.setdefault(str(entry.get("model")), Counter())[str(entry.get("fit"))] += 1
+        for model, fits in seen.items():
+            times = len(fits)
+            rows.append([r.name, model, str(times), str(sum(fits.values())),
+                         "once" if times == 1 else f"reopened {times - 1} time{'s' if times > 2 else ''}"])  # fmt: skip
+    if not rows:
+        text = "No error on a test split was computed: these runs keep none, or were made before that was recorded."
+        return [Text([text])]
+    header = ["run", "model", "fits judged", "times computed", "test split opened"]
+    note = "Every further fit of the same model that is judged on the test split reopens it."
+    return [Table("Openings of the test split", header, rows, note, texts=2)]

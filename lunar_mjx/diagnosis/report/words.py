@@ -1,0 +1,57 @@
+"""How the report writes numbers, channels and names that came from files."""
+
+from __future__ import annotations
+
+import html
+import math
+from typing import Any
+
+from lunar_mjx.diagnosis.unknown_inputs.probes import PROBES
+from lunar_mjx.logs.schema import CHANNELS, STEADY_CHANNELS
+
+SPLIT_NAMES = {
+    "fit": "fitted",
+    "select": "held out",
+    "test": "held out, test",
+    "apart": "set apart",
+    "held_out": "held out",
+}
+
+
+def shown(value: Any, digits: int = 3) -> str:
+    """A number in a few digits; a dash for None and NaN."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or math.isnan(value):
+        return "-"
+    size = abs(value)
+    if size and (size >= 1e5 or size < 1e-3):
+        return f"{value:.{digits - 1}e}"
+    return f"{value:.0f}" if size >= 10 ** (digits - 1) else f"{value:.{digits}g}"
+
+
+def plot_text(text: str, most: int = 60) -> str:
+    """Text for a figure: plotly reads a few tags and entities, which names from a log must not hold."""
+    return html.escape(text if len(text) <= most else text[: most - 1] + "…", quote=False)
+
+
+def channel_label(channel: str) -> str:
+    """Name of a channel with its unit, such as "drawbar pull, N"."""
+    if channel in STEADY_CHANNELS:
+        unit = STEADY_CHANNELS[channel][0]
+        stem = channel.removesuffix("_" + unit.replace("/", "_").replace(" ", "")) if unit != "1" else channel
+        return f"{stem.replace('_', ' ')}, {unit}"
+    for kind in CHANNELS:
+        stem = channel.removesuffix("_" + kind.suffix) if kind.suffix else channel
+        if (not kind.suffix or stem != channel) and kind.pattern.fullmatch(stem):
+            return f"{stem.replace('_', ' ')}, {kind.unit}"
+    return channel.replace("_", " ")
+
+
+def port_label(label: str) -> str:
+    """Label of an unknown input with the port it enters at and the unit of the input."""
+    probe = PROBES.get(label)
+    return f"{label}, {probe[3]}" if probe is not None and probe[3] != "1" else label
+
+
+def and_list(names: list[str] | tuple[str, ...]) -> str:
+    """Names in a sentence."""
+    return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)

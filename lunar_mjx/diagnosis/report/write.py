@@ -1,0 +1,128 @@
+"""Puts the criticism report together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lunar_mjx import __version__
+from lunar_mjx.diagnosis.report import explore, figures, tables
+from lunar_mjx.diagnosis.report.read import Result, read_result
+from lunar_mjx.diagnosis.report.steps import Step, ceiling, chain, comparable, error, judged
+from lunar_mjx.diagnosis.report.words import and_list, shown
+from lunar_mjx.errors import UserError
+from lunar_mjx.report.page import Block, Figure, Section, Text, write_page
+
+
+def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
+    """Writes one offline page on a chain of runs.
+
+    Args:
+      runs: run folders, in the order in which effects were added.
+      out: the HTML file.
+
+    Returns:
+      Its path.
+
+    Raises:
+      UserError: a folder is no run, or one of its files is damaged.
+    """
+    if not runs:
+        raise UserError("report: no run is given; give at least one run folder.")
+    results = [read_result(Path(run)) for run in runs]
+    judge = next((r for r in reversed(results) if r.verdict), results[-1])
+    steps = chain(results)
+    sections = []
+    if (judge.verdict or {}).get("verdict") == "BAD_DATA":
+        sections.append(Section("Why the logs cannot be used", tables.findings(judge)))
+    if steps:
+        sections += [_error_section(steps, results), _where(judge)]
+    if judge.verdict:
+        sections.append(_why(judge, results))
+    sections.append(Section("Parameters", tables.parameters(results[0], results[-1])))
+    sections.append(Section("Provenance", tables.provenance(results)))
+    logs = list(dict.fromkeys(Path(p).name for p in results[-1].run.get("logs") or []))
+    title = f"Criticism of a model: {and_list(logs[:4])}" + (f" and {len(logs) - 4} more" if len(logs) > 4 else "")
+    return write_page(Path(out), title, _verdict(results, judge, steps), [s for s in sections if s.blocks])
+
+
+def _verdict(results: Sequence[Result], judge: Result, steps: Sequence[Step]) -> list[str]:
+    lines = []
+    if judge.verdict:
+        lines.append(f"{judge.verdict.get('verdict')}: {judge.verdict.get('sentence')}")
+    if not judge.verdict or judge is not results[-1]:
+        last = results[-1].name
+        lines.append(f"{last} has been compared, not diagnosed; ask lunar-mjx why {last} for its verdict.")
+    if len(steps) > 1 and comparable(steps):
+        splits, measure = judged(steps)
+        first, end = error(steps[0], splits), error(steps[-1], splits)
+        if first and end:
+            verb = "falls" if end.value < first.value else "rises"
+            lines.append(f"From {steps[0].label} to {steps[-1].label}, the error on {measure} manoeuvres {verb} from "
+                         f"{shown(first.value)} to {shown(end.value)} sigma; the noise is 1.")  # fmt: skip
+    lines.append(_audit_line(judge))
+    return lines
+
+
+def _audit_line(result: Result) -> str:
+    audit = result.audit or {}
+    if audit.get("sentence"):
+        older = audit.get("version", __version__) != __version__
+        return str(audit["sentence"]) + (f" (Measured with version {audit['version']}.)" if older else "")
+    return (f"How often this tool is wrong on logs like these has not been measured; lunar-mjx why {result.name} "
+            "--audit 30 measures it in 30 minutes.")  # fmt: skip
+
+
+def _error_section(steps: Sequence[Step], results: Sequence[Result]) -> Section:
+    splits, measure = judged(steps)
+    now = [e for s in steps if (e := error(s, splits)) is not None]
+    fitted = [error(s, ("fit",)) for s in steps]
+    blocks: list[Block] = []
+    if not comparable(steps):
+        blocks.append(Text(["The runs were not made on the same measurements, so their errors do not compare."]))
+    if len(now) == len(steps):
+        top = ceiling(results[-1])
+        caption = (
+            f"Root mean square residual over {measure} manoeuvres in sigma of the noise. 1 sigma is the noise floor: a "
+            "true model cannot go below it but by chance."
+        )
+        if top is not None:
+            caption += (
+                " The ceiling is what the best smooth unknown input at any one port could leave, on fitted and "
+                "selecting manoeuvres together: no formula at a single port gets much below it."
+            )
+        blocks.append(Figure(figures.waterfall(steps, now, fitted, measure, top), caption))
+        blocks.append(tables.error_rows(steps, now, fitted, measure))
+    return Section("The error, step by step", blocks)
+
+
+def _where(judge: Result) -> Section:
+    blocks: list[Block] = [*explore.panels(judge), *tables.by_channel(judge), *explore.dependence(judge)]
+    verdict = judge.verdict or {}
+    ports = verdict.get("ports") or {}
+    if ports:
+        best = max(ports, key=lambda k: ports[k] or 0.0)
+        caption = (
+            "Gain of the log evidence when something nobody modelled acts at a port, its course free but smooth; "
+            "below 3 it is no better than noise."
+        )
+        blocks.append(Figure(figures.bars(ports, "gain of log evidence", best), caption))
+    follows = ((verdict.get("details") or {}).get("localise") or {}).get("dependence") or {}
+    if follows:
+        caption = "Chi-square that a parameter would take off if it followed slip, slip angle or load."
+        blocks.append(Figure(figures.bars(follows, "chi-square taken off"), caption))
+    return Section("Where it fails", blocks)
+
+
+def _why(judge: Result, results: Sequence[Result]) -> Section:
+    blocks = tables.effects(judge)
+    table = (judge.verdict or {}).get("isolability") or {}
+    if len(table) > 1:
+        caption = (
+            "Isolability: |cos| between the signatures that a refit cannot absorb. From 0.9 on, these logs hardly tell "
+            "the two effects apart."
+        )
+        blocks.append(Figure(figures.isolability(table), caption))
+    named = next((r for r in reversed(results) if (r.verdict or {}).get("effects")), judge)
+    blocks += explore.gallery(named)
+    return Section("Why: the evidence for every effect", blocks)

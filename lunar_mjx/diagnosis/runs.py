@@ -1,0 +1,181 @@
+"""A run folder: which logs, which model, and what was found so far, on disk as plain JSON and TOML."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx import __version__
+from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.logs import Finding, Log, SteadyLog, check, read_campaign
+from lunar_mjx.logs.readers.folder import without_answers
+from lunar_mjx.model import Model
+from lunar_mjx.model.file import load_model, save_model
+
+FORMAT = "lunar-mjx-run/1"
+RUN_FILE, MODEL_FILE, FITS_FILE = "run.json", "model.toml", "fits.json"
+COMPARISON_FILE, VERDICT_FILE, SERIES_FILE = "comparison.json", "verdict.json", "series.npz"
+SIGNATURES_FILE = "signatures.npz"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Run:
+    """A run folder.
+
+    Attributes:
+      folder: where it lies. logs: paths of the log folders. model: the model as compared.
+      candidates: effects from the user's own files, as file.py:name. splits: chosen by the user, by log or group.
+      added: effects added since the first run. parent: folder of the run that this one grew from.
+      seed: of all random starts. discrepancy: known unexplained error by quantity, added to the noise.
+    """
+
+    folder: Path
+    logs: tuple[Path, ...]
+    model: Model
+    candidates: tuple[str, ...] = ()
+    splits: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    added: tuple[str, ...] = ()
+    parent: str | None = None
+    seed: int = 0
+    discrepancy: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    def campaign(self) -> list[Log] | list[SteadyLog]:
+        """The logs, all of one kind.
+
+        Raises:
+          UserError: drive logs and steady-state tables together.
+        """
+        logs = read_campaign(self.logs)
+        if len({type(log) for log in logs}) > 1:
+            raise UserError(f"{self.logs[0]}: drive logs and steady-state tables do not go into one run; compare them "
+                            "in two.")  # fmt: skip
+        return logs  # type: ignore[return-value]
+
+    @functools.cached_property
+    def checked(self) -> tuple[list[Log] | list[SteadyLog], list[Finding]]:
+        """The logs and what the gate finds in them, read once.
+
+        Raises:
+          UserError: as `campaign`.
+        """
+        logs = self.campaign()
+        return logs, check(logs)
+
+    def write(self) -> None:
+        """Writes `run.json` and `model.toml`; earlier looks at the test split stay on record."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        opened = (self.load(RUN_FILE) or {}).get("test_opened", [])
+        save_model(self.model, self.folder / MODEL_FILE)
+        save_json(self.folder / RUN_FILE, {
+            "format": FORMAT, "version": __version__, "logs": [str(p) for p in self.logs],
+            "hashes": {str(p): folder_hash(p) for p in self.logs}, "candidates": list(self.candidates),
+            "splits": dict(self.splits), "added": list(self.added), "parent": self.parent, "seed": self.seed,
+            "discrepancy": dict(self.discrepancy), "test_opened": opened,
+        })  # fmt: skip
+
+    def opened_test(self, verb: str, models: Mapping[str, str]) -> None:
+        """Puts on record that the error on the test split was computed.
+
+        Args:
+          verb: by which command.
+          models: fingerprint of the fit by the model's label; the same fit looked at again is no new opening.
+        """
+        data = self.load(RUN_FILE)
+        data["test_opened"] = [
+            *data.get("test_opened", []), *({"verb": verb, "model": m, "fit": f} for m, f in models.items())
+        ]  # fmt: skip
+        self.save(RUN_FILE, data)
+
+    def load(self, name: str) -> Any:
+        """Contents of one of the run's JSON files; None if it has not been written yet."""
+        path = self.folder / name
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+    def save(self, name: str, content: Any) -> None:
+        """Writes one of the run's JSON files."""
+        save_json(self.folder / name, content)
+
+
+def load_run(folder: str | Path) -> Run:
+    """Reads a run folder.
+
+    Raises:
+      UserError: it is none, is of another version, or its logs have changed or gone.
+    """
+    folder = Path(folder)
+    path = require_file(folder / RUN_FILE, "the run (made by `lunar-mjx compare`)")
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data.get("format") != FORMAT:
+            raise bad_input(path, "format", data.get("format"), "is not known", f"give a run of format {FORMAT}")
+        logs = tuple(Path(p) for p in data["logs"])
+        hashes = data["hashes"]
+    except (ValueError, KeyError, AttributeError) as error:
+        raise UserError(f"{path}: is not a run ({error}); make it anew with lunar-mjx compare.") from None
+    for log in logs:
+        if not log.exists():
+            raise bad_input(path, "logs", str(log), "is missing", "put the log back, or compare anew")
+        if folder_hash(log) != hashes.get(str(log)):
+            raise bad_input(path, "logs", str(log), "has changed since the comparison", "compare anew")
+    model = load_model(folder / MODEL_FILE)
+    return Run(folder, logs, model, tuple(data["candidates"]), data["splits"], tuple(data["added"]), data["parent"],
+               int(data["seed"]), data.get("discrepancy", {}))  # fmt: skip
+
+
+def log_folders(paths: Sequence[str | Path]) -> tuple[Path, ...]:
+    """Absolute paths of the logs, as given, without answers to sealed ones.
+
+    Raises:
+      UserError: none is given, or one does not exist.
+    """
+    paths = without_answers(paths)
+    if not paths:
+        raise UserError("compare: no log is given; give at least one log folder.")
+    found = tuple(Path(p).resolve() for p in paths)
+    for path in found:
+        if not path.exists():
+            raise bad_input("compare", "log", str(path), "does not exist", "give a log folder")
+    return found
+
+
+def folder_hash(path: Path) -> str:
+    """SHA-256 over names and contents of a log's files."""
+    digest = hashlib.sha256()
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    for file in files:
+        digest.update(file.relative_to(path).as_posix().encode() if path.is_dir() else file.name.encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def save_json(path: Path, content: Any) -> None:
+    """Writes JSON without NaN (null instead), whole or not at all."""
+    text = json.dumps(plain(content), indent=1, allow_nan=False)
+    part = path.with_suffix(path.suffix + ".part")
+    part.write_text(text + "\n", encoding="utf-8")
+    part.replace(path)
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON takes it: lists, numbers, names, and None for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value

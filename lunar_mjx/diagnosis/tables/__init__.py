@@ -1,0 +1,1 @@
+"""Steady-state tables of single-wheel test beds as a problem of inference."""

@@ -1,0 +1,1 @@
+"""Many rovers at once: the batch axis, and what is computed once for many kernels."""

@@ -1,0 +1,258 @@
+"""The structured engine: exact rigid-body dynamics of a floating base with legs, as elementwise code.
+
+A rover's mass matrix is block-arrow: legs touch the base and not each other. Kinematics and recursive Newton-Euler run
+along every leg at once (arrays over the legs), the composite-rigid-body algorithm gives each leg's block, an unrolled
+factorisation eliminates it, and one 6 x 6 solve gives the base (Featherstone 2008, ch. 5, 6 and 9). Planar four-bars
+are closed exactly, so there is no constraint solver. Everything is in the coordinates of the chassis frame, where most
+axes and offsets are constant. The derivation is in docs/structured_engine.md.
+"""
+
+# MuJoCo ships no type stubs for its compiled module.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lunar_mjx.dynamics.indexing import assemble, select
+from lunar_mjx.dynamics.kinematics import Finish, Kinematics, wheel_feet
+from lunar_mjx.dynamics.quaternions import integrate, normalized, rotation
+from lunar_mjx.dynamics.spatial_algebra import (
+    IDENTITY,
+    ZERO,
+    Body,
+    Force,
+    Inertia,
+    Motion,
+    Rotation,
+    Symmetric,
+    Vector,
+    mul,
+)
+from lunar_mjx.dynamics.structured.legs import (
+    LegState,
+    cast_group,
+    forward_kinematics,
+    joint_speeds,
+    joint_turns,
+    leg_block,
+    solve,
+)
+from lunar_mjx.dynamics.structured.suitability import check_model
+from lunar_mjx.dynamics.structured.topology import LegGroup, Structure, read_structure
+from lunar_mjx.effects.ports import Forces
+from lunar_mjx.pytree import pytree
+from lunar_mjx.rover import Rover
+from lunar_mjx.spatial import Frame, Vec3
+
+
+@pytree
+class Pieces:
+    """Positions or velocities as separate components, so that a loop over time carries no array to cut up.
+
+    Attributes:
+      base: of the free joint, numbers.
+      joints: by group: for positions the turn of every link, for velocities the speeds of the independent joints, in
+        the links' own sense, each of shape (leg,).
+    """
+
+    base: tuple[Any, ...]
+    joints: tuple[tuple[Any, ...], ...]
+
+    @property
+    def dtype(self) -> Any:
+        return self.base[0].dtype
+
+
+class Base(NamedTuple):
+    """The chassis: pose and velocity in the world, and its spatial velocity in its own frame."""
+
+    position: Vector
+    quaternion: list[Any]
+    frame: Rotation
+    velocity: Vector
+    motion: Motion
+
+
+class StructuredEngine:
+    """Rigid-body dynamics of one rover with legs: `forward` gives the kinematics and a function that ends the step.
+
+    Raises:
+      UnsuitableError: the rover has something that this engine cannot honour exactly.
+    """
+
+    name = "structured"
+
+    def __init__(self, rover: Rover, timestep: float):
+        model = rover.compile()
+        model.opt.timestep = timestep
+        check_model(model, str(rover.mjcf))
+        self.mj_model = model
+        self.nq, self.nv = model.nq, model.nv
+        self.qpos0 = np.array(model.qpos0)
+        self.timestep = timestep
+        wheels = np.array([model.body(wheel.body).id for wheel in rover.wheels])
+        axles = np.array([model.jnt_axis[model.joint(wheel.drive).id] for wheel in rover.wheels])
+        chassis = model.body(rover.chassis).id
+        joints = [model.joint(name).id for name in rover.joints]
+        self.structure: Structure = read_structure(model, chassis, wheels.tolist(), axles, joints, str(rover.mjcf))
+        self.wheel_feet = wheel_feet(model, wheels, chassis)
+        self._joints = len(joints)
+
+    def forward(self, params: Any, qpos: Any, qvel: Any) -> tuple[Kinematics, Finish]:
+        """Kinematics at (qpos, qvel), and a function from forces to the next (qpos, qvel).
+
+        The dependent joints of loops are computed from the independent ones; their entries in `qpos` and `qvel` are
+        not read.
+
+        Args:
+          params: gravity, and the motors' rotor inertia where there are motors.
+          qpos, qvel: MuJoCo's coordinates of shapes (nq,) and (nv,), or both as `split` gives them.
+        """
+        whole = not isinstance(qpos, Pieces)
+        if whole:
+            qpos, qvel = self.split(qpos, qvel)
+        numbers = [cast_group(group, qpos.dtype) for group in self.structure.groups]
+        position, velocity = Vector(*qpos.base[:3]), Vector(*qvel.base[:3])
+        quaternion = normalized(list(qpos.base[3:]))
+        frame = rotation(quaternion)
+        base = Base(position, quaternion, frame, velocity, Motion(Vector(*qvel.base[3:]), frame.undo(velocity)))
+        legs = [
+            forward_kinematics(n, base.motion, angle, speed)
+            for n, angle, speed in zip(numbers, qpos.joints, qvel.joints, strict=True)
+        ]
+
+        def finish(forces: Forces) -> tuple[Any, Any]:
+            new = self._finish(params, numbers, legs, base, forces)
+            return self.join(*new) if whole else new
+
+        return self._kinematics(numbers, legs, base), finish
+
+    def split(self, qpos: Float[Array, "nq"], qvel: Float[Array, "nv"]) -> tuple[Pieces, Pieces]:
+        """The coordinates as the pieces that the engine computes with; dependent joints are left out."""
+        p, v = self.structure.free_qpos, self.structure.free_dof
+        groups = self.structure.groups
+        numbers = [cast_group(g, qpos.dtype) for g in groups]
+        turns = tuple(
+            joint_turns(n, [mul(n.links[k].numbers.sign, select(qpos, n.links[k].qpos)) for k in n.free])
+            for n in numbers
+        )
+        speeds = tuple(
+            tuple(mul(n.links[k].numbers.sign, select(qvel, n.links[k].dof)) for k in n.free) for n in numbers
+        )
+        return (
+            Pieces(tuple(qpos[p + i] for i in range(7)), turns),
+            Pieces(tuple(qvel[v + i] for i in range(6)), speeds),
+        )
+
+    def join(self, qpos: Pieces, qvel: Pieces) -> tuple[Float[Array, "nq"], Float[Array, "nv"]]:
+        """MuJoCo's coordinates from the pieces, with the dependent joints of loops."""
+        positions, speeds = [jnp.stack(qpos.base)], [jnp.stack(qvel.base)]
+        at_q, at_v = [self.structure.free_qpos + np.arange(7)], [self.structure.free_dof + np.arange(6)]
+        for group, q, w in zip(self.structure.groups, qpos.joints, qvel.joints, strict=True):
+            n = cast_group(group, qpos.dtype)
+            speed, _, _ = joint_speeds(n, q, w)
+            for k, link in enumerate(n.links):
+                positions.append(_over_legs(mul(link.numbers.sign, q[k].angle), n.count))
+                speeds.append(_over_legs(mul(link.numbers.sign, speed[k]), n.count))
+                at_q.append(link.qpos)
+                at_v.append(link.dof)
+        return assemble(positions, at_q), assemble(speeds, at_v)
+
+    def _kinematics(
+        self,
+        numbers: list[LegGroup],
+        legs: list[LegState],
+        base: Base,
+    ) -> Kinematics:
+        angles, speeds, drives = [], [], []
+        for group, leg in zip(numbers, legs, strict=True):
+            for k, link in enumerate(group.links):
+                if link.actuated is not None:
+                    angles.append(_over_legs(mul(link.numbers.sign, leg.angle[k]), group.count))
+                    speeds.append(_over_legs(mul(link.numbers.sign, leg.speed[k]), group.count))
+                    drives.append(link.actuated)
+        places, axles, travels, spins, order = [], [], [], [], []
+        for group, leg in zip(numbers, legs, strict=True):
+            for slot in group.wheels:
+                link = leg.links[slot.link]
+                at = link.origin + link.frame.apply(slot.numbers.center)
+                moving = link.velocity.linear + link.velocity.angular.cross(at)
+                vectors = at, link.frame.apply(slot.numbers.axle), moving, link.velocity.angular
+                for into, vector in zip((places, axles, travels, spins), vectors, strict=True):
+                    into.append([_over_legs(c, group.count) for c in base.frame.apply(vector)])
+                order.append(slot.index)
+
+        def of_wheels(pieces: list[list[Any]]) -> Vec3:
+            return Vec3(*(assemble([piece[i] for piece in pieces], order) for i in range(3)))
+
+        place = Vec3(*base.position)
+        return Kinematics(
+            position=place,
+            quaternion=jnp.stack(base.quaternion),
+            frame=Frame(*(Vec3(*column) for column in base.frame)),
+            velocity=Vec3(*base.velocity),
+            angular_velocity=Vec3(*base.frame.apply(base.motion.angular)),
+            joint_angle=assemble(angles, drives),
+            joint_speed=assemble(speeds, drives),
+            wheel_position=of_wheels(places) + place,
+            wheel_axle=of_wheels(axles),
+            wheel_velocity=of_wheels(travels),
+            wheel_angular_velocity=of_wheels(spins),
+        )
+
+    def _finish(
+        self, params: Any, numbers: list[LegGroup], legs: list[LegState], base: Base, forces: Forces
+    ) -> tuple[Pieces, Pieces]:
+        """Accelerations from the forces, and a step of semi-implicit Euler."""
+        dtype, dt = forces.joint_torque.dtype, self.timestep
+        frame, motion = base.frame, base.motion
+        gravity = params.gravity if forces.geometry.gravity is None else forces.geometry.gravity
+        up = frame.undo(Vector(0.0, 0.0, jnp.asarray(gravity, dtype)))
+        armature = _reflected_inertia(params, self._joints, dtype)
+        blocks = [
+            leg_block(group, leg, up, forces, frame, armature, dt) for group, leg in zip(numbers, legs, strict=True)
+        ]
+        chassis = _chassis_inertia(self.structure.base, forces)
+        applied = Force(frame.undo(Vector(*forces.chassis_moment)), frame.undo(Vector(*forces.chassis_force)))
+        force = chassis.apply(Motion(ZERO, up)) + motion.cross_force(chassis.apply(motion)) - applied
+        acceleration, rates = solve(chassis, force, blocks)
+        # the classical acceleration of the chassis frame's origin
+        linear = acceleration.linear + motion.angular.cross(motion.linear)
+        velocity = base.velocity + frame.apply(linear) * dt
+        spin = motion.angular + acceleration.angular * dt
+        position = base.position + velocity * dt
+        quaternion = integrate(base.quaternion, spin, dt)
+        angles, speeds = [], []
+        for n, leg, rate in zip(numbers, legs, rates, strict=True):
+            speed = [leg.speed[k] + dt * r for k, r in zip(n.free, rate, strict=True)]
+            angle = [leg.angle[k] + dt * w for k, w in zip(n.free, speed, strict=True)]
+            speeds.append(tuple(speed))
+            angles.append(joint_turns(n, angle))
+        return Pieces((*position, *quaternion), tuple(angles)), Pieces((*velocity, *spin), tuple(speeds))
+
+
+def _reflected_inertia(params: Any, joints: int, dtype: Any) -> Any:
+    """Rotor inertia times the square of the gear ratio at the actuated joints; None without motors."""
+    motor = params.effects.get("motor")
+    if motor is None:
+        return None
+    return motor["rotor_inertia"] * motor["gear_ratio"] ** 2 * jnp.ones(joints, dtype)
+
+
+def _chassis_inertia(base: Body, forces: Forces) -> Inertia:
+    """The chassis with its centre of mass shifted and a point mass on it."""
+    geometry = forces.geometry
+    moved = base._replace(com=base.com + Vector(*geometry.com_offset)).at(ZERO, IDENTITY)
+    place = Vector(*geometry.payload_position)
+    mass = geometry.payload_mass
+    return moved + Inertia(mass, place * mass, Symmetric.of_point(mass, place))
+
+
+def _over_legs(value: Any, count: int) -> Any:
+    """`value` as an array with one entry per leg."""
+    return jnp.broadcast_to(value, (count,)) if np.ndim(value) == 0 else value

@@ -1,0 +1,1 @@
+"""What every effect promises, and the checks of it (`lunar-mjx effect test`)."""

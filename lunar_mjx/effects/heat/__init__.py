@@ -1,0 +1,1 @@
+"""Effects of the motors' temperatures (port `heat`)."""

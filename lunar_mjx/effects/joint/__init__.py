@@ -1,0 +1,1 @@
+"""Effects of motors and joints (ports `command` and `motor_torque`)."""

@@ -1,0 +1,218 @@
+"""Calls the effects at their ports in the fixed order, and gathers the forces that they make."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import jax.numpy as jnp
+
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.effects.context import (
+    BodyWrench,
+    Command,
+    Contact,
+    Context,
+    Geometry,
+    Heat,
+    Normal,
+    RoverInfo,
+    Soil,
+    WheelForce,
+)
+from lunar_mjx.effects.wheel.closed_form import lateral_slip_speed
+from lunar_mjx.pytree import pytree
+from lunar_mjx.spatial import Vec3
+from lunar_mjx.terrain import inside, sample
+
+SLIP_SPEED_FLOOR = 2e-3
+"""Smallest denominator of the instantaneous slip, m/s; below it slip fades to zero."""
+
+EffectState = dict[str, dict[str, Any]]
+
+
+@pytree
+class Forces:
+    """What the effects ask the engine to apply, in world coordinates.
+
+    Attributes:
+      joint_torque: at the actuated joints, N m.
+      wheel_force, wheel_moment: on each wheel, at its centre, N, N m.
+      chassis_force, chassis_moment: on the chassis, at the origin of its frame, N, N m.
+      geometry: the rover as it is.
+    """
+
+    joint_torque: Any
+    wheel_force: Vec3
+    wheel_moment: Vec3
+    chassis_force: Vec3
+    chassis_moment: Vec3
+    geometry: Geometry
+
+
+class Pipeline:
+    """The effects of a model, sorted by port."""
+
+    def __init__(self, effects: tuple[Effect, ...]):
+        self.effects = effects
+        self._at = {}
+        for effect in sorted(effects, key=lambda e: e.order):
+            for port in effect.ports:
+                self._at.setdefault(port, []).append(effect)
+
+    def __contains__(self, port: str) -> bool:
+        return port in self._at
+
+    def run(self, port: str, ctx: Context, state: EffectState, value: Any) -> tuple[Any, EffectState]:
+        """Passes `value` through the effects at `port`; returns it with the effects' new state."""
+        for effect in self._at.get(port, ()):
+            own = state.get(effect.name, {})
+            result = effect.ports[port](ctx, ctx.parameters[effect.name], SimpleNamespace(**own), value)
+            if not effect.state:
+                value = result
+                continue
+            value, update = result
+            new = {}
+            for name, old in own.items():
+                value_now = update.get(name, old)
+                if name in update and effect.state[name].rate:
+                    value_now = old + ctx.dt * update[name]
+                # A weakly typed new state would compile the next call of the step anew.
+                new[name] = jnp.asarray(value_now, old.dtype)
+            state = {**state, effect.name: new}
+        return value, state
+
+
+def nominal_geometry(rover: RoverInfo) -> Geometry:
+    zero = jnp.zeros_like(rover.wheel_radius)
+    nil = jnp.zeros_like(rover.wheel_radius[..., 0])
+    none = Vec3(nil, nil, nil)
+    return Geometry(jnp.asarray(rover.wheel_radius), jnp.asarray(rover.wheel_width), zero, nil, none, none)
+
+
+def wheel_contact(ctx: Context) -> Contact:
+    """How the wheels meet the ground: sinkage, slip (eq. 8), slip angle (eq. 9) and the wheel frames.
+
+    The ground under a wheel is the plane that touches the bilinear surface below the wheel's centre. Slip and slip
+    angle are taken in the direction of travel, so that both keep their meaning when backing up.
+    """
+    geometry: Geometry = ctx.geometry  # type: ignore[assignment]
+    place = ctx.wheel_position
+    height, slope_x, slope_y = sample(ctx.terrain.field, place.x, place.y)
+    normal = Vec3(-slope_x, -slope_y, jnp.ones_like(slope_x)).unit()
+    tilt = ctx.wheel_axle.dot(normal)
+    lowest = geometry.radius * jnp.sqrt(jnp.maximum(1.0 - tilt * tilt, 1e-6))
+    sinkage = jnp.maximum(lowest - (place.z - height) * normal.z, 0.0)
+    ahead = ctx.wheel_axle.cross(normal).unit(1e-6)
+    across = normal.cross(ahead)
+    cos, sin = jnp.cos(geometry.toe), jnp.sin(geometry.toe)
+    forward, left = ahead * cos + across * sin, across * cos - ahead * sin
+    v_x, v_y = ctx.wheel_velocity.dot(forward), ctx.wheel_velocity.dot(left)
+    rim_speed = geometry.radius * ctx.wheel_angular_velocity.dot(ctx.wheel_axle)
+    roll = jnp.where(jnp.abs(rim_speed) > jnp.abs(v_x), rim_speed, v_x)
+    heading = jnp.where(roll < 0.0, -1.0, 1.0)
+    slip = heading * (rim_speed - v_x) / jnp.maximum(jnp.abs(roll), SLIP_SPEED_FLOOR)
+    travel = jnp.maximum(jnp.abs(v_x), SLIP_SPEED_FLOOR)
+    return Contact(
+        sinkage=sinkage,
+        sinkage_rate=-ctx.wheel_velocity.dot(normal),
+        slip=slip,
+        slip_angle=jnp.arctan2(v_y, travel),
+        v_x=v_x,
+        v_y=v_y,
+        rim_speed=rim_speed,
+        forward=forward,
+        left=left,
+        normal=normal,
+        inside=inside(ctx.terrain.field, place.x, place.y),
+        soil_slip=jnp.clip(slip, -1.0, 1.0),
+    )
+
+
+def initial_soil(like: Any) -> Soil:
+    zero, one = jnp.zeros_like(like), jnp.ones_like(like)
+    return Soil(zero, one, one, zero, zero, one, one, zero)
+
+
+def initial_normal(like: Any) -> Normal:
+    zero = jnp.zeros_like(like)
+    tiny = zero + 1e-4
+    return Normal(2.0 * tiny, zero, tiny, zero, zero, zero, zero)
+
+
+def initial_wheel(contact: Contact) -> WheelForce:
+    """Instantaneous slip as the value before any memory of the soil: what `shear_state` tends to while rolling."""
+    roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
+    speed = jnp.maximum(jnp.abs(roll), SLIP_SPEED_FLOOR)
+    zero = Vec3.zero(contact.sinkage)
+    return WheelForce(
+        slip_x=(contact.rim_speed - contact.v_x) / speed,
+        slip_y=lateral_slip_speed(contact) / speed,
+        direction=jnp.clip(roll / SLIP_SPEED_FLOOR, -1.0, 1.0),
+        force=zero,
+        moment=zero,
+    )
+
+
+def _remembered(contact: Contact, state: EffectState) -> Contact:
+    """A contact with the slip that the soil remembers, where an effect keeps it.
+
+    The slip of a wheel that creeps changes within a millimetre per second from none to full. Soil that answered to it
+    at once would shake a parked rover for ever; it is displaced over a contact length instead.
+    """
+    for kept in state.values():
+        if {"slip_x", "direction"} <= kept.keys():
+            return dataclasses.replace(contact, soil_slip=jnp.clip(kept["direction"] * kept["slip_x"], -1.0, 1.0))
+    return contact
+
+
+def wheel_ports(pipeline: Pipeline, ctx: Context, state: EffectState) -> tuple[Context, EffectState]:
+    """The ports soil, wheel_normal and wheel_shear, for a context that already has its contact."""
+    contact: Contact = _remembered(ctx.contact, state)  # type: ignore[arg-type]
+    ctx = dataclasses.replace(ctx, contact=contact)
+    soil, state = pipeline.run("soil", ctx, state, initial_soil(contact.sinkage))
+    ctx = dataclasses.replace(ctx, soil=soil)
+    normal, state = pipeline.run("wheel_normal", ctx, state, initial_normal(contact.sinkage))
+    ctx = dataclasses.replace(ctx, normal=normal)
+    wheel, state = pipeline.run("wheel_shear", ctx, state, initial_wheel(contact))
+    return dataclasses.replace(ctx, wheel=wheel), state
+
+
+def apply_effects(
+    pipeline: Pipeline, ctx: Context, control: Any, state: EffectState
+) -> tuple[Forces, Context, EffectState]:
+    """Runs every force port in order; returns the forces, the completed context and the effects' new state."""
+    command, state = pipeline.run("command", ctx, state, Command(control, jnp.zeros_like(control)))
+    ctx = dataclasses.replace(ctx, command=command)
+    torque, state = pipeline.run("motor_torque", ctx, state, jnp.zeros_like(ctx.joint_angle))
+    ctx = dataclasses.replace(ctx, torque=torque)
+    geometry, state = pipeline.run("geometry", ctx, state, nominal_geometry(ctx.rover))
+    ctx = dataclasses.replace(ctx, geometry=geometry)
+    if geometry.gravity is not None:
+        ctx = dataclasses.replace(ctx, gravity=geometry.gravity)
+    ctx = dataclasses.replace(ctx, contact=wheel_contact(ctx))
+    ctx, state = wheel_ports(pipeline, ctx, state)
+    zero = jnp.zeros_like(ctx.position.x)
+    none = Vec3(zero, zero, zero)
+    wrench, state = pipeline.run("body_wrench", ctx, state, BodyWrench(none, none, jnp.zeros_like(ctx.joint_angle)))
+    contact, wheel = ctx.contact, ctx.wheel
+
+    def to_world(v: Vec3) -> Vec3:
+        return contact.forward * v.x + contact.left * v.y + contact.normal * v.z  # type: ignore[union-attr]
+
+    forces = Forces(
+        joint_torque=torque + wrench.joint_torque,
+        wheel_force=to_world(wheel.force),  # type: ignore[union-attr]
+        wheel_moment=to_world(wheel.moment),  # type: ignore[union-attr]
+        chassis_force=wrench.force,
+        chassis_moment=wrench.moment,
+        geometry=geometry,
+    )
+    return forces, ctx, state
+
+
+def heat_flow(pipeline: Pipeline, ctx: Context, state: EffectState) -> tuple[Heat, EffectState]:
+    """The port heat: net heat into the two nodes of every motor, for the temperatures in the context."""
+    zero, one = jnp.zeros_like(ctx.joint_angle), jnp.ones_like(ctx.joint_angle)
+    return pipeline.run("heat", ctx, state, Heat(zero, zero, one, one))

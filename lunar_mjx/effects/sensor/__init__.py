@@ -1,0 +1,1 @@
+"""Effects of what sensors report (port `sensor`)."""

@@ -1,0 +1,1 @@
+"""Effects of the ground's parameters (port `soil`)."""

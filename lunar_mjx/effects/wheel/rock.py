@@ -1,0 +1,185 @@
+"""Wheel and chassis on hard things: rock surfaces (penalty contact with friction) and boulders."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+
+from lunar_mjx.effects.base import Effect, Parameter, effect
+from lunar_mjx.effects.wheel.closed_form import airborne, entrance_angle
+from lunar_mjx.spatial import Frame, Vec3
+from lunar_mjx.terrain import nearest_rock, sample
+
+_STIFFNESS = Parameter(2e5, None, (1e2, 1e8), "N/m", "contact stiffness k_N on rock", "paper's release: 5e4 to 1e6")
+_DAMPING = Parameter(400.0, 0.0, (0.0, 1e6), "N s/m", "contact damping c_N on rock", "paper's release: 1e2 to 1e5")
+_MU = Parameter(0.8, 0.0, (0.0, 2.0), "1", "friction coefficient on rock", "paper's release: 0.7 to 0.9")
+
+
+def _rock_normal(ctx, p, x, normal):
+    contact = ctx.contact
+    rock = ctx.soil.rock > 0.5
+    load = jnp.where(airborne(contact), 0.0, p.stiffness * contact.sinkage)
+    damping = jnp.where(airborne(contact), 0.0, jnp.maximum(p.damping * contact.sinkage_rate, -load))
+    theta_1 = entrance_angle(contact.sinkage, ctx.geometry.radius)
+    zero = jnp.zeros_like(load)
+    stress = normal.stress
+    if stress is not None:
+        stress = dataclasses.replace(stress, sigma=tuple(jnp.where(rock, 0.0, s) for s in stress.sigma))
+    return dataclasses.replace(
+        normal,
+        entrance=jnp.where(rock, theta_1, normal.entrance),
+        theta_m=jnp.where(rock, 0.5 * theta_1, normal.theta_m),
+        sigma_m=jnp.where(rock, zero, normal.sigma_m),
+        load=jnp.where(rock, load, normal.load),
+        resistance=jnp.where(rock, zero, normal.resistance),
+        damping=jnp.where(rock, damping, normal.damping),
+        stress=stress,
+    )
+
+
+def _rock_shear(ctx, p, x, wheel):
+    """Replaces the soil's shear by f = mu F_N (1 - exp(-|k| L/K)) k/|k|, with k the slip vector of the shear state."""
+    rock = ctx.soil.rock > 0.5
+    load = ctx.normal.load + ctx.normal.damping
+    slip = jnp.sqrt(wheel.slip_x**2 + wheel.slip_y**2 + 1e-12)
+    friction = -p.mu * load * jnp.expm1(-slip / p.slip_scale) / slip
+    along, side = friction * wheel.slip_x, -friction * wheel.slip_y
+    radius = ctx.geometry.radius
+    force = Vec3(along, side, load)
+    moment = Vec3(radius * side, -radius * along, jnp.zeros_like(load))
+    return dataclasses.replace(wheel, force=force.where(rock, wheel.force), moment=moment.where(rock, wheel.moment))
+
+
+hard_ground = Effect(
+    name="hard_ground",
+    ports={"wheel_normal": _rock_normal, "wheel_shear": _rock_shear},
+    parameters={
+        "stiffness": _STIFFNESS,
+        "damping": _DAMPING,
+        "mu": _MU,
+        "slip_scale": Parameter(0.01, None, (1e-4, 1.0), "1", "slip at which friction on rock is 63 % mobilised",
+                                "choice: order of a rigid wheel's"),
+    },
+    order=10,
+    doc="""Wheel on rock: F_N = k_N z + c_N zdot and friction mu F_N against the slip (seed paper III-C4), where the
+    map says rock. Friction saturates in the slip that the shear state carries, hence holds a parked wheel.""",
+)  # fmt: skip
+
+
+def _closest_point_to_sphere(center: Vec3, wheel_center: Vec3, axle: Vec3, radius, width) -> tuple[Vec3, Vec3, Any]:
+    """Point of a wheel nearest to a sphere's centre, relative to the wheel's; unit vector to that; distance."""
+    gap = center - wheel_center
+    axial = gap.dot(axle)
+    radial = gap - axle * axial
+    length = radial.norm(1e-9)
+    closest = radial * (jnp.minimum(length, radius) / length) + axle * jnp.clip(axial, -0.5 * width, 0.5 * width)
+    apart = gap - closest
+    distance = apart.norm(1e-9)
+    return closest, apart * (1.0 / distance), distance
+
+
+def _penalty(depth, rate, stiffness, damping):
+    """max(k depth + c rate, 0) where in contact, N."""
+    return jnp.where(depth > 0.0, jnp.maximum(stiffness * depth + damping * rate, 0.0), 0.0)
+
+
+def _sliding_friction(velocity: Vec3, normal: Vec3, mu, load, speed_scale) -> Vec3:
+    """mu F_N against the tangential velocity, smoothed below `speed_scale`."""
+    tangential = velocity - normal * velocity.dot(normal)
+    speed = tangential.norm(1e-6)
+    return tangential * (-mu * load * jnp.tanh(speed / speed_scale) / speed)
+
+
+_SPEED = Parameter(0.05, None, (1e-4, 1.0), "m/s", "sliding speed of full friction",
+                   "choice: stable with explicit forces at 2 ms")  # fmt: skip
+
+
+@effect("wheel_shear", order=20, stiffness=_STIFFNESS, damping=_DAMPING, mu=_MU, speed_scale=_SPEED)
+def boulders(ctx, p, x, wheel):
+    """Boulders are spheres that a wheel (a cylinder) runs against: penalty force along the line between them."""
+    if ctx.terrain.rocks is None:
+        return wheel
+    geometry, contact, place = ctx.geometry, ctx.contact, ctx.wheel_position
+    cx, cy, cz, rock_radius = nearest_rock(ctx.terrain.rocks, place.x, place.y)
+    closest, toward, distance = _closest_point_to_sphere(
+        Vec3(cx, cy, cz), place, ctx.wheel_axle, geometry.radius, geometry.width
+    )
+    velocity = ctx.wheel_velocity + ctx.wheel_angular_velocity.cross(closest)
+    depth = jnp.where(rock_radius > 0.0, rock_radius - distance, -1.0)
+    load = _penalty(depth, velocity.dot(toward), p.stiffness, p.damping)
+    force = toward * -load + _sliding_friction(velocity, toward, p.mu, load, p.speed_scale)
+    frame = Frame(contact.forward, contact.left, contact.normal)
+    return dataclasses.replace(
+        wheel,
+        force=wheel.force + frame.from_world(force),
+        moment=wheel.moment + frame.from_world(closest.cross(force)),
+    )
+
+
+_QUADRANTS = ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5))
+"""Where each box of the chassis looks for boulders, in half lengths from its centre."""
+
+
+def _boulders_under_chassis(ctx, p) -> list[tuple[Vec3, Vec3]]:
+    """Force on the chassis, N, and its arm from the chassis frame, m, per quadrant: sphere against box, world frame."""
+    center, half = ctx.rover.box_center, ctx.rover.box_half
+    rocks = []
+    for fore, side in _QUADRANTS:
+        probe = ctx.frame.to_world(Vec3(center.x + fore * half.x, center.y + side * half.y, center.z)) + ctx.position
+        rocks.append(nearest_rock(ctx.terrain.rocks, probe.x, probe.y))
+    out = []
+    for x, y, z, radius in rocks:
+        # quadrants that found the same boulder share its push
+        share = 1.0 / sum(jnp.where((x == other[0]) & (y == other[1]), 1.0, 0.0) for other in rocks)
+        gap = ctx.frame.from_world(Vec3(x, y, z) - ctx.position) - center
+        nearest = Vec3(*(jnp.clip(g, -h, h) for g, h in zip(gap, half, strict=True)))
+        apart = gap - nearest
+        distance = apart.norm(1e-9)
+        inside = distance < 1e-6
+        down = Vec3(jnp.zeros_like(distance), jnp.zeros_like(distance), -jnp.ones_like(distance))
+        toward = ctx.frame.to_world(down.where(inside, apart * (1.0 / distance)))
+        arm = ctx.frame.to_world(nearest + center)
+        velocity = ctx.velocity + ctx.angular_velocity.cross(arm)
+        depth = jnp.where(radius > 0.0, radius - jnp.where(inside, 0.0, distance), -1.0)
+        load = share * _penalty(depth, velocity.dot(toward), p.stiffness, p.damping)
+        out.append((toward * -load + _sliding_friction(velocity, toward, p.mu, load, p.speed_scale), arm))
+    return out
+
+
+@effect(
+    "body_wrench",
+    stiffness=Parameter(5e4, None, (1e2, 1e8), "N/m", "contact stiffness of the chassis", "choice"),
+    damping=Parameter(1e3, 0.0, (0.0, 1e6), "N s/m", "contact damping of the chassis", "choice"),
+    mu=Parameter(0.6, 0.0, (0.0, 2.0), "1", "friction coefficient of the chassis on the ground", "choice"),
+    speed_scale=_SPEED,
+)
+def chassis_contact(ctx, p, x, wrench):
+    """Points of the chassis that touch the ground and boulders that touch its boxes push it out."""
+    arm = ctx.frame.to_world(ctx.rover.chassis_points)
+    point = arm + ctx.position
+    velocity = ctx.velocity + ctx.angular_velocity.cross(arm)
+    height, slope_x, slope_y = sample(ctx.terrain.field, point.x, point.y)
+    normal = Vec3(-slope_x, -slope_y, jnp.ones_like(slope_x)).unit()
+    load = _penalty((height - point.z) * normal.z, -velocity.dot(normal), p.stiffness, p.damping)
+    force = normal * load + _sliding_friction(velocity, normal, p.mu, load, p.speed_scale)
+    total, moment = force.sum(), arm.cross(force).sum()
+    if ctx.terrain.rocks is not None and ctx.rover.box_center is not None:
+        for push, where in _boulders_under_chassis(ctx, p):
+            total, moment = total + push.sum(), moment + where.cross(push).sum()
+    return dataclasses.replace(wrench, force=wrench.force + total, moment=wrench.moment + moment)
+
+
+@effect(
+    "body_wrench",
+    stiffness=Parameter(5e3, 0.0, (0.0, 1e8), "N m/rad", "stiffness of the joint stops", "choice"),
+    damping=Parameter(50.0, 0.0, (0.0, 1e6), "N m s/rad", "damping of the joint stops", "choice"),
+)
+def joint_limits(ctx, p, x, wrench):
+    """Joint stops as passive springs with damping, so that the solver sees equality constraints only."""
+    below = jnp.maximum(ctx.rover.joint_lower - ctx.joint_angle, 0.0)
+    above = jnp.maximum(ctx.joint_angle - ctx.rover.joint_upper, 0.0)
+    upward = jnp.where(below > 0.0, jnp.maximum(p.stiffness * below - p.damping * ctx.joint_speed, 0.0), 0.0)
+    downward = jnp.where(above > 0.0, jnp.maximum(p.stiffness * above + p.damping * ctx.joint_speed, 0.0), 0.0)
+    return dataclasses.replace(wrench, joint_torque=wrench.joint_torque + upward - downward)

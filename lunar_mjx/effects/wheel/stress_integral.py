@@ -1,0 +1,110 @@
+"""Wheel on soft soil by quadrature of the Wong-Reece stress over the contact arc: the higher-fidelity option."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.effects.base import Effect, Parameter
+from lunar_mjx.effects.context import Stress
+from lunar_mjx.effects.wheel.closed_form import (
+    _DAMPING,
+    contact_with_soil,
+    cos_difference,
+    entrance_angle,
+    grounded,
+    max_normal_stress,
+    normal_damping_force,
+    shear_stress,
+    shearing_radius,
+    sin_difference,
+)
+from lunar_mjx.spatial import Vec3
+
+NODES_PER_SIDE = 6
+"""Gauss-Legendre nodes before and after the angle of maximum stress; tests state the error of this choice."""
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(NODES_PER_SIDE)
+
+
+def integrate(ctx, contact, theta_1, theta_m, theta_2):
+    """Load and resistance of the normal stress, N, and the stress at the nodes, for the angles given in rad."""
+    r, b = ctx.geometry.radius, ctx.geometry.width
+    modulus = ctx.soil.k_c / b + ctx.soil.k_phi
+    theta, weight, sigma = [], [], []
+    for node, w in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
+        share = 0.5 * (1.0 + node)
+        for start, end, front in ((theta_2, theta_m, False), (theta_m, theta_1, True)):
+            angle = start + (end - start) * share
+            # The rear stress at theta is the front stress at the angle that lies as far, in proportion, from theta_m.
+            mirror = angle if front else theta_1 - (angle - theta_2) / (theta_m - theta_2) * (theta_1 - theta_m)
+            depth = jnp.maximum(r * cos_difference(mirror, theta_1), 1e-12 * r)
+            theta.append(angle)
+            weight.append(0.5 * w * (end - start))
+            sigma.append(grounded(contact, modulus * depth**ctx.soil.n))
+    area = r * b
+    load = area * sum(w * s * jnp.cos(t) for t, w, s in zip(theta, weight, sigma, strict=True))
+    resistance = area * sum(w * s * jnp.sin(t) for t, w, s in zip(theta, weight, sigma, strict=True))
+    return load, resistance, Stress(theta=tuple(theta), weight=tuple(weight), sigma=tuple(sigma))
+
+
+def _normal(ctx, p, x, normal):
+    contact, geometry = contact_with_soil(ctx), ctx.geometry
+    theta_1 = entrance_angle(contact.sinkage, geometry.radius)
+    theta_m, theta_2 = 0.5 * theta_1, jnp.zeros_like(theta_1)
+    load, resistance, stress = integrate(ctx, contact, theta_1, theta_m, theta_2)
+    damping = jnp.maximum(normal_damping_force(ctx, p.damping, theta_1), -load)
+    sigma_m = max_normal_stress(ctx.soil, geometry.width, geometry.radius, theta_m, theta_1)
+    return dataclasses.replace(
+        normal,
+        entrance=theta_1,
+        exit=theta_2,
+        theta_m=theta_m,
+        sigma_m=grounded(contact, sigma_m),
+        load=load,
+        resistance=resistance,
+        damping=grounded(contact, damping),
+        stress=stress,
+    )
+
+
+def _shear(ctx, p, x, wheel):
+    geometry, normal, soil = ctx.geometry, ctx.normal, ctx.soil
+    r, b, r_s = geometry.radius, geometry.width, shearing_radius(p, geometry, wheel)
+    theta_1, stress = normal.entrance, normal.stress
+    along = lift = turn = across = roll = yaw = 0.0
+    for theta, weight, sigma in zip(stress.theta, stress.weight, stress.sigma, strict=True):
+        arc = sin_difference(theta_1, theta)
+        strength = grounded(ctx.contact, soil.cohesion + sigma * soil.tan_phi)
+        j_x = r_s * (wheel.direction * ((theta_1 - theta) - arc) + wheel.slip_x * arc)
+        tau, tau_y = shear_stress(wheel, soil, weight * strength, j_x, r * (theta_1 - theta) * wheel.slip_y)
+        cos, sin = jnp.cos(theta), jnp.sin(theta)
+        along, lift, turn = along + tau * cos, lift + tau * sin, turn + tau
+        across, roll, yaw = across + tau_y, roll + tau_y * cos, yaw + tau_y * sin
+    area = r * b
+    force = Vec3(
+        r_s * b * along - wheel.direction * normal.resistance,
+        -area * across,
+        normal.load + normal.damping + wheel.direction * r_s * b * lift,
+    )
+    moment = Vec3(-r * area * roll, -r_s * r_s * b * turn, -wheel.direction * r * area * yaw)
+    return dataclasses.replace(wheel, force=wheel.force + force, moment=wheel.moment + moment)
+
+
+stress_integral = Effect(
+    name="stress_integral",
+    ports={"wheel_normal": _normal, "wheel_shear": _shear},
+    parameters={
+        "damping": _DAMPING,
+        "shear_radius": Parameter(1.0, None, (0.8, 1.3), "1", "shearing radius r_s over the radius r", "r_s = r"),
+    },
+    replaces=("pressure_sinkage", "closed_form_shear"),
+    doc="""Normal and shear stress integrated over the contact arc by Gauss-Legendre quadrature.
+
+    sigma(theta) = (k_c/b + k_phi)[r(cos theta - cos theta_1)]^n in front of theta_m = theta_1/2, mirrored in proportion
+    behind it down to theta_2 = 0 (Wong & Reece 1967); tau(theta) = (c + sigma tan phi)(1 - exp(-j(theta)/K)) with
+    j(theta) = r_s[(theta_1 - theta) - (1 - s)(sin theta_1 - sin theta)] (Janosi & Hanamoto 1961) and across
+    r (1 - s)(theta_1 - theta) tan(beta) (Ishigami et al. 2007).""",
+)

@@ -1,0 +1,1 @@
+"""The navigation task: drive to a goal over rough, soft ground."""

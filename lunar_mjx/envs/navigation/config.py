@@ -1,0 +1,205 @@
+"""The navigation task's settings, and everything that the paper leaves unsaid about it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.envs.navigation.actions import ACTION_MODES
+from lunar_mjx.envs.navigation.kalman import KalmanConfig
+from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION, check_blocks
+from lunar_mjx.envs.navigation.randomise import Range
+from lunar_mjx.envs.navigation.rewards import CONSISTENT_WEIGHTS, FAILURE, PAPER_WEIGHTS, SUCCESS, TERMS
+from lunar_mjx.errors import bad_input, require_finite
+
+DIVERGENCE = ("stop", "reset")
+
+
+@dataclasses.dataclass(frozen=True)
+class NavigationConfig:
+    """Settings of the navigation task. Lengths in m, times in s, angles in rad.
+
+    Attributes:
+      decimation: physics steps per action.
+      action: action mode, see `actions.ACTION_MODES`.
+      four_wheel_steering: rear wheels steer opposite to the front ones.
+      top_speed: rim speed at a wheel speed action of 1, m/s.
+      load_share: tangential force at a drive torque action of 1, over the wheel's load.
+      observations: blocks that the policy sees, see `observations.BLOCKS`.
+      privileged: blocks that only a critic sees.
+      goal_distance: least and greatest distance from start to goal.
+      goal_radius: distance from the goal that counts as success.
+      start_within: half side of the square about the origin in which episodes begin; anywhere on the terrain if None.
+      start_yaw: episodes begin at headings within this of the goal's bearing; pi for any heading.
+      episode_time: after which an episode is cut off.
+      weights: of the reward terms, see `rewards.TERMS`.
+      success, failure: reward at the end of an episode (G and V of the paper).
+      most_tilt: lean of the body's up axis that counts as rolled over.
+      stuck_time, stuck_distance: a rover that stays within the distance of a place for the time is stuck.
+      edge: distance from the terrain's edge, within it, at which an episode fails.
+      places: pairs of start and goal drawn on the host.
+      place_seed: of those pairs.
+      steepest: slope at start and goal.
+      randomise: parameters drawn for every episode.
+      kalman: the acceleration filter's tuning.
+      divergence: what follows a state that is not finite: "stop" lets it through, so that a trainer's guard stops and
+        dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`.
+    """
+
+    decimation: int = 50
+    action: str = "paper"
+    four_wheel_steering: bool = False
+    top_speed: float = 1.0
+    load_share: float = 0.6
+    observations: tuple[str, ...] = PAPER_OBSERVATION
+    privileged: tuple[str, ...] = ()
+    goal_distance: tuple[float, float] = (5.0, 10.0)
+    goal_radius: float = 0.5
+    start_within: float | None = None
+    start_yaw: float = np.pi
+    episode_time: float = 30.0
+    weights: Mapping[str, float] = dataclasses.field(default_factory=lambda: dict(CONSISTENT_WEIGHTS))
+    success: float = SUCCESS
+    failure: float = FAILURE
+    most_tilt: float = np.pi / 3
+    stuck_time: float = 8.0
+    stuck_distance: float = 0.1
+    edge: float = 1.5
+    places: int = 16384
+    place_seed: int = 0
+    steepest: float = np.radians(20.0)
+    randomise: tuple[Range, ...] = ()
+    kalman: KalmanConfig = dataclasses.field(default_factory=KalmanConfig)
+    divergence: str = "stop"
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    def replace(self, **changes: Any) -> NavigationConfig:
+        """A copy with other values, checked.
+
+        Raises:
+          UserError: unknown setting, or a value that makes no sense.
+        """
+        known = [f.name for f in dataclasses.fields(self)]
+        for key in changes:
+            if key not in known:
+                raise bad_input("navigation", key, changes[key], "is no setting", f"use one of {', '.join(known)}")
+        return dataclasses.replace(self, **changes)
+
+
+def _check(c: NavigationConfig) -> None:
+    for name in ("decimation", "places"):
+        value = getattr(c, name)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise bad_input("navigation", name, value, "is not a whole number of at least 1", "give one")
+    for name in ("top_speed", "load_share", "goal_radius", "episode_time", "most_tilt", "stuck_time",
+                 "stuck_distance", "steepest"):  # fmt: skip
+        if require_finite("navigation", name, getattr(c, name)) <= 0.0:
+            raise bad_input("navigation", name, getattr(c, name), "is not positive", "give a number above zero")
+    for name in ("success", "failure", "edge", "start_yaw"):
+        require_finite("navigation", name, getattr(c, name))
+    low, high = c.goal_distance
+    if not c.goal_radius < low <= high < np.inf:
+        raise bad_input("navigation", "goal_distance", c.goal_distance, f"is not a range above goal_radius = "
+                        f"{c.goal_radius}", "give least and greatest distance in m")  # fmt: skip
+    for name, allowed in (("action", ACTION_MODES), ("divergence", DIVERGENCE)):
+        if getattr(c, name) not in allowed:
+            raise bad_input("navigation", name, getattr(c, name), "does not exist", f"use one of {', '.join(allowed)}")
+    check_blocks(c.observations, "observations")
+    check_blocks(c.privileged, "privileged")
+    if not c.observations:
+        raise bad_input("navigation", "observations", c.observations, "is empty", "name at least one block")
+    for name, weight in c.weights.items():
+        if name not in TERMS:
+            raise bad_input("navigation", "weights", name, "is no reward term", f"use some of {', '.join(TERMS)}")
+        require_finite("navigation", f"weights.{name}", weight)
+
+
+EGOCENTRIC = ("goal_body", "up", "body_velocity", "body_rates", "acceleration", "joints", "slip", "last_action",
+              "waited", "height_scan")  # fmt: skip
+"""What the tuned policies see: nothing depends on where in the world the rover is or which way north lies."""
+
+SOIL_RANGES = (
+    Range("soil.k_phi", 0.5, 2.0, "log", relative=True),
+    Range("soil.cohesion", 0.5, 2.0, "log", relative=True),
+    Range("soil.friction_angle", 0.9, 1.1, relative=True),
+    Range("soil.shear_modulus_x", 0.7, 1.4, "log", relative=True),
+    Range("motor.torque_constant", 0.95, 1.05, relative=True),
+    Range("motor.resistance", 0.95, 1.05, relative=True),
+    Range("winding_temperature", 250.0, 330.0),
+)
+"""Training's spread of soils and motors about the model's values."""
+
+UNSEEN_SOIL = (
+    Range("soil.k_phi", 0.4, 0.5, "log", relative=True),
+    Range("soil.cohesion", 0.4, 0.5, "log", relative=True),
+    Range("soil.friction_angle", 1.1, 1.15, relative=True),
+    Range("soil.shear_modulus_x", 0.6, 0.7, "log", relative=True),
+    Range("motor.torque_constant", 0.93, 0.95, relative=True),
+    Range("motor.resistance", 1.05, 1.07, relative=True),
+    Range("winding_temperature", 240.0, 250.0),
+)
+"""The held-out soil: softer and less cohesive, with more friction that takes less slip to build up, and tired, colder
+motors; outside training's range in every parameter. The weak end of all ranges at once is no test: slip is 0.7 on flat
+ground, and 9 rovers of 10 dig in on the slopes of `world:train` without any rock."""
+
+TASKS: dict[str, NavigationConfig] = {
+    "paper": NavigationConfig(
+        weights=dict(PAPER_WEIGHTS), goal_distance=(4.0, 6.0), start_within=2.0, start_yaw=np.pi / 2
+    ),
+    "consistent": NavigationConfig(goal_distance=(4.0, 6.0), start_within=2.0, start_yaw=np.pi / 2),
+    "large": NavigationConfig(
+        action="velocity",
+        four_wheel_steering=True,
+        observations=EGOCENTRIC,
+        privileged=("sinkage", "temperatures", "drawn"),
+        goal_distance=(10.0, 40.0),
+        episode_time=120.0,
+        # no price on time: discounting presses enough, and a price makes it pay to end an episode by getting stuck
+        weights={"progress": 20.0, "tilt": 0.05, "excite": 0.02, "jerkiness": 0.02},
+        failure=-100.0,
+        # a rover that rocks to and fro upon a stone is stuck too
+        stuck_time=10.0,
+        stuck_distance=0.3,
+        randomise=SOIL_RANGES,
+        divergence="reset",
+    ),
+}
+"""`paper`: section V with its reward as printed. `consistent`: the same with signed progress. `large`: the task of the
+large-batch trainings, goals 10 to 40 m away over rough ground, drawn soils and motors."""
+
+UNSAID: dict[str, tuple[str, str]] = {
+    "rover": ("luvmi_x", "the smaller of the two that the paper ships; every setting takes viper as well"),
+    "terrain": (
+        "lunar_plain",
+        "the paper says lunar terrain; its de Gerlache map at 1:100 has hills as large as rovers",
+    ),
+    "goal distance": ("4 to 6 m", "some body lengths of the rover: reached in 400 episodes of one rover"),
+    "start": ("within 2 m of the origin, heading within 90 deg of the goal", "the paper shows one place only"),
+    "goal radius": ("0.5 m", "about half the body's length"),
+    "episode length": ("30 s, then truncated, not terminated", "several times what the drive takes"),
+    "time step": ("2 ms physics, 0.1 s control", "the physics' own; 10 Hz is what rover electronics do"),
+    "torque at action 1": (
+        "drive: 0.6 of a wheel's load times its radius; steering: turns the motor's inertia to its limit in 0.5 s; "
+        "suspension: half the wheel's load times the arm",
+        "15 N m is 12 times what the soil can carry under this rover",
+    ),
+    "rear steering": ("held straight", "the paper steers with the two front motors"),
+    "rolled over": ("up axis more than 60 deg from the vertical", "beyond it no rover comes back"),
+    "stuck": ("within 0.1 m of one place for 8 s", "a wheel turns 13 times meanwhile at 1 m/s"),
+    "leaving the terrain": ("1.5 m from its edge counts as failed", "beyond the edge the ground is not defined"),
+    "action noise N(0, 0.3)": ("standard deviation 0.3", "SB3's NormalActionNoise takes the deviation"),
+    "Kalman filter": ("R from 1 cm and 2 cm/s, white jerk of 3 m/s^2.5", "time constant of about 0.1 s at 10 Hz"),
+    "frame of positions": ("world axes, origin at the episode's start", "so that places on a large map look alike"),
+    "reward of a control step": ("once per action, not per physics step", "as a Gym environment returns it"),
+    "r_prog": ("distance in the plane", "the goal has no height"),
+    "algorithm settings": (
+        "Stable-Baselines3's defaults of the paper's time (before 2.3), batches of 100, one update per step",
+        "the paper changes none",
+    ),
+}
+"""What the paper leaves unsaid about the task: the choice and its reason."""

@@ -1,0 +1,396 @@
+"""The seed paper's navigation task (section V) for a whole batch of rovers: pure functions on pytrees."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.dynamics import Params, System, build
+from lunar_mjx.dynamics import State as Physics
+from lunar_mjx.envs.core import State, side_by_side, where
+from lunar_mjx.envs.navigation import kalman, randomise, rewards
+from lunar_mjx.envs.navigation.actions import action_map
+from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
+from lunar_mjx.envs.navigation.observations import Scene, observe
+from lunar_mjx.envs.navigation.places import draw_places
+from lunar_mjx.envs.navigation.view import SCAN_SCALE, Reader, View, goal_in_body, read
+from lunar_mjx.envs.navigation.worlds import PREFIX, world
+from lunar_mjx.errors import bad_input
+from lunar_mjx.model import Model, make_model
+from lunar_mjx.pytree import pytree
+
+ENDS = ("reached", "rolled_over", "stuck", "off_terrain", "diverged")
+"""Ways in which an episode terminates; the first is success, the others bring the failure reward."""
+_USED = 0.125
+"""Share of the rovers that may be without a prepared episode before all are prepared anew."""
+
+
+@pytree
+class NavigationParams:
+    """What all environments share; another terrain, other places or ranges of the same shape need no compilation.
+
+    Attributes:
+      system: physical parameters.
+      starts, goals: (place, 2) m.
+      bounds: (range, 2) low and high of every randomised parameter.
+      gains: (n, 3, 2) of the Kalman filter.
+    """
+
+    system: Params
+    starts: Any
+    goals: Any
+    bounds: Any
+    gains: Any
+
+
+@pytree
+class Ready:
+    """The beginning of each rover's next episode, prepared; leading axis `env`.
+
+    Attributes:
+      obs, privileged, info: as in `State`. inner: with neither `ready` nor `used` of its own.
+    """
+
+    obs: Any
+    privileged: Any
+    info: dict[str, Any]
+    inner: Inner
+
+
+@pytree
+class Inner:
+    """State of the task beyond the observation; leading axis `env`.
+
+    Attributes:
+      physics: of the rovers.
+      key: raw random keys.
+      drawn: parameters drawn for the episode.
+      origin: where the episode began, m. goal: m.
+      filtered: Kalman filter.
+      slip, sinkage: of the last physics step.
+      last_action: as given.
+      anchor: (2,) place that the rover last left by the stuck distance, m. waited: time since then, s.
+      steps: control steps of the episode. total: its return.
+      ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
+    """
+
+    physics: Physics
+    key: Any
+    drawn: dict[str, Any]
+    origin: Any
+    goal: Any
+    filtered: kalman.KalmanState
+    slip: Any
+    sinkage: Any
+    last_action: Any
+    anchor: Any
+    waited: Any
+    steps: Any
+    total: Any
+    ready: Ready | None = None
+    used: Any = None
+
+
+class NavigationEnv:
+    """Drive to a goal over lunar terrain; see `docs/reinforcement_learning.md` and `NavigationConfig`.
+
+    Args:
+      model: rover, terrain and effects.
+      config: the task.
+      engine: of the physics, as for `lunar_mjx.dynamics.build`.
+
+    Raises:
+      UserError: settings that do not fit the model.
+    """
+
+    def __init__(self, model: Model, config: NavigationConfig, engine: str = "auto"):
+        randomise.check_ranges(model, config.randomise)
+        self.model, self.config = model, config
+        self.system: System = build(model, engine)
+        self.actions = action_map(model, config.action, config.top_speed, config.load_share, config.four_wheel_steering)
+        # the map's control modes differ between front and rear wheels, which those of the model cannot
+        self.system.info = dataclasses.replace(self.system.info, mode=self.actions.mode)
+        self.control_interval = config.decimation * model.timestep
+        self.episode_steps = max(1, round(config.episode_time / self.control_interval))
+        self._reader = Reader(self.system)
+        self._wheels = len(model.rover.wheels)
+        self._ride = model.rover.standing_height
+        self._scale = SCAN_SCALE.get(model.rover.name, 1.0)
+        self.params = self.place(model)
+        self.action_size = self.actions.size
+        shapes = jax.eval_shape(self.reset, self.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
+        self.observation_size = shapes.obs.shape[1]
+        self.privileged_size = shapes.privileged.shape[1]
+
+    def place(self, model: Model | None = None, ranges: Sequence[randomise.Range] | None = None, seed: int | None = None
+              ) -> NavigationParams:  # fmt: skip
+        """Parameters for another terrain, other ranges of the same parameters, or other places.
+
+        Args:
+          model: brings the terrain and physical parameters; this environment's own if None.
+          ranges: with the same parameters as the configuration's, in the same order.
+          seed: of the places.
+
+        Raises:
+          UserError: ranges of other parameters, or a terrain without room.
+        """
+        from lunar_mjx.dynamics.system import default_params
+
+        model, c = model or self.model, self.config
+        ranges = c.randomise if ranges is None else tuple(ranges)
+        if [(r.parameter, r.scale, r.relative) for r in ranges] != [
+            (r.parameter, r.scale, r.relative) for r in c.randomise
+        ]:
+            raise bad_input("navigation", "ranges", [r.parameter for r in ranges], "are not those of the task",
+                            "give the same parameters and scales in the same order")  # fmt: skip
+        starts, goals = draw_places(
+            model.terrain, c.places, c.goal_distance, c.place_seed if seed is None else seed,
+            clearance=0.5 + 2.0 * self._ride, margin=c.edge + 1.0, steepest=c.steepest, within=c.start_within,
+        )  # fmt: skip
+        bounds = np.array([(r.low, r.high) for r in ranges], np.float32).reshape(-1, 2)
+        gains = kalman.gains(c.kalman, c.decimation * model.timestep).astype(np.float32)
+        return NavigationParams(
+            default_params(model), *(jnp.asarray(a, jnp.result_type(float)) for a in (starts, goals, bounds, gains))
+        )
+
+    def reset(self, params: NavigationParams, keys: Any) -> State:
+        """Begins an episode in every environment; `keys` (env, 2) raw random keys."""
+        # the first episode and the prepared one in one batch: half the program to compile
+        both = self._begin(params, jnp.concatenate([keys, _split(keys)[:, 0]]))
+        first, ready = (jax.tree.map(lambda a, p=part: a[p], both) for part in
+                        (slice(keys.shape[0]), slice(keys.shape[0], None)))  # fmt: skip
+        obs, privileged, inner = first.obs, first.privileged, first.inner
+        zero, no = jnp.zeros(keys.shape[0], obs.dtype), jnp.zeros(keys.shape[0], bool)
+        terms = (f"reward_{n}" for n in self.config.weights)
+        names = ("episode_return", "episode_length", "success", *ENDS[1:], *terms)
+        metrics = dict.fromkeys(names, zero)
+        inner = dataclasses.replace(inner, ready=ready, used=no)
+        return State(obs, privileged, zero, no, no, obs, privileged, metrics, first.info, inner)
+
+    def step(self, params: NavigationParams, state: State, action: Any) -> State:
+        """Acts in every environment, `action` (env, action) in [-1, 1], and resets those whose episode ended.
+
+        Next episodes are prepared with `params` as they were then: after another terrain or range, call `reset`.
+        """
+        c, inner = self.config, state.inner
+        action = jnp.clip(action, -1.0, 1.0).astype(inner.last_action.dtype)
+        before = inner.goal - inner.physics.qpos[:, :2]
+        inner, view = self._advance(params, inner, action)
+        to_goal = inner.goal - view.position[:, :2]
+        transition = rewards.Transition(
+            before, to_goal, view.roll, view.pitch, view.yaw, view.filtered.acceleration[:, 2], action,
+            state.inner.last_action,
+        )  # fmt: skip
+        terms = {name: weight * rewards.TERMS[name](transition) for name, weight in c.weights.items()}
+        ends = self._ends(params, inner, view, to_goal)
+        success = ends["reached"]
+        terminated = success | ends["rolled_over"] | ends["stuck"] | ends["off_terrain"] | ends["diverged"]
+        running = sum(terms.values())
+        if c.divergence == "reset":
+            running = jnp.where(ends["diverged"], 0.0, running)
+        reward = running + jnp.where(success, c.success, jnp.where(terminated, c.failure, 0.0))
+        inner = dataclasses.replace(inner, steps=inner.steps + 1, total=inner.total + reward)
+        truncated = ~terminated & (inner.steps >= self.episode_steps)
+        metrics = {
+            "episode_return": inner.total,
+            "episode_length": inner.steps.astype(reward.dtype),
+            "success": success.astype(reward.dtype),
+            **{name: ends[name].astype(reward.dtype) for name in ENDS[1:]},
+            **{f"reward_{name}": value for name, value in terms.items()},
+        }
+        final_obs, final_privileged = self._observe(params, inner, view)
+        if c.divergence == "reset":
+            # the successor of a state that is gone carries no value, but must not poison a batch
+            final_obs, final_privileged = (jnp.nan_to_num(a, posinf=0.0, neginf=0.0) for a in
+                                           (final_obs, final_privileged))  # fmt: skip
+        return side_by_side(self._restart(params, inner, State(
+            final_obs, final_privileged, reward, terminated, truncated, final_obs, final_privileged, metrics,
+            self._info(view), inner,
+        )))  # fmt: skip
+
+    def _restart(self, params: NavigationParams, inner: Inner, state: State) -> State:
+        """Begins anew where the episode ended, keeping the final observations.
+
+        To begin takes many small kernels, to select few. So every rover keeps the beginning of its next episode; all
+        are prepared anew once some have been taken, or where an episode ends whose rover has none. Which episode comes
+        next depends on the rover's key alone, and not on when it was prepared.
+        """
+        done, kept = state.done, side_by_side((inner.ready, inner.used))
+        alone = dataclasses.replace(inner, ready=None, used=None)
+
+        def prepare(carry: Any) -> Any:
+            _, (_, used) = carry
+            return jnp.zeros((), bool), side_by_side((self._begin(params, inner.key), jnp.zeros_like(used)))
+
+        short = (done & inner.used).any() | (inner.used.mean(dtype=jnp.float32) > _USED)
+        # a loop of no or one turn: unlike a conditional, it leaves what it does not change where it is
+        _, (ready, used) = jax.lax.while_loop(lambda carry: carry[0], prepare, (short, kept))
+        here = side_by_side((state.obs, state.privileged, state.info, alone))
+        obs, privileged, info, alone = where(done, (ready.obs, ready.privileged, ready.info, ready.inner), here)
+        inner = dataclasses.replace(alone, ready=ready, used=used | done)
+        return dataclasses.replace(state, obs=obs, privileged=privileged, info=info, inner=inner)
+
+    def _begin(self, params: NavigationParams, keys: Any) -> Ready:
+        """New episodes with their first observations."""
+        inner = self._fresh(params, keys)
+        view = self._view(inner)
+        return Ready(*self._observe(params, inner, view), self._info(view), inner)
+
+    def _drive(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Physics, Any, Any]:
+        """The physics of one action: its state after, and slip and sinkage (env, wheel) of its last step."""
+        c = self.config
+        system, axes = randomise.apply(params.system, inner.drawn)
+        controls = self.actions.controls(action)
+        physics, (slip, sinkage) = self.system.rollout_batch(
+            system, inner.physics, controls[:, None], c.decimation, axes, lambda seen: (seen.slip, seen.sinkage),
+            one_body=True, last=True,
+        )  # fmt: skip
+        return physics, slip[:, 0], sinkage[:, 0]
+
+    def _advance(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Inner, View]:
+        c = self.config
+        physics, slip, sinkage = self._drive(params, inner, action)
+        position, velocity = physics.qpos[:, :3], physics.qvel[:, :3]
+        filtered = kalman.update(params.gains, self.control_interval, inner.filtered, position, velocity)
+        away = rewards.length(position[:, :2] - inner.anchor) > c.stuck_distance
+        waited = jnp.where(away, 0.0, inner.waited + self.control_interval)
+        inner = dataclasses.replace(
+            inner,
+            physics=physics,
+            filtered=filtered,
+            slip=slip,
+            sinkage=sinkage,
+            last_action=action,
+            anchor=jnp.where(away[:, None], position[:, :2], inner.anchor),
+            waited=waited,
+        )
+        return inner, self._view(inner)
+
+    def _ends(self, params: NavigationParams, inner: Inner, view: View, to_goal: Any) -> dict[str, Any]:
+        """Which end each episode came to; exclusive, in the order of `ENDS` but divergence first."""
+        c, field = self.config, params.system.terrain.field
+        rows, cols = field.heights.shape
+        physics = inner.physics
+        fine = jnp.isfinite(physics.qpos).all(-1) & jnp.isfinite(physics.qvel).all(-1)
+        diverged = ~fine if c.divergence == "reset" else jnp.zeros_like(fine)
+        x, y = view.position[:, 0], view.position[:, 1]
+        east, north = field.x0 + (cols - 1) * field.cell, field.y0 + (rows - 1) * field.cell
+        inside = (x > field.x0 + c.edge) & (x < east - c.edge) & (y > field.y0 + c.edge) & (y < north - c.edge)
+        found = {
+            "diverged": diverged,
+            "reached": rewards.reached(to_goal, c.goal_radius),
+            "rolled_over": rewards.rolled_over(view.up[:, 2], c.most_tilt),
+            "stuck": rewards.stuck(inner.waited, c.stuck_time),
+            "off_terrain": ~inside & fine,
+        }
+        taken = jnp.zeros_like(fine)
+        for name, happened in found.items():
+            found[name] = happened & ~taken
+            taken = taken | happened
+        return found
+
+    def _fresh(self, params: NavigationParams, keys: Any) -> Inner:
+        """New episodes, all at their beginning."""
+        c, count = self.config, keys.shape[0]
+        split = _split(keys)
+        pick = jax.vmap(lambda k: jax.random.randint(k, (), 0, params.starts.shape[0]))(split[:, 1])
+        start, goal = params.starts[pick], params.goals[pick]
+        turn = jax.vmap(lambda k: jax.random.uniform(k, (), minval=-1.0, maxval=1.0))(split[:, 2])
+        bearing = jnp.arctan2(goal[:, 1] - start[:, 1], goal[:, 0] - start[:, 0])
+        drawn = randomise.draw(c.randomise, params.system, params.bounds, split[:, 3])
+        system, axes = randomise.apply(params.system, drawn)
+        warm = drawn.get("winding_temperature")
+        physics = jax.vmap(self.system.reset, in_axes=(axes, 0, 0, 0, None if warm is None else 0))(
+            system, start[:, 0], start[:, 1], bearing + c.start_yaw * turn, warm
+        )
+        position = physics.qpos[:, :3]
+        zero, wheels = jnp.zeros(count, position.dtype), jnp.zeros((count, self._wheels), position.dtype)
+        return Inner(
+            physics=physics,
+            key=split[:, 0],
+            drawn=drawn,
+            origin=position,
+            goal=goal,
+            filtered=kalman.start(position, physics.qvel[:, :3]),
+            slip=wheels,
+            sinkage=wheels,
+            last_action=jnp.zeros((count, self.actions.size), position.dtype),
+            anchor=start,
+            waited=zero,
+            steps=jnp.zeros(count, jnp.int32),
+            total=zero,
+        )
+
+    def _view(self, inner: Inner) -> View:
+        return read(
+            self._reader, inner.physics, slip=inner.slip, sinkage=inner.sinkage, origin=inner.origin, goal=inner.goal,
+            filtered=inner.filtered, last_action=inner.last_action, waited=inner.waited,
+        )  # fmt: skip
+
+    def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:
+        scene = Scene(params.system.terrain, inner.drawn, self._ride, self._scale)
+        return observe(self.config.observations, view, scene), observe(self.config.privileged, view, scene)
+
+    def _info(self, view: View) -> dict[str, Any]:
+        return {
+            "goal_body": goal_in_body(view),
+            "position": view.position,
+            "joint_angle": view.joint_angle,
+            "body_velocity": view.body_velocity,
+        }
+
+
+def _split(keys: Any) -> Any:
+    """(env, 4, 2) keys of an episode; the first one is the next episode's."""
+    return jax.vmap(lambda k: jax.random.split(k, 4))(keys)
+
+
+def make_navigation(
+    task: str | NavigationConfig = "consistent",
+    rover: str = "luvmi_x",
+    terrain: Any = None,
+    preset: str = "consistent",
+    model: Model | str | Path | None = None,
+    engine: str = "auto",
+    **settings: Any,
+) -> NavigationEnv:
+    """Makes the navigation environment.
+
+    Args:
+      task: name of a shipped task (`paper`, `consistent`, `large`), or a configuration.
+      rover: name or folder.
+      terrain: anything `make_model` takes, or `world:train`, `world:heldout` and others of `worlds.WORLDS`; by default
+        `lunar_plain`, for the task `large` `world:train`.
+      preset: of the physics.
+      model: a model or `model.toml` instead of rover, terrain and preset; a terrain given beside it takes its place.
+      engine: of the physics.
+      **settings: that differ from the task's, see `NavigationConfig`.
+
+    Raises:
+      UserError: unknown names, or settings that do not fit.
+    """
+    if isinstance(task, str) and task not in TASKS:
+        raise bad_input("navigation", "task", task, "does not exist", f"use one of {', '.join(TASKS)}")
+    config = TASKS[task] if isinstance(task, str) else task
+    if rover == "viper" and "goal_radius" not in settings and config.goal_radius == TASKS["large"].goal_radius:
+        settings = {"goal_radius": 1.0, **settings}
+    config = config.replace(**settings)
+    if terrain is None and model is None:
+        terrain = PREFIX + "train" if task == "large" else "lunar_plain"
+    if isinstance(terrain, str) and terrain.startswith(PREFIX):
+        terrain = world(terrain.removeprefix(PREFIX))
+    if isinstance(model, str | Path):
+        from lunar_mjx.model.file import load_model
+
+        model = load_model(model)
+    if model is None:
+        model = make_model(rover, terrain or "lunar_plain", preset)
+    elif terrain is not None:
+        model = model.replace(terrain=terrain)
+    return NavigationEnv(model, config, engine)

@@ -1,0 +1,154 @@
+"""Observations of the navigation task: named blocks of numbers, put side by side in the order of the configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, View, goal_in_body, height_scan
+from lunar_mjx.errors import bad_input
+from lunar_mjx.pytree import pytree, static
+from lunar_mjx.terrain import Terrain
+
+PAPER_OBSERVATION = ("position", "euler", "velocity", "angular_velocity", "acceleration", "goal")
+"""The 17 numbers of section V: p, Euler angles, v, omega, filtered a (three each) and the goal (two)."""
+
+
+@pytree
+class Scene:
+    """What blocks beyond the rover itself read.
+
+    Attributes:
+      terrain: the ground.
+      drawn: parameters drawn for the episode, by name.
+      ride: standing height of the chassis frame, m. scan_scale: of the height scan's pattern.
+    """
+
+    terrain: Terrain
+    drawn: dict[str, Any]
+    ride: float = static(default=0.0)
+    scan_scale: float = static(default=1.0)
+
+
+Block = Callable[[View, Scene], Any]
+
+
+def position(v: View, s: Scene) -> Any:
+    """Position of the chassis frame from where the episode began, world axes, m."""
+    return v.position - v.origin
+
+
+def euler(v: View, s: Scene) -> Any:
+    """Roll, pitch and yaw, rad."""
+    return jnp.stack([v.roll, v.pitch, v.yaw], axis=-1)
+
+
+def velocity(v: View, s: Scene) -> Any:
+    """World axes, m/s."""
+    return v.velocity
+
+
+def angular_velocity(v: View, s: Scene) -> Any:
+    """World axes, rad/s."""
+    return v.angular_velocity
+
+
+def acceleration(v: View, s: Scene) -> Any:
+    """Kalman-filtered linear acceleration, world axes, m/s2."""
+    return v.filtered.acceleration
+
+
+def goal(v: View, s: Scene) -> Any:
+    """The goal from where the episode began, world axes, m."""
+    return v.goal - v.origin[:, :2]
+
+
+def goal_body(v: View, s: Scene) -> Any:
+    """Distance to the goal, 1 - exp(-distance / 3 m), and cosine and sine of its bearing from the heading."""
+    ahead = goal_in_body(v)
+    distance = jnp.sqrt(jnp.sum(ahead * ahead, axis=-1, keepdims=True))
+    return jnp.concatenate([distance, 1.0 - jnp.exp(-distance / 3.0), ahead / jnp.maximum(distance, 1e-3)], axis=-1)
+
+
+def up(v: View, s: Scene) -> Any:
+    """The vertical in the body frame."""
+    return v.world_up
+
+
+def body_velocity(v: View, s: Scene) -> Any:
+    """Along the body's axes, m/s."""
+    return v.body_velocity
+
+
+def body_rates(v: View, s: Scene) -> Any:
+    """Along the body's axes, rad/s."""
+    return v.body_rates
+
+
+def joints(v: View, s: Scene) -> Any:
+    """Angles of the joints that do not turn on and on, as sine (drive joints too), and speeds, rad/s."""
+    return jnp.concatenate([jnp.sin(v.joint_angle), v.joint_speed], axis=-1)
+
+
+def temperatures(v: View, s: Scene) -> Any:
+    """Windings, in units of 100 K above 25 degC."""
+    return (v.winding_temperature - 298.15) / 100.0
+
+
+def slip(v: View, s: Scene) -> Any:
+    """Slip ratio of every wheel within [-1, 1]."""
+    return jnp.clip(v.slip, -1.0, 1.0)
+
+
+def sinkage(v: View, s: Scene) -> Any:
+    """Sinkage of every wheel, cm."""
+    return 100.0 * v.sinkage
+
+
+def scan(v: View, s: Scene) -> Any:
+    """Height of ground and rocks at a pattern of places around the rover, m, within 1 m of its standing plane."""
+    return jnp.clip(height_scan(s.terrain, v, s.scan_scale, s.ride), -1.0, 1.0)
+
+
+def last_action(v: View, s: Scene) -> Any:
+    """The action before."""
+    return v.last_action
+
+
+def waited(v: View, s: Scene) -> Any:
+    """Time since the rover left the place that it may be stuck at, in units of 10 s."""
+    return v.waited[:, None] / 10.0
+
+
+def drawn(v: View, s: Scene) -> Any:
+    """What was drawn for the episode, logarithms of the sizes; for critics only, a rover cannot know it."""
+    parts = [jnp.log(jnp.abs(a).reshape(a.shape[0], -1) + 1e-6) for _, a in sorted(s.drawn.items())]
+    return jnp.concatenate(parts, axis=-1) if parts else jnp.zeros((v.yaw.shape[0], 0))
+
+
+BLOCKS: dict[str, Block] = {
+    f.__name__: f
+    for f in (
+        position, euler, velocity, angular_velocity, acceleration, goal, goal_body, up, body_velocity, body_rates,
+        joints, temperatures, slip, sinkage, last_action, waited, drawn,
+    )
+} | {"height_scan": scan}  # fmt: skip
+"""All blocks by name."""
+
+SCAN_POINTS = len(SCAN_AHEAD) * len(SCAN_ASIDE)
+
+
+def check_blocks(names: Sequence[str], field: str) -> None:
+    """Refuses names that are no blocks."""
+    for name in names:
+        if name not in BLOCKS:
+            raise bad_input("navigation", field, name, "is no observation", f"use some of {', '.join(BLOCKS)}")
+
+
+def observe(names: Sequence[str], view: View, scene: Scene) -> Any:
+    """The blocks side by side, (env, n)."""
+    if not names:
+        return jnp.zeros((view.yaw.shape[0], 0), view.position.dtype)
+    return jnp.concatenate([BLOCKS[name](view, scene) for name in names], axis=-1)

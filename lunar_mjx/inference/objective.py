@@ -1,0 +1,179 @@
+"""What a fit minimises: chi-square of whitened residuals with priors, and its quadratic model within bounds.
+
+Source of the bent steps: geodesic acceleration (Transtrum & Sethna 2012).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from lunar_mjx.inference.problem import Problem
+
+_PROBE = 0.1
+_NEAR = np.array([0.003, 0.01, 0.03])
+_ROOM = 1e-12
+"""Width that the solver needs between bounds."""
+
+
+def whitened_residuals(problem: Problem, u: np.ndarray) -> np.ndarray:
+    """(k, n) measured less predicted, whitened, at (k, coordinates); not finite where a prediction is not."""
+    difference = problem.observations.value[None] - problem.predict(u)
+    return problem.observations.whiten(difference.T).T
+
+
+class Objective:
+    """Chi-square of the fitted observations with the priors, and its quadratic model, over the free coordinates."""
+
+    def __init__(self, problem: Problem, free: np.ndarray, fitted: np.ndarray, eager: bool = False):
+        self.problem, self.free, self.fitted = problem, free, fitted
+        self._eager = eager
+        self.low, self.high = problem.bounds(free)
+
+    @property
+    def eager(self) -> bool:
+        """Whether Jacobians are taken with the residuals; a problem may come to afford that meanwhile."""
+        return self._eager or self.problem.eager
+
+    def residuals(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residuals (k, n), and chi-square (k,), infinite where a prediction is not finite."""
+        r = whitened_residuals(self.problem, u)
+        return r, self.chi2(u, r)
+
+    def chi2(self, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """(k,) chi-square of (k, n) residuals at (k, coordinates); infinite where a prediction is not finite."""
+        prior = np.array([np.sum(self.problem.prior_rows(row, self.free)[0] ** 2) for row in u])
+        with np.errstate(over="ignore", invalid="ignore"):
+            chi2 = np.sum(r[:, self.fitted] ** 2, axis=1) + prior
+        return np.where(np.isfinite(chi2), chi2, np.inf)
+
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        return self._whitened(self.problem.jacobian(u, self.free))
+
+    def wide_jacobian(self, u: np.ndarray, std: np.ndarray) -> np.ndarray:
+        """The same for intervals, over steps of about the standard errors (free,); not finite where a step fails."""
+        return self.problem.observations.whiten(self.problem.wide_jacobian(u, self.free, std))
+
+    def without_jumps(self, *jacobians: np.ndarray) -> np.ndarray:
+        """(n, free) of Jacobians over different steps, of every finite column the one that tells least.
+
+        A jump within a step adds to a derivative what looks like knowledge, and seldom takes any away.
+        """
+        told = np.array([np.sum(j[self.fitted] ** 2, axis=0) for j in jacobians])
+        least = np.argmin(np.where(np.isfinite(told), told, np.inf), axis=0)
+        j = np.take_along_axis(np.stack(jacobians), least[None, None], axis=0)[0]
+        return np.where(np.isfinite(j), j, 0.0)
+
+    def covariance(self, u: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
+        j = j[self.fitted]
+        _, scale = self.problem.prior_rows(u, self.free)
+        return np.linalg.pinv(j.T @ j + np.diag(scale**2), hermitian=True)
+
+    def standard_errors(self, u: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """(free,) square roots of its diagonal."""
+        return np.sqrt(np.maximum(np.diag(self.covariance(u, j)), 0.0))
+
+    def _whitened(self, jacobian: np.ndarray) -> np.ndarray:
+        j = self.problem.observations.whiten(jacobian)
+        return np.where(np.isfinite(j), j, 0.0)
+
+    def linearise(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, Callable[[int], np.ndarray]]:
+        """Whitened residuals (k, n), chi-square (k,), and Jacobians (n, free) by number, simulated in one batch."""
+        observations = self.problem.observations
+        predicted, jacobian = self.problem.linearise(u, self.free)
+        r = observations.whiten((observations.value[None] - predicted).T).T
+
+        def whitened(k: int) -> np.ndarray:
+            return self._whitened(jacobian(k))
+
+        return r, self.chi2(u, r), whitened
+
+    def quadratic(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Half the downhill gradient and the Gauss-Newton Hessian."""
+        prior, scale = self.problem.prior_rows(u, self.free)
+        j = j[self.fitted]
+        return j.T @ r[self.fitted] - scale * prior, j.T @ j + np.diag(scale**2)
+
+    def steps(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray, dampings: np.ndarray) -> np.ndarray:
+        """(dampings, coordinates) damped Gauss-Newton steps, each the best within the bounds.
+
+        Cut at the bounds only, a step would lead where the others fit a coordinate that is somewhere else.
+        """
+        at = u[self.free]
+        out = np.repeat(u[None], len(dampings), axis=0)
+        for i, damping in enumerate(dampings):
+            damped = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
+            step = _within(damped, downhill, self.low - at, self.high - at)
+            out[i, self.free] = np.clip(at + step, self.low, self.high)
+        return out
+
+    def bent(
+        self, u: np.ndarray, r: np.ndarray, j: np.ndarray, hessian: np.ndarray, trials: np.ndarray, dampings: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Steps bent along a curved valley by the second derivative in their direction (Transtrum and Sethna 2012).
+
+        Returns:
+          Their ends; and the probes by which the derivative was taken, with their residuals: steps as well, if short.
+        """
+        steps = (trials - u)[:, self.free]
+        probes = self.probes(u, trials)
+        ahead, _ = self.residuals(probes)
+        out = trials.copy()
+        for i, (step, damping) in enumerate(zip(steps, dampings, strict=True)):
+            if not np.isfinite(ahead[i]).all() or not np.any(step):
+                continue
+            second = -2.0 / _PROBE * ((ahead[i] - r) / _PROBE + j @ step)
+            inner = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
+            bend = -0.5 * np.linalg.lstsq(inner, j[self.fitted].T @ second[self.fitted], rcond=None)[0]
+            # beyond this the quadratic path is not to be trusted either
+            bend *= min(1.0, 0.75 * np.linalg.norm(step) / max(2.0 * float(np.linalg.norm(bend)), 1e-30))
+            out[i, self.free] = np.clip(u[self.free] + step + bend, self.low, self.high)
+        return out, probes, ahead
+
+    def probes(self, u: np.ndarray, trials: np.ndarray) -> np.ndarray:
+        """(k, coordinates) a short way towards each trial."""
+        out = np.repeat(u[None], len(trials), axis=0)
+        out[:, self.free] += _PROBE * (trials - u)[:, self.free]
+        return out
+
+    def roughness(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> float:
+        """Scatter of chi-square about its quadratic model over the first hundredths of a Gauss-Newton step.
+
+        A smooth function agrees with its model there, however its valley bends further on. A simulation with contacts
+        that open and close jumps; below these jumps there is nothing to be found.
+        """
+        downhill, hessian = self.quadratic(u, r, j)
+        rows, step = self._near(u, downhill, hessian)
+        _, chi2 = self.residuals(rows)
+        along = step[self.free]
+        model = -2.0 * _NEAR * float(downhill @ along) + _NEAR**2 * float(along @ hessian @ along)
+        return float(np.max(np.abs(chi2[1:] - chi2[0] - model)))
+
+    def foresee_roughness(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> None:
+        """`roughness` will be asked for."""
+        self.problem.foresee(self._near(u, *self.quadratic(u, r, j))[0])
+
+    def _near(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        step = self.steps(u, downhill, hessian, np.array([1e-8]))[0] - u
+        return u + np.concatenate([[0.0], _NEAR])[:, None] * step, step
+
+    def promise(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> float:
+        """Drop of chi-square that a full Gauss-Newton step within the bounds promises."""
+        step = (self.steps(u, downhill, hessian, np.zeros(1))[0] - u)[self.free]
+        return float(2.0 * downhill @ step - step @ hessian @ step)
+
+
+def _within(hessian: np.ndarray, downhill: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(n,) step that minimises a quadratic model between bounds about zero."""
+    step = np.linalg.lstsq(hessian, downhill, rcond=None)[0]
+    if np.all((step >= low) & (step <= high)):
+        return step
+    size = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    values, axes = np.linalg.eigh(hessian * np.outer(size, size))
+    root = np.sqrt(np.maximum(values, 1e-14 * max(float(values[-1]), 1e-30)))
+    rows = root[:, None] * axes.T
+    found = lsq_linear(rows, (axes.T @ (size * downhill)) / root, (low / size - _ROOM, high / size + _ROOM), "bvls")
+    return found.x * size

@@ -1,0 +1,1 @@
+"""Checks of measurement logs, before anything is fitted to them."""

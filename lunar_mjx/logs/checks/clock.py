@@ -1,0 +1,179 @@
+"""Checks of time: what repeats, jumps, changes its rate, or lacks samples."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lunar_mjx.logs.findings import Finding
+from lunar_mjx.logs.log import Log, LogTable
+
+RATE_TOLERANCE = 0.1
+"""Relative; loggers keep their rate to a per cent, and a fitted drift stays below it."""
+
+WINDOW = 25
+"""Intervals per window whose median is its rate: jitter of 20 % leaves 5 % in it."""
+
+LOST_SHARE = 0.3
+"""A log that lost more than this share of its samples is no record any more; links lose a few per cent."""
+
+_RATES = (("joint_{}_angle_rad", "joint_{}_speed_rad_s"), ("position_{}_m", "world_velocity_{}_m_s"))
+
+
+def check_clock(log: Log) -> list[Finding]:
+    """Time of every table, and that the tables share an origin."""
+    found: list[Finding] = []
+    for table in log.tables.values():
+        found += _check_table(log, table)
+    return found or _check_overlap(log)
+
+
+def _finding(log: Log, table: LogTable, row: int | None, kind: str, message: str) -> Finding:
+    return Finding(log.name, table.name, row, "time_s", kind, message)
+
+
+def _check_table(log: Log, table: LogTable) -> list[Finding]:
+    time = table.time_s
+    if len(time) < 3:
+        return [_finding(log, table, None, "short", f"has {len(time)} rows; a table needs three at least")]
+    missing = np.flatnonzero(~np.isfinite(time))
+    if missing.size:
+        row = int(missing[0])
+        return [_finding(log, table, row, "clock", f"is empty in {missing.size} rows; every row needs its time")]
+    steps = np.diff(time)
+    back = np.flatnonzero(steps <= 0.0)
+    if back.size:
+        row = int(back[0]) + 1
+        what = "repeats" if steps[row - 1] == 0.0 else "goes back"
+        return [
+            _finding(
+                log,
+                table,
+                row,
+                "clock",
+                f"{what}: {time[row]:.6g} s after {time[row - 1]:.6g} s, and so in "
+                f"{back.size} rows; sort the rows and drop copies",
+            )
+        ]
+    return _check_rate(log, table, steps) or _check_jumps(log, table, steps)
+
+
+def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
+    base = float(np.median(steps))
+    if abs(base * table.rate_hz - 1.0) > RATE_TOLERANCE:
+        return [
+            _finding(
+                log,
+                table,
+                None,
+                "clock",
+                f"rises by {base:.6g} s from row to row, but log.toml states "
+                f"rate_hz = {table.rate_hz:g}; correct one of them (is the time in seconds?)",
+            )
+        ]
+    windows = np.lib.stride_tricks.sliding_window_view(steps, WINDOW) if len(steps) >= 2 * WINDOW else None
+    if windows is None:
+        return []
+    rate = np.median(windows, axis=1) / base
+    near = np.maximum(np.round(rate), 1.0)
+    changed = np.abs(rate - 1.0) > RATE_TOLERANCE
+    # Lost samples make some steps multiples of the base; only a run of one and the same step is another rate.
+    steady = (np.abs(windows / base - rate[:, None]) < 0.3).mean(axis=1) > 0.9
+    changed &= (np.abs(rate - near) > 0.05) | steady
+    if not changed.any():
+        return []
+    row = int(np.argmax(changed)) + WINDOW // 2
+    return [
+        _finding(
+            log,
+            table,
+            row,
+            "clock",
+            f"changes its rate from {1.0 / base:.4g} Hz to "
+            f"{1.0 / (base * rate[np.argmax(changed)]):.4g} Hz; split the table there, or correct the clock",
+        )
+    ]
+
+
+def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
+    """Lost samples beyond the tolerable, and gaps in which a moving rover did not move: there the clock jumped."""
+    base = float(np.median(steps))
+    lost = float(np.sum(np.maximum(np.round(steps / base) - 1.0, 0.0)))
+    for row in np.flatnonzero(steps > 3.0 * base):
+        for integral, rate in _pairs(table):
+            moved, expected, still = _over_gap(table, int(row), integral, rate, base)
+            sigma = log.noise[integral].std if integral in log.noise else 0.0
+            # The clock jumped if what the sensor moved fits one ordinary step and not the gap, each clearly.
+            if (
+                abs(expected) > max(20.0 * sigma, 1e-6)
+                and abs(moved - expected) > 0.5 * abs(expected)
+                and (abs(moved - still) < 0.25 * abs(expected))
+            ):
+                return [
+                    _finding(
+                        log,
+                        table,
+                        int(row) + 1,
+                        "clock",
+                        f"jumps by {steps[row]:.4g} s, over which "
+                        f"{integral} moved by {moved:.4g} instead of {expected:.4g}; correct the clock",
+                    )
+                ]
+    share = lost / (lost + len(table))
+    if share > LOST_SHARE:
+        row = int(np.argmax(steps)) + 1
+        return [
+            _finding(
+                log,
+                table,
+                row,
+                "dropout",
+                f"lacks {100 * share:.0f} % of its samples (at most "
+                f"{100 * LOST_SHARE:.0f} % may be lost); the longest gap lasts {steps.max():.4g} s",
+            )
+        ]
+    return []
+
+
+def _pairs(table: LogTable) -> list[tuple[str, str]]:
+    names = []
+    for integral, rate in _RATES:
+        head, tail = integral.split("{}")
+        for name in table.channels:
+            if name.startswith(head) and name.endswith(tail):
+                partner = rate.format(name[len(head) : -len(tail)])
+                if partner in table.channels:
+                    names.append((name, partner))
+    return names
+
+
+def _over_gap(table: LogTable, row: int, integral: str, rate: str, base: float) -> tuple[float, float, float]:
+    """Movement over a gap, what its rate lets expect, and what one ordinary step would have given."""
+    values, speed = table.channels[integral], table.channels[rate]
+    mean = 0.5 * float(speed[row] + speed[row + 1])
+    gap = float(table.time_s[row + 1] - table.time_s[row])
+    moved = float(values[row + 1] - values[row])
+    if not np.isfinite(mean + moved):
+        return 0.0, 0.0, 0.0
+    return moved, mean * gap, mean * base
+
+
+def _check_overlap(log: Log) -> list[Finding]:
+    """All tables count from one origin: each must share half of its span, or of the other's, with the longest one."""
+    tables = list(log.tables.values())
+    longest = max(tables, key=lambda t: float(np.ptp(t.common_time_s)))
+    low, high = longest.common_time_s[0], longest.common_time_s[-1]
+    for table in tables:
+        first, last = table.common_time_s[0], table.common_time_s[-1]
+        shared = min(high, last) - max(low, first)
+        if shared < 0.5 * (last - first):
+            return [
+                _finding(
+                    log,
+                    table,
+                    None,
+                    "clock",
+                    f"runs from {first:g} to {last:g} s, apart from {longest.name} "
+                    f"({low:g} to {high:g} s); give one origin or clock_offset_s",
+                )
+            ]
+    return []

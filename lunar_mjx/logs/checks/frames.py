@@ -1,0 +1,399 @@
+"""Checks of frames and of body channels against each other: quaternions, gravity, axes, left and right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lunar_mjx.logs.findings import Finding
+from lunar_mjx.logs.log import Log
+from lunar_mjx.logs.series import (
+    Agreement,
+    agreement,
+    at,
+    edges,
+    guess,
+    increments,
+    integrals,
+    means,
+    sigma,
+    span,
+)
+
+NORM_TOLERANCE = 0.02
+"""A quaternion of four components with 1 % noise has a norm within 2 %."""
+
+GRAVITY_TOLERANCE = 0.15
+"""Relative; the bias of the poorest accelerometer is a few per cent of lunar gravity."""
+
+TILT_TOLERANCE = 15.0
+"""deg between measured and expected specific force: mounting errors and biases are a few degrees."""
+
+FACTOR_TOLERANCE = 0.3
+"""Relative, between two channels of which one is the other's rate: scale errors are a few per cent."""
+
+ALIKE, UNLIKE = 0.9, 0.5
+"""Cosine between two series above which they are proportional, and below which they have nothing in common."""
+
+COURSE_TOLERANCE = 60.0
+"""deg between heading and course of a rover that does not crab: on side slopes they differ by less than 30."""
+
+
+def check_frames(log: Log) -> list[Finding]:
+    """Attitude, gravity, velocities against positions, turning against wheels."""
+    found = _quaternion(log)
+    if not found:
+        found += _euler(log) + _gravity(log)
+    found += _velocities(log) + _turning(log)
+    return found or _course(log) + _left_right(log)
+
+
+def _finding(log: Log, channel: str, kind: str, message: str, row: int | None = None) -> Finding:
+    table = log.table_of(channel)
+    column = channel if table is None else table.columns.get(channel, channel)
+    return Finding(log.name, "" if table is None else table.name, row, column, kind, message)
+
+
+LEAST = {"position": 0.02, "roll": 1.0, "pitch": 1.0, "yaw": 1.0, "joint": 0.05}
+"""Change per window, in m, deg and rad, below which nothing is said: rocking and rounding look like anything."""
+
+QUATERNION = tuple(f"quaternion_{c}" for c in "wxyz")
+
+
+def _quaternion(log: Log) -> list[Finding]:
+    tables = [t for t in log.tables.values() if all(q in t.channels for q in QUATERNION)]
+    if not tables:
+        return []
+    norm = np.sqrt(sum(tables[0].channels[q] ** 2 for q in QUATERNION))
+    tolerance = max(NORM_TOLERANCE, 6.0 * max(sigma(log, q) for q in QUATERNION))
+    wrong = np.isfinite(norm) & (np.abs(norm - 1.0) > tolerance)
+    if not wrong.any():
+        return []
+    row = int(np.argmax(wrong))
+    return [
+        _finding(
+            log,
+            "quaternion_w",
+            "quaternion",
+            f"the quaternion has the norm {norm[row]:.4g}, and so in "
+            f"{int(wrong.sum())} rows; normalise it (w, x, y, z, body to world)",
+            row,
+        )
+    ]
+
+
+def attitude(log: Log, time: np.ndarray) -> np.ndarray | None:
+    """(n, 3, 3) body-to-world rotations at some times, from the quaternion or the Euler angles; None without either."""
+    parts = [at(log, q, time) for q in QUATERNION]
+    if all(p is not None for p in parts):
+        q = np.stack(parts)  # type: ignore[arg-type]
+        w, x, y, z = q / np.linalg.norm(q, axis=0)
+        return _rotation(w, x, y, z)
+    return _euler_rotation(log, time)
+
+
+def _euler_rotation(log: Log, time: np.ndarray) -> np.ndarray | None:
+    angles = [at(log, f"{a}_deg", time) for a in ("roll", "pitch", "yaw")]
+    if any(a is None for a in angles[:2]):
+        return None
+    roll, pitch, yaw = (np.zeros_like(time) if a is None else np.radians(a) for a in angles)
+    cr, sr, cp, sp, cy, sy = (f(0.5 * a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
+    return _rotation(
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def _rotation(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _euler(log: Log) -> list[Finding]:
+    """Euler angles against the quaternion, where a log has both."""
+    limits = span(log, (*QUATERNION, "roll_deg", "pitch_deg", "yaw_deg"))
+    if limits is None:
+        return []
+    time = np.linspace(*limits, 200)
+    one, two = attitude(log, time), _euler_rotation(log, time)
+    cosine = 0.5 * (np.einsum("nij,nij->n", one, two) - 1.0)  # type: ignore[arg-type]
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    if np.median(angle) < 5.0:
+        return []
+    return [
+        _finding(
+            log,
+            "roll_deg",
+            "frame",
+            f"the Euler angles differ from the quaternion by {np.median(angle):.0f} "
+            "deg; roll, pitch, yaw are intrinsic z-y'-x'', the quaternion is w, x, y, z from body to world",
+        )
+    ]
+
+
+def _gravity(log: Log) -> list[Finding]:
+    """At rest and on the mean of a drive the accelerometer reads +g along the world's z."""
+    names = [f"accelerometer_{a}_m_s2" for a in "xyz"]
+    limits = span(log, names)
+    if limits is None:
+        return []
+    time = np.linspace(*limits, 400)
+    w, x, y, z = (np.full(1, v) for v in log.imu.quaternion)
+    measured = np.stack([at(log, n, time) for n in names], 1) @ _rotation(w, x, y, z)[0].T  # type: ignore[type-var]
+    turn = attitude(log, time)
+    up = np.tile([0.0, 0.0, 1.0], (len(time), 1)) if turn is None else turn[:, 2, :]
+    force, expected = np.median(measured, axis=0), np.median(up, axis=0)
+    size, g = float(np.linalg.norm(force)), log.gravity_m_s2
+    angle = float(np.degrees(np.arccos(np.clip(force @ expected / max(size, 1e-12) / np.linalg.norm(expected), -1, 1))))
+    shown = ", ".join(f"{v:.3g}" for v in force)
+    if angle > 150.0:
+        return [
+            _finding(
+                log,
+                names[2],
+                "gravity",
+                f"the accelerometer reads ({shown}) m/s2 where +g along the "
+                "body's z "
+                "belongs: its sign is reversed; specific force points up at rest",
+            )
+        ]
+    if abs(size / g - 1.0) > GRAVITY_TOLERANCE + 6.0 * max(sigma(log, n) for n in names) / g / 20.0:
+        return [
+            _finding(
+                log,
+                names[2],
+                "gravity",
+                f"the accelerometer reads {size:.4g} m/s2 at rest, but "
+                "gravity_m_s2 = "
+                f"{g:g}{guess(size / g)}; correct its unit or gravity_m_s2",
+            )
+        ]
+    # without a known attitude the rover may stand on any slope
+    if angle > (TILT_TOLERANCE if turn is not None else 45.0):
+        return [
+            _finding(
+                log,
+                names[2],
+                "frame",
+                f"the accelerometer reads ({shown}) m/s2, {angle:.0f} deg off the "
+                "vertical that the attitude gives; check its axes and [imu] quaternion",
+            )
+        ]
+    return []
+
+
+def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Agreement | None:
+    """How the increments of a channel follow the integral of its rate (times `scale`) over windows of the log."""
+    limits = span(log, (integral, rate))
+    if limits is None:
+        return None
+    windows = edges(*limits)
+    length = float(windows[1] - windows[0])
+    noise = sigma(log, integral) + abs(scale) * sigma(log, rate) * np.sqrt(length * 0.05)
+    expected = scale * integrals(log, rate, windows, like=integral)
+    least = next(v for word, v in LEAST.items() if integral.startswith(word))
+    return agreement(increments(log, integral, windows), expected, noise, least)
+
+
+def _velocities(log: Log) -> list[Finding]:
+    """Velocities against positions: unit, sign, swapped axes."""
+    pairs = {a: (f"position_{a}_m", f"world_velocity_{a}_m_s") for a in "xyz"}
+    found = _paired(log, pairs, "the change of")
+    limits = span(log, [f"{k}_velocity_{a}_m_s" for k in ("world", "body") for a in "xy"])
+    if found or limits is None:
+        return found
+    time = np.linspace(*limits, 300)
+    speed = {}
+    for frame in ("world", "body"):
+        x, y = (at(log, f"{frame}_velocity_{a}_m_s", time) for a in "xy")
+        speed[frame] = np.hypot(x, y)  # type: ignore[arg-type]
+    noise = max(sigma(log, f"{k}_velocity_x_m_s") for k in ("world", "body"))
+    both = agreement(speed["body"], speed["world"], noise)
+    if both is not None and both.cosine > ALIKE and abs(both.factor - 1.0) > FACTOR_TOLERANCE:
+        return [
+            _finding(
+                log,
+                "body_velocity_x_m_s",
+                "unit",
+                f"is {both.factor:.3g} times the world velocity in size{guess(both.factor)}; correct its unit",
+            )
+        ]
+    return []
+
+
+def _turning(log: Log) -> list[Finding]:
+    """The gyroscope against the attitude."""
+    pairs = {"z": ("yaw_deg", "gyro_z_rad_s"), "x": ("roll_deg", "gyro_x_rad_s"), "y": ("pitch_deg", "gyro_y_rad_s")}
+    return _paired(log, pairs, "the change of", scale=57.29577951308232)
+
+
+def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float = 1.0) -> list[Finding]:
+    """Each channel against its rate: a wrong factor, or a rate that is another channel's."""
+    found = []
+    for key, (integral, rate) in pairs.items():
+        own = rate_agreement(log, integral, rate, scale)
+        others = [p[1] for k, p in pairs.items() if k != key]
+        twin = next((o for o in others if _alike(rate_agreement(log, integral, o, scale))), None)
+        cosine = 0.0 if own is None else own.cosine
+        if twin is not None and abs(cosine) < UNLIKE and span(log, (rate,)) is not None:
+            text = f"has nothing in common with {what} {integral} (cosine {cosine:.2f}), which {twin} follows"
+            found.append(_finding(log, rate, "swap", f"{text}; these two are swapped"))
+        elif own is None:
+            continue
+        elif abs(own.cosine) > ALIKE and abs(own.factor - 1.0) > FACTOR_TOLERANCE:
+            kind = "frame" if own.factor < 0.0 else "unit"
+            found.append(
+                _finding(
+                    log,
+                    rate,
+                    kind,
+                    f"does not agree with {integral}, which changes {own.factor:.3g} "
+                    "times "
+                    f"as fast{guess(own.factor)}; correct one of the two",
+                )
+            )
+        elif abs(own.cosine) < UNLIKE and own.series < 0.2 * own.reference:
+            found.append(
+                _finding(
+                    log,
+                    integral,
+                    "stuck",
+                    f"hardly changes ({own.series:.3g} per window) while {rate} "
+                    f"lets expect {own.reference:.3g}; leave the broken one out",
+                )
+            )
+    return found
+
+
+def _alike(pair: Agreement | None) -> bool:
+    return pair is not None and pair.cosine > ALIKE and abs(pair.factor - 1.0) < FACTOR_TOLERANCE
+
+
+def wheel_means(log: Log, windows: np.ndarray, corners: Sequence[str], kind: str) -> np.ndarray | None:
+    """Mean over some corners of a channel such as `joint_{}_drive_speed_rad_s`, by window."""
+    names = [kind.format(c) for c in corners]
+    present = [n for n in names if span(log, (n,)) is not None]
+    return None if len(present) < len(names) else np.mean([means(log, n, windows) for n in present], axis=0)
+
+
+SPEED, STEER = "joint_{}_drive_speed_rad_s", "joint_{}_steer_angle_rad"
+
+
+def _steers(log: Log) -> bool:
+    """Whether any joint is steered by more than 0.05 rad."""
+    names = [n for n in log.channel_names if "_steer_angle_rad" in n]
+    return any(s is not None and float(np.abs(s[1]).max()) > 0.05 for s in map(log.channel, names))
+
+
+def _turn_rate(log: Log) -> tuple[str, str] | None:
+    """The channel that tells how the rover turns, and whether it is a rate or an angle."""
+    for name, kind in (("gyro_z_rad_s", "rate"), ("yaw_deg", "angle")):
+        if span(log, (name,)) is not None:
+            return name, kind
+    return None
+
+
+def _left_right(log: Log) -> list[Finding]:
+    """A rover whose right wheels run faster turns left; front wheels steered left turn a forward drive left."""
+    turn = _turn_rate(log)
+    sides = [SPEED.format(c) for c in ("lf", "lr", "rf", "rr")]
+    limits = span(log, [*sides, turn[0]]) if turn else None
+    if turn is None or limits is None:
+        return []
+    windows = edges(*limits)
+    yaw = integrals(log, turn[0], windows) if turn[1] == "rate" else np.radians(increments(log, turn[0], windows))
+    left, right = (wheel_means(log, windows, c, SPEED) for c in (("lf", "lr"), ("rf", "rr")))
+    assert left is not None and right is not None
+    if not _steers(log):
+        pair = agreement(yaw, right - left, sigma(log, sides[0]))
+        if pair is not None and pair.cosine < -0.8:
+            return [
+                _finding(
+                    log,
+                    sides[0],
+                    "swap",
+                    f"the rover turns against its wheels (cosine {pair.cosine:.2f} "
+                    "between "
+                    f"{turn[0]} and right less left wheel speed): left and right are swapped, or z points down",
+                )
+            ]
+        return []
+    steer = [wheel_means(log, windows, c, STEER) for c in (("lf", "rf"), ("lr", "rr"))]
+    if steer[0] is None or span(log, [STEER.format(c) for c in ("lf", "rf")]) is None:
+        return []
+    forward = 0.5 * (left + right)
+    bend = steer[0] - (0.0 if steer[1] is None else steer[1])
+    pair = agreement(yaw, bend * forward, 0.01 * float(np.abs(forward).max()))
+    if pair is not None and pair.cosine < -0.8:
+        return [
+            _finding(
+                log,
+                STEER.format("lf"),
+                "swap",
+                "the rover turns against its steering (cosine "
+                f"{pair.cosine:.2f}); "
+                "positive steering turns a wheel to the left",
+            )
+        ]
+    return []
+
+
+_LEVEL = 2.0
+"""deg of pitch up to which no rover slides back on its own."""
+
+
+def _climbs(log: Log, windows: np.ndarray, spin: np.ndarray) -> np.ndarray:
+    """Windows in which the wheels drive uphill while the rover, as far as its altitude is known, does not rise.
+
+    A rover that climbs more than its soil bears slides back over spinning wheels. With an axis of its position reversed
+    it would seem to, too, but it would rise.
+    """
+    limits = span(log, ("pitch_deg",))
+    if limits is None or limits[0] > windows[0] or limits[1] < windows[-1]:
+        return np.zeros(len(windows) - 1, bool)
+    uphill = -means(log, "pitch_deg", windows) * np.sign(spin) > _LEVEL
+    height = span(log, ("position_z_m",))
+    if height is None or height[0] > windows[0] or height[1] < windows[-1]:
+        return uphill
+    return uphill & (increments(log, "position_z_m", windows) < 0.0)
+
+
+def _course(log: Log) -> list[Finding]:
+    """A rover that is not steered goes where its wheels drive it, along its heading; unless it slides back downhill."""
+    names = ("position_x_m", "position_y_m", "yaw_deg")
+    drives = [SPEED.format(c) for c in ("lf", "rf", "lr", "rr")]
+    limits = span(log, (*names, *drives))
+    if limits is None or _steers(log):
+        return []
+    windows = edges(*limits)
+    east, north = (increments(log, n, windows) for n in names[:2])
+    spin = np.mean([means(log, d, windows) for d in drives], axis=0)
+    turned = np.abs(increments(log, "yaw_deg", windows))
+    moved = np.hypot(east, north) * np.sign(spin)
+    keep = (np.abs(moved) > max(20.0 * sigma(log, names[0]), 1e-3)) & (np.abs(spin) > 0.05) & (turned < 20.0)
+    heading = np.radians(means(log, "yaw_deg", windows))
+    along, across = east * np.cos(heading) + north * np.sin(heading), north * np.cos(heading) - east * np.sin(heading)
+    off = np.degrees(np.arctan2(across * np.sign(spin), along * np.sign(spin)))
+    keep &= (np.abs(off) < 90.0) | ~_climbs(log, windows, spin)
+    if keep.sum() < 5:
+        return []
+    off = off[keep]
+    if np.median(np.abs(off)) < COURSE_TOLERANCE:
+        return []
+    return [
+        _finding(
+            log,
+            "position_x_m",
+            "frame",
+            f"the rover travels {np.median(np.abs(off)):.0f} deg off its "
+            "heading "
+            "without steering; x is forward at yaw 0, yaw turns to the left, and the world is right-handed",
+        )
+    ]

@@ -1,0 +1,74 @@
+"""The gate: is a log fit to be used? Nothing else runs before it.
+
+Every threshold is far from what an honest log shows (the reason stands beside each), so that good logs pass: what is
+found here is wrong by its own channels, before any model of the rover is asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from lunar_mjx.logs.checks.clock import check_clock
+from lunar_mjx.logs.checks.frames import check_frames
+from lunar_mjx.logs.checks.motors import check_motors
+from lunar_mjx.logs.checks.noise import check_noise
+from lunar_mjx.logs.checks.steady import check_steady
+from lunar_mjx.logs.checks.values import check_values
+from lunar_mjx.logs.findings import Finding, is_bad
+from lunar_mjx.logs.log import Log, SteadyLog
+
+Slowest = Mapping[str, float]
+
+
+def check(logs: Log | SteadyLog | Sequence[Log | SteadyLog], slowest_s: Slowest | None = None) -> list[Finding]:
+    """Checks logs before anything else looks at them.
+
+    Args:
+      logs: one log or several.
+      slowest_s: time constants of the effects that will be asked about, s, by effect; a campaign whose longest log is
+        shorter than one of them cannot show it.
+
+    Returns:
+      Findings in the order of the logs; those of severity `BAD_DATA` make a log unusable. Empty for a good log.
+    """
+    several = [logs] if isinstance(logs, Log | SteadyLog) else list(logs)
+    findings: list[Finding] = []
+    for log in several:
+        findings += list(log.problems) + (check_steady(log) if isinstance(log, SteadyLog) else _check_drive(log))
+    return findings + _check_length(several, slowest_s or {})
+
+
+def _check_drive(log: Log) -> list[Finding]:
+    found = check_clock(log)
+    if is_bad(found):
+        return found  # everything below reads channels by their time
+    found = check_values(log)
+    bad = {f.column for f in found if f.severity == "bad_data"}
+    for part in (check_frames, check_motors, check_noise):
+        found += [f for f in part(log) if f.column not in bad]
+    return found
+
+
+def _check_length(logs: Sequence[Log | SteadyLog], slowest_s: Slowest) -> list[Finding]:
+    drives = [(log.span_s[1] - log.span_s[0], log) for log in logs if isinstance(log, Log) and _timed(log)]
+    if not drives:
+        return []
+    longest, log = max(drives, key=lambda pair: pair[0])
+    return [
+        Finding(
+            log.name,
+            "",
+            None,
+            "time_s",
+            "short",
+            f"lasts {longest:g} s, the longest of its campaign, but "
+            f"{effect} "
+            f"acts over {seconds:g} s; record at least that long or do not ask for {effect}",
+        )
+        for effect, seconds in slowest_s.items()
+        if longest < seconds
+    ]
+
+
+def _timed(log: Log) -> bool:
+    return any(len(t) for t in log.tables.values())

@@ -1,0 +1,297 @@
+"""Checks of joints and motors against each other: commands, angles and speeds, currents and voltages, temperatures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lunar_mjx.logs.checks.frames import ALIKE, FACTOR_TOLERANCE, UNLIKE, _finding, rate_agreement
+from lunar_mjx.logs.findings import Finding
+from lunar_mjx.logs.log import Log
+from lunar_mjx.logs.schema import CORNERS
+from lunar_mjx.logs.series import agreement, at, continuous, guess, sigma, span
+
+CROSSED = 3.0
+"""By how much two joints must fit each other's partner better than their own, before they count as swapped."""
+
+MANY = 5.0
+"""Factor between a command and what follows it that no controller leaves, but a unit does."""
+
+LEAST_RESISTANCE = 0.02
+"""ohm, of any motor of a rover with its cables; less means that the current is in mA."""
+
+
+def check_motors(log: Log) -> list[Finding]:
+    """Every joint, and every pair of corners."""
+    found = []
+    for kind in ("drive", "steer", "sus"):
+        for quantity in ("speed_rad_s", "angle_rad"):
+            found += _follows(log, kind, quantity)
+        if not found:
+            found += _angles(log, kind) + _electric(log, kind) + _heat(log, kind)
+    return found
+
+
+def _present(log: Log, pattern: str) -> dict[str, str]:
+    """Channels of a pattern by corner."""
+    names = {c: pattern.format(c) for c in CORNERS}
+    return {c: n for c, n in names.items() if continuous(log, n) is not None}
+
+
+def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
+    """Measured joints against their commands, and against other corners' commands."""
+    measured = _present(log, f"joint_{{}}_{kind}_{quantity}")
+    commanded = _present(log, f"command_{{}}_{kind}_{quantity}")
+    corners = [c for c in measured if c in commanded]
+    limits = span(log, [measured[c] for c in corners] + [commanded[c] for c in corners]) if corners else None
+    if limits is None:
+        return []
+    time = np.linspace(*limits, 500)
+    seen = {c: at(log, measured[c], time) for c in corners}
+    wanted = {c: _held(log, commanded[c], time) for c in corners}
+    found = []
+    for a in corners:
+        noise = max(sigma(log, measured[a]), 1e-3)
+        mine, other = wanted[a], seen[a]
+        pair = None if mine is None or other is None else agreement(other, mine, noise / 3.0)
+        if pair is None:
+            continue
+        if pair.cosine > 0.95 and (pair.factor > MANY or 0.01 < pair.factor < 1.0 / (4.0 * MANY)):
+            found.append(
+                _finding(
+                    log,
+                    measured[a],
+                    "unit",
+                    f"is {pair.factor:.3g} times its command{guess(pair.factor)}; correct its unit, or the command's",
+                )
+            )
+        elif pair.cosine < -ALIKE:
+            found.append(
+                _finding(
+                    log,
+                    measured[a],
+                    "frame",
+                    f"moves against its command (cosine {pair.cosine:.2f}); "
+                    "positive drives forward, steers left, raises the chassis",
+                )
+            )
+    return found or _swapped(log, {c: measured[c] for c in corners}, seen, wanted, "command")  # type: ignore[arg-type]
+
+
+def _held(log: Log, name: str, time: np.ndarray) -> np.ndarray:
+    when, values = log.channel(name)  # type: ignore[misc]
+    return values[np.maximum(np.searchsorted(when, time + 1e-6, side="right") - 1, 0)]
+
+
+def _swapped(
+    log: Log, names: dict[str, str], seen: dict[str, np.ndarray], wanted: dict[str, np.ndarray], what: str
+) -> list[Finding]:
+    """Pairs of corners whose channels fit each other's reference far better than their own."""
+
+    def miss(a: str, b: str) -> float:
+        # the response is taken a little later too, so that a controller's lag does not count
+        gaps = [float(np.nanmean((np.roll(wanted[b], k) - seen[a])[5:] ** 2)) for k in range(5)]
+        return np.sqrt(min(gaps))
+
+    found = []
+    corners = list(names)
+    for i, a in enumerate(corners):
+        for b in corners[i + 1 :]:
+            apart = float(np.sqrt(np.nanmean((wanted[a] - wanted[b]) ** 2)))
+            noise = max(sigma(log, names[a]), sigma(log, names[b]), 1e-3)
+            own, crossed = max(miss(a, a), 1e-12) + miss(b, b), miss(a, b) + miss(b, a)
+            if apart > 5.0 * noise and min(miss(a, a), miss(b, b)) > 0.5 * apart and own > CROSSED * crossed:
+                found.append(
+                    _finding(
+                        log,
+                        names[a],
+                        "swap",
+                        f"follows the {what} of {b} and {names[b]} that of {a} "
+                        "(miss "
+                        f"{own:.3g} as they are, {crossed:.3g} crossed); exchange the two columns",
+                    )
+                )
+    return found
+
+
+def _angles(log: Log, kind: str) -> list[Finding]:
+    """Angles against speeds."""
+    angles, speeds = _present(log, f"joint_{{}}_{kind}_angle_rad"), _present(log, f"joint_{{}}_{kind}_speed_rad_s")
+    found = []
+    for c, angle in angles.items():
+        pair = rate_agreement(log, angle, speeds[c]) if c in speeds else None
+        if pair is None or (kind != "drive" and pair.reference < 0.02):
+            continue
+        if abs(pair.cosine) > ALIKE and abs(pair.factor - 1.0) > FACTOR_TOLERANCE:
+            found.append(
+                _finding(
+                    log,
+                    angle,
+                    "unit",
+                    f"changes {pair.factor:.3g} times as fast as {speeds[c]} says"
+                    f"{guess(pair.factor)}; correct one of the two",
+                )
+            )
+        elif pair.cosine < UNLIKE:
+            found.append(
+                _finding(
+                    log,
+                    angle,
+                    "swap",
+                    f"has nothing in common with {speeds[c]} (cosine "
+                    f"{pair.cosine:.2f}); "
+                    "one of them is another joint's, or broken",
+                )
+            )
+    return found or _crossed_speeds(log, kind, angles, speeds)
+
+
+def _crossed_speeds(log: Log, kind: str, angles: dict[str, str], speeds: dict[str, str]) -> list[Finding]:
+    """Angles of two joints that fit each other's speed."""
+    corners = [c for c in angles if c in speeds]
+    limits = span(log, [angles[c] for c in corners] + [speeds[c] for c in corners]) if corners else None
+    if limits is None or kind != "drive":
+        return []
+    time = np.linspace(*limits, 60)
+    length = time[1] - time[0]
+
+    def rate(name: str) -> np.ndarray:
+        return np.diff(at(log, name, time)) / length  # type: ignore[arg-type]
+
+    def mean(name: str) -> np.ndarray:
+        when, values = continuous(log, name)  # type: ignore[misc]
+        total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(when))])
+        return np.diff(np.interp(time, when, total)) / length
+
+    return _swapped(
+        log,
+        {c: angles[c] for c in corners},
+        {c: rate(angles[c]) for c in corners},
+        {c: mean(speeds[c]) for c in corners},
+        "speed",
+    )
+
+
+def _electric(log: Log, kind: str) -> list[Finding]:
+    """V = R I + k omega with R and k positive: units of the current, swapped columns, swapped motors."""
+    current, voltage = _present(log, f"motor_{{}}_{kind}_current_A"), _present(log, f"motor_{{}}_{kind}_voltage_V")
+    speed = _present(log, f"joint_{{}}_{kind}_speed_rad_s")
+    corners = [c for c in current if c in voltage and c in speed]
+    limits = span(log, [d[c] for c in corners for d in (current, voltage, speed)]) if corners else None
+    if limits is None:
+        return []
+    time = np.linspace(*limits, 500)
+    data = {c: tuple(at(log, d[c], time) for d in (voltage, current, speed)) for c in corners}
+    found = []
+    for c in corners:
+        fit = _circuit(*data[c])  # type: ignore[arg-type]
+        if fit is None:
+            continue
+        (resistance, back_emf), (error_r, error_k) = fit
+        if back_emf < -20.0 * error_k:
+            found.append(
+                _finding(
+                    log,
+                    voltage[c],
+                    "swap",
+                    "falls with the joint's speed at a given current "
+                    f"({back_emf:.3g} "
+                    f"V s/rad): it is swapped with {current[c]}, or has the wrong sign",
+                )
+            )
+        elif 0.0 < resistance < LEAST_RESISTANCE and resistance > 20.0 * error_r:
+            found.append(
+                _finding(
+                    log,
+                    current[c],
+                    "unit",
+                    f"gives a motor of {resistance:.3g} ohm with {voltage[c]} (looks like mA for A); correct its unit",
+                )
+            )
+    return found or _crossed_currents(log, current, data)  # type: ignore[arg-type]
+
+
+def _circuit(voltage: np.ndarray, current: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Resistance and back-EMF constant with standard errors; None where current and speed do not tell them apart."""
+    design = np.stack([current, speed], 1)
+    size = np.sqrt(np.mean(design**2, axis=0))
+    if not (size > 0.0).all():
+        return None
+    scaled = design / size
+    if np.linalg.cond(scaled) > 100.0:
+        return None
+    found, *_ = np.linalg.lstsq(scaled, voltage, rcond=None)
+    residual = voltage - scaled @ found
+    if residual @ residual > 0.1 * (voltage @ voltage):
+        return None  # another circuit than a motor's; no statement
+    variance = residual @ residual / max(1, len(voltage) - 2) * np.diag(np.linalg.inv(scaled.T @ scaled))
+    return found / size, np.sqrt(variance) / size
+
+
+def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, tuple[np.ndarray, ...]]) -> list[Finding]:
+    def miss(a: str, b: str) -> float:
+        design = np.stack([data[b][1], data[a][2]], 1)
+        return float(np.linalg.norm(data[a][0] - design @ np.linalg.lstsq(design, data[a][0], rcond=None)[0]))
+
+    found = []
+    corners = list(data)
+    for i, a in enumerate(corners):
+        for b in corners[i + 1 :]:
+            pairs = [(miss(a, a), miss(a, b)), (miss(b, b), miss(b, a))]
+            apart = float(np.sqrt(np.mean((data[a][1] - data[b][1]) ** 2)))
+            if apart > 5.0 * sigma(log, names[a]) and all(own > CROSSED * crossed for own, crossed in pairs):
+                found.append(
+                    _finding(
+                        log,
+                        names[a],
+                        "swap",
+                        f"fits the voltage of {b} and {names[b]} that of {a}; exchange the two columns",
+                    )
+                )
+    return found
+
+
+def _heat(log: Log, kind: str) -> list[Finding]:
+    """The winding, where the heat is made, rises above the housing while current flows."""
+    winding = _present(log, f"winding_{{}}_{kind}_temperature_degC")
+    housing = _present(log, f"housing_{{}}_{kind}_temperature_degC")
+    current = _present(log, f"motor_{{}}_{kind}_current_A")
+    found = []
+    for c in [c for c in winding if c in housing and c in current]:
+        limits = span(log, (winding[c], housing[c], current[c]))
+        if limits is None:
+            continue
+        time = np.arange(*limits, 0.5)
+        power = _average(at(log, current[c], time), 0.5 / 10.0)  # type: ignore[arg-type]
+        apart = at(log, winding[c], time) - at(log, housing[c], time)  # type: ignore[operator]
+        if len(time) < 40:
+            continue
+        rise, cosine = _slope(power, apart)
+        if cosine < -0.8 and abs(rise) * np.ptp(power) > max(5.0, 8.0 * sigma(log, winding[c])):
+            found.append(
+                _finding(
+                    log,
+                    winding[c],
+                    "swap",
+                    f"falls against {housing[c]} as current flows (correlation {cosine:.2f}): the two are swapped",
+                )
+            )
+    return found
+
+
+def _average(current: np.ndarray, share: float) -> np.ndarray:
+    """Squared current through a first-order lag, as the winding's heat follows it."""
+    out, state = np.zeros_like(current), float(current[0] ** 2)
+    for i, value in enumerate(current):
+        state += share * (value**2 - state)
+        out[i] = state
+    return out
+
+
+def _slope(x: np.ndarray, y: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    a, b = x - np.mean(x), np.asarray(y) - np.mean(y)
+    size = float(a @ a)
+    if size <= 0.0 or not (b @ b) > 0.0:
+        return 0.0, 0.0
+    return float(a @ b) / size, float(a @ b / np.sqrt(size * (b @ b)))

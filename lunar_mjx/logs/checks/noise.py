@@ -1,0 +1,173 @@
+"""Is the stated noise what the channels show at rest? White and first-order coloured noise, quantised or not."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from scipy import stats
+
+from lunar_mjx.logs.checks.values import CHANCE, quantum
+from lunar_mjx.logs.findings import Finding
+from lunar_mjx.logs.log import Log, Noise
+
+FACTOR = 2.0
+"""A stated noise that is wrong by less than this does not mislead; the data sheets themselves are no better."""
+
+QUIETER = 3.5
+"""The same for noise smaller than stated, and only where the rest shows white noise: of noise that is nine tenths slow,
+spans of a few seconds show a third."""
+
+SETTLE = 2.0
+"""Seconds after a command has changed in which a rover still rocks."""
+
+STILL = 0.02
+"""rad/s: a wheel of 0.25 m that turns slower moves by less than 5 mm/s."""
+
+LONGEST = 8.0
+"""Seconds of rest taken together, over which a parabola follows whatever creeps or cools."""
+
+WHITE = 0.15
+"""Largest correlation of neighbouring samples that passes for white noise."""
+
+SHORTEST = 1.2
+MARGIN = 0.3
+"""Seconds at both ends of a rest in which filters and difference quotients still see the motion beside it."""
+
+FEWEST = 20
+
+
+def rest_segments(log: Log) -> list[tuple[float, float]]:
+    """Spans of common time, s, at which all commands are constant, drives are commanded to rest and no joint moves."""
+    commands = [c for c in log.channel_names if c.startswith("command_")]
+    if not commands:
+        return []
+    start, end = log.span_s
+    grid = np.arange(start, end, 0.05)
+    rest = np.ones(len(grid), bool)
+    for name in commands:
+        rest &= _quiet_command(log, name, grid)
+    for name in log.channel_names:
+        if name.startswith("joint_") and name.endswith("_speed_rad_s"):
+            found = log.channel(name)
+            if found is None or len(found[0]) < FEWEST:
+                continue
+            noise = log.noise[name].std if name in log.noise else 0.0
+            speed = np.interp(grid, found[0], np.abs(_medians(found[1])))
+            rest &= speed < max(STILL, noise)
+    return _spans(grid, rest)
+
+
+def _medians(values: np.ndarray) -> np.ndarray:
+    """Running median of nine samples, so that noise does not look like motion."""
+    padded = np.pad(values, 4, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 9), axis=1)
+
+
+def _quiet_command(log: Log, name: str, grid: np.ndarray) -> np.ndarray:
+    found = log.channel(name)
+    if found is None or not found[0].size:
+        return np.ones(len(grid), bool)
+    time, values = found
+    held = values[np.maximum(np.searchsorted(time, grid + 1e-6, side="right") - 1, 0)]
+    quiet = np.ones(len(grid), bool) if name.endswith("_angle_rad") else held == 0.0
+    for when in time[1:][np.diff(values) != 0.0]:
+        quiet &= (grid < when) | (grid > when + SETTLE)
+    return quiet
+
+
+def _spans(grid: np.ndarray, rest: np.ndarray) -> list[tuple[float, float]]:
+    padded = np.concatenate([[False], rest, [False]]).astype(int)
+    starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
+    spans = []
+    for first, last in zip(starts, ends, strict=True):
+        low, high = float(grid[first]), float(grid[last - 1])
+        low, high = low + (SETTLE if first == 0 else MARGIN), high - MARGIN  # a log may begin in motion
+        pieces = max(1, int(np.ceil((high - low) / LONGEST)))
+        cuts = np.linspace(low, high, pieces + 1)
+        spans += [(float(a), float(b)) for a, b in itertools.pairwise(cuts) if b - a >= SHORTEST]
+    return spans
+
+
+def rest_noise(log: Log, name: str, spans: list[tuple[float, float]]) -> tuple[float, float, float] | None:
+    """Noise of a channel at rest after a parabola is taken off each span.
+
+    Returns:
+      Standard deviation, correlation of neighbouring samples, and the number of independent samples behind it; None if
+      there are too few.
+    """
+    found = log.channel(name)
+    if found is None:
+        return None
+    time, values = found
+    squares = products = count = freedom = pairs = 0.0
+    for low, high in spans:
+        keep = (time >= low) & (time <= high)
+        if keep.sum() < FEWEST:
+            continue
+        t = 2.0 * (time[keep] - low) / (high - low) - 1.0
+        residual = values[keep] - np.polynomial.polynomial.polyval(
+            t, np.polynomial.polynomial.polyfit(t, values[keep], 2)
+        )
+        squares += float(residual @ residual)
+        products += float(residual[1:] @ residual[:-1])
+        count, freedom, pairs = count + len(t), freedom + len(t) - 3, pairs + len(t) - 1
+    if freedom < FEWEST - 3 or squares == 0.0:
+        return None
+    correlation = float(np.clip(products / pairs / (squares / count), 0.0, 0.98))
+    # variance of a variance under AR(1): as from n (1 - rho^2)/(1 + rho^2) independent samples
+    independent = freedom * (1.0 - correlation**2) / (1.0 + correlation**2)
+    return float(np.sqrt(squares / freedom)), correlation, independent
+
+
+def check_noise(log: Log) -> list[Finding]:
+    """Channels whose noise at rest contradicts the stated one by more than `FACTOR`, beyond chance."""
+    spans = rest_segments(log)
+    if not spans:
+        return []
+    found: list[Finding] = []
+    for name, noise in log.noise.items():
+        estimate = rest_noise(log, name, spans) if noise.std > 0.0 and not name.startswith("command_") else None
+        if estimate is None:
+            continue
+        text = _contradiction(log, name, noise, *estimate)
+        table = log.table_of(name)
+        if text and table is not None:
+            found.append(
+                Finding(log.name, table.name, _row(log, name, spans), table.columns.get(name, name), "noise", text)
+            )
+    return found
+
+
+def _contradiction(log: Log, name: str, noise: Noise, std: float, correlation: float, independent: float) -> str:
+    values = log.channel(name)[1]  # type: ignore[index]
+    step = quantum(values)
+    expected = float(np.hypot(noise.std, step / np.sqrt(12.0)))
+    ratio = std / expected
+    if noise.correlation_time_s > 0.0 or correlation > 0.5:
+        independent = min(independent, 10.0)  # spans of a few seconds hold few correlation times
+    statistic, freedom = independent * ratio**2, independent
+    if ratio > FACTOR and stats.chi2.sf(statistic, freedom) < CHANCE:
+        side = "is noisier than stated"
+    elif (
+        ratio < 1.0 / QUIETER
+        and correlation < WHITE
+        and step < noise.std
+        and stats.chi2.cdf(statistic, freedom) < CHANCE
+    ):
+        side = "is quieter than stated"
+    else:
+        return ""
+    return (
+        f"{side}: standard deviation {std:.3g} at rest ({independent:.0f} independent samples, neighbours "
+        "correlated "
+        f"by {correlation:.2f}) where log.toml states {noise.std:g} from {noise.source}; state what is measured "
+        "at rest"
+    )
+
+
+def _row(log: Log, name: str, spans: list[tuple[float, float]]) -> int | None:
+    table = log.table_of(name)
+    if table is None:
+        return None
+    return int(np.searchsorted(table.common_time_s, spans[0][0]))

@@ -1,0 +1,249 @@
+"""Checks of steady-state tables: copied rows, replicates against the stated noise, the sign of what a wheel does."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from lunar_mjx.logs.checks.noise import FACTOR
+from lunar_mjx.logs.checks.values import CHANCE
+from lunar_mjx.logs.findings import WARNING, Finding
+from lunar_mjx.logs.log import SteadyLog
+from lunar_mjx.logs.schema import STEADY_CHANNELS
+from lunar_mjx.wheel_bed.table import QUANTITIES, average, replicate_groups
+
+
+def check_steady(log: SteadyLog) -> list[Finding]:
+    """Findings beyond what reading found."""
+    if len(log.table) == 0:
+        return [Finding(log.name, "", None, "", "dropout", "holds no usable row; see the other findings, or fill it")]
+    found = _copies(log) + _ranges(log) + _signs(log) + _swapped(log) + _clipped(log) + _noiseless(log)
+    return found + (_replicates(log) if not found else [])
+
+
+def _finding(
+    log: SteadyLog, row: int | None, column: str, kind: str, message: str, severity: str = "bad_data"
+) -> Finding:
+    number = int(log.rows[row]) if row is not None and len(log.rows) else row
+    return Finding(log.name, "", number, column, kind, message, severity)
+
+
+def _columns(log: SteadyLog) -> dict[str, np.ndarray]:
+    return {**log.table.test, **{QUANTITIES[q][0]: v for q, v in log.table.measured.items()}}
+
+
+def _copies(log: SteadyLog) -> list[Finding]:
+    """Rows whose measured values all occur again, more often than the digits of the instruments explain."""
+    measured = np.column_stack(list(log.table.measured.values()))
+    if measured.shape[1] < 2:  # one quantity with few digits repeats by chance
+        measured = np.column_stack([measured, *log.table.test.values()])
+    _, first, count = np.unique(measured, axis=0, return_index=True, return_counts=True)
+    trivial = np.all(measured[first] == 0.0, axis=1)
+    copies = int((count - 1)[~trivial].sum())
+    if not copies or stats.poisson.sf(copies - 1, _coincidences(log)) >= CHANCE:
+        return []
+    original = int(first[np.argmax((count > 1) & ~trivial)])
+    copy = int(np.flatnonzero((measured == measured[original]).all(axis=1))[1])
+    line = int(log.rows[original]) + 2 if len(log.rows) else original + 2
+    return [_finding(log, copy, "", "copy", f"holds the same measurements as line {line}; remove the copy")]
+
+
+def _coincidences(log: SteadyLog) -> float:
+    """Replicates that agree in everything measured by chance alone: instruments of few digits repeat themselves."""
+    group = replicate_groups(log.table)
+
+    def pairs(keys: list[np.ndarray]) -> float:
+        count = np.unique(np.column_stack(keys), axis=0, return_counts=True)[1]
+        return float((count * (count - 1) // 2).sum())
+
+    number, whole = pairs([group]), pairs([group, *log.table.measured.values()])
+    # a copied row must not count as proof that instruments repeat themselves
+    shares = [max((pairs([group, values]) - whole) / max(number, 1.0), _agree(values, group))
+              for values in log.table.measured.values()]  # fmt: skip
+    return number * float(np.prod(shares))
+
+
+def _agree(values: np.ndarray, group: np.ndarray) -> float:
+    """Chance that two replicates of one quantity agree, by the steps of its instrument and their scatter."""
+    steps = np.diff(np.unique(values))
+    _, group = np.unique(group, return_inverse=True)
+    count = np.bincount(group)
+    deviation = values - (np.bincount(group, values) / count)[group]
+    freedom = len(values) - len(count)
+    scatter = np.sqrt(float(deviation @ deviation) / freedom) if freedom else 0.0
+    if not len(steps) or not scatter > 0.0:
+        return 0.0
+    return float(min(1.0, steps.min() / (2.0 * np.sqrt(np.pi) * scatter)))
+
+
+def _ranges(log: SteadyLog) -> list[Finding]:
+    found = []
+    for column, values in _columns(log).items():
+        _, low, high = STEADY_CHANNELS[column]
+        beyond = (values < low) | (values > high)
+        if beyond.any():
+            row = int(np.argmax(beyond))
+            found.append(
+                _finding(
+                    log, row, column, "range", f"is {values[row]:.5g}, outside [{low:g}, {high:g}]; check its unit"
+                )
+            )
+    load = log.table.test["normal_load_N"]
+    for quantity in ("drawbar_pull", "side_force"):
+        values = log.table.measured.get(quantity)
+        if values is not None and np.median(np.abs(values)) > 3.0 * np.median(load):
+            found.append(
+                _finding(
+                    log,
+                    None,
+                    QUANTITIES[quantity][0],
+                    "unit",
+                    f"is {np.median(np.abs(values)):.3g} N "
+                    "at the "
+                    f"median under a load of {np.median(load):.3g} N: no soil bears that; check both "
+                    "units",
+                )
+            )
+    sinkage = log.table.measured.get("sinkage")
+    if sinkage is not None and np.median(sinkage) > 2.0 * log.table.radius:
+        found.append(
+            _finding(
+                log,
+                None,
+                "sinkage_m",
+                "unit",
+                f"is {np.median(sinkage):.3g} m at the median, more than the wheel's diameter; check its unit",
+            )
+        )
+    return found
+
+
+def _signs(log: SteadyLog) -> list[Finding]:
+    """Pull and torque grow with slip; a wheel sinks downwards; both by rank over the whole table."""
+    found = []
+    slip = log.table.test["slip_ratio"]
+    for quantity in ("drawbar_pull", "driving_torque"):
+        values = log.table.measured.get(quantity)
+        if values is None or len(values) < 8 or np.ptp(slip) < 0.3:
+            continue
+        rank = float(np.asarray(stats.spearmanr(slip, values))[0])
+        noise = log.table.sigma.get(quantity, 0.0)
+        if rank < -0.7 and np.ptp(values) > 10.0 * noise:
+            found.append(
+                _finding(
+                    log,
+                    None,
+                    QUANTITIES[quantity][0],
+                    "frame",
+                    "falls with slip (rank correlation "
+                    f"{rank:.2f})"
+                    ": its sign, or that of the slip ratio, is reversed; a driving wheel pulls forward",
+                )
+            )
+    sinkage = log.table.measured.get("sinkage")
+    if sinkage is not None and np.median(sinkage) < -5.0 * log.table.sigma.get("sinkage", 1e-4):
+        found.append(
+            _finding(
+                log,
+                None,
+                "sinkage_m",
+                "frame",
+                f"is {np.median(sinkage):.3g} m at the median; sinkage counts downwards",
+            )
+        )
+    return found
+
+
+def _swapped(log: SteadyLog) -> list[Finding]:
+    """A wheel that heads where it goes has no side force; one that follows the slip there is the drawbar pull."""
+    side, pull = log.table.measured.get("side_force"), log.table.measured.get("drawbar_pull")
+    straight = np.abs(log.table.test["slip_angle_deg"]) < 1.0
+    slip = log.table.test["slip_ratio"][straight]
+    if side is None or pull is None or straight.sum() < 8 or np.ptp(slip) < 0.3:
+        return []
+    side, pull = side[straight], pull[straight]
+    rank = float(np.asarray(stats.spearmanr(slip, side))[0])
+    if rank < 0.7 or np.std(side) < 5.0 * np.std(pull):
+        return []
+    message = f"follows the slip at zero slip angle (rank correlation {rank:.2f}), and the drawbar pull does not"
+    return [_finding(log, None, "side_force_N", "frame", f"{message}: the two columns are swapped")]
+
+
+_AT_LIMIT = 0.05
+"""Share of the rows at one extreme value from which a channel is saturated."""
+
+
+def _clipped(log: SteadyLog) -> list[Finding]:
+    """An extreme value that many rows share, where other values do not repeat so often: the instrument's limit."""
+    found = []
+    for quantity, values in log.table.measured.items():
+        count = np.unique(values, return_counts=True)[1]
+        for at, extreme in ((-1, values.max()), (0, values.min())):
+            others = np.delete(count, at)
+            often = max(8.0, _AT_LIMIT * len(values), 4.0 * float(others.max(initial=1)))
+            if len(count) > 2 and extreme != 0.0 and count[at] >= often:
+                row = int(np.argmax(values == extreme))
+                message = f"stays at {extreme:.5g} in {count[at]} of {len(values)} rows; leave out what was cut off"
+                found.append(_finding(log, row, QUANTITIES[quantity][0], "saturation", message))
+    return found
+
+
+def _noiseless(log: SteadyLog) -> list[Finding]:
+    """Quantities whose noise neither the log nor replicates tell: nothing could be counted in sigma."""
+    told = average(log.table).sigma
+    found = []
+    for quantity in log.table.measured:
+        column = QUANTITIES[quantity][0]
+        if not told.get(quantity, 0.0) > 0.0 and column not in log.noise:
+            message = (
+                f"nothing tells its noise; state [noise.{column}] std in log.toml, give replicates, or leave it out"
+            )
+            found.append(_finding(log, None, column, "noise", message))
+    return found
+
+
+def _replicates(log: SteadyLog) -> list[Finding]:
+    """The scatter of replicates against the stated noise, pooled over the points, by chi-square."""
+    group = replicate_groups(log.table)
+    count = np.bincount(group)
+    freedom = int((count - 1).sum())
+    found: list[Finding] = []
+    if freedom < 3:
+        return found
+    for quantity, values in log.table.measured.items():
+        column = QUANTITIES[quantity][0]
+        row_std = log.row_std.get(column)
+        stated = row_std if row_std is not None else np.full(len(values), log.table.sigma.get(quantity, np.nan))
+        if not np.isfinite(stated).all() or not (stated > 0.0).all():
+            continue
+        mean = np.bincount(group, weights=values) / count
+        residual = (values - mean[group]) / stated
+        # a correction for unequal stated noise within a group would change this by less than the factor allows
+        statistic = float(residual @ residual)
+        ratio = float(np.sqrt(statistic / freedom))
+        high, low = stats.chi2.sf(statistic, freedom) < CHANCE, stats.chi2.cdf(statistic, freedom) < CHANCE
+        if (ratio > FACTOR and high) or (ratio < 1.0 / FACTOR and low):
+            worst = int(np.argmax(np.abs(residual))) if ratio > 1.0 else None
+            found.append(
+                _finding(
+                    log,
+                    worst,
+                    column,
+                    "noise",
+                    f"its replicates scatter {ratio:.3g} times as much as "
+                    "the "
+                    f"stated noise ({freedom} degrees of freedom); state what the replicates show",
+                )
+            )
+        elif high and ratio > 1.3:
+            found.append(
+                _finding(
+                    log,
+                    None,
+                    column,
+                    "noise",
+                    f"its replicates scatter {ratio:.3g} times as much as the stated noise",
+                    WARNING,
+                )
+            )
+    return found

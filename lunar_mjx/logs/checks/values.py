@@ -1,0 +1,186 @@
+"""Checks of single channels: empty, out of the physical range, stuck, saturated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lunar_mjx.logs.apply import environment_value
+from lunar_mjx.logs.checks.clock import LOST_SHARE
+from lunar_mjx.logs.findings import Finding
+from lunar_mjx.logs.log import Log, LogTable
+from lunar_mjx.logs.schema import MIRROR, find_channel, limits
+from lunar_mjx.logs.series import sigma
+
+CHANCE = 1e-6
+"""Largest probability of a finding on a good channel."""
+
+SHORTEST_RUN = 20
+"""Equal samples in a row that may be chance, whatever the rest of the channel looks like."""
+
+CLIPPED_SHARE = 0.02
+"""Share of samples exactly at the extreme value; with noise of two quanta or more a good channel has a few."""
+
+FAR_FROM_AMBIENT = 200.0
+"""K between a motor at the log's start and its surroundings: 273 is kelvin for Celsius, no motor is that hot."""
+_BY_CHANCE = 2.5
+"""Standard deviations by which a share of few cells may exceed `LOST_SHARE` by chance."""
+
+
+def check_values(log: Log) -> list[Finding]:
+    """Every channel by itself, and by its stated noise."""
+    found: list[Finding] = []
+    for table in log.tables.values():
+        for name in table.channels:
+            found += _check_channel(log, table, name)
+    return found
+
+
+def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
+    column = table.columns.get(name, name)
+
+    def finding(row: int | None, kind: str, message: str) -> list[Finding]:
+        return [Finding(log.name, table.name, row, column, kind, message)]
+
+    values = table.channels[name]
+    there = np.isfinite(values)
+    if not there.any():
+        return finding(None, "dropout", "is empty; leave the column out")
+    # a short table whose sensor loses fewer cells than that may still have lost more by chance
+    chance = _BY_CHANCE * np.sqrt(LOST_SHARE * (1.0 - LOST_SHARE) / len(there))
+    if (share := float(1.0 - there.mean())) > LOST_SHARE + chance:
+        return finding(
+            int(np.argmin(there)),
+            "dropout",
+            f"is empty in {100 * share:.0f} % of its rows (at most "
+            f"{100 * (LOST_SHARE + chance):.0f} % may be); record it anew or leave the column out",
+        )
+    low, high, why = limits(name)
+    beyond = there & ((values < low) | (values > high))
+    if beyond.any():
+        row = int(np.argmax(beyond))
+        return finding(
+            row,
+            "range",
+            f"is {values[row]:.6g}, outside [{low:g}, {high:g}] ({why}), and so in "
+            f"{int(beyond.sum())} rows; check its unit, or leave these cells empty",
+        )
+    if name.endswith("_temperature_degC") and (text := _kelvin(log, values[there])):
+        return finding(int(np.argmax(there)), "unit", text)
+    if name.startswith("command_"):
+        return []
+    stuck = _stuck(log, table, name, values[there])
+    if stuck is not None:
+        first, length, value = stuck
+        row = int(np.flatnonzero(there)[first])
+        extreme = value in (values[there].min(), values[there].max()) and np.ptp(values[there]) > 0.0
+        what, kind = ("lies at its extreme", "saturated") if extreme else ("is stuck at", "stuck")
+        return finding(
+            row,
+            kind,
+            f"{what} {value:.6g} for {length} samples in a row, which its noise rules out; "
+            "leave these cells empty or the column out",
+        )
+    clipped = _clipped(log, name, values[there])
+    if clipped is not None:
+        row = int(np.flatnonzero(there & (values == clipped))[0])
+        count = int((values == clipped).sum())
+        return finding(
+            row,
+            "saturated",
+            f"is exactly {clipped:.6g}, its extreme, in {count} of {int(there.sum())} "
+            "samples: the sensor is clipped; leave these cells empty",
+        )
+    return []
+
+
+def _kelvin(log: Log, values: np.ndarray) -> str:
+    ambient = environment_value(log, "ambient_temperature_degC")
+    start = float(np.median(values[:5]))
+    if ambient is not None and ambient < 150.0 and abs(start - ambient) > FAR_FROM_AMBIENT:
+        hint = " (looks like kelvin)" if abs(start - 273.15 - ambient) < 100.0 else ""
+        return (
+            f"starts at {start:.4g} degC where the surroundings have {ambient:g} degC{hint}; give degrees Celsius, "
+            "or call the column by its unit"
+        )
+    if ambient is None and float(values.min()) > FAR_FROM_AMBIENT:
+        return f"never falls below {values.min():.4g} degC (looks like kelvin); give degrees Celsius"
+    return ""
+
+
+def quantum(values: np.ndarray) -> float:
+    """Smallest step between the values of a channel; 0 for a constant one."""
+    steps = np.diff(np.unique(values))
+    # what remains of a decimal number written with nine digits is no step
+    steps = steps[steps > 1e-8 * max(1e-12, float(np.abs(values).max()))]
+    return float(steps.min()) if steps.size else 0.0
+
+
+def longest_run(values: np.ndarray) -> tuple[int, int]:
+    """Start and length of the longest run of equal samples."""
+    changes = np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1, [len(values)]])
+    lengths = np.diff(changes)
+    longest = int(np.argmax(lengths))
+    return int(changes[longest]), int(lengths[longest])
+
+
+def _stuck(log: Log, table: LogTable, name: str, values: np.ndarray) -> tuple[int, int, float] | None:
+    """Start, length and value of a run that noise rules out, or that its siblings contradict."""
+    first, length = longest_run(values)
+    if length < SHORTEST_RUN:
+        return None
+    noise = sigma(log, name)
+    step = quantum(values) or _siblings_quantum(table, name)
+    if noise > 0.0 and step is not None and length >= _possible_run(noise, step, len(values)):
+        return first, length, float(values[first])
+    if length == len(values) and _siblings_move(table, name):
+        return first, length, float(values[0])
+    return None
+
+
+def _possible_run(noise: float, step: float, count: int) -> float:
+    """Length of a run of equal samples that noise of this size still allows in a channel of `count` samples.
+
+    At least a tenth of the variance is taken to be white, the rest to stand still in the middle of a quantum.
+    """
+    inside = math.erf(0.5 * step / (np.sqrt(0.1) * noise * np.sqrt(2.0)))
+    same = min(inside**2 + 0.5 * (1.0 - inside) ** 2, 1.0 - 1e-12)
+    return max(SHORTEST_RUN, math.log(CHANCE / count) / math.log(max(same, 1e-3)))
+
+
+def _siblings(table: LogTable, name: str) -> list[np.ndarray]:
+    """The same channel of the other corners."""
+    found = find_channel(name)
+    corner = found[1].groupdict().get("corner") if found else None
+    if corner is None:
+        return []
+    others = (name.replace(f"_{corner}_", f"_{c}_") for c in MIRROR if c != corner)
+    return [v[np.isfinite(v)] for o in others if (v := table.channels.get(o)) is not None and np.isfinite(v).any()]
+
+
+def _siblings_quantum(table: LogTable, name: str) -> float | None:
+    steps = [q for v in _siblings(table, name) if (q := quantum(v)) > 0.0]
+    return float(np.median(steps)) if len(steps) >= 2 else None
+
+
+def _siblings_move(table: LogTable, name: str) -> bool:
+    """Whether a measured channel of a wheel's drive never changes while at least two other wheels' do, and much."""
+    if "_drive_" not in name:
+        return False  # an idle steering joint beside others that steer is no broken sensor
+    moving = [np.ptp(v) > 20.0 * quantum(v) > 0.0 for v in _siblings(table, name)]
+    return sum(moving) >= 2
+
+
+def _clipped(log: Log, name: str, values: np.ndarray) -> float | None:
+    """The extreme value, if far more samples have exactly that than noise allows."""
+    noise, step = sigma(log, name), quantum(values)
+    if noise <= 0.0 or noise < 2.0 * step or len(values) < 100:
+        return None
+    for extreme in (float(values.max()), float(values.min())):
+        count = int((values == extreme).sum())
+        # slow noise stays at its extreme for a while too, but then its neighbours are as frequent
+        beside = int((np.abs(values - extreme) < 1.5 * step).sum()) - count
+        if count >= max(10, CLIPPED_SHARE * len(values), 5 * beside):
+            return extreme
+    return None

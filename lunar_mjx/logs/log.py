@@ -1,0 +1,156 @@
+"""A measurement log in memory: tables of channels, what was stated about them, and what reading them found wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar_mjx.logs.findings import Finding
+from lunar_mjx.wheel_bed.table import SteadyStateTable
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """Stated noise of a channel.
+
+    Attributes:
+      std: standard deviation of one sample, in the channel's unit.
+      source: datasheet, rest or replicate.
+      correlation_time_s: of a first-order autoregressive part; 0 for white noise.
+    """
+
+    std: float
+    source: str
+    correlation_time_s: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Imu:
+    """Where the IMU is mounted: position m in the chassis frame; quaternion w, x, y, z from its frame to the body's."""
+
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LogTable:
+    """One table of a log.
+
+    Attributes:
+      name: as `[tables.NAME]`. file: its path.
+      time_s: (n,) as written. channels: (n,) float64 by name of the schema, NaN at gaps, in the schema's units.
+      rate_hz: stated; the median one of `time_s` if nothing is stated.
+      clock_offset_s: add it to `time_s` to get the log's common time. clock_offset_std_s: its standard deviation.
+      columns: name in the file by channel. ignored: columns that are no channel.
+    """
+
+    name: str
+    file: Path
+    time_s: np.ndarray
+    channels: Mapping[str, np.ndarray]
+    rate_hz: float
+    clock_offset_s: float = 0.0
+    clock_offset_std_s: float = 0.0
+    columns: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
+
+    @property
+    def common_time_s(self) -> np.ndarray:
+        """(n,) times on the log's common clock, s."""
+        return self.time_s + self.clock_offset_s
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Log:
+    """A drive log: one folder.
+
+    Attributes:
+      folder: where it lies. name: the folder's name.
+      rover: name, or absolute path of a rover's folder. manoeuvre: canned name or free text.
+      gravity_m_s2: positive. terrain: name, slope:10deg or absolute path. terrain_origin_m: where the log's origin
+        lies in the terrain's coordinates, x and y.
+      split: fit, select, test or None.
+      environment: ambient temperature degC and Sun's angles deg: numbers, or the key itself where it is a channel.
+      rover_changes, initial: as written; what is omitted is unknown.
+      imu: where it is mounted.
+      tables: by name. noise: by channel.
+      source: who, licence, citation.
+      problems: what reading found wrong; `check` passes them on.
+    """
+
+    folder: Path
+    name: str
+    rover: str
+    manoeuvre: str
+    gravity_m_s2: float
+    terrain: str
+    split: str | None
+    environment: Mapping[str, float | str]
+    rover_changes: Mapping[str, Any]
+    initial: Mapping[str, Any]
+    imu: Imu
+    tables: Mapping[str, LogTable]
+    noise: Mapping[str, Noise]
+    source: Mapping[str, str]
+    terrain_origin_m: tuple[float, float] = (0.0, 0.0)
+    problems: tuple[Finding, ...] = ()
+
+    def channel(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Common time s and values of a channel without its gaps; None if no table has it."""
+        for table in self.tables.values():
+            if name in table.channels:
+                values = table.channels[name]
+                keep = np.isfinite(values) & np.isfinite(table.time_s)
+                return table.common_time_s[keep], values[keep]
+        return None
+
+    def table_of(self, channel: str) -> LogTable | None:
+        """The table that holds a channel."""
+        return next((t for t in self.tables.values() if channel in t.channels), None)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """All channels, in the order of the tables."""
+        return tuple(c for t in self.tables.values() for c in t.channels)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last common time of all tables, s."""
+        times = [t.common_time_s[np.isfinite(t.time_s)] for t in self.tables.values()]
+        times = [t for t in times if t.size]
+        return min(float(t.min()) for t in times), max(float(t.max()) for t in times)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SteadyLog:
+    """A steady-state log: the table of a single-wheel test bed.
+
+    Attributes:
+      folder: where it lies. name: the folder's name.
+      table: one row per run; rows that `problems` refuses are left out.
+      wheel: radius_m, width_m, grouser_count, grouser_height_m.
+      noise: stated, by column. row_std: (n,) standard deviation of each row, by column, where the table gives it.
+      split: fit, select, test or None. gravity_m_s2: positive. source: who, licence, citation.
+      rows: (n,) row of the file of each row of the table. trial: (n,) number of the trial, or None.
+      problems: what reading found wrong; `check` passes them on.
+    """
+
+    folder: Path
+    name: str
+    table: SteadyStateTable
+    wheel: Mapping[str, float]
+    noise: Mapping[str, Noise]
+    split: str | None
+    gravity_m_s2: float
+    source: Mapping[str, str]
+    row_std: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    rows: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    trial: np.ndarray | None = None
+    problems: tuple[Finding, ...] = ()

@@ -1,0 +1,1 @@
+"""Reads measurement logs from folders, tables and recordings of other tools."""

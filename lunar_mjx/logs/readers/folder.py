@@ -1,0 +1,226 @@
+"""Reads measurement logs: a folder of `log.toml` and tables; a folder of such folders is a campaign."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.logs.findings import Finding
+from lunar_mjx.logs.log import Imu, Log, LogTable, Noise, SteadyLog
+from lunar_mjx.logs.readers.steady import read_steady
+from lunar_mjx.logs.readers.table import read_log_table
+from lunar_mjx.logs.schema import FORMAT, NOISE_SOURCES, SPLITS, parse_column
+from lunar_mjx.toml_fields import Fields
+
+LOG_FILE = "log.toml"
+ANSWER = ".answer.toml"
+"""How the answer to a sealed log is called, after the log."""
+ENVIRONMENT = ("ambient_temperature_degC", "sun_azimuth_deg", "sun_elevation_deg")
+ROVER_CHANGES = ("payload_kg", "payload_position_m", "com_offset_m", "wheel_radius_offset_m")
+INITIAL = {
+    "position_m": 3, "quaternion": 4, "roll_deg": 1, "pitch_deg": 1, "yaw_deg": 1, "world_velocity_m_s": 3,
+    "angular_velocity_rad_s": 3, "winding_temperature_degC": 1, "housing_temperature_degC": 1,
+}  # fmt: skip
+"""Initial values by name and number of entries; a channel of one joint may be named as well."""
+TOP = ("format", "kind", "rover", "manoeuvre", "gravity_m_s2", "terrain", "terrain_origin_m", "split", "environment",
+       "rover_changes", "initial", "imu", "tables", "noise", "source", "commitment")  # fmt: skip
+
+
+def read_log(folder: str | Path) -> Log | SteadyLog:
+    """Reads one log.
+
+    What makes its data unusable without making them unreadable (a unit that does not convert, text in a column of
+    numbers) is kept in `problems` for `check`, which alone judges data.
+
+    Args:
+      folder: a folder with `log.toml`, or that file.
+
+    Raises:
+      UserError: the folder, a file, a key or a value is missing, unknown or of the wrong kind.
+    """
+    folder = Path(folder)
+    if folder.name == LOG_FILE and folder.is_file():
+        folder = folder.parent
+    path = folder / LOG_FILE
+    if not path.is_file():
+        raise UserError(f"{folder}: holds no {LOG_FILE}; give the folder of a log, or make one with lunar-mjx log new.")
+    top = Fields.read(path)
+    if top.values.get("format") != FORMAT:
+        raise bad_input(path, "format", top.values.get("format"), "is not known", f'write format = "{FORMAT}"')
+    kind = top.text("kind", "drive")
+    if kind == "steady_state":
+        return read_steady(folder, top, lambda f: _noise(f, None))
+    if kind != "drive":
+        raise bad_input(path, "kind", kind, "does not exist", "use drive (or leave it out) or steady_state")
+    return _read_drive(folder, top)
+
+
+def read_campaign(paths: str | Path | Sequence[str | Path]) -> list[Log | SteadyLog]:
+    """Reads several logs: each path is a log, or a folder of logs (a campaign), in alphabetical order.
+
+    Answers to sealed logs are left out.
+
+    Raises:
+      UserError: a path holds no log, or a log cannot be read.
+    """
+    given = without_answers([paths] if isinstance(paths, str | Path) else paths)
+    if not given:
+        raise UserError("read_campaign: no log is given; name at least one folder with a log.toml.")
+    logs: list[Log | SteadyLog] = []
+    seen: set[Path] = set()
+    for path in map(Path, given):
+        for folder in _log_folders(path):
+            if folder.resolve() in seen:
+                raise bad_input("read_campaign", "log", str(folder), "is named twice", "name every log once")
+            seen.add(folder.resolve())
+            logs.append(read_log(folder))
+    return logs
+
+
+def without_answers(paths: Sequence[str | Path]) -> list[str | Path]:
+    """The paths without answers to sealed logs, which lie beside these: `logs/*` is meant to name the logs."""
+    return [p for p in paths if not str(p).endswith(ANSWER)]
+
+
+def _log_folders(path: Path) -> list[Path]:
+    if path.is_file() or (path / LOG_FILE).is_file():
+        return [path.parent if path.is_file() and path.name == LOG_FILE else path]
+    found = sorted(p.parent for p in path.glob(f"*/{LOG_FILE}")) if path.is_dir() else []
+    if not found:
+        raise UserError(f"{path}: neither it nor a folder in it holds {LOG_FILE}; name a log or a campaign.")
+    return found
+
+
+def _read_drive(folder: Path, top: Fields) -> Log:
+    top.known(TOP)
+    problems: list[Finding] = []
+    environment, columns = _environment(top.table("environment"))
+    tables = _tables(folder, top, columns, problems)
+    names = tuple(c for t in tables.values() for c in t.channels)
+    origin = top.vector("terrain_origin_m", 2, (0.0, 0.0))
+    return Log(
+        folder=folder,
+        name=folder.resolve().name,
+        rover=_near(folder, top.text("rover"), "rover.toml"),
+        manoeuvre=top.text("manoeuvre", ""),
+        gravity_m_s2=top.positive("gravity_m_s2", 1.625),
+        terrain=_near(folder, top.text("terrain", "flat"), "terrain.toml"),
+        terrain_origin_m=(origin[0], origin[1]),
+        split=top.choice("split", SPLITS),
+        environment=environment,
+        rover_changes=_rover_changes(top.table("rover_changes")),
+        initial=_initial(top.table("initial")),
+        imu=_imu(top.table("imu")),
+        tables=tables,
+        noise=_noise(top.table("noise"), names),
+        source={k: str(v) for k, v in top.table("source").values.items()},
+        problems=tuple(problems),
+    )
+
+
+def _tables(folder: Path, top: Fields, extra: dict[str, str], problems: list[Finding]) -> dict[str, LogTable]:
+    stated = top.table("tables")
+    if not stated.values:
+        raise UserError(f"{top.path}: the table [tables.NAME] is missing; name at least one file of measurements.")
+    name = folder.resolve().name
+    tables = {}
+    for key in stated.values:
+        entry = stated.table(key)
+        entry.known(("file", "rate_hz", "clock_offset_s", "clock_offset_std_s"))
+        tables[key] = read_log_table(folder, name, key, entry, extra, problems)
+    owner: dict[str, str] = {}
+    for key, table in tables.items():
+        for channel in table.channels:
+            if channel in owner:
+                raise bad_input(top.path, "tables", f"{owner[channel]}, {key}", f"both hold {channel}",
+                                "keep it in one table")  # fmt: skip
+            owner[channel] = key
+    for key, column in extra.items():
+        if key not in owner:
+            raise bad_input(top.path, f"environment.{key}", column, "is no column of any table",
+                            "give a number or the name of a column")  # fmt: skip
+    return tables
+
+
+def _environment(fields: Fields) -> tuple[dict[str, float | str], dict[str, str]]:
+    """Constants, and the columns that hold what is no constant, by key."""
+    fields.known(ENVIRONMENT)
+    values: dict[str, float | str] = {}
+    columns: dict[str, str] = {}
+    for key, value in fields.values.items():
+        if isinstance(value, str):
+            values[key], columns[key] = key, value
+        else:
+            values[key] = fields.number(key)
+    ambient = values.get("ambient_temperature_degC")
+    if isinstance(ambient, float) and not -273.15 < ambient < 1000.0:
+        raise bad_input(fields.path, fields.field("ambient_temperature_degC"), ambient, "is no temperature in degC",
+                        "give degrees Celsius above -273.15")  # fmt: skip
+    return values, columns
+
+
+def _rover_changes(fields: Fields) -> dict[str, Any]:
+    fields.known(ROVER_CHANGES)
+    changes: dict[str, Any] = {}
+    for key in fields.values:
+        changes[key] = fields.vector(key, 3) if key in ("payload_position_m", "com_offset_m") else fields.number(key)
+    if changes.get("payload_kg", 0.0) < 0.0:
+        raise bad_input(fields.path, fields.field("payload_kg"), changes["payload_kg"], "is negative",
+                        "give the mass in kg")  # fmt: skip
+    return changes
+
+
+def _initial(fields: Fields) -> dict[str, Any]:
+    initial: dict[str, Any] = {}
+    for key, value in fields.values.items():
+        count = INITIAL.get(key)
+        column = parse_column(key, str(fields.path)) if count is None else None
+        if count is None and (column is None or column.problem or column.name != key):
+            raise bad_input(fields.path, fields.field(key), value, "is an unknown key",
+                            f"use one of {', '.join(INITIAL)}, or a channel's name")  # fmt: skip
+        initial[key] = fields.number(key) if count in (None, 1) else fields.vector(key, count)
+    return initial
+
+
+def _imu(fields: Fields) -> Imu:
+    fields.known(("position_m", "quaternion"))
+    p, q = fields.vector("position_m", 3, (0.0,) * 3), fields.vector("quaternion", 4, (1.0, 0.0, 0.0, 0.0))
+    norm = sum(v * v for v in q) ** 0.5
+    if abs(norm - 1.0) > 1e-3:
+        raise bad_input(fields.path, fields.field("quaternion"), list(q), f"has the norm {norm:.4g}", "normalise it")
+    return Imu((p[0], p[1], p[2]), (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm))
+
+
+def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
+    """Noise by channel; a key with `*` means every channel that it matches and that has no noise of its own."""
+    exact: dict[str, Noise] = {}
+    patterns: list[tuple[str, Noise]] = []
+    for key in fields.values:
+        entry = fields.table(key)
+        entry.known(("std", "source", "correlation_time_s"))
+        source = entry.choice("source", NOISE_SOURCES) or "datasheet"
+        std, correlation = entry.number("std"), entry.number("correlation_time_s", 0.0)
+        if std < 0.0 or correlation < 0.0:
+            raise bad_input(fields.path, fields.field(key), entry.values, "has a negative entry", "give zero or more")
+        if "*" in key:
+            patterns.append((key, Noise(std, source, correlation)))
+            continue
+        column = parse_column(key, str(fields.path)) if channels is not None else None
+        if column is not None and column.problem:
+            raise bad_input(fields.path, fields.field(key), key, column.problem, "state the noise in that unit")
+        name, scale = (column.name, column.scale) if column is not None else (key, 1.0)
+        exact[name] = Noise(std * abs(scale), source, correlation)
+    for pattern, noise in patterns:
+        for name in channels or ():
+            if fnmatchcase(name, pattern):
+                exact.setdefault(name, noise)
+    return exact
+
+
+def _near(folder: Path, spec: str, marker: str) -> str:
+    """A path counted from the log's folder as an absolute one; a name as it is."""
+    near = folder.resolve() / spec
+    return str(near) if near.is_file() or (near / marker).is_file() else spec

@@ -1,0 +1,144 @@
+"""Reads one table of a drive log from CSV or Parquet into channels of the schema."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.logs.findings import WARNING, Finding
+from lunar_mjx.logs.log import LogTable
+from lunar_mjx.logs.schema import parse_column
+from lunar_mjx.toml_fields import Fields
+
+TIME = "time_s"
+GAPS = ("", "nan", "na", "n/a", "null", "none", "-")
+"""Texts that mean a gap, in small letters."""
+
+
+def read_frame(path: Path, what: str) -> pd.DataFrame:
+    """A CSV or Parquet file as a frame; cells of CSV files stay text where they are not numbers.
+
+    Raises:
+      UserError: the file is missing, is not a table, or is Parquet without the package that reads it.
+    """
+    require_file(path, what)
+    if path.suffix.lower() in (".parquet", ".pq"):
+        return _read_parquet(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # rows longer than the header
+            warnings.simplefilter("ignore", pd.errors.DtypeWarning)  # a text deep in a column of numbers is found below
+            frame = pd.read_csv(path, index_col=False, comment=None)
+    except (ValueError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: is not a CSV table ({error}); write time_s and one column per channel.") from None
+    # Two columns of one name reach us as "name" and "name.1".
+    for column in map(str, frame.columns):
+        stem = re.fullmatch(r"(.+)\.\d+", column)
+        if stem and stem[1] in frame.columns:
+            raise bad_input(path, "column", stem[1], "occurs twice", "keep one of them")
+    return frame
+
+
+def _read_parquet(path: Path) -> pd.DataFrame:
+    if importlib.util.find_spec("pyarrow") is None:
+        raise UserError(f"{path}: a Parquet file needs the package pyarrow; install lunar-mjx[parquet] or save as CSV.")
+    try:
+        return pd.read_parquet(path, engine="pyarrow")
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: is not a Parquet table ({error}); save it again, or as CSV.") from None
+
+
+def numbers(frame: pd.DataFrame, column: str) -> tuple[np.ndarray, int | None]:
+    """A column as float64 with NaN at gaps, and the first row that holds something else than a number or a gap."""
+    series = frame[column]
+    if series.dtype.kind in "fiu":
+        values = np.asarray(series, float)
+        wrong = np.isinf(values)
+    else:
+        text = series.astype(str).str.strip()
+        values = np.asarray(pd.to_numeric(text, errors="coerce"), float)
+        wrong = (~np.isfinite(values)) & ~text.str.lower().isin(GAPS).to_numpy(bool)
+    first = int(np.argmax(wrong)) if wrong.any() else None
+    return np.where(np.isfinite(values), values, np.nan), first
+
+
+def read_log_table(
+    folder: Path, log: str, name: str, entry: Fields, extra: Mapping[str, str], problems: list[Finding]
+) -> LogTable:
+    """Reads the table that `[tables.NAME]` describes.
+
+    Args:
+      folder: of the log. log: its name. name: of the table.
+      entry: the table of `log.toml`.
+      extra: key of the environment -> column that holds it.
+      problems: receives what makes data unusable.
+
+    Raises:
+      UserError: the file is missing or is no table, or has no column `time_s`.
+    """
+    path = folder / entry.text("file")
+    frame = read_frame(path, f"the table {name}")
+    frame.columns = [str(c).strip() for c in frame.columns]
+    if TIME not in frame.columns:
+        shown = ", ".join(list(frame.columns)[:5])
+        raise bad_input(path, "columns", shown, f"lack {TIME}", "add the time in seconds as the first column")
+    time, wrong = numbers(frame, TIME)
+    if wrong is not None:
+        problems.append(_no_number(log, name, wrong, TIME, frame))
+    wanted = {column: key for key, column in extra.items()}
+    channels: dict[str, np.ndarray] = {}
+    columns: dict[str, str] = {}
+    ignored = []
+    for column in frame.columns:
+        if column == TIME:
+            continue
+        if column in wanted:
+            channel, scale, offset = wanted[column], 1.0, 0.0
+        else:
+            found = parse_column(column, str(path))
+            if found is None:
+                ignored.append(column)
+                problems.append(Finding(log, name, None, column, "unknown", "is no channel of the schema and is "
+                                        "ignored; correct its name if it should be one", WARNING))  # fmt: skip
+                continue
+            if found.problem:
+                problems.append(Finding(log, name, None, column, "unit", found.problem))
+                continue
+            channel, scale, offset = found.name, found.scale, found.offset
+        if channel in channels:
+            raise bad_input(path, "column", column, f"is the same channel as {columns[channel]}", "keep one of them")
+        values, wrong = numbers(frame, column)
+        if wrong is not None:
+            problems.append(_no_number(log, name, wrong, column, frame))
+        channels[channel] = scale * values + offset
+        columns[channel] = column
+    return LogTable(
+        name=name,
+        file=path,
+        time_s=time,
+        channels=channels,
+        rate_hz=entry.positive("rate_hz", _rate(time)),
+        clock_offset_s=entry.number("clock_offset_s", 0.0),
+        clock_offset_std_s=entry.number("clock_offset_std_s", 0.0),
+        columns=columns,
+        ignored=tuple(ignored),
+    )
+
+
+def _no_number(log: str, table: str, row: int, column: str, frame: pd.DataFrame) -> Finding:
+    value = str(frame[column].iloc[row])
+    return Finding(log, table, row, column, "number", f"holds {value[:40]!r}, which is neither a number nor a gap; "
+                   "leave the cell empty or correct it")  # fmt: skip
+
+
+def _rate(time: np.ndarray) -> float:
+    steps = np.diff(time[np.isfinite(time)])
+    steps = steps[steps > 0.0]
+    return float(1.0 / np.median(steps)) if steps.size else 1.0

@@ -1,0 +1,1 @@
+"""Logs recorded from the simulator, with the instruments that would have measured them."""

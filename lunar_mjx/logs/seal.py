@@ -1,0 +1,170 @@
+"""Sealed logs: the log carries a commitment to the answer, the sender keeps the answer, and both are compared later."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import tomli_w
+
+from lunar_mjx.effects.catalogue import CATALOGUE
+from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.logs.log import Log
+from lunar_mjx.logs.readers.folder import ANSWER, LOG_FILE, read_log
+from lunar_mjx.toml_fields import Fields
+
+FORMAT = "lunar-mjx-answer/1"
+PREFIX = "sha256:"
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """What is hidden in a simulated log.
+
+    Attributes:
+      log: name of its folder. nonce: 256 random bits in hexadecimal, without which no answer can be tried out.
+      seed: of the noise. preset, manoeuvre, scale: what was driven with what.
+      effects: name, whether it was added, and parameters of each hidden effect.
+      recording: noise, biases and losses.
+      data_sha256: of the tables, so that neither side can change them.
+    """
+
+    log: str
+    nonce: str
+    seed: int
+    preset: str
+    manoeuvre: str
+    scale: float
+    effects: Sequence[Mapping[str, Any]]
+    recording: Mapping[str, Any]
+    data_sha256: str
+
+    def commitment(self) -> str:
+        """SHA-256 of everything above, in one canonical spelling."""
+        text = json.dumps(dataclasses.asdict(self), sort_keys=True, separators=(",", ":"))
+        return PREFIX + hashlib.sha256(text.encode()).hexdigest()
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of the effects that the model lacks."""
+        return tuple(e["name"] for e in self.effects if e["added"])
+
+
+def answer_path(out: Path) -> Path:
+    """Where the answer to the log `out` is kept: beside it, never in it."""
+    return out.with_name(out.name + ANSWER)
+
+
+def write_answer(answer: Answer, path: Path) -> None:
+    """Writes an answer; `read_answer` gives the same one back."""
+    path.write_text(tomli_w.dumps({"format": FORMAT, **dataclasses.asdict(answer)}), encoding="utf-8")
+
+
+def read_answer(path: str | Path) -> Answer:
+    """Reads an answer.
+
+    Raises:
+      UserError: the file is missing, is no answer, or lacks a field.
+    """
+    top = Fields.read(Path(path), "the answer")
+    names = [f.name for f in dataclasses.fields(Answer)]
+    top.known(("format", *names))
+    if top.text("format", "") != FORMAT:
+        raise bad_input(
+            path, "format", top.values.get("format"), "is no answer", f'give a file with format = "{FORMAT}"'
+        )
+    for name in names:
+        if name not in top.values:
+            raise bad_input(path, name, None, "is missing", "give the answer as log simulate wrote it")
+    return Answer(**{n: top.values[n] for n in names})
+
+
+def hash_tables(tables: Mapping[str, pd.DataFrame]) -> str:
+    """SHA-256 over the names and values of all tables, as a log file holds them (nine digits)."""
+    digest = hashlib.sha256()
+    for name in sorted(tables):
+        frame = tables[name]
+        digest.update(name.encode())
+        for column in frame.columns:
+            digest.update(str(column).encode())
+            digest.update(",".join(f"{v:.9g}" for v in np.asarray(frame[column], float)).encode())
+    return digest.hexdigest()
+
+
+def log_hash(log: Log) -> str:
+    """The same hash of a log that was read."""
+    frames = {
+        name: pd.DataFrame({"time_s": t.time_s, **{t.columns.get(c, c): v for c, v in t.channels.items()}})
+        for name, t in log.tables.items()
+    }
+    return hash_tables(frames)
+
+
+def unseal(answer: str | Path, log: str | Path, verdict: str | Path | None = None) -> dict[str, Any]:
+    """Opens an answer: is it the one that the log was sealed with, and did the colleague find it?
+
+    Args:
+      answer: file that the sender kept.
+      log: folder of the log.
+      verdict: the colleague's verdict.json, or the folder that holds it.
+
+    Returns:
+      `hidden` (names), `effects` (with parameters), and with a verdict its label, effects and `score`: right, class
+      (within the named class), missed, false alarm or wrong.
+
+    Raises:
+      UserError: the log is not sealed, or neither with this answer nor with these data.
+    """
+    given, found = read_answer(answer), read_log(log)
+    path = Path(log) / LOG_FILE
+    committed = Fields.read(path).text("commitment", "")
+    if not committed:
+        raise UserError(f"{path}: commitment is missing; this log was not sealed.")
+    if committed != given.commitment():
+        raise UserError(f"{answer}: is not the answer that {log} was sealed with; ask its sender for the right file.")
+    if not isinstance(found, Log) or log_hash(found) != given.data_sha256:
+        raise UserError(f"{log}: its tables were changed after it was sealed; ask its sender for the log.")
+    result: dict[str, Any] = {"sealed": True, "hidden": list(given.hidden), "effects": [dict(e) for e in given.effects]}
+    if verdict is not None:
+        label, effects = read_verdict(verdict)
+        result |= {"verdict": label, "named": effects, "score": score(given, label, effects)}
+    return result
+
+
+def read_verdict(path: str | Path) -> tuple[str, list[str]]:
+    """Label and effects of a `verdict.json`.
+
+    Raises:
+      UserError: the file is missing or holds no verdict.
+    """
+    path = Path(path) / "verdict.json" if Path(path).is_dir() else Path(path)
+    require_file(path, "the verdict")
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return str(data["verdict"]), [str(e) for e in data.get("effects", [])]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise bad_input(
+            path, "verdict", None, "is not there", 'give a JSON file with "verdict" and "effects"'
+        ) from None
+
+
+def score(answer: Answer, label: str, effects: Sequence[str]) -> str:
+    """How a verdict stands to the answer; a changed parameter of the model's own effects counts as nothing hidden."""
+    hidden, named = set(answer.hidden), set(effects)
+    if label == "NOISE_ONLY":
+        return "missed" if hidden else "right"
+    if label in ("BAD_DATA", "BAD_FIT", "UNDECIDABLE"):
+        return "missed" if hidden else "wrong"
+    if not hidden:
+        return "false alarm"
+    if label == "UNKNOWN":
+        return "right" if any(name not in CATALOGUE for name in hidden) else "missed"
+    if label == "KNOWN_CLASS":
+        return "class" if hidden <= named else "wrong"
+    return "right" if hidden == named else "wrong"

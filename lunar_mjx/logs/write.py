@@ -1,0 +1,161 @@
+"""Writes measurement logs: tables of channels and the `log.toml` that describes them."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import tomli_w
+
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.logs.log import Noise
+from lunar_mjx.logs.readers.folder import LOG_FILE, TOP, read_log
+from lunar_mjx.logs.schema import FORMAT, parse_column
+
+
+def write_log(
+    folder: str | Path,
+    tables: Mapping[str, pd.DataFrame],
+    *,
+    rover: str,
+    noise: Mapping[str, Noise] | None = None,
+    rates_hz: Mapping[str, float] | None = None,
+    clock_offsets_s: Mapping[str, tuple[float, float]] | None = None,
+    parquet: bool = False,
+    **settings: Any,
+) -> Path:
+    """Writes a drive log that `read_log` reads back.
+
+    Args:
+      folder: must not exist, or be empty.
+      tables: frames by name, `time_s` first and channels of the schema after it; NaN at gaps.
+      rover: name, or path of a rover's folder.
+      noise: by channel.
+      rates_hz: by table; the median rate of its time if left out.
+      clock_offsets_s: offset and its standard deviation, by table.
+      parquet: write Parquet instead of CSV (needs pyarrow).
+      **settings: further keys of `log.toml`: manoeuvre, gravity_m_s2, terrain, terrain_origin_m, split, environment,
+        rover_changes, initial, imu, source, commitment.
+
+    Returns:
+      The folder.
+
+    Raises:
+      UserError: the folder is not empty, a table has no `time_s`, a column is no channel, or a setting is unknown.
+    """
+    folder = Path(folder)
+    for key in settings:
+        if key not in TOP or key in ("format", "kind", "tables", "noise"):
+            raise bad_input("write_log", key, settings[key], "is unknown", f"use one of {', '.join(TOP[2:])}")
+    for name, frame in tables.items():
+        _check_frame(name, frame)
+    top: dict[str, Any] = {"format": FORMAT, "rover": rover}
+    top |= {k: _plain(v) for k, v in settings.items() if v is not None}
+    new_folder(folder)
+    entries = {}
+    for name, frame in tables.items():
+        file = f"{name}.{'parquet' if parquet else 'csv'}"
+        write_frame(frame, folder / file)
+        rate = (rates_hz or {}).get(name) or float(1.0 / np.median(np.diff(frame["time_s"])))
+        entries[name] = {"file": file, "rate_hz": round(rate, 6)}
+        if name in (clock_offsets_s or {}):
+            offset, std = clock_offsets_s[name]  # type: ignore[index]
+            entries[name] |= {"clock_offset_s": float(offset), "clock_offset_std_s": float(std)}
+    top["tables"] = entries
+    top["noise"] = noise_tables(noise or {})
+    (folder / LOG_FILE).write_text(tomli_w.dumps(top), encoding="utf-8")
+    read_log(folder)
+    return folder
+
+
+def write_steady_log(
+    folder: str | Path,
+    frame: pd.DataFrame,
+    *,
+    wheel: Mapping[str, float],
+    slip_definition: str,
+    noise: Mapping[str, Noise] | None = None,
+    **settings: Any,
+) -> Path:
+    """Writes a steady-state log that `read_log` reads back.
+
+    Args:
+      folder: must not exist, or be empty.
+      frame: one row per run, with the columns of a steady-state table.
+      wheel: radius_m, width_m, grouser_count, grouser_height_m.
+      slip_definition: "wheel_frame" or "travel_speed".
+      noise: by column.
+      **settings: split, gravity_m_s2, source, manoeuvre, commitment.
+
+    Raises:
+      UserError: the folder is not empty, or the result cannot be read back.
+    """
+    folder = Path(folder)
+    top: dict[str, Any] = {"format": FORMAT, "kind": "steady_state", "file": "points.csv"}
+    top |= {"slip_definition": slip_definition} | {k: _plain(v) for k, v in settings.items() if v is not None}
+    top |= {"wheel": {k: _plain(v) for k, v in wheel.items()}, "noise": noise_tables(noise or {})}
+    new_folder(folder)
+    write_frame(frame, folder / "points.csv")
+    (folder / LOG_FILE).write_text(tomli_w.dumps(top), encoding="utf-8")
+    read_log(folder)
+    return folder
+
+
+def noise_tables(noise: Mapping[str, Noise]) -> dict[str, dict[str, Any]]:
+    """Noise as tables of `log.toml`."""
+    tables = {}
+    for name, entry in noise.items():
+        tables[name] = {"std": float(entry.std), "source": entry.source}
+        if entry.correlation_time_s:
+            tables[name]["correlation_time_s"] = float(entry.correlation_time_s)
+    return tables
+
+
+def refuse_used(folder: Path) -> None:
+    """Refuses a folder that holds anything, so that nobody's measurements are overwritten."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise bad_input("lunar-mjx log", "folder", str(folder), "exists already", "name a new folder")
+
+
+def new_folder(folder: Path) -> None:
+    """Makes a folder that must not exist or be empty."""
+    refuse_used(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise bad_input("lunar-mjx log", "folder", str(folder), f"cannot be made ({error.strerror})",
+                        "name another folder") from error  # fmt: skip
+
+
+def write_frame(frame: pd.DataFrame, path: Path) -> None:
+    """Writes a table by the ending of its path; empty cells for NaN, 9 significant digits in CSV."""
+    if path.suffix == ".parquet":
+        if importlib.util.find_spec("pyarrow") is None:
+            raise UserError(f"{path}: Parquet needs the package pyarrow; install lunar-mjx[parquet] or write CSV.")
+        frame.to_parquet(path, index=False, engine="pyarrow")
+        return
+    frame.to_csv(path, index=False, float_format="%.9g")
+
+
+def _check_frame(name: str, frame: pd.DataFrame) -> None:
+    if "time_s" not in frame.columns:
+        raise bad_input("write_log", f"tables.{name}", list(frame.columns)[:4], "lacks time_s", "add the time in s")
+    for column in map(str, frame.columns):
+        found = parse_column(column, "write_log") if column != "time_s" else None
+        if found is not None and found.problem:
+            raise bad_input("write_log", f"tables.{name}", column, found.problem, "rename the column")
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers and arrays as Python's, which TOML can hold."""
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(v) for v in value]
+    return str(value) if isinstance(value, Path) else value

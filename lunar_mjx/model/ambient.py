@@ -1,0 +1,34 @@
+"""Ambient temperature of a model: constant, or following the Sun over a lunar day."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from lunar_mjx.pytree import pytree
+
+SYNODIC_DAY = 29.530588 * 86400.0
+"""From noon to noon on the Moon, s."""
+
+
+@pytree
+class Ambient:
+    """Ambient temperature: constant, or following the Sun over a lunar day.
+
+    T_A = T_night + (T_noon - T_night) max(0, cos(2 pi (t - t_noon)/P))^(1/4): the equilibrium of a surface under the
+    Sun; constant where T_noon = T_night.
+
+    Attributes:
+      noon, night: temperatures, K. noon_time: when the Sun culminates, s. period: length of the day, s.
+    """
+
+    noon: Any
+    night: Any
+    noon_time: Any
+    period: Any
+
+    def at(self, time: Any) -> Any:
+        sun = jnp.cos(2.0 * jnp.pi * (time - self.noon_time) / self.period)
+        up = jnp.where(sun > 0.0, jnp.where(sun > 0.0, sun, 1.0) ** 0.25, 0.0)
+        return self.night + (self.noon - self.night) * up

@@ -1,0 +1,407 @@
+"""The model: a rover, a terrain and a list of effects, with one value for every parameter."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lunar_mjx.effects import catalogue, presets
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.effects.joint.motor import MODES, WINDINGS
+from lunar_mjx.errors import bad_input, require_finite
+from lunar_mjx.model.ambient import SYNODIC_DAY
+from lunar_mjx.resources import shipped
+from lunar_mjx.rover import Rover, load_rover
+from lunar_mjx.terrain import Terrain, load_terrain
+
+LUNAR_GRAVITY = 1.625
+"""m/s2, the seed paper's value."""
+
+ROOM = 298.15
+ZERO_CELSIUS = 273.15
+GAINS = ("position_gain_Nm_rad", "velocity_gain_Nms_rad")
+"""Names in `model.toml` of a joint group's two gains."""
+
+THERMAL_INTEGRATORS = ("heun", "euler")
+DEFAULT_TERRAIN = "lunar_plain"
+
+Value = float | tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Model:
+    """A rover, a terrain and a list of effects.
+
+    Attributes:
+      rover: the rover. terrain: the ground. terrain_spec: name or absolute path that it was loaded from; empty for a
+        terrain made in Python.
+      effects: in list order. parameters: value of every parameter, by effect and name.
+      preset: name of the preset that the list started from.
+      gravity: m/s2, positive. timestep: s. thermal_integrator: "heun" or "euler".
+      ambient: noon temperature K, night temperature K, time of noon s, length of the day s; constant if both are equal.
+      modes: control mode by joint group. gains: position gain N m/rad and velocity gain N m s/rad by joint group.
+      effect_files: catalogue name or /absolute/file.py:name of every effect.
+    """
+
+    rover: Rover
+    terrain: Terrain
+    terrain_spec: str
+    effects: tuple[Effect, ...]
+    parameters: Mapping[str, Mapping[str, Value]]
+    preset: str = "consistent"
+    gravity: float = LUNAR_GRAVITY
+    timestep: float = 0.002
+    thermal_integrator: str = "heun"
+    ambient: tuple[float, float, float, float] = (ROOM, ROOM, 0.0, SYNODIC_DAY)
+    modes: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    gains: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    effect_files: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def effect_names(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.effects)
+
+    def add(self, effect: Effect | str, source: str = "Model.add", /, **values: Any) -> Model:
+        """A model with one more effect, in the place of those that it replaces.
+
+        Args:
+          effect: an effect, a catalogue name, or file.py:name.
+          source: what to name in errors.
+          **values: parameter values that differ from the nominal ones.
+
+        Raises:
+          UserError: the effect is unknown, already in the list or replaced by one in it, or a value is unknown or out
+            of bounds.
+        """
+        written = settled_effect(effect) if isinstance(effect, str) else effect.name
+        found = catalogue.get(written) if isinstance(effect, str) else effect
+        if found.name in self.effect_names:
+            raise bad_input(source, "effect", found.name, "is already in the model", "set its parameters instead")
+        for other in self.effects:
+            if found.name in other.replaces and other.name not in found.replaces:
+                raise bad_input(source, "effect", found.name, f"is replaced by {other.name}, which is in the model",
+                                f"remove {other.name} first")  # fmt: skip
+        replaced = [i for i, e in enumerate(self.effects) if e.name in found.replaces]
+        kept = [e for e in self.effects if e.name not in found.replaces]
+        kept.insert(replaced[0] if replaced else len(kept), found)
+        parameters = {k: v for k, v in self.parameters.items() if k not in found.replaces}
+        parameters[found.name] = found.nominal()
+        files = {k: v for k, v in self.effect_files.items() if k not in found.replaces}
+        model = dataclasses.replace(
+            self, effects=tuple(kept), parameters=parameters, effect_files={**files, found.name: written}
+        )
+        return model.set(found.name, source, **values)
+
+    def remove(self, name: str) -> Model:
+        """A model without the effect `name`."""
+        self._effect(name, "Model.remove")
+        return dataclasses.replace(
+            self,
+            effects=tuple(e for e in self.effects if e.name != name),
+            parameters={k: v for k, v in self.parameters.items() if k != name},
+            effect_files={k: v for k, v in self.effect_files.items() if k != name},
+        )
+
+    def set(self, name: str, source: str = "Model.set", /, **values: Any) -> Model:
+        """A model with other values for parameters of the effect `name`.
+
+        A value is a number, one number per wheel or joint, or for joints a mapping from joint group to number, in which
+        groups left out keep their value.
+
+        Raises:
+          UserError: unknown effect or parameter, or a value that is not finite or out of bounds.
+        """
+        effect = self._effect(name, source)
+        new = dict(self.parameters[name])
+        for key, value in values.items():
+            if isinstance(value, Mapping):
+                value = self._by_group(effect, key, value, source)
+            elif hasattr(value, "tolist"):
+                value = value.tolist()
+            _check_flat(effect, key, value, source)
+            checked = effect.check(key, value, source)
+            if isinstance(checked, tuple):
+                _check_length(self.rover, effect, key, checked, source)
+            new[key] = checked
+        model = dataclasses.replace(self, parameters={**self.parameters, name: new})
+        if name == "soil" and {"k_c", "k_phi"} <= new.keys():
+            _check_soil(model, source)
+        return model
+
+    def replace(self, **changes: Any) -> Model:
+        """A model with other attributes, checked.
+
+        `modes` and `gains` may name some of the joint groups only. `terrain` may be a name or path, as in `make_model`.
+
+        Raises:
+          UserError: an attribute does not exist, or its value makes no sense.
+        """
+        given = set(changes.get("gains", {}))
+        known = [f.name for f in dataclasses.fields(self)]
+        for key in changes:
+            if key not in known:
+                raise bad_input("Model.replace", key, changes[key], "is unknown", f"use one of {', '.join(known)}")
+        for key in ("modes", "gains"):
+            if key in changes:
+                changes[key] = {**getattr(self, key), **changes[key]}
+        if "terrain" in changes:
+            # the name of the old ground must not be saved for the new one
+            changes = {**_ground(changes.pop("terrain")), **changes}
+        model = dataclasses.replace(self, **changes)
+        check_settings(model, "Model.replace")
+        return with_position_gains(model, given)
+
+    def _effect(self, name: str, source: str) -> Effect:
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise bad_input(source, "effect", name, "is not in the model", f"use one of {', '.join(self.effect_names)}")
+
+    def _by_group(self, effect: Effect, key: str, value: Mapping[str, Any], source: str) -> tuple[float, ...]:
+        """One value per joint from one per joint group."""
+        field = f"effects.{effect.name}.{key}"
+        if key not in effect.parameters or effect.parameters[key].axis != "joint":
+            effect.check(key, effect.parameters[key].nominal if key in effect.parameters else 0.0, source)
+            raise bad_input(source, field, dict(value), "has a value per joint group", "give one number here")
+        groups = [g.name for g in self.rover.groups]
+        for group in value:
+            if group not in groups:
+                raise bad_input(source, f"{field}.{group}", value[group], "names no joint group of the rover",
+                                f"use one of {', '.join(groups)}")  # fmt: skip
+        present = self.parameters[effect.name][key]
+        names = [g.name for g in self.rover.groups for _ in g.joints]
+        old = present if isinstance(present, tuple) else (present,) * len(names)
+        for group, number in value.items():
+            if isinstance(number, list | tuple | Mapping):
+                raise bad_input(source, f"{field}.{group}", number, "is not a number", "give one number per group")
+        return tuple(
+            float(effect.check(key, value[n], source)) if n in value else o  # type: ignore[arg-type]
+            for n, o in zip(names, old, strict=True)
+        )
+
+
+def _check_length(rover: Rover, effect: Effect, key: str, value: Sequence[float], source: str) -> None:
+    axis = effect.parameters[key].axis
+    wanted = len(rover.wheels) if axis == "wheel" else len(rover.joints)
+    if len(value) != wanted:
+        raise bad_input(source, f"effects.{effect.name}.{key}", list(value), f"has {len(value)} values",
+                        f"give one number, or {wanted}, one per {axis}")  # fmt: skip
+
+
+def _check_flat(effect: Effect, key: str, value: Any, source: str) -> None:
+    if isinstance(value, list | tuple) and any(isinstance(v, list | tuple | Mapping) for v in value):
+        raise bad_input(source, f"effects.{effect.name}.{key}", value, "is nested", "give a flat list of numbers")
+
+
+def _check_soil(model: Model, source: str) -> None:
+    """Refuses a soil that would pull a wheel of the rover down: k_c/b + k_phi must be positive for every width b."""
+    k_c, k_phi = (float(model.parameters["soil"][key]) for key in ("k_c", "k_phi"))  # type: ignore[arg-type]
+    width = min(wheel.width for wheel in model.rover.wheels)
+    if k_c / width + k_phi <= 0.0:
+        raise bad_input(source, "effects.soil.k_c", k_c,
+                        f"makes the soil's stiffness k_c/b + k_phi = {k_c / width + k_phi:g} under a wheel {width:g} m "
+                        "wide, which is not positive",
+                        "give a larger k_c or k_phi, or a rover with wider wheels")  # fmt: skip
+
+
+READS_MOTOR = (
+    "joint_control",
+    "winding_conduction",
+    "rotor_stator_path",
+    "iron_loss",
+    "gear_friction_heat",
+    "magnet_nonlinearity",
+    "directional_gear_efficiency",
+    "backlash",
+    "voltage_saturation",
+)
+"""Effects that read the parameters of the effect `motor`."""
+
+
+def check_effects(model: Model, source: str | Path) -> None:
+    """Refuses a list of effects that cannot run.
+
+    Raises:
+      UserError: an effect needs another one that is not in the list.
+    """
+    needy = [name for name in READS_MOTOR if name in model.effect_names]
+    if needy and "motor" not in model.effect_names:
+        raise bad_input(source, "effect_list", ", ".join(model.effect_names), f"lacks motor, which {needy[0]} reads",
+                        f"add motor or take out {', '.join(needy)}")  # fmt: skip
+
+
+_POSITION_RATE = 20.0
+"""1/s; a wheel that gets its position loop from its velocity loop nears its target at about this rate."""
+
+
+def with_position_gains(model: Model, given: Collection[str]) -> Model:
+    """Gives groups in position mode that have no position gain one in proportion to their velocity gain.
+
+    A group made for velocity control has none and would stand still whatever the target. Groups in `given` keep theirs.
+    """
+    gains = {
+        group: (_POSITION_RATE * gain[1], gain[1])
+        for group, gain in model.gains.items()
+        if model.modes.get(group) == "position" and gain[0] == 0.0 and group not in given
+    }
+    return dataclasses.replace(model, gains={**model.gains, **gains}) if gains else model
+
+
+def check_settings(model: Model, source: str | Path) -> None:
+    """Refuses model-wide settings that make no sense.
+
+    Raises:
+      UserError: the sentence names the field as it is called in `model.toml`.
+    """
+    if require_finite(source, "gravity_m_s2", model.gravity) < 0.0:
+        raise bad_input(source, "gravity_m_s2", model.gravity, "is negative", "give the magnitude; it points down")
+    if not 1e-5 <= require_finite(source, "timestep_s", model.timestep) <= 0.02:
+        raise bad_input(source, "timestep_s", model.timestep, "is outside [1e-5, 0.02] s", "use about 0.002 s")
+    if model.thermal_integrator not in THERMAL_INTEGRATORS:
+        raise bad_input(source, "thermal_integrator", model.thermal_integrator, "does not exist",
+                        f"use one of {', '.join(THERMAL_INTEGRATORS)}")  # fmt: skip
+    _check_ambient(model.ambient, source)
+    for group, mode in model.modes.items():
+        _check_group(model.rover, f"control.{group}.mode", group, mode, source)
+        if mode not in MODES:
+            raise bad_input(source, f"control.{group}.mode", mode, "does not exist", f"use one of {', '.join(MODES)}")
+    for group, gains in model.gains.items():
+        _check_group(model.rover, f"control.{group}", group, gains, source)
+        if len(gains) != len(GAINS):
+            raise bad_input(source, f"control.{group}", gains, "are not two gains", f"give {' and '.join(GAINS)}")
+        for name, gain in zip(GAINS, gains, strict=True):
+            if require_finite(source, f"control.{group}.{name}", gain) < 0.0:
+                raise bad_input(source, f"control.{group}.{name}", gain, "is negative", "give zero or more")
+
+
+def _check_group(rover: Rover, field: str, group: str, value: Any, source: str | Path) -> None:
+    if rover.group(group) is None:
+        raise bad_input(source, field, value, "names no joint group of the rover",
+                        f"use one of {', '.join(g.name for g in rover.groups)}")  # fmt: skip
+
+
+def _check_ambient(ambient: Sequence[float], source: str | Path) -> None:
+    if not hasattr(ambient, "__len__") or len(ambient) != 4:
+        raise bad_input(source, "ambient", ambient, "is not four numbers",
+                        "give noon and night temperature in K, time of noon and length of the day in s")  # fmt: skip
+    noon, night, noon_time, period = ambient
+    for field, kelvin in (("noon", noon), ("night", night)):
+        if require_finite(source, f"ambient.{field}_temperature_degC", kelvin) <= 0.0:
+            raise bad_input(source, f"ambient.{field}_temperature_degC", round(kelvin - ZERO_CELSIUS, 6),
+                            "is not above absolute zero", "give degrees Celsius above -273.15")  # fmt: skip
+    require_finite(source, "ambient.noon_time_s", noon_time)
+    if require_finite(source, "ambient.period_s", period) <= 0.0:
+        raise bad_input(source, "ambient.period_s", period, "is not positive", "give the length of the day in s")
+
+
+def settled(kind: str, spec: str | Path, marker: str) -> str:
+    """A rover's or terrain's spec that means the same from every folder.
+
+    Args:
+      kind: "models" or "terrain".
+      spec: name of a shipped one, path, or anything else (such as slope:10deg).
+      marker: file that a folder of this kind holds.
+
+    Returns:
+      A shipped one's name, else the absolute path where there is such a file or folder, else `spec` itself.
+    """
+    path = Path(spec)
+    if not path.is_file() and not (path / marker).is_file():
+        return str(spec)
+    full = path.resolve()
+    return full.name if full.is_dir() and full.parent == shipped(kind).resolve() else str(full)
+
+
+def settled_effect(spec: str) -> str:
+    """An effect's spec that means the same from every folder: catalogue name, or /absolute/file.py:name."""
+    if ".py" not in spec:
+        return spec
+    file, colon, member = spec.partition(":")
+    return f"{Path(file).resolve()}{colon}{member}"
+
+
+def make_model(
+    rover: str | Path | Rover = "viper",
+    terrain: str | Path | dict[str, Any] | Terrain = DEFAULT_TERRAIN,
+    preset: str = "consistent",
+    **changes: Any,
+) -> Model:
+    """A model from a preset.
+
+    Args:
+      rover: name or folder of a rover, or a rover.
+      terrain: name, file or folder of a terrain, the tables of a `terrain.toml` as a dict, or a terrain.
+      preset: "consistent" or "paper".
+      **changes: attributes of `Model` that differ (gravity, timestep, ambient, modes, gains, ...); `modes` and `gains`
+        may name some of the joint groups only.
+
+    Raises:
+      UserError: unknown rover, terrain, preset or attribute value.
+    """
+    if preset not in presets.PRESETS:
+        raise bad_input("make_model", "preset", preset, "does not exist", f"use one of {', '.join(presets.PRESETS)}")
+    loaded = rover if isinstance(rover, Rover) else load_rover(rover)
+    effects = tuple(catalogue.CATALOGUE[name] for name in presets.PRESETS[preset])
+    modes = {g.name: g.mode for g in loaded.groups} | dict(changes.pop("modes", {}))
+    given_gains = dict(changes.pop("gains", {}))
+    model = Model(
+        rover=loaded,
+        **_ground(terrain),
+        effects=effects,
+        parameters={e.name: e.nominal() for e in effects},
+        preset=preset,
+        thermal_integrator="euler" if preset == "paper" else "heun",
+        modes=modes,
+        effect_files={e.name: e.name for e in effects},
+    )
+    model = preset_values(rover_motors(model))
+    model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded))
+    return model.replace(**changes, gains=given_gains)
+
+
+def _ground(terrain: str | Path | dict[str, Any] | Terrain) -> dict[str, Any]:
+    """The attributes `terrain` and `terrain_spec` of a model; a terrain made in Python has no name to save."""
+    if isinstance(terrain, Terrain):
+        return {"terrain": terrain, "terrain_spec": ""}
+    spec = "" if isinstance(terrain, dict) else settled("terrain", terrain, "terrain.toml")
+    return {"terrain": load_terrain(terrain), "terrain_spec": spec}
+
+
+def preset_values(model: Model) -> Model:
+    """The values in which the model's preset departs from the nominal ones."""
+    for name, values in presets.PRESET_PARAMETERS[model.preset].items():
+        model = model.set(name, f"preset {model.preset}", **values)
+    return model
+
+
+def _gains_of_gear(model: Model, rover: Rover) -> dict[str, tuple[float, float]]:
+    """The gains of the rover, scaled with the inertia at the joint, which a preset's gear changes."""
+    ratios = model.parameters["motor"]["gear_ratio"]
+    assert isinstance(ratios, tuple)
+    compiled = rover.compile()
+    gains = {}
+    for group in rover.groups:
+        ratio = ratios[rover.joints.index(group.joints[0])]
+        inertia = float(compiled.dof_M0[compiled.joint(group.joints[0]).dofadr[0]])
+        reflected = group.rotor_inertia * (ratio**2 - group.gear_ratio**2)
+        scale = (inertia + reflected) / inertia
+        gains[group.name] = (group.position_gain * scale, group.velocity_gain * scale)
+    return gains
+
+
+def rover_motors(model: Model) -> Model:
+    """Motor parameters that the rover's folder states for each joint group."""
+    groups = model.rover.groups
+    windings = {g.name: WINDINGS[g.winding] for g in groups}
+    model = model.set(
+        "motor",
+        str(model.rover.folder),
+        gear_ratio={g.name: g.gear_ratio for g in groups},
+        gear_efficiency={g.name: g.gear_efficiency for g in groups},
+        rotor_inertia={g.name: g.rotor_inertia for g in groups},
+        resistance={n: w["resistance"] for n, w in windings.items()},
+        torque_constant={n: w["torque_constant"] for n, w in windings.items()},
+    )
+    return model.set("joint_control", current_limit={n: w["current_limit"] for n, w in windings.items()})

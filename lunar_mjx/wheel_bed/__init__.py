@@ -1,0 +1,1 @@
+"""The single-wheel test bed: simulated, read from tables, compared and refitted."""

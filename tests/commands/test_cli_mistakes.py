@@ -1,0 +1,319 @@
+"""The command, given a mistake: one sentence and status 2, and nothing lost."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from PIL import Image
+
+from lunar_mjx.commands import app as cli
+from lunar_mjx.model import make_model
+from lunar_mjx.simulate import command_channels
+from tests.cli_harness import MAIN, Result, Run, subprocess_run
+
+DATA = Path(__file__).parents[1] / "rover" / "data"
+
+
+def csv(**changes: object) -> str:
+    """Commands of 0.2 s with some columns changed or, where None, dropped."""
+    names = command_channels(make_model("luvmi_x", "flat"))
+    columns = {"time_s": [0.0, 0.05, 0.1, 0.15], **{name: [0.1] * 4 for name in names}, **changes}
+    return pd.DataFrame({k: v for k, v in columns.items() if v is not None}).to_csv(index=False)
+
+
+def urdf(old: str, new: str, count: int = -1) -> str:
+    text = (DATA / "steered.urdf").read_text()
+    assert old in text
+    return text.replace(old, new, count)
+
+
+def toml(*lines: str) -> str:
+    return "\n".join(['format = "lunar-mjx-model/1"', 'rover = "luvmi_x"', 'terrain = "flat"', *lines])
+
+
+DRIVE = "command_lf_drive_speed_rad_s"
+INERTIA = 'ixx="0.5" ixy="0" ixz="0" iyy="1.3" iyz="0" izz="1.6"'
+LUVMI = ["simulate", "--rover", "luvmi_x", "--terrain", "flat", "--duration", "0.1", "--out", "OUT"]
+CONVERT = ["convert", "FILES/rover.urdf", "--out", "OUT"]
+MODEL = ["simulate", "--model", "FILES/model.toml", "--out", "OUT"]
+TABLE = [*LUVMI, "--commands", "FILES/commands.csv"]
+SHOW = ["effect", "show", "FILES/mine.py"]
+
+# what is wrong: (arguments, files to write, words that the line must hold)
+MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
+    "URDF missing": (CONVERT, {}, ["rover.urdf", "not there"]),
+    "URDF is no XML": (CONVERT, {"rover.urdf": urdf("</robot>", "</robt>")}, ["rover.urdf", "not well-formed"]),
+    "URDF with negative mass": (
+        CONVERT,
+        {"rover.urdf": urdf('<mass value="1.9"/>', '<mass value="-1.9"/>')},
+        ["rover.urdf", "mass", "-1.9", "not positive"],
+    ),
+    "URDF with zero inertia": (
+        CONVERT,
+        {"rover.urdf": urdf(INERTIA, re.sub(r'"[\d.]+"', '"0"', INERTIA))},
+        ["rover.urdf", "Body", "zero"],
+    ),
+    "URDF without wheels": (
+        CONVERT,
+        {"rover.urdf": urdf('<cylinder radius="0.12" length="0.09"/>', '<box size="1 1 1"/>')},
+        ["rover.urdf", "wheels"],
+    ),
+    "URDF with a dangling joint": (
+        CONVERT,
+        {"rover.urdf": urdf('<child link="FrontLeftArm"/>', '<child link="Arm"/>')},
+        ["rover.urdf", "FrontLeftArmJoint", "'Arm'"],
+    ),
+    "description missing": (
+        [*CONVERT, "--description", "FILES/gone.toml"],
+        {"rover.urdf": urdf("steered", "steered")},
+        ["gone.toml", "not there"],
+    ),
+    "name that is no file name": (
+        [*CONVERT, "--name", "../up"],
+        {"rover.urdf": urdf("steered", "steered")},
+        ["'../up'", "name"],
+    ),
+    "DEM missing": (["terrain", "info", "FILES/gone.tif"], {}, ["gone.tif", "not there"]),
+    "DEM with only nodata": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\nNODATA_value -9\n-9 -9 -9\n-9 -9 -9\n"},
+        ["a.asc", "nodata"],
+    ),
+    "PNG without scale": (
+        ["terrain", "export", "FILES/a.png", "OUT/a.stl"],
+        {"a.png": Image.new("L", (4, 4))},
+        ["a.png", "height_scale = None", "without a scale"],
+    ),
+    "slope too steep": (["terrain", "info", "slope:95deg"], {}, ["slope:95deg", "below 90"]),
+    "terrain unknown": (["terrain", "info", "sea"], {}, ["sea", "lunar_plain"]),
+    "terrain.toml with an unknown key": (
+        ["terrain", "info", "FILES/t.toml"],
+        {"t.toml": "[plane]\nangle = 3.0\n"},
+        ["t.toml", "plane.angle = 3.0", "slope_deg"],
+    ),
+    "mesh format unknown": (["terrain", "export", "flat", "OUT/a.step"], {}, ["a.step", "'.step'", ".stl"]),
+    "mesh folder missing": (["terrain", "export", "flat", "FILES/no/a.stl"], {}, ["a.stl", "make it first"]),
+    "DEM given to a slope": (
+        ["terrain", "info", "slope:3deg", "--dem", "FILES/a.tif"],
+        {},
+        ["--dem", "a.tif", "does not go with slope:3deg"],
+    ),
+    "seed given to a DEM": (["terrain", "info", "FILES/a.tif", "--seed", "3"], {}, ["--seed = 3", "a.tif"]),
+    "DEM given is missing": (
+        ["terrain", "info", "de_gerlache_rim", "--dem", "FILES/gone.tif"],
+        {},
+        ["gone.tif", "not there"],
+    ),
+    "rover unknown": ([*LUVMI, "--rover", "moonbuggy"], {}, ["moonbuggy", "luvmi_x, viper"]),
+    "simulated terrain unknown": ([*LUVMI, "--terrain", "sea"], {}, ["sea", "lunar_plain"]),
+    "simulated slope too steep": ([*LUVMI, "--terrain", "slope:95deg"], {}, ["slope:95deg", "below 90"]),
+    "simulated preset unknown": ([*LUVMI, "--preset", "best"], {}, ["'best'", "consistent, paper"]),
+    "device unknown": ([*LUVMI, "--device", "tpu"], {}, ["--device = 'tpu'", "cpu or cuda"]),
+    "drive nan": ([*LUVMI, "--drive", "nan"], {}, ["--drive = nan", "not finite"]),
+    "steer inf": ([*LUVMI, "--steer", "inf"], {}, ["--steer = inf", "not finite"]),
+    "start nan": ([*LUVMI, "--x", "nan"], {}, ["--x = nan", "not finite"]),
+    "heading nan": ([*LUVMI, "--yaw-deg", "nan"], {}, ["--yaw-deg = nan", "not finite"]),
+    "start off the terrain": ([*LUVMI, "--y", "500"], {}, ["y = 500", "off the terrain flat"]),
+    "duration negative": ([*LUVMI, "--duration", "-3"], {}, ["duration = -3", "below 0.05 s"]),
+    "duration endless": ([*LUVMI, "--duration", "1e12"], {}, ["duration = 1000000000000", "above 50000 s"]),
+    "simulated effect unknown": ([*LUVMI, "--effects", "warp"], {}, ["'warp'", "catalogue"]),
+    "simulated effect twice": ([*LUVMI, "--effects", "soil"], {}, ["--effects", "'soil'", "already"]),
+    "commands missing": (TABLE, {}, ["commands.csv", "not there"]),
+    "commands with nan": (
+        TABLE,
+        {"commands.csv": csv(**{DRIVE: [0.1, "nan", 0.1, 0.1]})},
+        ["commands.csv", "line 3", f"{DRIVE} = nan", "not a finite"],
+    ),
+    "commands with text": (
+        TABLE,
+        {"commands.csv": csv(**{DRIVE: [0.1, 0.1, "fast", 0.1]})},
+        ["commands.csv", "line 4", "'fast'"],
+    ),
+    "commands without a column": (TABLE, {"commands.csv": csv(**{DRIVE: None})}, ["commands.csv", f"lack {DRIVE}"]),
+    "commands at uneven times": (
+        TABLE,
+        {"commands.csv": csv(time_s=[0.0, 0.05, 0.1, 0.3])},
+        ["commands.csv", "time_s", "uneven"],
+    ),
+    "commands out of step": (
+        TABLE,
+        {"commands.csv": csv(time_s=[0.0, 0.005, 0.01, 0.015])},
+        ["interval = '0.005 s'", "timestep_s"],
+    ),
+    "commands are no table": (TABLE, {"commands.csv": b"\xff\xfe\x00"}, ["commands.csv", "not a CSV table"]),
+    "model missing": (MODEL, {}, ["model.toml", "not there"]),
+    "model is no TOML": (MODEL, {"model.toml": "format = \n"}, ["model.toml", "not valid TOML", "line 1"]),
+    "model with an unknown key": (
+        MODEL,
+        {"model.toml": toml("gravity = 1")},
+        ["model.toml: gravity = 1", "unknown key"],
+    ),
+    "model of an unknown preset": (MODEL, {"model.toml": toml('preset = "best"')}, ["model.toml: preset = 'best'"]),
+    "model with a wrong unit": (
+        MODEL,
+        {"model.toml": toml("[effects.soil]", 'cohesion = {value = 1.0, unit = "m"}')},
+        ["model.toml: effects.soil.cohesion = '1 m'", "give it in Pa"],
+    ),
+    "model out of bounds": (
+        MODEL,
+        {"model.toml": toml("[effects.soil]", "n = -1.0")},
+        ["model.toml: effects.soil.n = -1", "outside [0.1, 3]"],
+    ),
+    "model with a broken effect file": (
+        MODEL,
+        {"model.toml": toml('effect_list = ["motor", "mine.py"]'), "mine.py": "x = (\n"},
+        ["model.toml: effect_list = 'mine.py'", "does not run", "SyntaxError"],
+    ),
+    "preset unknown": (["preset", "best"], {}, ["'best'", "consistent, paper"]),
+    "preset of an unknown rover": (["preset", "paper", "--rover", "moonbuggy"], {}, ["moonbuggy", "viper"]),
+    "preset saved nowhere": (["preset", "paper", "--save", "FILES/no/m.toml"], {}, ["m.toml", "cannot be written"]),
+    "preset saved on a folder": (["preset", "paper", "--save", "OUT"], {}, ["out", "cannot be written"]),
+    "effect unknown": (["effect", "show", "warp"], {}, ["'warp'", "soil"]),
+    "effect file missing": (SHOW, {}, ["mine.py", "not there"]),
+    "effect file fails": (
+        SHOW,
+        {"mine.py": "raise ValueError('first\\nsecond')\n"},
+        ["mine.py", "does not run", "ValueError: first second"],
+    ),
+    "effect file without effects": (SHOW, {"mine.py": "x = 1\n"}, ["mine.py", "defines no effect"]),
+    "effect with crossed bounds": (
+        SHOW,
+        {"mine.py": "from lunar_mjx.effects import Parameter\nParameter(5.0, None, (0.0, 1.0), '1', 'a', 'b')\n"},
+        ["nominal = 5.0", "outside the bounds"],
+    ),
+    "figure unknown": (["figures", "--only", "9", "--out", "OUT"], {}, ["--only = '9'", "3", "5", "slope"]),
+    "figures on an unknown device": (["figures", "--device", "tpu", "--out", "OUT"], {}, ["--device = 'tpu'"]),
+    "demo on an unknown device": (["demo", "--device", "tpu", "--out", "OUT"], {}, ["--device = 'tpu'"]),
+    "port that is no number": (["view", "--port", "abc"], {}, ["view: --port = 'abc' is not a whole number"]),
+    "duration that is no number": ([*LUVMI, "--duration=long"], {}, ["--duration = 'long' is not a number"]),
+    "pictures beyond the range": (["render", "OUT", "--fps", "99"], {}, ["render: --fps = '99' is above 60"]),
+    "seed below the range": (["terrain", "info", "flat", "--seed", "-1"], {}, ["--seed = '-1' is below 0"]),
+    "option without its value": (["figures", "--only"], {}, ["--only", "requires an argument", "--help"]),
+    "option unknown": (["view", "--prot", "3"], {}, ["--prot", "--port", "see lunar-mjx view --help"]),
+    "command unknown": (["figurs"], {}, ["'figurs'", "lunar-mjx --help"]),
+    "command of a group unknown": (["terrain", "look"], {}, ["terrain: no such command 'look'"]),
+    "argument missing": (["plot"], {}, ["plot: missing argument", "lunar-mjx plot --help"]),
+    "argument too many": (["plot", "a", "b"], {}, ["(b)", "lunar-mjx plot --help"]),
+    "option missing": (CONVERT[:2], {}, ["missing option '--out'"]),
+    "demo into a file": (["demo", "--out", "OUT/kept.txt"], {}, ["--out", "kept.txt", "not a folder"]),
+    "figures into a file": (["figures", "--out", "OUT/kept.txt"], {}, ["--out", "kept.txt", "not a folder"]),
+    "drive into a file": ([*LUVMI[:-1], "OUT/kept.txt"], {}, ["--out", "kept.txt", "not a folder"]),
+    "drive into a folder in a file": ([*LUVMI[:-1], "OUT/kept.txt/a/b"], {}, ["--out", "kept.txt is a file"]),
+    "convert into a file": (
+        [*CONVERT[:-1], "OUT/kept.txt"],
+        {"rover.urdf": urdf("steered", "steered")},
+        ["--out", "kept.txt", "not a folder"],
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake(mistake: str, run: Run, tmp_path: Path) -> None:
+    arguments, files, words = MISTAKES[mistake]
+    given, out = tmp_path / "given", tmp_path / "out"
+    given.mkdir()
+    for name, content in files.items():
+        if isinstance(content, Image.Image):
+            content.save(given / name)
+        elif isinstance(content, bytes):
+            (given / name).write_bytes(content)
+        else:
+            (given / name).write_text(str(content))
+    kept = {"kept.txt": b"kept", "drive.csv": b"time_s\n", "model.toml": b"# mine\n", "rover.toml": b"# mine\n"}
+    out.mkdir()
+    for name, content in kept.items():
+        (out / name).write_bytes(content)
+    result = run(*(a.replace("FILES", str(given)).replace("OUT", str(out)) for a in arguments))
+    assert_one_sentence(result, words)
+    assert not result.out
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == kept, "bad input loses nothing"
+
+
+def assert_one_sentence(result: Result, words: list[str]) -> None:
+    assert result.status == 2, result
+    assert result.err.startswith("lunar-mjx: ") and result.err.endswith("\n") and result.err.count("\n") == 1, (
+        result.err
+    )
+    assert "Traceback" not in result.err
+    for word in words:
+        assert word in result.err, result.err
+
+
+def test_nothing_is_made_for_a_refused_drive(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    result = run("simulate", "--rover", "luvmi_x", "--terrain", "flat", "--duration", "-1", "--out", out)
+    assert result.status == 2 and not (tmp_path / "a").exists()
+
+
+def has_cuda() -> bool:
+    import jax
+
+    try:
+        return bool(jax.devices("cuda"))
+    except RuntimeError:
+        return False
+
+
+def test_cuda_asked_for_and_absent(tmp_path: Path) -> None:
+    """In a process of its own, for JAX to look for devices anew."""
+    if has_cuda():
+        pytest.skip("this machine has CUDA")
+    done = subprocess_run(MAIN, "simulate", "--device", "cuda", "--out", tmp_path / "out")
+    words = ["--device = 'cuda'", "no CUDA device", "lunar-mjx[gpu]", "--device cpu"]
+    assert_one_sentence(Result(done.returncode, done.stdout, done.stderr), words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_mistake_in_a_process_of_its_own(tmp_path: Path) -> None:
+    done = subprocess_run(MAIN, "simulate", "--terrain", "sea", "--out", tmp_path / "out")
+    assert_one_sentence(Result(done.returncode, done.stdout, done.stderr), ["sea", "lunar_plain"])
+    assert not done.stdout, "not even what MJX prints when it is imported"
+
+
+def test_interrupted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    # A process started in the background inherits a SIGINT that is ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(cli, "select_device", interrupt)
+    try:
+        assert run("simulate", "--rover", "luvmi_x") == (130, "", "lunar-mjx: interrupted\n")
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_full_disk_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device", "runs/drive.csv")
+
+    monkeypatch.setattr(cli, "select_device", full)
+    assert_one_sentence(run("demo"), ["runs/drive.csv: No space left on device"])
+
+
+def test_our_own_mistakes_keep_their_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(cli, "select_device", broken)
+    with pytest.raises(ZeroDivisionError):
+        run("demo")
+
+
+def test_only_the_two_notices_are_held_back(capsys: pytest.CaptureFixture[str]) -> None:
+    from lunar_mjx._quiet import without_warp_notices
+
+    with without_warp_notices():
+        print("Failed to import warp: No module named 'warp'")
+        print("Failed to import something else")
+        print("Failed to import mujoco_warp: No module named 'warp'")
+    assert capsys.readouterr().out == "Failed to import something else\n"
+    with pytest.raises(KeyError), without_warp_notices():
+        print("told before the error")
+        raise KeyError
+    assert capsys.readouterr().out == "told before the error\n"

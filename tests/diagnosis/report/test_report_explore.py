@@ -1,0 +1,66 @@
+"""What the report lets one look at: panels for every channel and manoeuvre, bins of a covariate, shapes of effects."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from lunar_mjx.diagnosis.report import explore
+from lunar_mjx.diagnosis.report.read import Result, Traces
+from lunar_mjx.inference.observations import Observations, Series
+
+TIME = np.arange(60) * 0.5
+CHANNELS = ("pitch_deg", "motor_lf_drive_current_A")
+
+
+@pytest.fixture(scope="module")
+def result():
+    """Two logs of two channels; the second channel of the second log misfits, and one effect has just that shape."""
+    series = tuple(Series(log, c, n * 60, (n + 1) * 60, TIME, 0.1) for n, (log, c) in enumerate(
+        (log, c) for log in range(2) for c in CHANNELS))  # fmt: skip
+    unit = np.repeat([0, 1], 120)
+    o = Observations(np.zeros(240), series, ("a", "b"), ("fit", "fit"), unit, ("fit", "fit"), ("flat", "climb"))
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((3, 240))
+    shape = np.zeros(240)
+    shape[180:] = 8.0 * np.sin(TIME)
+    residual = noise + np.array([[2.0], [1.0], [0.0]]) * shape
+    residual[0, 3] = np.nan
+    traces = Traces(o, ("as given", "refitted", "with drag"), -0.1 * residual, residual, np.tile(TIME, 4))
+    evidence = [{"effect": "drag", "status": "accepted"}, {"effect": "faint", "status": "not tested"}]
+    return Result("run", {}, None, {"evidence": evidence}, None, None, None, None, traces,
+                  {"drag": shape, "faint": 0.0 * shape})  # fmt: skip
+
+
+def test_every_channel_of_every_manoeuvre_has_a_panel_and_the_worst_comes_first(result):
+    (block,) = explore.panels(result)
+    assert len(block.panels) == 4
+    first = next(iter(block.panels.values()))
+    assert first["label"] == "motor lf drive current, A: climb"
+    measured, refitted, improved, left, less = first["y"]
+    np.testing.assert_allclose(measured, 0.0)
+    np.testing.assert_allclose(left, result.traces.residual[1, 180:], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(less, result.traces.residual[2, 180:], rtol=1e-4, atol=1e-4)
+    assert len(refitted) == len(improved) == len(first["x"]) == 60
+    assert {str(k) for row in block.figure.data[0].customdata for k in row} == set(block.panels)
+    json.dumps(block.panels, allow_nan=False)
+
+
+def test_residuals_are_averaged_over_what_they_may_follow(result):
+    (block,) = explore.dependence(result)
+    titles = [a.title.text for a in block.figure.select_xaxes() if a.title.text]
+    assert titles == ["time, s"]  # the measured pitch is the same throughout
+    x = np.linspace(0.0, 1.0, 200)
+    centre, mean, error = explore._binned(x, 3.0 * x)
+    np.testing.assert_allclose(mean, 3.0 * np.array(centre))
+    assert len(mean) == len(error) == 16
+
+
+def test_the_gallery_shows_an_effect_where_it_shows_most(result):
+    (block,) = explore.gallery(result)
+    dots, line = block.figure.data
+    np.testing.assert_allclose(dots.y, result.traces.residual[1, 180:])
+    np.testing.assert_allclose(line.y, 8.0 * np.sin(TIME))
+    assert "climb" in block.figure.layout.annotations[0].text

@@ -1,0 +1,228 @@
+"""The house: which room may look into which, no circles, no crowded folder, no prefix where a folder is meant.
+
+Imports are read from the source, those inside functions too: what is imported late is leant on all the same.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "lunar_mjx"
+
+FLOORS: tuple[frozenset[str], ...] = tuple(
+    frozenset(floor.split())
+    for floor in (
+        "errors pytree spatial _quiet report",
+        "resources units toml_fields inference",
+        "rover terrain",
+        "effects cameras",
+        "model",
+        "dynamics",
+        "simulate effect_contract wheel_bed",
+        "manoeuvres backends envs visual",
+        "logs agents viewer",
+        "diagnosis",
+        "criticism paper",
+        "demo",
+        "commands",
+        "cli",
+    )
+)
+"""Rooms from the ground up. A room looks down only: never up, and never into another room of its own floor."""
+
+THIRD_PARTY: dict[str, frozenset[str]] = {
+    "inference": frozenset({"numpy", "scipy", "jax"}),
+    "errors": frozenset(),
+    "effects": frozenset({"numpy", "jax", "jaxtyping"}),
+    "rover": frozenset({"numpy", "scipy", "mujoco", "trimesh", "tomli_w"}),
+}
+"""What rooms that others stand on may take from outside the standard library."""
+
+ONLY_IN = {"typer": frozenset({"commands"}), "mujoco.mjx": frozenset({"_quiet"})}
+"""Libraries that belong to one room."""
+
+LATE_CIRCLES: dict[frozenset[str], str] = {}
+"""Circles closed by an import inside a function that are borne, with the reason."""
+
+WORDS = frozenset(
+    [
+        "rover",
+        "rovers",
+        "wheel",
+        "wheels",
+        "joint",
+        "joints",
+        "port",
+        "ports",
+        "channel",
+        "channels",
+        "soil",
+        "motor",
+        "slip",
+        "gear",
+        "encoder",
+        "imu",
+    ]
+)
+"""Words of rovers, ports and channels: no name in `inference` holds one."""
+WORDS_BORNE = {
+    "observations.py": "channel",  # the name of a measured series, which inference never takes apart
+    "held_out.py": "channel",  # groups residuals by the names of their series
+}
+"""To be worked off: names that hold a word of `WORDS`, by file."""
+
+CROWDED = 15
+"""Modules of one folder that a reader still takes in."""
+REPEATED = 3
+"""Modules of one folder with a first word in common from which that word is a folder."""
+PREFIXES_BORNE = {
+    ("benchmarks", "rl"): "to become a folder with a shared harness",
+    ("benchmarks/hidden", "bed"): "to become a folder beside drives",
+}
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the package by its dotted name."""
+    found = {}
+    for path in sorted((ROOT / PACKAGE).rglob("*.py")):
+        parts = list(path.relative_to(ROOT).with_suffix("").parts)
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports(path: Path, known: dict[str, Path]) -> tuple[set[str], set[str]]:
+    """Modules of the package, and names outside it, that a file imports anywhere."""
+    inside, outside = set(), set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [a.name for a in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path}: write the whole name of {node.module}"
+            base = node.module or ""
+            names = [full if (full := f"{base}.{a.name}") in known else base for a in node.names]
+        else:
+            continue
+        for name in names:
+            (inside if name.split(".")[0] == PACKAGE else outside).add(name)
+    return inside, outside
+
+
+def graph() -> dict[str, set[str]]:
+    """Modules of the package that each module imports."""
+    known = modules()
+    return {name: imports(path, known)[0] - {name} for name, path in known.items()}
+
+
+def room(module: str) -> str:
+    """The part of the package that a module lies in."""
+    return module.split(".")[1] if "." in module else PACKAGE
+
+
+def circles(edges: dict[str, set[str]]) -> list[frozenset[str]]:
+    """Groups of nodes that reach each other (Tarjan 1972)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in sorted(edges.get(node, ())):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            group = stack[stack.index(node) :]
+            del stack[stack.index(node) :]
+            if len(group) > 1:
+                found.append(frozenset(group))
+
+    for node in sorted(edges):
+        if node not in index:
+            visit(node)
+    return found
+
+
+def test_every_room_has_its_floor() -> None:
+    rooms = {room(m) for m in modules()} - {PACKAGE}
+    floors = [r for floor in FLOORS for r in floor]
+    assert rooms == set(floors) and len(floors) == len(set(floors))
+
+
+def test_no_import_climbs() -> None:
+    level = {r: k for k, floor in enumerate(FLOORS) for r in floor}
+    climbing = sorted(
+        f"{module} -> {other}"
+        for module, others in graph().items()
+        for other in others
+        if room(other) != PACKAGE
+        and room(module) != PACKAGE
+        and room(module) != room(other)
+        and level[room(other)] >= level[room(module)]
+    )
+    assert not climbing, climbing
+
+
+def test_no_import_circles() -> None:
+    assert [c for c in circles(graph()) if c not in LATE_CIRCLES] == []
+
+
+def test_rooms_take_only_what_belongs_to_them_from_outside() -> None:
+    import sys
+
+    known, wrong = modules(), []
+    for name, path in known.items():
+        for other in imports(path, known)[1]:
+            top = other.split(".")[0]
+            allowed = THIRD_PARTY.get(room(name))
+            if allowed is not None and top not in allowed and top not in sys.stdlib_module_names:
+                wrong.append(f"{name} -> {other}")
+            for library, rooms in ONLY_IN.items():
+                if (other == library or other.startswith(library + ".")) and room(name) not in rooms:
+                    wrong.append(f"{name} -> {other}")
+    assert not wrong, wrong
+
+
+def test_inference_names_no_rover_port_or_channel() -> None:
+    wrong = []
+    for path in sorted((ROOT / PACKAGE / "inference").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for field in ("id", "attr", "arg", "name"):
+                name = getattr(node, field, None)
+                if not isinstance(name, str):
+                    continue
+                for word in WORDS & set(re.split(r"_+", name.lower())):
+                    if word.rstrip("s") != WORDS_BORNE.get(path.name):
+                        wrong.append(f"{path.name}: {name}")
+    assert not wrong, sorted(set(wrong))
+
+
+def test_no_crowded_folder() -> None:
+    crowd = Counter(path.parent for path in modules().values() if path.name != "__init__.py")
+    assert {str(k.relative_to(ROOT)): n for k, n in crowd.items() if n > CROWDED} == {}
+
+
+def test_a_repeated_prefix_is_a_folder() -> None:
+    repeated = {}
+    for top in (PACKAGE, "benchmarks", "train"):
+        folders = {p.parent for p in (ROOT / top).rglob("*.py")}
+        for folder in folders:
+            first = Counter(p.stem.split("_")[0] for p in folder.glob("*.py") if not p.stem.startswith("_"))
+            for word, count in first.items():
+                if count >= REPEATED:
+                    repeated[str(folder.relative_to(ROOT)), word] = count
+    assert set(repeated) == set(PREFIXES_BORNE), repeated
+
+
+def test_tests_mirror_the_package() -> None:
+    """A folder of tests is a room, or a top folder of the repository."""
+    folders = {p.name for p in (ROOT / "tests").iterdir() if p.is_dir() and any(p.rglob("*.py"))}
+    rooms = {room(m) for m in modules()}
+    assert folders <= rooms | {"benchmarks", "docs"}, folders - rooms
