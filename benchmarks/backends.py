@@ -78,12 +78,18 @@ def spheres(model: Model, steps: int, batch: int) -> dict[str, Any]:
     heights = np.asarray(field.heights)[:128, :128]
     low, high = float(heights.min()), float(heights.max())
     half = 0.5 * (len(heights) - 1) * float(field.cell)
-    spec.add_hfield(name="ground", nrow=len(heights), ncol=len(heights), size=[half, half, max(high - low, 1e-3), 1.0],
-                    userdata=((heights - low) / max(high - low, 1e-3)).ravel())  # fmt: skip
+    spec.add_hfield(
+        name="ground",
+        nrow=len(heights),
+        ncol=len(heights),
+        size=[half, half, max(high - low, 1e-3), 1.0],
+        userdata=((heights - low) / max(high - low, 1e-3)).ravel(),
+    )
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", contype=1, conaffinity=1)
     for wheel in model.rover.wheels:
-        spec.body(wheel.body).add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[wheel.radius, 0, 0], contype=1,
-                                       conaffinity=1, mass=0.0)  # fmt: skip
+        spec.body(wheel.body).add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[wheel.radius, 0, 0], contype=1, conaffinity=1, mass=0.0
+        )
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     spec.option.iterations, spec.option.ls_iterations = 4, 8
     native = spec.compile()
@@ -148,8 +154,12 @@ def rows_of(rover: str, options: argparse.Namespace, add: Callable[..., None]) -
                 add("native, NumPy effects", batch, 1, in_processes("native", rover, batch, 1, options.seconds))
             largest = max(options.numpy_batches)
             if cores > 1:
-                add("native, NumPy effects", largest * cores, cores,
-                    in_processes("native", rover, largest, cores, options.seconds))  # fmt: skip
+                add(
+                    "native, NumPy effects",
+                    largest * cores,
+                    cores,
+                    in_processes("native", rover, largest, cores, options.seconds),
+                )
         if "pybullet" in options.engines:
             try:
                 add("pybullet", 1, 1, in_processes("pybullet", rover, 1, 1, options.seconds))
@@ -189,8 +199,15 @@ def jax_rows(model: Model, options: argparse.Namespace, devices: list[Any], add:
             add("mjx, spheres, CPU" if on_cpu else "mjx, spheres", batch, workers, spheres(model, steps, batch))
 
 
-LOOKS = {"structured": (BLUE, "o"), "mjx": (VERMILION, "s"), "mjx, bare": (ORANGE, "^"), "mjx, spheres": (PURPLE, "v"),
-         "native, bare": (GREEN, "P"), "native, NumPy effects": (SKY, "X"), "pybullet": (INK, "D")}  # fmt: skip
+LOOKS = {
+    "structured": (BLUE, "o"),
+    "mjx": (VERMILION, "s"),
+    "mjx, bare": (ORANGE, "^"),
+    "mjx, spheres": (PURPLE, "v"),
+    "native, bare": (GREEN, "P"),
+    "native, NumPy effects": (SKY, "X"),
+    "pybullet": (INK, "D"),
+}
 """Colour and marker of every engine; hollow on a CPU where there is a row of a GPU, too."""
 
 
@@ -212,13 +229,26 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             own.sort(key=lambda r: r["batch"])
             colour, marker = LOOKS[engine.removesuffix(", CPU")]
             hollow = engine.endswith(", CPU")
-            axes.loglog([r["batch"] for r in own], [r["steps_per_s"] for r in own], marker=marker, color=colour,
-                        linestyle=":" if hollow else "-", linewidth=1.1, markersize=6,
-                        markerfacecolor="white" if hollow else colour)  # fmt: skip
+            axes.loglog(
+                [r["batch"] for r in own],
+                [r["steps_per_s"] for r in own],
+                marker=marker,
+                color=colour,
+                linestyle=":" if hollow else "-",
+                linewidth=1.1,
+                markersize=6,
+                markerfacecolor="white" if hollow else colour,
+            )
         heights = _spread([own[-1]["steps_per_s"] for own in lines.values()])
         for ((engine, workers), own), height in zip(lines.items(), heights, strict=True):
-            axes.text(1.5 * own[-1]["batch"], height, f"{engine}, {workers} {_unit(engine, workers)}", fontsize=7,
-                      color=INK, va="center")  # fmt: skip
+            axes.text(
+                1.5 * own[-1]["batch"],
+                height,
+                f"{engine}, {workers} {_unit(engine, workers)}",
+                fontsize=7,
+                color=INK,
+                va="center",
+            )
         axes.set_xlim(0.7, 3e6)
         axes.set_title(rover, loc="left", fontsize=10)
         axes.set_xlabel("rovers at once")
@@ -248,14 +278,18 @@ def _unit(engine: str, workers: int) -> str:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows as a Markdown table."""
-    lines = ["| rover | engine | rovers | workers | rover-steps/s | us per rover-step | compile s | memory MB |",
-             "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        "| rover | engine | rovers | workers | rover-steps/s | us per rover-step | compile s | memory MB |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for r in rows:
         compile_s, memory = (f"{r[k]:.1f}" if r.get(k) else "" for k in ("compile_s", "memory_MB"))
         workers, finite = f"{r['workers']} {_unit(r['engine'], r['workers'])}", r.get("finite", True)
-        lines.append(f"| {r['rover']} | {r['engine']} | {r['batch']:,} | {workers} | "
-                     f"{r['steps_per_s']:,.0f}{'' if finite else ' (not finite)'} | "
-                     f"{1e6 / r['steps_per_s']:.3g} | {compile_s} | {memory} |")  # fmt: skip
+        lines.append(
+            f"| {r['rover']} | {r['engine']} | {r['batch']:,} | {workers} | "
+            f"{r['steps_per_s']:,.0f}{'' if finite else ' (not finite)'} | "
+            f"{1e6 / r['steps_per_s']:.3g} | {compile_s} | {memory} |"
+        )
     return "\n".join(lines)
 
 
@@ -298,13 +332,28 @@ def main() -> None:
     LOCK[:] = [options.lock] if options.lock else []
     device = jax.devices()[0]
     options.platforms = options.platforms.split(",") if options.platforms else [device.platform]
-    about = {"device": device.device_kind, "devices": options.devices, "cores": options.cores,
-             "cpu": cpu_name(), "load_before": os.getloadavg(), "jax": jax.__version__,
-             "mujoco": mujoco.__version__}  # fmt: skip
+    about = {
+        "device": device.device_kind,
+        "devices": options.devices,
+        "cores": options.cores,
+        "cpu": cpu_name(),
+        "load_before": os.getloadavg(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+    }
 
     def add(rover: str, engine: str, batch: int, workers: int, result: dict[str, Any]) -> None:
-        rows.append({"rover": rover, "engine": engine, "batch": batch, "workers": workers, **result,
-                     "us_per_rover_step": 1e6 / result["steps_per_s"], "load": os.getloadavg()[0]})  # fmt: skip
+        rows.append(
+            {
+                "rover": rover,
+                "engine": engine,
+                "batch": batch,
+                "workers": workers,
+                **result,
+                "us_per_rover_step": 1e6 / result["steps_per_s"],
+                "load": os.getloadavg()[0],
+            }
+        )
         print(f"{rover:8s} {engine:24s} {batch:8d} x {workers:2d} {result['steps_per_s']:14,.0f} steps/s", flush=True)
         if options.out:
             options.out.write_text(json.dumps({"about": about, "rows": rows}, indent=1) + "\n")

@@ -191,9 +191,14 @@ def sindy(problem: Any, base: Refit) -> dict[str, Any]:
     names = library.get_feature_names(list(FEATURES))
     terms = {c: _terms(theta[fitted], target[fitted][:, k], tried[best][k], names) for k, c in enumerate(channels)}
     strength = dict(zip(channels, np.sqrt(np.mean(predicted[fitted] ** 2, axis=0)).tolist(), strict=True))
-    return {"terms": terms, "strength": strength, "held_out_error": error[best], "silent": not any(terms.values()),
-            "number_of_terms": sum(len(t) for t in terms.values()),
-            "at_noise": at_noise(problem, -(target - predicted).T.ravel(), base.free, "select")}  # fmt: skip
+    return {
+        "terms": terms,
+        "strength": strength,
+        "held_out_error": error[best],
+        "silent": not any(terms.values()),
+        "number_of_terms": sum(len(t) for t in terms.values()),
+        "at_noise": at_noise(problem, -(target - predicted).T.ravel(), base.free, "select"),
+    }
 
 
 def _terms(theta: np.ndarray, target: np.ndarray, row: np.ndarray, names: Sequence[str]) -> list[tuple[str, float]]:

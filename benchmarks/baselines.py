@@ -53,14 +53,32 @@ from benchmarks import baseline_tools as tools  # noqa: E402
 from lunar_mjx.errors import UserError  # noqa: E402
 
 COUNTS = {"singles": 300, "nulls": 400, "outside": 100, "singles_x5": 100}
-QUANTITIES_OF: Mapping[str, frozenset[str]] = {k: frozenset(v.split()) for k, v in {
-    "slip_sinkage": "slip", "angle_sinkage": "angle", "exit_angle": "slip 1", "bulldozing": "sinkage",
-    "grousers": "load 1", "friction_circle": "angle slip", "rolling_resistance": "load",
-    "wheel_radius_error": "slip sinkage 1", "steering_toe": "angle 1", "speed_stiffness": "slip",
-    "cable_drag": "angle 1", "side_offset": "1", "load_friction": "load", "strain_softening": "slip",
-    "hard_layer": "sinkage", "seal_torque": "1", "side_bearing": "angle slip", "load_stiffness": "load",
-    "angle_modulus": "angle", "deep_cohesion": "sinkage", "camber_thrust": "load slip",
-}.items()}  # fmt: skip
+QUANTITIES_OF: Mapping[str, frozenset[str]] = {
+    k: frozenset(v.split())
+    for k, v in {
+        "slip_sinkage": "slip",
+        "angle_sinkage": "angle",
+        "exit_angle": "slip 1",
+        "bulldozing": "sinkage",
+        "grousers": "load 1",
+        "friction_circle": "angle slip",
+        "rolling_resistance": "load",
+        "wheel_radius_error": "slip sinkage 1",
+        "steering_toe": "angle 1",
+        "speed_stiffness": "slip",
+        "cable_drag": "angle 1",
+        "side_offset": "1",
+        "load_friction": "load",
+        "strain_softening": "slip",
+        "hard_layer": "sinkage",
+        "seal_torque": "1",
+        "side_bearing": "angle slip",
+        "load_stiffness": "load",
+        "angle_modulus": "angle",
+        "deep_cohesion": "sinkage",
+        "camber_thrust": "load slip",
+    }.items()
+}
 """Quantities that a hidden effect's equation names; "1" for a constant."""
 
 
@@ -135,8 +153,10 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         mine = [r for r in rows if r["group"] == group]
         if not mine:
             continue
-        table = {"lunar_mjx.criticism, right": share(mine, lambda r: r["right"]),
-                 "lunar_mjx.criticism, wrong name": share(mine, lambda r: r["wrong_name"])}  # fmt: skip
+        table = {
+            "lunar_mjx.criticism, right": share(mine, lambda r: r["right"]),
+            "lunar_mjx.criticism, wrong name": share(mine, lambda r: r["wrong_name"]),
+        }
         for rule in ("careful", "smallest"):
             table[f"mujoco.sysid {rule}, right"] = share(mine, lambda r, rule=rule: refit(r, rule, "right"))
             table[f"mujoco.sysid {rule}, wrong name"] = share(mine, lambda r, rule=rule: refit(r, rule, "wrong_name"))
@@ -153,9 +173,11 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 mine, lambda r: any(s.get("at_noise") for s in r.get("suggestions", ()))
             )
         out[group] = table
-    for tool, seconds in (("lunar_mjx.criticism", lambda r: r.get("seconds")),
-                          ("mujoco.sysid", lambda r: r.get("refit", {}).get("seconds")),
-                          ("pySINDy", lambda r: r.get("sindy", {}).get("seconds"))):  # fmt: skip
+    for tool, seconds in (
+        ("lunar_mjx.criticism", lambda r: r.get("seconds")),
+        ("mujoco.sysid", lambda r: r.get("refit", {}).get("seconds")),
+        ("pySINDy", lambda r: r.get("sindy", {}).get("seconds")),
+    ):
         known = [s for r in rows if (s := seconds(r)) is not None]
         out.setdefault("median seconds a case", {})[tool] = float(np.median(known)) if known else None
     return out
@@ -189,8 +211,20 @@ def summary(args: argparse.Namespace) -> None:
         raise UserError(f"{args.results[0]}: holds no results; run the cases first.")
     found = figures(rows)
     seeds = [p.with_suffix(".seed.json") for p in args.results]
-    shown = ("case", "seed", "commit", "uncommitted_changes", "verdict", "named", "outcome", "port", "true_ports",
-             "suggestions", "refit", "sindy")  # fmt: skip
+    shown = (
+        "case",
+        "seed",
+        "commit",
+        "uncommitted_changes",
+        "verdict",
+        "named",
+        "outcome",
+        "port",
+        "true_ports",
+        "suggestions",
+        "refit",
+        "sindy",
+    )
     cases = [{k: r.get(k) for k in shown} | {"hidden": r["truth"]["effects"]} for r in rows]
     for case in cases:
         if case["sindy"]:  # the dearest terms are those that count
@@ -201,8 +235,11 @@ def summary(args: argparse.Namespace) -> None:
     for group, table in found.items():
         print(group)
         for name, f in table.items():
-            text = f if not isinstance(f, dict) else (
-                f"{f['hits']}/{f['of']} ({100 * f['low']:.0f} to {100 * f['high']:.0f} %)")  # fmt: skip
+            text = (
+                f
+                if not isinstance(f, dict)
+                else (f"{f['hits']}/{f['of']} ({100 * f['low']:.0f} to {100 * f['high']:.0f} %)")
+            )
             print(f"  {name:<58} {text}")
 
 

@@ -58,8 +58,15 @@ def renderer_rows(model: Model, sizes: list[Pinhole], qpos: np.ndarray, repeats:
             with RoverCamera(model.rover, model.terrain, qpos[None, :2], camera) as eye:
                 eye.place(qpos)
                 _, each = seconds(eye.front, max(3, repeats))
-                rows.append({"kind": "renderer: rgba, depth, segmentation", "size": [camera.width, camera.height],
-                             "batch": 1, "images_per_s": 1.0 / each, "depth": eye.front().depth})  # fmt: skip
+                rows.append(
+                    {
+                        "kind": "renderer: rgba, depth, segmentation",
+                        "size": [camera.width, camera.height],
+                        "batch": 1,
+                        "images_per_s": 1.0 / each,
+                        "depth": eye.front().depth,
+                    }
+                )
         except UserError as missing:
             print(missing)
             return []
@@ -98,21 +105,44 @@ def main() -> None:
             at_once = max(1, min(batch, given.pixels // (camera.width * camera.height)))
             look = jax.jit(partial(depth_images, camera=camera, at_once=at_once if at_once < batch else None))
             first, each = seconds(partial(look, terrain, position[:batch], rotation[:batch]), given.repeats)
-            rows.append({"kind": "depth, JAX", "size": [camera.width, camera.height], "batch": batch,
-                         "images_per_s": batch / each, "first_call_s": first, "median_error": error})  # fmt: skip
+            rows.append(
+                {
+                    "kind": "depth, JAX",
+                    "size": [camera.width, camera.height],
+                    "batch": batch,
+                    "images_per_s": batch / each,
+                    "first_call_s": first,
+                    "median_error": error,
+                }
+            )
     shape = tuple(int(n) for n in given.scan.split("x"))
     for batch in batches:
         scan = jax.jit(partial(height_scan, shape=shape))
         yaw = jnp.zeros(batch)
         first, each = seconds(partial(scan, terrain, qpos[:batch, :3], yaw), given.repeats)
-        rows.append({"kind": "height scan, JAX", "size": list(shape[::-1]), "batch": batch,
-                     "images_per_s": batch / each, "first_call_s": first})  # fmt: skip
+        rows.append(
+            {
+                "kind": "height scan, JAX",
+                "size": list(shape[::-1]),
+                "batch": batch,
+                "images_per_s": batch / each,
+                "first_call_s": first,
+            }
+        )
     device = jax.devices()[0]
-    about = {"rover": given.rover, "terrain": given.terrain, "device": device.device_kind, "jax": jax.__version__,
-             "processor": platform.processor() or platform.machine(), "repeats": given.repeats}  # fmt: skip
+    about = {
+        "rover": given.rover,
+        "terrain": given.terrain,
+        "device": device.device_kind,
+        "jax": jax.__version__,
+        "processor": platform.processor() or platform.machine(),
+        "repeats": given.repeats,
+    }
     for row in rows:
-        print(f"{row['kind']:36} {row['size'][0]:4} x {row['size'][1]:<4} batch {row['batch']:6}: "
-              f"{row['images_per_s']:12,.1f} images/s")  # fmt: skip
+        print(
+            f"{row['kind']:36} {row['size'][0]:4} x {row['size'][1]:<4} batch {row['batch']:6}: "
+            f"{row['images_per_s']:12,.1f} images/s"
+        )
     given.out.write_text(json.dumps({"about": about, "rows": rows}, indent=1) + "\n", encoding="utf-8")
 
 

@@ -28,18 +28,41 @@ from lunar_mjx.diagnosis.drives.program import cores
 from lunar_mjx.model import make_model
 
 EFFECTS = (
-    "coulomb_friction", "viscous_friction", "directional_gear_efficiency", "iron_loss", "gear_friction_heat", "cogging",
-    "actuator_delay", "slip_sinkage", "exit_angle", "bulldozing", "friction_circle", "dynamic_sinkage", "soil_patches",
-    "multipass", "rolling_resistance", "com_offset", "wheel_radius_error", "gravity_error", "clock_offset",
+    "coulomb_friction",
+    "viscous_friction",
+    "directional_gear_efficiency",
+    "iron_loss",
+    "gear_friction_heat",
+    "cogging",
+    "actuator_delay",
+    "slip_sinkage",
+    "exit_angle",
+    "bulldozing",
+    "friction_circle",
+    "dynamic_sinkage",
+    "soil_patches",
+    "multipass",
+    "rolling_resistance",
+    "com_offset",
+    "wheel_radius_error",
+    "gravity_error",
+    "clock_offset",
     "channel_scale",
-)  # fmt: skip
+)
 
 MORE = (
-    Manoeuvre("slalom", "flat", False, "fit", ((0, 0), (1, 0), (1.5, 2.5), (9, 2.5), (9.5, 0)),
-              ((0, 0), (2, 0.1), (3.5, -0.1), (5, 0.1), (6.5, -0.1), (8, 0.1), (9, 0))),
-    Manoeuvre("crawl_and_sprint", "flat", False, "select",
-              ((0, 0), (1, 0), (1.5, 0.6), (5, 0.6), (6, 5), (9, 5), (9.5, 0))),
-)  # fmt: skip
+    Manoeuvre(
+        "slalom",
+        "flat",
+        False,
+        "fit",
+        ((0, 0), (1, 0), (1.5, 2.5), (9, 2.5), (9.5, 0)),
+        ((0, 0), (2, 0.1), (3.5, -0.1), (5, 0.1), (6.5, -0.1), (8, 0.1), (9, 0)),
+    ),
+    Manoeuvre(
+        "crawl_and_sprint", "flat", False, "select", ((0, 0), (1, 0), (1.5, 0.6), (5, 0.6), (6, 5), (9, 5), (9.5, 0))
+    ),
+)
 """Beside the six manoeuvres of the hidden benchmark."""
 
 
@@ -61,10 +84,16 @@ def main() -> None:
     logs = read_campaign(args.logs)
     steps = sum(log.span_s[1] - log.span_s[0] for log in logs)
     record = {
-        "device": str(jax.devices()[0].device_kind), "platform": jax.default_backend(), "cores": cores(),
-        "load_average": list(os.getloadavg()), "jax": jax.__version__, "logs": len(logs), "seconds_of_driving": steps,
-        "effects": len(EFFECTS), "rounds": [],
-    }  # fmt: skip
+        "device": str(jax.devices()[0].device_kind),
+        "platform": jax.default_backend(),
+        "cores": cores(),
+        "load_average": list(os.getloadavg()),
+        "jax": jax.__version__,
+        "logs": len(logs),
+        "seconds_of_driving": steps,
+        "effects": len(EFFECTS),
+        "rounds": [],
+    }
     model = make_model(logs[0].rover, terrain="flat")
     for number in range(args.rounds):
         SIMULATED.clear()  # else a round would find what the one before has simulated
@@ -75,9 +104,13 @@ def main() -> None:
             diagnosis = why(run, None if args.all else EFFECTS)
             ended = time.perf_counter()
         row = {
-            "round": number, "compare_s": fitted - begun, "why_s": ended - fitted, "total_s": ended - begun,
-            "verdict": diagnosis.verdict.label, "effects": list(diagnosis.effects),
-        }  # fmt: skip
+            "round": number,
+            "compare_s": fitted - begun,
+            "why_s": ended - fitted,
+            "total_s": ended - begun,
+            "verdict": diagnosis.verdict.label,
+            "effects": list(diagnosis.effects),
+        }
         record["rounds"].append(row)
         print(json.dumps(row), flush=True)
         args.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

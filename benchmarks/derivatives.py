@@ -83,8 +83,13 @@ def timed(function: Callable[[Any], Any], argument: Any) -> dict[str, Any]:
             walls.append(time.perf_counter() - begin)
             cpus.append(time.process_time() - begin_cpu)
         wall, cpu = min(walls), min(cpus)
-    return {"seconds": wall, "cpu_s": cpu, "compile_s": compile_s, "compile_cpu_s": compile_cpu_s,
-            "finite": bool(jnp.isfinite(value).all())}  # fmt: skip
+    return {
+        "seconds": wall,
+        "cpu_s": cpu,
+        "compile_s": compile_s,
+        "compile_cpu_s": compile_cpu_s,
+        "finite": bool(jnp.isfinite(value).all()),
+    }
 
 
 def main() -> None:
@@ -104,10 +109,18 @@ def main() -> None:
         system = build(make_model(options.rover, "flat"), "structured")
         steps = round(options.seconds / system.dt)
         one = jnp.ones(options.parameters)
-        rows: dict[str, Any] = {"about": {
-            "device": device.device_kind, "jax": jax.__version__, "rover": options.rover, "batch": options.batch,
-            "parameters": options.parameters, "steps": steps, "chunk": options.chunk,
-            "nproc": os.environ.get("NPROC")}}  # fmt: skip
+        rows: dict[str, Any] = {
+            "about": {
+                "device": device.device_kind,
+                "jax": jax.__version__,
+                "rover": options.rover,
+                "batch": options.batch,
+                "parameters": options.parameters,
+                "steps": steps,
+                "chunk": options.chunk,
+                "nproc": os.environ.get("NPROC"),
+            }
+        }
         end = drive(system, starts(system, options.batch), steps)
         changed = jnp.concatenate([one[None], one + 1e-3 * jnp.eye(options.parameters)])
         for name, function, argument in (

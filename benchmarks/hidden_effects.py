@@ -39,8 +39,16 @@ def run(args: argparse.Namespace) -> None:
     done = {row["case"] for row in runner.read_rows([args.out]) if row["seed"] == str(seed)}
     left = [job for job in runner.order(counts) if f"{job[0]}-{job[1]:03d}" not in done]
     print(f"seed {seed}: {len(left)} of {sum(counts.values())} cases are left")
-    number = runner.work(solve.table_row, left, args.out, seed, args.minutes, args.workers, suggest=args.suggest,
-                         keep=str(args.keep) if args.keep else None)  # fmt: skip
+    number = runner.work(
+        solve.table_row,
+        left,
+        args.out,
+        seed,
+        args.minutes,
+        args.workers,
+        suggest=args.suggest,
+        keep=str(args.keep) if args.keep else None,
+    )
     print(f"{number} cases done, {len(left) - number} left")
 
 
@@ -50,8 +58,9 @@ def generate(args: argparse.Namespace) -> None:
 
     counts = _counts(args.cases, args.count, dict(drives.GROUPS))
     seed = int(runner.campaign(args.folder / "drives", args.seed)["seed"])
-    left = [job for job in runner.order(counts)
-            if not (args.folder / "answers" / f"{job[0]}-{job[1]:03d}.json").is_file()]  # fmt: skip
+    left = [
+        job for job in runner.order(counts) if not (args.folder / "answers" / f"{job[0]}-{job[1]:03d}.json").is_file()
+    ]
     number = 0
     for row in runner.rows(drives.generate, left, seed, args.minutes, args.workers, out=args.folder):
         print(row, flush=True)
@@ -73,8 +82,16 @@ def score(args: argparse.Namespace) -> None:
     first, last, of = args.share
     mine = [job for place, job in enumerate(drives.waiting(args.folder)) if first <= place % of <= last]
     left = [job for job in mine if f"{job[0]}-{job[1]:03d}" not in done]
-    number = runner.work(solve.drive_row, left, args.out, seed, args.minutes, args.workers, folder=str(args.folder),
-                         keep=str(args.keep) if args.keep else None)  # fmt: skip
+    number = runner.work(
+        solve.drive_row,
+        left,
+        args.out,
+        seed,
+        args.minutes,
+        args.workers,
+        folder=str(args.folder),
+        keep=str(args.keep) if args.keep else None,
+    )
     print(f"{number} campaigns done, {len(left) - number} left")
 
 
@@ -127,8 +144,13 @@ def parser() -> argparse.ArgumentParser:
     scored.add_argument("--out", type=Path, required=True, help="JSON lines, one row per campaign")
     scored.add_argument("--minutes", type=float, default=9.0)
     scored.add_argument("--workers", type=int, default=1)
-    scored.add_argument("--share", type=share, default=(0, 0, 1), metavar="FIRST-LAST/NUMBER",
-                        help="of the campaigns, where several programs score one folder")  # fmt: skip
+    scored.add_argument(
+        "--share",
+        type=share,
+        default=(0, 0, 1),
+        metavar="FIRST-LAST/NUMBER",
+        help="of the campaigns, where several programs score one folder",
+    )
     scored.add_argument("--keep", type=Path, help="folder in which runs stay")
     scored.set_defaults(do=score)
     table = verbs.add_parser("summary", help="figures with intervals, and the confusion matrix")

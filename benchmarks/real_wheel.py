@@ -66,8 +66,10 @@ SOIL_FREE = (
 EFFECTS: Mapping[str, tuple[Free, ...]] = {
     "friction_circle": (Free("friction_circle", "share", 0.0, 0.0, 1.0, 0.5),),
     "exit_angle": (
-        Free("exit_angle", "c1", 0.5, 0.05, 0.95, 0.1), Free("exit_angle", "c2", 0.0, -0.5, 0.5, 0.1),
-        Free("exit_angle", "c3", 0.0, 0.0, 0.9, 0.2), Free("exit_angle", "c4", 0.0, -0.9, 0.9, 0.2),
+        Free("exit_angle", "c1", 0.5, 0.05, 0.95, 0.1),
+        Free("exit_angle", "c2", 0.0, -0.5, 0.5, 0.1),
+        Free("exit_angle", "c3", 0.0, 0.0, 0.9, 0.2),
+        Free("exit_angle", "c4", 0.0, -0.9, 0.9, 0.2),
     ),
     "slide_softening": (Free("slide_softening", "softening", 0.0, 0.0, 20.0, 0.5),),
     "side_entry": (Free("side_entry", "kept", 1.0, 0.0, 1.0, 0.3),),
@@ -75,15 +77,29 @@ EFFECTS: Mapping[str, tuple[Free, ...]] = {
     "shear_softening": (Free("shear_softening", "loss", 0.0, 0.0, 0.98, 0.3),),
     "skid_shear": (Free("skid_shear", "share", 0.0, 0.0, 0.99, 0.5),),
     "side_wall": (
-        Free("side_wall", "pressure", 0.0, 0.0, 2.0, 0.5), Free("side_wall", "build_up", 4.0, 0.1, 20.0, 0.5, True),
+        Free("side_wall", "pressure", 0.0, 0.0, 2.0, 0.5),
+        Free("side_wall", "build_up", 4.0, 0.1, 20.0, 0.5, True),
     ),
-}  # fmt: skip
+}
 """Candidates and what they free, from their nulls. The order is that of adding to the wheel, and means nothing else."""
-TOGETHER = {"soil.n": 1.2, "soil.k_phi": 1e7, "soil.friction_angle": 0.6, "soil.cohesion": 200.0,
-            "soil.shear_modulus_x": 0.02, "soil.shear_modulus_y": 0.03, "friction_circle.share": 0.7,
-            "exit_angle.c1": 0.8, "exit_angle.c3": 0.8, "exit_angle.c4": 0.4, "slide_softening.softening": 0.7,
-            "side_entry.kept": 0.3, "shear_softening.loss": 0.6, "skid_shear.share": 0.7,
-            "side_exit.lost": 0.7, "side_wall.pressure": 1.4}  # fmt: skip
+TOGETHER = {
+    "soil.n": 1.2,
+    "soil.k_phi": 1e7,
+    "soil.friction_angle": 0.6,
+    "soil.cohesion": 200.0,
+    "soil.shear_modulus_x": 0.02,
+    "soil.shear_modulus_y": 0.03,
+    "friction_circle.share": 0.7,
+    "exit_angle.c1": 0.8,
+    "exit_angle.c3": 0.8,
+    "exit_angle.c4": 0.4,
+    "slide_softening.softening": 0.7,
+    "side_entry.kept": 0.3,
+    "shear_softening.loss": 0.6,
+    "skid_shear.share": 0.7,
+    "side_exit.lost": 0.7,
+    "side_wall.pressure": 1.4,
+}
 """First start of the fit of all effects together: they help only jointly, and one by one may lead elsewhere."""
 
 
@@ -191,8 +207,9 @@ class Model:
                 last[u.tobytes()] = self.linear(u)
             return last[u.tobytes()]
 
-        found = least_squares(lambda u: both(u)[0], start, lambda u: both(u)[1], (low, high), x_scale=1.0,
-                              max_nfev=evaluations, ftol=1e-4)  # fmt: skip
+        found = least_squares(
+            lambda u: both(u)[0], start, lambda u: both(u)[1], (low, high), x_scale=1.0, max_nfev=evaluations, ftol=1e-4
+        )
         return found.x, float(2.0 * found.cost), int(found.nfev)
 
 
@@ -212,10 +229,20 @@ def row(bench: Bench, name: str, effects: Sequence[str], model: Model, u: np.nda
         for f, x, a, b in zip(model.free, u, low, high, strict=True)
         if x < a + 1e-3 or x > b - 1e-3
     ]
-    found = {"model": name, "effects": list(effects), "free_parameters": len(u), "values": flat(values), "at_bound": at,
-             **bench.errors(bench.residuals(values)), **more}  # fmt: skip
-    print(f"{name:44} fitted {found['fitted']:6.2f}  inside {found['inside']:6.2f}  75 deg {found['extrapolated']:6.2f}"
-          f"  together {found['held_out']:6.2f}", flush=True)  # fmt: skip
+    found = {
+        "model": name,
+        "effects": list(effects),
+        "free_parameters": len(u),
+        "values": flat(values),
+        "at_bound": at,
+        **bench.errors(bench.residuals(values)),
+        **more,
+    }
+    print(
+        f"{name:44} fitted {found['fitted']:6.2f}  inside {found['inside']:6.2f}  75 deg {found['extrapolated']:6.2f}"
+        f"  together {found['held_out']:6.2f}",
+        flush=True,
+    )
     return found
 
 
@@ -226,9 +253,16 @@ def presets() -> list[dict[str, Any]]:
     for preset, case in (("paper", "paper, soil and contact"), ("consistent", "consistent, soil")):
         r = next(r for r in kept if r["name"] == case)
         for name, e in ((preset, r["nominal"]), (f"{preset}, refitted", r)):
-            rows.append({"model": name, "effects": [], "fitted": e["fitted"], "inside": e["inside"],
-                         "held_out": e["held_out"],
-                         "extrapolated": e.get("beyond", float("nan"))})  # fmt: skip
+            rows.append(
+                {
+                    "model": name,
+                    "effects": [],
+                    "fitted": e["fitted"],
+                    "inside": e["inside"],
+                    "held_out": e["held_out"],
+                    "extrapolated": e.get("beyond", float("nan")),
+                }
+            )
             print(f"{name:44} fitted {e['fitted']:6.2f}  together {e['held_out']:6.2f}", flush=True)
     return rows
 
@@ -259,8 +293,16 @@ def together(bench: Bench, result: dict[str, Any], late: Callable[[], bool], sav
         save()
     best = min(fits, key=lambda f: f["chi2"])
     near = sum(f["chi2"] < best["chi2"] + AGREE for f in fits)
-    result["together"] = row(bench, "all together", list(EFFECTS), model, model.place(best["values"]),
-                             chi2=best["chi2"], starts=len(fits), agreeing=near)  # fmt: skip
+    result["together"] = row(
+        bench,
+        "all together",
+        list(EFFECTS),
+        model,
+        model.place(best["values"]),
+        chi2=best["chi2"],
+        starts=len(fits),
+        agreeing=near,
+    )
     save()
 
 
@@ -281,8 +323,9 @@ def climb(bench: Bench, result: dict[str, Any], late: Callable[[], bool], save: 
             grown = Model(bench, free_of([*added, best]))
             place, chi2, count = grown.fit(grown.place(ladder[-1]["values"]))
             if ladder[-1]["chi2"] - chi2 >= LEAST:
-                ladder.append(row(bench, f"+ {best}", [*added, best], grown, place, chi2=chi2, evaluations=count,
-                                  why=ranked))  # fmt: skip
+                ladder.append(
+                    row(bench, f"+ {best}", [*added, best], grown, place, chi2=chi2, evaluations=count, why=ranked)
+                )
                 break
         else:
             result["finished"] = ranked
@@ -309,12 +352,23 @@ def unknown(result: Mapping[str, Any], most: int = 5) -> dict[str, Any]:
         t, grown = library[name], Model(bench, [*model.free, *free[name]])
         place, better, _ = grown.fit(grown.place(flat(model.values(u))))
         found = row(bench, f"+ {t.target}: {t.formula}", [*last["effects"], name], grown, place, chi2=better)
-        suggestions.append({"port": t.port, "target": t.target, "formula": t.formula, "unit": t.unit,
-                            "amount": found["values"][f"{name}.amount"], "score": ranked[name],
-                            **{k: v for k, v in found.items() if k not in ("effects", "model")}})  # fmt: skip
+        suggestions.append(
+            {
+                "port": t.port,
+                "target": t.target,
+                "formula": t.formula,
+                "unit": t.unit,
+                "amount": found["values"][f"{name}.amount"],
+                "score": ranked[name],
+                **{k: v for k, v in found.items() if k not in ("effects", "model")},
+            }
+        )
     listed = {f"{library[n].target}: {library[n].formula}": v for n, v in ranked.items()}
-    return {"of": base, "suggestions": sorted(suggestions, key=lambda r: r["chi2"]),
-            "scored": dict(sorted(listed.items(), key=lambda r: -r[1]))}  # fmt: skip
+    return {
+        "of": base,
+        "suggestions": sorted(suggestions, key=lambda r: r["chi2"]),
+        "scored": dict(sorted(listed.items(), key=lambda r: -r[1])),
+    }
 
 
 def draw(result: Mapping[str, Any]) -> None:

@@ -19,17 +19,35 @@ from rl_common import Clock, save, say
 from rl_large import DURING, FINAL, percent, training_of
 
 PPO = {
-    "num_envs": 8192, "unroll_length": 24, "batch_size": 2048, "num_minibatches": 4, "num_updates_per_batch": 5,
-    "learning_rate": 3e-4, "learning_rate_schedule": "ADAPTIVE_KL", "desired_kl": 0.01, "entropy_cost": 0.005,
-    "discounting": 0.995, "gae_lambda": 0.95, "clipping_epsilon": 0.2, "max_grad_norm": 1.0, "reward_scaling": 0.01,
+    "num_envs": 8192,
+    "unroll_length": 24,
+    "batch_size": 2048,
+    "num_minibatches": 4,
+    "num_updates_per_batch": 5,
+    "learning_rate": 3e-4,
+    "learning_rate_schedule": "ADAPTIVE_KL",
+    "desired_kl": 0.01,
+    "entropy_cost": 0.005,
+    "discounting": 0.995,
+    "gae_lambda": 0.95,
+    "clipping_epsilon": 0.2,
+    "max_grad_norm": 1.0,
+    "reward_scaling": 0.01,
     "normalize_observations": True,
-}  # fmt: skip
+}
 """As rovers and legged robots are commonly trained by the thousand (Rudin et al. 2022)."""
 SAC = {
-    "num_envs": 8192, "batch_size": 8192, "grad_updates_per_step": 8, "learning_rate": 3e-4, "discounting": 0.995,
-    "tau": 0.05, "reward_scaling": 0.1, "min_replay_size": 8192 * 16, "max_replay_size": 8192 * 128,
+    "num_envs": 8192,
+    "batch_size": 8192,
+    "grad_updates_per_step": 8,
+    "learning_rate": 3e-4,
+    "discounting": 0.995,
+    "tau": 0.05,
+    "reward_scaling": 0.1,
+    "min_replay_size": 8192 * 16,
+    "max_replay_size": 8192 * 128,
     "normalize_observations": True,
-}  # fmt: skip
+}
 LAYERS = (512, 256, 128)
 PER_EPOCH = {"ppo": 40, "sac": 300}
 """Training steps between two scores."""
@@ -49,8 +67,11 @@ def prepare() -> None:
     try:
         import orbax.checkpoint  # noqa: F401
     except ImportError:
-        for name in ("brax.training.checkpoint", "brax.training.agents.ppo.checkpoint",
-                     "brax.training.agents.sac.checkpoint"):  # fmt: skip
+        for name in (
+            "brax.training.checkpoint",
+            "brax.training.agents.ppo.checkpoint",
+            "brax.training.agents.sac.checkpoint",
+        ):
             sys.modules[name] = types.ModuleType(name)
 
 
@@ -78,8 +99,16 @@ class Watch:
 class Training:
     """One training: what is called after every epoch, and what it came to."""
 
-    def __init__(self, name: str, env: Any, unseen: Any, episodes: int, seconds: float, target: float,
-                 keep: Callable[[dict[str, Any]], None]):  # fmt: skip
+    def __init__(
+        self,
+        name: str,
+        env: Any,
+        unseen: Any,
+        episodes: int,
+        seconds: float,
+        target: float,
+        keep: Callable[[dict[str, Any]], None],
+    ):
         self.name, self.target, self.keep = name, target, keep
         self.env, self.unseen, self.episodes = env, unseen, episodes
         self.clock = Clock(seconds)
@@ -105,8 +134,10 @@ class Training:
         self._compiling.join()
         score = self._judge(self.unseen, watch.params, DURING)
         self.rows.append({"steps": int(steps), "elapsed_s": self.elapsed(), **score.record()})
-        say(f"{self.name}: {self.elapsed():.1f} s, {int(steps):,} steps, unseen {percent(score.record())}, return "
-            f"{score.episode_return:.0f}")  # fmt: skip
+        say(
+            f"{self.name}: {self.elapsed():.1f} s, {int(steps):,} steps, unseen {percent(score.record())}, return "
+            f"{score.episode_return:.0f}"
+        )
         self.keep(self.record())
         if self.clock.left < 0.0:
             raise OutOfTime
@@ -121,9 +152,13 @@ class Training:
         times = [(min(rest) if rest else float("nan")) + sum(rest[:i]) for i in range(len(self.rows))]
         rows = [{**row, "elapsed_s": t} for row, t in zip(self.rows, times, strict=True)]
         reached = next((r for r in rows if r["success"] >= self.target), None)
-        return {"unseen": rows, "first_epoch_s": self.seconds[0] if self.seconds else None,
-                "seconds_to_target": reached and reached["elapsed_s"],
-                "steps_to_target": reached and reached["steps"], "process_s": self.clock.spent}  # fmt: skip
+        return {
+            "unseen": rows,
+            "first_epoch_s": self.seconds[0] if self.seconds else None,
+            "seconds_to_target": reached and reached["elapsed_s"],
+            "steps_to_target": reached and reached["steps"],
+            "process_s": self.clock.spent,
+        }
 
     def final(self) -> dict[str, Any]:
         """Score of the last parameters on the episodes of final scores."""
@@ -136,18 +171,37 @@ def run_ppo(env: Any, settings: dict[str, Any], seed: int, per_epoch: int, watch
     from brax.training.agents.ppo import train as ppo
 
     step = settings["batch_size"] * settings["num_minibatches"] * settings["unroll_length"]
-    run(ppo, env, settings, seed, per_epoch * step, watch,
-        functools.partial(networks.make_ppo_networks, policy_hidden_layer_sizes=LAYERS,
-                          value_hidden_layer_sizes=LAYERS))  # fmt: skip
+    run(
+        ppo,
+        env,
+        settings,
+        seed,
+        per_epoch * step,
+        watch,
+        functools.partial(
+            networks.make_ppo_networks, policy_hidden_layer_sizes=LAYERS, value_hidden_layer_sizes=LAYERS
+        ),
+    )
 
 
 def run_sac(env: Any, settings: dict[str, Any], seed: int, per_epoch: int, watch: Training) -> None:
     from brax.training.agents.sac import networks
     from brax.training.agents.sac import train as sac
 
-    run(sac, env, settings, seed, per_epoch * settings["num_envs"], watch,
-        functools.partial(networks.make_sac_networks, hidden_layer_sizes=LAYERS, policy_network_layer_norm=True,
-                          q_network_layer_norm=True))  # fmt: skip
+    run(
+        sac,
+        env,
+        settings,
+        seed,
+        per_epoch * settings["num_envs"],
+        watch,
+        functools.partial(
+            networks.make_sac_networks,
+            hidden_layer_sizes=LAYERS,
+            policy_network_layer_norm=True,
+            q_network_layer_norm=True,
+        ),
+    )
 
 
 def run(module: Any, env: Any, settings: dict[str, Any], seed: int, epoch: int, watch: Training, networks: Any) -> None:
@@ -159,10 +213,19 @@ def run(module: Any, env: Any, settings: dict[str, Any], seed: int, epoch: int, 
     acting.Evaluator = Watch  # pyright: ignore[reportAttributeAccessIssue]
     try:
         module.train(
-            BraxEnv(env), num_timesteps=epochs * epoch, num_evals=epochs + 1, episode_length=env.episode_steps,
-            wrap_env_fn=wrap, network_factory=networks, seed=seed, deterministic_eval=True, max_devices_per_host=1,
-            progress_fn=watch.progress, num_eval_envs=1, **settings,
-        )  # fmt: skip
+            BraxEnv(env),
+            num_timesteps=epochs * epoch,
+            num_evals=epochs + 1,
+            episode_length=env.episode_steps,
+            wrap_env_fn=wrap,
+            network_factory=networks,
+            seed=seed,
+            deterministic_eval=True,
+            max_devices_per_host=1,
+            progress_fn=watch.progress,
+            num_eval_envs=1,
+            **settings,
+        )
     except OutOfTime:
         pass
     finally:
@@ -182,8 +245,11 @@ def brax(args: argparse.Namespace, clock: Clock) -> None:
     for i, (name, settings, function) in enumerate((("ppo", PPO, run_ppo), ("sac", SAC, run_sac))):
         per_epoch = PER_EPOCH[name]
         if args.tiny:
-            small = {"num_envs": 64, "batch_size": 32, "unroll_length": 5, "num_minibatches": 2} if name == "ppo" else {
-                "num_envs": 64, "batch_size": 64, "min_replay_size": 128, "max_replay_size": 1024}  # fmt: skip
+            small = (
+                {"num_envs": 64, "batch_size": 32, "unroll_length": 5, "num_minibatches": 2}
+                if name == "ppo"
+                else {"num_envs": 64, "batch_size": 64, "min_replay_size": 128, "max_replay_size": 1024}
+            )
             settings, per_epoch = {**settings, **small}, 3
 
         def keep(record: dict[str, Any], name: str = name, settings: dict[str, Any] = settings) -> None:

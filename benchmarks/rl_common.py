@@ -29,8 +29,12 @@ def save(out: Path, name: str, record: dict[str, Any]) -> None:
 
     from lunar_mjx.agents.train import plain
 
-    about = {"device": jax.devices()[0].device_kind, "devices": jax.device_count(), "jax": jax.__version__,
-             "mujoco": mujoco.__version__}  # fmt: skip
+    about = {
+        "device": jax.devices()[0].device_kind,
+        "devices": jax.device_count(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+    }
     text = json.dumps(plain({"about": about, **record}), indent=None) + "\n"
     (out / f"rl_{name}.json").write_text(text, encoding="utf-8")
 

@@ -23,8 +23,14 @@ from lunar_mjx.agents.curves import mean_interval, new_figure
 from lunar_mjx.agents.policy import load_policy
 
 ROOT = Path(__file__).parents[1]
-TABLES = {"paper": more.table_paper, "rates": more.table_rates, "scaling": more.table_scaling,
-          "realism": more.table_realism, "brax": more.table_brax, "sb3": more.table_sb3}  # fmt: skip
+TABLES = {
+    "paper": more.table_paper,
+    "rates": more.table_rates,
+    "scaling": more.table_scaling,
+    "realism": more.table_realism,
+    "brax": more.table_brax,
+    "sb3": more.table_sb3,
+}
 PLOTS = {"paper": more.plot_paper, "rates": more.plot_rates, "realism": more.plot_realism}
 PARTS = tuple(TABLES)
 _LIMIT = 2_000_000
@@ -62,8 +68,14 @@ def plot_large(record: dict[str, Any], path: Path) -> None:
     figure, (left, right) = new_figure(2)
     for seed in record["seeds"]:
         found = seed["unseen"]
-        left.plot([s["elapsed_s"] for s in found], [100 * s["success"] for s in found], "o-", ms=3, lw=1,
-                  label=f"seed {seed['seed']}")  # fmt: skip
+        left.plot(
+            [s["elapsed_s"] for s in found],
+            [100 * s["success"] for s in found],
+            "o-",
+            ms=3,
+            lw=1,
+            label=f"seed {seed['seed']}",
+        )
         rows = [r for r in seed["rows"] if r.get("episode_return") is not None]
         right.plot([r["elapsed_s"] for r in rows], [r["episode_return"] for r in rows], lw=1)
     for style, (name, score) in zip(("--", "-.", ":", (0, (1, 4))), record["agents"].items(), strict=False):
@@ -82,8 +94,10 @@ def table_large(record: dict[str, Any]) -> list[str]:
     for seed in record["seeds"]:
         after = seed["seconds_to_target"]
         said = f"{after:.0f} s, {seed['steps_to_target'] / 1e6:.1f} M steps" if after else "not reached"
-        lines.append(f"  seed {seed['seed']}: final {percent(seed['final'])}; {100 * record['target']:.0f} % after "
-                     f"{said} (training {seed['train_s']:.0f} s)")  # fmt: skip
+        lines.append(
+            f"  seed {seed['seed']}: final {percent(seed['final'])}; {100 * record['target']:.0f} % after "
+            f"{said} (training {seed['train_s']:.0f} s)"
+        )
     times = [s["seconds_to_target"] for s in record["seeds"] if s["seconds_to_target"]]
     if len(times) > 1:
         mean, low, high = (float(a[0]) for a in mean_interval(np.array(times)[:, None].astype(float)))

@@ -35,8 +35,16 @@ def training_of(args: argparse.Namespace, more: list[str] | None = None) -> Any:
     if args.tiny:
         options |= {"terrain": "flat", "goal_distance": (2.0, 4.0), "episode_time": 10.0, "places": 256}
         unseen["terrain"] = "flat"
-        small = {"envs": 64, "batch": 256, "updates": 2, "actor_layers": (64, 64), "critic_layers": (64, 64),
-                 "atoms": 21, "epoch_steps": 25, "buffer_steps": 64}  # fmt: skip
+        small = {
+            "envs": 64,
+            "batch": 256,
+            "updates": 2,
+            "actor_layers": (64, 64),
+            "critic_layers": (64, 64),
+            "atoms": 21,
+            "epoch_steps": 25,
+            "buffer_steps": 64,
+        }
     training = override(training, **{**small, **pairs("--set", args.set), **pairs("--compare", more)})
     return dataclasses.replace(training, options={**options, **env_options(args.env)}, unseen=unseen)
 
@@ -94,9 +102,14 @@ def large(args: argparse.Namespace, clock: Clock) -> None:
         learners.append(Learner(env, training_of(args, args.compare).train))
     judge = Judge(learners[0], dict(training.unseen), 32 if args.tiny else 1024)
     record: dict[str, Any] = {
-        "rover": args.rover, "environment": environment, "train": dataclasses.asdict(training.train),
-        "compare": args.compare, "target": args.target, "setup_s": clock.spent, "seeds": [],
-    }  # fmt: skip
+        "rover": args.rover,
+        "environment": environment,
+        "train": dataclasses.asdict(training.train),
+        "compare": args.compare,
+        "target": args.target,
+        "setup_s": clock.spent,
+        "seeds": [],
+    }
     say(f"large: made in {clock.spent:.0f} s, observation {env.observation_size} + {env.privileged_size} numbers")
     record |= compile_all(learners, judge)
     policy = jax.device_get(learners[0].policy(learners[0].init(10_000)))
@@ -134,13 +147,16 @@ def compile_all(learners: list[Any], judge: Judge) -> dict[str, float]:
         epochs = [w.result() for w in waits]
         seconds = {"compile_epoch_s": epochs[0], "compile_score_s": score.result(), "compile_all_s": 0.0}
     seconds["compile_all_s"] = time.monotonic() - begin
-    say(f"large: compiled in {seconds['compile_all_s']:.0f} s, side by side: training {[round(e) for e in epochs]} s, "
-        f"scores {seconds['compile_score_s']:.0f} s")  # fmt: skip
+    say(
+        f"large: compiled in {seconds['compile_all_s']:.0f} s, side by side: training {[round(e) for e in epochs]} s, "
+        f"scores {seconds['compile_score_s']:.0f} s"
+    )
     return seconds
 
 
-def one_run(args: Any, clock: Clock, record: dict[str, Any], judge: Judge, learner: Any, which: int, seed: int,
-            kept: float) -> tuple[float, Any]:  # fmt: skip
+def one_run(
+    args: Any, clock: Clock, record: dict[str, Any], judge: Judge, learner: Any, which: int, seed: int, kept: float
+) -> tuple[float, Any]:
     """Trains one seed; keeps its best policy if none before was better; returns the best score and the last state."""
     import jax
 
@@ -160,15 +176,20 @@ def one_run(args: Any, clock: Clock, record: dict[str, Any], judge: Judge, learn
         policy = jax.device_get(learner.policy(state))
         unseen, seen = judge.score(policy, DURING), judge.score(policy, DURING, "train")
         scores.append({"steps": row["steps"], "elapsed_s": row["elapsed_s"], **unseen.record(), "train": seen.record()})
-        say(f"{label}: {row['elapsed_s']:.1f} s, {row['steps']:,} steps, {row['steps_per_s']:,.0f} steps/s, unseen "
+        say(
+            f"{label}: {row['elapsed_s']:.1f} s, {row['steps']:,} steps, {row['steps_per_s']:,.0f} steps/s, unseen "
             f"{100 * unseen.success:.1f} %, trained ground {100 * seen.success:.1f} %, ends {short(unseen.ends)}, "
             f"return {unseen.episode_return:.0f}; while training: success {row['success']:.3f}, return "
             f"{row['episode_return']:.0f}, reward {row['reward']:.3f}, critic {row['target']:.2f} "
             f"({row['target_low']:.2f} to {row['target_high']:.2f}), losses {row['critic_loss']:.3f} "
-            f"{row['actor_loss']:.3f}")  # fmt: skip
+            f"{row['actor_loss']:.3f}"
+        )
         if seen.success >= best[0]:
-            best = (seen.success, policy, {"steps": row["steps"], "elapsed_s": row["elapsed_s"],
-                                           "train_score": seen.record()})  # fmt: skip
+            best = (
+                seen.success,
+                policy,
+                {"steps": row["steps"], "elapsed_s": row["elapsed_s"], "train_score": seen.record()},
+            )
             if seen.success > kept:
                 notes = {"seed": seed, "train": record["train"], "compare": args.compare if which else [], **best[2]}
                 save_policy(policy_of(learner, state, record["environment"], notes), path)
@@ -179,15 +200,27 @@ def one_run(args: Any, clock: Clock, record: dict[str, Any], judge: Judge, learn
     final = judge.score(last, FINAL)
     chosen = final if best[1] is None else judge.score(best[1], FINAL)
     reached = next((s for s in scores if s["success"] >= args.target), None)
-    record["seeds"].append({
-        "seed": seed, "compared": bool(which), "rows": result.rows, "unseen": scores, "last": final.record(),
-        "final": chosen.record(), "kept": best[2], "train_s": result.rows[-1]["elapsed_s"],
-        "steps": result.rows[-1]["steps"], "seconds_to_target": reached and reached["elapsed_s"],
-        "steps_to_target": reached and reached["steps"], "process_s": time.monotonic() - begin,
-    })  # fmt: skip
-    say(f"{label}: kept policy (trained ground {100 * best[0]:.1f} %) {percent(chosen.record())} of {chosen.episodes} "
+    record["seeds"].append(
+        {
+            "seed": seed,
+            "compared": bool(which),
+            "rows": result.rows,
+            "unseen": scores,
+            "last": final.record(),
+            "final": chosen.record(),
+            "kept": best[2],
+            "train_s": result.rows[-1]["elapsed_s"],
+            "steps": result.rows[-1]["steps"],
+            "seconds_to_target": reached and reached["elapsed_s"],
+            "steps_to_target": reached and reached["steps"],
+            "process_s": time.monotonic() - begin,
+        }
+    )
+    say(
+        f"{label}: kept policy (trained ground {100 * best[0]:.1f} %) {percent(chosen.record())} of {chosen.episodes} "
         f"unseen, last policy {percent(final.record())}; {100 * args.target:.0f} % after "
-        f"{reached and round(reached['elapsed_s'], 1)} s of training")  # fmt: skip
+        f"{reached and round(reached['elapsed_s'], 1)} s of training"
+    )
     save(args.out, "large", record)
     return max(kept, best[0]), result.state
 

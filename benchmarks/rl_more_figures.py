@@ -26,8 +26,9 @@ def percent(score: dict[str, Any]) -> str:
 def variants(record: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any]]]]:
     """Runs by variant and algorithm, the main variant first."""
     found = {record["variant"]: record["runs"], **{v: other["runs"] for v, other in record["others"].items()}}
-    return {v: {n.removeprefix("paper-").upper(): runs for n, runs in groups.items() if runs}
-            for v, groups in found.items()}  # fmt: skip
+    return {
+        v: {n.removeprefix("paper-").upper(): runs for n, runs in groups.items() if runs} for v, groups in found.items()
+    }
 
 
 def first_good(run: dict[str, Any], share: float = 0.9) -> int | None:
@@ -68,9 +69,11 @@ def table_paper(record: dict[str, Any]) -> list[str]:
         for name, runs in algorithms.items():
             last = [round(float(np.mean(r["episodes"]["success"][-LAST:])), 2) for r in runs]
             returns = [round(float(np.mean(r["episodes"]["episode_return"][-LAST:]))) for r in runs]
-            lines.append(f"  {variant}, {name}: steps {[r['steps'] for r in runs]}, episodes "
-                         f"{[len(r['episodes']['success']) for r in runs]}, last {LAST}: success {last}, return "
-                         f"{returns}; 90 % of 20 first at episode {[first_good(r) for r in runs]}")  # fmt: skip
+            lines.append(
+                f"  {variant}, {name}: steps {[r['steps'] for r in runs]}, episodes "
+                f"{[len(r['episodes']['success']) for r in runs]}, last {LAST}: success {last}, return "
+                f"{returns}; 90 % of 20 first at episode {[first_good(r) for r in runs]}"
+            )
     return lines
 
 
@@ -79,8 +82,10 @@ def table_paper(record: dict[str, Any]) -> list[str]:
 
 def plot_rates(record: dict[str, Any], path: Path) -> None:
     """Environment steps per second against the bare physics, over the number of rovers, at decimation 5."""
-    rows = sorted((r for r in record["rows"] if r["decimation"] == 5 and r["observation"] == "17 numbers"),
-                  key=lambda r: r["rovers"])  # fmt: skip
+    rows = sorted(
+        (r for r in record["rows"] if r["decimation"] == 5 and r["observation"] == "17 numbers"),
+        key=lambda r: r["rovers"],
+    )
     figure, (left, right) = new_figure(2)
     at = [r["rovers"] for r in rows]
     left.loglog(at, [r["bare_steps_per_s"] / 1e6 for r in rows], "s--", ms=4, color="0.5", label="bare physics")
@@ -100,17 +105,22 @@ def table_rates(record: dict[str, Any]) -> list[str]:
     lines = [f"Environment steps per second, {record['rover']}, {record['about']['device']}:"]
     for r in record["rows"]:
         held = r["state_bytes_per_rover"] + r["temporary_bytes_per_rover"]
-        lines.append(f"  {r['observation']:17s} decimation {r['decimation']:3d} rovers {r['rovers']:7,d} "
-                     f"{r['env_steps_per_s'] / 1e6:6.2f} M/s, bare {r['bare_steps_per_s'] / 1e6:6.2f} M/s, "
-                     f"ratio {r['ratio']:.3f}, {held / 1e3:.1f} kB a rover "
-                     f"({r['state_bytes_per_rover'] / 1e3:.1f} kept)")  # fmt: skip
+        lines.append(
+            f"  {r['observation']:17s} decimation {r['decimation']:3d} rovers {r['rovers']:7,d} "
+            f"{r['env_steps_per_s'] / 1e6:6.2f} M/s, bare {r['bare_steps_per_s'] / 1e6:6.2f} M/s, "
+            f"ratio {r['ratio']:.3f}, {held / 1e3:.1f} kB a rover "
+            f"({r['state_bytes_per_rover'] / 1e3:.1f} kept)"
+        )
     return lines
 
 
 def table_scaling(record: dict[str, Any]) -> list[str]:
     lines = [f"Whole training on several devices, {record['rover']}, {record['about']['device']}:"]
-    return lines + [f"  {r['devices']} devices {r['steps_per_s']:,.0f} steps/s, {r['updates_per_s']:.0f} updates/s, "
-                    f"efficiency {r['efficiency']:.3f}" for r in record["rows"]]  # fmt: skip
+    return lines + [
+        f"  {r['devices']} devices {r['steps_per_s']:,.0f} steps/s, {r['updates_per_s']:.0f} updates/s, "
+        f"efficiency {r['efficiency']:.3f}"
+        for r in record["rows"]
+    ]
 
 
 # What realism is worth
@@ -152,8 +162,15 @@ def plot_realism(record: dict[str, Any], path: Path) -> None:
             axes.barh(at, share, left=bottom, height=0.55, label=reason.replace("_", " "))
             bottom += share
     fails = np.array([[100 * (1 - c["success"]), 100 * (1 - c["high"]), 100 * (1 - c["low"])] for c in cells.values()])
-    axes.errorbar(fails[:, 0], at, xerr=[fails[:, 0] - fails[:, 1], fails[:, 2] - fails[:, 0]], fmt="none", ecolor="k",
-                  capsize=3, lw=1)  # fmt: skip
+    axes.errorbar(
+        fails[:, 0],
+        at,
+        xerr=[fails[:, 0] - fails[:, 1], fails[:, 2] - fails[:, 0]],
+        fmt="none",
+        ecolor="k",
+        capsize=3,
+        lw=1,
+    )
     labels = [f"trained {trained},\ntested {tested} the effects" for trained, tested in cells]
     axes.set_yticks(at, labels, fontsize=8)
     axes.invert_yaxis()
@@ -184,10 +201,12 @@ def table_brax(record: dict[str, Any]) -> list[str]:
         after = run["seconds_to_target"]
         said = f"{after:.0f} s, {run['steps_to_target'] / 1e6:.1f} M steps" if after else "not reached"
         last = run["unseen"][-1]
-        lines.append(f"  {name}: {100 * record['target']:.0f} % after {said}; best {percent(best)} after "
-                     f"{best['elapsed_s']:.0f} s, {best['steps'] / 1e6:.1f} M steps; last "
-                     f"{percent(run.get('final', last))} after {last['elapsed_s']:.0f} s, {last['steps'] / 1e6:.1f} M "
-                     "steps")  # fmt: skip
+        lines.append(
+            f"  {name}: {100 * record['target']:.0f} % after {said}; best {percent(best)} after "
+            f"{best['elapsed_s']:.0f} s, {best['steps'] / 1e6:.1f} M steps; last "
+            f"{percent(run.get('final', last))} after {last['elapsed_s']:.0f} s, {last['steps'] / 1e6:.1f} M "
+            "steps"
+        )
     return lines
 
 
@@ -196,8 +215,10 @@ def table_sb3(record: dict[str, Any]) -> list[str]:
     ends: dict[str, int] = {}
     for e in episodes:
         ends[e["end"]] = ends.get(e["end"], 0) + 1
-    lines = [f"SB3 TD3 on PyBullet, one rover: {record['steps']:,} steps, {len(episodes)} episodes in "
-             f"{record['cpu_s'] / 60:.0f} min of CPU time, ends {ends}"]  # fmt: skip
+    lines = [
+        f"SB3 TD3 on PyBullet, one rover: {record['steps']:,} steps, {len(episodes)} episodes in "
+        f"{record['cpu_s'] / 60:.0f} min of CPU time, ends {ends}"
+    ]
     if "final" in record:
         final = record["final"]
         ended = {k: round(v, 3) for k, v in final["ends"].items() if v}
@@ -215,10 +236,23 @@ def plot_learners(large: dict[str, Any] | None, brax: dict[str, Any] | None, pat
     for label, found, colour in lines:
         for axes, x, unit in ((left, "elapsed_s", 1.0), (right, "steps", 1e6)):
             places = [s[x] / unit if s[x] is not None else np.nan for s in found]
-            axes.plot(places, [100 * s["success"] for s in found], "o-", ms=2.5, lw=1, color=colour,
-                      label=None if label in named else label)  # fmt: skip
-            axes.fill_between(places, [100 * s["low"] for s in found], [100 * s["high"] for s in found], color=colour,
-                              alpha=0.15, lw=0)  # fmt: skip
+            axes.plot(
+                places,
+                [100 * s["success"] for s in found],
+                "o-",
+                ms=2.5,
+                lw=1,
+                color=colour,
+                label=None if label in named else label,
+            )
+            axes.fill_between(
+                places,
+                [100 * s["low"] for s in found],
+                [100 * s["high"] for s in found],
+                color=colour,
+                alpha=0.15,
+                lw=0,
+            )
         named.add(label)
     left.set(xlabel="s of training", xscale="log", ylabel="success on unseen ground, %", ylim=(-3, 103))
     right.set(xlabel="million environment steps", xscale="log", ylim=(-3, 103))

@@ -15,8 +15,17 @@ from typing import Any
 
 TRAININGS = ("paper-td3", "paper-ddpg")
 _SIGNED = {"task": "consistent", "places": 1, "decimation": 100}
-_STEADY = {"reward_scale": 0.01, "layer_norm": True, "n_step": 3, "actor_rate": 3e-4, "actor_layers": (256, 128),
-           "critic_layers": (256, 128), "batch": 128, "buffer_steps": 60_000, "value_range": (-7.0, 6.2)}  # fmt: skip
+_STEADY = {
+    "reward_scale": 0.01,
+    "layer_norm": True,
+    "n_step": 3,
+    "actor_rate": 3e-4,
+    "actor_layers": (256, 128),
+    "critic_layers": (256, 128),
+    "batch": 128,
+    "buffer_steps": 60_000,
+    "value_range": (-7.0, 6.2),
+}
 VARIANTS: dict[str, tuple[int, dict[str, Any], dict[str, Any], tuple[str, ...]]] = {
     "signed": (5, _SIGNED, {}, TRAININGS),
     "printed": (5, {"places": 1}, {}, TRAININGS),
@@ -24,13 +33,12 @@ VARIANTS: dict[str, tuple[int, dict[str, Any], dict[str, Any], tuple[str, ...]]]
     "scaled": (5, _SIGNED, {"reward_scale": 0.01}, TRAININGS),
     "slow actor": (4, _SIGNED, {"actor_rate": 1e-4}, TRAININGS[1:]),
     "scaled, slow actor": (4, _SIGNED, {"reward_scale": 0.01, "actor_rate": 1e-4}, TRAININGS[1:]),
-    "scaled, layer norm, 3 steps": (4, _SIGNED, {"reward_scale": 0.01, "layer_norm": True, "n_step": 3},
-                                    TRAININGS[1:]),
+    "scaled, layer norm, 3 steps": (4, _SIGNED, {"reward_scale": 0.01, "layer_norm": True, "n_step": 3}, TRAININGS[1:]),
     "steady": (5, _SIGNED, {**_STEADY, "gamma": 0.95}, TRAININGS),
     "steady, discount 0.99": (3, _SIGNED, _STEADY, TRAININGS[1:]),
     "scaled, discount 0.95": (3, _SIGNED, {"reward_scale": 0.01, "gamma": 0.95, "buffer_steps": 60_000}, TRAININGS[1:]),
     "ahead": (4, {**_SIGNED, "start_yaw": 0.5}, {}, TRAININGS[1:]),
-}  # fmt: skip
+}
 """Seeds, options of the environment, settings of the training, and the algorithms. `signed`: progress with its sign,
 one predefined start and destination as in section V, acted on at 5 Hz. `printed`: the reward as printed, likewise, at
 the task's 10 Hz; at 5 Hz and a discount of 0.99 driving on for ever would be worth more than arriving. `drawn`: start
@@ -49,20 +57,44 @@ def paper_start(args: argparse.Namespace, seconds: float) -> list[dict[str, Any]
     """Starts one process per algorithm and seed, each on a core of its own; returns them."""
     folder = Path(tempfile.mkdtemp(prefix="rl_paper_"))
     cores = sorted(os.sched_getaffinity(0))
-    jobs = [(variant, training, seed) for variant in args.variants for seed in range(VARIANTS[variant][0])
-            for training in VARIANTS[variant][3]]  # fmt: skip
+    jobs = [
+        (variant, training, seed)
+        for variant in args.variants
+        for seed in range(VARIANTS[variant][0])
+        for training in VARIANTS[variant][3]
+    ]
     jobs = jobs[:2] if args.tiny else jobs
     # two cores are left to the process that drives the GPU
     free = cores[2:] if args.part == "all" and len(cores) > 2 else cores
     jobs = jobs[: max(2, len(free))]
-    env = {**os.environ, "JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "",
-           "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}  # fmt: skip
+    env = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "CUDA_VISIBLE_DEVICES": "",
+        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    }
     children = []
     for i, (variant, training, seed) in enumerate(jobs):
         out = folder / f"{list(VARIANTS).index(variant)}_{training}_{seed}"
-        line = [sys.executable, str(Path(__file__).with_name("rl_proof.py")), "--part", "paper-child", "--training",
-                training, "--first-seed", seed, "--seconds", seconds, "--out", out, "--core", free[i % len(free)],
-                "--variants", variant, *(["--tiny"] if args.tiny else [])]  # fmt: skip
+        line = [
+            sys.executable,
+            str(Path(__file__).with_name("rl_proof.py")),
+            "--part",
+            "paper-child",
+            "--training",
+            training,
+            "--first-seed",
+            seed,
+            "--seconds",
+            seconds,
+            "--out",
+            out,
+            "--core",
+            free[i % len(free)],
+            "--variants",
+            variant,
+            *(["--tiny"] if args.tiny else []),
+        ]
         log = out.with_suffix(".log").open("w")
         process = subprocess.Popen([str(a) for a in line], env=env, stdout=log, stderr=log)
         children.append(
@@ -92,11 +124,16 @@ def paper_child(args: argparse.Namespace) -> None:
     learner = Learner(make(training.environment, **options), training.train)
     seeds = range(args.first_seed, args.first_seed + args.together)
     records: list[dict[str, Any]] = [
-        {"seed": seed, "train": plain(dataclasses.asdict(training.train)), "environment": plain(options),
-         "episodes": {name: [] for name in (*EPISODE, "step")}, "critic": {"step": [], "target": [], "loss": []},
-         "without_noise": {"step": [], "success": []}}
+        {
+            "seed": seed,
+            "train": plain(dataclasses.asdict(training.train)),
+            "environment": plain(options),
+            "episodes": {name: [] for name in (*EPISODE, "step")},
+            "critic": {"step": [], "target": [], "loss": []},
+            "without_noise": {"step": [], "success": []},
+        }
         for seed in seeds
-    ]  # fmt: skip
+    ]
     # all seeds in one program, each with everything of its own
     epoch: Any = jax.jit(jax.vmap(learner._epoch, in_axes=(None, 0)), donate_argnums=1)
     state = jax.jit(jax.vmap(learner._init))(jnp.stack([jax.random.PRNGKey(seed) for seed in seeds]))
@@ -174,14 +211,20 @@ def paper_merge(children: list[dict[str, Any]], seconds: float) -> dict[str, Any
             group = runs.setdefault(child["variant"], {}).setdefault(child["training"], [])
             group += json.loads(path.read_text(encoding="utf-8"))
         else:
-            print(f"paper: {what} seed {child['seed']} left nothing: "
-                  f"{Path(child['log'].name).read_text(encoding='utf-8')[-600:]}", flush=True)  # fmt: skip
+            print(
+                f"paper: {what} seed {child['seed']} left nothing: "
+                f"{Path(child['log'].name).read_text(encoding='utf-8')[-600:]}",
+                flush=True,
+            )
     for variant, groups in runs.items():
         for name, found in groups.items():
             lasts = [r["episodes"]["success"][-50:] for r in found]
-            print(f"paper: {variant}, {name}: steps {[r['steps'] for r in found]}, episodes "
-                  f"{[len(r['episodes']['success']) for r in found]}, success of the last 50 "
-                  f"{[round(sum(last) / max(1, len(last)), 2) for last in lasts]}", flush=True)  # fmt: skip
+            print(
+                f"paper: {variant}, {name}: steps {[r['steps'] for r in found]}, episodes "
+                f"{[len(r['episodes']['success']) for r in found]}, success of the last 50 "
+                f"{[round(sum(last) / max(1, len(last)), 2) for last in lasts]}",
+                flush=True,
+            )
     about = {v: {"options": VARIANTS[v][1], "settings": VARIANTS[v][2]} for v in (MAIN, *runs)}
     others = {v: {**about[v], "runs": found} for v, found in runs.items() if v != MAIN}
     return {"variant": MAIN, **about[MAIN], "runs": runs.get(MAIN, {}), "others": others}

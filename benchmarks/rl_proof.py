@@ -29,8 +29,15 @@ from rl_large import large, training_of
 from rl_paper import DEFAULT, VARIANTS, paper_child, paper_merge, paper_start
 from rl_realism import realism
 
-PERIOD = {"all": 535.0, "large": 300.0, "rates": 200.0, "paper": 400.0, "scaling": 150.0,
-          "brax": 340.0, "realism": 300.0}  # fmt: skip
+PERIOD = {
+    "all": 535.0,
+    "large": 300.0,
+    "rates": 200.0,
+    "paper": 400.0,
+    "scaling": 150.0,
+    "brax": 340.0,
+    "realism": 300.0,
+}
 """s that each part may take."""
 
 
@@ -44,10 +51,20 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
 
     ground = {"terrain": "flat", "goal_distance": (2.0, 4.0), "places": 256} if args.tiny else {}
     few = {"observations": PAPER_OBSERVATION, "privileged": ()}
-    plan = [("17 numbers", 5, 65536), ("all observations", 50, 65536), ("17 numbers", 5, 1024),
-            ("17 numbers", 5, 2048), ("17 numbers", 5, 4096), ("17 numbers", 5, 8192), ("17 numbers", 5, 16384),
-            ("17 numbers", 5, 32768), ("17 numbers", 50, 65536),
-            ("all observations", 5, 65536), ("all observations", 50, 4096), ("17 numbers", 5, 262144)]  # fmt: skip
+    plan = [
+        ("17 numbers", 5, 65536),
+        ("all observations", 50, 65536),
+        ("17 numbers", 5, 1024),
+        ("17 numbers", 5, 2048),
+        ("17 numbers", 5, 4096),
+        ("17 numbers", 5, 8192),
+        ("17 numbers", 5, 16384),
+        ("17 numbers", 5, 32768),
+        ("17 numbers", 50, 65536),
+        ("all observations", 5, 65536),
+        ("all observations", 50, 4096),
+        ("17 numbers", 5, 262144),
+    ]
     plan = [row for row in plan if args.rows is None or f"{row[0][:2]}/{row[1]}/{row[2]}" in args.rows]
     plan = [("17 numbers", 5, 8)] if args.tiny else plan
     made: dict[tuple[str, int], Any] = {}
@@ -56,8 +73,10 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
         if (label, decimation) not in made:
             made[label, decimation] = make_navigation("large", args.rover, **options)
     with ThreadPoolExecutor(8) as pool:
-        waits = [pool.submit(Rate, made[label, decimation], size, 4 if args.tiny else max(20, 1000 // decimation))
-                 for label, decimation, size in plan]  # fmt: skip
+        waits = [
+            pool.submit(Rate, made[label, decimation], size, 4 if args.tiny else max(20, 1000 // decimation))
+            for label, decimation, size in plan
+        ]
         ready = [w.result() for w in waits]
     say(f"rates: {len(ready)} rows compiled after {clock.spent:.0f} s")
     wait(args, clock)
@@ -68,9 +87,11 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
             return
         row = rate.measure(1 if args.tiny else 5)
         rows.append({"observation": label, "decimation": decimation, "rovers": size, **row})
-        say(f"rates: {label}, decimation {decimation}, {size:,} rovers: "
+        say(
+            f"rates: {label}, decimation {decimation}, {size:,} rovers: "
             f"{row['env_steps_per_s']:,.0f} environment steps/s, bare physics {row['bare_steps_per_s']:,.0f}, "
-            f"ratio {row['ratio']:.3f}")  # fmt: skip
+            f"ratio {row['ratio']:.3f}"
+        )
         save(args.out, "rates", {"rover": args.rover, "rows": rows})
 
 
@@ -169,8 +190,9 @@ def scaling(args: argparse.Namespace, clock: Clock) -> None:
     counts = [2**i for i in range(jax.device_count().bit_length())]
     learners = {}
     for count in counts:
-        config = dataclasses.replace(training.train, envs=training.train.envs * count,
-                                     batch=training.train.batch * count)  # fmt: skip
+        config = dataclasses.replace(
+            training.train, envs=training.train.envs * count, batch=training.train.batch * count
+        )
         learners[count] = Learner(env, config, Mesh(np.array(jax.devices()[:count]), (AXIS,)))
     with ThreadPoolExecutor() as pool:
         list(pool.map(lambda learner: learner.compile(), learners.values()))
@@ -187,8 +209,14 @@ def scaling(args: argparse.Namespace, clock: Clock) -> None:
             if i:
                 best = min(best, time.monotonic() - begin)
         rate = config.envs * config.epoch_steps / best
-        rows.append({"devices": count, "steps_per_s": rate, "updates_per_s": config.updates * config.epoch_steps / best,
-                     "efficiency": rate / count / (rows[0]["steps_per_s"] if rows else rate)})  # fmt: skip
+        rows.append(
+            {
+                "devices": count,
+                "steps_per_s": rate,
+                "updates_per_s": config.updates * config.epoch_steps / best,
+                "efficiency": rate / count / (rows[0]["steps_per_s"] if rows else rate),
+            }
+        )
         say(f"scaling: {count} devices, {rate:,.0f} steps/s, efficiency {rows[-1]['efficiency']:.3f}")
         save(args.out, "scaling", {"rover": args.rover, "rows": rows})
         del state
@@ -206,8 +234,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2_000_000_000, help="most environment steps of a seed")
     parser.add_argument("--seed-seconds", type=float, default=150.0, help="most s of one seed of part large")
     parser.add_argument("--eval-every", type=float, default=15.0, help="s of training")
-    parser.add_argument("--compare", nargs="*", default=[], metavar="NAME=VALUE",
-                        help="other settings of part large, trained if the first miss the target")  # fmt: skip
+    parser.add_argument(
+        "--compare",
+        nargs="*",
+        default=[],
+        metavar="NAME=VALUE",
+        help="other settings of part large, trained if the first miss the target",
+    )
     parser.add_argument("--target", type=float, default=0.95)
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment")

@@ -16,8 +16,14 @@ from typing import Any
 from rl_common import Clock, save, say
 from rl_large import FINAL, percent, training_of
 
-THERMAL = ("thermal_cutoff", "winding_conduction", "rotor_stator_path", "housing_convection", "housing_conduction",
-           "housing_radiation")  # fmt: skip
+THERMAL = (
+    "thermal_cutoff",
+    "winding_conduction",
+    "rotor_stator_path",
+    "housing_convection",
+    "housing_conduction",
+    "housing_radiation",
+)
 STEPS = 10_000_000
 """Environment steps of each training: twice what the first score of 95 % takes."""
 
@@ -61,10 +67,13 @@ def realism(args: argparse.Namespace, clock: Clock) -> None:
             wait.result()
     say(f"realism: compiled in {time.monotonic() - begin:.0f} s")
     record: dict[str, Any] = {
-        "rover": args.rover, "environment": {"options": plain(dict(training.options)), "unseen": training.unseen},
-        "train": dataclasses.asdict(training.train), "effects": {n: e.model.effect_names for n, e in envs.items()},
-        "steps": 3200 if args.tiny else STEPS, "seeds": [],
-    }  # fmt: skip
+        "rover": args.rover,
+        "environment": {"options": plain(dict(training.options)), "unseen": training.unseen},
+        "train": dataclasses.asdict(training.train),
+        "effects": {n: e.model.effect_names for n, e in envs.items()},
+        "steps": 3200 if args.tiny else STEPS,
+        "seeds": [],
+    }
     longest = 0.0
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         for name, learner in learners.items():
@@ -78,10 +87,20 @@ def realism(args: argparse.Namespace, clock: Clock) -> None:
             policy = jax.device_get(learner.policy(result.state))
             scores = {where: judge(params[where], policy, FINAL).record() for where, judge in judges.items()}
             last = result.rows[-1]
-            record["seeds"].append({"seed": seed, "trained": name, "scores": scores, "train_s": last["elapsed_s"],
-                                    "steps": last["steps"], "episode_return": last["episode_return"]})  # fmt: skip
+            record["seeds"].append(
+                {
+                    "seed": seed,
+                    "trained": name,
+                    "scores": scores,
+                    "train_s": last["elapsed_s"],
+                    "steps": last["steps"],
+                    "episode_return": last["episode_return"],
+                }
+            )
             longest = max(longest, time.monotonic() - began)
-            say(f"realism: seed {seed}, trained {name} the effects for {last['elapsed_s']:.0f} s: "
-                + ", ".join(f"tested {where} them {percent(s)}" for where, s in scores.items()))  # fmt: skip
+            say(
+                f"realism: seed {seed}, trained {name} the effects for {last['elapsed_s']:.0f} s: "
+                + ", ".join(f"tested {where} them {percent(s)}" for where, s in scores.items())
+            )
             save(args.out, "realism", record)
             del result

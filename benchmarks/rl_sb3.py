@@ -89,9 +89,11 @@ class BulletNavigation(gym.Env):
         seen, now, old = self.backend.observe(), self.backend.state(), self._state.inner.physics
         single = jnp.float32
         warm = old.temperature.__class__(
-            jnp.asarray(now.winding_temperature - REFERENCE_TEMPERATURE, single), old.temperature.winding_lost,
-            jnp.asarray(now.housing_temperature - REFERENCE_TEMPERATURE, single), old.temperature.housing_lost,
-        )  # fmt: skip
+            jnp.asarray(now.winding_temperature - REFERENCE_TEMPERATURE, single),
+            old.temperature.winding_lost,
+            jnp.asarray(now.housing_temperature - REFERENCE_TEMPERATURE, single),
+            old.temperature.housing_lost,
+        )
         physics = old.__class__(
             old.step, jnp.asarray(now.qpos, single), jnp.asarray(now.qvel, single), warm, old.effects
         )
@@ -99,8 +101,13 @@ class BulletNavigation(gym.Env):
         self._state = self._step(self.env.params, self._state, action, driven)
         state = jax.device_get(self._state)
         metrics = {k: float(v[0]) for k, v in state.metrics.items() if not k.startswith("reward_")}
-        return (np.asarray(state.final_obs[0], np.float32), float(state.reward[0]), bool(state.terminated[0]),
-                bool(state.truncated[0]), metrics)  # fmt: skip
+        return (
+            np.asarray(state.final_obs[0], np.float32),
+            float(state.reward[0]),
+            bool(state.terminated[0]),
+            bool(state.truncated[0]),
+            metrics,
+        )
 
 
 def make_recorder(args: argparse.Namespace, env: BulletNavigation, record: dict[str, Any]) -> Any:
@@ -117,10 +124,17 @@ def make_recorder(args: argparse.Namespace, env: BulletNavigation, record: dict[
             cpu, wall = time.process_time(), time.monotonic() - begin
             if self.locals["dones"][0]:
                 end = next((e for e in ENDS if info.get(e if e != "reached" else "success", 0.0) > 0.0), "time")
-                record["episodes"].append({
-                    "step": self.num_timesteps, "cpu_s": cpu, "wall_s": wall, "return": info["episode_return"],
-                    "length": info["episode_length"], "success": info["success"], "end": end,
-                })  # fmt: skip
+                record["episodes"].append(
+                    {
+                        "step": self.num_timesteps,
+                        "cpu_s": cpu,
+                        "wall_s": wall,
+                        "return": info["episode_return"],
+                        "length": info["episode_length"],
+                        "success": info["success"],
+                        "end": end,
+                    }
+                )
             over = cpu >= args.cpu_seconds or (stop_at is not None and time.time() >= stop_at)
             if over or wall - self.last >= 60.0:
                 self.last = wall
@@ -154,13 +168,25 @@ def keep_policy(model: Any, env: BulletNavigation, path: Path, record: dict[str,
     from lunar_mjx.agents.policy import Policy, save_policy
 
     layers = [m for m in model.policy.actor.mu if hasattr(m, "weight")]
-    params = {"params": {f"hidden_{i}": {"kernel": m.weight.detach().numpy().T, "bias": m.bias.detach().numpy()}
-                         for i, m in enumerate(layers)}}  # fmt: skip
-    network = {"obs": env.env.observation_size, "actions": env.env.action_size,
-               "layers": [m.out_features for m in layers[:-1]], "activation": "relu", "layer_norm": False}  # fmt: skip
+    params = {
+        "params": {
+            f"hidden_{i}": {"kernel": m.weight.detach().numpy().T, "bias": m.bias.detach().numpy()}
+            for i, m in enumerate(layers)
+        }
+    }
+    network = {
+        "obs": env.env.observation_size,
+        "actions": env.env.action_size,
+        "layers": [m.out_features for m in layers[:-1]],
+        "activation": "relu",
+        "layer_norm": False,
+    }
     notes = {"algorithm": "stable-baselines3 TD3", "steps": record["steps"], "cpu_s": record["cpu_s"]}
-    environment = {"name": "navigation", "options": {"task": "large", "rover": record["rover"]},
-                   "unseen": {"terrain": "world:heldout", "ranges": "unseen"}}  # fmt: skip
+    environment = {
+        "name": "navigation",
+        "options": {"task": "large", "rover": record["rover"]},
+        "unseen": {"terrain": "world:heldout", "ranges": "unseen"},
+    }
     save_policy(Policy(params, None, None, network, environment, notes), path)
 
 
@@ -176,19 +202,30 @@ def train(args: argparse.Namespace) -> None:
         options |= {"terrain": "flat", "goal_distance": (2.0, 4.0), "places": 256, "episode_time": 2.0}
     env = BulletNavigation(options)
     noise = NormalActionNoise(np.zeros(env.env.action_size), np.full(env.env.action_size, 0.3))
-    model = stable_baselines3.TD3("MlpPolicy", env, action_noise=noise, seed=args.seed, device="cpu",
-                                  buffer_size=200_000)  # fmt: skip
-    versions = {"stable_baselines3": stable_baselines3.__version__, "torch": torch.__version__,
-                "pybullet_api": pybullet.getAPIVersion()}  # fmt: skip
+    model = stable_baselines3.TD3(
+        "MlpPolicy", env, action_noise=noise, seed=args.seed, device="cpu", buffer_size=200_000
+    )
+    versions = {
+        "stable_baselines3": stable_baselines3.__version__,
+        "torch": torch.__version__,
+        "pybullet_api": pybullet.getAPIVersion(),
+    }
     record: dict[str, Any] = {
         "what": "SB3 TD3 defaults, action noise N(0, 0.3), PyBullet reference backend, one rover, one CPU thread",
-        "about": versions, "rover": args.rover, "options": {k: v for k, v in options.items() if k != "randomise"},
-        "seed": args.seed, "steps": 0, "cpu_s": time.process_time(), "episodes": [],
-    }  # fmt: skip
+        "about": versions,
+        "rover": args.rover,
+        "options": {k: v for k, v in options.items() if k != "randomise"},
+        "seed": args.seed,
+        "steps": 0,
+        "cpu_s": time.process_time(),
+        "episodes": [],
+    }
     model.learn(args.steps, callback=make_recorder(args, env, record))
     won = [e["success"] for e in record["episodes"]]
-    print(f"{record['steps']} steps, {len(won)} episodes, success of the last 50 "
-          f"{np.mean(won[-50:]) if won else float('nan'):.2f}, {record['cpu_s']:.0f} s of CPU time")  # fmt: skip
+    print(
+        f"{record['steps']} steps, {len(won)} episodes, success of the last 50 "
+        f"{np.mean(won[-50:]) if won else float('nan'):.2f}, {record['cpu_s']:.0f} s of CPU time"
+    )
 
 
 def score(args: argparse.Namespace) -> None:

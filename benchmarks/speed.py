@@ -184,10 +184,20 @@ def side_by_side(rover: str, batch: int, options: argparse.Namespace) -> dict[st
         # long enough to overlap
         command += ["--only-full", "--skip-mjx", "--pool", "1", "--steps", str(20 * options.steps)]
         children = [
-            subprocess.Popen([*command, "--meet", f"{meeting}:{options.processes}", "--out", str(meeting / f"{i}.json"),
-                              "--core", str(cores[i % len(cores)])], stdout=subprocess.DEVNULL)
+            subprocess.Popen(
+                [
+                    *command,
+                    "--meet",
+                    f"{meeting}:{options.processes}",
+                    "--out",
+                    str(meeting / f"{i}.json"),
+                    "--core",
+                    str(cores[i % len(cores)]),
+                ],
+                stdout=subprocess.DEVNULL,
+            )
             for i in range(options.processes)
-        ]  # fmt: skip
+        ]
         if any(child.wait() for child in children):
             raise SystemExit("speed.py: one of the processes ended with an error; run it with --processes 0.")
         rows = [json.loads((meeting / f"{i}.json").read_text())["rows"][0] for i in range(options.processes)]
@@ -232,10 +242,23 @@ def rows_of(rover: str, options: argparse.Namespace, rows: list[dict[str, Any]],
     def add(engine: str, batch: int, result: dict[str, Any]) -> None:
         counted = {"parity": gap < TOLERANCE, "parity_gap": gap} if engine.startswith("structured") else {}
         rows.append({"rover": rover, "engine": engine, "batch": batch, **counted, **result})
-        print(f"{rover:8s} {engine:28s} {batch:8d} {result['steps_per_s']:14,.0f} steps/s  " + ", ".join(
-            f"{k} {v:.3g}" for k, v in result.items() if k in ("compile_s", "kernels_in_loop", "bytes_per_step",
-                                                               "flop_per_step", "process_cpu_ns_per_step", "efficiency")
-        ), flush=True)  # fmt: skip
+        print(
+            f"{rover:8s} {engine:28s} {batch:8d} {result['steps_per_s']:14,.0f} steps/s  "
+            + ", ".join(
+                f"{k} {v:.3g}"
+                for k, v in result.items()
+                if k
+                in (
+                    "compile_s",
+                    "kernels_in_loop",
+                    "bytes_per_step",
+                    "flop_per_step",
+                    "process_cpu_ns_per_step",
+                    "efficiency",
+                )
+            ),
+            flush=True,
+        )
         save()
 
     full, bare = build(model, "structured"), model
@@ -255,11 +278,17 @@ def rows_of(rover: str, options: argparse.Namespace, rows: list[dict[str, Any]],
             add(f"structured, {count} devices", count * batch, own | {"efficiency": share})
         if not options.only_full and batch in (options.batches[-1], options.main):
             own = starts(integral, batch)
-            add("structured, stress integral", batch,
-                timed(rollout(integral, options.steps, chunk), own, options.steps, batch))  # fmt: skip
+            add(
+                "structured, stress integral",
+                batch,
+                timed(rollout(integral, options.steps, chunk), own, options.steps, batch),
+            )
             naked = build(bare, "structured")
-            add("structured, no effects", batch,
-                timed(rollout(naked, options.steps, chunk), starts(naked, batch), options.steps, batch))  # fmt: skip
+            add(
+                "structured, no effects",
+                batch,
+                timed(rollout(naked, options.steps, chunk), starts(naked, batch), options.steps, batch),
+            )
         if batch == options.main:
             maps = per_rover_maps(full, batch)
             # an argument: as a constant of the program 4 GB of maps would be compiled in
@@ -312,9 +341,16 @@ def main() -> None:
     MEETING[:] = [options.meet] if options.meet else []
     rows: list[dict[str, Any]] = []
     LOCK[:] = [options.lock] if options.lock else []
-    about = {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "mujoco": mujoco.__version__,
-             "cpu": cpu_name(), "cores": len(os.sched_getaffinity(0)), "steps": options.steps,
-             "chunk": options.chunk, "pool": options.pool}  # fmt: skip
+    about = {
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+        "cpu": cpu_name(),
+        "cores": len(os.sched_getaffinity(0)),
+        "steps": options.steps,
+        "chunk": options.chunk,
+        "pool": options.pool,
+    }
 
     def save() -> None:
         if options.out:

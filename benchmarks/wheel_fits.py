@@ -27,9 +27,13 @@ def main() -> None:
     results = []
     for name, bed, free in cases:
         before, found = compare(bed, table, name), fit(bed, table, free, name)
-        nominal = {"fitted": before.score(FIT_ANGLES), "held_out": before.score(INSIDE_ANGLES + BEYOND_ANGLES),
-                   "inside": before.score(INSIDE_ANGLES), "beyond": before.score(BEYOND_ANGLES),
-                   "all_angles_rms": before.rms}  # fmt: skip
+        nominal = {
+            "fitted": before.score(FIT_ANGLES),
+            "held_out": before.score(INSIDE_ANGLES + BEYOND_ANGLES),
+            "inside": before.score(INSIDE_ANGLES),
+            "beyond": before.score(BEYOND_ANGLES),
+            "all_angles_rms": before.rms,
+        }
         results.append({"nominal": nominal, **found.to_dict()})
         judged = (
             f"(inside {found.inside:.1f}, beyond {found.beyond:.1f}); {found.agreeing} of {len(found.starts)} agree"

@@ -75,8 +75,9 @@ def constant_commands(model: Model, duration: float, interval: float | None = No
     if duration < interval:
         raise bad_input("command", "duration", duration, f"is below {interval:g} s", "give a longer time in s")
     if duration > MOST_COMMANDS * interval:
-        raise bad_input("command", "duration", duration, f"is above {MOST_COMMANDS * interval:g} s",
-                        "drive in several parts")  # fmt: skip
+        raise bad_input(
+            "command", "duration", duration, f"is above {MOST_COMMANDS * interval:g} s", "drive in several parts"
+        )
     return Commands(np.tile(np.array(value, float), (round(duration / interval), 1)), interval)
 
 
@@ -104,15 +105,25 @@ def read_commands(path: str | Path, model: Model) -> Commands:
         wrong = np.flatnonzero(~np.isfinite(numbers))
         if wrong.size:
             row = int(wrong[0])
-            raise bad_input(f"{path}, line {row + 2}", name, table[name].iloc[row], "is not a finite number",
-                            "give a number in the unit of the column's name")  # fmt: skip
+            raise bad_input(
+                f"{path}, line {row + 2}",
+                name,
+                table[name].iloc[row],
+                "is not a finite number",
+                "give a number in the unit of the column's name",
+            )
     time = table["time_s"].to_numpy(float)
     steps = np.diff(time)
     if time.size < 2 or (steps <= 0).any():
         raise bad_input(path, "time_s", time[:3].tolist(), "does not rise", "sort the rows by time; give two at least")
     if np.ptp(steps) > 1e-3 * steps.mean():
-        raise bad_input(path, "time_s", f"{steps.min():g} to {steps.max():g} s apart", "is uneven",
-                        "resample the commands to a constant rate")  # fmt: skip
+        raise bad_input(
+            path,
+            "time_s",
+            f"{steps.min():g} to {steps.max():g} s apart",
+            "is uneven",
+            "resample the commands to a constant rate",
+        )
     return Commands(table[names[1:]].to_numpy(float), float(steps.mean()))
 
 
@@ -133,14 +144,22 @@ def simulate(
         raise bad_input("simulate", "commands", commands.values.shape, "have another shape", f"give (time, {joints})")
     if not np.isfinite(commands.values).all():
         row, column = np.argwhere(~np.isfinite(commands.values))[0]
-        raise bad_input(f"simulate, command {row}", system.joint_names[column], commands.values[row, column],
-                        "is not finite", "give a finite number")  # fmt: skip
+        raise bad_input(
+            f"simulate, command {row}",
+            system.joint_names[column],
+            commands.values[row, column],
+            "is not finite",
+            "give a finite number",
+        )
     every = round(commands.interval / model.timestep)
     if every < 1 or abs(every * model.timestep - commands.interval) > 1e-3 * commands.interval:
-        raise bad_input("simulate", "interval", f"{commands.interval:g} s",
-                        f"is no whole number of time steps of {model.timestep:g} s",
-                        f"set timestep_s = {commands.interval / max(every, 1):.6g}, or resample the commands"
-                        )  # fmt: skip
+        raise bad_input(
+            "simulate",
+            "interval",
+            f"{commands.interval:g} s",
+            f"is no whole number of time steps of {model.timestep:g} s",
+            f"set timestep_s = {commands.interval / max(every, 1):.6g}, or resample the commands",
+        )
     state = system.reset(system.params, x, y, yaw)
     run = jax.jit(lambda p, s, c: system.rollout(p, s, c, every=every))
     count = len(commands.values)
@@ -166,8 +185,13 @@ def check_finite(telemetry: Telemetry) -> None:
         finite &= np.isfinite(leaf.reshape(len(finite), -1)).all(axis=1)
     if not finite.all():
         when = float(telemetry.time[np.argmin(finite)])
-        raise bad_input("simulate", "time", f"{when:g} s", "is where the simulation diverged",
-                        "use a smaller timestep_s, softer gains or smaller commands")  # fmt: skip
+        raise bad_input(
+            "simulate",
+            "time",
+            f"{when:g} s",
+            "is where the simulation diverged",
+            "use a smaller timestep_s, softer gains or smaller commands",
+        )
 
 
 def check_start(model: Model, x: float, y: float, yaw: float) -> None:
@@ -179,8 +203,13 @@ def check_start(model: Model, x: float, y: float, yaw: float) -> None:
     for name, value, low, count in (("x", x, field.x0, cols), ("y", y, field.y0, rows)):
         low, high = float(low), float(low + (count - 1) * field.cell)
         if not low <= value <= high:
-            raise bad_input("simulate", name, value, f"is off the terrain {model.terrain.name}",
-                            f"start within {low:g} .. {high:g} m")  # fmt: skip
+            raise bad_input(
+                "simulate",
+                name,
+                value,
+                f"is off the terrain {model.terrain.name}",
+                f"start within {low:g} .. {high:g} m",
+            )
 
 
 def _blame_user_effect(model: Model, error: Exception) -> None:
@@ -233,8 +262,13 @@ def front_steering(model: Model, commands: Commands, angle: float) -> Commands:
         raise bad_input("command", "steer", angle, "needs steered front wheels, which the rover lacks", "leave it at 0")
     values = commands.values.copy()
     if angle and model.modes["steer"] != "position":
-        raise bad_input("command", "steer", angle, f"is an angle, but the mode of steer is {model.modes['steer']}",
-                        "set control.steer.mode to position, or give the commands as a table")  # fmt: skip
+        raise bad_input(
+            "command",
+            "steer",
+            angle,
+            f"is an angle, but the mode of steer is {model.modes['steer']}",
+            "set control.steer.mode to position, or give the commands as a table",
+        )
     for name in fronts:
         values[:, model.rover.joints.index(name)] = angle
     return Commands(values, commands.interval)

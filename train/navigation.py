@@ -48,8 +48,16 @@ def main() -> None:
     report = run_training(args.training, training, run, args.out, args.eval_every, args.eval_episodes, args.target)
     rows = report.record["rows"]
     steady = sorted(r["steps_per_s"] for r in rows[1:]) or [0.0]
-    print(json.dumps({"final": report.record["final"], "finished": report.result.finished,
-                      "train_s": rows[-1]["elapsed_s"], "median_steps_per_s": steady[len(steady) // 2]}))  # fmt: skip
+    print(
+        json.dumps(
+            {
+                "final": report.record["final"],
+                "finished": report.result.finished,
+                "train_s": rows[-1]["elapsed_s"],
+                "median_steps_per_s": steady[len(steady) // 2],
+            }
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -84,15 +84,27 @@ def measure(points: Points, soil: Soil, hidden: Sequence[Hidden] = (), law: str 
         low, high = np.where(over, low, middle), np.where(over, middle, high)
     z = 0.5 * (low + high)
     out = _forces(points, soil, hidden, law, z)
-    return {"drawbar_pull_N": out["force_x"], "side_force_N": -out["force_y"], "driving_torque_Nm": out["torque"],
-            "sinkage_m": z, "carried": found | carried}  # fmt: skip
+    return {
+        "drawbar_pull_N": out["force_x"],
+        "side_force_N": -out["force_y"],
+        "driving_torque_Nm": out["torque"],
+        "sinkage_m": z,
+        "carried": found | carried,
+    }
 
 
 def _forces(points: Points, soil: Soil, hidden: Sequence[Hidden], law: str, z: np.ndarray) -> Values:
     one = np.ones_like(z)
-    v: Values = {"z": z, "r": points.radius * one, "b": points.width * one, "beta": points.angle * one,
-                 "s": points.slip * one, "load": points.load * one, "gravity": points.gravity,
-                 "speed": points.speed * one}  # fmt: skip
+    v: Values = {
+        "z": z,
+        "r": points.radius * one,
+        "b": points.width * one,
+        "beta": points.angle * one,
+        "s": points.slip * one,
+        "load": points.load * one,
+        "gravity": points.gravity,
+        "speed": points.speed * one,
+    }
 
     def act(stage: str) -> None:
         for effect in hidden:

@@ -131,25 +131,64 @@ def _sign(g: Rng) -> float:
     return 1.0 if g.random() < 0.5 else -1.0
 
 
-KNOWN: Mapping[str, Kind] = {k.name: k for k in (
-    Kind("slip_sinkage", lambda g, r: {"driving": g.uniform(0.3, 1.2), "skid": g.uniform(0.2, 0.8)},
-         _slip_sinkage, ("soil",)),
-    Kind("angle_sinkage", lambda g, r: {"lateral": g.uniform(0.5, 1.5)}, _angle_sinkage, ("soil",)),
-    Kind("exit_angle", lambda g, r: {"c1": g.uniform(0.35, 0.5), "c2": g.uniform(0.05, 0.25),
-                                     "c3": g.uniform(0.1, 0.3), "c4": g.uniform(0.0, 0.2)},
-         _exit_angle, ("wheel_normal",)),
-    Kind("bulldozing", lambda g, r: {"front": g.uniform(0.6, 1.4), "side": g.uniform(0.6, 1.4),
-                                     "density": g.uniform(1450.0, 1750.0)}, _bulldozing, ("wheel_shear",)),
-    Kind("grousers", lambda g, r: {"height": g.uniform(0.05, 0.12) * r, "count": float(g.integers(12, 31))},
-         _grousers, ("wheel_shear",)),
-    Kind("friction_circle", lambda g, r: {"share": g.uniform(0.6, 1.0)}, _friction_circle, ("wheel_shear",)),
-    Kind("rolling_resistance", lambda g, r: {"coefficient": g.uniform(0.02, 0.08)}, _rolling_resistance,
-         ("wheel_shear",)),
-    Kind("wheel_radius_error", lambda g, r: {"offset": _sign(g) * g.uniform(0.03, 0.07) * r}, _wheel_radius_error,
-         ("geometry",)),
-    Kind("steering_toe", lambda g, r: {"angle": _sign(g) * np.radians(g.uniform(1.0, 4.0))}, _steering_toe,
-         ("geometry",)),
-)}  # fmt: skip
+KNOWN: Mapping[str, Kind] = {
+    k.name: k
+    for k in (
+        Kind(
+            "slip_sinkage",
+            lambda g, r: {"driving": g.uniform(0.3, 1.2), "skid": g.uniform(0.2, 0.8)},
+            _slip_sinkage,
+            ("soil",),
+        ),
+        Kind("angle_sinkage", lambda g, r: {"lateral": g.uniform(0.5, 1.5)}, _angle_sinkage, ("soil",)),
+        Kind(
+            "exit_angle",
+            lambda g, r: {
+                "c1": g.uniform(0.35, 0.5),
+                "c2": g.uniform(0.05, 0.25),
+                "c3": g.uniform(0.1, 0.3),
+                "c4": g.uniform(0.0, 0.2),
+            },
+            _exit_angle,
+            ("wheel_normal",),
+        ),
+        Kind(
+            "bulldozing",
+            lambda g, r: {
+                "front": g.uniform(0.6, 1.4),
+                "side": g.uniform(0.6, 1.4),
+                "density": g.uniform(1450.0, 1750.0),
+            },
+            _bulldozing,
+            ("wheel_shear",),
+        ),
+        Kind(
+            "grousers",
+            lambda g, r: {"height": g.uniform(0.05, 0.12) * r, "count": float(g.integers(12, 31))},
+            _grousers,
+            ("wheel_shear",),
+        ),
+        Kind("friction_circle", lambda g, r: {"share": g.uniform(0.6, 1.0)}, _friction_circle, ("wheel_shear",)),
+        Kind(
+            "rolling_resistance",
+            lambda g, r: {"coefficient": g.uniform(0.02, 0.08)},
+            _rolling_resistance,
+            ("wheel_shear",),
+        ),
+        Kind(
+            "wheel_radius_error",
+            lambda g, r: {"offset": _sign(g) * g.uniform(0.03, 0.07) * r},
+            _wheel_radius_error,
+            ("geometry",),
+        ),
+        Kind(
+            "steering_toe",
+            lambda g, r: {"angle": _sign(g) * np.radians(g.uniform(1.0, 4.0))},
+            _steering_toe,
+            ("geometry",),
+        ),
+    )
+}
 """Effects of the catalogue that a bed in steady state can show."""
 
 
@@ -202,31 +241,75 @@ def _deep_cohesion(p: Numbers, r: float) -> Hidden:
 
 _SHEAR, _SOIL, _NORMAL = ("wheel_shear",), ("soil",), ("wheel_normal", "soil")
 
-OUTSIDE: Mapping[str, Kind] = {k.name: k for k in (
-    Kind("speed_stiffness", _amount(0.1, 0.3), _scaled("speed_stiffness", "k_c k_phi", lambda v, p: np.maximum(
-        1.0 - v["s"], 0.1) ** p["amount"]), _SOIL),
-    Kind("cable_drag", _amount(0.03, 0.08), _added("cable_drag", "fx", lambda v, p: -p["amount"] * 1500.0 * v["r"]
-                                                   * v["b"] * np.cos(v["beta"])), ("wheel_shear", "wheel_normal")),
-    Kind("side_offset", _amount(0.03, 0.08), _added("side_offset", "fy", lambda v, p: p["amount"] * 1500.0 * v["r"]
-                                                    * v["b"]), _SHEAR),
-    Kind("load_friction", _amount(0.08, 0.2), _scaled("load_friction", "tan_phi", lambda v, p: _loaded(v)
-                                                      ** -p["amount"]), _SOIL),
-    Kind("strain_softening", _amount(0.2, 0.5), _scaled("strain_softening", "tan_phi cohesion", lambda v, p: 1.0
-                                                        - p["amount"] * np.maximum(v["slip"], 0.0) ** 2),
-         ("soil", "wheel_shear")),
-    Kind("hard_layer", lambda g, r: {"depth": g.uniform(0.2, 0.3)}, _layer, _NORMAL),
-    Kind("seal_torque", _amount(0.03, 0.08), _added("seal_torque", "torque", lambda v, p: p["amount"] * 1500.0
-                                                    * v["r"] ** 2 * v["b"]), _SHEAR),
-    Kind("side_bearing", _amount(0.1, 0.3), _added("side_bearing", "torque", lambda v, p: p["amount"] * v["r"]
-                                                   * np.abs(v["fy"])), _SHEAR),
-    Kind("load_stiffness", _amount(0.15, 0.4), _scaled("load_stiffness", "k_c k_phi", lambda v, p: _loaded(v)
-                                                       ** p["amount"]), _NORMAL),
-    Kind("angle_modulus", _amount(0.8, 2.0), _scaled("angle_modulus", "modulus_y", lambda v, p: 1.0 + p["amount"]
-                                                     * np.abs(v["beta"])), ("soil", "wheel_shear")),
-    Kind("deep_cohesion", _amount(8e3, 2e4), _deep_cohesion, ("soil", "wheel_shear")),
-    Kind("camber_thrust", _amount(0.02, 0.06), _added("camber_thrust", "fy", lambda v, p: p["amount"] * v["load"]
-                                                      * (1.0 - v["s"])), _SHEAR),
-)}  # fmt: skip
+OUTSIDE: Mapping[str, Kind] = {
+    k.name: k
+    for k in (
+        Kind(
+            "speed_stiffness",
+            _amount(0.1, 0.3),
+            _scaled("speed_stiffness", "k_c k_phi", lambda v, p: np.maximum(1.0 - v["s"], 0.1) ** p["amount"]),
+            _SOIL,
+        ),
+        Kind(
+            "cable_drag",
+            _amount(0.03, 0.08),
+            _added("cable_drag", "fx", lambda v, p: -p["amount"] * 1500.0 * v["r"] * v["b"] * np.cos(v["beta"])),
+            ("wheel_shear", "wheel_normal"),
+        ),
+        Kind(
+            "side_offset",
+            _amount(0.03, 0.08),
+            _added("side_offset", "fy", lambda v, p: p["amount"] * 1500.0 * v["r"] * v["b"]),
+            _SHEAR,
+        ),
+        Kind(
+            "load_friction",
+            _amount(0.08, 0.2),
+            _scaled("load_friction", "tan_phi", lambda v, p: _loaded(v) ** -p["amount"]),
+            _SOIL,
+        ),
+        Kind(
+            "strain_softening",
+            _amount(0.2, 0.5),
+            _scaled(
+                "strain_softening", "tan_phi cohesion", lambda v, p: 1.0 - p["amount"] * np.maximum(v["slip"], 0.0) ** 2
+            ),
+            ("soil", "wheel_shear"),
+        ),
+        Kind("hard_layer", lambda g, r: {"depth": g.uniform(0.2, 0.3)}, _layer, _NORMAL),
+        Kind(
+            "seal_torque",
+            _amount(0.03, 0.08),
+            _added("seal_torque", "torque", lambda v, p: p["amount"] * 1500.0 * v["r"] ** 2 * v["b"]),
+            _SHEAR,
+        ),
+        Kind(
+            "side_bearing",
+            _amount(0.1, 0.3),
+            _added("side_bearing", "torque", lambda v, p: p["amount"] * v["r"] * np.abs(v["fy"])),
+            _SHEAR,
+        ),
+        Kind(
+            "load_stiffness",
+            _amount(0.15, 0.4),
+            _scaled("load_stiffness", "k_c k_phi", lambda v, p: _loaded(v) ** p["amount"]),
+            _NORMAL,
+        ),
+        Kind(
+            "angle_modulus",
+            _amount(0.8, 2.0),
+            _scaled("angle_modulus", "modulus_y", lambda v, p: 1.0 + p["amount"] * np.abs(v["beta"])),
+            ("soil", "wheel_shear"),
+        ),
+        Kind("deep_cohesion", _amount(8e3, 2e4), _deep_cohesion, ("soil", "wheel_shear")),
+        Kind(
+            "camber_thrust",
+            _amount(0.02, 0.06),
+            _added("camber_thrust", "fy", lambda v, p: p["amount"] * v["load"] * (1.0 - v["s"])),
+            _SHEAR,
+        ),
+    )
+}
 """Effects that the catalogue lacks, with the ports at which they act."""
 
 

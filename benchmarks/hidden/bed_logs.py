@@ -49,14 +49,18 @@ def draw_soil(rng: np.random.Generator) -> Soil:
     """A soil as it might lie in the bin, away from the nominal one."""
     modulus = rng.uniform(0.010, 0.025)
     return Soil(
-        k_phi=8.2e5 * np.exp(rng.normal(0.0, 0.35)), n=rng.uniform(0.9, 1.2), cohesion=rng.uniform(60.0, 500.0),
-        friction_angle=np.radians(rng.uniform(29.0, 39.0)), modulus_x=modulus,
+        k_phi=8.2e5 * np.exp(rng.normal(0.0, 0.35)),
+        n=rng.uniform(0.9, 1.2),
+        cohesion=rng.uniform(60.0, 500.0),
+        friction_angle=np.radians(rng.uniform(29.0, 39.0)),
+        modulus_x=modulus,
         modulus_y=modulus * rng.uniform(0.7, 1.4),
-    )  # fmt: skip
+    )
 
 
-def grid(rng: np.random.Generator, angles: Sequence[float] = (0.0, 10.0, 20.0, 30.0, 45.0), loads: int = 3,
-         slips: int = 9) -> Points:  # fmt: skip
+def grid(
+    rng: np.random.Generator, angles: Sequence[float] = (0.0, 10.0, 20.0, 30.0, 45.0), loads: int = 3, slips: int = 9
+) -> Points:
     """A test plan: slip -0.1 to 0.7, slip angles deg, loads around a contact pressure of 1.5 kPa on r b."""
     radius = rng.uniform(0.10, 0.25)
     width = radius * rng.uniform(0.6, 1.0)
@@ -124,6 +128,11 @@ def write(folder: Path, frame: pd.DataFrame, truth: Truth, recipe: Recipe, commi
     """Writes the log folder with the stated noise of the datasheet."""
     noise = {q: Noise(recipe.scale * truth.sigma[q], "datasheet") for q in QUANTITIES if q in frame}
     write_steady_log(
-        folder, frame, wheel={"radius_m": truth.points.radius, "width_m": truth.points.width},
-        slip_definition="wheel_frame", noise=noise, gravity_m_s2=truth.points.gravity, commitment=commitment,
-    )  # fmt: skip
+        folder,
+        frame,
+        wheel={"radius_m": truth.points.radius, "width_m": truth.points.width},
+        slip_definition="wheel_frame",
+        noise=noise,
+        gravity_m_s2=truth.points.gravity,
+        commitment=commitment,
+    )

@@ -18,9 +18,16 @@ from .noise import NOISES, Recipe
 from .separable import SEPARABLE, left_over, nearest
 
 GROUPS: Mapping[str, int] = {
-    "nulls": 400, "singles": 300, "singles_x5": 100, "pairs": 100, "triples": 30, "outside": 100, "undecidable": 50,
-    "sabotaged": 20, "dirt": 60,
-}  # fmt: skip
+    "nulls": 400,
+    "singles": 300,
+    "singles_x5": 100,
+    "pairs": 100,
+    "triples": 30,
+    "outside": 100,
+    "undecidable": 50,
+    "sabotaged": 20,
+    "dirt": 60,
+}
 """Groups of cases, nulls first, with their number in the whole benchmark."""
 ABSORBED = 2.5
 """Length in sigma below which what a refit leaves of an effect cannot be told from noise."""
@@ -65,10 +72,14 @@ class Case:
     def answer(self) -> dict[str, Any]:
         """What is hidden, as plain data."""
         return {
-            "case": self.name, "nonce": self.nonce, "effects": self.truth.effects, "sabotage": self.sabotage,
-            "soil": dataclasses.asdict(self.truth.soil), "law": self.truth.law,
+            "case": self.name,
+            "nonce": self.nonce,
+            "effects": self.truth.effects,
+            "sabotage": self.sabotage,
+            "soil": dataclasses.asdict(self.truth.soil),
+            "law": self.truth.law,
             "recipe": dataclasses.asdict(self.recipe),
-        }  # fmt: skip
+        }
 
     def commitment(self) -> str:
         """SHA-256 of the answer, which the log carries."""
@@ -179,9 +190,16 @@ def _dirty(rng: Rng, number: int) -> tuple[Truth, Recipe, float, str]:
 
 
 _DRAW: Mapping[str, Callable[[Rng, int], tuple[Truth, Recipe, float, str]]] = {
-    "nulls": _null, "singles": _single, "singles_x5": lambda g, n: _single(g, n, 5.0), "pairs": _several(2),
-    "triples": _several(3), "outside": _outside, "undecidable": _undecidable, "sabotaged": _sabotaged, "dirt": _dirty,
-}  # fmt: skip
+    "nulls": _null,
+    "singles": _single,
+    "singles_x5": lambda g, n: _single(g, n, 5.0),
+    "pairs": _several(2),
+    "triples": _several(3),
+    "outside": _outside,
+    "undecidable": _undecidable,
+    "sabotaged": _sabotaged,
+    "dirt": _dirty,
+}
 
 
 # --- sabotage: what goes wrong between a bed and a file -------------------------------------------------------------

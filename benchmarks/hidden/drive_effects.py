@@ -108,8 +108,11 @@ def _iron_loss(p: Numbers, drive: np.ndarray) -> Hook:
 
 
 def _harness(frame: Frame, p: Numbers) -> Frame:
-    changed = {c: frame[c] + p["resistance"] * frame[c.replace("voltage_V", "current_A")]
-               for c in frame if c.startswith("motor_") and c.endswith("voltage_V")}  # fmt: skip
+    changed = {
+        c: frame[c] + p["resistance"] * frame[c.replace("voltage_V", "current_A")]
+        for c in frame
+        if c.startswith("motor_") and c.endswith("voltage_V")
+    }
     return frame.assign(**changed)
 
 
@@ -142,37 +145,71 @@ def _signed(name: str, low: float, high: float) -> Callable[[Rng], Numbers]:
 
 
 KNOWN: Mapping[str, DriveKind] = {
-    "coulomb_friction": DriveKind(_one("torque", 0.2, 0.8), ("motor_torque",), _torque(
-        "coulomb_friction", lambda ctx, p: p["torque"] * np.tanh(ctx.joint_speed / 0.02))),
-    "slip_sinkage": DriveKind(lambda g: {"driving": float(g.uniform(0.5, 1.5)), "skid": float(g.uniform(0.3, 0.8))},
-                              ("soil",), _slip_sinkage),
+    "coulomb_friction": DriveKind(
+        _one("torque", 0.2, 0.8),
+        ("motor_torque",),
+        _torque("coulomb_friction", lambda ctx, p: p["torque"] * np.tanh(ctx.joint_speed / 0.02)),
+    ),
+    "slip_sinkage": DriveKind(
+        lambda g: {"driving": float(g.uniform(0.5, 1.5)), "skid": float(g.uniform(0.3, 0.8))}, ("soil",), _slip_sinkage
+    ),
     "iron_loss": DriveKind(_one("coefficient", 5e-7, 2e-6), ("heat", "motor_torque"), _iron_loss),
     # in whole steps of the generator, which delays by whole steps
     "actuator_delay": DriveKind(lambda g: {"delay": round(float(g.uniform(0.03, 0.12)), 3)}, ("command",), _delay),
     "rolling_resistance": DriveKind(_one("coefficient", 0.03, 0.08), ("wheel_shear",), _rolling_resistance),
-    "wheel_radius_error": DriveKind(_signed("offset", 0.002, 0.006), ("geometry",), _geometry(
-        "wheel_radius_error", "radius", lambda r, p: r + p["offset"])),
-    "steering_toe": DriveKind(_signed("angle", 0.01, 0.04), ("geometry",), _geometry(
-        "steering_toe", "toe", lambda t, p: t + p["angle"])),
-    "com_offset": DriveKind(lambda g: {"x": float(g.choice([-1.0, 1.0]) * g.uniform(0.03, 0.08))}, ("geometry",),
-                            _geometry("com_offset", "com_offset", lambda v, p: v + np.array([p["x"], 0.0, 0.0]))),
+    "wheel_radius_error": DriveKind(
+        _signed("offset", 0.002, 0.006),
+        ("geometry",),
+        _geometry("wheel_radius_error", "radius", lambda r, p: r + p["offset"]),
+    ),
+    "steering_toe": DriveKind(
+        _signed("angle", 0.01, 0.04), ("geometry",), _geometry("steering_toe", "toe", lambda t, p: t + p["angle"])
+    ),
+    "com_offset": DriveKind(
+        lambda g: {"x": float(g.choice([-1.0, 1.0]) * g.uniform(0.03, 0.08))},
+        ("geometry",),
+        _geometry("com_offset", "com_offset", lambda v, p: v + np.array([p["x"], 0.0, 0.0])),
+    ),
     "harness_resistance": DriveKind(_one("resistance", 0.2, 0.6), ("sensor",), sensor=_harness),
-    "thermistor_lag": DriveKind(lambda g: {"winding": float(g.uniform(3.0, 8.0)), "housing": float(
-        g.uniform(10.0, 30.0))}, ("sensor",), sensor=_thermistor),
+    "thermistor_lag": DriveKind(
+        lambda g: {"winding": float(g.uniform(3.0, 8.0)), "housing": float(g.uniform(10.0, 30.0))},
+        ("sensor",),
+        sensor=_thermistor,
+    ),
     "clock_offset": DriveKind(_one("odometry", 0.06, 0.2), ("sensor",), sensor=_late),
-}  # fmt: skip
+}
 """Effects of the catalogue that short drives can show."""
 
 OUTSIDE: Mapping[str, DriveKind] = {
-    "churning": DriveKind(_one("amount", 0.05, 0.15), ("motor_torque",), _torque(
-        "churning", lambda ctx, p: p["amount"] * ctx.joint_speed * np.abs(ctx.joint_speed))),
-    "commutator_heat": DriveKind(_one("amount", 0.5, 1.5), ("heat",), _heat(
-        "commutator_heat", "winding", lambda ctx, p: p["amount"] * np.abs(ctx.current))),
-    "electronics_heat": DriveKind(_one("amount", 0.3, 1.0), ("heat",), _heat(
-        "electronics_heat", "housing", lambda ctx, p: p["amount"] + 0.0 * ctx.joint_speed)),
-    "tail_push": DriveKind(_one("amount", 4.0, 10.0), ("body_wrench",), lambda p, drive: Hook("tail_push", {
-        "body": lambda ctx, state, value: {**value, "force": value["force"] - p["amount"] * ctx.rotation[..., 0]}})),
-    "weak_amplifier": DriveKind(_one("amount", 0.04, 0.12), ("command", "motor_torque"), lambda p, drive: Hook(
-        "weak_amplifier", {"current": lambda ctx, state, value: value * (1.0 - p["amount"] * drive)})),
-}  # fmt: skip
+    "churning": DriveKind(
+        _one("amount", 0.05, 0.15),
+        ("motor_torque",),
+        _torque("churning", lambda ctx, p: p["amount"] * ctx.joint_speed * np.abs(ctx.joint_speed)),
+    ),
+    "commutator_heat": DriveKind(
+        _one("amount", 0.5, 1.5),
+        ("heat",),
+        _heat("commutator_heat", "winding", lambda ctx, p: p["amount"] * np.abs(ctx.current)),
+    ),
+    "electronics_heat": DriveKind(
+        _one("amount", 0.3, 1.0),
+        ("heat",),
+        _heat("electronics_heat", "housing", lambda ctx, p: p["amount"] + 0.0 * ctx.joint_speed),
+    ),
+    "tail_push": DriveKind(
+        _one("amount", 4.0, 10.0),
+        ("body_wrench",),
+        lambda p, drive: Hook(
+            "tail_push",
+            {"body": lambda ctx, state, value: {**value, "force": value["force"] - p["amount"] * ctx.rotation[..., 0]}},
+        ),
+    ),
+    "weak_amplifier": DriveKind(
+        _one("amount", 0.04, 0.12),
+        ("command", "motor_torque"),
+        lambda p, drive: Hook(
+            "weak_amplifier", {"current": lambda ctx, state, value: value * (1.0 - p["amount"] * drive)}
+        ),
+    ),
+}
 """Effects that the catalogue lacks."""

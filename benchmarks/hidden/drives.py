@@ -35,8 +35,16 @@ SETTLE, LENGTH = 1.5, 10.0
 GRAVITY, AMBIENT_degC = 1.625, 25.0
 PAYLOAD_kg, PAYLOAD_AT = 15.0, (0.0, 0.0, 0.2)
 
-SIGMA = {"position": 0.005, "world_velocity": 0.005, "roll": 0.1, "pitch": 0.1, "yaw": 0.2, "joint": 0.005,
-         "winding": 0.3, "housing": 0.3}  # fmt: skip
+SIGMA = {
+    "position": 0.005,
+    "world_velocity": 0.005,
+    "roll": 0.1,
+    "pitch": 0.1,
+    "yaw": 0.2,
+    "joint": 0.005,
+    "winding": 0.3,
+    "housing": 0.3,
+}
 """Datasheet noise by the beginning of a channel's name, in its unit."""
 _ELECTRICAL = {"A": 0.01, "V": 0.05}
 
@@ -54,35 +62,68 @@ class Manoeuvre:
 
 
 MANOEUVRES = (
-    Manoeuvre("speed_steps", "flat", False, "fit", ((0, 0), (1, 0), (1.2, 1), (3, 1), (3.2, 2.5), (6, 2.5), (6.2, 4),
-                                                    (8.5, 4), (9, 0))),
-    Manoeuvre("reversals", "flat", False, "fit", ((0, 0), (1, 0), (1.3, 2), (3, 2), (3.5, -2), (5.5, -2), (6, 3),
-                                                  (8, 3), (8.5, -1), (10, -1))),
-    Manoeuvre("steering", "flat", False, "select", ((0, 0), (1, 0), (1.5, 2), (9, 2), (9.5, 0)),
-              ((0, 0), (2, 0), (3, 0.15), (5, 0.15), (6, -0.15), (8, -0.15), (9, 0))),
+    Manoeuvre(
+        "speed_steps",
+        "flat",
+        False,
+        "fit",
+        ((0, 0), (1, 0), (1.2, 1), (3, 1), (3.2, 2.5), (6, 2.5), (6.2, 4), (8.5, 4), (9, 0)),
+    ),
+    Manoeuvre(
+        "reversals",
+        "flat",
+        False,
+        "fit",
+        ((0, 0), (1, 0), (1.3, 2), (3, 2), (3.5, -2), (5.5, -2), (6, 3), (8, 3), (8.5, -1), (10, -1)),
+    ),
+    Manoeuvre(
+        "steering",
+        "flat",
+        False,
+        "select",
+        ((0, 0), (1, 0), (1.5, 2), (9, 2), (9.5, 0)),
+        ((0, 0), (2, 0), (3, 0.15), (5, 0.15), (6, -0.15), (8, -0.15), (9, 0)),
+    ),
     Manoeuvre("climb", "slope:8deg", False, "fit", ((0, 0), (1, 0), (1.5, 1.5), (5, 1.5), (5.5, 3), (9, 3), (9.5, 0))),
-    Manoeuvre("descent", "slope:8deg", False, "select", ((0, 0), (1, 0), (1.5, -1.5), (5, -1.5), (6, 0), (7, 0),
-                                                         (7.5, -2.5), (10, -2.5))),
-    Manoeuvre("loaded", "flat", True, "fit", ((0, 0), (1, 0), (1.3, 1), (4, 1), (4.3, 3), (7, 3), (7.5, -1.5),
-                                              (10, -1.5))),
-)  # fmt: skip
+    Manoeuvre(
+        "descent",
+        "slope:8deg",
+        False,
+        "select",
+        ((0, 0), (1, 0), (1.5, -1.5), (5, -1.5), (6, 0), (7, 0), (7.5, -2.5), (10, -2.5)),
+    ),
+    Manoeuvre(
+        "loaded", "flat", True, "fit", ((0, 0), (1, 0), (1.3, 1), (4, 1), (4.3, 3), (7, 3), (7.5, -1.5), (10, -1.5))
+    ),
+)
 
 
 def draw(group: str, number: int, seed: int) -> tuple[dict[str, Any], np.random.Generator]:
     """What is hidden in a campaign: effects, the true soil, and the noise."""
     rng = np.random.default_rng([seed % 2**63, 100 + list(GROUPS).index(group), number])
     known, outside = list(drive_effects.KNOWN), list(drive_effects.OUTSIDE)
-    names = {"nulls": list, "singles": lambda: [known[number % len(known)]],
-             "pairs": lambda: sorted(str(n) for n in rng.choice(known, 2, replace=False)),
-             "outside": lambda: [outside[number % len(outside)]]}[group]()  # fmt: skip
+    names = {
+        "nulls": list,
+        "singles": lambda: [known[number % len(known)]],
+        "pairs": lambda: sorted(str(n) for n in rng.choice(known, 2, replace=False)),
+        "outside": lambda: [outside[number % len(outside)]],
+    }[group]()
     kinds = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
     recipe = Recipe(NOISES[(number + number // len(known)) % len(NOISES)])
-    soil = {"k_phi": 8.2e5 * float(np.exp(rng.normal(0.0, 0.25))), "cohesion": float(rng.uniform(100.0, 300.0)),
-            "friction_angle": float(np.radians(rng.uniform(32.0, 38.0)))}  # fmt: skip
+    soil = {
+        "k_phi": 8.2e5 * float(np.exp(rng.normal(0.0, 0.25))),
+        "cohesion": float(rng.uniform(100.0, 300.0)),
+        "friction_angle": float(np.radians(rng.uniform(32.0, 38.0))),
+    }
     answer = {
-        "case": f"{group}-{number:03d}", "group": group, "nonce": rng.bytes(32).hex(), "sabotage": "",
-        "effects": {n: kinds[n].draw(rng) for n in names}, "soil": soil, "recipe": dataclasses.asdict(recipe),
-    }  # fmt: skip
+        "case": f"{group}-{number:03d}",
+        "group": group,
+        "nonce": rng.bytes(32).hex(),
+        "sabotage": "",
+        "effects": {n: kinds[n].draw(rng) for n in names},
+        "soil": soil,
+        "recipe": dataclasses.asdict(recipe),
+    }
     return answer, rng
 
 
@@ -197,9 +238,18 @@ def _write(folder: Path, m: Manoeuvre, frame: pd.DataFrame, recipe: Recipe, seal
     noise = {c: Noise(recipe.scale * s, "datasheet") for c in frame if (s := sigma_of(c))}
     changes = {"payload_kg": PAYLOAD_kg, "payload_position_m": list(PAYLOAD_AT)} if m.payload else None
     write_log(
-        folder, tables, rover=ROVER, noise=noise, manoeuvre=m.name, gravity_m_s2=GRAVITY, terrain=m.terrain,
-        split=m.split, environment={"ambient_temperature_degC": AMBIENT_degC}, rover_changes=changes, commitment=seal,
-    )  # fmt: skip
+        folder,
+        tables,
+        rover=ROVER,
+        noise=noise,
+        manoeuvre=m.name,
+        gravity_m_s2=GRAVITY,
+        terrain=m.terrain,
+        split=m.split,
+        environment={"ambient_temperature_degC": AMBIENT_degC},
+        rover_changes=changes,
+        commitment=seal,
+    )
 
 
 def waiting(folder: Path) -> list[tuple[str, int]]:

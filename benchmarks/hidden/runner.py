@@ -24,8 +24,13 @@ def commit() -> tuple[str, bool]:
     """The commit of the code under test, and whether files that count differ from it; "" where git is not there."""
     try:
         head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=_ROOT, capture_output=True, text=True, check=True)
-        changed = subprocess.run(["git", "status", "--porcelain", "--", "lunar_mjx", "benchmarks/hidden"], cwd=_ROOT,
-                                 capture_output=True, text=True, check=True)  # fmt: skip
+        changed = subprocess.run(
+            ["git", "status", "--porcelain", "--", "lunar_mjx", "benchmarks/hidden"],
+            cwd=_ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
     except (OSError, subprocess.CalledProcessError):
         return os.environ.get("HIDDEN_COMMIT", ""), False
     return head.stdout.strip(), bool(changed.stdout.strip())
@@ -43,9 +48,12 @@ def campaign(out: Path, seed: int | None) -> dict[str, Any]:
     now = datetime.datetime.now(datetime.UTC)
     drawn = int.from_bytes(hashlib.sha256(f"{head} {now.isoformat()} {time.time_ns()}".encode()).digest()[:7], "big")
     data = {
-        "seed": str(drawn if seed is None else seed), "given": seed is not None, "commit": head,
-        "uncommitted_changes": dirty, "drawn": now.isoformat(timespec="seconds"),
-    }  # fmt: skip
+        "seed": str(drawn if seed is None else seed),
+        "given": seed is not None,
+        "commit": head,
+        "uncommitted_changes": dirty,
+        "drawn": now.isoformat(timespec="seconds"),
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     return data
@@ -66,8 +74,11 @@ def read_rows(paths: Sequence[Path]) -> list[dict[str, Any]]:
 
 def order(counts: Mapping[str, int]) -> list[Job]:
     """All cases, every group in proportion, so that a part of them is a small copy of the whole."""
-    jobs = [((n + 0.5) / count, place, group, n) for place, (group, count) in enumerate(counts.items())
-            for n in range(count)]  # fmt: skip
+    jobs = [
+        ((n + 0.5) / count, place, group, n)
+        for place, (group, count) in enumerate(counts.items())
+        for n in range(count)
+    ]
     return [(group, n) for _, _, group, n in sorted(jobs)]
 
 
@@ -90,8 +101,11 @@ def work(solve: Solve, jobs: Sequence[Job], out: Path, seed: int, minutes: float
             file.write(json.dumps(_plain(row), allow_nan=False) + "\n")
             file.flush()
             done += 1
-            print(f"{row['case']:<18} {row['verdict']:<12} {row.get('outcome', ''):<18} "
-                  f"{', '.join(row.get('named', []))} ({row.get('seconds', 0.0):.0f} s)", flush=True)  # fmt: skip
+            print(
+                f"{row['case']:<18} {row['verdict']:<12} {row.get('outcome', ''):<18} "
+                f"{', '.join(row.get('named', []))} ({row.get('seconds', 0.0):.0f} s)",
+                flush=True,
+            )
     return done
 
 
@@ -139,9 +153,20 @@ def guarded(solve: Solve, group: str, number: int, seed: int, options: Mapping[s
         return solve(group, number, seed, **options)
     except Exception:
         kind = "drives" if "drive" in solve.__name__ else "tables"
-        return {"case": f"{group}-{number:03d}", "kind": kind, "group": group, "seed": str(seed), "verdict": "CRASH",
-                "named": [], "truth": {"effects": {}}, "right": False, "outcome": "crash", "wrong_name": False,
-                "sentence": traceback.format_exc(limit=-4), "seconds": 0.0}  # fmt: skip
+        return {
+            "case": f"{group}-{number:03d}",
+            "kind": kind,
+            "group": group,
+            "seed": str(seed),
+            "verdict": "CRASH",
+            "named": [],
+            "truth": {"effects": {}},
+            "right": False,
+            "outcome": "crash",
+            "wrong_name": False,
+            "sentence": traceback.format_exc(limit=-4),
+            "seconds": 0.0,
+        }
 
 
 def _plain(value: Any) -> Any:

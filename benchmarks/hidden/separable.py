@@ -60,14 +60,18 @@ def nearest(truth: Truth, scale: float = 1.0, replicates: int = 3) -> tuple[str,
         for k in range(len(at)):
             step = np.zeros(len(at))
             step[k] = 0.1 if k >= len(_SOIL) else 1e-3
-            columns.append((residual(at + step) - residual(at + (0.0 if k >= len(_SOIL) else -1.0) * step))
-                           / (step[k] * (1.0 if k >= len(_SOIL) else 2.0)))  # fmt: skip
+            columns.append(
+                (residual(at + step) - residual(at + (0.0 if k >= len(_SOIL) else -1.0) * step))
+                / (step[k] * (1.0 if k >= len(_SOIL) else 2.0))
+            )
         jacobian = np.stack(columns, axis=1)
         solved = np.linalg.lstsq(jacobian, base.fun, rcond=1e-10)[0]
         left = float(np.linalg.norm(base.fun - jacobian @ solved))
         found.append((left, name))
-    refitted = [(min(left, left_over(truth, [n], scale, replicates)) if left < _SURELY * SEPARABLE else left, n)
-                for left, n in sorted(found)]  # fmt: skip
+    refitted = [
+        (min(left, left_over(truth, [n], scale, replicates)) if left < _SURELY * SEPARABLE else left, n)
+        for left, n in sorted(found)
+    ]
     left, name = min(refitted)
     return name, left
 

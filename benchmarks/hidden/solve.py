@@ -79,11 +79,20 @@ def table_row(group: str, number: int, seed: int, suggest: bool = False, keep: s
         seconds = time.monotonic() - drawn
         verdict = found.verdict.label if found else "REFUSED"
         row: dict[str, Any] = {
-            "case": case.name, "kind": "tables", "group": group, "seed": str(seed), "truth": case.answer(),
-            "commitment": case.commitment(), "separable": case.separable, "noise": case.recipe.kind,
-            "scale": case.recipe.scale, "dirt": case.recipe.dirt, "verdict": verdict,
-            "sentence": found.sentence if found else refused, "named": list(found.effects) if found else [],
-        }  # fmt: skip
+            "case": case.name,
+            "kind": "tables",
+            "group": group,
+            "seed": str(seed),
+            "truth": case.answer(),
+            "commitment": case.commitment(),
+            "separable": case.separable,
+            "noise": case.recipe.kind,
+            "scale": case.recipe.scale,
+            "dirt": case.recipe.dirt,
+            "verdict": verdict,
+            "sentence": found.sentence if found else refused,
+            "named": list(found.effects) if found else [],
+        }
         row["explained"] = answer.verdict.label if answer else None
         if found is not None and found.verdict not in (Verdict.BAD_DATA, Verdict.BAD_FIT):
             row |= _physics(case, found, place / "run")
@@ -116,21 +125,33 @@ def drive_row(group: str, number: int, seed: int, folder: str, keep: str | None 
         sealed = json.loads((Path(folder) / "answers" / f"{name}.json").read_text(encoding="utf-8"))
         answer = sealed["answer"]
         row: dict[str, Any] = {
-            "case": name, "kind": "drives", "group": group, "seed": str(seed), "truth": answer,
-            "commitment": sealed["commitment"], "sealed_well": sealed["commitment"] == drives.commitment(answer),
-            "noise": answer["recipe"]["kind"], "scale": answer["recipe"]["scale"], "dirt": answer["recipe"]["dirt"],
-            "verdict": found.verdict.label if found else "REFUSED", "named": list(found.effects) if found else [],
-            "sentence": found.sentence if found else refused, "seconds": round(seconds, 2),
+            "case": name,
+            "kind": "drives",
+            "group": group,
+            "seed": str(seed),
+            "truth": answer,
+            "commitment": sealed["commitment"],
+            "sealed_well": sealed["commitment"] == drives.commitment(answer),
+            "noise": answer["recipe"]["kind"],
+            "scale": answer["recipe"]["scale"],
+            "dirt": answer["recipe"]["dirt"],
+            "verdict": found.verdict.label if found else "REFUSED",
+            "named": list(found.effects) if found else [],
+            "sentence": found.sentence if found else refused,
+            "seconds": round(seconds, 2),
             "half_step_chi2": _half_steps(found),
-        }  # fmt: skip
+        }
         if found is not None and found.verdict not in (Verdict.BAD_DATA, Verdict.BAD_FIT):
             kinds = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
             row |= {
-                "port": found.port, "ports": dict(found.ports), "parameters": _values(answer["effects"], found),
+                "port": found.port,
+                "ports": dict(found.ports),
+                "parameters": _values(answer["effects"], found),
                 "true_ports": sorted({port for n in answer["effects"] for port in kinds[n].ports}),
-                "error_before": dict(found.error_before), "error_after": dict(found.error_after),
+                "error_before": dict(found.error_before),
+                "error_after": dict(found.error_after),
                 "undecidable": list(found.undecidable),
-            }  # fmt: skip
+            }
         return row | outcome(row, lambda other: 0.0)
     finally:
         if not keep:
@@ -150,11 +171,17 @@ def _twins(truth: bed_logs.Truth, name: str) -> float:
 
 def _physics(case: cases.Case, found: Diagnosis, run: Path) -> dict[str, Any]:
     row = {
-        "port": found.port, "ports": dict(found.ports), "true_ports": _ports(case.truth.effects),
-        "error_before": dict(found.error_before), "error_after": dict(found.error_after),
-        "parameters": _values(case.truth.effects, found), "undecidable": list(found.undecidable),
-        "floor": None, "over_floor": None, "told": None,
-    }  # fmt: skip
+        "port": found.port,
+        "ports": dict(found.ports),
+        "true_ports": _ports(case.truth.effects),
+        "error_before": dict(found.error_before),
+        "error_after": dict(found.error_after),
+        "parameters": _values(case.truth.effects, found),
+        "undecidable": list(found.undecidable),
+        "floor": None,
+        "over_floor": None,
+        "told": None,
+    }
     if (run / SERIES_FILE).is_file():
         seen, sigma, predicted = _seen(case.truth, run)
         held = ~seen.fitted
@@ -192,8 +219,17 @@ def _values(effects: Mapping[str, Mapping[str, float]], found: Diagnosis) -> lis
             if name in e.values and np.isfinite(e.std.get(name, np.nan)):
                 value, std = e.values[name], e.std[name]
                 away = abs(value - true)
-                rows.append({"effect": e.effect, "name": name, "truth": true, "value": value, "std": std,
-                             "error": away / abs(true), "covered": away <= _95 * std})  # fmt: skip
+                rows.append(
+                    {
+                        "effect": e.effect,
+                        "name": name,
+                        "truth": true,
+                        "value": value,
+                        "std": std,
+                        "error": away / abs(true),
+                        "covered": away <= _95 * std,
+                    }
+                )
     return rows
 
 
@@ -207,5 +243,7 @@ def _suggestions(run: Path) -> list[dict[str, Any]]:
         found = discover(loaded, settings=Settings(seed=loaded.seed))
     except UserError as error:
         return [{"refused": str(error)}]
-    return [{"port": s.port, "target": s.target, "formula": s.formula, "at_noise": s.at_noise}
-            for s in found.suggestions[:3]]  # fmt: skip
+    return [
+        {"port": s.port, "target": s.target, "formula": s.formula, "at_noise": s.at_noise}
+        for s in found.suggestions[:3]
+    ]

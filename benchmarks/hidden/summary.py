@@ -71,7 +71,8 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
         "singles at 5 times the noise": {"target": ">= 0.80", **share(group("singles_x5"), right)},
         "singles at 5 times the noise, wrong name": {"target": "<= 0.02", **share(group("singles_x5"), wrong)},
         "singles at 5 times the noise, separable there": share(
-            [r for r in group("singles_x5") if r["separable"] >= SEPARABLE * r["scale"]], right),
+            [r for r in group("singles_x5") if r["separable"] >= SEPARABLE * r["scale"]], right
+        ),
         "nulls, false alarm": {"target": "<= 0.01", **share(nulls, lambda r: r["outcome"] == "false alarm")},
         "nulls, something named": share(nulls, wrong),
         "nulls, not answered": share(nulls, lambda r: r["outcome"] in ("refused", "crash")),
@@ -79,36 +80,52 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
         "pairs, wrong name": share(group("pairs"), wrong),
         "triples, all named": {"target": ">= 0.70", **share(group("triples"), right)},
         "outside the catalogue": {"target": ">= 0.90", **share(outside, right)},
-        "outside, right port": {"target": ">= 0.85", **share(
-            [r for r in outside if r["verdict"] == "UNKNOWN"], lambda r: r.get("port") in r.get("true_ports", ()))},
-        "outside, one of three formulas fits": {"target": ">= 0.80", **share(
-            suggested, lambda r: any(s.get("at_noise") for s in r["suggestions"]))},
+        "outside, right port": {
+            "target": ">= 0.85",
+            **share(
+                [r for r in outside if r["verdict"] == "UNKNOWN"], lambda r: r.get("port") in r.get("true_ports", ())
+            ),
+        },
+        "outside, one of three formulas fits": {
+            "target": ">= 0.80",
+            **share(suggested, lambda r: any(s.get("at_noise") for s in r["suggestions"])),
+        },
         "undecidable, called so": {"target": ">= 0.95", **share(group("undecidable"), right)},
         "sabotaged, BAD_DATA": {"target": ">= 0.95", **share(group("sabotaged"), right)},
         "dirt, wrong name": share(group("dirt"), wrong),
         "held-out error over the floor": {
             "target": "median <= 1.01, 95th percentile <= 1.03",
-            **_spread([r["over_floor"] for r in named], 0.5, 0.95)},
-        **{f"held-out error over the floor, {noise}": _spread(
-            [r["over_floor"] for r in named if r.get("noise") == noise], 0.5, 0.95) for noise in NOISES},
+            **_spread([r["over_floor"] for r in named], 0.5, 0.95),
+        },
+        **{
+            f"held-out error over the floor, {noise}": _spread(
+                [r["over_floor"] for r in named if r.get("noise") == noise], 0.5, 0.95
+            )
+            for noise in NOISES
+        },
         "the same, by who was told": _spread([r["told"]["over_floor"] for r in told], 0.5, 0.95),
         "held-out error over that of who was told": _spread(
-            [r["over_floor"] / r["told"]["over_floor"] for r in told if r["told"]["over_floor"]], 0.5, 0.95),
+            [r["over_floor"] / r["told"]["over_floor"] for r in told if r["told"]["over_floor"]], 0.5, 0.95
+        ),
         "relative parameter error": {
-            "target": "median <= 0.02, 90th percentile <= 0.10", **_spread([p["error"] for p in values], 0.5, 0.9)},
+            "target": "median <= 0.02, 90th percentile <= 0.10",
+            **_spread([p["error"] for p in values], 0.5, 0.9),
+        },
         "parameter error by who was told": _spread([p["error"] for p in best], 0.5, 0.9),
         "the same, where the stated error is below a tenth": _spread(
-            [p["error"] for p in values if p["std"] < 0.1 * abs(p["value"])], 0.5, 0.9),
+            [p["error"] for p in values if p["std"] < 0.1 * abs(p["value"])], 0.5, 0.9
+        ),
         "95 % interval covers": {"target": "0.93 to 0.97", **share(values, lambda p: p["covered"])},
         "95 % interval of who was told covers": share(best, lambda p: p["covered"]),
         "seconds": _spread([r.get("seconds", 0.0) for r in rows], 0.5, 0.9),
         "crashes": share(rows, lambda r: r["verdict"] == "CRASH"),
         "by effect": _by_effect(group("singles")),
         "dirt by size": _by_dirt(group("dirt")),
-        "by noise": {n: share([r for r in group("nulls") if r.get("noise") == n],
-                              lambda r: r["outcome"] == "false alarm")
-                     for n in sorted({str(r.get("noise")) for r in group("nulls")})},
-    }  # fmt: skip
+        "by noise": {
+            n: share([r for r in group("nulls") if r.get("noise") == n], lambda r: r["outcome"] == "false alarm")
+            for n in sorted({str(r.get("noise")) for r in group("nulls")})
+        },
+    }
 
 
 def _by_effect(rows: Sequence[Row]) -> dict[str, Any]:
@@ -121,8 +138,10 @@ def _by_dirt(rows: Sequence[Row]) -> dict[str, Any]:
     for size in sorted({r["dirt"] for r in rows}):
         here = [r for r in rows if r["dirt"] == size]
         verdicts = sorted({r["verdict"] for r in here})
-        out[f"{size:g}"] = {"wrong name": share(here, lambda r: r["wrong_name"]),
-                            **{v: sum(r["verdict"] == v for r in here) for v in verdicts}}  # fmt: skip
+        out[f"{size:g}"] = {
+            "wrong name": share(here, lambda r: r["wrong_name"]),
+            **{v: sum(r["verdict"] == v for r in here) for v in verdicts},
+        }
     return out
 
 

@@ -50,8 +50,10 @@ def told(truth: Truth, recipe: Recipe, seen: Observed, replicates: int = 3) -> d
     names = [(effect, key) for effect, values in truth.effects.items() for key in values]
     sigma = np.array([truth.sigma[c] for c in seen.channel]) * recipe.scale / np.sqrt(replicates)
     clean = true_values(truth, seen) / sigma
-    columns = [(_predicted(truth, seen, names, e) - _predicted(truth, seen, names, -e)) / (2.0 * _STEP * sigma)
-               for e in _STEP * np.eye(len(_SOIL) + len(names))]  # fmt: skip
+    columns = [
+        (_predicted(truth, seen, names, e) - _predicted(truth, seen, names, -e)) / (2.0 * _STEP * sigma)
+        for e in _STEP * np.eye(len(_SOIL) + len(names))
+    ]
     jacobian, noise, fitted = np.stack(columns, axis=1), seen.value / sigma - clean, seen.fitted
     known = np.linalg.inv(_correlation(seen, recipe)[np.ix_(fitted, fitted)])
     information = np.diag(jacobian[fitted].T @ known @ jacobian[fitted])
@@ -63,8 +65,11 @@ def told(truth: Truth, recipe: Recipe, seen: Observed, replicates: int = 3) -> d
     left = (noise - scaled @ away)[~fitted]
     std = size * np.sqrt(np.diag(covariance))
     ends = zip(names, (size * away)[len(_SOIL) :], std[len(_SOIL) :], felt[len(_SOIL) :], strict=True)
-    rows = [{"effect": effect, "name": key, "error": float(abs(a)), "covered": bool(abs(a) <= _95 * s)}
-            for (effect, key), a, s, shows in ends if shows]  # fmt: skip
+    rows = [
+        {"effect": effect, "name": key, "error": float(abs(a)), "covered": bool(abs(a) <= _95 * s)}
+        for (effect, key), a, s, shows in ends
+        if shows
+    ]
     floor = np.sqrt(np.mean(noise[~fitted] ** 2)) if left.size else 0.0
     return {"over_floor": float(np.sqrt(np.mean(left**2)) / floor) if floor else None, "parameters": rows}
 

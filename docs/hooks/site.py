@@ -53,9 +53,18 @@ def _effect(e: Effect) -> str:
         facts.append(f"replaces {', '.join(f'`{r}`' for r in e.replaces)}")
     parts = [f"### {e.name}", cell(e.doc), f"*{'; '.join(facts)}*"]
     if e.parameters:
-        rows = [[f"`{k}`", cell(p.meaning), f"{p.nominal:.6g}", "" if p.null is None else f"{p.null:.6g}",
-                 f"{p.bounds[0]:.4g} to {p.bounds[1]:.4g}", cell(p.unit), cell(p.source)]
-                for k, p in e.parameters.items()]  # fmt: skip
+        rows = [
+            [
+                f"`{k}`",
+                cell(p.meaning),
+                f"{p.nominal:.6g}",
+                "" if p.null is None else f"{p.null:.6g}",
+                f"{p.bounds[0]:.4g} to {p.bounds[1]:.4g}",
+                cell(p.unit),
+                cell(p.source),
+            ]
+            for k, p in e.parameters.items()
+        ]
         parts.append(table(["parameter", "meaning", "nominal", "null", "bounds", "unit", "source"], rows))
     if e.state:
         rows = [[f"`{k}`", cell(s.meaning), s.axis, cell(s.unit)] for k, s in e.state.items()]
@@ -95,8 +104,14 @@ def windings() -> str:
     return table(["winding, V", *keys], [[str(n), *(f"{w[k]:.6g}" for k in keys)] for n, w in WINDINGS.items()])
 
 
-TABLES = {"effects": effects, "presets": presets, "flaws": flaws, "unsaid": unsaid, "soils": soils,
-          "windings": windings}  # fmt: skip
+TABLES = {
+    "effects": effects,
+    "presets": presets,
+    "flaws": flaws,
+    "unsaid": unsaid,
+    "soils": soils,
+    "windings": windings,
+}
 """What a page may ask for by name."""
 
 

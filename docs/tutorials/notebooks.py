@@ -87,8 +87,12 @@ def _shown(value: Any) -> dict[str, str]:
 def notebook(made: list[dict[str, Any]]) -> dict[str, Any]:
     """A notebook of format 4.5."""
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
-    return {"cells": made, "metadata": {"kernelspec": kernel, "language_info": {"name": "python"}}, "nbformat": 4,
-            "nbformat_minor": 5}  # fmt: skip
+    return {
+        "cells": made,
+        "metadata": {"kernelspec": kernel, "language_info": {"name": "python"}},
+        "nbformat": 4,
+        "nbformat_minor": 5,
+    }
 
 
 def page(name: str, made: list[dict[str, Any]], pictures: Path) -> str:

@@ -52,8 +52,7 @@ class Checkpoints:
         """
         try:
             found = self._manager.restore(
-                step,
-                args=ocp.args.Composite(state=ocp.args.StandardRestore(_flat(like)), notes=ocp.args.JsonRestore()),
+                step, args=ocp.args.Composite(state=ocp.args.StandardRestore(_flat(like)), notes=ocp.args.JsonRestore())
             )
         except (ValueError, KeyError) as error:
             reason = str(error).split("\n")[0][:200]

@@ -32,47 +32,101 @@ class Training:
 
 
 _LARGE = TrainConfig(
-    td3.TUNED, envs=8192, batch=16384, updates=4, buffer_steps=256, random_steps=8, noise=(0.02, 0.4), normalise=True,
-    epoch_steps=50, episodes=False,
-)  # fmt: skip
+    td3.TUNED,
+    envs=8192,
+    batch=16384,
+    updates=4,
+    buffer_steps=256,
+    random_steps=8,
+    noise=(0.02, 0.4),
+    normalise=True,
+    epoch_steps=50,
+    episodes=False,
+)
 _SMALL_TD3 = td3.TD3Config(
-    actor_layers=(128, 128), critic_layers=(128, 128), actor_last_scale=0.01, layer_norm=True, actor_rate=3e-4,
-    critic_rate=1e-3, gamma=0.95, tau=0.02, n_step=3, reward_scale=0.02,
-)  # fmt: skip
-_SHORT_OPTIONS = {"task": "consistent", "action": "velocity", "terrain": "flat", "goal_distance": (3.0, 5.0),
-                  "episode_time": 12.0, "decimation": 100,
-                  "observations": ("goal_body", "body_velocity", "body_rates")}  # fmt: skip
+    actor_layers=(128, 128),
+    critic_layers=(128, 128),
+    actor_last_scale=0.01,
+    layer_norm=True,
+    actor_rate=3e-4,
+    critic_rate=1e-3,
+    gamma=0.95,
+    tau=0.02,
+    n_step=3,
+    reward_scale=0.02,
+)
+_SHORT_OPTIONS = {
+    "task": "consistent",
+    "action": "velocity",
+    "terrain": "flat",
+    "goal_distance": (3.0, 5.0),
+    "episode_time": 12.0,
+    "decimation": 100,
+    "observations": ("goal_body", "body_velocity", "body_rates"),
+}
 _POINT = TrainConfig(
-    td3.TD3Config(actor_layers=(64, 64), critic_layers=(64, 64), n_step=3, tau=0.02), envs=32, batch=256, updates=2,
-    buffer_steps=1000, random_steps=20, noise=(0.05, 0.4), normalise=True, epoch_steps=100,
-)  # fmt: skip
+    td3.TD3Config(actor_layers=(64, 64), critic_layers=(64, 64), n_step=3, tau=0.02),
+    envs=32,
+    batch=256,
+    updates=2,
+    buffer_steps=1000,
+    random_steps=20,
+    noise=(0.05, 0.4),
+    normalise=True,
+    epoch_steps=100,
+)
 _UNSEEN = {"terrain": "world:heldout", "ranges": "unseen"}
 
 TRAININGS: dict[str, Training] = {
     "paper-td3": Training(
-        "navigation", {"task": "paper"}, TrainConfig(td3.TD3Config(), batch=100, buffer_steps=200_000), 120_000,
+        "navigation",
+        {"task": "paper"},
+        TrainConfig(td3.TD3Config(), batch=100, buffer_steps=200_000),
+        120_000,
         note="section V with SB3's defaults of TD3",
     ),
     "paper-ddpg": Training(
-        "navigation", {"task": "paper"}, TrainConfig(ddpg.DDPGConfig(), batch=100, buffer_steps=200_000), 120_000,
+        "navigation",
+        {"task": "paper"},
+        TrainConfig(ddpg.DDPGConfig(), batch=100, buffer_steps=200_000),
+        120_000,
         note="section V with SB3's defaults of DDPG",
     ),
     "large-td3": Training(
-        "navigation", {"task": "large"}, _LARGE, 60_000_000, _UNSEEN,
+        "navigation",
+        {"task": "large"},
+        _LARGE,
+        60_000_000,
+        _UNSEEN,
         note="TD3 with thousands of rovers on rough ground, goals 10 to 40 m away",
     ),
     "large-ddpg": Training(
-        "navigation", {"task": "large"}, dataclasses.replace(_LARGE, algorithm=ddpg.TUNED), 60_000_000, _UNSEEN,
+        "navigation",
+        {"task": "large"},
+        dataclasses.replace(_LARGE, algorithm=ddpg.TUNED),
+        60_000_000,
+        _UNSEEN,
         note="DDPG likewise",
     ),
     "short": Training(
-        "navigation", _SHORT_OPTIONS,
-        TrainConfig(_SMALL_TD3, envs=64, batch=256, updates=8, buffer_steps=400, random_steps=10, noise=(0.05, 0.5),
-                    normalise=True, epoch_steps=25),
-        48_000, note="TD3 on flat ground, goals 3 to 5 m away: learns within minutes on two CPU cores",
+        "navigation",
+        _SHORT_OPTIONS,
+        TrainConfig(
+            _SMALL_TD3,
+            envs=64,
+            batch=256,
+            updates=8,
+            buffer_steps=400,
+            random_steps=10,
+            noise=(0.05, 0.5),
+            normalise=True,
+            epoch_steps=25,
+        ),
+        48_000,
+        note="TD3 on flat ground, goals 3 to 5 m away: learns within minutes on two CPU cores",
     ),
     "point": Training("point", {}, _POINT, 96_000, note="a point without physics: seconds"),
-}  # fmt: skip
+}
 """Trainings that `lunar-mjx train` knows by name."""
 
 

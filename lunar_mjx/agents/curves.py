@@ -49,8 +49,9 @@ def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str =
         steps, label = [r["steps"] for r in rows], f"seed {record['seed']}"
         first.plot(steps, [r["episode_return"] for r in rows], lw=1, label=label)
         second.plot(steps, [100 * r["success"] for r in rows], lw=1)
-        third.plot([s["elapsed_s"] for s in record["unseen"]], [100 * s["success"] for s in record["unseen"]], "o-",
-                   ms=3, lw=1)  # fmt: skip
+        third.plot(
+            [s["elapsed_s"] for s in record["unseen"]], [100 * s["success"] for s in record["unseen"]], "o-", ms=3, lw=1
+        )
     first.set(xlabel="environment steps", ylabel="return of ended episodes", title=title)
     second.set(xlabel="environment steps", ylabel="success in training, %", ylim=(-3, 103))
     third.set(xlabel="wall time of training, s", ylabel="success on unseen ground, %", ylim=(-3, 103))

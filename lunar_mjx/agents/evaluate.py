@@ -121,9 +121,12 @@ def _score(result: dict[str, np.ndarray], interval: float) -> Score:
         episode_return=float(returns.mean()),
         return_deviation=float(returns.std()),
         episode_time=float(result["episode_length"].mean()) * interval,
-        ends={"success": float(success.mean()), **ends,
-              "time": max(0.0, 1.0 - float(success.mean()) - sum(ends.values()))},
-    )  # fmt: skip
+        ends={
+            "success": float(success.mean()),
+            **ends,
+            "time": max(0.0, 1.0 - float(success.mean()) - sum(ends.values())),
+        },
+    )
 
 
 def evaluate(env: Environment, agent: Agent, episodes: int, seed: int, env_params: Any = None) -> Score:

@@ -94,9 +94,13 @@ def replay(env: Environment, path: Path) -> State:
         for place, leaf in jax.tree_util.tree_leaves_with_path(shapes):
             name = jax.tree_util.keystr(place)
             if name not in data or data[name].shape != leaf.shape:
-                raise bad_input(path, name, "missing" if name not in data else data[name].shape,
-                                "is not the state of this environment",
-                                "make the environment with the settings of the training")  # fmt: skip
+                raise bad_input(
+                    path,
+                    name,
+                    "missing" if name not in data else data[name].shape,
+                    "is not the state of this environment",
+                    "make the environment with the settings of the training",
+                )
             found.append(jnp.asarray(data[name]))
         state = jax.tree.unflatten(jax.tree.structure(shapes), found)
         return jax.jit(env.step)(env.params, state, jnp.asarray(data["action"]))

@@ -71,8 +71,13 @@ class TrainConfig:
         if not 0.0 <= self.noise[0] <= self.noise[1]:
             raise bad_input("TrainConfig", "noise", self.noise, "is no range of deviations", "give (least, greatest)")
         if self.random_steps < self.algorithm.n_step:
-            raise bad_input("TrainConfig", "random_steps", self.random_steps,
-                            f"is below n_step = {self.algorithm.n_step}", "raise it")  # fmt: skip
+            raise bad_input(
+                "TrainConfig",
+                "random_steps",
+                self.random_steps,
+                f"is below n_step = {self.algorithm.n_step}",
+                "raise it",
+            )
 
 
 @pytree
@@ -110,8 +115,13 @@ class Learner:
         self.devices = self.mesh.size
         for name in ("envs", "batch"):
             if getattr(config, name) % self.devices:
-                raise bad_input("TrainConfig", name, getattr(config, name),
-                                f"does not divide among {self.devices} devices", "give a multiple")  # fmt: skip
+                raise bad_input(
+                    "TrainConfig",
+                    name,
+                    getattr(config, name),
+                    f"does not divide among {self.devices} devices",
+                    "give a multiple",
+                )
         algorithm = config.algorithm
         kind = TD3 if isinstance(algorithm, TD3Config) else DDPG
         self.agent = kind(algorithm, env.observation_size, env.privileged_size, env.action_size)  # type: ignore[arg-type]
@@ -290,6 +300,12 @@ def normalised(values: Any, mean: Any, deviation: Any) -> Any:
 
 def _transition(before: State, action: Any, after: State) -> Transition:
     return Transition(
-        before.obs, before.privileged, action, after.reward, after.terminated, after.truncated, after.final_obs,
+        before.obs,
+        before.privileged,
+        action,
+        after.reward,
+        after.terminated,
+        after.truncated,
+        after.final_obs,
         after.final_privileged,
-    )  # fmt: skip
+    )

@@ -15,8 +15,11 @@ with without_warp_notices():
     from brax.training import networks as brax_networks
 
 ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
-    "relu": jax.nn.relu, "elu": jax.nn.elu, "swish": jax.nn.swish, "tanh": jnp.tanh
-}  # fmt: skip
+    "relu": jax.nn.relu,
+    "elu": jax.nn.elu,
+    "swish": jax.nn.swish,
+    "tanh": jnp.tanh,
+}
 
 Network = brax_networks.FeedForwardNetwork
 """`init(key) -> params` and `apply(params, ...)`."""
@@ -34,9 +37,13 @@ def _mlp(sizes: Sequence[int], activation: str, layer_norm: bool) -> Any:
 
 
 def make_actor(
-    obs: int, actions: int, layers: Sequence[int], activation: str = "relu", layer_norm: bool = False,
+    obs: int,
+    actions: int,
+    layers: Sequence[int],
+    activation: str = "relu",
+    layer_norm: bool = False,
     last_scale: float = 1.0,
-) -> Network:  # fmt: skip
+) -> Network:
     """A deterministic policy: `apply(params, obs) -> action` in [-1, 1].
 
     Args:
@@ -58,9 +65,14 @@ def make_actor(
 
 
 def make_critics(
-    obs: int, actions: int, layers: Sequence[int], count: int = 2, outputs: int = 1, activation: str = "relu",
+    obs: int,
+    actions: int,
+    layers: Sequence[int],
+    count: int = 2,
+    outputs: int = 1,
+    activation: str = "relu",
     layer_norm: bool = False,
-) -> Network:  # fmt: skip
+) -> Network:
     """Several critics: `apply(params, obs, action) -> (critic, batch, outputs)`; params lead with the axis `critic`."""
     module = _mlp((*layers, outputs), activation, layer_norm)
 

@@ -50,16 +50,25 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
         return env, make_agent(name, env), unseen
     path = Path(name) if name.endswith(".npz") else shipped_policy(name)
     if path is None:
-        raise bad_input("agent", "agent", name, "is no rover with a trained policy",
-                        f"give a policy.npz, or one of {', '.join(AGENTS)}")  # fmt: skip
+        raise bad_input(
+            "agent",
+            "agent",
+            name,
+            "is no rover with a trained policy",
+            f"give a policy.npz, or one of {', '.join(AGENTS)}",
+        )
     policy = load_policy(path)
     made_in = policy.environment
     arguments = {k: tuple(v) if isinstance(v, list) else v for k, v in made_in["options"].items()}
     env = make(made_in["name"], **{**arguments, **options})
     if env.observation_size != policy.network["obs"] or env.action_size != policy.network["actions"]:
-        raise bad_input(path, "observations", policy.network["obs"],
-                        f"do not fit the environment's {env.observation_size}",
-                        "change no observations or actions")  # fmt: skip
+        raise bad_input(
+            path,
+            "observations",
+            policy.network["obs"],
+            f"do not fit the environment's {env.observation_size}",
+            "change no observations or actions",
+        )
     return env, lambda state, key: policy.act(state.obs), dict(made_in.get("unseen", {}))
 
 
@@ -95,17 +104,37 @@ class Episode:
         if view not in VIEWS:
             raise bad_input("play", "view", view, "does not exist", f"use one of {', '.join(VIEWS)}")
         frames, still = self._frames(view)
-        table = np.column_stack([np.arange(len(self.reward)) * self.env.control_interval, self.qpos[:-1, :3],
-                                 self.yaw[:-1], self.reward, self.action])  # fmt: skip
-        names = ["time_s", "position_x_m", "position_y_m", "position_z_m", "yaw_rad", "reward",
-                 *(f"action_{n}" for n in self.env.actions.names)]  # fmt: skip
+        table = np.column_stack(
+            [
+                np.arange(len(self.reward)) * self.env.control_interval,
+                self.qpos[:-1, :3],
+                self.yaw[:-1],
+                self.reward,
+                self.action,
+            ]
+        )
+        names = [
+            "time_s",
+            "position_x_m",
+            "position_y_m",
+            "position_z_m",
+            "yaw_rad",
+            "reward",
+            *(f"action_{n}" for n in self.env.actions.names),
+        ]
         csv, picture, video = (folder / n for n in ("episode.csv", "path.png", "episode.webp"))
         np.savetxt(csv, table, delimiter=",", header=",".join(names), comments="", fmt="%.6g")
         Image.fromarray(still).save(picture)
         stride = max(1, len(self.reward) // _FRAMES)
         images = [Image.fromarray(f) for f in frames]
-        images[0].save(video, save_all=True, append_images=images[1:], loop=0, quality=75,
-                       duration=max(20, round(1000 * stride * self.env.control_interval / 4)))  # fmt: skip
+        images[0].save(
+            video,
+            save_all=True,
+            append_images=images[1:],
+            loop=0,
+            quality=75,
+            duration=max(20, round(1000 * stride * self.env.control_interval / 4)),
+        )
         note = {"end": self.end, "goal_m": self.goal.tolist(), "speed_up": 4}
         (folder / "episode.json").write_text(json.dumps(note) + "\n", encoding="utf-8")
         return [csv, picture, video]
@@ -153,8 +182,13 @@ def play_episode(env: Any, params: Any, agent: Agent, seed: int = 0) -> Episode:
         rewards.append(float(state.reward[0]))
         if bool(state.done[0]):
             flags = {k: float(v[0]) for k, v in state.metrics.items() if not k.startswith("reward_")}
-            names = {"success": "goal reached", "rolled_over": "rolled over", "stuck": "stuck",
-                     "off_terrain": "left the terrain", "diverged": "diverged"}  # fmt: skip
+            names = {
+                "success": "goal reached",
+                "rolled_over": "rolled over",
+                "stuck": "stuck",
+                "off_terrain": "left the terrain",
+                "diverged": "diverged",
+            }
             end = next((text for k, text in names.items() if flags[k] > 0), end)
             # the pose after the last step is gone with the reset: the picture ends one step before
             qpos.append(qpos[-1])

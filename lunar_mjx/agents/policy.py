@@ -60,8 +60,9 @@ def policy_of(learner: Learner, state: Any, environment: dict[str, Any], notes: 
 
 def save_policy(policy: Policy, path: Path) -> Path:
     """Writes a policy as an .npz file without pickles; returns the path."""
-    leaves = {f"params{jax.tree_util.keystr(p)}": np.asarray(a) for p, a in
-              jax.tree_util.tree_leaves_with_path(policy.params)}  # fmt: skip
+    leaves = {
+        f"params{jax.tree_util.keystr(p)}": np.asarray(a) for p, a in jax.tree_util.tree_leaves_with_path(policy.params)
+    }
     if policy.mean is not None:
         leaves |= {"mean": np.asarray(policy.mean), "deviation": np.asarray(policy.deviation)}
     record = {"format": FORMAT, "network": policy.network, "environment": policy.environment, "notes": policy.notes}

@@ -86,8 +86,13 @@ class ReplayBuffer:
 
     def __post_init__(self) -> None:
         if not 1 <= self.n_step <= self.length:
-            raise bad_input("ReplayBuffer", "n_step", self.n_step, f"is not within 1 .. length = {self.length}",
-                            "lower it or lengthen the buffer")  # fmt: skip
+            raise bad_input(
+                "ReplayBuffer",
+                "n_step",
+                self.n_step,
+                f"is not within 1 .. length = {self.length}",
+                "lower it or lengthen the buffer",
+            )
         if not 0.0 <= self.gamma <= 1.0:
             raise bad_input("ReplayBuffer", "gamma", self.gamma, "is outside [0, 1]", "give about 0.99")
 

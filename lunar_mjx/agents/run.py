@@ -63,8 +63,16 @@ class Scorer:
       folder: the policy with the best score is kept there as `best_policy.npz`.
     """
 
-    def __init__(self, env: Any, unseen: Mapping[str, Any], episodes: int, every: float, target: float | None,
-                 folder: Path | None, environment: dict[str, Any]):  # fmt: skip
+    def __init__(
+        self,
+        env: Any,
+        unseen: Mapping[str, Any],
+        episodes: int,
+        every: float,
+        target: float | None,
+        folder: Path | None,
+        environment: dict[str, Any],
+    ):
         self.params = unseen_params(env, unseen)
         self.every, self.target, self.folder, self.environment = every, target, folder, environment
         self._best, self._evaluator = -1.0, None
@@ -132,8 +140,11 @@ def run_training(
     """
     begin = time.monotonic()
     env = make(training.environment, **training.options)
-    environment = {"name": training.environment, "options": plain(dict(training.options)),
-                   "unseen": dict(training.unseen)}  # fmt: skip
+    environment = {
+        "name": training.environment,
+        "options": plain(dict(training.options)),
+        "unseen": dict(training.unseen),
+    }
     learner = Learner(env, training.train)
     scorer = Scorer(env, training.unseen, eval_episodes, eval_every, target, folder, environment)
     result = train(learner, run, folder, environment, scorer)

@@ -176,8 +176,13 @@ class TD3:
             state, actor_loss = jax.lax.cond(due, improve, lambda s: (s, jnp.zeros((), loss.dtype)), state)
             actor_loss = actor_loss * c.policy_delay  # zero in between: the mean over updates is the loss
         value = self.mean_value(target)
-        return state, {"critic_loss": loss, "actor_loss": actor_loss, "target": jnp.mean(value),
-                       "target_low": jnp.min(value), "target_high": jnp.max(value)}  # fmt: skip
+        return state, {
+            "critic_loss": loss,
+            "actor_loss": actor_loss,
+            "target": jnp.mean(value),
+            "target_low": jnp.min(value),
+            "target_high": jnp.max(value),
+        }
 
     def targets(self, state: TD3State, batch: Batch, key: Any) -> Any:
         """What the critics should say: (batch,) returns, or (batch, atom) probabilities."""

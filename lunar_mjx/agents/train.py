@@ -180,8 +180,9 @@ class _Loop:
             )
         if not self.folder:
             number = int(np.argmax(seen.tripped)) * envs + int(seen.env[np.argmax(seen.tripped)])
-            raise guard.DivergenceError(f"train: environment {number} gave a value that is not finite; "
-                                        "train into a folder to keep its state.")  # fmt: skip
+            raise guard.DivergenceError(
+                f"train: environment {number} gave a value that is not finite; train into a folder to keep its state."
+            )
         path = self.folder / "not_finite.npz"
         number, when = guard.dump(seen, path, envs)
         raise guard.DivergenceError(

@@ -96,8 +96,9 @@ class Backend(abc.ABC):
         wanted = (self.rovers, len(self.model.rover.joints))
         values = np.asarray(control, float)
         if values.shape not in (wanted, wanted[1:]):
-            raise bad_input(f"{self.name}.step", "control", values.shape, "has another shape",
-                            f"give ({wanted[1]},) or {wanted}")  # fmt: skip
+            raise bad_input(
+                f"{self.name}.step", "control", values.shape, "has another shape", f"give ({wanted[1]},) or {wanted}"
+            )
         return np.broadcast_to(values, wanted)
 
     def stages(self, control: Any) -> dict[str, Observation]:
@@ -138,8 +139,13 @@ class Backend(abc.ABC):
         fine = np.isfinite(seen["position"]).all() and np.isfinite(seen["velocity"]).all()
         if not (fine and np.isfinite(seen["joint_speed"]).all()):
             when = round(float(seen["time"].flat[0]), 6)
-            raise bad_input(self.name, "time, s", when, "is where the simulation diverged",
-                            "use a smaller timestep_s, softer gains or smaller commands")  # fmt: skip
+            raise bad_input(
+                self.name,
+                "time, s",
+                when,
+                "is where the simulation diverged",
+                "use a smaller timestep_s, softer gains or smaller commands",
+            )
 
     def channels(self, seen: Telemetry, commands: Commands, rover: int = 0) -> pd.DataFrame:
         """One rover's telemetry as log channels (units in the names, temperatures in degrees Celsius)."""
@@ -151,14 +157,26 @@ def whole_steps(commands: Commands, timestep: float) -> int:
     every = round(commands.interval / timestep)
     if every < 1 or abs(every * timestep - commands.interval) > 1e-3 * commands.interval:
         better = commands.interval / max(every, 1)
-        raise bad_input("run", "interval", f"{commands.interval:g} s",
-                        f"is no whole number of time steps of {timestep:g} s",
-                        f"set timestep_s = {better:.6g}, or resample the commands")  # fmt: skip
+        raise bad_input(
+            "run",
+            "interval",
+            f"{commands.interval:g} s",
+            f"is no whole number of time steps of {timestep:g} s",
+            f"set timestep_s = {better:.6g}, or resample the commands",
+        )
     return every
 
 
-VECTORS = ("position", "velocity", "angular_velocity", "wheel_position", "wheel_velocity", "wheel_force",
-           "wheel_moment", "euler")  # fmt: skip
+VECTORS = (
+    "position",
+    "velocity",
+    "angular_velocity",
+    "wheel_position",
+    "wheel_velocity",
+    "wheel_force",
+    "wheel_moment",
+    "euler",
+)
 
 
 def telemetry(rows: list[Observation]) -> Telemetry:
@@ -171,5 +189,8 @@ def telemetry(rows: list[Observation]) -> Telemetry:
 
 def observation(seen: Telemetry) -> Observation:
     """A batch of telemetry as plain arrays."""
-    return {f.name: np.stack([np.asarray(a) for a in value], -1) if isinstance(value, Vec3) else np.asarray(value)
-            for f in dataclasses.fields(seen) for value in (getattr(seen, f.name),)}  # fmt: skip
+    return {
+        f.name: np.stack([np.asarray(a) for a in value], -1) if isinstance(value, Vec3) else np.asarray(value)
+        for f in dataclasses.fields(seen)
+        for value in (getattr(seen, f.name),)
+    }

@@ -27,20 +27,40 @@ class BulletGround:
         values = model.parameters
         normal = values.get("penalty_contact", values.get("hard_ground"))
         if normal is None:
-            raise bad_input("pybullet", "contact", "engine", "needs the effect penalty_contact or hard_ground",
-                            "add one, or use contact numpy")  # fmt: skip
+            raise bad_input(
+                "pybullet",
+                "contact",
+                "engine",
+                "needs the effect penalty_contact or hard_ground",
+                "add one, or use contact numpy",
+            )
         mu = values["engine_friction"]["mu"] if "engine_friction" in values else normal.get("mu", 0.0)
         field = ground.field
         heights = field.flat.reshape(field.rows, field.cols)
-        shape = p.createCollisionShape(p.GEOM_HEIGHTFIELD, meshScale=[field.cell, field.cell, 1.0],
-                                       heightfieldData=heights.ravel().tolist(), numHeightfieldRows=field.cols,
-                                       numHeightfieldColumns=field.rows, **self._id)  # fmt: skip
+        shape = p.createCollisionShape(
+            p.GEOM_HEIGHTFIELD,
+            meshScale=[field.cell, field.cell, 1.0],
+            heightfieldData=heights.ravel().tolist(),
+            numHeightfieldRows=field.cols,
+            numHeightfieldColumns=field.rows,
+            **self._id,
+        )
         # Bullet puts the middle of the grid and of the heights at the body's origin
-        middle = [field.x0 + 0.5 * (field.cols - 1) * field.cell, field.y0 + 0.5 * (field.rows - 1) * field.cell,
-                  0.5 * float(heights.min() + heights.max())]  # fmt: skip
+        middle = [
+            field.x0 + 0.5 * (field.cols - 1) * field.cell,
+            field.y0 + 0.5 * (field.rows - 1) * field.cell,
+            0.5 * float(heights.min() + heights.max()),
+        ]
         self._terrain = p.createMultiBody(0, shape, basePosition=middle, **self._id)
-        p.changeDynamics(self._terrain, -1, lateralFriction=mu, contactStiffness=normal["stiffness"],
-                         contactDamping=normal["damping"], restitution=0.0, **self._id)  # fmt: skip
+        p.changeDynamics(
+            self._terrain,
+            -1,
+            lateralFriction=mu,
+            contactStiffness=normal["stiffness"],
+            contactDamping=normal["damping"],
+            restitution=0.0,
+            **self._id,
+        )
         p.setCollisionFilterGroupMask(self._terrain, -1, _TERRAIN, _WHEELS, **self._id)
         for wheel in wheels:
             p.setCollisionFilterGroupMask(body, wheel, _WHEELS, _TERRAIN, **self._id)

@@ -124,11 +124,14 @@ class JaxBackend(Backend):
 
     def set_state(self, state: BackendState) -> None:
         with self._precision():
-            offsets = [jnp.asarray(k - REFERENCE_TEMPERATURE, float)
-                       for k in (state.winding_temperature, state.housing_temperature)]  # fmt: skip
+            offsets = [
+                jnp.asarray(k - REFERENCE_TEMPERATURE, float)
+                for k in (state.winding_temperature, state.housing_temperature)
+            ]
             zero = jnp.zeros_like(offsets[0])
-            effects = {e: {k: jnp.asarray(state.effects[e][k], float) for k in own}
-                       for e, own in self._state.effects.items()}  # fmt: skip
+            effects = {
+                e: {k: jnp.asarray(state.effects[e][k], float) for k in own} for e, own in self._state.effects.items()
+            }
             self._state = State(
                 step=jnp.full((self.rovers,), state.step, jnp.int32),
                 qpos=jnp.asarray(state.qpos, float),

@@ -72,7 +72,9 @@ def _into(turn: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
     """Body to world, (time, 3, 3), of w, x, y, z."""
     w, x, y, z = quaternion.T
-    rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]  # fmt: skip
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
     return np.moveaxis(np.array(rows), -1, 0)

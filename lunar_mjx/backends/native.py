@@ -42,8 +42,9 @@ class NativeBackend(NumpyBackend):
 
     name = "native"
 
-    def __init__(self, model: Model, hooks: Iterable[Hook] = (), rovers: int = 1, threads: int = 1,
-                 damped_within: bool = False) -> None:  # fmt: skip
+    def __init__(
+        self, model: Model, hooks: Iterable[Hook] = (), rovers: int = 1, threads: int = 1, damped_within: bool = False
+    ) -> None:
         super().__init__(model, hooks, rovers)
         m = self._mj = native_model(model)
         if damped_within:  # M + dt D in place of M, so that MuJoCo's own addition must go

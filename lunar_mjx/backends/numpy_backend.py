@@ -72,8 +72,9 @@ class NumpyBackend(Backend):
         c.step = self._step
         c.winding_temperature, c.housing_temperature = self._winding, self._housing
         self._look(c)
-        self.forces.start(c, control if isinstance(control, np.ndarray) and control.ndim == 2
-                          else self.controls(control))  # fmt: skip
+        self.forces.start(
+            c, control if isinstance(control, np.ndarray) and control.ndim == 2 else self.controls(control)
+        )
         self._effects = self.forces.forces(c, self._effects)
         self._winding, self._housing = self.forces.heat(c)
         self._push(c)
@@ -82,8 +83,15 @@ class NumpyBackend(Backend):
     def state(self) -> BackendState:
         qpos, qvel = self._coordinates()
         effects = {e: {k: v.copy() for k, v in own.items()} for e, own in self._effects.items()}
-        return BackendState(self._step, qpos, qvel, self._winding.copy(), self._housing.copy(), effects,
-                            copy.deepcopy(self.hooks.states))  # fmt: skip
+        return BackendState(
+            self._step,
+            qpos,
+            qvel,
+            self._winding.copy(),
+            self._housing.copy(),
+            effects,
+            copy.deepcopy(self.hooks.states),
+        )
 
     def set_state(self, state: BackendState) -> None:
         self._step = state.step
@@ -104,8 +112,11 @@ def observe(c: Context) -> Observation:
     motor = c.numbers.effects.get("motor")
     back_emf = 0.0 if motor is None else c.torque_constant * motor.gear_ratio * c.joint_speed
     rotation = c.rotation
-    euler = [np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]), np.arcsin(np.clip(-rotation[:, 2, 0], -1.0, 1.0)),
-             np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])]  # fmt: skip
+    euler = [
+        np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]),
+        np.arcsin(np.clip(-rotation[:, 2, 0], -1.0, 1.0)),
+        np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
+    ]
     seen = {
         "time": np.full(c.rovers, c.time),
         "euler": np.stack(euler, axis=-1),

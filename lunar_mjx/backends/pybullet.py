@@ -138,8 +138,9 @@ class PyBulletBackend(NumpyBackend):
         for i, world in enumerate(self._worlds):
             torque = np.zeros(len(world.names))
             torque[self._joint_of] = c.torque[i] + c.body["joint_torque"][i]
-            loads = [(link, force[i, k], c.wheel_position[i, k], moment[i, k])
-                     for k, link in enumerate(self._wheel_links)]  # fmt: skip
+            loads = [
+                (link, force[i, k], c.wheel_position[i, k], moment[i, k]) for k, link in enumerate(self._wheel_links)
+            ]
             loads.append((-1, c.body["force"][i], c.position[i], c.body["moment"][i]))
             if bears is not None:
                 world.bear(self._wheel_links, bears[i])
@@ -181,8 +182,13 @@ def urdf_of(rover: Rover) -> Path:
     description = tomllib.loads((rover.folder / "rover.toml").read_text(encoding="utf-8"))
     path = rover.folder / description.get("source", f"{rover.name}.urdf")
     if not path.is_file():
-        raise bad_input(rover.folder, "source", path.name, "is not there, and PyBullet loads URDF only",
-                        "put the rover's URDF into its folder")  # fmt: skip
+        raise bad_input(
+            rover.folder,
+            "source",
+            path.name,
+            "is not there, and PyBullet loads URDF only",
+            "put the rover's URDF into its folder",
+        )
     return path
 
 
@@ -194,9 +200,12 @@ class _World:
         self._client = p.connect(p.DIRECT)
         self._id = {"physicsClientId": self._client}
         with _quiet():
-            self._body = p.loadURDF(str(urdf_of(model.rover)), useFixedBase=False,
-                                    flags=p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_IMPLICIT_CYLINDER,
-                                    **self._id)  # fmt: skip
+            self._body = p.loadURDF(
+                str(urdf_of(model.rover)),
+                useFixedBase=False,
+                flags=p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_IMPLICIT_CYLINDER,
+                **self._id,
+            )
         p.setGravity(0.0, 0.0, -model.gravity, **self._id)
         p.setTimeStep(model.timestep, **self._id)
         p.setPhysicsEngineParameter(numSolverIterations=200, solverResidualThreshold=0.0, erp=0.8, **self._id)
@@ -226,15 +235,27 @@ class _World:
         turned = np.sum(axes * mj.jnt_axis[ids], axis=1)
         if np.abs(np.abs(turned) - 1.0).max() > 1e-6:
             wrong = self.names[int(np.argmax(np.abs(np.abs(turned) - 1.0)))]
-            raise bad_input("pybullet", "joint", wrong, "turns about another axis than in the rover's MJCF",
-                            "write the URDF with link frames parallel to the chassis")  # fmt: skip
+            raise bad_input(
+                "pybullet",
+                "joint",
+                wrong,
+                "turns about another axis than in the rover's MJCF",
+                "write the URDF with link frames parallel to the chassis",
+            )
         self._sign = np.sign(turned)
         self._spring, self._rest = mj.jnt_stiffness[ids].copy(), mj.qpos_spring[self._qadr].copy()
         self._damping = mj.dof_damping[self._dadr].copy()
         self._inertia = mj.dof_armature[self._dadr] + self._dt * self._damping
         for link in range(-1, len(infos)):
-            p.changeDynamics(self._body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0,
-                             maxJointVelocity=1e4, **self._id)  # fmt: skip
+            p.changeDynamics(
+                self._body,
+                link,
+                linearDamping=0.0,
+                angularDamping=0.0,
+                jointDamping=0.0,
+                maxJointVelocity=1e4,
+                **self._id,
+            )
             p.setCollisionFilterGroupMask(self._body, link, 0, 0, **self._id)
         for link in self._moving:
             p.changeDynamics(self._body, link, jointLowerLimit=-1e9, jointUpperLimit=1e9, **self._id)
@@ -255,8 +276,17 @@ class _World:
         for link, anchor in zip(links, (loop.anchor1, loop.anchor2), strict=True):
             info = p.getDynamicsInfo(self._body, link, **self._id)
             anchors.append(_matrix(info[4]).T @ (np.array(anchor) - np.array(info[3])))
-        constraint = p.createConstraint(self._body, links[0], self._body, links[1], p.JOINT_POINT2POINT, [0, 0, 0],
-                                        anchors[0].tolist(), anchors[1].tolist(), **self._id)  # fmt: skip
+        constraint = p.createConstraint(
+            self._body,
+            links[0],
+            self._body,
+            links[1],
+            p.JOINT_POINT2POINT,
+            [0, 0, 0],
+            anchors[0].tolist(),
+            anchors[1].tolist(),
+            **self._id,
+        )
         p.changeConstraint(constraint, maxForce=1e9, **self._id)
         return links[0], links[1], np.array(loop.anchor1), np.array(loop.anchor2)
 
@@ -332,8 +362,9 @@ class _World:
                 p.applyExternalForce(self._body, link, force.tolist(), point.tolist(), p.WORLD_FRAME, **self._id)
             if moment.any():
                 p.applyExternalTorque(self._body, link, moment.tolist(), p.WORLD_FRAME, **self._id)
-        p.setJointMotorControlArray(self._body, self._moving, p.TORQUE_CONTROL, forces=(self._sign * torque).tolist(),
-                                    **self._id)  # fmt: skip
+        p.setJointMotorControlArray(
+            self._body, self._moving, p.TORQUE_CONTROL, forces=(self._sign * torque).tolist(), **self._id
+        )
         p.stepSimulation(**self._id)
 
     def _response(self, angle: np.ndarray) -> np.ndarray:
@@ -344,8 +375,10 @@ class _World:
             still = [0.0] * len(q)
             rows = []
             for first, second, here, there in self._pins:
-                one, two = (np.array(p.calculateJacobian(self._body, link, at.tolist(), q, still, still, **self._id)[0])
-                            for link, at in ((first, here), (second, there)))  # fmt: skip
+                one, two = (
+                    np.array(p.calculateJacobian(self._body, link, at.tolist(), q, still, still, **self._id)[0])
+                    for link, at in ((first, here), (second, there))
+                )
                 rows.append(one - two)
             loops = np.concatenate(rows)
             inverse = inverse - inverse @ loops.T @ np.linalg.pinv(loops @ inverse @ loops.T, 1e-9) @ loops @ inverse
@@ -365,16 +398,26 @@ class _World:
 def _matrix(quaternion: Any) -> np.ndarray:
     """Rotation matrix of x, y, z, w."""
     x, y, z, w = quaternion
-    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def _quaternion(matrix: np.ndarray) -> list[float]:
     """x, y, z, w of a rotation matrix, by the largest of the four components."""
     m = matrix
-    squares = np.array([1 + m[0, 0] - m[1, 1] - m[2, 2], 1 - m[0, 0] + m[1, 1] - m[2, 2],
-                        1 - m[0, 0] - m[1, 1] + m[2, 2], 1 + m[0, 0] + m[1, 1] + m[2, 2]])  # fmt: skip
+    squares = np.array(
+        [
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+        ]
+    )
     k = int(np.argmax(squares))
     if k == 3:
         q = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]]

@@ -7,5 +7,21 @@ from lunar_mjx.cameras.raymarch import depth_image, depth_images, height_scan, m
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.texture import Track
 
-__all__ = ["LABELS", "Images", "Pinhole", "Pose", "RoverCamera", "Sun", "Track", "depth_image", "depth_images",
-           "facing", "front_mount", "height_scan", "look_at", "mounted", "orbit", "project"]  # fmt: skip
+__all__ = [
+    "LABELS",
+    "Images",
+    "Pinhole",
+    "Pose",
+    "RoverCamera",
+    "Sun",
+    "Track",
+    "depth_image",
+    "depth_images",
+    "facing",
+    "front_mount",
+    "height_scan",
+    "look_at",
+    "mounted",
+    "orbit",
+    "project",
+]

@@ -62,20 +62,31 @@ class RoverCamera:
     """
 
     def __init__(
-        self, rover: Rover, terrain: Terrain, places: Any = None, camera: Pinhole | None = None,
-        mount: Pose | None = None, sun: Sun | None = None, tracks: Sequence[Track] = (), margin: float = 15.0,
-        largest: tuple[int, int] = (1280, 960), backends: Sequence[str] | None = None, untrodden: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        rover: Rover,
+        terrain: Terrain,
+        places: Any = None,
+        camera: Pinhole | None = None,
+        mount: Pose | None = None,
+        sun: Sun | None = None,
+        tracks: Sequence[Track] = (),
+        margin: float = 15.0,
+        largest: tuple[int, int] = (1280, 960),
+        backends: Sequence[str] | None = None,
+        untrodden: bool = False,
+    ) -> None:
         self.camera, self.sun = camera or Pinhole(), sun or Sun()
         self.mount = mount or front_mount(rover)
         around = np.zeros((1, 2)) if places is None else np.asarray(places, float)
-        self.model, self._painter = build_scene(rover, terrain, around, self.sun, tracks, margin, self.mount,
-                                                self.camera.fovy_deg)  # fmt: skip
+        self.model, self._painter = build_scene(
+            rover, terrain, around, self.sun, tracks, margin, self.mount, self.camera.fovy_deg
+        )
         self.data = mujoco.MjData(self.model)
         self._chassis = self.model.body(rover.chassis).id
         self._labels = np.array([_label(self.model.geom(i).name) for i in range(self.model.ngeom)] + [0])
-        self._offscreen = Offscreen(self.model, max(largest[0], self.camera.width),
-                                    max(largest[1], self.camera.height), backends)  # fmt: skip
+        self._offscreen = Offscreen(
+            self.model, max(largest[0], self.camera.width), max(largest[1], self.camera.height), backends
+        )
         self.place(self.model.qpos0)
         if tracks and not untrodden:
             self.roll(max(len(t.places) for t in tracks))
@@ -100,8 +111,9 @@ class RoverCamera:
     @property
     def front_pose(self) -> Pose:
         """Pose of the front camera in the world."""
-        return carried(self.mount, self.data.xpos[self._chassis].copy(),
-                       self.data.xmat[self._chassis].reshape(3, 3).copy())  # fmt: skip
+        return carried(
+            self.mount, self.data.xpos[self._chassis].copy(), self.data.xmat[self._chassis].reshape(3, 3).copy()
+        )
 
     def front(self) -> Images:
         """What the front camera sees."""

@@ -99,8 +99,9 @@ class Offscreen:
     def look(self, data: Any, pose: Pose, camera: Pinhole, sun: np.ndarray | None = None) -> None:
         """Places the camera; `sun` is where the shadows' light stands, (3,) m."""
         free = mujoco.MjvCamera()
-        mujoco.mjv_updateScene(self._model, data, self._option, None, free, mujoco.mjtCatBit.mjCAT_ALL.value,
-                               self._scene)  # fmt: skip
+        mujoco.mjv_updateScene(
+            self._model, data, self._option, None, free, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+        )
         tall = camera.near * np.tan(0.5 * np.radians(camera.fovy_deg))
         for eye in self._scene.camera:
             eye.pos, eye.forward, eye.up = pose.position, -pose.rotation[:, 2], pose.rotation[:, 1]

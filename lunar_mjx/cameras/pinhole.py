@@ -60,9 +60,14 @@ class Pinhole:
         """Camera to clip coordinates, as gluPerspective: multiply column vectors from the left."""
         f = 1.0 / math.tan(0.5 * math.radians(self.fovy_deg))
         near, far = self.near, self.far
-        return np.array([[f * self.height / self.width, 0, 0, 0], [0, f, 0, 0],
-                         [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
-                         [0, 0, -1, 0]])  # fmt: skip
+        return np.array(
+            [
+                [f * self.height / self.width, 0, 0, 0],
+                [0, f, 0, 0],
+                [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
+                [0, 0, -1, 0],
+            ]
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,8 +95,13 @@ def look_at(position: object, target: object, up: object = (0.0, 0.0, 1.0)) -> P
     ahead = to - eye
     right = np.cross(ahead, above)
     if np.linalg.norm(right) < 1e-9 * max(1.0, float(np.linalg.norm(ahead))):
-        raise bad_input("camera", "target", to.tolist(), f"gives no picture from {eye.tolist()}",
-                        "look elsewhere, or give another up")  # fmt: skip
+        raise bad_input(
+            "camera",
+            "target",
+            to.tolist(),
+            f"gives no picture from {eye.tolist()}",
+            "look elsewhere, or give another up",
+        )
     ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
     return Pose(eye, np.stack([right, np.cross(right, ahead), -ahead], axis=1))
 
@@ -99,8 +109,9 @@ def look_at(position: object, target: object, up: object = (0.0, 0.0, 1.0)) -> P
 def orbit(target: object, distance: float, azimuth_deg: float, elevation_deg: float) -> Pose:
     """A free camera around `target` (3,) m: seen from compass azimuth (clockwise from north) and elevation."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    away = np.array([math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation),
-                     math.sin(elevation)])  # fmt: skip
+    away = np.array(
+        [math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation), math.sin(elevation)]
+    )
     centre = np.asarray(target, float)
     return look_at(centre + distance * away, centre)
 

@@ -25,9 +25,13 @@ START = 0.2
 
 
 def depth_image(
-    terrain: Terrain, position: Float[Array, "3"], rotation: Float[Array, "3 3"], camera: Pinhole, far: float = 60.0,
+    terrain: Terrain,
+    position: Float[Array, "3"],
+    rotation: Float[Array, "3 3"],
+    camera: Pinhole,
+    far: float = 60.0,
     steps: int = STEPS,
-) -> Float[Array, "height width"]:  # fmt: skip
+) -> Float[Array, "height width"]:
     """Depth along the optical axis of what a camera sees of the terrain and its rocks, m; infinite beyond `far`.
 
     Args:
@@ -71,9 +75,14 @@ def depth_image(
 
 
 def depth_images(
-    terrain: Terrain, position: Float[Array, "rover 3"], rotation: Float[Array, "rover 3 3"], camera: Pinhole,
-    far: float = 60.0, steps: int = STEPS, at_once: int | None = None,
-) -> Float[Array, "rover height width"]:  # fmt: skip
+    terrain: Terrain,
+    position: Float[Array, "rover 3"],
+    rotation: Float[Array, "rover 3 3"],
+    camera: Pinhole,
+    far: float = 60.0,
+    steps: int = STEPS,
+    at_once: int | None = None,
+) -> Float[Array, "rover height width"]:
     """`depth_image` of many cameras on one terrain; `at_once` bounds how many are in memory (all if None)."""
 
     def one(pose: tuple[Any, Any]) -> Any:
@@ -99,9 +108,13 @@ def mounted(
 
 
 def height_scan(
-    terrain: Terrain, position: Float[Array, "*rover 3"], yaw: Float[Array, "*rover"],
-    shape: tuple[int, int] = (32, 32), ahead: tuple[float, float] = (-1.0, 5.0), aside: float = 3.0,
-) -> Float[Array, "*rover rows cols"]:  # fmt: skip
+    terrain: Terrain,
+    position: Float[Array, "*rover 3"],
+    yaw: Float[Array, "*rover"],
+    shape: tuple[int, int] = (32, 32),
+    ahead: tuple[float, float] = (-1.0, 5.0),
+    aside: float = 3.0,
+) -> Float[Array, "*rover rows cols"]:
     """A picture of heights around rovers, seen from above: rows from far to near, columns from left to right.
 
     Args:

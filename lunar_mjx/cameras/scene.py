@@ -114,11 +114,25 @@ def build_scene(
     visual.quality.shadowsize, visual.quality.offsamples = 4096, 4
     visual.headlight.ambient, visual.headlight.diffuse = [0.04] * 3, [0.05] * 3
     visual.headlight.specular = [0.0] * 3
-    spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-                     rgb1=[0, 0, 0], rgb2=[0, 0, 0], width=32, height=192)  # fmt: skip
-    spec.worldbody.add_light(name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 20],
-                             dir=(-sun.direction).tolist(), castshadow=True, diffuse=[sun.exposure] * 3,
-                             ambient=[0.0] * 3, specular=[0.15] * 3)  # fmt: skip
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[0, 0, 0],
+        rgb2=[0, 0, 0],
+        width=32,
+        height=192,
+    )
+    spec.worldbody.add_light(
+        name="sun",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=[0, 0, 20],
+        dir=(-sun.direction).tolist(),
+        castshadow=True,
+        diffuse=[sun.exposure] * 3,
+        ambient=[0.0] * 3,
+        specular=[0.15] * 3,
+    )
     low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
     near = cut(terrain, low, high, NODES)
     _add_far(spec, terrain, near)
@@ -152,8 +166,9 @@ def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray | None, 
         spec.assets = {**spec.assets, f"{name}.png": file.getvalue()}
         spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-    spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, mass=0.0,
-                            contype=0, conaffinity=0)  # fmt: skip
+    spec.worldbody.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, mass=0.0, contype=0, conaffinity=0
+    )
 
 
 def _surface(patch: Patch, lower: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -196,5 +211,12 @@ def _add_rocks(spec: Any, terrain: Terrain, patch: Patch) -> None:
     spec.add_material(name=ROCK, rgba=[0.5, 0.48, 0.46, 1], specular=0.1, shininess=0.1)
     for i, (center, radius) in enumerate(zip(centers, radii, strict=True)):
         if radius > 0 and (center[:2] > low).all() and (center[:2] < high).all():
-            spec.worldbody.add_geom(name=f"{ROCK}_{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0],
-                                    pos=center, material=ROCK, contype=0, conaffinity=0)  # fmt: skip
+            spec.worldbody.add_geom(
+                name=f"{ROCK}_{i}",
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[radius, 0, 0],
+                pos=center,
+                material=ROCK,
+                contype=0,
+                conaffinity=0,
+            )

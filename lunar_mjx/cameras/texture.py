@@ -83,8 +83,10 @@ class TrackPainter:
 
     def _ruts(self, track: Track) -> list[tuple[int, list, int]]:
         kept = thinned(track.places, 0.02)
-        return [(int(j), self._bar(track.places[i], track.places[j], track.width), _RUT)
-                for i, j in itertools.pairwise(kept)]  # fmt: skip
+        return [
+            (int(j), self._bar(track.places[i], track.places[j], track.width), _RUT)
+            for i, j in itertools.pairwise(kept)
+        ]
 
     def _prints(self, track: Track) -> list[tuple[int, list, int]]:
         """A bar every `pitch` m of path."""
@@ -102,8 +104,10 @@ class TrackPainter:
         way *= 0.12 * pitch / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
         # a little after the rut beneath it, which would else be painted over it
         when = np.searchsorted(length, np.minimum(at + 0.03, length[-1]))
-        return [(int(w) + 1, self._bar(m - d, m + d, 0.94 * track.width), _PRINT)
-                for w, m, d in zip(when, middle, way, strict=True)]  # fmt: skip
+        return [
+            (int(w) + 1, self._bar(m - d, m + d, 0.94 * track.width), _PRINT)
+            for w, m, d in zip(when, middle, way, strict=True)
+        ]
 
     def _bar(self, a: np.ndarray, b: np.ndarray, width: float) -> list[tuple[float, float]]:
         """Corners in pixels of the bar from a to b."""

@@ -89,8 +89,10 @@ def convert(
     from lunar_mjx.rover import convert as convert_urdf
 
     rover = convert_urdf(urdf, out, description, name)
-    print(f"{rover.name}: {rover.mass:g} kg, {len(rover.wheels)} wheels, {len(rover.joints)} motors, "
-          f"{len(rover.loops)} loops")  # fmt: skip
+    print(
+        f"{rover.name}: {rover.mass:g} kg, {len(rover.wheels)} wheels, {len(rover.joints)} motors, "
+        f"{len(rover.loops)} loops"
+    )
     for note in rover.notes:
         print(f"note: {note}")
     print(rover.mjcf)
@@ -142,8 +144,7 @@ def simulate(
     save_model(built, folder / "model.toml")
     first, last = table.iloc[0], table.iloc[-1]  # on a slope the chassis leans away from where its wheels were put
     way = math.hypot(last.position_x_m - first.position_x_m, last.position_y_m - first.position_y_m)
-    print(f"{built.rover.name} drove {way:.3f} m "
-          f"in {last.time_s:.1f} s")  # fmt: skip
+    print(f"{built.rover.name} drove {way:.3f} m in {last.time_s:.1f} s")
     print(path)
 
 

@@ -40,9 +40,14 @@ DiscrepancyOption = Annotated[
 def register(app: typer.Typer) -> None:
     """Adds the verbs to the application."""
     for name, function in (
-        ("compare", compare), ("why", why), ("next", next_), ("add", add), ("unknown", unknown), ("report", report),
+        ("compare", compare),
+        ("why", why),
+        ("next", next_),
+        ("add", add),
+        ("unknown", unknown),
+        ("report", report),
         ("improve", improve),
-    ):  # fmt: skip
+    ):
         app.command(name)(function)
 
 
@@ -63,8 +68,16 @@ def compare(
     keep_compiled()
     try:
         with console_progress() as progress:
-            run = verbs.compare(logs, _model(model, preset, logs), out, effects or (), _pairs("--split", split), seed,
-                                _numbers("--discrepancy", discrepancy), progress)  # fmt: skip
+            run = verbs.compare(
+                logs,
+                _model(model, preset, logs),
+                out,
+                effects or (),
+                _pairs("--split", split),
+                seed,
+                _numbers("--discrepancy", discrepancy),
+                progress,
+            )
     except verbs.BadData as bad:
         _finish(bad.diagnosis, False)
     _print_comparison(run)
@@ -181,9 +194,16 @@ def improve(
     keep_compiled()
     with console_progress() as progress:
         diagnosis, runs = verbs.improve(
-            logs, _model(model, preset, logs), out, effects or (), _pairs("--split", split), seed,
-            keep_going=keep_going, discrepancy=_numbers("--discrepancy", discrepancy), progress=progress,
-        )  # fmt: skip
+            logs,
+            _model(model, preset, logs),
+            out,
+            effects or (),
+            _pairs("--split", split),
+            seed,
+            keep_going=keep_going,
+            discrepancy=_numbers("--discrepancy", discrepancy),
+            progress=progress,
+        )
     if runs:
         _write_report([r.folder for r in runs], out / "report.html")
     _finish(diagnosis, as_json)

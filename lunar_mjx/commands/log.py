@@ -64,8 +64,16 @@ def check(
     read = read_campaign(logs)
     found = check_logs(read, _numbers("--slowest", slowest))
     if as_json:
-        print(json.dumps({"logs": [log.name for log in read], "bad_data": is_bad(found),
-                          "findings": [f.to_dict() for f in found]}, indent=2))  # fmt: skip
+        print(
+            json.dumps(
+                {
+                    "logs": [log.name for log in read],
+                    "bad_data": is_bad(found),
+                    "findings": [f.to_dict() for f in found],
+                },
+                indent=2,
+            )
+        )
     else:
         _print_findings(read, found)
     if is_bad(found):
@@ -131,13 +139,25 @@ def simulate(
     from lunar_mjx.logs.seal import answer_path
     from lunar_mjx.model.file import load_model
 
-    recording = Recording(parse_noise(noise), coloured, quantise=quantise, dropouts=dropouts,
-                          bias=_numbers("--bias", bias), forces=forces)  # fmt: skip
+    recording = Recording(
+        parse_noise(noise), coloured, quantise=quantise, dropouts=dropouts, bias=_numbers("--bias", bias), forces=forces
+    )
     hidden = [_effect(text) for text in effect or []] + [(text, {}) for text in effects or []]
     folder = simulate_log(
-        out, rover, manoeuvre, hidden, preset=preset, model=load_model(model) if model else None, terrain=terrain,
-        gravity_m_s2=gravity, recording=recording, seconds=seconds, seed=seed, seal=seal, split=split,
-    )  # fmt: skip
+        out,
+        rover,
+        manoeuvre,
+        hidden,
+        preset=preset,
+        model=load_model(model) if model else None,
+        terrain=terrain,
+        gravity_m_s2=gravity,
+        recording=recording,
+        seconds=seconds,
+        seed=seed,
+        seal=seal,
+        split=split,
+    )
     print(folder)
     print(f"answer (keep it): {answer_path(out)}" if seal else f"answer: {answer_path(out)}")
 

@@ -38,9 +38,12 @@ def select_device(device: str) -> None:
         found = []
     if not found:
         raise bad_input(
-            "lunar-mjx", "--device", device, "is not here: JAX sees no CUDA device",
+            "lunar-mjx",
+            "--device",
+            device,
+            "is not here: JAX sees no CUDA device",
             "install the extra lunar-mjx[gpu] on a machine with an NVIDIA GPU, or use --device cpu",
-        )  # fmt: skip
+        )
 
 
 def check_folder(out: Path) -> None:

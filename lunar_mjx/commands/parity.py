@@ -13,12 +13,15 @@ def parity(
     rover: Annotated[str, typer.Option(help="Name of a shipped rover, or folder that `convert` wrote.")] = "luvmi_x",
     preset: Annotated[str, typer.Option(help="consistent, paper or both.")] = "both",
     engines: Annotated[
-        str, typer.Option(help="Comma-separated: structured, mjx, structured:float32, mjx:float32, pybullet, "
-                               "pybullet:engine; default is all that are installed, but mjx:float32.")
+        str,
+        typer.Option(
+            help="Comma-separated: structured, mjx, structured:float32, mjx:float32, pybullet, "
+            "pybullet:engine; default is all that are installed, but mjx:float32."
+        ),
     ] = "",
     duration: Annotated[float, typer.Option(help="of the drives, s")] = 5.0,
     samples: Annotated[int, typer.Option(help="states per ground for the comparison of single steps")] = 16,
-) -> None:  # fmt: skip
+) -> None:
     """Compare the engines with native MuJoCo: one state stage by stage, single steps, and drives; write a page."""
     from lunar_mjx.commands.options import check_finite, check_folder, make_folder
     from lunar_mjx.errors import bad_input
@@ -36,10 +39,16 @@ def parity(
     presets = ("consistent", "paper") if preset == "both" else (preset,)
     with console_progress() as report:
         studies = [
-            run_study(rover, name, used, duration, samples,
-                      report=lambda what, done, i=i: report(what, (i + done) / len(presets)))
+            run_study(
+                rover,
+                name,
+                used,
+                duration,
+                samples,
+                report=lambda what, done, i=i: report(what, (i + done) / len(presets)),
+            )
             for i, name in enumerate(presets)
-        ]  # fmt: skip
+        ]
     path = write_parity_page(make_folder(out) / "parity.html", studies, note)
     for study in studies:
         for pair in study.pairs:

@@ -56,7 +56,7 @@ def render(
     fps: Annotated[int, typer.Option(min=1, max=60, help="pictures per second of the video")] = 20,
     speed: Annotated[float, typer.Option(help="times real time; 0: as fast as keeps the video within 20 s")] = 0.0,
     sun: Annotated[str, typer.Option(help="azimuth,elevation of the Sun, deg")] = "135,15",
-) -> None:  # fmt: skip
+) -> None:
     """Make a video of a drive, with path, slip and temperature."""
     from lunar_mjx.commands.options import check_finite
 
@@ -97,7 +97,7 @@ def view(
     engine: Annotated[
         str, typer.Option(help="native (starts at once), structured, mjx; auto: native where it has every effect.")
     ] = "auto",
-) -> None:  # fmt: skip
+) -> None:
     """Drive a rover by keyboard: in a window, or without a screen on a web page that only this machine can open."""
     from lunar_mjx.commands.options import check_finite
 
@@ -138,8 +138,13 @@ def _numbers(option: str, text: str, between: str, kind: type) -> list:
 
 
 def _refuse(option: str, text: str, between: str) -> list:
-    raise bad_input("lunar-mjx", option, text, "is not two numbers", f"write it as 960{between}540" if between == "x"
-                    else "write it as 135,15")  # fmt: skip
+    raise bad_input(
+        "lunar-mjx",
+        option,
+        text,
+        "is not two numbers",
+        f"write it as 960{between}540" if between == "x" else "write it as 135,15",
+    )
 
 
 def _check_file(path: Path, endings: tuple[str, ...]) -> None:

@@ -89,8 +89,10 @@ def train(
     run = RunConfig(steps or chosen.steps, seed, time_limit, checkpoint_every, not restart, quiet)
     report = run_training(training, chosen, run, make_folder(out), eval_every, eval_episodes, target)
     score = report.score
-    print(f"success on unseen ground {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of "
-          f"{score.episodes} episodes, return {score.episode_return:.1f}")  # fmt: skip
+    print(
+        f"success on unseen ground {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of "
+        f"{score.episodes} episodes, return {score.episode_return:.1f}"
+    )
     if not report.result.finished:
         print("time limit reached; the same command resumes")
     print(out / "policy.npz")
@@ -126,9 +128,11 @@ def evaluate(
         unseen = {**unseen, "terrain": terrain}
     params = made.params if seen and terrain is None else unseen_params(made, {} if seen else unseen)
     score = Evaluator(made, lambda _, state, key: act(state, key), episodes)(params, (), seed)
-    print(f"success {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of {score.episodes} "
-          f"episodes, return {score.episode_return:.1f} +- {score.return_deviation:.1f}, "
-          f"{score.episode_time:.1f} s an episode")  # fmt: skip
+    print(
+        f"success {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of {score.episodes} "
+        f"episodes, return {score.episode_return:.1f} +- {score.return_deviation:.1f}, "
+        f"{score.episode_time:.1f} s an episode"
+    )
     print(", ".join(f"{name} {100 * share:.1f} %" for name, share in score.ends.items()))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -41,21 +41,44 @@ def paths_figure(drives: Sequence[Drive], terrain: Terrain) -> go.Figure:
     xs, ys = (np.concatenate([getattr(d, k).ravel() for d in drives]) for k in ("x", "y"))
     image, box = _relief(terrain, (xs.min(), xs.max()), (ys.min(), ys.max()))
     west, east, south, north = box
-    figure.add_layout_image(source=image, xref="x", yref="y", x=west, y=north, sizex=east - west,
-                            sizey=north - south, sizing="stretch", layer="below")  # fmt: skip
+    figure.add_layout_image(
+        source=image,
+        xref="x",
+        yref="y",
+        x=west,
+        y=north,
+        sizex=east - west,
+        sizey=north - south,
+        sizing="stretch",
+        layer="below",
+    )
     _add_rocks(figure, terrain, box)
     for d in drives:
         name, colour = ROVERS.get(d.rover, (d.rover, INK))
         for i in range(d.x.shape[1]):
             figure.add_scatter(
-                x=d.x[::5, i].round(3), y=d.y[::5, i].round(3), mode="lines", name=name, legendgroup=name,
-                showlegend=i == 0, line={"color": colour, "width": 3}, hovertemplate=f"{name} {i + 1}<extra></extra>",
-            )  # fmt: skip
+                x=d.x[::5, i].round(3),
+                y=d.y[::5, i].round(3),
+                mode="lines",
+                name=name,
+                legendgroup=name,
+                showlegend=i == 0,
+                line={"color": colour, "width": 3},
+                hovertemplate=f"{name} {i + 1}<extra></extra>",
+            )
         figure.add_scatter(
-            x=d.x[0].round(3), y=d.y[0].round(3), mode="markers", name=f"start of {name}", hoverinfo="skip",
-            marker={"symbol": "circle" if d.rover == "viper" else "square", "size": 8, "color": "white",
-                    "line": {"color": colour, "width": 2}},
-        )  # fmt: skip
+            x=d.x[0].round(3),
+            y=d.y[0].round(3),
+            mode="markers",
+            name=f"start of {name}",
+            hoverinfo="skip",
+            marker={
+                "symbol": "circle" if d.rover == "viper" else "square",
+                "size": 8,
+                "color": "white",
+                "line": {"color": colour, "width": 2},
+            },
+        )
     finish(figure, 820)
     figure.update_xaxes(title_text="east, m", range=[west, east], constrain="domain", showgrid=False)
     figure.update_yaxes(
@@ -97,8 +120,17 @@ def _add_rocks(figure: go.Figure, terrain: Terrain, box: tuple[float, float, flo
     shapes = []
     for (x, y, _), r in zip(centers, radii, strict=True):
         if r > 0.0 and box[0] < x < box[1] and box[2] < y < box[3]:
-            shapes.append({"type": "circle", "x0": x - r, "x1": x + r, "y0": y - r, "y1": y + r, "line": {"width": 0.5},
-                           "fillcolor": "#3a3a3a"})  # fmt: skip
+            shapes.append(
+                {
+                    "type": "circle",
+                    "x0": x - r,
+                    "x1": x + r,
+                    "y0": y - r,
+                    "y1": y + r,
+                    "line": {"width": 0.5},
+                    "fillcolor": "#3a3a3a",
+                }
+            )
     figure.update_layout(shapes=shapes)
     if shapes:
         figure.add_scatter(x=[None], y=[None], mode="markers", name="rock", marker={"color": "#3a3a3a", "size": 9})
@@ -108,9 +140,13 @@ def history_figure(drives: Sequence[Drive], individuals: int = 3) -> go.Figure:
     """Slip, sinkage and winding temperature over time: median and range over the batch, and a few individuals."""
     rows = ("mean slip", "deepest sinkage, mm", "hottest winding, °C")
     figure = make_subplots(
-        rows=3, cols=len(drives), shared_xaxes=True, vertical_spacing=0.05, horizontal_spacing=0.08,
+        rows=3,
+        cols=len(drives),
+        shared_xaxes=True,
+        vertical_spacing=0.05,
+        horizontal_spacing=0.08,
         column_titles=[ROVERS.get(d.rover, (d.rover, INK))[0] for d in drives],
-    )  # fmt: skip
+    )
     for column, d in enumerate(drives, 1):
         colour = ROVERS.get(d.rover, (d.rover, INK))[1]
         for row, values in enumerate((d.mean_slip, 1e3 * d.sinkage.max(axis=-1), d.winding_degC), 1):
@@ -130,15 +166,40 @@ def _band(figure, time, values, colour, row, column, individuals, legend) -> Non
     low, middle, high = (f(values, axis=1).round(4) for f in (np.nanmin, np.nanmedian, np.nanmax))
     place = {"row": row, "col": column}
     figure.add_scatter(x=time, y=high, mode="lines", line={"width": 0}, showlegend=False, hoverinfo="skip", **place)
-    figure.add_scatter(x=time, y=low, mode="lines", line={"width": 0}, fill="tonexty", fillcolor=faded(colour, 0.2),
-                       name="range over the batch", showlegend=legend, hoverinfo="skip", **place)  # fmt: skip
+    figure.add_scatter(
+        x=time,
+        y=low,
+        mode="lines",
+        line={"width": 0},
+        fill="tonexty",
+        fillcolor=faded(colour, 0.2),
+        name="range over the batch",
+        showlegend=legend,
+        hoverinfo="skip",
+        **place,
+    )
     for i in range(min(individuals, values.shape[1])):
-        figure.add_scatter(x=time, y=values[:, i].round(4), mode="lines", name="single rovers",
-                           showlegend=legend and i == 0, legendgroup="single",
-                           line={"color": faded(colour, 0.65), "width": 1, "dash": ("solid", "dot", "dash")[i % 3]},
-                           hovertemplate=f"rover {i + 1}: %{{y}}<extra></extra>", **place)  # fmt: skip
-    figure.add_scatter(x=time, y=middle, mode="lines", name="median", line={"color": INK, "width": 2.5},
-                       showlegend=legend, hovertemplate="median: %{y}<extra></extra>", **place)  # fmt: skip
+        figure.add_scatter(
+            x=time,
+            y=values[:, i].round(4),
+            mode="lines",
+            name="single rovers",
+            showlegend=legend and i == 0,
+            legendgroup="single",
+            line={"color": faded(colour, 0.65), "width": 1, "dash": ("solid", "dot", "dash")[i % 3]},
+            hovertemplate=f"rover {i + 1}: %{{y}}<extra></extra>",
+            **place,
+        )
+    figure.add_scatter(
+        x=time,
+        y=middle,
+        mode="lines",
+        name="median",
+        line={"color": INK, "width": 2.5},
+        showlegend=legend,
+        hovertemplate="median: %{y}<extra></extra>",
+        **place,
+    )
 
 
 def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequence[float], beds: Sequence) -> go.Figure:
@@ -147,9 +208,14 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
     scatter = replicate_scatter()
     curves = [dense_curves(bed, table, angles) for bed in beds]
     figure = make_subplots(
-        rows=len(rows), cols=len(angles), shared_xaxes=True, shared_yaxes=True, vertical_spacing=0.035,
-        horizontal_spacing=0.012, column_titles=[f"{a:g}°" for a in angles],
-    )  # fmt: skip
+        rows=len(rows),
+        cols=len(angles),
+        shared_xaxes=True,
+        shared_yaxes=True,
+        vertical_spacing=0.035,
+        horizontal_spacing=0.012,
+        column_titles=[f"{a:g}°" for a in angles],
+    )
     for column, angle in enumerate(angles, 1):
         here = np.abs(table.test["slip_angle_deg"] - angle) < 0.01
         for row, (quantity, _, scale) in enumerate(rows, 1):
@@ -157,19 +223,33 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
             for case, curve in zip(cases, curves, strict=True):
                 style = CASE_STYLE.get(case.name, SERIES[3])
                 figure.add_scatter(
-                    x=curve["slip_ratio"].round(3), y=(scale * curve[quantity][column - 1]).round(3), mode="lines",
+                    x=curve["slip_ratio"].round(3),
+                    y=(scale * curve[quantity][column - 1]).round(3),
+                    mode="lines",
                     name=case.name,
-                    line={"color": style.colour, "dash": style.dash, "width": 2}, showlegend=legend,
-                    legendgroup=case.name, hovertemplate=f"{case.name}: %{{y}}<extra></extra>", **place,
-                )  # fmt: skip
+                    line={"color": style.colour, "dash": style.dash, "width": 2},
+                    showlegend=legend,
+                    legendgroup=case.name,
+                    hovertemplate=f"{case.name}: %{{y}}<extra></extra>",
+                    **place,
+                )
             figure.add_scatter(
-                x=table.test["slip_ratio"][here].round(3), y=(scale * table.measured[quantity][here]).round(3),
-                error_y={"type": "data", "array": (scale * scatter[quantity][here]).round(3), "thickness": 1.2,
-                         "width": 3},
-                mode="markers", name="measured (mean and scatter of 3 runs)", showlegend=legend, legendgroup="measured",
+                x=table.test["slip_ratio"][here].round(3),
+                y=(scale * table.measured[quantity][here]).round(3),
+                error_y={
+                    "type": "data",
+                    "array": (scale * scatter[quantity][here]).round(3),
+                    "thickness": 1.2,
+                    "width": 3,
+                },
+                mode="markers",
+                name="measured (mean and scatter of 3 runs)",
+                showlegend=legend,
+                legendgroup="measured",
                 marker={"color": MEASURED.colour, "size": 6, "symbol": MEASURED.symbol},
-                hovertemplate="measured: %{y}<extra></extra>", **place,
-            )  # fmt: skip
+                hovertemplate="measured: %{y}<extra></extra>",
+                **place,
+            )
     finish(figure, 820, margin={"l": 66, "r": 12, "t": 96, "b": 52})
     figure.update_layout(legend={"y": 1.06})
     for row, (_, title, _) in enumerate(rows, 1):

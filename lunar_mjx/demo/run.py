@@ -27,12 +27,7 @@ _SHARES = {"viper": 0.45, "luvmi_x": 0.35}
 
 
 def run_demo(
-    out: Path,
-    progress: Reporter | None = None,
-    rovers: int = 16,
-    seconds: float = 30.0,
-    seed: int = 1,
-    starts: int = 8,
+    out: Path, progress: Reporter | None = None, rovers: int = 16, seconds: float = 30.0, seed: int = 1, starts: int = 8
 ) -> Path:
     """Drives a batch of VIPERs and LUVMI-Xs, compares the wheel with the CMU test bed, and writes what came of it.
 

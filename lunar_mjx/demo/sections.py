@@ -78,14 +78,30 @@ def driving_section(drives: Sequence[Drive], terrain: Terrain) -> Section:
         slip = d.rover_slip
         for label, statistic in (("median", np.median), ("least", np.min), ("most", np.max)):
             pick = functools.partial(of_finite, statistic)
-            rows.append([
-                f"{_name(d)}, {d.mass:.0f} kg, {label}", f"{pick(d.command_speed):.2f}", f"{pick(d.distance):.2f}",
-                f"{pick(slip):.2f}", f"{1e3 * pick(d.sinkage.mean(axis=(0, 2))):.1f}",
-                f"{1e3 * pick(d.sinkage.max(axis=(0, 2))):.1f}", f"{pick(d.winding_degC.max(axis=0)):.1f}",
-                f"{pick(d.energy) / 1e3:.2f}", f"{np.degrees(pick(np.abs(d.roll).max(axis=0))):.1f}",
-            ])  # fmt: skip
-    header = ["rover", "commanded rim speed, m/s", "distance, m", "mean slip", "mean sinkage, mm",
-              "largest sinkage, mm", "hottest winding, °C", "electrical energy, kJ", "largest roll, deg"]  # fmt: skip
+            rows.append(
+                [
+                    f"{_name(d)}, {d.mass:.0f} kg, {label}",
+                    f"{pick(d.command_speed):.2f}",
+                    f"{pick(d.distance):.2f}",
+                    f"{pick(slip):.2f}",
+                    f"{1e3 * pick(d.sinkage.mean(axis=(0, 2))):.1f}",
+                    f"{1e3 * pick(d.sinkage.max(axis=(0, 2))):.1f}",
+                    f"{pick(d.winding_degC.max(axis=0)):.1f}",
+                    f"{pick(d.energy) / 1e3:.2f}",
+                    f"{np.degrees(pick(np.abs(d.roll).max(axis=0))):.1f}",
+                ]
+            )
+    header = [
+        "rover",
+        "commanded rim speed, m/s",
+        "distance, m",
+        "mean slip",
+        "mean sinkage, mm",
+        "largest sinkage, mm",
+        "hottest winding, °C",
+        "electrical energy, kJ",
+        "largest roll, deg",
+    ]
     about = (
         "All rovers share the model preset consistent and the soil of the Lunar Sourcebook, and differ in place, "
         f"heading, speed and steering. The ground is the shipped terrain {terrain.name} at true scale. Each rover "
@@ -138,11 +154,25 @@ def _error_table(cases: Sequence[Case]) -> Table:
     rows = []
     for case in cases:
         c = case.comparison
-        rows.append([case.name, case.soil, *(f"{c.rms[q]:.1f}" for q in quantities), f"{c.overall:.1f}",
-                     *(f"{v:.1f}" for v in case.scores().values())])  # fmt: skip
-    header = ["model", "soil", *(QUANTITIES[q][2] for q in quantities), "all", f"fitted ({_angles(FIT_ANGLES)})",
-              f"held out inside ({_angles(INSIDE_ANGLES)})", f"beyond ({_angles(BEYOND_ANGLES)})",
-              f"apart ({_angles(APART_ANGLES)})"]  # fmt: skip
+        rows.append(
+            [
+                case.name,
+                case.soil,
+                *(f"{c.rms[q]:.1f}" for q in quantities),
+                f"{c.overall:.1f}",
+                *(f"{v:.1f}" for v in case.scores().values()),
+            ]
+        )
+    header = [
+        "model",
+        "soil",
+        *(QUANTITIES[q][2] for q in quantities),
+        "all",
+        f"fitted ({_angles(FIT_ANGLES)})",
+        f"held out inside ({_angles(INSIDE_ANGLES)})",
+        f"beyond ({_angles(BEYOND_ANGLES)})",
+        f"apart ({_angles(APART_ANGLES)})",
+    ]
     note = (
         "A model as good as a repeated run would score about 1. Nominal soils are never fitted to these measurements."
     )
@@ -193,12 +223,18 @@ def provenance_section(table: SteadyStateTable, terrain: str, seed: int) -> Sect
         ("Measurements", table.source.get("citation", "")),
         ("Measured by", table.source.get("who", "")),
         ("Licence of the measurements", table.source.get("licence", "")),
-        ("Wheel", f"smooth, radius {1e3 * table.radius:g} mm, width {1e3 * table.width:g} mm (the radius is given "
-         "as 58 mm in another publication of the group)"),
+        (
+            "Wheel",
+            f"smooth, radius {1e3 * table.radius:g} mm, width {1e3 * table.width:g} mm (the radius is given "
+            "as 58 mm in another publication of the group)",
+        ),
         ("Points", f"{len(table)}, each the mean of {int(table.replicates.min())} or more runs"),
-        ("Slip definition", "rim speed against travel speed in the table; the model is given both speeds and forms "
-         "the slip of the wheel's frame (eq. 8) itself"),
+        (
+            "Slip definition",
+            "rim speed against travel speed in the table; the model is given both speeds and forms "
+            "the slip of the wheel's frame (eq. 8) itself",
+        ),
         ("Drive", f"preset consistent, terrain {terrain}, time step 2 ms, float32, seed {seed}"),
         ("Versions", ", ".join(f"{k} {v}" for k, v in versions().items())),
-    ]  # fmt: skip
+    ]
     return Section("Where this comes from", [Facts(pairs)])

@@ -35,8 +35,13 @@ class Case(NamedTuple):
     def to_dict(self) -> dict[str, Any]:
         """Numbers and names only."""
         fitted = None if self.fit is None else self.fit.to_dict()
-        return {"name": self.name, "soil": self.soil, "scores_sigma": self.scores(), "fit": fitted,
-                "comparison": self.comparison.to_dict()}  # fmt: skip
+        return {
+            "name": self.name,
+            "soil": self.soil,
+            "scores_sigma": self.scores(),
+            "fit": fitted,
+            "comparison": self.comparison.to_dict(),
+        }
 
 
 _CURVE_POINTS = 61
@@ -64,8 +69,15 @@ def wheel_cases(starts: int = 8, seed: int = 0, progress: Callable[[float], None
         cases.append(Case(name, soil, compare(beds[name], table, name), None))
         tell(0.1 * (i + 1))
     for i, (name, free) in enumerate((("paper", SOIL + PAPER_CONTACT), ("consistent", SOIL))):
-        found = fit(beds[name], table, free, f"{name}, refitted", starts, seed,
-                    lambda done, i=i: tell(0.2 + 0.4 * (i + done / starts)))  # fmt: skip
+        found = fit(
+            beds[name],
+            table,
+            free,
+            f"{name}, refitted",
+            starts,
+            seed,
+            lambda done, i=i: tell(0.2 + 0.4 * (i + done / starts)),
+        )
         what = "soil and contact" if len(free) > len(SOIL) else "soil"
         cases.append(Case(found.name, f"{what} {REFITTED}", found.comparison, found))
     return cases

@@ -72,10 +72,17 @@ def alternatives(
         if not np.isfinite(refitted.chi2) or not np.isfinite(refitted.residual[judged]).all():
             continue
         gain, se = predictive_gain(problem, chosen.fit, refitted, old, predictive_residual(mine, refitted))
-        found.append(Alternative(
-            name, tuple(e for e in effect.replaces if e in present), refitted.chi2, chosen.fit.chi2,
-            errors(mine, refitted), gain, se,
-        ))  # fmt: skip
+        found.append(
+            Alternative(
+                name,
+                tuple(e for e in effect.replaces if e in present),
+                refitted.chi2,
+                chosen.fit.chi2,
+                errors(mine, refitted),
+                gain,
+                se,
+            )
+        )
     return tuple(sorted(found, key=lambda a: -a.held_out_gain))
 
 

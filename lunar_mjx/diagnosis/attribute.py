@@ -42,12 +42,15 @@ def diagnose(
         "certificate": _certificate(base.fit),
         "noise_test_before": dataclasses.asdict(base.noise),
         "noise_test_after": dataclasses.asdict(chosen.noise),
-        "patterns": {"before": base.pattern.to_dict() if base.pattern else None,
-                     "after": chosen.pattern.to_dict() if chosen.pattern else None,
-                     "unlisted": dataclasses.asdict(found.unlisted) if found.unlisted else None},
-        "seed": settings.seed, "alpha": settings.alpha,
+        "patterns": {
+            "before": base.pattern.to_dict() if base.pattern else None,
+            "after": chosen.pattern.to_dict() if chosen.pattern else None,
+            "unlisted": dataclasses.asdict(found.unlisted) if found.unlisted else None,
+        },
+        "seed": settings.seed,
+        "alpha": settings.alpha,
         "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
-    }  # fmt: skip
+    }
     if base.fit.problems and not (chosen.effects and chosen.at_noise):
         reason = "; ".join(base.fit.problems)
         sentence = f"The baseline fit has no certificate ({reason}), so nothing is said about physics."
@@ -80,10 +83,16 @@ def diagnose(
     details["excess_explained"] = explained
     verdict, effects, sentence = _verdict(found, explained, settings)
     diagnosis = Diagnosis(
-        verdict=verdict, effects=effects, sentence=sentence + unsure, evidence=evidence,
-        error_before=errors(problem, base.fit), error_after=errors(problem, chosen.fit),
-        isolability=found.cosines, undecidable=undecidable, details=details,
-    )  # fmt: skip
+        verdict=verdict,
+        effects=effects,
+        sentence=sentence + unsure,
+        evidence=evidence,
+        error_before=errors(problem, base.fit),
+        error_after=errors(problem, chosen.fit),
+        isolability=found.cosines,
+        undecidable=undecidable,
+        details=details,
+    )
     return diagnosis, found
 
 
@@ -95,15 +104,26 @@ def certify(problem: Problem, found: Search, settings: Settings) -> Fit:
     # what held-out logs' own nuisances have moved since is of no account: a step heeds the fitted logs alone
     known = (chosen.fit.residual, chosen.fit.jacobian) if same else None
     with problem.focused(chosen.effects):
-        return fit_in_own_step(problem, free, chosen.fit.u, starts=settings.starts, seed=settings.seed, spread=0.5,
-                               known=None if problem.cheap_jacobian else known)  # fmt: skip
+        return fit_in_own_step(
+            problem,
+            free,
+            chosen.fit.u,
+            starts=settings.starts,
+            seed=settings.seed,
+            spread=0.5,
+            known=None if problem.cheap_jacobian else known,
+        )
 
 
 def _certificate(found: Fit) -> dict[str, Any]:
     return {
-        "chi2": found.chi2, "gradient": found.gradient, "starts": list(found.starts),
-        "at_bound": list(found.at_bound), "problems": list(found.problems), **found.extra,
-    }  # fmt: skip
+        "chi2": found.chi2,
+        "gradient": found.gradient,
+        "starts": list(found.starts),
+        "at_bound": list(found.at_bound),
+        "problems": list(found.problems),
+        **found.extra,
+    }
 
 
 def _verdict(found: Search, explained: float, settings: Settings) -> tuple[Verdict, tuple[str, ...], str]:
@@ -175,12 +195,23 @@ def _evidence(problem: Problem, found: Search, settings: Settings) -> tuple[Effe
         nearest = max(others.items(), key=lambda item: item[1]) if others else ("", 0.0)
         status, reason = _status(s, found, rivals, settings)
         scored = singles.get(s.effect)
-        rows.append(EffectEvidence(
-            effect=s.effect, separable_sigma=s.length, separable_share=s.share, chi2=s.chi2, z=s.z, p=s.p,
-            held_out_gain=scored.gain if scored else float("nan"),
-            held_out_se=scored.gain_se if scored else float("nan"),
-            values=values, std=std, nearest=nearest, status=status, reason=reason,
-        ))  # fmt: skip
+        rows.append(
+            EffectEvidence(
+                effect=s.effect,
+                separable_sigma=s.length,
+                separable_share=s.share,
+                chi2=s.chi2,
+                z=s.z,
+                p=s.p,
+                held_out_gain=scored.gain if scored else float("nan"),
+                held_out_se=scored.gain_se if scored else float("nan"),
+                values=values,
+                std=std,
+                nearest=nearest,
+                status=status,
+                reason=reason,
+            )
+        )
     order = {name: i for i, name in enumerate(found.chosen.effects)}
     return tuple(sorted(rows, key=lambda e: (order.get(e.effect, len(order)), -e.chi2)))
 

@@ -132,8 +132,12 @@ def _case(problem: Problem, base: Fit, sizes: dict[str, float], number: int, set
     measured = clean + draw_noise(problem.observations, rng)
     simulated.observations = dataclasses.replace(problem.observations, value=measured)
     diagnosis, _ = diagnose(simulated, settings)
-    return {**case, "verdict": diagnosis.verdict.label, "effects": list(diagnosis.effects),
-            "outcome": _outcome(truth, diagnosis.verdict, diagnosis.effects)}  # fmt: skip
+    return {
+        **case,
+        "verdict": diagnosis.verdict.label,
+        "effects": list(diagnosis.effects),
+        "outcome": _outcome(truth, diagnosis.verdict, diagnosis.effects),
+    }
 
 
 def draw_noise(observations: Observations, rng: np.random.Generator) -> np.ndarray:

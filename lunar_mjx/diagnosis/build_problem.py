@@ -16,15 +16,25 @@ from lunar_mjx.inference.problem import Problem
 from lunar_mjx.logs import SteadyLog
 from lunar_mjx.wheel_bed.bed import EARTH_GRAVITY, WheelBed
 
-NO_CANDIDATE = frozenset({
-    "parking_brake", "payload", "tether", "hard_surface", "surface_type", "soil_gradient", "boulders",
-    "engine_friction", "joint_limits", "chassis_contact", "encoder_quantisation",
-})  # fmt: skip
+NO_CANDIDATE = frozenset(
+    {
+        "parking_brake",
+        "payload",
+        "tether",
+        "hard_surface",
+        "surface_type",
+        "soil_gradient",
+        "boulders",
+        "engine_friction",
+        "joint_limits",
+        "chassis_contact",
+        "encoder_quantisation",
+    }
+)
 """Effects that are an arrangement of the test which its user knows, an engine's substitute for physics, or without a
 derivative: they are never proposed as missing."""
 
-FINER_FORMS = frozenset({"slide_softening", "side_entry", "side_exit", "shear_softening", "skid_shear",
-                          "side_wall"})  # fmt: skip
+FINER_FORMS = frozenset({"slide_softening", "side_entry", "side_exit", "shear_softening", "skid_shear", "side_wall"})
 """Finer forms of slip_sinkage, angle_sinkage, bulldozing: only a bed that imposes slip and slip angle, against a model
 that integrates the stress, can tell them from these; elsewhere they would only be their twins."""
 

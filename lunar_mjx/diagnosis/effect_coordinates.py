@@ -22,8 +22,9 @@ def of_candidate(effect: Effect, values: Mapping[str, float] | None = None) -> t
         if p.null is not None:
             found.append(_amplitude(effect.name, name, p))
         elif p.nominal > 0.0 and p.bounds[0] >= 0.0:
-            found.append(Coordinate(effect.name, name, start or p.nominal, 0.3, *p.bounds, log=True, prior=1.0,
-                                    unit=p.unit))  # fmt: skip
+            found.append(
+                Coordinate(effect.name, name, start or p.nominal, 0.3, *p.bounds, log=True, prior=1.0, unit=p.unit)
+            )
     return tuple(found)
 
 

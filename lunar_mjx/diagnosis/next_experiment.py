@@ -68,10 +68,7 @@ class NextExperiment:
 
 
 def next_experiment(
-    folder: str | Path | Run,
-    between: Sequence[str] = (),
-    seconds: float = SECONDS,
-    progress: Progress = silent,
+    folder: str | Path | Run, between: Sequence[str] = (), seconds: float = SECONDS, progress: Progress = silent
 ) -> NextExperiment:
     """The manoeuvre (or sweep of a test bed) that best separates what the logs leave open; writes `next.json`.
 
@@ -200,9 +197,14 @@ def _rank(problem: Problem, known: _Knowledge, names: Sequence[str], plans: Sequ
 
 
 def _left(
-    problem: Problem, known: _Knowledge, difference: np.ndarray, jacobian: np.ndarray, free: np.ndarray,
-    effects: Sequence[str], hypothesis: str,
-) -> float:  # fmt: skip
+    problem: Problem,
+    known: _Knowledge,
+    difference: np.ndarray,
+    jacobian: np.ndarray,
+    free: np.ndarray,
+    effects: Sequence[str],
+    hypothesis: str,
+) -> float:
     """Squared length of a difference after the hypothesis has been refitted to it, the earlier logs counted in."""
     others = np.concatenate([[-1], *(problem.candidates[e] for e in effects if e != hypothesis)])
     mine = ~np.isin(free, others)

@@ -58,13 +58,28 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
                 when = np.arange(count) / table.rate_hz
                 tables[table.name] = LogTable(table.name, Path(name), when, fill, table.rate_hz)
         payload = {"payload_kg": plan.payload_share * model.rover.mass, "payload_position_m": (0.0, 0.0, 0.2)}
-        found.append((name, plan.description, Log(
-            folder=Path(name), name=name, rover=template.rover, manoeuvre=name, gravity_m_s2=template.gravity_m_s2,
-            terrain=plan.terrain, split="fit", environment=environment,
-            rover_changes={**template.rover_changes, **(payload if plan.payload_share else {})},
-            initial={"position_m": (plan.start[0], plan.start[1], model.rover.standing_height)}, imu=template.imu,
-            tables=tables, noise=template.noise, source={},
-        )))  # fmt: skip
+        found.append(
+            (
+                name,
+                plan.description,
+                Log(
+                    folder=Path(name),
+                    name=name,
+                    rover=template.rover,
+                    manoeuvre=name,
+                    gravity_m_s2=template.gravity_m_s2,
+                    terrain=plan.terrain,
+                    split="fit",
+                    environment=environment,
+                    rover_changes={**template.rover_changes, **(payload if plan.payload_share else {})},
+                    initial={"position_m": (plan.start[0], plan.start[1], model.rover.standing_height)},
+                    imu=template.imu,
+                    tables=tables,
+                    noise=template.noise,
+                    source={},
+                ),
+            )
+        )
     return found
 
 
@@ -81,22 +96,36 @@ def planned_sweeps(logs: Sequence[SteadyLog]) -> list[tuple[str, str, SteadyLog]
     load = float(np.median(table.test["normal_load_N"]))
     sigma = {q: s for q in table.measured if (s := _sigma(template, table, q)) > 0.0}
     reference = sigma.get("drawbar_pull", sigma.get("side_force", 0.01 * load))
-    typical = {"drawbar_pull": reference, "side_force": reference, "driving_torque": reference * table.radius,
-               "sinkage": 5e-4}  # fmt: skip
+    typical = {
+        "drawbar_pull": reference,
+        "side_force": reference,
+        "driving_torque": reference * table.radius,
+        "sinkage": 5e-4,
+    }
     found = []
     for share in LOADS:
         for angle in ANGLES:
             name = f"slip sweep at {angle:g} deg slip angle, {share * load:.3g} N"
-            found.append((name, "twelve slip ratios from -0.3 to 0.8, three runs each",
-                          _sweep(template, name, angle, share * load, sigma)))  # fmt: skip
+            found.append(
+                (
+                    name,
+                    "twelve slip ratios from -0.3 to 0.8, three runs each",
+                    _sweep(template, name, angle, share * load, sigma),
+                )
+            )
     missing = [q for q in QUANTITIES if q not in table.measured]
     if missing:
         names = " and ".join(QUANTITIES[q][2] for q in missing)
         for angle in (0.0, 30.0):
             name = f"slip sweep at {angle:g} deg slip angle, {load:.3g} N, measuring {names} too"
             every = {**typical, **sigma}
-            found.append((name, "twelve slip ratios from -0.3 to 0.8, three runs each",
-                          _sweep(template, name, angle, load, every)))  # fmt: skip
+            found.append(
+                (
+                    name,
+                    "twelve slip ratios from -0.3 to 0.8, three runs each",
+                    _sweep(template, name, angle, load, every),
+                )
+            )
     return found
 
 
@@ -109,9 +138,12 @@ def _sigma(log: SteadyLog, table: SteadyStateTable, quantity: str) -> float:
 def _sweep(template: SteadyLog, name: str, angle: float, load: float, sigma: dict[str, float]) -> SteadyLog:
     count = len(SLIPS)
     table = dataclasses.replace(
-        template.table, name=name,
+        template.table,
+        name=name,
         test={"slip_ratio": SLIPS, "slip_angle_deg": np.full(count, angle), "normal_load_N": np.full(count, load)},
-        measured={q: np.zeros(count) for q in sigma}, replicates=np.ones(count, int), sigma={},
-    )  # fmt: skip
+        measured={q: np.zeros(count) for q in sigma},
+        replicates=np.ones(count, int),
+        sigma={},
+    )
     noise = {QUANTITIES[q][0]: Noise(s / np.sqrt(REPLICATES), "replicate") for q, s in sigma.items()}
     return dataclasses.replace(template, folder=Path(name), table=table, noise=noise, split="fit")

@@ -152,9 +152,15 @@ def refit_all(
 
 
 def refit(
-    problem: Problem, parent: Candidate, effects: tuple[str, ...], scored: Score | None, memory: Memory,
-    rival: Rival | float = np.inf, start: np.ndarray | None = None, **how: Any,
-) -> Candidate:  # fmt: skip
+    problem: Problem,
+    parent: Candidate,
+    effects: tuple[str, ...],
+    scored: Score | None,
+    memory: Memory,
+    rival: Rival | float = np.inf,
+    start: np.ndarray | None = None,
+    **how: Any,
+) -> Candidate:
     """Refits from a start; without one from the parent with the new effect at its linear estimate, and from a third of
     it where that fails; `how` are further arguments of `fit`."""
     free = problem.free(effects)

@@ -55,8 +55,9 @@ class Run:
         """
         logs = read_campaign(self.logs)
         if len({type(log) for log in logs}) > 1:
-            raise UserError(f"{self.logs[0]}: drive logs and steady-state tables do not go into one run; compare them "
-                            "in two.")  # fmt: skip
+            raise UserError(
+                f"{self.logs[0]}: drive logs and steady-state tables do not go into one run; compare them in two."
+            )
         return logs  # type: ignore[return-value]
 
     @functools.cached_property
@@ -74,12 +75,22 @@ class Run:
         self.folder.mkdir(parents=True, exist_ok=True)
         opened = (self.load(RUN_FILE) or {}).get("test_opened", [])
         save_model(self.model, self.folder / MODEL_FILE)
-        save_json(self.folder / RUN_FILE, {
-            "format": FORMAT, "version": __version__, "logs": [str(p) for p in self.logs],
-            "hashes": {str(p): folder_hash(p) for p in self.logs}, "candidates": list(self.candidates),
-            "splits": dict(self.splits), "added": list(self.added), "parent": self.parent, "seed": self.seed,
-            "discrepancy": dict(self.discrepancy), "test_opened": opened,
-        })  # fmt: skip
+        save_json(
+            self.folder / RUN_FILE,
+            {
+                "format": FORMAT,
+                "version": __version__,
+                "logs": [str(p) for p in self.logs],
+                "hashes": {str(p): folder_hash(p) for p in self.logs},
+                "candidates": list(self.candidates),
+                "splits": dict(self.splits),
+                "added": list(self.added),
+                "parent": self.parent,
+                "seed": self.seed,
+                "discrepancy": dict(self.discrepancy),
+                "test_opened": opened,
+            },
+        )
 
     def opened_test(self, verb: str, models: Mapping[str, str]) -> None:
         """Puts on record that the error on the test split was computed.
@@ -90,8 +101,9 @@ class Run:
         """
         data = self.load(RUN_FILE)
         data["test_opened"] = [
-            *data.get("test_opened", []), *({"verb": verb, "model": m, "fit": f} for m, f in models.items())
-        ]  # fmt: skip
+            *data.get("test_opened", []),
+            *({"verb": verb, "model": m, "fit": f} for m, f in models.items()),
+        ]
         self.save(RUN_FILE, data)
 
     def load(self, name: str) -> Any:
@@ -126,8 +138,17 @@ def load_run(folder: str | Path) -> Run:
         if folder_hash(log) != hashes.get(str(log)):
             raise bad_input(path, "logs", str(log), "has changed since the comparison", "compare anew")
     model = load_model(folder / MODEL_FILE)
-    return Run(folder, logs, model, tuple(data["candidates"]), data["splits"], tuple(data["added"]), data["parent"],
-               int(data["seed"]), data.get("discrepancy", {}))  # fmt: skip
+    return Run(
+        folder,
+        logs,
+        model,
+        tuple(data["candidates"]),
+        data["splits"],
+        tuple(data["added"]),
+        data["parent"],
+        int(data["seed"]),
+        data.get("discrepancy", {}),
+    )
 
 
 def log_folders(paths: Sequence[str | Path]) -> tuple[Path, ...]:

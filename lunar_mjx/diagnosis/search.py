@@ -145,9 +145,12 @@ def _unlisted(problem: Problem, base: Candidate, best: Candidate, settings: Sett
 
 
 def _reaching(
-    problem: Problem, base: Candidate, grown: Sequence[Candidate], settings: Settings,
+    problem: Problem,
+    base: Candidate,
+    grown: Sequence[Candidate],
+    settings: Settings,
     tried: dict[frozenset[str], Candidate],
-) -> Candidate | None:  # fmt: skip
+) -> Candidate | None:
     """The first that leaves nothing but noise; those looked at replace what was tried."""
     for c in grown:
         if c.noise.passes and _earned(problem, base, c, settings):
@@ -176,9 +179,13 @@ def _in_own_steps(
 
 
 def _completed(
-    problem: Problem, best: Candidate, settings: Settings, tried: dict[frozenset[str], Candidate], memory: Memory,
+    problem: Problem,
+    best: Candidate,
+    settings: Settings,
+    tried: dict[frozenset[str], Candidate],
+    memory: Memory,
     progress: Progress,
-) -> Candidate:  # fmt: skip
+) -> Candidate:
     """A model at the noise with a simpler effect where one does the same, and with what is significant beside it."""
     while True:
         progress("looking for more", 0.0)

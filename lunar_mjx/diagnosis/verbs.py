@@ -72,8 +72,15 @@ def compare(
     Raises:
       UserError: a mistake of the user's. BadData: the logs do not pass the gate.
     """
-    run = Run(Path(out), log_folders(logs), model, tuple(effects), dict(splits or {}), seed=seed,
-              discrepancy=dict(discrepancy or {}))  # fmt: skip
+    run = Run(
+        Path(out),
+        log_folders(logs),
+        model,
+        tuple(effects),
+        dict(splits or {}),
+        seed=seed,
+        discrepancy=dict(discrepancy or {}),
+    )
     return _compare(run, progress)
 
 
@@ -121,21 +128,35 @@ def comparison(problem: Problem, start: np.ndarray, fitted: Fit) -> dict[str, An
         part = slice(s.start, s.stop)
         for unit in np.unique(observations.unit[part]):
             keep = np.arange(s.start, s.stop)[observations.unit[part] == unit]
-            table.append({
-                "manoeuvre": observations.unit_names[unit], "split": observations.unit_split[unit],
-                "channel": s.channel, "samples": len(keep), "as_given": _rms(start[keep]),
-                "refitted": _rms(fitted.residual[keep]),
-            })  # fmt: skip
+            table.append(
+                {
+                    "manoeuvre": observations.unit_names[unit],
+                    "split": observations.unit_split[unit],
+                    "channel": s.channel,
+                    "samples": len(keep),
+                    "as_given": _rms(start[keep]),
+                    "refitted": _rms(fitted.residual[keep]),
+                }
+            )
     given = {k: _rms(start[observations.in_split(*v)]) for k, v in _SPLITS.items() if observations.in_split(*v).any()}
     return {
-        "unit": "sigma of the measurement noise", "as_given": given, "refitted": errors(problem, fitted),
-        "noise_test": dataclasses.asdict(noise_test(problem, fitted)), "by_channel": table,
-        "parameters": _parameter_table(problem, fitted), "certificate": {
-            "chi2": fitted.chi2, "gradient": fitted.gradient, "starts": list(fitted.starts),
-            "at_bound": list(fitted.at_bound), "problems": list(fitted.problems), **fitted.extra,
+        "unit": "sigma of the measurement noise",
+        "as_given": given,
+        "refitted": errors(problem, fitted),
+        "noise_test": dataclasses.asdict(noise_test(problem, fitted)),
+        "by_channel": table,
+        "parameters": _parameter_table(problem, fitted),
+        "certificate": {
+            "chi2": fitted.chi2,
+            "gradient": fitted.gradient,
+            "starts": list(fitted.starts),
+            "at_bound": list(fitted.at_bound),
+            "problems": list(fitted.problems),
+            **fitted.extra,
         },
-        "observations": len(observations), "logs": list(observations.logs),
-    }  # fmt: skip
+        "observations": len(observations),
+        "logs": list(observations.logs),
+    }
 
 
 _SPLITS = {
@@ -160,9 +181,11 @@ def _parameter_table(problem: Problem, fitted: Fit) -> dict[str, Any]:
         value, std = parameters(problem, fitted, effect, covariance)
         mine = [c for c in moved if c.effect == effect]
         table[effect] = {
-            "value": value, "std": std, "given": {c.name: c.start for c in mine},
+            "value": value,
+            "std": std,
+            "given": {c.name: c.start for c in mine},
             "unit": {c.name: "factor" if c.factor else c.unit for c in mine},
-        }  # fmt: skip
+        }
     return table
 
 
@@ -173,8 +196,11 @@ def _record_test(run: Run, verb: str, problem: Problem, fits: Mapping[str, Fit])
     rows = {"as given": problem.origin(), **{label: f.u for label, f in fits.items()}}
     prints = {}
     for label, u in rows.items():
-        moved = [f"{c.key} {c.value(v):.9g}" for i, (c, v) in enumerate(zip(problem.coordinates, u, strict=True))
-                 if v != 0.0 or i in problem.baseline]  # fmt: skip
+        moved = [
+            f"{c.key} {c.value(v):.9g}"
+            for i, (c, v) in enumerate(zip(problem.coordinates, u, strict=True))
+            if v != 0.0 or i in problem.baseline
+        ]
         prints[label] = hashlib.sha256("\n".join(moved).encode()).hexdigest()[:16]
     run.opened_test(verb, prints)
 
@@ -183,9 +209,10 @@ def _save_signatures(run: Run, found: Search) -> None:
     """Projected signatures over the fitted observations, each at its best linear amount, in sigma."""
     scored = [s for s in found.scores if s.signature.size]
     np.savez_compressed(
-        run.folder / SIGNATURES_FILE, names=np.array([s.effect for s in scored], str),
+        run.folder / SIGNATURES_FILE,
+        names=np.array([s.effect for s in scored], str),
         signatures=np.array([s.signature @ s.amount for s in scored], np.float32),
-    )  # fmt: skip
+    )
 
 
 def _save_series(run: Run, problem: Problem, start: np.ndarray, fits: Mapping[str, Fit]) -> None:
@@ -206,14 +233,22 @@ def _save_series(run: Run, problem: Problem, start: np.ndarray, fits: Mapping[st
         [np.full(s.stop - s.start, np.nan) if s.time is None else s.time for s in observations.series]
     )
     np.savez_compressed(
-        run.folder / SERIES_FILE, measured=observations.value, sigma=observations.sigma(), time=time, place=place,
-        unit=observations.unit, unit_names=np.array(observations.unit_names), split=np.array(observations.unit_split),
+        run.folder / SERIES_FILE,
+        measured=observations.value,
+        sigma=observations.sigma(),
+        time=time,
+        place=place,
+        unit=observations.unit,
+        unit_names=np.array(observations.unit_names),
+        split=np.array(observations.unit_split),
         series_start=np.array([s.start for s in observations.series]),
         series_channel=np.array([s.channel for s in observations.series]),
-        series_log=np.array([s.log for s in observations.series]), logs=np.array(observations.logs),
-        labels=np.array(["as given", *fits]), predicted=predicted,
+        series_log=np.array([s.log for s in observations.series]),
+        logs=np.array(observations.logs),
+        labels=np.array(["as given", *fits]),
+        predicted=predicted,
         residual=np.vstack([start, *(f.residual for f in fits.values())]),
-    )  # fmt: skip
+    )
 
 
 def why(
@@ -258,10 +293,17 @@ def why(
                     f"(gain {tried[0].held_out_gain:.0f} +- {tried[0].held_out_se:.0f}): add it and ask again."
                 )
         diagnosis = dataclasses.replace(
-            diagnosis, port=port, ports=place.ports, sentence=sentence,
-            details={**diagnosis.details, "localise": place.to_dict(), "alternatives": others,
-                     "parameters": _parameter_table(problem, found.chosen.fit)},
-        )  # fmt: skip
+            diagnosis,
+            port=port,
+            ports=place.ports,
+            sentence=sentence,
+            details={
+                **diagnosis.details,
+                "localise": place.to_dict(),
+                "alternatives": others,
+                "parameters": _parameter_table(problem, found.chosen.fit),
+            },
+        )
         fits = {"refitted": found.base.fit}
         if found.chosen.effects:
             fits["with " + ", ".join(found.chosen.effects)] = found.chosen.fit
@@ -286,16 +328,20 @@ def explain(diagnosis: Diagnosis, effect: str) -> Diagnosis:
         if effect in refused:
             sentence = f"{effect} cannot be tested here: it {refused[effect]}."
             return dataclasses.replace(diagnosis, verdict=Verdict.UNDECIDABLE, effects=(effect,), sentence=sentence)
-        raise UserError(f"why --explain: nothing is known about {effect!r}; use one of "
-                        f"{', '.join(e.effect for e in diagnosis.evidence)}.")  # fmt: skip
+        raise UserError(
+            f"why --explain: nothing is known about {effect!r}; use one of "
+            f"{', '.join(e.effect for e in diagnosis.evidence)}."
+        )
     nearest = (
         f"; its nearest confounder is {found.nearest[0]} (|cos| {found.nearest[1]:.2f})" if found.nearest[0] else ""
     )
     if found.status == "not tested":
         return dataclasses.replace(
-            diagnosis, verdict=Verdict.UNDECIDABLE, effects=(effect,),
+            diagnosis,
+            verdict=Verdict.UNDECIDABLE,
+            effects=(effect,),
             sentence=f"{effect} leaves no separable signal in these logs: {found.reason}{nearest}.",
-        )  # fmt: skip
+        )
     sentence = (
         f"{effect} is {found.status} ({found.reason}): separable {found.separable_sigma:.1f} sigma "
         f"({100.0 * found.separable_share:.1f} % of its signal), z {found.z:.1f}, family-wise p {found.p:.2g}, "

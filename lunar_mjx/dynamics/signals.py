@@ -34,8 +34,16 @@ from lunar_mjx.spatial import Frame, Vec3
 if TYPE_CHECKING:
     from lunar_mjx.dynamics.system import System
 
-__all__ = ["SensorContext", "Signals", "apply_sensors", "joint_channels", "measure", "observe", "sample_signals",
-           "sensor_context"]  # fmt: skip
+__all__ = [
+    "SensorContext",
+    "Signals",
+    "apply_sensors",
+    "joint_channels",
+    "measure",
+    "observe",
+    "sample_signals",
+    "sensor_context",
+]
 
 _ZERO_CELSIUS = 273.15
 _RAD_TO_DEG = 57.29577951308232
@@ -210,8 +218,13 @@ def sample_signals(signals: Signals, channel: str, times: Float[AnyArray, "*batc
       UserError: there is no such channel.
     """
     if channel not in signals.channels:
-        raise bad_input("sample_signals", "channel", channel, "is not among the signals",
-                        f"use one of {', '.join(list(signals.channels)[:6])}, ...")  # fmt: skip
+        raise bad_input(
+            "sample_signals",
+            "channel",
+            channel,
+            "is not among the signals",
+            f"use one of {', '.join(list(signals.channels)[:6])}, ...",
+        )
     if channel not in QUATERNION:
         value = interpolate(signals.time, unwrapped(channel, signals), times)
         return wrapped_degrees(value) if channel in EULER else value

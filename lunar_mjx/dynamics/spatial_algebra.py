@@ -172,9 +172,7 @@ class Symmetric(NamedTuple):
         """Moments of inertia about the origin of a point mass at `c`: m (|c|^2 1 - c c^T)."""
         mx, my, mz = c * mass
         xx, yy, zz = mul(mx, c.x), mul(my, c.y), mul(mz, c.z)
-        return cls(
-            add(yy, zz), add(xx, zz), add(xx, yy), neg(mul(mx, c.y)), neg(mul(mx, c.z)), neg(mul(my, c.z))
-        )  # fmt: skip
+        return cls(add(yy, zz), add(xx, zz), add(xx, yy), neg(mul(mx, c.y)), neg(mul(mx, c.z)), neg(mul(my, c.z)))
 
 
 class Force(NamedTuple):

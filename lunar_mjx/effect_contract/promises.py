@@ -222,8 +222,12 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
     guilty = [(base, port, w) for base in BASES for port, w in worst[base].items() if not w <= HOMOGENEITY]
     if guilty:
         told = ", ".join(f"of {BASES[base]} (port {port}, {w:.0e})" for base, port, w in guilty)
-        return Check("units", False, f"the result depends on the unit {told}: a number in the function stands for a "
-                     "quantity; make it a parameter with that unit, or mend the unit of a parameter")  # fmt: skip
+        return Check(
+            "units",
+            False,
+            f"the result depends on the unit {told}: a number in the function stands for a "
+            "quantity; make it a parameter with that unit, or mend the unit of a parameter",
+        )
     largest = max([w for ports in worst.values() for w in ports.values()], default=0.0)
     return Check("units", bool(largest <= HOMOGENEITY), f"homogeneous to {largest:.1g} in other base units")
 
@@ -255,8 +259,9 @@ def _watched(effect: Effect, scales: Mapping[str, Rescaling], found: list[tuple[
         return both
 
     ports = {port: watch(port, function) for port, function in effect.ports.items()}
-    return Effect(effect.name, ports, effect.parameters, effect.state, effect.replaces, effect.order,
-                  effect.transient, effect.doc)  # fmt: skip
+    return Effect(
+        effect.name, ports, effect.parameters, effect.state, effect.replaces, effect.order, effect.transient, effect.doc
+    )
 
 
 def _differences(got: Any, want: Any) -> tuple[list[Any], list[Any]]:

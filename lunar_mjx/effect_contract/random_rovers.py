@@ -47,9 +47,16 @@ def rover(wheels: int) -> RoverInfo:
     points = Vec3(jnp.asarray([0.5, -0.5]), jnp.asarray([0.3, -0.3]), jnp.asarray([-0.2, 0.05]))
     group = number % 3
     return RoverInfo(
-        RADIUS * jnp.ones(wheels), WIDTH * jnp.ones(wheels), group, jnp.where(group == 0, -jnp.inf, -0.2 * one),
-        jnp.where(group == 0, jnp.inf, 0.2 * one), (number // 3 + number) % 4, 40.0 * one, 3.0 * one, points,
-    )  # fmt: skip
+        RADIUS * jnp.ones(wheels),
+        WIDTH * jnp.ones(wheels),
+        group,
+        jnp.where(group == 0, -jnp.inf, -0.2 * one),
+        jnp.where(group == 0, jnp.inf, 0.2 * one),
+        (number // 3 + number) % 4,
+        40.0 * one,
+        3.0 * one,
+        points,
+    )
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
@@ -123,16 +130,14 @@ def context(effects: Sequence[Effect], values: Values, world: Terrain, s: Mappin
         winding_temperature=s["winding"][moment],
         housing_temperature=s["housing"][moment],
         steering_angle=s["steering"][moment],
-        wheel_position=Vec3(
-            place[:, 0], place[:, 1], RADIUS - s["sinkage"][moment] + np.tan(SLOPE) * place[:, 0]
-        ),
+        wheel_position=Vec3(place[:, 0], place[:, 1], RADIUS - s["sinkage"][moment] + np.tan(SLOPE) * place[:, 0]),
         wheel_axle=Vec3.of(s["axle"][moment]),
         wheel_velocity=Vec3.of(s["velocity"][moment]),
         wheel_angular_velocity=Vec3.of(s["spin"][moment]),
         terrain=world,
         rover=rover(wheels),
         parameters={e.name: SimpleNamespace(**{**e.nominal(), **values.get(e.name, {})}) for e in effects},
-    )  # fmt: skip
+    )
 
 
 def reset_memory(effects: Sequence[Effect], wheels: int) -> Memory:

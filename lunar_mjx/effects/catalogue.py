@@ -138,8 +138,10 @@ def get(name: str) -> Effect:
             raise UserError(f"{file}: no effect is called {member!r} there; it holds {', '.join(found)}.")
         return found[member]
     if name not in CATALOGUE:
-        raise UserError(f"effect {name!r} is not in the catalogue; use a file (my_effects.py:{name}) or one of "
-                        f"{', '.join(CATALOGUE)}.")  # fmt: skip
+        raise UserError(
+            f"effect {name!r} is not in the catalogue; use a file (my_effects.py:{name}) or one of "
+            f"{', '.join(CATALOGUE)}."
+        )
     return CATALOGUE[name]
 
 

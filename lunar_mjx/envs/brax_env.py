@@ -86,7 +86,7 @@ class _Batch(Env):
             "episode_done": zero,
             "episode_metrics": {"sum_reward": zero, "length": zero, **dict.fromkeys(metrics, zero)},
         }
-        return BraxState(state, state.obs, zero, zero, metrics, info)  # fmt: skip
+        return BraxState(state, state.obs, zero, zero, metrics, info)
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         before: Any = state.pipeline_state
@@ -97,8 +97,13 @@ class _Batch(Env):
         adds = {"sum_reward": reward, "length": jnp.ones_like(reward), **metrics}
         totals = {k: info["episode_metrics"][k] * going + v for k, v in adds.items()}
         steps = info["steps"] * going + 1.0
-        new = {**info, "steps": steps, "truncation": own.truncated.astype(reward.dtype), "episode_done": done,
-               "episode_metrics": totals}  # fmt: skip
+        new = {
+            **info,
+            "steps": steps,
+            "truncation": own.truncated.astype(reward.dtype),
+            "episode_done": done,
+            "episode_metrics": totals,
+        }
         return BraxState(own, own.obs, reward, done, metrics, new)
 
     @property
@@ -121,8 +126,13 @@ def wrap(env: BraxEnv, episode_length: int = 1000, action_repeat: int = 1, rando
       UserError: an episode length other than the environment's, or what the environment does by itself.
     """
     if episode_length != env.env.episode_steps:
-        raise bad_input("brax", "episode_length", episode_length, "is not the environment's",
-                        f"give episode_length={env.env.episode_steps}")  # fmt: skip
+        raise bad_input(
+            "brax",
+            "episode_length",
+            episode_length,
+            "is not the environment's",
+            f"give episode_length={env.env.episode_steps}",
+        )
     if action_repeat != 1:
         raise bad_input("brax", "action_repeat", action_repeat, "is not 1", "set the environment's decimation")
     if randomization_fn is not None:

@@ -61,8 +61,13 @@ class SingleEnv(gym.Env):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, environment: Environment | str = "navigation", render_mode: str | None = None,
-                 view: str = "auto", **options: Any):  # fmt: skip
+    def __init__(
+        self,
+        environment: Environment | str = "navigation",
+        render_mode: str | None = None,
+        view: str = "auto",
+        **options: Any,
+    ):
         self.env = _made(environment, options)
         _check_mode(render_mode, self.env)
         self.render_mode = render_mode
@@ -92,8 +97,13 @@ class SingleEnv(gym.Env):
         if self._picture:
             self._picture.add(self._state, done)
         info = _info(state, 0) | ({k: float(v[0]) for k, v in state.metrics.items()} if done else {})
-        return (np.asarray(state.final_obs[0], np.float32), float(state.reward[0]), bool(state.terminated[0]),
-                bool(state.truncated[0]), info)  # fmt: skip
+        return (
+            np.asarray(state.final_obs[0], np.float32),
+            float(state.reward[0]),
+            bool(state.terminated[0]),
+            bool(state.truncated[0]),
+            info,
+        )
 
     def render(self) -> np.ndarray | None:
         """A picture, (height, width, 3) uint8, in the render mode rgb_array."""
@@ -172,13 +182,23 @@ class VectorEnv(gym.vector.VectorEnv):
       render_mode: None; pictures are made by the single environment.
     """
 
-    def __init__(self, num_envs: int = 1, environment: Environment | str = "navigation",
-                 render_mode: str | None = None, **options: Any):  # fmt: skip
+    def __init__(
+        self,
+        num_envs: int = 1,
+        environment: Environment | str = "navigation",
+        render_mode: str | None = None,
+        **options: Any,
+    ):
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise bad_input("gym.make_vec", "num_envs", num_envs, "is not a whole number of at least 1", "give one")
         if render_mode is not None:
-            raise bad_input("gym.make_vec", "render_mode", render_mode, "does not exist for a batch",
-                            "render one environment from gym.make")  # fmt: skip
+            raise bad_input(
+                "gym.make_vec",
+                "render_mode",
+                render_mode,
+                "does not exist for a batch",
+                "render one environment from gym.make",
+            )
         self.env, self.num_envs, self.render_mode = _made(environment, options), num_envs, None
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.single_observation_space, self.single_action_space = _spaces(self.env)
@@ -199,8 +219,10 @@ class VectorEnv(gym.vector.VectorEnv):
         if self.state is None:
             raise bad_input("gym.step", "actions", "a step", "comes before the first reset", "call reset first")
         self.state = self._step(self.env.params, self.state, jnp.asarray(actions, jnp.float32))
-        seen = {name: getattr(self.state, name) for name in ("obs", "final_obs", "reward", "terminated", "truncated",
-                                                             "info", "metrics")}  # fmt: skip
+        seen = {
+            name: getattr(self.state, name)
+            for name in ("obs", "final_obs", "reward", "terminated", "truncated", "info", "metrics")
+        }
         seen = jax.device_get(seen)
         infos = self._infos(seen["info"])
         done = seen["terminated"] | seen["truncated"]
@@ -209,10 +231,19 @@ class VectorEnv(gym.vector.VectorEnv):
             for i in np.flatnonzero(done):
                 final[i] = np.asarray(seen["final_obs"][i], np.float32)
             metrics = {k: np.where(done, v, 0.0) for k, v in seen["metrics"].items()}
-            infos |= {"final_obs": final, "_final_obs": done.copy(), "_final_info": done.copy(),
-                      "final_info": self._infos(metrics, done)}  # fmt: skip
-        return (np.asarray(seen["obs"], np.float32), np.asarray(seen["reward"], np.float64),
-                np.asarray(seen["terminated"]), np.asarray(seen["truncated"]), infos)  # fmt: skip
+            infos |= {
+                "final_obs": final,
+                "_final_obs": done.copy(),
+                "_final_info": done.copy(),
+                "final_info": self._infos(metrics, done),
+            }
+        return (
+            np.asarray(seen["obs"], np.float32),
+            np.asarray(seen["reward"], np.float64),
+            np.asarray(seen["terminated"]),
+            np.asarray(seen["truncated"]),
+            infos,
+        )
 
     def _infos(self, values: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
         mask = np.ones(self.num_envs, bool) if mask is None else mask

@@ -78,9 +78,17 @@ class PointEnv:
             "success": success.astype(total.dtype),
         }
         return State(
-            obs, privileged, reward, success, truncated, final_obs, final_privileged, metrics,
-            {"goal_body": privileged}, inner,
-        )  # fmt: skip
+            obs,
+            privileged,
+            reward,
+            success,
+            truncated,
+            final_obs,
+            final_privileged,
+            metrics,
+            {"goal_body": privileged},
+            inner,
+        )
 
     def _fresh(self, keys: Any) -> PointState:
         split = jax.vmap(lambda k: jax.random.split(k, 3))(keys)

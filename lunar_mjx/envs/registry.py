@@ -60,13 +60,16 @@ def _by_name(name: str) -> Callable[..., Environment]:
         return (SHIPPED | _registered)[name]
     point = _installed().get(name)
     if point is None:
-        raise bad_input("envs.make", "environment", name, "does not exist",
-                        f"use {', '.join(names())}, or my_env.py:make_env")  # fmt: skip
+        raise bad_input(
+            "envs.make", "environment", name, "does not exist", f"use {', '.join(names())}, or my_env.py:make_env"
+        )
     try:
         return point.load()
     except Exception as error:
-        raise UserError(f"envs.make: the entry point {name} = {point.value} does not load ({type(error).__name__}: "
-                        f"{error}); mend the package that brings it.") from error  # fmt: skip
+        raise UserError(
+            f"envs.make: the entry point {name} = {point.value} does not load ({type(error).__name__}: "
+            f"{error}); mend the package that brings it."
+        ) from error
 
 
 def make(name: str, /, **options: Any) -> Environment:

@@ -151,19 +151,42 @@ def _scene(rover: Rover, terrain: Terrain, places: np.ndarray) -> Any:
     rows, cols = part.shape
     base, span = part.min(), max(float(np.ptp(part)), 1e-3)
     half_x, half_y = 0.5 * (cols - 1) * cell, 0.5 * (rows - 1) * cell
-    spec.add_hfield(name="ground", nrow=rows, ncol=cols, size=[half_x, half_y, span, 0.5],
-                    userdata=((part - base) / span).astype(np.float32).ravel().tolist())  # fmt: skip
+    spec.add_hfield(
+        name="ground",
+        nrow=rows,
+        ncol=cols,
+        size=[half_x, half_y, span, 0.5],
+        userdata=((part - base) / span).astype(np.float32).ravel().tolist(),
+    )
     world = spec.worldbody
-    world.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", rgba=[0.55, 0.53, 0.51, 1],
-                   pos=[x0 + c0 * cell + half_x, y0 + r0 * cell + half_y, base], contype=0, conaffinity=0)  # fmt: skip
+    world.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname="ground",
+        rgba=[0.55, 0.53, 0.51, 1],
+        pos=[x0 + c0 * cell + half_x, y0 + r0 * cell + half_y, base],
+        contype=0,
+        conaffinity=0,
+    )
     if terrain.rocks is not None:
         centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
         for center, radius in zip(centers, radii, strict=True):
             if radius > 0 and (center[:2] > low).all() and (center[:2] < high).all():
-                world.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=center,
-                               rgba=[0.4, 0.37, 0.34, 1], contype=0, conaffinity=0)  # fmt: skip
+                world.add_geom(
+                    type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                    size=[radius, 0, 0],
+                    pos=center,
+                    rgba=[0.4, 0.37, 0.34, 1],
+                    contype=0,
+                    conaffinity=0,
+                )
     goal = world.add_body(name="goal", mocap=True)
-    goal.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.05, 1.0, 0], pos=[0, 0, 1], rgba=[0.2, 1, 0.4, 0.8],
-                  contype=0, conaffinity=0)  # fmt: skip
+    goal.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[0.05, 1.0, 0],
+        pos=[0, 0, 1],
+        rgba=[0.2, 1, 0.4, 0.8],
+        contype=0,
+        conaffinity=0,
+    )
     world.add_light(pos=[0, 0, 50], dir=[0.6, -0.5, -0.62], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     return spec.compile()

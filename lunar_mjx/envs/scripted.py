@@ -35,8 +35,9 @@ def make_agent(name: str, env: Environment) -> Agent:
     if not isinstance(env, NavigationEnv):
         return lambda state, key: _toward(state.info["goal_body"])
     if env.config.action not in ("paper", "velocity"):
-        raise bad_input("agent", "scripted", env.config.action, "has one action per motor",
-                        "use the action mode paper or velocity")  # fmt: skip
+        raise bad_input(
+            "agent", "scripted", env.config.action, "has one action per motor", "use the action mode paper or velocity"
+        )
     return _driver(env)
 
 

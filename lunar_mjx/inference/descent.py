@@ -201,9 +201,13 @@ class _Walk:
 
 
 def descend(
-    goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS, rival: Rival | float = np.inf,
-    known: tuple[np.ndarray, np.ndarray] | None = None, outdone: Callable[[Descent], bool] | None = None,
-) -> Descent:  # fmt: skip
+    goal: Objective,
+    start: np.ndarray,
+    iterations: int = _ITERATIONS,
+    rival: Rival | float = np.inf,
+    known: tuple[np.ndarray, np.ndarray] | None = None,
+    outdone: Callable[[Descent], bool] | None = None,
+) -> Descent:
     """Levenberg-Marquardt from one start, all dampings of an iteration in one batch.
 
     Where Jacobians are dear, Broyden's update stands in for them as long as steps keep their promise, and a descent

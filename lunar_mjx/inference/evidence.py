@@ -270,8 +270,17 @@ def infer(
     log_evidence = here.value + 0.5 * len(x) * _LOG_2PI - 0.5 * float(np.linalg.slogdet(hessian)[1])
     spread = np.sqrt(np.diag(np.linalg.inv(hessian)))
     many = len(fields)
-    return Evidence(log_evidence, np.exp(x[:many]), spread[:many], np.exp(x[many:]), here.mean, here.covariance,
-                    promised, gram, amplitudes)  # fmt: skip
+    return Evidence(
+        log_evidence,
+        np.exp(x[:many]),
+        spread[:many],
+        np.exp(x[many:]),
+        here.mean,
+        here.covariance,
+        promised,
+        gram,
+        amplitudes,
+    )
 
 
 def _newton_step(here: _At) -> np.ndarray:

@@ -58,12 +58,21 @@ class Memory:
         if wide is not None:
             jacobian = goal.without_jumps(jacobian, goal.wide_jacobian(u, wide))
         return Fit(
-            u=u, free=free, chi2=float(chi2[0]), residual=residual[0],
-            jacobian=jacobian, fitted=goal.fitted,
-            gradient=entry["gradient"], starts=tuple(entry["starts"]), at_bound=tuple(entry["at_bound"]),
-            extra=entry["extra"], problems=tuple(entry["problems"]), step_error=problem.kept_step_error(),
-            own_step_error=bool(entry.get("own_step_error")), wide=wide,
-        )  # fmt: skip
+            u=u,
+            free=free,
+            chi2=float(chi2[0]),
+            residual=residual[0],
+            jacobian=jacobian,
+            fitted=goal.fitted,
+            gradient=entry["gradient"],
+            starts=tuple(entry["starts"]),
+            at_bound=tuple(entry["at_bound"]),
+            extra=entry["extra"],
+            problems=tuple(entry["problems"]),
+            step_error=problem.kept_step_error(),
+            own_step_error=bool(entry.get("own_step_error")),
+            wide=wide,
+        )
 
     def place(self, problem: Problem, name: str) -> np.ndarray | None:
         """(coordinates,) as kept under a name; None if unknown or of other coordinates."""
@@ -82,13 +91,18 @@ class Memory:
     def keep(self, problem: Problem, effects: Sequence[str], found: Fit) -> None:
         """Remembers a fit."""
         entry = {
-            "u": {problem.coordinates[i].key: float(found.u[i]) for i in found.free}, "gradient": found.gradient,
-            "starts": list(found.starts), "at_bound": list(found.at_bound), "extra": dict(found.extra),
-            "problems": list(found.problems), "chi2": found.chi2, "own_step_error": found.own_step_error,
-            "wide": None if found.wide is None else {
-                problem.coordinates[i].key: float(w) for i, w in zip(found.free, found.wide, strict=True)
-            },
-        }  # fmt: skip
+            "u": {problem.coordinates[i].key: float(found.u[i]) for i in found.free},
+            "gradient": found.gradient,
+            "starts": list(found.starts),
+            "at_bound": list(found.at_bound),
+            "extra": dict(found.extra),
+            "problems": list(found.problems),
+            "chi2": found.chi2,
+            "own_step_error": found.own_step_error,
+            "wide": None
+            if found.wide is None
+            else {problem.coordinates[i].key: float(w) for i, w in zip(found.free, found.wide, strict=True)},
+        }
         self._store("+".join(effects), entry)
 
     def _store(self, name: str, entry: Mapping[str, Any]) -> None:

@@ -194,11 +194,20 @@ def fit(
     agreeing = sum(c <= best.chi2 + same_chi2(best.chi2, count) for c in chi2s)
     problems = _faults(best, slack_of(best.chi2, count), agreeing, starts, edge, extra)
     return Fit(
-        u=best.u, free=np.asarray(free), chi2=best.chi2, residual=best.residual,
-        jacobian=jacobian, fitted=fitted, gradient=best.promise,
-        starts=chi2s, at_bound=edge, extra=extra, problems=problems, step_error=problem.kept_step_error(),
+        u=best.u,
+        free=np.asarray(free),
+        chi2=best.chi2,
+        residual=best.residual,
+        jacobian=jacobian,
+        fitted=fitted,
+        gradient=best.promise,
+        starts=chi2s,
+        at_bound=edge,
+        extra=extra,
+        problems=problems,
+        step_error=problem.kept_step_error(),
         wide=wide,
-    )  # fmt: skip
+    )
 
 
 def step_too_long(found: Fit) -> bool:
@@ -299,8 +308,8 @@ def _near(goal: Objective, centre: np.ndarray, origin: np.ndarray, others: np.nd
 
 
 def _faults(
-    best: Descent, slack: float, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float],
-) -> tuple[str, ...]:  # fmt: skip
+    best: Descent, slack: float, agreeing: int, starts: int, edge: Sequence[str], extra: Mapping[str, float]
+) -> tuple[str, ...]:
     problems = []
     if not np.isfinite(best.chi2):
         return ("every start diverged",)
@@ -335,5 +344,8 @@ def _at_bound(problem: Problem, goal: Objective, best: Descent) -> tuple[str, ..
     edge = (at <= goal.low + EDGE) | (at >= goal.high - EDGE)
     # The bounds of a candidate are where its physics ends: a share of 1, a friction of 0.
     own = np.concatenate([np.zeros(0, int), *problem.candidates.values()])
-    return tuple(problem.coordinates[i].key for i, e in zip(goal.free, edge, strict=True)
-                 if e and not problem.coordinates[i].physical and i not in own)  # fmt: skip
+    return tuple(
+        problem.coordinates[i].key
+        for i, e in zip(goal.free, edge, strict=True)
+        if e and not problem.coordinates[i].physical and i not in own
+    )

@@ -71,9 +71,13 @@ def gain(problem: Problem, before: Fit, after: Fit, splits: tuple[str, ...] = ("
 
 
 def predictive_gain(
-    problem: Problem, before: Fit, after: Fit, old: np.ndarray, new: np.ndarray,
+    problem: Problem,
+    before: Fit,
+    after: Fit,
+    old: np.ndarray,
+    new: np.ndarray,
     splits: tuple[str, ...] = ("fit", "select"),
-) -> tuple[float, float]:  # fmt: skip
+) -> tuple[float, float]:
     """As `gain`, from predictive residuals: for models that are not of one problem, but of the same measurements.
 
     Args:

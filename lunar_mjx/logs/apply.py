@@ -30,8 +30,13 @@ def log_modes(log: Log, model: Model) -> dict[str, str]:
         found = [m for m in MODES if any(_command(channels[j], m) in names for j in group.joints)]
         if len(found) > 1:
             shown = ", ".join(f"command_*_{_KIND[group.name]}_{COMMAND_UNITS[m]}" for m in found)
-            raise bad_input(log.folder, "commands", shown, f"command the {group.name} joints in several modes",
-                            "command all joints of a group in one unit")  # fmt: skip
+            raise bad_input(
+                log.folder,
+                "commands",
+                shown,
+                f"command the {group.name} joints in several modes",
+                "command all joints of a group in one unit",
+            )
         if found:
             modes[group.name] = found[0]
     return modes
@@ -59,12 +64,22 @@ def commands(log: Log, model: Model) -> tuple[Commands, float]:
     """
     modes = log_modes(log, model)
     if not modes:
-        raise bad_input(log.folder, "commands", None, "are missing: no channel command_* is in any table",
-                        "log what was commanded, such as command_lf_drive_speed_rad_s")  # fmt: skip
+        raise bad_input(
+            log.folder,
+            "commands",
+            None,
+            "are missing: no channel command_* is in any table",
+            "log what was commanded, such as command_lf_drive_speed_rad_s",
+        )
     for group, mode in modes.items():
         if model.modes[group] != mode:
-            raise bad_input(log.folder, f"commands of {group}", mode, f"differ from the model's mode "
-                            f"{model.modes[group]}", "make the model with log_model(log, model)")  # fmt: skip
+            raise bad_input(
+                log.folder,
+                f"commands of {group}",
+                mode,
+                f"differ from the model's mode {model.modes[group]}",
+                "make the model with log_model(log, model)",
+            )
     start, end = log.span_s
     names = _command_names(model)
     interval = _interval([log.table_of(n) for n in names if log.table_of(n) is not None], model.timestep)
@@ -106,8 +121,13 @@ def log_model(log: Log, base: Model) -> Model:
       UserError: the log is of another rover, or states what the model cannot take.
     """
     if Path(log.rover).name != base.rover.name and log.rover != str(base.rover.folder):
-        raise bad_input(log.folder, "rover", log.rover, f"is not the model's rover {base.rover.name}",
-                        "give the model of the log's rover")  # fmt: skip
+        raise bad_input(
+            log.folder,
+            "rover",
+            log.rover,
+            f"is not the model's rover {base.rover.name}",
+            "give the model of the log's rover",
+        )
     changes: dict[str, Any] = {"gravity": log.gravity_m_s2, "modes": log_modes(log, base)}
     if log.terrain != base.terrain_spec:
         changes["terrain"] = log.terrain
@@ -147,8 +167,13 @@ def moved(terrain: Terrain, x: float, y: float) -> Terrain:
     import dataclasses
 
     if terrain.rocks is not None or terrain.soil is not None:
-        raise bad_input("log_model", "terrain_origin_m", [-x, -y], f"does not go with {terrain.name}, which has rocks "
-                        "or a soil map", "write the log in the terrain's coordinates")  # fmt: skip
+        raise bad_input(
+            "log_model",
+            "terrain_origin_m",
+            [-x, -y],
+            f"does not go with {terrain.name}, which has rocks or a soil map",
+            "write the log in the terrain's coordinates",
+        )
     field: HeightField = dataclasses.replace(terrain.field, x0=terrain.field.x0 + x, y0=terrain.field.y0 + y)
     return dataclasses.replace(terrain, field=field)
 
@@ -171,8 +196,10 @@ def _with_payload(model: Model, mass: float, position: Any, source: str) -> Mode
     if "payload" in model.effect_names:
         old = model.parameters["payload"]
         both = float(old["mass"]) + mass  # type: ignore[arg-type]
-        position = [(float(old[k]) * float(old["mass"]) + p * mass) / both  # type: ignore[arg-type]
-                    for k, p in zip("xyz", position, strict=True)]  # fmt: skip
+        position = [
+            (float(old[k]) * float(old["mass"]) + p * mass) / both  # type: ignore[arg-type]
+            for k, p in zip("xyz", position, strict=True)
+        ]
         mass = both
     return _set(model, "payload", source, mass=mass, **dict(zip("xyz", position, strict=True)))
 

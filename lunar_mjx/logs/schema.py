@@ -96,7 +96,7 @@ CHANNELS: tuple[Channel, ...] = (
     _channel("command_{c}_{j}_torque", "Nm", "command", -5e3, 5e3, "more than any rover's joint bears"),
     _channel("command_{c}_{j}_speed", "rad_s", "command", -100.0, 100.0, "a wheel of 0.1 m would drive 10 m/s"),
     _channel("command_{c}_{j}_angle", "rad", "command", -1e6, 1e6, "a wheel of 0.1 m would have rolled 100 km"),
-)  # fmt: skip
+)
 """Every channel of the schema."""
 
 ANGLE_LIMIT = 2.0 * 3.141592653589793

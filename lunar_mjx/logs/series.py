@@ -113,12 +113,24 @@ def agreement(series: np.ndarray, reference: np.ndarray, noise: float, least: fl
 
 
 FACTORS = {
-    57.29577951308232: "degrees for radians", 1.0 / 57.29577951308232: "radians for degrees",
-    1000.0: "thousandths (mm, mA)", 1e-3: "thousands (km, kN)", 100.0: "hundredths (cm, percent)", 0.01: "hundreds",
-    9.549296585513721: "rpm for rad/s", 1.0 / 9.549296585513721: "rad/s for rpm", 6.283185307179586: "rad for turns",
-    1.0 / 6.283185307179586: "turns for rad", 60.0: "minutes for seconds", 1.0 / 60.0: "seconds for minutes",
-    -1.0: "the sign", 3.6: "km/h for m/s", 1.0 / 3.6: "m/s for km/h", 6.0: "deg/s for rpm", 1.0 / 6.0: "rpm for deg/s",
-}  # fmt: skip
+    57.29577951308232: "degrees for radians",
+    1.0 / 57.29577951308232: "radians for degrees",
+    1000.0: "thousandths (mm, mA)",
+    1e-3: "thousands (km, kN)",
+    100.0: "hundredths (cm, percent)",
+    0.01: "hundreds",
+    9.549296585513721: "rpm for rad/s",
+    1.0 / 9.549296585513721: "rad/s for rpm",
+    6.283185307179586: "rad for turns",
+    1.0 / 6.283185307179586: "turns for rad",
+    60.0: "minutes for seconds",
+    1.0 / 60.0: "seconds for minutes",
+    -1.0: "the sign",
+    3.6: "km/h for m/s",
+    1.0 / 3.6: "m/s for km/h",
+    6.0: "deg/s for rpm",
+    1.0 / 6.0: "rpm for deg/s",
+}
 
 
 def guess(factor: float) -> str:

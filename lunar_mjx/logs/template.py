@@ -89,8 +89,17 @@ licence = ""
 citation = ""
 """
 
-_POINTS = ("slip_ratio", "slip_angle_deg", "normal_load_N", "travel_speed_m_s", "drawbar_pull_N", "side_force_N",
-           "driving_torque_Nm", "sinkage_m", "trial")  # fmt: skip
+_POINTS = (
+    "slip_ratio",
+    "slip_angle_deg",
+    "normal_load_N",
+    "travel_speed_m_s",
+    "drawbar_pull_N",
+    "side_force_N",
+    "driving_torque_Nm",
+    "sinkage_m",
+    "trial",
+)
 
 
 def new_log(folder: str | Path, rover: str = "viper", manoeuvre: str = "speed_staircase", steady: bool = False) -> Path:
@@ -140,8 +149,11 @@ def _columns(rover: str, manoeuvre: str) -> tuple[dict[str, list[str]], dict[str
     from lunar_mjx.simulate import command_channels, joint_channels
 
     model = make_model(rover, "flat")
-    settings = {"terrain": "flat", "ambient": "20.0", "payload": "# payload_kg = 60.0\n"
-                "# payload_position_m = [0.0, 0.0, 0.4]"}  # fmt: skip
+    settings = {
+        "terrain": "flat",
+        "ambient": "20.0",
+        "payload": "# payload_kg = 60.0\n# payload_position_m = [0.0, 0.0, 0.4]",
+    }
     if manoeuvre in MANOEUVRES:
         plan = load_manoeuvre(manoeuvre)
         model = model.replace(modes={"drive": plan.drive_mode})

@@ -127,8 +127,9 @@ def new_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise bad_input("lunar-mjx log", "folder", str(folder), f"cannot be made ({error.strerror})",
-                        "name another folder") from error  # fmt: skip
+        raise bad_input(
+            "lunar-mjx log", "folder", str(folder), f"cannot be made ({error.strerror})", "name another folder"
+        ) from error
 
 
 def write_frame(frame: pd.DataFrame, path: Path) -> None:

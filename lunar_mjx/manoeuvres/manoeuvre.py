@@ -25,8 +25,18 @@ MANOEUVRES: tuple[str, ...] = tuple(sorted(p.stem for p in _FOLDER.glob("*.toml"
 ARRANGEMENTS = ("stand", "parking_brake", "tether", "hard_surface")
 """Effects that a test may be arranged with; its user knows of them, and so does every model of its log."""
 
-_TOP = ("format", "description", "separates", "terrain", "start", "environment", "payload_share", "modes",
-        "arrangement", "segment")  # fmt: skip
+_TOP = (
+    "format",
+    "description",
+    "separates",
+    "terrain",
+    "start",
+    "environment",
+    "payload_share",
+    "modes",
+    "arrangement",
+    "segment",
+)
 _SIDES = ("front", "rear", "left", "right")
 _QUANTITIES = {"speed_m_s": "velocity", "current_A": "current"}
 _SEGMENT = ("duration_s", "ramp_s", *_QUANTITIES, "steer_deg", "suspension_deg", "spin_deg_s")
@@ -94,8 +104,9 @@ def load_manoeuvre(name: str | Path) -> Manoeuvre:
     """
     path = _FOLDER / f"{name}.toml" if str(name) in MANOEUVRES else Path(name)
     if path.suffix != ".toml":
-        raise bad_input("manoeuvre", "name", str(name), "is neither canned nor a TOML file",
-                        f"use one of {', '.join(MANOEUVRES)}")  # fmt: skip
+        raise bad_input(
+            "manoeuvre", "name", str(name), "is neither canned nor a TOML file", f"use one of {', '.join(MANOEUVRES)}"
+        )
     top = Fields.read(path, "the manoeuvre")
     top.known(_TOP)
     if top.text("format", "") != FORMAT:
@@ -127,8 +138,13 @@ def _segment(fields: Fields, mode: str) -> Segment:
     fields.known(_SEGMENT)
     for quantity, meant in _QUANTITIES.items():
         if quantity in fields.values and meant != mode:
-            raise bad_input(fields.path, fields.field(quantity), fields.values[quantity], f"goes with modes.drive = "
-                            f'"{meant}"', "set that mode, or use the other quantity")  # fmt: skip
+            raise bad_input(
+                fields.path,
+                fields.field(quantity),
+                fields.values[quantity],
+                f'goes with modes.drive = "{meant}"',
+                "set that mode, or use the other quantity",
+            )
     duration = fields.positive("duration_s")
     ramp = fields.number("ramp_s", 0.0)
     if not 0.0 <= ramp <= duration:
@@ -191,8 +207,13 @@ def commands(manoeuvre: Manoeuvre, model: Model, scale: float = 1.0) -> Commands
     if not 0.0 < scale <= 1e3:
         raise bad_input("manoeuvre", "scale", scale, "is not a factor on durations", "give a positive number")
     if model.modes["drive"] != manoeuvre.drive_mode:
-        raise bad_input(manoeuvre.name, "mode", model.modes["drive"], "is not that of its drive commands",
-                        f'set control.drive.mode = "{manoeuvre.drive_mode}"')  # fmt: skip
+        raise bad_input(
+            manoeuvre.name,
+            "mode",
+            model.modes["drive"],
+            "is not that of its drive commands",
+            f'set control.drive.mode = "{manoeuvre.drive_mode}"',
+        )
     interval = max(1, round(INTERVAL / model.timestep)) * model.timestep
     count = round(scale * manoeuvre.duration_s / interval)
     if count < 2:

@@ -88,8 +88,10 @@ def print_preset(model: Model, console: Console) -> None:
             first = ""
     console.print(table)
     if model.preset == "paper":
-        for title, rows in (("left unsaid by the paper: the value taken", UNSAID),
-                            ("undefined in print: what is done there", REGULARISATIONS)):  # fmt: skip
+        for title, rows in (
+            ("left unsaid by the paper: the value taken", UNSAID),
+            ("undefined in print: what is done there", REGULARISATIONS),
+        ):
             table = make_table("what", "choice", title=title)
             for what, choice in rows.items():
                 table.add_row(what, choice)

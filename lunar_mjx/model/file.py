@@ -33,8 +33,19 @@ from lunar_mjx.units import to_unit
 
 FORMAT = "lunar-mjx-model/1"
 _MARKERS = {"models": "rover.toml", "terrain": "terrain.toml"}
-_TOP = ("format", "rover", "terrain", "preset", "gravity_m_s2", "timestep_s", "thermal_integrator", "effect_list",
-        "ambient", "control", "effects")  # fmt: skip
+_TOP = (
+    "format",
+    "rover",
+    "terrain",
+    "preset",
+    "gravity_m_s2",
+    "timestep_s",
+    "thermal_integrator",
+    "effect_list",
+    "ambient",
+    "control",
+    "effects",
+)
 _AMBIENT = ("temperature_degC", "noon_temperature_degC", "night_temperature_degC", "noon_time_s", "period_s")
 _CONTROL = ("mode", *GAINS)
 
@@ -105,19 +116,33 @@ def save_model(model: Model, path: str | Path) -> Path:
 def _record(model: Model, path: Path) -> dict[str, Any]:
     """The contents of the file at `path`."""
     if not model.terrain_spec:
-        raise bad_input(path, "terrain", model.terrain.name, "was made in Python and no file names it",
-                        "make the model with a terrain's name or path")  # fmt: skip
+        raise bad_input(
+            path,
+            "terrain",
+            model.terrain.name,
+            "was made in Python and no file names it",
+            "make the model with a terrain's name or path",
+        )
     for effect in model.effects:
         spec = model.effect_files[effect.name]
         if ".py" not in spec and catalogue.CATALOGUE.get(spec) is not effect:
-            raise bad_input(path, "effect_list", effect.name, "was made in Python and no file names it",
-                            f"put it into a file and add it as my_effects.py:{effect.name}")  # fmt: skip
+            raise bad_input(
+                path,
+                "effect_list",
+                effect.name,
+                "was made in Python and no file names it",
+                f"put it into a file and add it as my_effects.py:{effect.name}",
+            )
     noon, night, noon_time, period = (float(v) for v in model.ambient)
     if noon == night and (noon_time, period) == (0.0, SYNODIC_DAY):
         ambient: dict[str, float] = {"temperature_degC": _celsius(noon)}
     else:
-        ambient = {"noon_temperature_degC": _celsius(noon), "night_temperature_degC": _celsius(night),
-                   "noon_time_s": noon_time, "period_s": period}  # fmt: skip
+        ambient = {
+            "noon_temperature_degC": _celsius(noon),
+            "night_temperature_degC": _celsius(night),
+            "noon_time_s": noon_time,
+            "period_s": period,
+        }
     folder = path.parent.resolve()
     return {
         "format": FORMAT,
@@ -162,8 +187,9 @@ def _control(path: Path, table: Mapping[str, Any], model: Model) -> tuple[dict[s
     for group, entry in table.items():
         field = f"control.{group}"
         if group not in model.modes:
-            raise bad_input(path, field, entry, "names no joint group of the rover",
-                            f"use one of {', '.join(model.modes)}")  # fmt: skip
+            raise bad_input(
+                path, field, entry, "names no joint group of the rover", f"use one of {', '.join(model.modes)}"
+            )
         _known(path, field, _table(path, field, entry), _CONTROL)
         modes[group] = _text(path, f"{field}.mode", entry.get("mode", model.modes[group]))
         gains[group] = tuple(
@@ -180,8 +206,13 @@ def _effects(path: Path, data: Mapping[str, Any], model: Model) -> Model:
         model = _list_effects(path, data["effect_list"], model)
     for name, values in tables.items():
         if name not in model.effect_names:
-            raise bad_input(path, f"effects.{name}", values,
-                            "is not in the list of effects", "add it to effect_list or drop the table")  # fmt: skip
+            raise bad_input(
+                path,
+                f"effects.{name}",
+                values,
+                "is not in the list of effects",
+                "add it to effect_list or drop the table",
+            )
         effect = next(e for e in model.effects if e.name == name)
         values = _table(path, f"effects.{name}", values)
         model = model.set(name, str(path), **{k: _value(path, effect, k, v) for k, v in values.items()})
@@ -239,14 +270,20 @@ def _ambient(path: Path, table: Mapping[str, Any], default: tuple[float, ...]) -
     def kelvin(key: str) -> float:
         celsius = _number(path, f"ambient.{key}", table[key])
         if celsius <= -ZERO_CELSIUS:
-            raise bad_input(path, f"ambient.{key}", celsius, "is not above absolute zero",
-                            "give degrees Celsius above -273.15")  # fmt: skip
+            raise bad_input(
+                path, f"ambient.{key}", celsius, "is not above absolute zero", "give degrees Celsius above -273.15"
+            )
         return round(celsius + ZERO_CELSIUS, 9)  # so that what was saved, rounded likewise, is the same again
 
     if "temperature_degC" in table:
         if len(table) > 1:
-            raise bad_input(path, "ambient.temperature_degC", table["temperature_degC"], "is given beside a lunar day",
-                            "give either temperature_degC or noon and night temperatures")  # fmt: skip
+            raise bad_input(
+                path,
+                "ambient.temperature_degC",
+                table["temperature_degC"],
+                "is given beside a lunar day",
+                "give either temperature_degC or noon and night temperatures",
+            )
         return kelvin("temperature_degC"), kelvin("temperature_degC"), 0.0, SYNODIC_DAY
     for key in ("noon_temperature_degC", "night_temperature_degC"):
         if key not in table:

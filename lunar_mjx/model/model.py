@@ -81,8 +81,13 @@ class Model:
             raise bad_input(source, "effect", found.name, "is already in the model", "set its parameters instead")
         for other in self.effects:
             if found.name in other.replaces and other.name not in found.replaces:
-                raise bad_input(source, "effect", found.name, f"is replaced by {other.name}, which is in the model",
-                                f"remove {other.name} first")  # fmt: skip
+                raise bad_input(
+                    source,
+                    "effect",
+                    found.name,
+                    f"is replaced by {other.name}, which is in the model",
+                    f"remove {other.name} first",
+                )
         replaced = [i for i, e in enumerate(self.effects) if e.name in found.replaces]
         kept = [e for e in self.effects if e.name not in found.replaces]
         kept.insert(replaced[0] if replaced else len(kept), found)
@@ -168,8 +173,13 @@ class Model:
         groups = [g.name for g in self.rover.groups]
         for group in value:
             if group not in groups:
-                raise bad_input(source, f"{field}.{group}", value[group], "names no joint group of the rover",
-                                f"use one of {', '.join(groups)}")  # fmt: skip
+                raise bad_input(
+                    source,
+                    f"{field}.{group}",
+                    value[group],
+                    "names no joint group of the rover",
+                    f"use one of {', '.join(groups)}",
+                )
         present = self.parameters[effect.name][key]
         names = [g.name for g in self.rover.groups for _ in g.joints]
         old = present if isinstance(present, tuple) else (present,) * len(names)
@@ -186,8 +196,13 @@ def _check_length(rover: Rover, effect: Effect, key: str, value: Sequence[float]
     axis = effect.parameters[key].axis
     wanted = len(rover.wheels) if axis == "wheel" else len(rover.joints)
     if len(value) != wanted:
-        raise bad_input(source, f"effects.{effect.name}.{key}", list(value), f"has {len(value)} values",
-                        f"give one number, or {wanted}, one per {axis}")  # fmt: skip
+        raise bad_input(
+            source,
+            f"effects.{effect.name}.{key}",
+            list(value),
+            f"has {len(value)} values",
+            f"give one number, or {wanted}, one per {axis}",
+        )
 
 
 def _check_flat(effect: Effect, key: str, value: Any, source: str) -> None:
@@ -200,10 +215,14 @@ def _check_soil(model: Model, source: str) -> None:
     k_c, k_phi = (float(model.parameters["soil"][key]) for key in ("k_c", "k_phi"))  # type: ignore[arg-type]
     width = min(wheel.width for wheel in model.rover.wheels)
     if k_c / width + k_phi <= 0.0:
-        raise bad_input(source, "effects.soil.k_c", k_c,
-                        f"makes the soil's stiffness k_c/b + k_phi = {k_c / width + k_phi:g} under a wheel {width:g} m "
-                        "wide, which is not positive",
-                        "give a larger k_c or k_phi, or a rover with wider wheels")  # fmt: skip
+        raise bad_input(
+            source,
+            "effects.soil.k_c",
+            k_c,
+            f"makes the soil's stiffness k_c/b + k_phi = {k_c / width + k_phi:g} under a wheel {width:g} m "
+            "wide, which is not positive",
+            "give a larger k_c or k_phi, or a rover with wider wheels",
+        )
 
 
 READS_MOTOR = (
@@ -228,8 +247,13 @@ def check_effects(model: Model, source: str | Path) -> None:
     """
     needy = [name for name in READS_MOTOR if name in model.effect_names]
     if needy and "motor" not in model.effect_names:
-        raise bad_input(source, "effect_list", ", ".join(model.effect_names), f"lacks motor, which {needy[0]} reads",
-                        f"add motor or take out {', '.join(needy)}")  # fmt: skip
+        raise bad_input(
+            source,
+            "effect_list",
+            ", ".join(model.effect_names),
+            f"lacks motor, which {needy[0]} reads",
+            f"add motor or take out {', '.join(needy)}",
+        )
 
 
 _POSITION_RATE = 20.0
@@ -260,8 +284,13 @@ def check_settings(model: Model, source: str | Path) -> None:
     if not 1e-5 <= require_finite(source, "timestep_s", model.timestep) <= 0.02:
         raise bad_input(source, "timestep_s", model.timestep, "is outside [1e-5, 0.02] s", "use about 0.002 s")
     if model.thermal_integrator not in THERMAL_INTEGRATORS:
-        raise bad_input(source, "thermal_integrator", model.thermal_integrator, "does not exist",
-                        f"use one of {', '.join(THERMAL_INTEGRATORS)}")  # fmt: skip
+        raise bad_input(
+            source,
+            "thermal_integrator",
+            model.thermal_integrator,
+            "does not exist",
+            f"use one of {', '.join(THERMAL_INTEGRATORS)}",
+        )
     _check_ambient(model.ambient, source)
     for group, mode in model.modes.items():
         _check_group(model.rover, f"control.{group}.mode", group, mode, source)
@@ -278,19 +307,34 @@ def check_settings(model: Model, source: str | Path) -> None:
 
 def _check_group(rover: Rover, field: str, group: str, value: Any, source: str | Path) -> None:
     if rover.group(group) is None:
-        raise bad_input(source, field, value, "names no joint group of the rover",
-                        f"use one of {', '.join(g.name for g in rover.groups)}")  # fmt: skip
+        raise bad_input(
+            source,
+            field,
+            value,
+            "names no joint group of the rover",
+            f"use one of {', '.join(g.name for g in rover.groups)}",
+        )
 
 
 def _check_ambient(ambient: Sequence[float], source: str | Path) -> None:
     if not hasattr(ambient, "__len__") or len(ambient) != 4:
-        raise bad_input(source, "ambient", ambient, "is not four numbers",
-                        "give noon and night temperature in K, time of noon and length of the day in s")  # fmt: skip
+        raise bad_input(
+            source,
+            "ambient",
+            ambient,
+            "is not four numbers",
+            "give noon and night temperature in K, time of noon and length of the day in s",
+        )
     noon, night, noon_time, period = ambient
     for field, kelvin in (("noon", noon), ("night", night)):
         if require_finite(source, f"ambient.{field}_temperature_degC", kelvin) <= 0.0:
-            raise bad_input(source, f"ambient.{field}_temperature_degC", round(kelvin - ZERO_CELSIUS, 6),
-                            "is not above absolute zero", "give degrees Celsius above -273.15")  # fmt: skip
+            raise bad_input(
+                source,
+                f"ambient.{field}_temperature_degC",
+                round(kelvin - ZERO_CELSIUS, 6),
+                "is not above absolute zero",
+                "give degrees Celsius above -273.15",
+            )
     require_finite(source, "ambient.noon_time_s", noon_time)
     if require_finite(source, "ambient.period_s", period) <= 0.0:
         raise bad_input(source, "ambient.period_s", period, "is not positive", "give the length of the day in s")

@@ -124,10 +124,17 @@ def figure_slope() -> tuple[Figure, dict]:
         "stall_slope_deg": _crossing(slope, slip, STALL_SLIP),
         "stall_slip": STALL_SLIP,
         "runs": [
-            {"slope_deg": r.slope_deg, "slip": r.slip, "speed_m_s": r.speed, "wheel_slip": r.wheel_slip.tolist(),
-             "sinkage_m": r.sinkage.tolist(), "torque_Nm": r.torque.tolist()} for r in runs
+            {
+                "slope_deg": r.slope_deg,
+                "slip": r.slip,
+                "speed_m_s": r.speed,
+                "wheel_slip": r.wheel_slip.tolist(),
+                "sinkage_m": r.sinkage.tolist(),
+                "torque_Nm": r.torque.tolist(),
+            }
+            for r in runs
         ],
-    }  # fmt: skip
+    }
     return figure, numbers
 
 
@@ -155,8 +162,11 @@ def figure_6(trainings: Sequence[Path]) -> tuple[Figure, dict]:
 
     kept = () if trainings else kept_trainings()
     if kept:
-        print(f"Fig. 6 draws the trainings kept in {' and '.join(f'benchmarks/{p.name}' for p in kept)}; others: "
-              "--training.", file=sys.stderr)  # fmt: skip
+        print(
+            f"Fig. 6 draws the trainings kept in {' and '.join(f'benchmarks/{p.name}' for p in kept)}; others: "
+            "--training.",
+            file=sys.stderr,
+        )
     return figure_6(trainings or kept)
 
 
@@ -169,8 +179,15 @@ FIGURES: dict[str, Callable[..., tuple[Figure, dict]]] = {
     "6": figure_6,
     "slope": figure_slope,
 }
-_FILES = {"1": "fig1_display", "2": "fig2_workflow", "3": "fig3_motor_heat", "4": "fig4_rovers_and_terrain",
-          "5": "fig5_soft_ground", "6": "fig6_training", "slope": "slope_stall"}  # fmt: skip
+_FILES = {
+    "1": "fig1_display",
+    "2": "fig2_workflow",
+    "3": "fig3_motor_heat",
+    "4": "fig4_rovers_and_terrain",
+    "5": "fig5_soft_ground",
+    "6": "fig6_training",
+    "slope": "slope_stall",
+}
 NEED_OPENGL = ("1", "4")
 """Figures that MuJoCo's renderer draws."""
 NEED_TRAININGS = ("6",)

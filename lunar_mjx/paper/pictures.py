@@ -28,8 +28,15 @@ _BOXES: dict[str, tuple[float, float, str, str, str]] = {
     "learn": (3.0, 1.0, "learning", "DDPG, TD3, Gymnasium", GREEN),
     "judge": (3.0, 0.0, "criticism", "compare, find the missing effect", ORANGE),
 }
-_ARROWS = (("urdf", "model"), ("dem", "model"), ("effects", "model"), ("model", "step"), ("step", "state"),
-           ("step", "learn"), ("step", "judge"))  # fmt: skip
+_ARROWS = (
+    ("urdf", "model"),
+    ("dem", "model"),
+    ("effects", "model"),
+    ("model", "step"),
+    ("step", "state"),
+    ("step", "learn"),
+    ("step", "judge"),
+)
 
 
 def figure_1() -> tuple[Figure, dict[str, Any]]:
@@ -57,10 +64,16 @@ def figure_1() -> tuple[Figure, dict[str, Any]]:
     bar = figure.colorbar(shown, cax=labels.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=range(len(LABELS)))
     bar.ax.set_yticklabels(LABELS)
     shares = {name: float((images.segmentation == i).mean()) for i, name in enumerate(LABELS)}
-    return figure, {"size": [optics.width, optics.height], "fovy_deg": optics.fovy_deg,
-                    "camera_position_m": pose.position.tolist(), "view_matrix": images.view.tolist(),
-                    "projection_matrix": images.projection.tolist(), "share_of_pixels": shares,
-                    "nearest_m": float(np.nanmin(near)), "median_m": float(np.nanmedian(near))}  # fmt: skip
+    return figure, {
+        "size": [optics.width, optics.height],
+        "fovy_deg": optics.fovy_deg,
+        "camera_position_m": pose.position.tolist(),
+        "view_matrix": images.view.tolist(),
+        "projection_matrix": images.projection.tolist(),
+        "share_of_pixels": shares,
+        "nearest_m": float(np.nanmin(near)),
+        "median_m": float(np.nanmedian(near)),
+    }
 
 
 def figure_2() -> tuple[Figure, dict[str, Any]]:
@@ -69,16 +82,28 @@ def figure_2() -> tuple[Figure, dict[str, Any]]:
     axes = figure.subplots()
     wide, high = 0.74, 0.56
     for x, y, title, text, colour in _BOXES.values():
-        axes.add_patch(FancyBboxPatch((1.1 * x, y), wide, high, boxstyle="round,pad=0.04", facecolor="white",
-                                      edgecolor=colour, linewidth=1.8))  # fmt: skip
+        axes.add_patch(
+            FancyBboxPatch(
+                (1.1 * x, y), wide, high, boxstyle="round,pad=0.04", facecolor="white", edgecolor=colour, linewidth=1.8
+            )
+        )
         axes.text(1.1 * x + wide / 2, y + 0.36, title, ha="center", va="center", fontsize=10, weight="bold")
         axes.text(1.1 * x + wide / 2, y + 0.15, text, ha="center", va="center", fontsize=7, color=MUTED)
     for start, end in _ARROWS:
         a, b = _BOXES[start], _BOXES[end]
         tail, head = (1.1 * a[0] + wide + 0.05, a[1] + high / 2), (1.1 * b[0] - 0.05, b[1] + high / 2)
         axes.add_patch(FancyArrowPatch(tail, head, arrowstyle="-|>", mutation_scale=12, color=INK))
-    axes.add_patch(FancyArrowPatch((3.3 + wide / 2, -0.06), (wide / 2, -0.06), connectionstyle="arc3,rad=-0.16",
-                                   arrowstyle="-|>", mutation_scale=12, color=ORANGE, linestyle="--"))  # fmt: skip
+    axes.add_patch(
+        FancyArrowPatch(
+            (3.3 + wide / 2, -0.06),
+            (wide / 2, -0.06),
+            connectionstyle="arc3,rad=-0.16",
+            arrowstyle="-|>",
+            mutation_scale=12,
+            color=ORANGE,
+            linestyle="--",
+        )
+    )
     axes.text(1.1 * 1.85, -0.5, "the effect that was missing", ha="center", fontsize=8, color=INK)
     axes.set_xlim(-0.1, 4.2)
     axes.set_ylim(-0.85, 2.75)
@@ -117,9 +142,13 @@ def figure_4() -> tuple[Figure, dict[str, Any]]:
     surface.set_box_aspect((1, 1, max(0.01, float(np.ptp(part)) / (extent[1] - extent[0]))))
     surface.set(xlabel="east, m", ylabel="north, m", zlabel="height, m")
     surface.set_title("(d) its surface, true to scale", loc="left", fontsize=10)
-    numbers["terrain"] = {"name": terrain.name, "extent_m": [extent[1] - extent[0], extent[3] - extent[2]],
-                          "cell_m": cell, "lowest_m": float(heights.min()),
-                          "highest_m": float(heights.max())}  # fmt: skip
+    numbers["terrain"] = {
+        "name": terrain.name,
+        "extent_m": [extent[1] - extent[0], extent[3] - extent[2]],
+        "cell_m": cell,
+        "lowest_m": float(heights.min()),
+        "highest_m": float(heights.max()),
+    }
     return figure, numbers
 
 

@@ -37,8 +37,9 @@ def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]
       UserError: no training is given, or a file holds none.
     """
     if not paths:
-        raise UserError("figures: Fig. 6 needs trainings; make one with lunar-mjx train, and give its folder with "
-                        "--training.")  # fmt: skip
+        raise UserError(
+            "figures: Fig. 6 needs trainings; make one with lunar-mjx train, and give its folder with --training."
+        )
     found: dict[str, list[dict[str, Any]]] = {}
     for path in map(Path, paths):
         file = path / CURVE if path.is_dir() else path
@@ -48,11 +49,21 @@ def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]
             if not named or not all(_is_training(r) for _, r in named):
                 raise KeyError
         except FileNotFoundError:
-            raise bad_input("figures", "--training", str(path), f"has no {CURVE}" if path.is_dir() else "is not there",
-                            "give a folder that lunar-mjx train has finished") from None  # fmt: skip
+            raise bad_input(
+                "figures",
+                "--training",
+                str(path),
+                f"has no {CURVE}" if path.is_dir() else "is not there",
+                "give a folder that lunar-mjx train has finished",
+            ) from None
         except (ValueError, KeyError, TypeError, AttributeError):
-            raise bad_input("figures", "--training", str(path), "holds no record of a training",
-                            "give a folder that lunar-mjx train wrote") from None  # fmt: skip
+            raise bad_input(
+                "figures",
+                "--training",
+                str(path),
+                "holds no record of a training",
+                "give a folder that lunar-mjx train wrote",
+            ) from None
         for name, record in named:
             found.setdefault(name, []).append(record)
     return found
@@ -92,8 +103,10 @@ def figure_6(paths: Sequence[str | Path]) -> tuple[Figure, dict[str, Any]]:
     _finish(right, x, f"success, %{mean}" if episodes else "success, %   (dots: on unseen ground)")
     right.set_ylim(-3.0, 103.0)
     left.legend(frameon=False, fontsize=8)
-    return figure, {"axis": "episode" if episodes else "steps",
-                    "trainings": {name: [_numbers(r) for r in runs] for name, runs in groups.items()}}  # fmt: skip
+    return figure, {
+        "axis": "episode" if episodes else "steps",
+        "trainings": {name: [_numbers(r) for r in runs] for name, runs in groups.items()},
+    }
 
 
 def _by_step(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str, colour: str, line: Any) -> None:
@@ -102,12 +115,25 @@ def _by_step(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str,
     for i, run in enumerate(runs):
         rows = [r for r in run["rows"] if r.get("episode_return") is not None]
         steps = [r["steps"] for r in rows]
-        left.plot(steps, [r["episode_return"] for r in rows], color=colour, linestyle=line, linewidth=1.1,
-                  label=label if i == 0 else None)  # fmt: skip
+        left.plot(
+            steps,
+            [r["episode_return"] for r in rows],
+            color=colour,
+            linestyle=line,
+            linewidth=1.1,
+            label=label if i == 0 else None,
+        )
         right.plot(steps, [100.0 * r["success"] for r in rows], color=colour, linestyle=line, linewidth=1.0)
         unseen = run.get("unseen") or []
-        right.plot([s["steps"] for s in unseen], [100.0 * s["success"] for s in unseen], "o", color=colour,
-                   markersize=4, markeredgecolor="white", markeredgewidth=0.6)  # fmt: skip
+        right.plot(
+            [s["steps"] for s in unseen],
+            [100.0 * s["success"] for s in unseen],
+            "o",
+            color=colour,
+            markersize=4,
+            markeredgecolor="white",
+            markeredgewidth=0.6,
+        )
 
 
 def _by_episode(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str, colour: str, line: Any) -> None:
@@ -135,13 +161,17 @@ def _finish(axes: Axes, x: str, y: str) -> None:
 
 def _numbers(record: dict[str, Any]) -> dict[str, Any]:
     rows = [r for r in record.get("rows") or [] if r.get("episode_return") is not None]
-    out = {"seed": record["seed"], "steps": record.get("steps") or (rows[-1]["steps"] if rows else 0),
-           "last_return": rows[-1]["episode_return"] if rows else None,
-           "last_success_in_training": rows[-1]["success"] if rows else None,
-           "final_on_unseen_ground": record.get("final")}  # fmt: skip
+    out = {
+        "seed": record["seed"],
+        "steps": record.get("steps") or (rows[-1]["steps"] if rows else 0),
+        "last_return": rows[-1]["episode_return"] if rows else None,
+        "last_success_in_training": rows[-1]["success"] if rows else None,
+        "final_on_unseen_ground": record.get("final"),
+    }
     if _has_episodes(record):
         kept = record["episodes"]
         out["episodes"] = len(kept["episode_return"])
-        out["mean_of_last_50_episodes"] = {k: float(np.mean(v[-50:])) for k, v in kept.items()
-                                           if k in ("episode_return", "success")}  # fmt: skip
+        out["mean_of_last_50_episodes"] = {
+            k: float(np.mean(v[-50:])) for k, v in kept.items() if k in ("episode_return", "success")
+        }
     return out

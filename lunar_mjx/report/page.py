@@ -67,8 +67,12 @@ class Section(NamedTuple):
     blocks: Sequence[Block]
 
 
-_CONFIG = {"displaylogo": False, "responsive": True, "showLink": False,
-           "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"]}  # fmt: skip
+_CONFIG = {
+    "displaylogo": False,
+    "responsive": True,
+    "showLink": False,
+    "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"],
+}
 
 
 def _script() -> str:
@@ -121,10 +125,13 @@ def _block(block: Block, figures: list[str]) -> dict[str, Any]:
         return {"kind": kind, "caption": block.caption, **_placed(block.figure, figures)}
     if isinstance(block, Explorer):
         return {
-            "kind": kind, "caption": block.caption, "map": _placed(block.figure, figures),
-            "detail": _placed(block.detail, figures), "panels": _packed(json.dumps(block.panels, allow_nan=False)),
+            "kind": kind,
+            "caption": block.caption,
+            "map": _placed(block.figure, figures),
+            "detail": _placed(block.detail, figures),
+            "panels": _packed(json.dumps(block.panels, allow_nan=False)),
             "choices": [(key, panel["label"]) for key, panel in block.panels.items()],
-        }  # fmt: skip
+        }
     return {"kind": kind, **block._asdict()}
 
 

@@ -40,8 +40,14 @@ def faded(colour: str, alpha: float) -> str:
 
 def finish(figure: go.Figure, height: int, **layout: Any) -> go.Figure:
     """Applies the common look to a figure."""
-    axis = {"gridcolor": RULE, "linecolor": MUTED, "zeroline": False, "ticks": "outside", "tickcolor": RULE,
-            "title": {"standoff": 6}}  # fmt: skip
+    axis = {
+        "gridcolor": RULE,
+        "linecolor": MUTED,
+        "zeroline": False,
+        "ticks": "outside",
+        "tickcolor": RULE,
+        "title": {"standoff": 6},
+    }
     figure.update_layout(
         template="none",
         height=height,

@@ -117,8 +117,13 @@ def read_urdf(path: str | Path) -> Urdf:
     for element in robot.iter():
         if isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag.split("}")[0]:
             tag = f"xacro:{element.tag.split('}')[1]}"
-            raise bad_input(path, "element", tag, "was not expanded, and its parts would be lost",
-                            "expand the file first: xacro in.xacro > out.urdf")  # fmt: skip
+            raise bad_input(
+                path,
+                "element",
+                tag,
+                "was not expanded, and its parts would be lost",
+                "expand the file first: xacro in.xacro > out.urdf",
+            )
     reader = _Reader(path)
     colours = {m.get("name", ""): reader.colour(m) for m in robot.findall("material") if m.find("color") is not None}
     links = [reader.link(element, colours) for element in robot.findall("link")]

@@ -51,8 +51,13 @@ class Dem:
             )
         if (np.abs(heights) > HIGHEST).any():
             worst = heights.flat[np.nanargmax(np.abs(heights))]
-            raise bad_input(self.source, "heights", f"{worst:g} m", "is no height but a mark of nodata, or not in m",
-                            "declare it as nodata in the file, or correct the scale")  # fmt: skip
+            raise bad_input(
+                self.source,
+                "heights",
+                f"{worst:g} m",
+                "is no height but a mark of nodata, or not in m",
+                "declare it as nodata in the file, or correct the scale",
+            )
         if not np.isfinite(heights).all():
             count = int((~np.isfinite(heights)).sum())
             raise bad_input(
@@ -99,9 +104,12 @@ class Dem:
         (c0, c1), (r0, r1) = spans
         if c1 - c0 < 2 or r1 - r0 < 2:
             raise bad_input(
-                self.source, "crop", f"{width:g} x {height:g} m", f"holds fewer than 2 x 2 nodes {self.cell:g} m apart",
+                self.source,
+                "crop",
+                f"{width:g} x {height:g} m",
+                f"holds fewer than 2 x 2 nodes {self.cell:g} m apart",
                 "crop a larger rectangle",
-            )  # fmt: skip
+            )
         return dataclasses.replace(
             self, heights=self.heights[r0:r1, c0:c1], x0=west + c0 * self.cell, y0=south + r0 * self.cell
         )

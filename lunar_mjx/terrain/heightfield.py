@@ -49,9 +49,7 @@ def grid_index(u: Float[Array, "*points"], last: int) -> Int[Array, "*points"]:
 
 
 def bilinear(
-    values: Float[Array, "rows cols"],
-    u: Float[Array, "*points"],
-    v: Float[Array, "*points"],
+    values: Float[Array, "rows cols"], u: Float[Array, "*points"], v: Float[Array, "*points"]
 ) -> tuple[Float[Array, "*points"], Float[Array, "*points"], Float[Array, "*points"]]:
     """Bilinear interpolation with one set of four gathers.
 

@@ -80,9 +80,16 @@ def load_dem(config: TerrainConfig, name: str, folder: Path, dem: str | Path | N
     crop = config.crop
     if file is not None:
         table = config.dem
-        options = {} if table is None else {
-            "cell": table.cell, "height_scale": table.height_scale, "band": table.band, "dequantise": table.dequantise
-        }  # fmt: skip
+        options = (
+            {}
+            if table is None
+            else {
+                "cell": table.cell,
+                "height_scale": table.height_scale,
+                "band": table.band,
+                "dequantise": table.dequantise,
+            }
+        )
         ground = read_dem(file, crop=crop, **options)
     elif config.surface is not None:
         s = config.surface

@@ -75,12 +75,7 @@ def make_surface(
 
 
 def add_detail(
-    dem: Dem,
-    cell: float,
-    seed: int,
-    *,
-    roughness: Roughness | None = None,
-    craters: Craters | None = None,
+    dem: Dem, cell: float, seed: int, *, roughness: Roughness | None = None, craters: Craters | None = None
 ) -> Dem:
     """Adds roughness and craters below the resolution of a DEM, and nothing above it.
 

@@ -42,12 +42,7 @@ class Roughness:
 
 
 def fractal(
-    rows: int,
-    cols: int,
-    cell: float,
-    roughness: Roughness,
-    rng: np.random.Generator,
-    longest: float = np.inf,
+    rows: int, cols: int, cell: float, roughness: Roughness, rng: np.random.Generator, longest: float = np.inf
 ) -> np.ndarray:
     """Heights of a random self-affine surface.
 

@@ -78,8 +78,15 @@ class LiveDrive:
       UserError: as `open_engine`, or a start off the terrain.
     """
 
-    def __init__(self, model: Model, engine: str = "auto", top_speed: float = 0.5, x: float = 0.0, y: float = 0.0,
-                 yaw: float = 0.0) -> None:  # fmt: skip
+    def __init__(
+        self,
+        model: Model,
+        engine: str = "auto",
+        top_speed: float = 0.5,
+        x: float = 0.0,
+        y: float = 0.0,
+        yaw: float = 0.0,
+    ) -> None:
         check_start(model, x, y, yaw)
         self.model = drivable(model)
         self.pilot = Pilot(self.model, top_speed)

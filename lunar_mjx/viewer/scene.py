@@ -34,8 +34,9 @@ def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
     """The rover's shapes, wheels, and the light, as plain data for JSON."""
     rover = model.rover
     mj = rover.compile()
-    shapes = [_shape(mj, i) for i in range(mj.ngeom)
-              if mj.geom_group[i] < _HIDDEN_GROUP and int(mj.geom_type[i]) in _SHAPES]  # fmt: skip
+    shapes = [
+        _shape(mj, i) for i in range(mj.ngeom) if mj.geom_group[i] < _HIDDEN_GROUP and int(mj.geom_type[i]) in _SHAPES
+    ]
     return {
         "rover": rover.name,
         "terrain": model.terrain.name,
@@ -56,8 +57,14 @@ def _shape(mj: mujoco.MjModel, i: int) -> dict[str, Any]:
     size = mj.geom_size[i].tolist()
     if mj.geom_type[i] == mujoco.mjtGeom.mjGEOM_SPHERE:
         size = size[:1] * 3
-    shape = {"kind": kind, "body": int(mj.geom_bodyid[i]), "size": size, "place": mj.geom_pos[i].tolist(),
-             "turn": mj.geom_quat[i].tolist(), "colour": mj.geom_rgba[i].tolist()}  # fmt: skip
+    shape = {
+        "kind": kind,
+        "body": int(mj.geom_bodyid[i]),
+        "size": size,
+        "place": mj.geom_pos[i].tolist(),
+        "turn": mj.geom_quat[i].tolist(),
+        "colour": mj.geom_rgba[i].tolist(),
+    }
     if kind == "mesh":
         k = int(mj.geom_dataid[i])
         first, count = int(mj.mesh_vertadr[k]), int(mj.mesh_vertnum[k])

@@ -80,8 +80,13 @@ class Viewer(ThreadingHTTPServer):
         try:
             super().__init__((LOOPBACK, port), _Handler)
         except OSError as error:
-            raise bad_input("view", "--port", port, f"cannot be opened ({error.strerror})",
-                            "name another port, or 0 for any free one") from error  # fmt: skip
+            raise bad_input(
+                "view",
+                "--port",
+                port,
+                f"cannot be opened ({error.strerror})",
+                "name another port, or 0 for any free one",
+            ) from error
         own = self.server_address[1]
         self.hosts = {f"{name}:{own}" for name in (LOOPBACK, "localhost")} | (
             {LOOPBACK, "localhost"} if own == 80 else set()

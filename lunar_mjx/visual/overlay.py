@@ -101,14 +101,27 @@ class Overlay:
             draw.text((x, 0.3 * self._line), corner, font=self._font, fill=colour)
             x += 1.8 * self._line
         hot = self._hot[:, None]
-        self._plot(draw, frames[1], hot, float(hot.min()), max(float(hot.max()), float(hot.min()) + 1.0), [_HOT],
-                   "hottest winding, °C")  # fmt: skip
+        self._plot(
+            draw,
+            frames[1],
+            hot,
+            float(hot.min()),
+            max(float(hot.max()), float(hot.min()) + 1.0),
+            [_HOT],
+            "hottest winding, °C",
+        )
         return strip, frames
 
     def _plot(
-        self, draw: Any, frame: tuple[float, float, float, float], values: np.ndarray, low: float, high: float,
-        colours: list[tuple[int, int, int]], title: str,
-    ) -> None:  # fmt: skip
+        self,
+        draw: Any,
+        frame: tuple[float, float, float, float],
+        values: np.ndarray,
+        low: float,
+        high: float,
+        colours: list[tuple[int, int, int]],
+        title: str,
+    ) -> None:
         left, right, top, bottom = frame
         draw.text((left, 0.3 * self._line), title, font=self._font, fill=_TEXT)
         for value in (low, high):

@@ -18,9 +18,13 @@ from lunar_mjx.visual.recorded import RecordedDrive
 from lunar_mjx.visual.relief import relief, rocks_within
 
 WHEEL_STYLES = {
-    "lf": (BLUE, "-"), "rf": (ORANGE, "-"), "lr": (BLUE, (0, (4, 2))), "rr": (ORANGE, (0, (4, 2))),
-    "lm": (BLUE, ":"), "rm": (ORANGE, ":"),
-}  # fmt: skip
+    "lf": (BLUE, "-"),
+    "rf": (ORANGE, "-"),
+    "lr": (BLUE, (0, (4, 2))),
+    "rr": (ORANGE, (0, (4, 2))),
+    "lm": (BLUE, ":"),
+    "rm": (ORANGE, ":"),
+}
 """Sides by colour, front, middle and rear by the line: legible without colour."""
 
 _MARGIN = 0.12
@@ -91,8 +95,13 @@ def drive_summary(drive: RecordedDrive) -> Figure:
     axes.set_xlabel("time, s")
     name, model = drive.model.rover.name, drive.model
     length = float(np.hypot(*np.diff(drive.position[:, :2], axis=0).T).sum())
-    figure.suptitle(f"{name} on {model.terrain.name}, preset {model.preset}: {length:.2f} m in "
-                    f"{drive.time[-1] - drive.time[0]:.1f} s", x=0.01, ha="left", fontsize=12)  # fmt: skip
+    figure.suptitle(
+        f"{name} on {model.terrain.name}, preset {model.preset}: {length:.2f} m in "
+        f"{drive.time[-1] - drive.time[0]:.1f} s",
+        x=0.01,
+        ha="left",
+        fontsize=12,
+    )
     return figure
 
 
@@ -178,6 +187,11 @@ def terrain_preview(terrain: Terrain) -> Figure:
     right.plot(ordered, 100.0 * (1.0 - np.arange(ordered.size) / ordered.size), color=INK)
     style(right, "ground at least as steep, %", "slope, °")
     right.set_title(f"median {np.median(slope):.2g}°, steepest {slope.max():.3g}°", loc="left", fontsize=9)
-    figure.suptitle(f"{terrain.name}: {high[0] - low[0]:.4g} m x {high[1] - low[1]:.4g} m, heights "
-                    f"{heights.min():.3g} to {heights.max():.3g} m", x=0.01, ha="left", fontsize=12)  # fmt: skip
+    figure.suptitle(
+        f"{terrain.name}: {high[0] - low[0]:.4g} m x {high[1] - low[1]:.4g} m, heights "
+        f"{heights.min():.3g} to {heights.max():.3g} m",
+        x=0.01,
+        ha="left",
+        fontsize=12,
+    )
     return figure

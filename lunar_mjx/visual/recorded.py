@@ -91,8 +91,13 @@ class RecordedDrive:
         """Channels by name, (time, name)."""
         for name in names:
             if name not in self.table.columns:
-                raise bad_input(self.folder / TABLE, "columns", f"{len(self.table.columns)} channels", f"lack {name}",
-                                "write the drive anew with lunar-mjx simulate")  # fmt: skip
+                raise bad_input(
+                    self.folder / TABLE,
+                    "columns",
+                    f"{len(self.table.columns)} channels",
+                    f"lack {name}",
+                    "write the drive anew with lunar-mjx simulate",
+                )
         return self.table[names].to_numpy(float)
 
     @functools.cached_property
@@ -161,8 +166,9 @@ def read_drive(folder: str | Path) -> RecordedDrive:
         raise bad_input("drive", "RUN", str(folder), "is not a folder", "give the folder that lunar-mjx simulate wrote")
     for name in (TABLE, MODEL):
         if not (folder / name).is_file():
-            raise bad_input("drive", "RUN", str(folder), f"holds no {name}",
-                            "give the folder that lunar-mjx simulate wrote")  # fmt: skip
+            raise bad_input(
+                "drive", "RUN", str(folder), f"holds no {name}", "give the folder that lunar-mjx simulate wrote"
+            )
     try:
         table = pd.read_csv(folder / TABLE)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
@@ -170,8 +176,13 @@ def read_drive(folder: str | Path) -> RecordedDrive:
     drive = RecordedDrive(folder, load_model(folder / MODEL), table)
     numbers = drive.columns(["time_s", *(f"position_{a}_m" for a in "xyz")])
     if len(table) < 2 or not np.isfinite(numbers).all() or (np.diff(numbers[:, 0]) <= 0).any():
-        raise bad_input(folder / TABLE, "time_s", f"{len(table)} rows", "do not rise, or hold a gap",
-                        "give two rows or more, sorted by time")  # fmt: skip
+        raise bad_input(
+            folder / TABLE,
+            "time_s",
+            f"{len(table)} rows",
+            "do not rise, or hold a gap",
+            "give two rows or more, sorted by time",
+        )
     return drive
 
 

@@ -33,9 +33,15 @@ def frame_rows(drive: RecordedDrive, fps: int, speed: float) -> tuple[np.ndarray
 
 
 def render_video(
-    drive: RecordedDrive, path: Path, view: str = "auto", size: tuple[int, int] = (960, 540), fps: int = 20,
-    speed: float = 0.0, sun: Sun | None = None, report: Reporter = lambda what, done: None,
-) -> Path:  # fmt: skip
+    drive: RecordedDrive,
+    path: Path,
+    view: str = "auto",
+    size: tuple[int, int] = (960, 540),
+    fps: int = 20,
+    speed: float = 0.0,
+    sun: Sun | None = None,
+    report: Reporter = lambda what, done: None,
+) -> Path:
     """Writes a video of a drive.
 
     Args:
@@ -73,9 +79,16 @@ def _pictures(drive: RecordedDrive, view: str, size: tuple[int, int], sun: Sun) 
     """A function from a row to its picture, and which view it is."""
     if view != "top":
         try:
-            camera = RoverCamera(drive.model.rover, drive.terrain, drive.position[:, :2],
-                                 Pinhole(*size, fovy_deg=60.0), sun=sun, tracks=drive.tracks(), largest=size,
-                                 untrodden=True)  # fmt: skip
+            camera = RoverCamera(
+                drive.model.rover,
+                drive.terrain,
+                drive.position[:, :2],
+                Pinhole(*size, fovy_deg=60.0),
+                sun=sun,
+                tracks=drive.tracks(),
+                largest=size,
+                untrodden=True,
+            )
         except UserError:
             if view != "auto":
                 raise

@@ -99,12 +99,7 @@ class _Loads(NamedTuple):
 
 
 def wheel_test(
-    slip_ratio: Any,
-    slip_angle: Any,
-    normal_load: Any,
-    radius: Any,
-    width: Any,
-    slip_definition: str = "wheel_frame",
+    slip_ratio: Any, slip_angle: Any, normal_load: Any, radius: Any, width: Any, slip_definition: str = "wheel_frame"
 ) -> WheelTest:
     """A test at given slip ratios.
 
@@ -122,8 +117,13 @@ def wheel_test(
       UserError: unknown definition of slip.
     """
     if slip_definition not in SLIP_DEFINITIONS:
-        raise bad_input("wheel_test", "slip_definition", slip_definition, "does not exist",
-                        f"use one of {', '.join(SLIP_DEFINITIONS)}")  # fmt: skip
+        raise bad_input(
+            "wheel_test",
+            "slip_definition",
+            slip_definition,
+            "does not exist",
+            f"use one of {', '.join(SLIP_DEFINITIONS)}",
+        )
     arrays = (slip_ratio, slip_angle, normal_load, radius, width)
     slip, angle, load, radius, width = jnp.broadcast_arrays(*(jnp.asarray(a, float) for a in arrays))
     rim = jnp.where(slip >= 0.0, 1.0, 1.0 + slip)
@@ -143,10 +143,7 @@ class WheelBed:
     """
 
     def __init__(
-        self,
-        effects: Sequence[Effect | str],
-        parameters: Parameters | None = None,
-        gravity: float = EARTH_GRAVITY,
+        self, effects: Sequence[Effect | str], parameters: Parameters | None = None, gravity: float = EARTH_GRAVITY
     ):
         found = [catalogue.get(e) if isinstance(e, str) else e for e in effects]
         self.effects = tuple(e for e in found if not e.transient and any(port in PORTS for port in e.ports))
@@ -155,8 +152,13 @@ class WheelBed:
         for name, values in self.parameters.items():
             for key, value in values.items():
                 if isinstance(value, tuple | list):
-                    raise bad_input("WheelBed", f"effects.{name}.{key}", value, "has one value per wheel",
-                                    "give one number: a test bed has one wheel")  # fmt: skip
+                    raise bad_input(
+                        "WheelBed",
+                        f"effects.{name}.{key}",
+                        value,
+                        "has one value per wheel",
+                        "give one number: a test bed has one wheel",
+                    )
         ports = {port for e in self.effects for port in e.ports}
         if not {"wheel_normal", "wheel_shear"} <= ports:
             raise UserError(
@@ -175,8 +177,7 @@ class WheelBed:
           UserError: no such preset.
         """
         if preset not in presets.PRESETS:
-            raise bad_input("WheelBed", "preset", preset, "does not exist",
-                            f"use one of {', '.join(presets.PRESETS)}")  # fmt: skip
+            raise bad_input("WheelBed", "preset", preset, "does not exist", f"use one of {', '.join(presets.PRESETS)}")
         values: dict[str, Any] = {}
         bed = cls(presets.PRESETS[preset])
         for name in bed.parameters:
@@ -213,8 +214,13 @@ class WheelBed:
         """The bed's parameters with `values` in place of some."""
         unknown = [n for n in values if n not in self.parameters]
         if unknown:
-            raise bad_input("WheelBed", "effect", unknown[0], "does not act on this wheel",
-                            f"use one of {', '.join(self.parameters)}")  # fmt: skip
+            raise bad_input(
+                "WheelBed",
+                "effect",
+                unknown[0],
+                "does not act on this wheel",
+                f"use one of {', '.join(self.parameters)}",
+            )
         return {name: {**old, **values.get(name, {})} for name, old in self.parameters.items()}
 
     def __call__(self, parameters: Parameters, test: WheelTest) -> WheelResult:

@@ -89,9 +89,7 @@ def residuals(result: WheelResult, table: SteadyStateTable) -> dict[str, Any]:
 
 
 def compare(
-    model: WheelBed | Model | str | Sequence[Effect | str],
-    table: SteadyStateTable,
-    name: str | None = None,
+    model: WheelBed | Model | str | Sequence[Effect | str], table: SteadyStateTable, name: str | None = None
 ) -> Comparison:
     """Repeats a table on a model's wheel, in float64.
 

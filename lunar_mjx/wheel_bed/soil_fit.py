@@ -93,9 +93,11 @@ class WheelFit:
         for left_out in ("bed", "comparison"):
             del plain[left_out]
         return plain | {
-            "fit_angles_deg": FIT_ANGLES, "inside_angles_deg": INSIDE_ANGLES, "beyond_angles_deg": BEYOND_ANGLES,
+            "fit_angles_deg": FIT_ANGLES,
+            "inside_angles_deg": INSIDE_ANGLES,
+            "beyond_angles_deg": BEYOND_ANGLES,
             "held_out_rms": {q: held_out_rms(self.comparison, q) for q in self.comparison.residual},
-        }  # fmt: skip
+        }
 
 
 def held_out_rms(comparison: Comparison, quantity: str) -> float:

@@ -115,8 +115,9 @@ def read_table(
         if require_finite(file, field, value) <= 0.0:
             raise bad_input(file, field, value, "is not positive", "give the wheel's dimension in m")
     if slip_definition not in SLIP_DEFINITIONS:
-        raise bad_input(file, "slip_definition", slip_definition, "does not exist",
-                        f"use one of {', '.join(SLIP_DEFINITIONS)}")  # fmt: skip
+        raise bad_input(
+            file, "slip_definition", slip_definition, "does not exist", f"use one of {', '.join(SLIP_DEFINITIONS)}"
+        )
     try:
         frame = pd.read_csv(file)
     except (ValueError, UnicodeDecodeError) as error:
@@ -153,8 +154,9 @@ def _check_columns(file: Path, frame: pd.DataFrame) -> None:
             if column not in _COLUMNS and (
                 column == stem or (rest != column and "std" not in rest and "_" not in rest)
             ):
-                raise bad_input(file, "column", column, "does not have the unit of the schema",
-                                f"convert it and call it {wanted}")  # fmt: skip
+                raise bad_input(
+                    file, "column", column, "does not have the unit of the schema", f"convert it and call it {wanted}"
+                )
     for column in _REQUIRED:
         if column not in frame:
             raise UserError(f"{file}: the column {column} is missing; the table needs {', '.join(_REQUIRED)}.")
@@ -171,8 +173,13 @@ def _numbers(file: Path, frame: pd.DataFrame) -> dict[str, np.ndarray]:
         bad = ~np.isfinite(values)
         if bad.any():
             row = int(np.argmax(bad))
-            raise bad_input(file, f"line {row + 2}, {column}", frame[column].to_list()[row], "is not a finite number",
-                            "correct the cell or leave the row out")  # fmt: skip
+            raise bad_input(
+                file,
+                f"line {row + 2}, {column}",
+                frame[column].to_list()[row],
+                "is not a finite number",
+                "correct the cell or leave the row out",
+            )
         numbers[column] = values
     return numbers
 
@@ -193,8 +200,12 @@ def _check_values(file: Path, numbers: Mapping[str, np.ndarray], slip_definition
         still = np.maximum(numbers[speeds[0]], numbers[speeds[1]]) <= 0.0
         refuse(still, speeds[0], "is zero, and so is the travel speed", "drop the row")
     elif slip_definition == "wheel_frame":
-        refuse(np.abs(numbers["slip_angle_deg"]) > 89.9, "slip_angle_deg", "has no slip in the wheel's frame",
-               "give both speeds, or slip by travel speed")  # fmt: skip
+        refuse(
+            np.abs(numbers["slip_angle_deg"]) > 89.9,
+            "slip_angle_deg",
+            "has no slip in the wheel's frame",
+            "give both speeds, or slip by travel speed",
+        )
     rows = np.column_stack(list(numbers.values()))
     first = np.unique(rows, axis=0, return_index=True)[1]
     copied = ~np.isin(np.arange(len(rows)), first)

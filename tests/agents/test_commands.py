@@ -8,8 +8,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-SHORT = [f"--env={text}" for text in ("terrain=flat", "goal_distance=[1.0, 1.5]", "places=64", "decimation=25",
-                                      "episode_time=3.0", "action=velocity", "start_yaw=0.3")]  # fmt: skip
+SHORT = [
+    f"--env={text}"
+    for text in (
+        "terrain=flat",
+        "goal_distance=[1.0, 1.5]",
+        "places=64",
+        "decimation=25",
+        "episode_time=3.0",
+        "action=velocity",
+        "start_yaw=0.3",
+    )
+]
 """A goal a few seconds away: the straight line reaches it."""
 
 

@@ -45,9 +45,16 @@ def run(*arguments: object, devices: int = 1) -> dict:
 
 def settings(algorithm) -> TrainConfig:
     return TrainConfig(
-        algorithm, envs=32, batch=256, updates=2, buffer_steps=1000, random_steps=20, noise=(0.05, 0.4), normalise=True,
+        algorithm,
+        envs=32,
+        batch=256,
+        updates=2,
+        buffer_steps=1000,
+        random_steps=20,
+        noise=(0.05, 0.4),
+        normalise=True,
         epoch_steps=100,
-    )  # fmt: skip
+    )
 
 
 SMALL = {"actor_layers": (64, 64), "critic_layers": (64, 64), "n_step": 3, "tau": 0.02}
@@ -135,10 +142,14 @@ def test_two_processes_on_loopback_are_two_devices(spread):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    lines = [command("-", "--steps", 1600, "--coordinator", f"127.0.0.1:{port}", "--processes", 2, "--process", i)
-             for i in (0, 1)]  # fmt: skip
-    running = [subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-               for line, env in lines]  # fmt: skip
+    lines = [
+        command("-", "--steps", 1600, "--coordinator", f"127.0.0.1:{port}", "--processes", 2, "--process", i)
+        for i in (0, 1)
+    ]
+    running = [
+        subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for line, env in lines
+    ]
     try:
         outputs = [p.communicate(timeout=300) for p in running]
     finally:
@@ -187,8 +198,9 @@ def test_evaluation_counts_the_first_episode_of_each_environment():
     assert twice(env.params, (), 3) == twice(env.params, (), 3)
 
 
-@pytest.mark.parametrize(("successes", "count", "low", "high"), [(8, 10, 0.4902, 0.9433), (0, 10, 0.0, 0.2775),
-                                                                 (256, 256, 0.9852, 1.0)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("successes", "count", "low", "high"), [(8, 10, 0.4902, 0.9433), (0, 10, 0.0, 0.2775), (256, 256, 0.9852, 1.0)]
+)
 def test_wilson_interval(successes, count, low, high):
     """Published values (Wilson score, 95 %)."""
     assert wilson(successes, count) == pytest.approx((low, high), abs=1e-4)

@@ -21,7 +21,10 @@ def _drop(ctx, state, value):
 
 FAULTS = {
     "lateral force": (Hook("lateral force", {"shear": _flip}), ("soil wrench", "acceleration"), (" y", " x", " z")),
-    "wheel radius": (Hook("wheel radius", {"geometry": _grow}),
-                     ("slip", "sinkage", "soil wrench", "acceleration"), ("lr",)),
+    "wheel radius": (
+        Hook("wheel radius", {"geometry": _grow}),
+        ("slip", "sinkage", "soil wrench", "acceleration"),
+        ("lr",),
+    ),
     "rotor-stator term": (Hook("rotor-stator term", {"heat": _drop}), ("heat",), ("_drive", "_steer", "_suspension")),
-}  # fmt: skip
+}

@@ -110,8 +110,9 @@ def test_run_gives_log_channels(model):
         assert not table.isna().any(axis=None)
         assert table["accelerometer_z_m_s2"].iloc[-3] == pytest.approx(1.625, abs=0.2)
         speed = np.hypot(table["body_velocity_x_m_s"], table["body_velocity_y_m_s"]).iloc[-1]
-        assert speed == pytest.approx(np.hypot(table["world_velocity_x_m_s"], table["world_velocity_y_m_s"]).iloc[-1],
-                                      rel=1e-3)  # fmt: skip
+        assert speed == pytest.approx(
+            np.hypot(table["world_velocity_x_m_s"], table["world_velocity_y_m_s"]).iloc[-1], rel=1e-3
+        )
     assert set(tables[0]) >= {"command_lf_drive_speed_rad_s", "wheel_rr_slip_angle_deg", "gyro_z_rad_s"}
 
 
@@ -145,9 +146,11 @@ def test_run_says_when_it_diverged(model):
 
 @pytest.mark.parametrize(
     ("commands", "message"),
-    [(Commands(np.zeros((3, 5)), 0.05), r"control = \(5,\) has another shape"),
-     (Commands(np.zeros((3, 12)), 0.0511), "is no whole number of time steps")],
-)  # fmt: skip
+    [
+        (Commands(np.zeros((3, 5)), 0.05), r"control = \(5,\) has another shape"),
+        (Commands(np.zeros((3, 12)), 0.0511), "is no whole number of time steps"),
+    ],
+)
 def test_refuses_commands_of_another_shape_or_rate(model, commands, message):
     with pytest.raises(UserError, match=message):
         NativeBackend(model).run(commands)
@@ -162,8 +165,7 @@ def test_payload_rests_on_the_wheels(model):
             backend.step(np.zeros(12))
         loads[name] = backend.observe()["wheel_force"][0, :, 2]
         assert loads[name].sum() == pytest.approx(70.0 * 1.625, rel=2e-3)
-    np.testing.assert_allclose(loads["front"][:2].sum() - loads["rear"][:2].sum(),
-                               20.0 * 1.625 * 0.4 / 0.74, rtol=0.05)  # fmt: skip
+    np.testing.assert_allclose(loads["front"][:2].sum() - loads["rear"][:2].sum(), 20.0 * 1.625 * 0.4 / 0.74, rtol=0.05)
 
 
 def test_rotors_are_part_of_the_inertia(model):

@@ -34,8 +34,17 @@ def test_the_drive_moves_every_stage(luvmi):
     """A comparison of rovers that stand still would prove nothing."""
     samples = luvmi.of["slope, hard"][0]
     assert samples.state.qpos[-1, 0] > 0.1
-    least = {"wheel_velocity": 0.05, "slip": 0.01, "slip_angle": 1e-3, "sinkage": 1e-4, "wheel_force": 10.0,
-             "wheel_moment": 0.1, "joint_torque": 1.0, "winding_heat": 0.01, "acceleration": 1.0}  # fmt: skip
+    least = {
+        "wheel_velocity": 0.05,
+        "slip": 0.01,
+        "slip_angle": 1e-3,
+        "sinkage": 1e-4,
+        "wheel_force": 10.0,
+        "wheel_moment": 0.1,
+        "joint_torque": 1.0,
+        "winding_heat": 0.01,
+        "acceleration": 1.0,
+    }
     for name, value in least.items():
         assert np.abs(samples.stages[name]).max() > value, name
     assert np.abs(luvmi.of["flat, soft"][0].stages["housing_heat"]).max() > 1e-3
@@ -79,8 +88,9 @@ def test_a_drive_stays_within_tolerance_and_noise(luvmi):
     assert not _failed(parity.judge_drive(case, run, noise, perturbed.double, wanted, luvmi.model))
     hook = FAULTS["wheel radius"][0]
     wrong = parity.native_runner(luvmi.model, [hook]).drive(case, luvmi.commands)
-    assert "position" in {r.quantity for r in parity.judge_drive(case, run, noise, wrong, wanted, luvmi.model)
-                          if not r.passed}  # fmt: skip
+    assert "position" in {
+        r.quantity for r in parity.judge_drive(case, run, noise, wrong, wanted, luvmi.model) if not r.passed
+    }
 
 
 @pytest.mark.slow
@@ -110,8 +120,9 @@ def test_what_sets_viper_apart_from_native_mujoco():
     exact = parity.JaxRunner("structured", viper.model).step_from(case, samples)[0]
     gaps = []
     for within, compliance in ((False, 1.0), (True, 1.0), (True, 0.1)):
-        backend = NativeBackend(viper.model.replace(terrain=case.terrain), rovers=len(samples.control),
-                                damped_within=within)  # fmt: skip
+        backend = NativeBackend(
+            viper.model.replace(terrain=case.terrain), rovers=len(samples.control), damped_within=within
+        )
         for rover in range(len(samples.control)):
             backend.soften_loops(rover, compliance)
         seen, _ = evaluate(backend, samples.state, samples.control)
@@ -126,8 +137,9 @@ def test_page_says_where_engines_part(tmp_path, luvmi, monkeypatch):
     from lunar_mjx.backends.parity import study as parity_study
 
     hook = FAULTS["lateral force"][0]
-    monkeypatch.setattr(parity_study, "make_runner",
-                        lambda engine, model: parity.native_runner(model, [hook], "faulty"))  # fmt: skip
+    monkeypatch.setattr(
+        parity_study, "make_runner", lambda engine, model: parity.native_runner(model, [hook], "faulty")
+    )
     study = parity_study.run_study("luvmi_x", "consistent", ["structured"], 1.0, 4, grounds=("slope, soft",))
     assert "first in the stage soil wrench (wheel_force, " in verdict(study, study.pairs[0])
     page = write_parity_page(tmp_path / "parity.html", [study])

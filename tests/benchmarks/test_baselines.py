@@ -32,9 +32,16 @@ def table(points: int = 81) -> Observations:
     angle = np.repeat(np.arange(5), points // 5 + 1)[:points]
     place = np.column_stack([rng.uniform(-0.1, 0.7, points), 11.0 * angle, rng.uniform(20.0, 60.0, points)])
     series = tuple(Series(0, c, i * points, (i + 1) * points, None, 1.0) for i, c in enumerate(CHANNELS))
-    return Observations(np.zeros(4 * points), series, ("log",), ("fit",), np.tile(angle, 4),
-                        ("fit", "select", "fit", "select", "fit"), tuple(map(str, range(5))),
-                        np.tile(place, (4, 1)))  # fmt: skip
+    return Observations(
+        np.zeros(4 * points),
+        series,
+        ("log",),
+        ("fit",),
+        np.tile(angle, 4),
+        ("fit", "select", "fit", "select", "fit"),
+        tuple(map(str, range(5))),
+        np.tile(place, (4, 1)),
+    )
 
 
 def problem(amount: float = 0.0, seed: int = 1, **limits: float) -> tuple[Linear, dict[str, np.ndarray]]:
@@ -51,8 +58,9 @@ def problem(amount: float = 0.0, seed: int = 1, **limits: float) -> tuple[Linear
     # the baseline knows slip and angle only in the sinkage, so that it absorbs neither candidate
     base = np.column_stack([np.r_[np.zeros(3 * n), x[:n, 2] / 60.0], np.r_[np.zeros(3 * n), np.ones(n)]])
     value = base @ [3.0, -2.0] + amount * extra["slip"] + rng.normal(size=4 * n)
-    observations = Observations(value, seen.series, seen.logs, seen.split, seen.unit, seen.unit_split,
-                                seen.unit_names, seen.place)  # fmt: skip
+    observations = Observations(
+        value, seen.series, seen.logs, seen.split, seen.unit, seen.unit_split, seen.unit_names, seen.place
+    )
     return Linear(base, extra, observations, **limits), extra
 
 
@@ -87,12 +95,15 @@ def refit(made: Linear, effect: str, error: float) -> tools.Refit:
     return tools.Refit(effect, made.origin(), made.free([]), residual, 1)
 
 
-@pytest.mark.parametrize(("soil", "slip", "smallest", "careful"), [
-    (0.98, 0.97, "slip", "NOISE_ONLY"),
-    (0.97, 0.98, "NOISE_ONLY", "NOISE_ONLY"),
-    (3.0, 0.98, "slip", "slip"),
-    (3.0, 2.0, "slip", "UNKNOWN"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("soil", "slip", "smallest", "careful"),
+    [
+        (0.98, 0.97, "slip", "NOISE_ONLY"),
+        (0.97, 0.98, "NOISE_ONLY", "NOISE_ONLY"),
+        (3.0, 0.98, "slip", "slip"),
+        (3.0, 2.0, "slip", "UNKNOWN"),
+    ],
+)
 def test_rules(soil: float, slip: float, smallest: str, careful: str) -> None:
     made, _ = problem()
     said = tools.answers(made, [refit(made, "", soil), refit(made, "slip", slip), refit(made, "angle", 4.0)])
@@ -131,10 +142,15 @@ class Truth:
         return {c: np.full(5, v) for c, v in size.items()}
 
 
-@pytest.mark.parametrize(("channel", "term", "right"), [
-    ("driving_torque_Nm", "slip load", True), ("driving_torque_Nm", "slip^2", True),
-    ("driving_torque_Nm", "1", False), ("sinkage_m", "slip", False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("channel", "term", "right"),
+    [
+        ("driving_torque_Nm", "slip load", True),
+        ("driving_torque_Nm", "slip^2", True),
+        ("driving_torque_Nm", "1", False),
+        ("sinkage_m", "slip", False),
+    ],
+)
 def test_where_a_formula_points(monkeypatch: pytest.MonkeyPatch, channel: str, term: str, right: bool) -> None:
     monkeypatch.setattr(baselines.dataclasses, "replace", lambda truth, effects: Truth(effects))
     truth = Truth({"slip_sinkage": {}})
@@ -153,19 +169,31 @@ def test_every_hidden_effect_has_its_quantities() -> None:
 
 
 def test_figures_count_crashes_as_wrong() -> None:
-    good = {"smallest": {"right": False, "wrong_name": True}, "careful": {"right": True, "wrong_name": False},
-            "seconds": 2.0}  # fmt: skip
-    rows = [{"group": "nulls", "right": True, "wrong_name": False, "refit": good, "sindy": {"silent": True},
-             "seconds": 1.0},
-            {"group": "nulls", "right": False, "wrong_name": False, "verdict": "CRASH"}]  # fmt: skip
+    good = {
+        "smallest": {"right": False, "wrong_name": True},
+        "careful": {"right": True, "wrong_name": False},
+        "seconds": 2.0,
+    }
+    rows = [
+        {
+            "group": "nulls",
+            "right": True,
+            "wrong_name": False,
+            "refit": good,
+            "sindy": {"silent": True},
+            "seconds": 1.0,
+        },
+        {"group": "nulls", "right": False, "wrong_name": False, "verdict": "CRASH"},
+    ]
     found = baselines.figures(rows)["nulls"]
     hits = {k: (v["hits"], v["of"]) for k, v in found.items()}
     assert hits["mujoco.sysid careful, right"] == (1, 2) and hits["mujoco.sysid smallest, wrong name"] == (1, 2)
     assert hits["pySINDy, silent"] == (1, 2) and hits["lunar_mjx.criticism, right"] == (1, 2)
 
 
-def test_a_missing_tool_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-                                        tmp_path: Path) -> None:  # fmt: skip
+def test_a_missing_tool_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     monkeypatch.setitem(sys.modules, "mujoco.sysid", types.ModuleType("mujoco.sysid"))
     monkeypatch.setattr("mujoco.sysid", sys.modules["mujoco.sysid"], raising=False)
     monkeypatch.setattr(sys, "argv", ["baselines.py", "run", "--out", str(tmp_path / "a.jsonl")])

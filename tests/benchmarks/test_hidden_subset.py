@@ -54,8 +54,9 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
     assert all(r["outcome"] == "quiet" for r in found), told(found)
 
 
-@pytest.mark.parametrize(("group", "numbers", "misses"),
-                         [("singles", QUICK, 0), ("singles_x5", NOISY, 1), ("pairs", PAIRS, 0)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("group", "numbers", "misses"), [("singles", QUICK, 0), ("singles_x5", NOISY, 1), ("pairs", PAIRS, 0)]
+)
 def test_what_is_hidden_is_named(group: str, numbers: Sequence[int], misses: int) -> None:
     """One effect alone; one at five times the noise, where a class may be wider than it has to be; two together."""
     found = chosen(group, numbers)
@@ -123,9 +124,16 @@ def test_every_hidden_effect_changes_the_drive(name: str, plain_drive: dict[str,
 @pytest.mark.parametrize("name", [n for n, kind in DRIVE_KINDS.items() if kind.sensor is not None])
 def test_every_hidden_sensor_effect_changes_the_log(name: str) -> None:
     t = np.arange(0.0, 10.0, 0.05)
-    frame = pd.DataFrame({"time_s": t, "position_x_m": 0.1 * t, "motor_lf_drive_current_A": np.sin(t),
-                          "motor_lf_drive_voltage_V": 5.0 + 0.0 * t, "winding_lf_drive_temperature_degC": 25.0 + t,
-                          "housing_lf_drive_temperature_degC": 25.0 + 0.1 * t})  # fmt: skip
+    frame = pd.DataFrame(
+        {
+            "time_s": t,
+            "position_x_m": 0.1 * t,
+            "motor_lf_drive_current_A": np.sin(t),
+            "motor_lf_drive_voltage_V": 5.0 + 0.0 * t,
+            "winding_lf_drive_temperature_degC": 25.0 + t,
+            "housing_lf_drive_temperature_degC": 25.0 + 0.1 * t,
+        }
+    )
     kind = DRIVE_KINDS[name]
     assert kind.sensor is not None
     changed = kind.sensor(frame, kind.draw(np.random.default_rng(0)))
@@ -137,28 +145,31 @@ def row(group: str, verdict: str, named: list[str], hidden: list[str], **more: A
     return {"group": group, "verdict": verdict, "named": named, "truth": {"effects": {n: {} for n in hidden}}, **more}
 
 
-@pytest.mark.parametrize(("case", "twins", "right", "wrong_name"), [
-    (row("nulls", "NOISE_ONLY", [], []), 0.0, True, False),
-    (row("nulls", "KNOWN", ["a"], []), 0.0, False, True),
-    (row("nulls", "UNKNOWN", [], []), 0.0, False, False),
-    (row("singles", "KNOWN", ["a"], ["a"]), 0.0, True, False),
-    (row("singles", "KNOWN", ["b"], ["a"]), 0.0, False, True),
-    (row("singles", "KNOWN_CLASS", ["a", "b"], ["a"]), 1.0, True, False),
-    (row("singles", "KNOWN_CLASS", ["a", "b"], ["a"]), 50.0, False, False),
-    (row("singles", "KNOWN_CLASS", ["c", "b"], ["a"]), 1.0, False, True),
-    (row("singles", "MULTIPLE", ["a", "b"], ["a"]), 0.0, False, True),
-    (row("singles", "UNKNOWN", ["a"], ["a"]), 0.0, False, False),
-    (row("pairs", "MULTIPLE", ["b", "a"], ["a", "b"]), 0.0, True, False),
-    (row("pairs", "KNOWN", ["a"], ["a", "b"]), 0.0, False, False),
-    (row("pairs", "MULTIPLE", ["a", "c"], ["a", "b"]), 0.0, False, True),
-    (row("outside", "UNKNOWN", [], ["x"]), 0.0, True, False),
-    (row("outside", "KNOWN", ["a"], ["x"]), 0.0, False, True),
-    (row("undecidable", "NOISE_ONLY", [], ["a"], explained="UNDECIDABLE"), 0.0, True, False),
-    (row("undecidable", "NOISE_ONLY", [], ["a"], explained="NOISE_ONLY"), 0.0, False, False),
-    (row("dirt", "UNKNOWN", [], ["a"]), 0.0, True, False),
-    (row("dirt", "KNOWN", ["b"], ["a"]), 0.0, False, True),
-    (row("sabotaged", "NOISE_ONLY", [], []), 0.0, False, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("case", "twins", "right", "wrong_name"),
+    [
+        (row("nulls", "NOISE_ONLY", [], []), 0.0, True, False),
+        (row("nulls", "KNOWN", ["a"], []), 0.0, False, True),
+        (row("nulls", "UNKNOWN", [], []), 0.0, False, False),
+        (row("singles", "KNOWN", ["a"], ["a"]), 0.0, True, False),
+        (row("singles", "KNOWN", ["b"], ["a"]), 0.0, False, True),
+        (row("singles", "KNOWN_CLASS", ["a", "b"], ["a"]), 1.0, True, False),
+        (row("singles", "KNOWN_CLASS", ["a", "b"], ["a"]), 50.0, False, False),
+        (row("singles", "KNOWN_CLASS", ["c", "b"], ["a"]), 1.0, False, True),
+        (row("singles", "MULTIPLE", ["a", "b"], ["a"]), 0.0, False, True),
+        (row("singles", "UNKNOWN", ["a"], ["a"]), 0.0, False, False),
+        (row("pairs", "MULTIPLE", ["b", "a"], ["a", "b"]), 0.0, True, False),
+        (row("pairs", "KNOWN", ["a"], ["a", "b"]), 0.0, False, False),
+        (row("pairs", "MULTIPLE", ["a", "c"], ["a", "b"]), 0.0, False, True),
+        (row("outside", "UNKNOWN", [], ["x"]), 0.0, True, False),
+        (row("outside", "KNOWN", ["a"], ["x"]), 0.0, False, True),
+        (row("undecidable", "NOISE_ONLY", [], ["a"], explained="UNDECIDABLE"), 0.0, True, False),
+        (row("undecidable", "NOISE_ONLY", [], ["a"], explained="NOISE_ONLY"), 0.0, False, False),
+        (row("dirt", "UNKNOWN", [], ["a"]), 0.0, True, False),
+        (row("dirt", "KNOWN", ["b"], ["a"]), 0.0, False, True),
+        (row("sabotaged", "NOISE_ONLY", [], []), 0.0, False, False),
+    ],
+)
 def test_answers_are_judged(case: Mapping[str, Any], twins: float, right: bool, wrong_name: bool) -> None:
     found = outcome(case, lambda other: twins)
     assert (found["right"], found["wrong_name"]) == (right, wrong_name)
@@ -174,9 +185,20 @@ def test_wilson_interval() -> None:
 def small(group: str, number: int, seed: int, limit: int = 9) -> dict[str, Any]:
     if number >= limit:
         raise ValueError("a crash")
-    return {"case": f"{group}-{number:03d}", "kind": "tables", "group": group, "seed": str(seed), "named": [],
-            "verdict": "NOISE_ONLY", "truth": {"effects": {}}, "right": True, "outcome": "quiet", "wrong_name": False,
-            "noise": "white", "seconds": 0.0}  # fmt: skip
+    return {
+        "case": f"{group}-{number:03d}",
+        "kind": "tables",
+        "group": group,
+        "seed": str(seed),
+        "named": [],
+        "verdict": "NOISE_ONLY",
+        "truth": {"effects": {}},
+        "right": True,
+        "outcome": "quiet",
+        "wrong_name": False,
+        "noise": "white",
+        "seconds": 0.0,
+    }
 
 
 def test_a_stopped_benchmark_goes_on(tmp_path: Path) -> None:

@@ -25,8 +25,9 @@ def opengl() -> tuple[str, ...]:
 def scene(opengl: tuple[str, ...]):
     """A LUVMI-X that looks along x, its chassis level at (-1, 0, 0.3)."""
     rover = load_rover("luvmi_x")
-    with RoverCamera(rover, bumpy(), np.zeros((1, 2)), EYE, sun=Sun(90.0, 30.0), largest=(160, 120),
-                     backends=opengl) as camera:  # fmt: skip
+    with RoverCamera(
+        rover, bumpy(), np.zeros((1, 2)), EYE, sun=Sun(90.0, 30.0), largest=(160, 120), backends=opengl
+    ) as camera:
         qpos = camera.model.qpos0.copy()
         qpos[:3] = -1.0, 0.0, 0.3
         camera.place(qpos)

@@ -110,8 +110,18 @@ def test_tracks_show_in_the_picture(opengl):
     """Painted into the texture while the rover drives: seen from above, north up, where the wheel rolled."""
     at = np.linspace(-2.0, 2.0, 101)
     track = Track(np.stack([at, np.full(101, 1.0)], axis=-1), 0.4, 0.0)
-    with RoverCamera(load_rover("luvmi_x"), flat(20.0), np.zeros((1, 2)), EYE, sun=Sun(180.0, 60.0), tracks=[track],
-                     margin=6.0, largest=(200, 200), backends=opengl, untrodden=True) as camera:  # fmt: skip
+    with RoverCamera(
+        load_rover("luvmi_x"),
+        flat(20.0),
+        np.zeros((1, 2)),
+        EYE,
+        sun=Sun(180.0, 60.0),
+        tracks=[track],
+        margin=6.0,
+        largest=(200, 200),
+        backends=opengl,
+        untrodden=True,
+    ) as camera:
         above, optics = look_at((0.0, 1.0, 5.0), (0.0, 1.0, 0.0), up=(0.0, 1.0, 0.0)), Pinhole(200, 200, 50.0)
         before = np.maximum(camera.picture(above, optics).astype(float).mean(-1), 1.0)
         camera.roll(51)

@@ -51,10 +51,13 @@ def test_front_camera_sits_on_the_mast(name):
 
 @pytest.mark.parametrize(
     ("make", "message"),
-    [(lambda: Pinhole(0, 10), "width = 0 is outside"), (lambda: Pinhole(fovy_deg=190.0), "fovy_deg = 190.0 is outside"),
-     (lambda: Pinhole(near=0.0), "near = 0.0 is not between"),
-     (lambda: look_at((0, 0, 1), (0, 0, 0)), "gives no picture")],
-)  # fmt: skip
+    [
+        (lambda: Pinhole(0, 10), "width = 0 is outside"),
+        (lambda: Pinhole(fovy_deg=190.0), "fovy_deg = 190.0 is outside"),
+        (lambda: Pinhole(near=0.0), "near = 0.0 is not between"),
+        (lambda: look_at((0, 0, 1), (0, 0, 0)), "gives no picture"),
+    ],
+)
 def test_mistakes_are_one_sentence(make, message):
     with pytest.raises(UserError, match=message):
         make()

@@ -18,8 +18,15 @@ def run(tmp_path) -> Run:
     log.mkdir()
     (log / "points.csv").write_text("a,b\n1,2\n")
     model = make_model("luvmi_x", terrain="flat").add("slip_sinkage", "test", driving=0.4)
-    found = Run(tmp_path / "run", log_folders([log]), model, splits={"x": "test"}, added=("slip_sinkage",), seed=7,
-                discrepancy={"sinkage": 0.001})  # fmt: skip
+    found = Run(
+        tmp_path / "run",
+        log_folders([log]),
+        model,
+        splits={"x": "test"},
+        added=("slip_sinkage",),
+        seed=7,
+        discrepancy={"sinkage": 0.001},
+    )
     found.write()
     return found
 
@@ -28,8 +35,11 @@ def test_a_run_comes_back_as_it_was_written(run):
     again = load_run(run.folder)
     assert again.logs == run.logs
     assert (again.splits, again.added, again.seed, again.discrepancy) == (
-        run.splits, run.added, run.seed, run.discrepancy,
-    )  # fmt: skip
+        run.splits,
+        run.added,
+        run.seed,
+        run.discrepancy,
+    )
     assert again.model.effect_names == run.model.effect_names
     assert again.model.parameters["slip_sinkage"]["driving"] == 0.4
 

@@ -33,14 +33,26 @@ def write_table(folder, driving: float, seed: int = 0) -> None:
     bed = WheelBed.of_preset("consistent").with_effect("slip_sinkage", driving=driving, skid=0.0)
     test = wheel_test(slip, np.radians(angle), load, RADIUS, WIDTH)
     result = bed.run(test)
-    frame = pd.DataFrame({"slip_ratio": slip, "slip_angle_deg": angle, "normal_load_N": load,
-                          "drawbar_pull_N": result.drawbar_pull, "side_force_N": result.side_force,
-                          "sinkage_m": result.sinkage})  # fmt: skip
+    frame = pd.DataFrame(
+        {
+            "slip_ratio": slip,
+            "slip_angle_deg": angle,
+            "normal_load_N": load,
+            "drawbar_pull_N": result.drawbar_pull,
+            "side_force_N": result.side_force,
+            "sinkage_m": result.sinkage,
+        }
+    )
     rng = np.random.default_rng(seed)
     for column, std in STD.items():
         frame[column] += std * rng.standard_normal(len(frame))
-    write_steady_log(folder, frame, wheel={"radius_m": RADIUS, "width_m": WIDTH}, slip_definition="wheel_frame",
-                     noise={c: Noise(s, "datasheet") for c, s in STD.items()})  # fmt: skip
+    write_steady_log(
+        folder,
+        frame,
+        wheel={"radius_m": RADIUS, "width_m": WIDTH},
+        slip_definition="wheel_frame",
+        noise={c: Noise(s, "datasheet") for c, s in STD.items()},
+    )
 
 
 @pytest.fixture(scope="module")

@@ -93,8 +93,12 @@ def test_pictures_and_links_are_there():
 @pytest.mark.slow
 def test_site_builds_strictly_and_asks_nobody(tmp_path):
     pytest.importorskip("mkdocs")
-    subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)],
-                   cwd=ROOT, check=True, capture_output=True)  # fmt: skip
+    subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
     pages = list(tmp_path.rglob("*.html"))
     assert len(pages) > 8
     for page in pages:

@@ -30,8 +30,10 @@ def test_tutorial_runs(name):
     made = TOOL.run(name)
     committed = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
     kinds = [[o["output_type"] + "".join(sorted(o.get("data", ()))) for o in c.get("outputs", ())] for c in made]
-    assert kinds == [[o["output_type"] + "".join(sorted(o.get("data", ()))) for o in c.get("outputs", ())]
-                     for c in committed["cells"]]  # fmt: skip
+    assert kinds == [
+        [o["output_type"] + "".join(sorted(o.get("data", ()))) for o in c.get("outputs", ())]
+        for c in committed["cells"]
+    ]
     assert any(kinds)
 
 

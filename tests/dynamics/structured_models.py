@@ -22,9 +22,7 @@ def _rover(folder: Path, name: str, legs: str, tail: str, corners: list[str], jo
     wheels = tuple(Wheel(c, f"{c}_wheel", 0.2, 0.1, f"{c}_drive", None, None) for c in corners)
     group = JointGroup("drive", joints, "torque", 0.0, 0.0, 1.0, 1.0, 0.0, 48)
     limits = dict.fromkeys(joints, (-np.inf, np.inf))
-    return Rover(
-        name, Path(folder), path, wheels, (group,), limits, "chassis", np.zeros((1, 3)), (), 0.0, 0.0
-    )  # fmt: skip
+    return Rover(name, Path(folder), path, wheels, (group,), limits, "chassis", np.zeros((1, 3)), (), 0.0, 0.0)
 
 
 def _vector(values) -> str:

@@ -71,8 +71,13 @@ def test_ten_seconds_in_both_modes_agree_with_finite_differences(rover):
             central = np.stack([(a - b) / (2 * h) for a, b in sides], axis=1)
             errors.append(np.abs(central - forward).max(axis=1) / np.abs(forward).max(axis=1))
         weights = np.asarray(weights)
-    print(rover, "travelled", np.linalg.norm(moved), "m; worst relative difference by step",
-          dict(zip(STEPS, np.max(errors, axis=1), strict=True)))  # fmt: skip
+    print(
+        rover,
+        "travelled",
+        np.linalg.norm(moved),
+        "m; worst relative difference by step",
+        dict(zip(STEPS, np.max(errors, axis=1), strict=True)),
+    )
     assert np.linalg.norm(moved) > 0.3
     assert (np.abs(forward).max(axis=1) > 1e-6).all()
     # an output's greatest derivative is the scale of its row: some factors hardly matter to some outputs

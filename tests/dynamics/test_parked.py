@@ -16,8 +16,12 @@ from lunar_mjx.model import make_model
 OFFSETS = np.linspace(-2.9e-3, -2.3e-3, 41)
 """Errors of the wheels' radius, m: rovers that fall for 25 to 29 steps before they touch the ground."""
 DURATION = 1.5
-COLUMNS = {("wheel_radius_error", "offset"): 0, ("slip_sinkage", "driving"): 1, ("slip_sinkage", "skid"): 2,
-           ("slide_softening", "softening"): 3}  # fmt: skip
+COLUMNS = {
+    ("wheel_radius_error", "offset"): 0,
+    ("slip_sinkage", "driving"): 1,
+    ("slip_sinkage", "skid"): 2,
+    ("slide_softening", "softening"): 3,
+}
 """What differs between rovers, by effect and parameter."""
 
 

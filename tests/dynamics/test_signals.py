@@ -32,8 +32,11 @@ def rover() -> Rover:
 def system_of(rover: Rover, *effects: Effect) -> Any:
     """What `observe` and `measure` read of a system, without building one."""
     params = Params(
-        jnp.asarray(GRAVITY), Ambient(300.0, 300.0, 0.0, 1.0), {e.name: e.nominal() for e in effects}, None  # type: ignore[arg-type]
-    )  # fmt: skip
+        jnp.asarray(GRAVITY),
+        Ambient(300.0, 300.0, 0.0, 1.0),
+        {e.name: e.nominal() for e in effects},
+        None,  # type: ignore[arg-type]
+    )
     model = SimpleNamespace(rover=rover, effects=effects)
     return SimpleNamespace(model=model, params=params, info=None)
 
@@ -68,14 +71,30 @@ def telemetry(
     joint, wheel = np.zeros((n, 12)), np.zeros((n, 4))
     nil, none = Vec3(*np.zeros((3, n))), Vec3(*np.zeros((3, n, 4)))
     fields: dict[str, Any] = {
-        "time": times, "position": nil, "quaternion": quaternion(roll + 0 * times, pitch, yaw),
-        "euler": Vec3(*(a + 0 * times for a in (roll, pitch, yaw))), "velocity": nil, "angular_velocity": nil,
-        **dict.fromkeys(("joint_angle", "joint_speed", "joint_torque", "current", "voltage", "joule_heat",
-                         "winding_heat", "housing_heat"), joint),
-        "winding_temperature": joint + 300.0, "housing_temperature": joint + 290.0,
+        "time": times,
+        "position": nil,
+        "quaternion": quaternion(roll + 0 * times, pitch, yaw),
+        "euler": Vec3(*(a + 0 * times for a in (roll, pitch, yaw))),
+        "velocity": nil,
+        "angular_velocity": nil,
+        **dict.fromkeys(
+            (
+                "joint_angle",
+                "joint_speed",
+                "joint_torque",
+                "current",
+                "voltage",
+                "joule_heat",
+                "winding_heat",
+                "housing_heat",
+            ),
+            joint,
+        ),
+        "winding_temperature": joint + 300.0,
+        "housing_temperature": joint + 290.0,
         **dict.fromkeys(("wheel_position", "wheel_velocity", "wheel_force", "wheel_moment"), none),
         **dict.fromkeys(("sinkage", "slip", "slip_angle", "on_terrain"), wheel),
-    }  # fmt: skip
+    }
     return Telemetry(**{**fields, **known})
 
 

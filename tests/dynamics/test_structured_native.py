@@ -87,8 +87,15 @@ def _assert_equals_rigid_loop(rover, states):
     qpos[:, 7:] = np.clip(qpos[:, 7:], -0.15, 0.15)
     qpos, qvel = reference.closed(qpos, qvel)
     new_qvel = np.asarray(reference.step(qpos, qvel, forces)[1][1])
-    free = np.r_[:6, [link.dof[i] for g in reference.engine.structure.groups for link in
-                      (g.links[k] for k in g.free) for i in range(g.count)]]  # fmt: skip
+    free = np.r_[
+        :6,
+        [
+            link.dof[i]
+            for g in reference.engine.structure.groups
+            for link in (g.links[k] for k in g.free)
+            for i in range(g.count)
+        ],
+    ]
     for i in range(states):
         exact = reference.hard_loop(qpos[i], qvel[i], {k: f[i] for k, f in forces.items()})
         found = (new_qvel[i] - qvel[i]) / dt
@@ -189,10 +196,13 @@ def test_refuses_joints_it_cannot_honour(joint, message, tmp_path):
         ("</worldbody>", '</worldbody><equality><weld body1="mast" body2="l0_wheel"/></equality>', "no connect"),
         ("</worldbody>", '</worldbody><actuator><position joint="l0_drive"/></actuator>', "biastype"),
         ("</worldbody>", '</worldbody><tendon><fixed><joint joint="l0_drive" coef="1"/></fixed></tendon>', "tendons"),
-        ("</worldbody>", '</worldbody><equality><connect body1="l0_wheel" body2="l1_wheel" anchor="0 0 0"/></equality>',
-         "1 \\+ 1"),
+        (
+            "</worldbody>",
+            '</worldbody><equality><connect body1="l0_wheel" body2="l1_wheel" anchor="0 0 0"/></equality>',
+            "1 \\+ 1",
+        ),
     ],
-)  # fmt: skip
+)
 def test_refuses_models_it_cannot_honour(old, new, message, tmp_path):
     rover = made.spider(tmp_path, 3, links=1)
     rover.mjcf.write_text(rover.mjcf.read_text().replace(old, new, 1))

@@ -67,9 +67,16 @@ def rover() -> RoverInfo:
     points = Vec3(jnp.asarray([0.5, -0.5]), jnp.asarray([0.3, -0.3]), jnp.asarray([-0.2, 0.05]))
     group = number % 3
     return RoverInfo(
-        0.25 * jnp.ones(WHEELS), 0.2 * jnp.ones(WHEELS), group, jnp.where(group == 0, -jnp.inf, -0.2 * one),
-        jnp.where(group == 0, jnp.inf, 0.2 * one), number % 4, 40.0 * one, 3.0 * one, points,
-    )  # fmt: skip
+        0.25 * jnp.ones(WHEELS),
+        0.2 * jnp.ones(WHEELS),
+        group,
+        jnp.where(group == 0, -jnp.inf, -0.2 * one),
+        jnp.where(group == 0, jnp.inf, 0.2 * one),
+        number % 4,
+        40.0 * one,
+        3.0 * one,
+        points,
+    )
 
 
 def unit(v: Array) -> Array:

@@ -16,11 +16,25 @@ Array = Any
 COMPANIONS = {"gear_friction_heat": ("coulomb_friction",)}
 """Effects without which one has little to act on."""
 NAMES = (
-    "actuator_delay", "backlash", "cogging", "cold_grease", "coulomb_friction", "directional_gear_efficiency",
-    "driveline_compliance", "gear_friction_heat", "housing_conduction", "housing_radiation", "iron_loss",
-    "magnet_nonlinearity", "regolith_infrared", "rotor_stator_path", "solar_flux", "stribeck_friction",
-    "viscous_friction", "voltage_saturation",
-)  # fmt: skip
+    "actuator_delay",
+    "backlash",
+    "cogging",
+    "cold_grease",
+    "coulomb_friction",
+    "directional_gear_efficiency",
+    "driveline_compliance",
+    "gear_friction_heat",
+    "housing_conduction",
+    "housing_radiation",
+    "iron_loss",
+    "magnet_nonlinearity",
+    "regolith_infrared",
+    "rotor_stator_path",
+    "solar_flux",
+    "stribeck_friction",
+    "viscous_friction",
+    "voltage_saturation",
+)
 SMALL = {"voltage_saturation": 1e-9, "backlash": 1e-7, "driveline_compliance": 1e-10, "magnet_nonlinearity": 1e-9}
 """Step of the difference quotient at the null, where the effect is far from linear over 1e-6 of its unit."""
 

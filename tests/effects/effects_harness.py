@@ -50,10 +50,21 @@ def random_wheels(count: int = STATES, seed: int = 0) -> tuple[WheelState, dict[
     direction = rng.choice([-1.0, 1.0, 0.0], count)
     direction = np.where(direction == 0, uniform(-1, 1), direction)
     state = WheelState(
-        radius, width, sinkage, uniform(-0.1, 0.1), slip, (1 - slip) * np.tan(angle), direction, table["k_c"],
-        table["k_phi"], table["n"], table["cohesion"], np.tan(table["friction_angle"]), table["shear_modulus_x"],
+        radius,
+        width,
+        sinkage,
+        uniform(-0.1, 0.1),
+        slip,
+        (1 - slip) * np.tan(angle),
+        direction,
+        table["k_c"],
+        table["k_phi"],
+        table["n"],
+        table["cohesion"],
+        np.tan(table["friction_angle"]),
+        table["shear_modulus_x"],
         table["shear_modulus_y"],
-    )  # fmt: skip
+    )
     motion = {"v_x": uniform(-1, 1), "v_y": uniform(-1, 1), "rim_speed": uniform(-1, 1)}
     # the paper's regularisation below 0.02 m/s is tested by itself
     motion = {k: np.where(np.abs(v) < 0.03, 0.03, v) for k, v in motion.items()}
@@ -66,9 +77,16 @@ def rover_info(radius: Array, width: Array, joints: int = 1, mode: Array = 0) ->
     """A rover with these wheels, and joints of one mode or of the given ones."""
     ones = jnp.ones(joints, jnp.result_type(float))
     info = RoverInfo(
-        radius, width, jnp.zeros(joints, int), -0.5 * ones, 0.5 * ones, jnp.zeros(joints, int) + mode, 40.0 * ones,
-        3.0 * ones, Vec3(0 * ones[:1], 0 * ones[:1], -0.1 * ones[:1]),
-    )  # fmt: skip
+        radius,
+        width,
+        jnp.zeros(joints, int),
+        -0.5 * ones,
+        0.5 * ones,
+        jnp.zeros(joints, int) + mode,
+        40.0 * ones,
+        3.0 * ones,
+        Vec3(0 * ones[:1], 0 * ones[:1], -0.1 * ones[:1]),
+    )
     return info
 
 
@@ -98,13 +116,20 @@ def _compiled(names: tuple[str | Effect, ...]) -> Callable[..., tuple[WheelForce
         nil = Vec3(zero, zero, zero)
         roll = jnp.where(jnp.abs(motion["rim_speed"]) > jnp.abs(motion["v_x"]), motion["rim_speed"], motion["v_x"])
         contact = Contact(
-            s.sinkage, s.sinkage_rate, jnp.sign(roll) * s.slip_x, jnp.arctan2(motion["v_y"], jnp.abs(motion["v_x"])),
-            motion["v_x"], motion["v_y"], motion["rim_speed"], nil, nil, nil, zero == 0,
+            s.sinkage,
+            s.sinkage_rate,
+            jnp.sign(roll) * s.slip_x,
+            jnp.arctan2(motion["v_y"], jnp.abs(motion["v_x"])),
+            motion["v_x"],
+            motion["v_y"],
+            motion["rim_speed"],
+            nil,
+            nil,
+            nil,
+            zero == 0,
             jnp.clip(jnp.sign(roll) * s.slip_x, -1.0, 1.0),
-        )  # fmt: skip
-        soil = Soil(
-            s.k_c, s.k_phi, s.n, s.cohesion, s.tan_phi, s.shear_modulus_x, s.shear_modulus_y, rock + zero
-        )  # fmt: skip
+        )
+        soil = Soil(s.k_c, s.k_phi, s.n, s.cohesion, s.tan_phi, s.shear_modulus_x, s.shear_modulus_y, rock + zero)
         ctx = bare_context(
             dt=jnp.asarray(0.002, s.sinkage.dtype),
             geometry=nominal_geometry(rover_info(s.radius, s.width)),

@@ -63,8 +63,15 @@ def many() -> Scene:
     """Every mode at rest, rolling, fast, reversing through zero, at -190 and 150 degC, with targets that change."""
     steps = 12
     when = np.arange(steps)[:, None]
-    cases = [(0.0, 0.0, 25.0), (0.5, 0.0, -190.0), (-0.5, 0.0, 150.0), (0.05, -0.01, 25.0), (3.0, 0.0, 25.0),
-             (-0.03, 0.006, -190.0), (1.0, 0.0, 60.0)]  # fmt: skip
+    cases = [
+        (0.0, 0.0, 25.0),
+        (0.5, 0.0, -190.0),
+        (-0.5, 0.0, 150.0),
+        (0.05, -0.01, 25.0),
+        (3.0, 0.0, 25.0),
+        (-0.03, 0.006, -190.0),
+        (1.0, 0.0, 60.0),
+    ]
     start, rate, celsius = np.array(cases).T
     count = len(cases)
     speed = np.tile(start + rate * when, (1, 4))

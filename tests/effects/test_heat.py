@@ -153,8 +153,18 @@ def balance(preset: str, rule: Any, ambient: float, integrator: str) -> tuple[Ar
     steps, dt, current = 60_000, 0.01, 0.8
     start = 290.0
     names = heat_effects(preset)
-    out = respond(names, np.float64, dt, steps, steps, integrator=integrator, start=start, ambient=ambient,
-                  current=current, power=np.zeros(1))  # fmt: skip
+    out = respond(
+        names,
+        np.float64,
+        dt,
+        steps,
+        steps,
+        integrator=integrator,
+        start=start,
+        ambient=ambient,
+        current=current,
+        power=np.zeros(1),
+    )
     winding, housing = (np.concatenate([[start], t[:, 0]]) for t in out[:2])
     p = {n: catalogue.get(n).nominal() for n in names}
     motor = p["motor"]

@@ -116,8 +116,16 @@ def test_energy_is_conserved_from_the_supply_to_the_joint() -> None:
 
     The joint's angle is held, so that cogging is left out; temperatures change K and R.
     """
-    losses = ("magnet_nonlinearity", "directional_gear_efficiency", "coulomb_friction", "stribeck_friction",
-              "viscous_friction", "cold_grease", "iron_loss", "gear_friction_heat")  # fmt: skip
+    losses = (
+        "magnet_nonlinearity",
+        "directional_gear_efficiency",
+        "coulomb_friction",
+        "stribeck_friction",
+        "viscous_friction",
+        "cold_grease",
+        "iron_loss",
+        "gear_friction_heat",
+    )
     s = many()
     out = drive(s, *losses)
     dt = s.winding - KELVIN - 25.0
@@ -197,13 +205,19 @@ def test_delay_beyond_its_memory_is_that_of_eight_changes() -> None:
 def test_compliance_is_a_lag_of_k_d_over_k_s() -> None:
     """Velocity control: tau + c k_d dtau/dt = tau_0; a step of 1.2 N m with a lag of 30 ms."""
     steps, compliance = 200, 0.01
-    out = drive(scene(np.full((steps, 1), 0.4), mode=VELOCITY), "driveline_compliance",
-                driveline_compliance={"compliance": compliance})["torque"][:, 0]  # fmt: skip
+    out = drive(
+        scene(np.full((steps, 1), 0.4), mode=VELOCITY),
+        "driveline_compliance",
+        driveline_compliance={"compliance": compliance},
+    )["torque"][:, 0]
     time = (np.arange(steps) + 1.0) * DT
     rigid = VELOCITY_GAIN * 0.4
     assert out == pytest.approx(rigid * -np.expm1(-time / (compliance * VELOCITY_GAIN)), abs=0.02 * rigid)
-    held = drive(scene(np.full((steps, 1), 0.4), mode=POSITION), "driveline_compliance",
-                 driveline_compliance={"compliance": compliance})["torque"][-1, 0]  # fmt: skip
+    held = drive(
+        scene(np.full((steps, 1), 0.4), mode=POSITION),
+        "driveline_compliance",
+        driveline_compliance={"compliance": compliance},
+    )["torque"][-1, 0]
     assert held == pytest.approx(POSITION_GAIN * 0.4 / (1.0 + POSITION_GAIN * compliance), rel=1e-6), "a softer spring"
     free = drive(scene(np.full((5, 1), 2.0), mode=CURRENT), "driveline_compliance")
     assert free["current"] == pytest.approx(2.0)
@@ -274,9 +288,13 @@ def test_a_cold_saturated_motor_comes_to_rest_at_its_idle_speed() -> None:
         def step(carry: Any, _: Any) -> Any:
             speed, correction = carry
             ctx = bare_context(
-                dt=jnp.asarray(DT), joint_angle=0 * speed, joint_speed=speed, winding_temperature=cold,
-                rover=rover_info(jnp.ones(1), jnp.ones(1), 1, 3), parameters=parameters(pipeline.effects),
-            )  # fmt: skip
+                dt=jnp.asarray(DT),
+                joint_angle=0 * speed,
+                joint_speed=speed,
+                winding_temperature=cold,
+                rover=rover_info(jnp.ones(1), jnp.ones(1), 1, 3),
+                parameters=parameters(pipeline.effects),
+            )
             memory = {"voltage_saturation": {"correction": correction}}
             command, memory = pipeline.run("command", ctx, memory, Command(jnp.asarray([5.0]), 0 * speed))
             constant = K * (1 - 0.0012 * (83.15 - 298.15))

@@ -116,10 +116,14 @@ def test_every_measured_channel_has_a_family() -> None:
     assert [name for name in moving() if family(name) is None] == ["command_lf_drive_speed_rad_s"]
 
 
-@pytest.mark.parametrize("name, values, late", [
-    ("clock_offset", {"odometry": 0.03}, 0.03), ("clock_offset", {"odometry": -0.12}, -0.12),
-    ("clock_drift", {"odometry": 0.01}, 0.01 * TIMES),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, values, late",
+    [
+        ("clock_offset", {"odometry": 0.03}, 0.03),
+        ("clock_offset", {"odometry": -0.12}, -0.12),
+        ("clock_drift", {"odometry": 0.01}, 0.01 * TIMES),
+    ],
+)
 def test_a_clock_that_is_late(name: str, values: Any, late: Array) -> None:
     """y_m(t) = y(t - delta), for one family only; yaw and quaternion turn on through 180 deg."""
     found, truth = sensed(name, values, moving()), moving()

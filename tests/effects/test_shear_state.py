@@ -61,9 +61,15 @@ def step(
             return jnp.broadcast_to(jnp.asarray(a, dtype), shape)
 
         out = _step(
-            jnp.asarray(dt, dtype), cast(v_x), cast(v_y), cast(rim), cast(sinkage), cast(more.get("rock", 0.0)),
-            {k: cast(v) for k, v in state.items()}, jnp.asarray(more.get("damping_time", 0.1), dtype),
-        )  # fmt: skip
+            jnp.asarray(dt, dtype),
+            cast(v_x),
+            cast(v_y),
+            cast(rim),
+            cast(sinkage),
+            cast(more.get("rock", 0.0)),
+            {k: cast(v) for k, v in state.items()},
+            jnp.asarray(more.get("damping_time", 0.1), dtype),
+        )
         return jax.tree.map(lambda a: np.asarray(a, float), out)
 
 

@@ -32,8 +32,22 @@ def sideways(degrees: Array, rim: Array, speed: float = 0.1) -> tuple[WheelState
     fastest = np.maximum(rim, v_x)
     slip = (rim - v_x) / fastest
     across = v_y / fastest * np.where(rim < v_x, 2.0 - rim / v_x, 1.0)
-    state = WheelState(R * one, B * one, Z * one, 0 * one, slip, across, one, 0 * one, 1e6 * one, one, COHESION * one,
-                       np.tan(PHI) * one, 0.02 * one, K_Y * one)  # fmt: skip
+    state = WheelState(
+        R * one,
+        B * one,
+        Z * one,
+        0 * one,
+        slip,
+        across,
+        one,
+        0 * one,
+        1e6 * one,
+        one,
+        COHESION * one,
+        np.tan(PHI) * one,
+        0.02 * one,
+        K_Y * one,
+    )
     return state, {"v_x": v_x, "v_y": v_y, "rim_speed": rim, "steering_angle": 0 * one}
 
 
@@ -44,8 +58,20 @@ def blade(degrees: Array, rim: Array, **values: float) -> Array:
         s, motion = sideways(degrees, rim)
         zero = jnp.zeros(s.sinkage.shape)
         nil = Vec3(zero, zero, zero)
-        contact = Contact(s.sinkage, zero, s.slip_x, zero, motion["v_x"], motion["v_y"], motion["rim_speed"], nil, nil,
-                          nil, zero == 0, s.slip_x)  # fmt: skip
+        contact = Contact(
+            s.sinkage,
+            zero,
+            s.slip_x,
+            zero,
+            motion["v_x"],
+            motion["v_y"],
+            motion["rim_speed"],
+            nil,
+            nil,
+            nil,
+            zero == 0,
+            s.slip_x,
+        )
         normal = initial_normal(zero)
         normal = dataclasses.replace(normal, entrance=entrance_angle(s.sinkage, s.radius))
         ctx = bare_context(

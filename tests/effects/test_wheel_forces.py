@@ -99,9 +99,21 @@ def test_drawbar_pull_of_viper_in_lunar_soil(names: tuple[str, ...], drawbar: fl
     one = np.ones(count)
     sinkage = np.linspace(1e-4, 0.1, count)
     state = ref.WheelState(
-        0.25 * one, 0.2 * one, sinkage, 0 * one, 0.4 * one, 0 * one, one, 1.4e3 * one, 8.2e5 * one, one, 170 * one,
-        np.tan(np.radians(35)) * one, 0.0178 * one, 0.0178 * one,
-    )  # fmt: skip
+        0.25 * one,
+        0.2 * one,
+        sinkage,
+        0 * one,
+        0.4 * one,
+        0 * one,
+        one,
+        1.4e3 * one,
+        8.2e5 * one,
+        one,
+        170 * one,
+        np.tan(np.radians(35)) * one,
+        0.0178 * one,
+        0.0178 * one,
+    )
     motion = {"v_x": 0.06 * one, "v_y": 0 * one, "rim_speed": 0.1 * one, "steering_angle": 0 * one}
     wheel, _ = wheel_forces(names, state, motion, {}, np.float64)
     depth = np.interp(load, wheel.force.z, sinkage)
@@ -145,9 +157,21 @@ def test_paper_soil_forces_are_decorative() -> None:
     """Flaw 2: with the paper's soil and contact, eqs. 10-14 with j mended give about 0.02 N under a 19 N wheel load."""
     one = np.ones(1)
     state = ref.WheelState(
-        0.1 * one, 0.08 * one, 19 / 5e4 * one, 0 * one, 0.4 * one, 0 * one, one, 1e5 * one, 1e3 * one, 1.1 * one,
-        462.3 * one, np.tan(0.3889) * one, 0.015 * one, 0.015 * one,
-    )  # fmt: skip
+        0.1 * one,
+        0.08 * one,
+        19 / 5e4 * one,
+        0 * one,
+        0.4 * one,
+        0 * one,
+        one,
+        1e5 * one,
+        1e3 * one,
+        1.1 * one,
+        462.3 * one,
+        np.tan(0.3889) * one,
+        0.015 * one,
+        0.015 * one,
+    )
     motion = {"v_x": 0.06 * one, "v_y": 0 * one, "rim_speed": 0.1 * one, "steering_angle": 0 * one}
     values = {"printed_shear": {"mend_j": 1.0}}
     wheel, normal = wheel_forces(("penalty_contact", "printed_shear"), state, motion, values, np.float64)

@@ -123,8 +123,9 @@ def test_sb3_trains_on_both():
         np.testing.assert_allclose([i["terminal_observation"] for i in infos], before, atol=1e-6)
         for algorithm in (TD3, DDPG, SAC):
             for env in (batch, SingleEnv(PointEnv(6))):
-                agent = algorithm("MlpPolicy", env, learning_starts=8, batch_size=8, device="cpu",
-                                  policy_kwargs={"net_arch": [8]})  # fmt: skip
+                agent = algorithm(
+                    "MlpPolicy", env, learning_starts=8, batch_size=8, device="cpu", policy_kwargs={"net_arch": [8]}
+                )
                 agent.learn(24)
                 assert agent.num_timesteps >= 24
         assert PPO("MlpPolicy", batch, n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(32)

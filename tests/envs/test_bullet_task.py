@@ -21,8 +21,14 @@ def test_pybullet_gives_the_same_observations_and_rewards(monkeypatch):
         monkeypatch.setenv(name, "cpu" if name == "JAX_PLATFORMS" else "")
     from rl_sb3 import BulletNavigation
 
-    options = {"task": "large", "randomise": (), "terrain": "flat", "goal_distance": (2.0, 4.0), "places": 64,
-               "episode_time": 1.0}  # fmt: skip
+    options = {
+        "task": "large",
+        "randomise": (),
+        "terrain": "flat",
+        "goal_distance": (2.0, 4.0),
+        "places": 64,
+        "episode_time": 1.0,
+    }
     bullet, own = BulletNavigation(options), make("navigation", **options)
     obs, _ = bullet.reset(seed=3)
     state, step = bullet._state, jax.jit(own.step)

@@ -29,9 +29,15 @@ from lunar_mjx.model import make_model
 from lunar_mjx.terrain import load_terrain, surface
 from lunar_mjx.terrain.rocks import build_rocks
 
-SHORT = {"task": "consistent", "terrain": "flat", "decimation": 50, "episode_time": 1.0, "places": 64,
-         "goal_distance": (1.0, 1.5), "randomise": (Range("soil.cohesion", 0.5, 2.0, "log", relative=True),
-                                                    Range("winding_temperature", 280.0, 300.0))}  # fmt: skip
+SHORT = {
+    "task": "consistent",
+    "terrain": "flat",
+    "decimation": 50,
+    "episode_time": 1.0,
+    "places": 64,
+    "goal_distance": (1.0, 1.5),
+    "randomise": (Range("soil.cohesion", 0.5, 2.0, "log", relative=True), Range("winding_temperature", 280.0, 300.0)),
+}
 
 
 @pytest.fixture(scope="module")
@@ -168,8 +174,16 @@ def test_it_never_pays_to_end_an_episode_early():
     """Sitting out an episode, shaken and leaning, costs less than failing; the worst way to the goal beats both."""
     c = TASKS["large"]
     two = np.zeros((1, 2), np.float32)
-    idle = rewards.Transition(two + 30.0, two + 30.0, np.full(1, 0.2), np.full(1, 0.2), np.zeros(1), np.ones(1),
-                              np.zeros((1, 6)), np.zeros((1, 6)))  # fmt: skip
+    idle = rewards.Transition(
+        two + 30.0,
+        two + 30.0,
+        np.full(1, 0.2),
+        np.full(1, 0.2),
+        np.zeros(1),
+        np.ones(1),
+        np.zeros((1, 6)),
+        np.zeros((1, 6)),
+    )
     step = sum(w * float(rewards.TERMS[n](idle)[0]) for n, w in c.weights.items())
     whole = step * round(c.episode_time / (c.decimation * 0.002))
     assert c.failure < whole <= 0.0
@@ -199,8 +213,13 @@ def test_six_actions_drive_the_joints_that_the_paper_names():
 
 
 def test_places_lie_within_bounds_clear_of_rocks_and_as_far_apart_as_asked():
-    ground = load_terrain({"seed": 3, "surface": {"width": 30.0, "height": 30.0, "cell": 0.2},
-                           "rocks": {"abundance": 0.05, "smallest": 0.4, "largest": 1.0, "gap": 0.5}})  # fmt: skip
+    ground = load_terrain(
+        {
+            "seed": 3,
+            "surface": {"width": 30.0, "height": 30.0, "cell": 0.2},
+            "rocks": {"abundance": 0.05, "smallest": 0.4, "largest": 1.0, "gap": 0.5},
+        }
+    )
     starts, goals = draw_places(ground, 300, (3.0, 6.0), 1, clearance=0.4, margin=2.0)
     apart = np.hypot(*(goals - starts).T)
     assert apart.min() >= 3.0 - 1e-5 and apart.max() <= 6.0 + 1e-5
@@ -223,9 +242,14 @@ def test_held_out_soil_is_outside_all_of_training():
 
 def test_tasks_and_mistakes():
     assert TASKS["paper"].weights == rewards.PAPER_WEIGHTS and TASKS["large"].goal_distance == (10.0, 40.0)
-    for settings, said in (({"task": "easy"}, "paper, consistent, large"), ({"decimation": 0}, "decimation"),
-                           ({"speed": 3}, "is no setting"), ({"observations": ("smell",)}, "is no observation"),
-                           ({"goal_distance": (0.1, 5.0)}, "goal_radius"), ({"weights": {"joy": 1.0}}, "reward term"),
-                           ({"randomise": (Range("soil.joy", 1, 2),)}, "no parameter")):  # fmt: skip
+    for settings, said in (
+        ({"task": "easy"}, "paper, consistent, large"),
+        ({"decimation": 0}, "decimation"),
+        ({"speed": 3}, "is no setting"),
+        ({"observations": ("smell",)}, "is no observation"),
+        ({"goal_distance": (0.1, 5.0)}, "goal_radius"),
+        ({"weights": {"joy": 1.0}}, "reward term"),
+        ({"randomise": (Range("soil.joy", 1, 2),)}, "no parameter"),
+    ):
         with pytest.raises(UserError, match=said):
             make_navigation(**{"terrain": "flat", **settings})

@@ -71,9 +71,11 @@ def test_environments_known_by_name(monkeypatch):
     register("my_points", lambda steps=5: PointEnv(steps))
     assert make("my_points", steps=9).episode_steps == 9
     points = metadata.EntryPoints(
-        [metadata.EntryPoint("theirs", "lunar_mjx.envs:PointEnv", registry.GROUP),
-         metadata.EntryPoint("broken", "no_such_module:env", registry.GROUP)]
-    )  # fmt: skip
+        [
+            metadata.EntryPoint("theirs", "lunar_mjx.envs:PointEnv", registry.GROUP),
+            metadata.EntryPoint("broken", "no_such_module:env", registry.GROUP),
+        ]
+    )
     monkeypatch.setattr(metadata, "entry_points", lambda group: points.select(group=group))
     assert make("theirs", episode_steps=7).episode_steps == 7
     with pytest.raises(UserError, match=r"broken.*does not load.*ModuleNotFoundError"):

@@ -136,9 +136,10 @@ def test_truncated_prior_of_one_amplitude_is_exact():
 
     def density(a):
         return math.exp(
-            float(np.sum(stats.norm.logpdf(residual, column[:, 0] * a))) + stats.norm.logpdf(a, 0.0, 0.7)
+            float(np.sum(stats.norm.logpdf(residual, column[:, 0] * a)))
+            + stats.norm.logpdf(a, 0.0, 0.7)
             - found.log_evidence
-        ) / (stats.norm.cdf(1.0, 0.0, 0.7) - 0.5)  # fmt: skip
+        ) / (stats.norm.cdf(1.0, 0.0, 0.7) - 0.5)
 
     wanted = math.log(integrate.quad(density, 0.0, 1.0)[0])
     assert found.log_inside(np.array([0.0]), np.array([1.0])) == pytest.approx(wanted, abs=1e-3)
@@ -148,8 +149,12 @@ def test_sizes_are_found_again():
     rng = np.random.default_rng(1)
     columns = rng.normal(size=(3000, 200)) * 5.0
     residual = columns @ (0.07 * rng.normal(size=200)) + 1.3 * rng.normal(size=3000)
-    found = infer(Gram.of(columns, residual), Amplitudes.of(np.ones(200), np.zeros(200, int)), (Field("a", 0.05),),
-                  (NoiseSize("n", 0.3),))  # fmt: skip
+    found = infer(
+        Gram.of(columns, residual),
+        Amplitudes.of(np.ones(200), np.zeros(200, int)),
+        (Field("a", 0.05),),
+        (NoiseSize("n", 0.3),),
+    )
     assert found.tau[0] == pytest.approx(0.07, rel=0.15)
     assert found.noise[0] == pytest.approx(1.3, rel=0.05)
 

@@ -245,8 +245,12 @@ def test_a_descent_that_falls_far_short_is_left_once_a_rival_has_arrived():
         nonlocal rival, arrives
         rival, arrives, Late.calls = Rival(), when, 0
         problem = Late()
-        seen = dataclasses.replace(problem.observations, value=np.zeros(3), unit=np.zeros(3, int), series=(
-            dataclasses.replace(problem.observations.series[0], stop=3, time=np.arange(3.0)),))  # fmt: skip
+        seen = dataclasses.replace(
+            problem.observations,
+            value=np.zeros(3),
+            unit=np.zeros(3, int),
+            series=(dataclasses.replace(problem.observations.series[0], stop=3, time=np.arange(3.0)),),
+        )
         problem.observations = seen
         goal = Objective(problem, problem.free(), seen.in_split("fit"))
         found = descend(goal, np.array([-1.2, 1.0]), rival=rival)

@@ -97,9 +97,15 @@ def test_a_chain_divides_out_the_covariance_of_its_sweeps():
 def test_replicates_tell_the_correlation_of_neighbours(correlation):
     trial, test, value = ar1_table(correlation)
     table = SteadyStateTable(
-        name="bed", test=test, measured={"drawbar_pull": value}, replicates=np.ones(len(value)), sigma={},
-        radius=0.1, width=0.1, slip_definition="wheel_frame",
-    )  # fmt: skip
+        name="bed",
+        test=test,
+        measured={"drawbar_pull": value},
+        replicates=np.ones(len(value)),
+        sigma={},
+        radius=0.1,
+        width=0.1,
+        slip_definition="wheel_frame",
+    )
     log = SimpleNamespace(table=table, trial=trial)
     found = scatter(log)["drawbar_pull"]
     assert found.correlation == pytest.approx(correlation, abs=0.12)

@@ -107,8 +107,15 @@ class Turning(Problem):
         self.time, self.start, self.windows = time, start, 0
         self.coordinates, self.baseline, self.candidates = (coordinate("base", "w"),), np.arange(1), {}
         value = np.cos(self.TRUTH * time) + 0.01 * np.sin(71.0 * time)
-        self.observations = Observations(value, (Series(0, "y", 0, len(time), time, 0.01),), ("log",), ("fit",),
-                                         np.zeros(len(time), int), ("fit",), ("log",))  # fmt: skip
+        self.observations = Observations(
+            value,
+            (Series(0, "y", 0, len(time), time, 0.01),),
+            ("log",),
+            ("fit",),
+            np.zeros(len(time), int),
+            ("fit",),
+            ("log",),
+        )
         self.effects, self.not_tested, self._within = {}, (), False
 
     def origin(self) -> np.ndarray:

@@ -22,8 +22,9 @@ def manoeuvres(number: int, samples: int, **noise) -> Observations:
     )
     split = tuple("select" if number >= 6 and i >= number - 2 else "fit" for i in range(number))
     names = tuple(f"log{i}" for i in range(number))
-    return Observations(np.zeros(number * samples), series, names, split, np.repeat(np.arange(number), samples), split,
-                        names)  # fmt: skip
+    return Observations(
+        np.zeros(number * samples), series, names, split, np.repeat(np.arange(number), samples), split, names
+    )
 
 
 class Linear(Problem):
@@ -52,9 +53,14 @@ class Decay(Problem):
         self.coordinates = (coordinate("base", "a", **limits), coordinate("base", "b", low=0.0, high=50.0))
         self.baseline, self.candidates = np.arange(2), {}
         self.observations = Observations(
-            value, (Series(0, "y", 0, len(time), time, 0.01),), ("log",), ("fit",), np.zeros(len(time), int), ("fit",),
+            value,
+            (Series(0, "y", 0, len(time), time, 0.01),),
             ("log",),
-        )  # fmt: skip
+            ("fit",),
+            np.zeros(len(time), int),
+            ("fit",),
+            ("log",),
+        )
         self.effects, self.not_tested = {}, ()
 
     def predict(self, u):
@@ -72,9 +78,14 @@ class TwoMinima(Problem):
     def __init__(self):
         self.coordinates, self.baseline, self.candidates = (coordinate("base", "u"),), np.arange(1), {}
         self.observations = Observations(
-            np.zeros(2), (Series(0, "y", 0, 2, np.arange(2.0), 1.0),), ("log",), ("fit",), np.zeros(2, int), ("fit",),
+            np.zeros(2),
+            (Series(0, "y", 0, 2, np.arange(2.0), 1.0),),
             ("log",),
-        )  # fmt: skip
+            ("fit",),
+            np.zeros(2, int),
+            ("fit",),
+            ("log",),
+        )
         self.effects, self.not_tested = {}, ()
 
     def origin(self):

@@ -16,9 +16,17 @@ GRAVITY = 1.625
 RADIUS = 0.1
 TRACK = 0.6
 STD = {
-    "position": 2e-3, "yaw": 0.1, "velocity": 5e-3, "gyro": 2e-3, "accelerometer": 0.01, "angle": 1e-3, "speed": 5e-3,
-    "current": 0.01, "voltage": 0.05, "temperature": 0.3,
-}  # fmt: skip
+    "position": 2e-3,
+    "yaw": 0.1,
+    "velocity": 5e-3,
+    "gyro": 2e-3,
+    "accelerometer": 0.01,
+    "angle": 1e-3,
+    "speed": 5e-3,
+    "current": 0.01,
+    "voltage": 0.05,
+    "temperature": 0.3,
+}
 
 
 def drive_tables(seed: int = 0, seconds: float = 20.0) -> dict[str, pd.DataFrame]:
@@ -77,11 +85,19 @@ def _lag(values: np.ndarray, share: float) -> np.ndarray:
 
 def noise(scale: float = 1.0) -> dict[str, Noise]:
     kinds = {
-        "position_*": "position", "world_velocity_*": "velocity", "roll_deg": "yaw", "pitch_deg": "yaw",
-        "yaw_deg": "yaw", "gyro_*": "gyro", "accelerometer_*": "accelerometer", "joint_*_angle_rad": "angle",
-        "joint_*_speed_rad_s": "speed", "motor_*_current_A": "current", "motor_*_voltage_V": "voltage",
+        "position_*": "position",
+        "world_velocity_*": "velocity",
+        "roll_deg": "yaw",
+        "pitch_deg": "yaw",
+        "yaw_deg": "yaw",
+        "gyro_*": "gyro",
+        "accelerometer_*": "accelerometer",
+        "joint_*_angle_rad": "angle",
+        "joint_*_speed_rad_s": "speed",
+        "motor_*_current_A": "current",
+        "motor_*_voltage_V": "voltage",
         "*_temperature_degC": "temperature",
-    }  # fmt: skip
+    }
     return {pattern: Noise(scale * STD[kind], "datasheet") for pattern, kind in kinds.items()}
 
 
@@ -96,8 +112,13 @@ def make_log(
     tables = drive_tables(seed, seconds)
     if change is not None:
         change(tables)
-    given = {"noise": noise(), "manoeuvre": "test", "gravity_m_s2": GRAVITY,
-             "environment": {"ambient_temperature_degC": -20.0}, **settings}  # fmt: skip
+    given = {
+        "noise": noise(),
+        "manoeuvre": "test",
+        "gravity_m_s2": GRAVITY,
+        "environment": {"ambient_temperature_degC": -20.0},
+        **settings,
+    }
     write_log(folder, tables, rover="luvmi_x", **given)  # type: ignore[arg-type]
     log = read_log(folder)
     assert isinstance(log, Log)

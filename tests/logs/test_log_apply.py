@@ -30,10 +30,18 @@ def small(folder: Path, columns: dict[str, list[float]], step: float = 0.05, **s
 
 
 def test_conditions(base: Model, tmp_path: Path) -> None:
-    log = make_log(tmp_path / "a", gravity_m_s2=9.81, terrain="slope:10deg",
-                   rover_changes={"payload_kg": 30.0, "payload_position_m": [0.1, 0.0, 0.4],
-                                  "com_offset_m": [0.0, 0.02, 0.0], "wheel_radius_offset_m": 0.002},
-                   environment={"ambient_temperature_degC": -50.0})  # fmt: skip
+    log = make_log(
+        tmp_path / "a",
+        gravity_m_s2=9.81,
+        terrain="slope:10deg",
+        rover_changes={
+            "payload_kg": 30.0,
+            "payload_position_m": [0.1, 0.0, 0.4],
+            "com_offset_m": [0.0, 0.02, 0.0],
+            "wheel_radius_offset_m": 0.002,
+        },
+        environment={"ambient_temperature_degC": -50.0},
+    )
     model = log_model(log, base)
     assert model.gravity == 9.81 and model.terrain_spec == "slope:10deg"
     assert model.ambient[0] == pytest.approx(223.15) == model.ambient[1]

@@ -149,47 +149,97 @@ CASES: dict[str, tuple[Callable[[Tables], object], str, str, int | None]] = {
     "tables from two origins": (time_of(lambda t: t + 5000.0, "thermal"), "clock", "time_s", None),
     "time missing": (set_rows("time_s", slice(5, 6), np.nan), "clock", "time_s", 7),
     "empty column": (set_rows("yaw_deg", slice(None), np.nan), "dropout", "yaw_deg", None),
-    "half a column lost": (set_rows("motor_lf_drive_current_A", slice(40, 240), np.nan), "dropout",
-                           "motor_lf_drive_current_A", 42),
-    "temperature in kelvin": (scale("winding_lf_drive_temperature_degC", 1.0, 273.15), "unit",
-                              "winding_lf_drive_temperature_degC", 2),
+    "half a column lost": (
+        set_rows("motor_lf_drive_current_A", slice(40, 240), np.nan),
+        "dropout",
+        "motor_lf_drive_current_A",
+        42,
+    ),
+    "temperature in kelvin": (
+        scale("winding_lf_drive_temperature_degC", 1.0, 273.15),
+        "unit",
+        "winding_lf_drive_temperature_degC",
+        2,
+    ),
     "angle in degrees": (scale("joint_rf_drive_angle_rad", 57.29578), "unit", "joint_rf_drive_angle_rad", None),
     "speed in rpm": (scale("joint_lr_drive_speed_rad_s", 9.5493), "unit", "joint_lr_drive_speed_rad_s", None),
     "gyro in deg/s": (scale("gyro_z_rad_s", 57.29578), "unit", "gyro_z_rad_s", None),
     "current in mA": (scale("motor_rr_drive_current_A", 1000.0), "any", "motor_rr_drive_current_A", None),
     "position in mm": (scale("position_x_m", 1000.0), "any", "world_velocity_x_m_s", None),
-    "acceleration in g": (both(*(scale(f"accelerometer_{a}_m_s2", 1 / 9.80665) for a in "xyz")), "gravity",
-                          "accelerometer_z_m_s2", None),
+    "acceleration in g": (
+        both(*(scale(f"accelerometer_{a}_m_s2", 1 / 9.80665) for a in "xyz")),
+        "gravity",
+        "accelerometer_z_m_s2",
+        None,
+    ),
     "earth's gravity": (scale("accelerometer_z_m_s2", 9.80665 / GRAVITY), "gravity", "accelerometer_z_m_s2", None),
     "gravity's sign": (scale("accelerometer_z_m_s2", -1.0), "gravity", "accelerometer_z_m_s2", None),
-    "accelerometer's axes": (swap(("accelerometer_x_m_s2", "accelerometer_z_m_s2")), "frame",
-                            "accelerometer_z_m_s2", None),
+    "accelerometer's axes": (
+        swap(("accelerometer_x_m_s2", "accelerometer_z_m_s2")),
+        "frame",
+        "accelerometer_z_m_s2",
+        None,
+    ),
     "quaternion not normalised": (set_rows("quaternion_w", slice(30, 35), 1.3), "any", "quaternion_w", 32),
     "quaternion scaled": (both(*(scale(f"quaternion_{c}", 0.9) for c in "wxyz")), "quaternion", "quaternion_w", 2),
     "quaternion's order": (swap(("quaternion_w", "quaternion_z")), "frame", "roll_deg", None),
-    "left and right of the speeds": (sides_of("joint_{}_drive_speed_rad_s"), "swap",
-                                     "joint_lf_drive_speed_rad_s", None),
-    "left and right of all": (both(sides_of("joint_{}_drive_speed_rad_s"), sides_of("joint_{}_drive_angle_rad"),
-                                   sides_of("command_{}_drive_speed_rad_s")), "swap",
-                                     "joint_lf_drive_speed_rad_s", None),
+    "left and right of the speeds": (
+        sides_of("joint_{}_drive_speed_rad_s"),
+        "swap",
+        "joint_lf_drive_speed_rad_s",
+        None,
+    ),
+    "left and right of all": (
+        both(
+            sides_of("joint_{}_drive_speed_rad_s"),
+            sides_of("joint_{}_drive_angle_rad"),
+            sides_of("command_{}_drive_speed_rad_s"),
+        ),
+        "swap",
+        "joint_lf_drive_speed_rad_s",
+        None,
+    ),
     "left and right of the angles": (sides_of("joint_{}_drive_angle_rad"), "swap", "joint_lf_drive_angle_rad", None),
-    "currents swapped": (swap(("motor_lf_drive_current_A", "motor_rr_drive_current_A")), "swap",
-                         "motor_lf_drive_current_A", None),
-    "current and voltage swapped": (swap(("motor_lf_drive_current_A", "motor_lf_drive_voltage_V")), "swap",
-                                    "motor_lf_drive_voltage_V", None),
+    "currents swapped": (
+        swap(("motor_lf_drive_current_A", "motor_rr_drive_current_A")),
+        "swap",
+        "motor_lf_drive_current_A",
+        None,
+    ),
+    "current and voltage swapped": (
+        swap(("motor_lf_drive_current_A", "motor_lf_drive_voltage_V")),
+        "swap",
+        "motor_lf_drive_voltage_V",
+        None,
+    ),
     "velocity's axes": (swap(("world_velocity_x_m_s", "world_velocity_y_m_s")), "any", "world_velocity_x_m_s", None),
-    "world's axes": (both(swap(("world_velocity_x_m_s", "world_velocity_y_m_s")), swap(("position_x_m",
-                     "position_y_m"))),
-                     "frame", "position_x_m", None),
+    "world's axes": (
+        both(swap(("world_velocity_x_m_s", "world_velocity_y_m_s")), swap(("position_x_m", "position_y_m"))),
+        "frame",
+        "position_x_m",
+        None,
+    ),
     "velocity's sign": (scale("world_velocity_x_m_s", -1.0), "frame", "world_velocity_x_m_s", None),
-    "stuck while moving": (set_rows("joint_lr_drive_speed_rad_s", slice(120, 200), None), "stuck",
-                           "joint_lr_drive_speed_rad_s", 122),
-    "stuck all the time": (set_rows("motor_lr_drive_current_A", slice(None), None), "stuck", "motor_lr_drive_current_A",
-                           2),
+    "stuck while moving": (
+        set_rows("joint_lr_drive_speed_rad_s", slice(120, 200), None),
+        "stuck",
+        "joint_lr_drive_speed_rad_s",
+        122,
+    ),
+    "stuck all the time": (
+        set_rows("motor_lr_drive_current_A", slice(None), None),
+        "stuck",
+        "motor_lr_drive_current_A",
+        2,
+    ),
     "saturated": (clip("joint_rr_drive_speed_rad_s", 0.99), "saturated", "joint_rr_drive_speed_rad_s", None),
-    "beyond the range": (set_rows("winding_rf_drive_temperature_degC", slice(7, 8), 4000.0), "range",
-                         "winding_rf_drive_temperature_degC", 9),
-}  # fmt: skip
+    "beyond the range": (
+        set_rows("winding_rf_drive_temperature_degC", slice(7, 8), 4000.0),
+        "range",
+        "winding_rf_drive_temperature_degC",
+        9,
+    ),
+}
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -268,8 +318,11 @@ def test_a_rover_that_slides_back_down_a_slope_is_no_reversed_axis(
     def change(tables: Tables) -> None:
         drive = tables["drive"]
         t = drive["time_s"].to_numpy()
-        keep = [c for c in drive if c.startswith(("time", "position", "roll", "pitch", "yaw", "joint", "command"))
-                and "angle" not in c]  # fmt: skip
+        keep = [
+            c
+            for c in drive
+            if c.startswith(("time", "position", "roll", "pitch", "yaw", "joint", "command")) and "angle" not in c
+        ]
         drive = drive[keep].copy()
         rng = np.random.default_rng(1)
         for axis, speed in zip("xyz", (way, 0.0, rise), strict=True):

@@ -78,9 +78,13 @@ def times(k: int) -> tuple[int, int]:
 
 
 def joints(k: int, stamp: Any) -> dict[str, Any]:
-    return {"header": {"stamp": stamp, "frame_id": ""}, "name": ["lf_drive", "rf_drive"],
-            "position": [angle(k), 0.0], "velocity": [1.0, 2.0],
-            "effort": [0.0, float("nan") if k == 3 else 0.7]}  # fmt: skip
+    return {
+        "header": {"stamp": stamp, "frame_id": ""},
+        "name": ["lf_drive", "rf_drive"],
+        "position": [angle(k), 0.0],
+        "velocity": [1.0, 2.0],
+        "effort": [0.0, float("nan") if k == 3 else 0.7],
+    }
 
 
 def write_json_mcap(path: Path) -> None:
@@ -140,8 +144,10 @@ def write_ros_mcap(path: Path) -> None:
         for k in range(COUNT):
             stamped, recorded = times(k)
             first = joints(k, {"sec": stamped // 10**9, "nanosec": stamped % 10**9})
-            place = {"position": {"x": 5.0 + k, "y": 0.0, "z": 0.0},
-                     "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}  # fmt: skip
+            place = {
+                "position": {"x": 5.0 + k, "y": 0.0, "z": 0.0},
+                "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            }
             writer.write_message("/joint_states", state, first, recorded, recorded)
             writer.write_message("/odom", pose, {"pose": place}, recorded, recorded)
         writer.finish()
@@ -155,13 +161,23 @@ def write_ros_bag(path: Path) -> None:
 
     old = path.suffix == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
-    kinds = {n.rpartition("/")[2]: store.types[n] for n in (
-        "sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time",
-        "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Pose", "geometry_msgs/msg/Point",
-        "geometry_msgs/msg/Quaternion")}  # fmt: skip
+    kinds = {
+        n.rpartition("/")[2]: store.types[n]
+        for n in (
+            "sensor_msgs/msg/JointState",
+            "std_msgs/msg/Header",
+            "builtin_interfaces/msg/Time",
+            "geometry_msgs/msg/PoseStamped",
+            "geometry_msgs/msg/Pose",
+            "geometry_msgs/msg/Point",
+            "geometry_msgs/msg/Quaternion",
+        )
+    }
     with rosbag1.Writer(path) if old else rosbag2.Writer(path, version=9) as writer:
-        connections = [writer.add_connection(t, n, typestore=store) for t, n in (
-            ("/joint_states", "sensor_msgs/msg/JointState"), ("/odom", "geometry_msgs/msg/PoseStamped"))]  # fmt: skip
+        connections = [
+            writer.add_connection(t, n, typestore=store)
+            for t, n in (("/joint_states", "sensor_msgs/msg/JointState"), ("/odom", "geometry_msgs/msg/PoseStamped"))
+        ]
         for k in range(COUNT):
             stamped, recorded = times(k)
             number = (k,) if old else ()
@@ -177,9 +193,11 @@ def write_ros_bag(path: Path) -> None:
 
 
 RECORDINGS: dict[str, Callable[[Path], None]] = {
-    "json.mcap": write_json_mcap, "ros.mcap": write_ros_mcap, "bag": write_ros_bag,
+    "json.mcap": write_json_mcap,
+    "ros.mcap": write_ros_mcap,
+    "bag": write_ros_bag,
     "ros1.bag": write_ros_bag,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
@@ -193,17 +211,20 @@ def test_a_recording_becomes_a_log(name: str, run: Run, tmp_path: Path, map_file
     assert again.status == 2 and "exists already" in again.err
 
 
-@pytest.mark.parametrize(("old", "new", "words"), [
-    ("/odom", "/odometry", ("topic", "/odometry", "/joint_states, /odom")),
-    ("pose.position.x", "pose.place.x", ("odometry.channels.position_x_mm", "'place'", "position")),
-    ("position[lf_drive]", "position[mast]", ("'mast'", "lf_drive, rf_drive")),
-    ("velocity[1]", "velocity[7]", ("velocity has 2 entries",)),
-    ('"pose.position.x"', '"pose.position"', ("holds a dict, not a number",)),
-    ('time = "recorded"', 'time = "header.stamp"', ("tables.odometry.time", "'header'")),
-    ("position_x_mm", "speed_of_light", ("speed_of_light", "no channel")),
-    ("topic = \"/odom\"", "topic = \"/odom\"\nfilter = 3", ("tables.odometry.filter", "unknown key")),
-    ('rover = "luvmi_x"', "", ("rover",)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("/odom", "/odometry", ("topic", "/odometry", "/joint_states, /odom")),
+        ("pose.position.x", "pose.place.x", ("odometry.channels.position_x_mm", "'place'", "position")),
+        ("position[lf_drive]", "position[mast]", ("'mast'", "lf_drive, rf_drive")),
+        ("velocity[1]", "velocity[7]", ("velocity has 2 entries",)),
+        ('"pose.position.x"', '"pose.position"', ("holds a dict, not a number",)),
+        ('time = "recorded"', 'time = "header.stamp"', ("tables.odometry.time", "'header'")),
+        ("position_x_mm", "speed_of_light", ("speed_of_light", "no channel")),
+        ('topic = "/odom"', 'topic = "/odom"\nfilter = 3', ("tables.odometry.filter", "unknown key")),
+        ('rover = "luvmi_x"', "", ("rover",)),
+    ],
+)
 def test_a_map_that_does_not_fit_is_told(
     run: Run, tmp_path: Path, map_file: Path, old: str, new: str, words: tuple[str, ...]
 ) -> None:

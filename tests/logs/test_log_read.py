@@ -16,8 +16,13 @@ from tests.logs.log_files import CORNERS, drive_tables, make_log
 
 
 def test_a_log_comes_back_as_it_was_written(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "a", split="fit", initial={"position_m": [0, 0, 0.16], "yaw_deg": 0.0},
-                   rover_changes={"payload_kg": 6.0}, imu={"position_m": [0.1, 0.0, 0.0]})  # fmt: skip
+    log = make_log(
+        tmp_path / "a",
+        split="fit",
+        initial={"position_m": [0, 0, 0.16], "yaw_deg": 0.0},
+        rover_changes={"payload_kg": 6.0},
+        imu={"position_m": [0.1, 0.0, 0.0]},
+    )
     tables = drive_tables()
     assert set(log.tables) == {"drive", "thermal"} and log.split == "fit" and log.problems == ()
     assert log.tables["thermal"].rate_hz == 1.0 and log.tables["drive"].rate_hz == pytest.approx(20.0)
@@ -54,8 +59,17 @@ def test_units_convert(column: str, name: str, given: float, wanted: float) -> N
     assert found.scale * given + found.offset == pytest.approx(wanted, abs=1e-9)
 
 
-@pytest.mark.parametrize("column", ["position_x_degC", "position_x", "accelerometer_z_g", "quaternion_w_deg",
-                                    "motor_lf_drive_current_rad", "wheel_lf_slip_angle_m"])  # fmt: skip
+@pytest.mark.parametrize(
+    "column",
+    [
+        "position_x_degC",
+        "position_x",
+        "accelerometer_z_g",
+        "quaternion_w_deg",
+        "motor_lf_drive_current_rad",
+        "wheel_lf_slip_angle_m",
+    ],
+)
 def test_units_that_do_not_convert_are_a_problem_and_no_channel(column: str, tmp_path: Path) -> None:
     log = make_log(tmp_path / "a")
     path = tmp_path / "a" / "drive.csv"
@@ -193,9 +207,12 @@ def steady(folder: Path, text: str, toml: str = STEADY) -> SteadyLog:
 
 
 def test_a_steady_state_log(tmp_path: Path) -> None:
-    log = steady(tmp_path, "slip_percent,slip_angle_rad,normal_load_kN,drawbar_pull_N,drawbar_pull_std_N,sinkage_mm,"
-                           "trial\n"
-                           "10,0,0.02,3,0.5,12,1\n30,0.5235987755982988,0.02,6,0.6,17,2\n")  # fmt: skip
+    log = steady(
+        tmp_path,
+        "slip_percent,slip_angle_rad,normal_load_kN,drawbar_pull_N,drawbar_pull_std_N,sinkage_mm,"
+        "trial\n"
+        "10,0,0.02,3,0.5,12,1\n30,0.5235987755982988,0.02,6,0.6,17,2\n",
+    )
     np.testing.assert_allclose(log.table.test["slip_ratio"], [0.1, 0.3])
     np.testing.assert_allclose(log.table.test["slip_angle_deg"], [0.0, 30.0])
     np.testing.assert_allclose(log.table.test["normal_load_N"], 20.0)

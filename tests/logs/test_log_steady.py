@@ -23,9 +23,17 @@ def points(seed: int = 0) -> pd.DataFrame:
     for angle in (0.0, 30.0):
         for slip in np.linspace(-0.3, 0.6, 7):
             for trial in range(3):
-                rows.append({"slip_ratio": slip, "slip_angle_deg": angle, "normal_load_N": 20.0 + 0.1 * rng.random(),
-                             "drawbar_pull_N": 12.0 * np.tanh(3.0 * slip) - 2.0, "side_force_N": 0.2 * angle,
-                             "sinkage_m": 0.01 + 0.02 * abs(slip), "trial": trial + 1})  # fmt: skip
+                rows.append(
+                    {
+                        "slip_ratio": slip,
+                        "slip_angle_deg": angle,
+                        "normal_load_N": 20.0 + 0.1 * rng.random(),
+                        "drawbar_pull_N": 12.0 * np.tanh(3.0 * slip) - 2.0,
+                        "side_force_N": 0.2 * angle,
+                        "sinkage_m": 0.01 + 0.02 * abs(slip),
+                        "trial": trial + 1,
+                    }
+                )
     frame = pd.DataFrame(rows)
     for column, std in STD.items():
         frame[column] += std * rng.standard_normal(len(frame))
@@ -34,8 +42,9 @@ def points(seed: int = 0) -> pd.DataFrame:
 
 def make(folder: Path, frame: pd.DataFrame, scale: float = 1.0) -> SteadyLog:
     noise = {c: Noise(scale * s, "replicate") for c, s in STD.items() if c in frame}
-    write_steady_log(folder, frame, wheel={"radius_m": 0.0625, "width_m": 0.05}, slip_definition="travel_speed",
-                     noise=noise)  # fmt: skip
+    write_steady_log(
+        folder, frame, wheel={"radius_m": 0.0625, "width_m": 0.05}, slip_definition="travel_speed", noise=noise
+    )
     log = read_log(folder)
     assert isinstance(log, SteadyLog)
     return log
@@ -80,9 +89,14 @@ def test_a_quantity_whose_noise_nobody_knows_is_told(tmp_path: Path) -> None:
 
 def test_the_measured_wheel_passes(tmp_path: Path) -> None:
     figures = load_figures()
-    frame = pd.DataFrame({**figures.test, "drawbar_pull_N": figures.measured["drawbar_pull"],
-                          "side_force_N": figures.measured["side_force"], "sinkage_m": figures.measured["sinkage"]}
-                         )  # fmt: skip
+    frame = pd.DataFrame(
+        {
+            **figures.test,
+            "drawbar_pull_N": figures.measured["drawbar_pull"],
+            "side_force_N": figures.measured["side_force"],
+            "sinkage_m": figures.measured["sinkage"],
+        }
+    )
     assert not is_bad(check(make(tmp_path / "a", frame)))
 
 

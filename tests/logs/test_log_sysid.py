@@ -58,8 +58,11 @@ def test_names_of_signals(sysid: Any, tmp_path: Path) -> None:
     packed = sysid.TimeSeries.from_custom_map(whole.times, whole.data, [("imu_gyro", 3, sensor)])
     folder = from_time_series({"imu": packed}, tmp_path / "b", rover="luvmi_x", names={"imu_gyro": gyro})
     np.testing.assert_allclose(read_log(folder).tables["imu"].channels[gyro[2]], whole.data[:, 2], rtol=1e-8)
-    for names, told in (({}, "imu_gyro"), ({"imu_gyro": gyro[:2]}, "3 columns"),
-                        ({"imu_gyro": gyro, "mast": "roll_deg"}, "mast")):  # fmt: skip
+    for names, told in (
+        ({}, "imu_gyro"),
+        ({"imu_gyro": gyro[:2]}, "3 columns"),
+        ({"imu_gyro": gyro, "mast": "roll_deg"}, "mast"),
+    ):
         with pytest.raises(UserError, match=told):
             from_time_series({"imu": packed}, tmp_path / "c", rover="luvmi_x", names=names)
     with pytest.raises(UserError, match="no_such"):

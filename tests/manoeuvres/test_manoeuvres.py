@@ -24,9 +24,21 @@ def luvmi() -> Model:
 
 
 def test_the_manoeuvres_of_the_catalogue_are_there() -> None:
-    wanted = {"rest_four_headings", "rest_in_shadow", "wheels_lifted", "cold_start", "stall_heat_soak",
-              "speed_staircase", "square_wave", "slope", "slip_sweep", "three_passes", "crab_and_plough",
-              "speed_staircase_payload", "square_wave_payload"}  # fmt: skip
+    wanted = {
+        "rest_four_headings",
+        "rest_in_shadow",
+        "wheels_lifted",
+        "cold_start",
+        "stall_heat_soak",
+        "speed_staircase",
+        "square_wave",
+        "slope",
+        "slip_sweep",
+        "three_passes",
+        "crab_and_plough",
+        "speed_staircase_payload",
+        "square_wave_payload",
+    }
     assert set(MANOEUVRES) == wanted
 
 
@@ -58,7 +70,9 @@ def column(model: Model, joint: str) -> int:
 
 
 def test_sides_ramps_and_angles(luvmi: Model, tmp_path: Path) -> None:
-    plan = own_file(tmp_path, """
+    plan = own_file(
+        tmp_path,
+        """
 [[segment]]
 duration_s = 1.0
 speed_m_s = { front = 0.1, left = 0.02 }
@@ -67,7 +81,8 @@ steer_deg = { left = 10.0, right = -10.0 }
 duration_s = 2.0
 ramp_s = 1.0
 speed_m_s = 0.3
-""")  # fmt: skip
+""",
+    )
     values = commands(plan, luvmi).values
     assert values.shape[0] == 60
     np.testing.assert_allclose(values[0, :4], [1.2, 1.0, 0.2, 0.0])

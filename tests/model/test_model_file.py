@@ -61,8 +61,7 @@ def varied(tmp_path: Path) -> dict[str, Model]:
         "constant ambient with a phase": base.replace(ambient=(250.0, 250.0, 10.0, 1000.0)),
         "cold": base.replace(ambient=(40.1, 40.1, *base.ambient[2:])),
         "control": base.replace(
-            modes={**base.modes, "drive": "torque", "steer": "current"},
-            gains={**base.gains, "steer": (1.0 / 3.0, 0.7)},
+            modes={**base.modes, "drive": "torque", "steer": "current"}, gains={**base.gains, "steer": (1.0 / 3.0, 0.7)}
         ),
         "globals": base.replace(gravity=9.81, timestep=1e-3 / 3.0, thermal_integrator="euler"),
         "slope": make_model("luvmi_x", "slope:7.5deg", "paper"),

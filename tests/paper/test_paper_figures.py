@@ -28,8 +28,14 @@ def _record(seed, episodes=True):
     rows = [{"steps": 0, "episode_return": None, "success": None}]
     rows += [{"steps": 100 * i, "episode_return": float(i - seed), "success": 0.1 * i} for i in range(1, 8)]
     kept = {"episode_return": [float(i + seed) for i in range(30 - seed)]} if episodes else None
-    return {"training": "paper-td3", "seed": seed, "rows": rows, "episodes": kept, "final": {"success": 0.7},
-            "unseen": [{"steps": 300, "success": 0.5}]}  # fmt: skip
+    return {
+        "training": "paper-td3",
+        "seed": seed,
+        "rows": rows,
+        "episodes": kept,
+        "final": {"success": 0.7},
+        "unseen": [{"steps": 300, "success": 0.5}],
+    }
 
 
 def test_learning_curves_are_those_of_the_trainings(tmp_path):
@@ -78,9 +84,14 @@ def test_learning_curves_of_many_rovers_are_by_step(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(None, "is not there"), ("{", "holds no record"), ("[]", "holds no record"),
-     ('{"training": "x"}', "holds no record"), ('{"seeds": []}', "holds no record")],
-)  # fmt: skip
+    [
+        (None, "is not there"),
+        ("{", "holds no record"),
+        ("[]", "holds no record"),
+        ('{"training": "x"}', "holds no record"),
+        ('{"seeds": []}', "holds no record"),
+    ],
+)
 def test_what_is_no_training_is_one_sentence(run, tmp_path, monkeypatch, content, message):
     file = tmp_path / "curve.json"
     if content is not None:

@@ -16,8 +16,12 @@ HOSTILE = '</script><script>alert("x")</script>&<b>'
 
 def page(tmp_path) -> str:
     figure = finish(go.Figure(go.Scatter(x=[1, 2], y=[3, 4], name=HOSTILE)), 300, title=HOSTILE)
-    blocks = [Text([HOSTILE]), Figure(figure, HOSTILE), Facts([(HOSTILE, HOSTILE)]),
-              Table(HOSTILE, [HOSTILE], [[HOSTILE]], HOSTILE)]  # fmt: skip
+    blocks = [
+        Text([HOSTILE]),
+        Figure(figure, HOSTILE),
+        Facts([(HOSTILE, HOSTILE)]),
+        Table(HOSTILE, [HOSTILE], [[HOSTILE]], HOSTILE),
+    ]
     path = write_page(tmp_path / "sub" / "page.html", HOSTILE, [HOSTILE], [Section(HOSTILE, blocks)])
     return path.read_text(encoding="utf-8")
 

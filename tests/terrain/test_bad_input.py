@@ -50,9 +50,17 @@ def tif(path, data, crs=POLAR, transform=None, nodata=None):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(
-            path, "w", driver="GTiff", height=data.shape[0], width=data.shape[1], count=1, dtype="float32", crs=crs,
-            transform=transform, nodata=nodata,
-        ) as raster:  # fmt: skip
+            path,
+            "w",
+            driver="GTiff",
+            height=data.shape[0],
+            width=data.shape[1],
+            count=1,
+            dtype="float32",
+            crs=crs,
+            transform=transform,
+            nodata=nodata,
+        ) as raster:
             raster.write(data.astype("float32"), 1)
     return path
 

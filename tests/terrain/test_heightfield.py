@@ -77,9 +77,11 @@ def test_plane_has_its_normal_and_slope(x64):
     length = np.sqrt(1.25)
     np.testing.assert_allclose([nx, ny, nz], [-0.3 / length, 0.4 / length, 1 / length], rtol=1e-12)
     assert float(slope(field, 1.3, 2.6)) == pytest.approx(np.arctan(0.5))
-    assert not bool(jnp.isnan(jax.grad(lambda h: slope(HeightField(h, *(jnp.zeros(()),) * 2, jnp.ones(())), 1.2, 1.3))(
-        jnp.zeros((3, 3))
-    )).any())  # fmt: skip
+    assert not bool(
+        jnp.isnan(
+            jax.grad(lambda h: slope(HeightField(h, *(jnp.zeros(()),) * 2, jnp.ones(())), 1.2, 1.3))(jnp.zeros((3, 3)))
+        ).any()
+    )
 
 
 def test_edge_is_flat_continuation(x64):

@@ -148,9 +148,16 @@ def test_pds3_missing_constant_and_attached_label(tmp_path):
     data = (GRID * 2).astype("<f4")
     data[0, 1] = np.frombuffer(bytes.fromhex("FF7FFFFB"), ">f4")[0]
     label = LABEL.format(
-        record=512, pointer="^IMAGE = 5", kind="PC_REAL", bits=32, unit="METER", scale=0.5, offset=0,
-        map_scale="5 <METERS/PIXEL>", extra="MISSING_CONSTANT = 16#FF7FFFFB#",
-    )  # fmt: skip
+        record=512,
+        pointer="^IMAGE = 5",
+        kind="PC_REAL",
+        bits=32,
+        unit="METER",
+        scale=0.5,
+        offset=0,
+        map_scale="5 <METERS/PIXEL>",
+        extra="MISSING_CONSTANT = 16#FF7FFFFB#",
+    )
     path = tmp_path / "NAC_DTM.IMG"
     path.write_bytes(label.encode().ljust(4 * 512) + data.tobytes())
     dem = read_dem(path)

@@ -72,8 +72,15 @@ def test_stand_in_has_the_statistics_of_the_site():
 
     table = read_config(find("terrain", "de_gerlache_rim", "terrain.toml") / "terrain.toml").surface
     assert table is not None
-    dem = make_surface(table.width, table.height, table.cell, 1, roughness=table.roughness, craters=table.craters,
-                       center=(table.x, table.y))  # fmt: skip
+    dem = make_surface(
+        table.width,
+        table.height,
+        table.cell,
+        1,
+        roughness=table.roughness,
+        craters=table.craters,
+        center=(table.x, table.y),
+    )
     # The product's own grid: pixel centres from -44997.5 and 7002.5 m, 3200 of them.
     assert dem.heights.shape == (3200, 3200) and (dem.x0, dem.y0) == (-44997.5, 7002.5)
     north, east = np.gradient(dem.heights[::2, ::2], 10.0)

@@ -157,16 +157,18 @@ def test_window_needs_a_screen(monkeypatch, drive):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(("--port", "70000"), "--port = 70000 is no port; give 1024 to 65535, or 0 for any free one"),
-     (("--port", "-1"), "--port = -1 is no port"),
-     (("--port", "http"), "--port"),
-     (("--speed", "0"), "--speed = 0.0 is not positive"),
-     (("--speed", "nan"), "--speed = nan is not finite"),
-     (("--engine", "warp"), "--engine = 'warp' does not exist; use one of auto, native, structured, mjx"),
-     (("--sun", "1"), "--sun = '1' is not two numbers"),
-     (("--x", "1e6"), "is off the terrain flat"),
-     (("--rover", "nowhere"), "nowhere")],
-)  # fmt: skip
+    [
+        (("--port", "70000"), "--port = 70000 is no port; give 1024 to 65535, or 0 for any free one"),
+        (("--port", "-1"), "--port = -1 is no port"),
+        (("--port", "http"), "--port"),
+        (("--speed", "0"), "--speed = 0.0 is not positive"),
+        (("--speed", "nan"), "--speed = nan is not finite"),
+        (("--engine", "warp"), "--engine = 'warp' does not exist; use one of auto, native, structured, mjx"),
+        (("--sun", "1"), "--sun = '1' is not two numbers"),
+        (("--x", "1e6"), "is off the terrain flat"),
+        (("--rover", "nowhere"), "nowhere"),
+    ],
+)
 def test_mistakes_are_one_sentence(run, arguments, message):
     result = run("view", "--web", "--terrain", "flat", *arguments)
     assert result.status == 2 and message in result.err and "Traceback" not in result.err
@@ -176,9 +178,13 @@ def test_mistakes_are_one_sentence(run, arguments, message):
 def test_control_c_ends_it_cleanly():
     # a job in the background ignores the interrupt, and its children inherit that
     main = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {MAIN}"
-    process = subprocess.Popen([sys.executable, "-c", main, "view", "--web", "--rover", "luvmi_x", "--terrain", "flat",
-                                "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                               env={**os.environ, "PYTHONUNBUFFERED": "1"})  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-c", main, "view", "--web", "--rover", "luvmi_x", "--terrain", "flat", "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
     with process:
         try:
             assert process.stdout is not None

@@ -30,15 +30,26 @@ def test_listens_on_the_loopback_address_only(viewer):
 
 
 @pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example:{port}", "127.0.0.1:1",
-                                  "", "[::1]:{port}"])  # fmt: skip
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example:{port}", "127.0.0.1:1", "", "[::1]:{port}"]
+)
 def test_a_foreign_name_for_this_machine_is_refused(viewer, path, host):
     status, _, text = ask(viewer, "GET", path, Host=host.format(port=viewer.server_address[1]))
     assert status == 403 and viewer.address.encode() in text and len(text) < 200
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "https://127.0.0.1:{port}", "http://127.0.0.1:1", "null", "",
-                                    "http://127.0.0.1:{port}.evil.example", "http://localhost"])  # fmt: skip
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "https://127.0.0.1:{port}",
+        "http://127.0.0.1:1",
+        "null",
+        "",
+        "http://127.0.0.1:{port}.evil.example",
+        "http://localhost",
+    ],
+)
 def test_pages_of_another_origin_are_refused(viewer, origin):
     foreign = origin.format(port=viewer.server_address[1])
     for path in PATHS:
@@ -82,10 +93,18 @@ def test_nothing_is_asked_of_the_internet(viewer, path):
 
 @pytest.mark.parametrize(
     ("path", "body", "status"),
-    [("/keys", {"held": ["fly"]}, 400), ("/keys", {"held": [["forward"]]}, 400), ("/keys", {"held": "forward"}, 400),
-     ("/keys", [], 400), ("/keys", "{", 400), ("/keys", "[" * 3000, 400), ("/keys", "9" * 5000, 400),
-     ("/elsewhere", {}, 400), ("/reset", {}, 200)],
-)  # fmt: skip
+    [
+        ("/keys", {"held": ["fly"]}, 400),
+        ("/keys", {"held": [["forward"]]}, 400),
+        ("/keys", {"held": "forward"}, 400),
+        ("/keys", [], 400),
+        ("/keys", "{", 400),
+        ("/keys", "[" * 3000, 400),
+        ("/keys", "9" * 5000, 400),
+        ("/elsewhere", {}, 400),
+        ("/reset", {}, 200),
+    ],
+)
 def test_messages_are_checked(viewer, path, body, status):
     assert ask(viewer, "POST", path, body)[0] == status
 

@@ -21,14 +21,26 @@ class Browser:
         assert CHROMIUM is not None
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
-        flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-                 "--disable-dev-shm-usage", "--no-first-run", "--disable-background-networking", "--hide-scrollbars",
-                 "--remote-debugging-pipe", f"--user-data-dir={folder}"]  # fmt: skip
+        flags = [
+            "--headless=new",
+            "--no-sandbox",
+            "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader",
+            "--disable-dev-shm-usage",
+            "--no-first-run",
+            "--disable-background-networking",
+            "--hide-scrollbars",
+            "--remote-debugging-pipe",
+            f"--user-data-dir={folder}",
+        ]
         # DevTools speaks on the file descriptors 3 and 4
         shell = f"exec '{CHROMIUM}' \"$@\" 3<&{to_read} 4>&{to_write}"
-        self._process = subprocess.Popen(["bash", "-c", shell, "chromium", *flags, "about:blank"],
-                                         pass_fds=(to_read, to_write), stdout=subprocess.DEVNULL,
-                                         stderr=subprocess.DEVNULL)  # fmt: skip
+        self._process = subprocess.Popen(
+            ["bash", "-c", shell, "chromium", *flags, "about:blank"],
+            pass_fds=(to_read, to_write),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         os.close(to_read)
         os.close(to_write)
         self._count, self._rest, self.problems = 0, b"", []

@@ -111,13 +111,15 @@ def test_map_has_north_up(luvmi):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(("--view", "side"), "view = 'side' does not exist; use one of auto, follow, front, top"),
-     (("--size", "big"), "--size = 'big' is not two numbers; write it as 960x540"),
-     (("--size", "90x50"), "size = '90x50' is outside 160x120 to 3840x2160"),
-     (("--out", "film.avi"), "--out = 'film.avi' is of no known kind; end it in .mp4, .webp, .gif"),
-     (("--speed", "-2"), "--speed = -2.0 is negative"),
-     (("--sun", "90,-5"), "elevation_deg = -5.0 is outside")],
-)  # fmt: skip
+    [
+        (("--view", "side"), "view = 'side' does not exist; use one of auto, follow, front, top"),
+        (("--size", "big"), "--size = 'big' is not two numbers; write it as 960x540"),
+        (("--size", "90x50"), "size = '90x50' is outside 160x120 to 3840x2160"),
+        (("--out", "film.avi"), "--out = 'film.avi' is of no known kind; end it in .mp4, .webp, .gif"),
+        (("--speed", "-2"), "--speed = -2.0 is negative"),
+        (("--sun", "90,-5"), "elevation_deg = -5.0 is outside"),
+    ],
+)
 def test_mistakes_are_one_sentence(run, luvmi, arguments, message):
     result = run("render", luvmi[0], *arguments)
     assert result.status == 2 and message in result.err

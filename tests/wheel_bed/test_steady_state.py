@@ -85,8 +85,11 @@ def test_the_error_is_in_units_of_the_scatter(consistent, figures):
 def test_a_fit_recovers_the_soil_that_made_the_table(consistent, figures):
     truth = {"soil": {"k_c": 0.0, "k_phi": 6e5, "n": 0.9, "friction_angle": 0.55}}
     table = synthetic(consistent.with_values(truth), figures)
-    free = (Free("soil", "k_phi", 1e5, 1e7, log=True), Free("soil", "n", 0.5, 1.5),
-            Free("soil", "friction_angle", 0.2, 0.8))  # fmt: skip
+    free = (
+        Free("soil", "k_phi", 1e5, 1e7, log=True),
+        Free("soil", "n", 0.5, 1.5),
+        Free("soil", "friction_angle", 0.2, 0.8),
+    )
     found = fit(consistent, table, free, starts=2)
     assert found.fitted < 1e-4 and found.held_out < 1e-4
     for name, value in found.values["soil"].items():
@@ -111,7 +114,7 @@ REFUSED = [
     (f"{HEADER}\n0.1,90,20,1\n", "no slip in the wheel's frame"),
     (f"{HEADER}\n0.1,0,20,1\n0.1,0,20,1\n", "line 3, slip_ratio = 0.1 begins a row that occurs twice"),
     (f"{HEADER},drawbar_pull_N\n0.1,0,20,1,1\n", "occurs twice"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("text", "message"), REFUSED)

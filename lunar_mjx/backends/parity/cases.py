@@ -139,8 +139,14 @@ RELATIVE = {"float64": 1e-9, "pybullet": 5e-6, "float32": 5e-4, SOFT_LOOP: 1e-5}
 """Relative tolerance by what separates two engines: float64 rounding through the equations; PyBullet, which keeps joint
 axes and frames to about 1e-8; float32; and in drives MuJoCo's loops, which give way, against loops closed exactly."""
 
-SOFT_STEP = {"acceleration": 0.1, "velocity": 1e-3, "joint_speed": 0.02, "position": 1e-6, "orientation": 1e-6,
-             "joint_angle": 1e-4}  # fmt: skip
+SOFT_STEP = {
+    "acceleration": 0.1,
+    "velocity": 1e-3,
+    "joint_speed": 0.02,
+    "position": 1e-6,
+    "orientation": 1e-6,
+    "joint_angle": 1e-4,
+}
 """Relative tolerances of the quantities that a soft loop changes within a step that starts with closed loops; all
 others must agree as if there were no loop.
 
@@ -159,7 +165,7 @@ DRIVE_EXCEPTIONS: dict[str, dict[str, float]] = {
     # VIPER chatters on a slope of rock until it drives and PyBullet's comes to rest elsewhere, 6e-5 m away: slip then
     # differs by up to 0.022 and a drive's torque by up to 0.8 N m of 278. Started from the reference's state after
     # that, its slip stays within 8e-6 of the reference with stiff loops damped within.
-    f"pybullet, {SOFT_LOOP}": {"slip": 2e-3, "joint_torque": 4e-3},
+    f"pybullet, {SOFT_LOOP}": {"slip": 2e-3, "joint_torque": 4e-3}
 }
 """Quantities with another relative tolerance in drives, by all that separates two engines."""
 
@@ -167,6 +173,6 @@ ABSOLUTE: dict[str, dict[str, float]] = {
     # PyBullet keeps the frames of a URDF in float32: LUVMI-X's wheels lie up to 3e-8 m off, which is 0.006 N on rock of
     # 2e5 N/m, and VIPER's 6e-8 m, of which no more came (0.0040 N on boulders); the moment is that at its wheel's rim;
     # a step's change of speed is the tolerance of the acceleration, 2e-3 m/s2 or rad/s2, over 2 ms
-    "pybullet": {"wheel_force": 6e-3, "wheel_moment": 1.5e-3, "velocity": 4e-6, "joint_speed": 4e-6},
+    "pybullet": {"wheel_force": 6e-3, "wheel_moment": 1.5e-3, "velocity": 4e-6, "joint_speed": 4e-6}
 }
 """Least absolute tolerances, where a measured cause sets them."""

@@ -36,12 +36,28 @@ from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands
 from lunar_mjx.terrain import Terrain, stack
 
-STEP_QUANTITIES = ("position", "orientation", "joint_angle", "velocity", "joint_speed", "winding_temperature",
-                   "housing_temperature", "shear_state")  # fmt: skip
+STEP_QUANTITIES = (
+    "position",
+    "orientation",
+    "joint_angle",
+    "velocity",
+    "joint_speed",
+    "winding_temperature",
+    "housing_temperature",
+    "shear_state",
+)
 """What level 2 compares after one step."""
 
-DRIVE_QUANTITIES = ("position", "orientation", "joint_angle", "sinkage", "slip", "joint_torque",
-                    "winding_temperature", "housing_temperature")  # fmt: skip
+DRIVE_QUANTITIES = (
+    "position",
+    "orientation",
+    "joint_angle",
+    "sinkage",
+    "slip",
+    "joint_torque",
+    "winding_temperature",
+    "housing_temperature",
+)
 """What level 3 compares along a drive."""
 
 FLOOR_FACTOR = 10.0
@@ -167,8 +183,7 @@ def _joined(pieces: list[Observation]) -> Observation:
 def _rows(samples: Samples, at: np.ndarray) -> tuple[BackendState, np.ndarray]:
     s = samples.state
     effects = {e: {k: v[at] for k, v in own.items()} for e, own in s.effects.items()}
-    state = BackendState(s.step, s.qpos[at], s.qvel[at], s.winding_temperature[at], s.housing_temperature[at],
-                         effects)  # fmt: skip
+    state = BackendState(s.step, s.qpos[at], s.qvel[at], s.winding_temperature[at], s.housing_temperature[at], effects)
     return state, samples.control[at]
 
 
@@ -216,7 +231,7 @@ def judge(
     """Levels 1 and 2: another engine's stages and steps against the reference's, from the same states.
 
     With `soft_loop`, where only one of the two engines can hold loops open, from the states whose loops are closed.
-    """  # fmt: skip
+    """
     out = []
     rows = samples.closed if soft_loop else slice(None)
     stages = [(1, stage, q, samples.stages, other[0]) for stage, names in STAGES.items() for q in names]

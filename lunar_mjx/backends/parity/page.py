@@ -32,16 +32,27 @@ def write_parity_page(path: Path, studies: Sequence[Study], note: str = "") -> P
     for study in studies:
         for pair in study.pairs:
             title = f"{study.model.rover.name}, {study.model.preset}: {pair.first} and {pair.second}"
-            blocks = [Text([verdict(study, pair)]), Figure(_errors(pair), "Largest normalised error by quantity."),
-                      Figure(_drift(study, pair), "Distance between the two rovers along the drive."),
-                      _table(pair)]  # fmt: skip
+            blocks = [
+                Text([verdict(study, pair)]),
+                Figure(_errors(pair), "Largest normalised error by quantity."),
+                Figure(_drift(study, pair), "Distance between the two rovers along the drive."),
+                _table(pair),
+            ]
             sections.append(Section(title, blocks))
     sentences = [verdict(study, pair) for study in studies for pair in study.pairs] + ([note] if note else [])
     numbers = [
-        {"rover": s.model.rover.name, "preset": s.model.preset, "first": p.first, "second": p.second, "kind": p.kind,
-         "judged": p.judged, "results": [{**vars(r), "passed": r.passed} for r in p.results]}
-        for s in studies for p in s.pairs
-    ]  # fmt: skip
+        {
+            "rover": s.model.rover.name,
+            "preset": s.model.preset,
+            "first": p.first,
+            "second": p.second,
+            "kind": p.kind,
+            "judged": p.judged,
+            "results": [{**vars(r), "passed": r.passed} for r in p.results],
+        }
+        for s in studies
+        for p in s.pairs
+    ]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.with_suffix(".json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
     return write_page(path, "Parity of the engines", sentences, sections)
@@ -76,8 +87,9 @@ def _method(study: Study) -> list[str]:
     kinds = ", ".join(f"{k} {v:g}" for k, v in RELATIVE.items())
     but = "; ".join(f"{k}: {', '.join(f'{q} {v:g}' for q, v in own.items())}" for k, own in EXCEPTIONS.items())
     apart = "; ".join(f"{k}: {', '.join(f'{q} {v:g}' for q, v in own.items())}" for k, own in DRIVE_EXCEPTIONS.items())
-    least = "; ".join(f"{k}: {', '.join(f'{q} {v:g} {QUANTITIES[q][0]}' for q, v in own.items())}"
-                      for k, own in ABSOLUTE.items())  # fmt: skip
+    least = "; ".join(
+        f"{k}: {', '.join(f'{q} {v:g} {QUANTITIES[q][0]}' for q, v in own.items())}" for k, own in ABSOLUTE.items()
+    )
     loops = ", ".join(f"{q} {v:g}" for q, v in SOFT_STEP.items())
     shares = ", ".join(f"{c:g}" for c in COMPLIANCE)
     return [
@@ -110,8 +122,13 @@ def _errors(pair: Pair) -> go.Figure:
         own = [r for r in pair.results if r.case == name]
         style = SERIES[k % len(SERIES)]
         labels = [f"{r.level}  {r.quantity}" for r in own]
-        figure.add_scatter(x=[max(r.error, 1e-12) for r in own], y=labels, mode="markers", name=name,
-                           marker={"color": style.colour, "symbol": style.symbol, "size": 8})  # fmt: skip
+        figure.add_scatter(
+            x=[max(r.error, 1e-12) for r in own],
+            y=labels,
+            mode="markers",
+            name=name,
+            marker={"color": style.colour, "symbol": style.symbol, "size": 8},
+        )
     figure.add_vline(x=1.0, line={"color": VERMILION if pair.judged else INK, "dash": "dash"})
     finish(figure, 720, margin={"l": 190, "r": 16, "t": 60, "b": 52})
     figure.update_xaxes(title_text="largest error over its tolerance", type="log", exponentformat="power")
@@ -130,10 +147,15 @@ def _drift(study: Study, pair: Pair) -> go.Figure:
         noise = np.max([np.linalg.norm(exact - n, axis=-1) for n in perturbed], axis=0)
         for name, value, dash in ((case.name, apart, "solid"), ("noise floor", noise, "dot")):
             distance = np.maximum(value, 1e-18)
-            figure.add_scatter(x=a["time"].round(3), y=distance, mode="lines", legendgroup=case.name,
-                               name=name if name != "noise floor" else f"{case.name}, noise floor",
-                               line={"color": style.colour, "dash": dash, "width": 2 if dash == "solid" else 1},
-                               showlegend=dash == "solid")  # fmt: skip
+            figure.add_scatter(
+                x=a["time"].round(3),
+                y=distance,
+                mode="lines",
+                legendgroup=case.name,
+                name=name if name != "noise floor" else f"{case.name}, noise floor",
+                line={"color": style.colour, "dash": dash, "width": 2 if dash == "solid" else 1},
+                showlegend=dash == "solid",
+            )
     finish(figure, 420, margin={"l": 84, "r": 16, "t": 60, "b": 52})
     figure.update_xaxes(title_text="time, s")
     figure.update_yaxes(title_text="distance, m (dotted: noise floor)", type="log", exponentformat="power")
@@ -149,5 +171,9 @@ def _table(pair: Pair) -> Table:
         largest = max(own, key=lambda r: r.difference)
         shown = f"{largest.difference:.2g} {QUANTITIES[quantity][0]}"
         rows.append([f"{level}: {LEVELS[level]}", stage, quantity, shown, *(f"{r.error:.2g}" for r in own)])
-    return Table("Largest difference, and error over tolerance by ground.",
-                 ["level", "stage", "quantity", "largest difference", *names], rows, texts=3)  # fmt: skip
+    return Table(
+        "Largest difference, and error over tolerance by ground.",
+        ["level", "stage", "quantity", "largest difference", *names],
+        rows,
+        texts=3,
+    )

@@ -180,5 +180,11 @@ def _join(states: list[BackendState]) -> BackendState:
         return np.stack([get(s)[0] for s in states])
 
     effects = {e: {k: rows(lambda s, e=e, k=k: s.effects[e][k]) for k in own} for e, own in states[0].effects.items()}
-    return BackendState(0, rows(lambda s: s.qpos), rows(lambda s: s.qvel), rows(lambda s: s.winding_temperature),
-                        rows(lambda s: s.housing_temperature), effects)  # fmt: skip
+    return BackendState(
+        0,
+        rows(lambda s: s.qpos),
+        rows(lambda s: s.qvel),
+        rows(lambda s: s.winding_temperature),
+        rows(lambda s: s.housing_temperature),
+        effects,
+    )

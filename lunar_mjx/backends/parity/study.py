@@ -118,8 +118,9 @@ def run_study(
     known = cases(model.rover)
     wrong = set(grounds or ()) - {c.name for c in known}
     if wrong:
-        raise bad_input("parity", "ground", sorted(wrong)[0], "does not exist",
-                        f"use some of {'; '.join(c.name for c in known)}")  # fmt: skip
+        raise bad_input(
+            "parity", "ground", sorted(wrong)[0], "does not exist", f"use some of {'; '.join(c.name for c in known)}"
+        )
     used = [c for c in known if grounds is None or c.name in grounds]
     runners = [make_runner(e, model) for e in engines]
     commands = drive(model, duration)
@@ -128,14 +129,22 @@ def run_study(
     for i, case in enumerate(used):
         report(f"{preset}: native, {case.name}", 2 * i / parts)
         recorded[case.name] = record(model, case, commands, samples)
-    reference = Run(NativeBackend.name, {k: (r[0].stages, r[0].after) for k, r in recorded.items()},
-                    {k: r[1] for k, r in recorded.items()})  # fmt: skip
+    reference = Run(
+        NativeBackend.name,
+        {k: (r[0].stages, r[0].after) for k, r in recorded.items()},
+        {k: r[1] for k, r in recorded.items()},
+    )
     of = {k: r[0] for k, r in recorded.items()}
     runs = {reference.name: reference}
     for i, runner in enumerate(runners):
         first = len(used) * (2 + 3 * i)
-        runs[runner.name] = _run(runner, used, of, commands, lambda what, done, first=first: report(
-            f"{preset}: {what}", (first + 3 * len(used) * done) / parts))  # fmt: skip
+        runs[runner.name] = _run(
+            runner,
+            used,
+            of,
+            commands,
+            lambda what, done, first=first: report(f"{preset}: {what}", (first + 3 * len(used) * done) / parts),
+        )
     noise = {k: r[2] for k, r in recorded.items()}
     pairs = [_pair(model, used, reference, runs[r.name], of, noise) for r in runners]
     if "structured" in runs and "mjx" in runs:
@@ -186,6 +195,7 @@ def _pair(model: Model, used: list[Case], a: Run, b: Run, of: dict[str, Samples]
         samples = dataclasses.replace(of[case.name], stages=a.steps[case.name][0], after=a.steps[case.name][1])
         results += judge(case, samples, b.steps[case.name], tolerances(kind), model, SOFT_LOOP in kind)
         floor = floor_of((a.name, b.name), kind, noise[case.name])
-        results += judge_drive(case, a.drives[case.name], floor, b.drives[case.name],
-                               tolerances(kind, drive=True), model)  # fmt: skip
+        results += judge_drive(
+            case, a.drives[case.name], floor, b.drives[case.name], tolerances(kind, drive=True), model
+        )
     return Pair(a.name, b.name, kind, results, judged="own contact" not in b.name)

@@ -67,9 +67,14 @@ class ForceModel:
         error = effects["wheel_radius_error"].offset if "wheel_radius_error" in effects else 0.0
         toe = effects["steering_toe"].angle if "steering_toe" in effects else 0.0
         mass = effects["payload"].mass if "payload" in effects else 0.0
-        return {"radius": numbers.radius * one + error, "width": numbers.width * one, "toe": one * toe,
-                "payload_mass": np.full(n, mass), "payload_position": point["payload"],
-                "com_offset": point["com_offset"]}  # fmt: skip
+        return {
+            "radius": numbers.radius * one + error,
+            "width": numbers.width * one,
+            "toe": one * toe,
+            "payload_mass": np.full(n, mass),
+            "payload_position": point["payload"],
+            "com_offset": point["com_offset"],
+        }
 
     def initial_state(self) -> EffectState:
         """State of the effects at reset."""
@@ -165,8 +170,15 @@ class ForceModel:
         if "soil" in hooks:
             c.soil = hooks.call("soil", c, {k: v.copy() for k, v in c.soil.items()})
         zero = np.zeros(c.wheel_position.shape[:-1])
-        c.normal = {"entrance": zero + 2e-4, "exit": zero, "theta_m": zero + 1e-4, "sigma_m": zero, "load": zero,
-                    "resistance": zero, "damping": zero}  # fmt: skip
+        c.normal = {
+            "entrance": zero + 2e-4,
+            "exit": zero,
+            "theta_m": zero + 1e-4,
+            "sigma_m": zero,
+            "load": zero,
+            "resistance": zero,
+            "damping": zero,
+        }
         for function, p in self._normal:
             function(c, p)
         if "normal" in hooks:
@@ -202,8 +214,11 @@ class ForceModel:
         rate_w, rate_h = flow["winding"] / flow["winding_capacity"], flow["housing"] / flow["housing_capacity"]
         if self.numbers.integrator == "heun":
             then = self._heat_at(c, c.winding_temperature + dt * rate_w, c.housing_temperature + dt * rate_h)
-            flow = {**first, "winding": 0.5 * (first["winding"] + then["winding"]),
-                    "housing": 0.5 * (first["housing"] + then["housing"])}  # fmt: skip
+            flow = {
+                **first,
+                "winding": 0.5 * (first["winding"] + then["winding"]),
+                "housing": 0.5 * (first["housing"] + then["housing"]),
+            }
             rate_w, rate_h = flow["winding"] / flow["winding_capacity"], flow["housing"] / flow["housing_capacity"]
         c.heat = flow
         return c.winding_temperature + dt * rate_w, c.housing_temperature + dt * rate_h

@@ -20,8 +20,14 @@ def rock_normal(c: Context, p: SimpleNamespace) -> None:
     touching = contact["sinkage"] > 0.0
     load = p.stiffness * contact["sinkage"] * touching
     theta_1 = entrance(contact["sinkage"], c.geometry["radius"])
-    values = {"entrance": theta_1, "theta_m": 0.5 * theta_1, "sigma_m": 0.0, "load": load, "resistance": 0.0,
-              "damping": np.maximum(p.damping * contact["sinkage_rate"], -load) * touching}  # fmt: skip
+    values = {
+        "entrance": theta_1,
+        "theta_m": 0.5 * theta_1,
+        "sigma_m": 0.0,
+        "load": load,
+        "resistance": 0.0,
+        "damping": np.maximum(p.damping * contact["sinkage_rate"], -load) * touching,
+    }
     for name, value in values.items():
         normal[name] = np.where(rock, value, normal[name])
     if "stress" in normal:

@@ -65,5 +65,9 @@ def heat_flow(c: Context, winding_K: np.ndarray, housing_K: np.ndarray) -> Value
             squared = housing_K * housing_K
             lost = squared * squared - c.ambient_temperature**4
             into_housing = into_housing - p.emissivity * STEFAN_BOLTZMANN * p.area * lost
-    return {"winding": into_winding, "housing": into_housing,
-            "winding_capacity": capacity_w, "housing_capacity": capacity_h}  # fmt: skip
+    return {
+        "winding": into_winding,
+        "housing": into_housing,
+        "winding_capacity": capacity_w,
+        "housing_capacity": capacity_h,
+    }

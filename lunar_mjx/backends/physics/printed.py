@@ -21,8 +21,13 @@ def penalty_contact(c: Context, p: SimpleNamespace) -> None:
     theta_m = 0.5 * theta_1
     sigma = peak_stress(c.soil, c.geometry["width"], r, np.cos(theta_m), np.cos(theta_1))
     load = p.stiffness * contact["sinkage"]
-    c.normal.update(entrance=theta_1, theta_m=theta_m, sigma_m=sigma * touching, load=load * touching,
-                    damping=np.maximum(p.damping * contact["sinkage_rate"], -load) * touching)  # fmt: skip
+    c.normal.update(
+        entrance=theta_1,
+        theta_m=theta_m,
+        sigma_m=sigma * touching,
+        load=load * touching,
+        damping=np.maximum(p.damping * contact["sinkage_rate"], -load) * touching,
+    )
 
 
 def _printed_slip(contact: Values) -> np.ndarray:

@@ -23,8 +23,16 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 def uniform_soil(p: SimpleNamespace | None, like: np.ndarray) -> Values:
     """The same soil under every wheel (effect `soil`); without that effect a soil that bears next to nothing."""
     given = {} if p is None else vars(p) | {"tan_phi": np.tan(p.friction_angle)}
-    bare = {"k_c": 0.0, "k_phi": 1.0, "n": 1.0, "cohesion": 0.0, "tan_phi": 0.0, "shear_modulus_x": 1.0,
-            "shear_modulus_y": 1.0, "rock": 0.0}  # fmt: skip
+    bare = {
+        "k_c": 0.0,
+        "k_phi": 1.0,
+        "n": 1.0,
+        "cohesion": 0.0,
+        "tan_phi": 0.0,
+        "shear_modulus_x": 1.0,
+        "shear_modulus_y": 1.0,
+        "rock": 0.0,
+    }
     return {name: np.zeros_like(like) + given.get(name, value) for name, value in bare.items()}
 
 
@@ -83,8 +91,14 @@ def pressure_sinkage(c: Context, p: SimpleNamespace) -> None:
     a_factor, b_factor = arc_factors(theta_m)
     per_stress = r * b * sigma
     load = per_stress * a_factor
-    c.normal.update(entrance=theta_1, theta_m=theta_m, sigma_m=sigma, load=load, resistance=per_stress * b_factor,
-                    damping=area_damping(c, p.damping, theta_1, load) * touching)  # fmt: skip
+    c.normal.update(
+        entrance=theta_1,
+        theta_m=theta_m,
+        sigma_m=sigma,
+        load=load,
+        resistance=per_stress * b_factor,
+        damping=area_damping(c, p.damping, theta_1, load) * touching,
+    )
 
 
 def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:

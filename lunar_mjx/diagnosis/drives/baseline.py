@@ -14,17 +14,25 @@ from lunar_mjx.model import Model
 
 BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "soil": {
-        "k_phi": (0.3, 2.0), "n": (0.1, 2.0), "cohesion": (0.3, 2.0), "friction_angle": (0.1, 2.0),
-        "shear_modulus_x": (0.3, 2.0), "shear_modulus_y": (0.3, 2.0),
+        "k_phi": (0.3, 2.0),
+        "n": (0.1, 2.0),
+        "cohesion": (0.3, 2.0),
+        "friction_angle": (0.1, 2.0),
+        "shear_modulus_x": (0.3, 2.0),
+        "shear_modulus_y": (0.3, 2.0),
     },
     "penalty_contact": {"stiffness": (0.3, 2.0)},
     "motor": {
-        "resistance": (0.05, 2.0), "torque_constant": (0.05, 2.0), "gear_efficiency": (0.1, 1.0),
-        "winding_capacity": (0.2, 2.0), "housing_capacity": (0.2, 2.0), "R_th1": (0.2, 2.0),
+        "resistance": (0.05, 2.0),
+        "torque_constant": (0.05, 2.0),
+        "gear_efficiency": (0.1, 1.0),
+        "winding_capacity": (0.2, 2.0),
+        "housing_capacity": (0.2, 2.0),
+        "R_th1": (0.2, 2.0),
     },
     "housing_convection": {"R_th2": (0.3, 2.0)},
     "housing_conduction": {"conductance": (0.3, 2.0)},
-}  # fmt: skip
+}
 """What a refit moves, by effect and parameter: scale as a share of the value, and prior standard deviation in scales:
 how well soil and motor are known before a drive."""
 

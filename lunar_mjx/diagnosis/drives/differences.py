@@ -50,9 +50,12 @@ class Differences:
         return self._size[i] if u[i] + self._size[i] <= self._coordinates[i].bounds()[1] else -self._size[i]
 
     def jacobian(
-        self, u: np.ndarray, values: np.ndarray, observations: Observations,
+        self,
+        u: np.ndarray,
+        values: np.ndarray,
+        observations: Observations,
         direction: Callable[[Coordinate], np.ndarray],
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """(n, m) from the predictions (k, n) of `rows(u)`; `direction` gives what a linear nuisance's unit adds."""
         difference = values[1:] - values[:1]
         out = np.zeros((len(observations), len(self._which)))

@@ -75,8 +75,10 @@ def begin_at(params: Params, state: Any, measured: Mapping[str, Any]) -> Any:
     turn = jnp.where(jnp.isnan(pose[2]), 0.0, jnp.arctan2(jnp.sin(pose[2] - yaw), jnp.cos(pose[2] - yaw)))
     # about the normal of the ground, in coordinates of the body
     spin = rotation(q).undo(Vector(*(turn * n for n in normal(field, to_x, to_y))))
-    velocity = [state.qvel[0] * jnp.cos(turn) - state.qvel[1] * jnp.sin(turn),
-                state.qvel[0] * jnp.sin(turn) + state.qvel[1] * jnp.cos(turn)]  # fmt: skip
+    velocity = [
+        state.qvel[0] * jnp.cos(turn) - state.qvel[1] * jnp.sin(turn),
+        state.qvel[0] * jnp.sin(turn) + state.qvel[1] * jnp.cos(turn),
+    ]
     qpos = state.qpos.at[:7].set(jnp.stack([to_x, to_y, z, *integrate(q, spin, 1.0)]))
     heat, offset = {}, {}
     for part in ("winding", "housing"):
@@ -84,6 +86,8 @@ def begin_at(params: Params, state: Any, measured: Mapping[str, Any]) -> Any:
         heat[part] = jnp.where(known, measured[part] - REFERENCE_TEMPERATURE, getattr(state.temperature, part))
         offset[f"{part}_lost"] = jnp.where(known, 0.0, getattr(state.temperature, f"{part}_lost"))
     return dataclasses.replace(
-        state, qpos=qpos, qvel=state.qvel.at[:2].set(jnp.stack(velocity)),
+        state,
+        qpos=qpos,
+        qvel=state.qvel.at[:2].set(jnp.stack(velocity)),
         temperature=dataclasses.replace(state.temperature, **heat, **offset),
-    )  # fmt: skip
+    )

@@ -19,10 +19,22 @@ if TYPE_CHECKING:
 K = TypeVar("K", bound=Hashable)
 
 DATASHEET = {
-    "position": 0.005, "world": 0.005, "body": 0.005, "roll": 0.1, "pitch": 0.1, "yaw": 0.2, "quaternion": 0.002,
-    "gyro": 0.002, "accelerometer": 0.02, "joint": 0.005, "bus": 0.05, "winding": 0.3, "housing": 0.3,
-    "wheel": 0.002, "drawbar": 1.0,
-}  # fmt: skip
+    "position": 0.005,
+    "world": 0.005,
+    "body": 0.005,
+    "roll": 0.1,
+    "pitch": 0.1,
+    "yaw": 0.2,
+    "quaternion": 0.002,
+    "gyro": 0.002,
+    "accelerometer": 0.02,
+    "joint": 0.005,
+    "bus": 0.05,
+    "winding": 0.3,
+    "housing": 0.3,
+    "wheel": 0.002,
+    "drawbar": 1.0,
+}
 """Standard deviation by the first word of a channel, in its unit, where a log states nothing: visual odometry of a few
 millimetres, a tactical MEMS IMU, 12-bit encoders, thermistors of 0.3 K."""
 _ELECTRICAL = {"A": 0.01, "V": 0.05, "Nm": 0.2}

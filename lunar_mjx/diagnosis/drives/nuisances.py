@@ -58,19 +58,49 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
     `stood` tells whether the time for which the rover had stood is one.
     """
     found = [
-        Coordinate(NUISANCE, name, run.start[name], _START[name][0], run.start[name] - _START[name][1],
-                   run.start[name] + _START[name][1], prior=10.0, log_index=number)
-        for name in run.unknown if name in _START
-    ]  # fmt: skip
+        Coordinate(
+            NUISANCE,
+            name,
+            run.start[name],
+            _START[name][0],
+            run.start[name] - _START[name][1],
+            run.start[name] + _START[name][1],
+            prior=10.0,
+            log_index=number,
+        )
+        for name in run.unknown
+        if name in _START
+    ]
     if stood:
-        found.append(Coordinate(NUISANCE, STOOD, run.start[STOOD], _STOOD_SCALE, SETTLE, _STOOD_MOST, prior=10.0,
-                                physical=True, log_index=number))  # fmt: skip
+        found.append(
+            Coordinate(
+                NUISANCE,
+                STOOD,
+                run.start[STOOD],
+                _STOOD_SCALE,
+                SETTLE,
+                _STOOD_MOST,
+                prior=10.0,
+                physical=True,
+                log_index=number,
+            )
+        )
     for s in observations.series:
         if s.log == number and is_encoder(s):
             first = float(np.mean(observations.value[s.start : s.stop][:5]))
             scale = 3.0 * float(observations.sigma()[s.start])
-            found.append(Coordinate(NUISANCE, s.channel, first, scale, first - 30.0 * scale, first + 30.0 * scale,
-                                    prior=10.0, log_index=number))  # fmt: skip
+            found.append(
+                Coordinate(
+                    NUISANCE,
+                    s.channel,
+                    first,
+                    scale,
+                    first - 30.0 * scale,
+                    first + 30.0 * scale,
+                    prior=10.0,
+                    log_index=number,
+                )
+            )
     return found
 
 

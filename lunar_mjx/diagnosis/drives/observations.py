@@ -51,6 +51,11 @@ def observations_of(
     names = tuple(log.name for log in logs)
     split = tuple(splits.get(n, d) for n, d in zip(names, default, strict=True))
     return Observations(
-        value=np.concatenate(value), series=tuple(series), logs=names, split=split,
-        unit=np.concatenate(unit), unit_split=split, unit_names=names,
-    )  # fmt: skip
+        value=np.concatenate(value),
+        series=tuple(series),
+        logs=names,
+        split=split,
+        unit=np.concatenate(unit),
+        unit_split=split,
+        unit_names=names,
+    )

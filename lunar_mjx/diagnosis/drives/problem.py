@@ -161,8 +161,17 @@ class DriveProblem(Problem):
         self, candidates: Mapping[str, Effect], progress: Progress = silent, model: Model | None = None
     ) -> DriveProblem:
         """The same logs with other candidates, against another model if one is given."""
-        return DriveProblem(self.logs, model or self.model, candidates, self._splits, self._baseline_spec,
-                            self._channels, self.bench.chunk, self.bench.engine, progress)  # fmt: skip
+        return DriveProblem(
+            self.logs,
+            model or self.model,
+            candidates,
+            self._splits,
+            self._baseline_spec,
+            self._channels,
+            self.bench.chunk,
+            self.bench.engine,
+            progress,
+        )
 
     def instead(self, model: Model, candidates: Mapping[str, Effect], progress: Progress = silent) -> DriveProblem:
         """The same logs, with the noise as it was learnt, against another model of the same rover."""

@@ -211,12 +211,16 @@ def stack_logs(
         ground = terrains[0] if shared else jax.tree.map(lambda *a: np.stack(a), *terrains)
         ground = jax.device_put(ground)
     return Logs(
-        program=program, numbers=tuple(numbers), params=jax.tree.map(lambda *a: np.stack(a), *bare),
+        program=program,
+        numbers=tuple(numbers),
+        params=jax.tree.map(lambda *a: np.stack(a), *bare),
         start={n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature", STOOD)},
-        terrain=ground, shared=shared,
+        terrain=ground,
+        shared=shared,
         commands=np.stack([_padded(r.commands, length) for r in runs]),
-        logs=tuple(logs), begin=tuple(r.begin for r in runs),
-    )  # fmt: skip
+        logs=tuple(logs),
+        begin=tuple(r.begin for r in runs),
+    )
 
 
 def cores() -> int:

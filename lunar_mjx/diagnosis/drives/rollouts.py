@@ -83,9 +83,18 @@ class Bench:
         modes, gains = (tuple(sorted(d.items())) for d in (run.model.modes, run.model.gains))
         model = run.model
         key = (
-            str(model.rover.folder), model.timestep, model.thermal_integrator, tuple(id(e) for e in model.effects),
-            self.engine, modes, gains, shapes, run.every, run.imu_position, wanted,
-        )  # fmt: skip
+            str(model.rover.folder),
+            model.timestep,
+            model.thermal_integrator,
+            tuple(id(e) for e in model.effects),
+            self.engine,
+            modes,
+            gains,
+            shapes,
+            run.every,
+            run.imu_position,
+            wanted,
+        )
         if key not in _PROGRAMS:
             while len(_PROGRAMS) >= _MOST_PROGRAMS:
                 _PROGRAMS.pop(next(iter(_PROGRAMS)))
@@ -226,8 +235,9 @@ def _params(model: Model) -> Params:
     """
     effects = {e.name: {k: np.asarray(v, float) for k, v in model.parameters[e.name].items()} for e in model.effects}
     terrain = jax.tree.map(_array, dataclasses.replace(model.terrain, name=""))
-    return Params(np.asarray(model.gravity, float), Ambient(*(np.asarray(v, float) for v in model.ambient)), effects,
-                  terrain)  # fmt: skip
+    return Params(
+        np.asarray(model.gravity, float), Ambient(*(np.asarray(v, float) for v in model.ambient)), effects, terrain
+    )
 
 
 def _array(leaf: Any) -> np.ndarray:

@@ -98,8 +98,9 @@ def _suggestion(
 ) -> Suggestion:
     ports, targets = (list(dict.fromkeys(getattr(p, name) for p in parts)) for name in ("port", "target"))
     formula = "; ".join(p.formula for p in parts)
-    return Suggestion(" and ".join(ports), " and ".join(targets), formula, tuple(parts), chi2, *gained, error, at_noise,
-                      length)  # fmt: skip
+    return Suggestion(
+        " and ".join(ports), " and ".join(targets), formula, tuple(parts), chi2, *gained, error, at_noise, length
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,14 +132,17 @@ class Discovery:
         lines = [f"Port {self.port}; {self.number} formulas scored:"]
         for i, s in enumerate(self.suggestions, 1):
             lines.append(f"  {i}. " + "; and ".join(p.text() for p in s.parts))
-            lines.append(f"     chi2 -{s.chi2:.0f}, held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
-                         + (", at the noise" if s.at_noise else ""))  # fmt: skip
+            lines.append(
+                f"     chi2 -{s.chi2:.0f}, held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
+                + (", at the noise" if s.at_noise else "")
+            )
         if self.ceiling is not None:
             lines.append(f"  any smooth input at this port explains chi2 of at most about {self.ceiling:.0f}")
         if self.files:
             runs = ["RUN", *(f"run{k + 2}" for k in range(len(self.files)))]
-            then = ", then ".join(f"lunar-mjx add {a} {file} -o {b}" for a, file, b in zip(runs, self.files, runs[1:],
-                                                                                           strict=False))  # fmt: skip
+            then = ", then ".join(
+                f"lunar-mjx add {a} {file} -o {b}" for a, file, b in zip(runs, self.files, runs[1:], strict=False)
+            )
             lines.append(f"Effect file: {', '.join(self.files)}; look at it, then: {then}")
         else:
             lines.append("No formula pays on manoeuvres left out; none is written.")
@@ -191,8 +195,9 @@ def discover(
             text = functools.partial(with_amount, term, part.amount, provenance=provenance, constants=values)
             files.append(str(_write(run, Path(out) if out else None, part.port, k, text)))
     ceiling = max((v for k, v in place.get("ceiling", {}).items() if k.partition(":")[0] == port), default=None)
-    result = Discovery(port, tuple(s for s, _ in found), tuple(scored[:LISTED]), ceiling, tuple(files),
-                       errors(problem, base), number)  # fmt: skip
+    result = Discovery(
+        port, tuple(s for s, _ in found), tuple(scored[:LISTED]), ceiling, tuple(files), errors(problem, base), number
+    )
     run.save(UNKNOWN_FILE, result.to_dict())
     return result
 
@@ -237,10 +242,26 @@ def _of_trial(trial: Trial, base: Fit) -> Row:
             nominal, _, unit, *_ = CONSTANTS[choice.shape]
             constants[choice.shape] = float(nominal * problem.coordinates[shape[0]].value(trial.fit.u[shape[0]])), unit
         t = choice.term
-        parts.append(Part(t.port, t.target, t.formula, t.latex, float(scale * trial.fit.u[amount]),
-                          float(scale * root[free.index(amount)]), t.unit, constants))  # fmt: skip
-    suggestion = _suggestion(parts, base.chi2 - trial.fit.chi2, (trial.gain, trial.gain_se),
-                             errors(problem, trial.fit), trial.at_noise, trial.length)  # fmt: skip
+        parts.append(
+            Part(
+                t.port,
+                t.target,
+                t.formula,
+                t.latex,
+                float(scale * trial.fit.u[amount]),
+                float(scale * root[free.index(amount)]),
+                t.unit,
+                constants,
+            )
+        )
+    suggestion = _suggestion(
+        parts,
+        base.chi2 - trial.fit.chi2,
+        (trial.gain, trial.gain_se),
+        errors(problem, trial.fit),
+        trial.at_noise,
+        trial.length,
+    )
     return suggestion, tuple(c.term for _, (c, _) in sorted(trial.slots.held.items()))
 
 
@@ -263,8 +284,14 @@ def suggest(
         std = c.std(fitted.u[place], float(fitted.covariance(problem)[k, k]) ** 0.5)
         t = library[s.effect]
         part = Part(t.port, t.target, t.formula, t.latex, float(c.value(fitted.u[place])), std, t.unit)
-        suggestion = _suggestion([part], base.chi2 - fitted.chi2, gain(problem, base, fitted), errors(problem, fitted),
-                                 noise_test(problem, fitted).passes, t.length)  # fmt: skip
+        suggestion = _suggestion(
+            [part],
+            base.chi2 - fitted.chi2,
+            gain(problem, base, fitted),
+            errors(problem, fitted),
+            noise_test(problem, fitted).passes,
+            t.length,
+        )
         found.append((suggestion, (t,)))
     found.sort(key=lambda row: -(2.0 * row[0].held_out_gain - PENALTY * row[0].length))
     return found, scored

@@ -97,8 +97,9 @@ def _print_of(expression: Expr, symbols: Sequence[Any]) -> bytes:
     """Values at random arguments on a scale of their own, rounded: alike for what is algebraically equal."""
     rng = np.random.default_rng(7)
     size = 24
-    arguments = [rng.uniform(0.05, 1.5, size) * (1.0 if s.is_positive else rng.choice([-1.0, 1.0], size))
-                 for s in symbols]  # fmt: skip
+    arguments = [
+        rng.uniform(0.05, 1.5, size) * (1.0 if s.is_positive else rng.choice([-1.0, 1.0], size)) for s in symbols
+    ]
     values = np.broadcast_to(np.asarray(function(expression, symbols)(*arguments), float), (size,))
     largest = values[np.argmax(np.abs(values))]
     values = values / largest if largest else values

@@ -188,8 +188,14 @@ class _Search:
         power = np.sum(signature**2, axis=0)
         amount = signature.T @ residual[keep] / np.where(power > 1e-6, power, np.inf)
         chi2 = np.where(np.abs(amount) < _FAR, amount**2 * power, 0.0)
-        return _Scores([c for o in out for c in o[0]], chi2, amount, signature,
-                       np.concatenate([o[2] for o in out], axis=1), np.concatenate([o[3] for o in out]))  # fmt: skip
+        return _Scores(
+            [c for o in out for c in o[0]],
+            chi2,
+            amount,
+            signature,
+            np.concatenate([o[2] for o in out], axis=1),
+            np.concatenate([o[3] for o in out]),
+        )
 
     def _without(self, slots: Slots, at: Fit, dropped: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residual, and the columns and the leash of all that moves, of a fit without one of its formulas."""

@@ -225,12 +225,18 @@ class Slots:
         for test, sinkage in zip(self.problem.tests, self._sinkages(u), strict=True):
             rim, beta = np.asarray(test.rim_speed), np.asarray(test.slip_angle)
             v_x = np.asarray(test.travel_speed) * np.cos(beta)
-            values = {"s": (rim - v_x) / np.maximum(np.maximum(rim, np.abs(v_x)), 1e-9), "z": sinkage,
-                      "beta": beta, "r": np.asarray(test.radius),
-                      "W": np.asarray(test.normal_load)}  # fmt: skip
+            values = {
+                "s": (rim - v_x) / np.maximum(np.maximum(rim, np.abs(v_x)), 1e-9),
+                "z": sinkage,
+                "beta": beta,
+                "r": np.asarray(test.radius),
+                "W": np.asarray(test.normal_load),
+            }
             values |= {k: np.asarray(v[0]) for k, v in CONSTANTS.items()}
-            rows = np.stack([np.broadcast_to(of(**{n: values[n] for n in names}), sinkage.shape)
-                             for names, of in _functions(port)], axis=1)  # fmt: skip
+            rows = np.stack(
+                [np.broadcast_to(of(**{n: values[n] for n in names}), sinkage.shape) for names, of in _functions(port)],
+                axis=1,
+            )
             columns.append(rows)
         out = np.zeros((len(self.problem.observations), len(features(port))))
         for s in self.problem.observations.series:

@@ -25,9 +25,14 @@ _FORCES = (
     Quantity("M_y", "value.moment.y", "N m", "moment about the axle"),
     Quantity("d", "value.direction", "1", "direction of rolling"),
     Quantity("side", "jnp.tanh(20.0 * value.slip_y)", "1", "side to which the wheel slides"),
-    Quantity("q", f"{_SHARE} / jnp.where(ctx.soil.cohesion + {_SHARE} > 0.0, ctx.soil.cohesion + {_SHARE}, 1.0)", "1",
-             "share of friction in the shear strength", True),
-)  # fmt: skip
+    Quantity(
+        "q",
+        f"{_SHARE} / jnp.where(ctx.soil.cohesion + {_SHARE} > 0.0, ctx.soil.cohesion + {_SHARE}, 1.0)",
+        "1",
+        "share of friction in the shear strength",
+        True,
+    ),
+)
 _JOINT = (
     Quantity("omega", "ctx.joint_speed", "rad/s", "speed of the joint"),
     Quantity("T_R", "ctx.winding_temperature", "K", "temperature of the winding", True),
@@ -36,16 +41,25 @@ _JOINT = (
 _CURRENT = Quantity("I", "ctx.command.current", "A", "motor current")
 SEEN: Mapping[str, tuple[Quantity, ...]] = {
     "soil": _CONTACT,
-    "wheel_normal": (*_CONTACT, Quantity("W", "value.load", "N", "load that the soil carries", True),
-                     Quantity("R", "value.resistance", "N", "resistance of compaction", True)),
-    "wheel_shear": (*_CONTACT, Quantity("W", "ctx.normal.load", "N", "load that the soil carries", True),
-                    Quantity("R", "ctx.normal.resistance", "N", "resistance of compaction", True), *_FORCES),
+    "wheel_normal": (
+        *_CONTACT,
+        Quantity("W", "value.load", "N", "load that the soil carries", True),
+        Quantity("R", "value.resistance", "N", "resistance of compaction", True),
+    ),
+    "wheel_shear": (
+        *_CONTACT,
+        Quantity("W", "ctx.normal.load", "N", "load that the soil carries", True),
+        Quantity("R", "ctx.normal.resistance", "N", "resistance of compaction", True),
+        *_FORCES,
+    ),
     **dict.fromkeys(("motor_torque", "heat"), (_CURRENT, *_JOINT)),
     "command": (dataclasses.replace(_CURRENT, code="value.current"), *_JOINT),
-    "body_wrench": (Quantity("v", "ctx.velocity.dot(ctx.frame.forward)", "m/s", "speed forward"),
-                    Quantity("climb", "ctx.frame.forward.z", "1", "sine of the pitch")),
+    "body_wrench": (
+        Quantity("v", "ctx.velocity.dot(ctx.frame.forward)", "m/s", "speed forward"),
+        Quantity("climb", "ctx.frame.forward.z", "1", "sine of the pitch"),
+    ),
     "geometry": (),
-}  # fmt: skip
+}
 """What formulas at a port may hold."""
 
 CONSTANTS: Mapping[str, tuple[float, tuple[float, float], str, str, bool]] = {
@@ -71,8 +85,16 @@ def known(port: str) -> tuple[Quantity, ...]:
 
 
 ONE = "1"
-SLIP = ("s", "Abs(s)", "Max(s, 0)", "Max(-s, 0)", "1 - s", "log(Max(1 - s, 1/50))", "1 - exp(-Abs(s)/s_0)",
-        "Max(Abs(s) - s_0, 0)")  # fmt: skip
+SLIP = (
+    "s",
+    "Abs(s)",
+    "Max(s, 0)",
+    "Max(-s, 0)",
+    "1 - s",
+    "log(Max(1 - s, 1/50))",
+    "1 - exp(-Abs(s)/s_0)",
+    "Max(Abs(s) - s_0, 0)",
+)
 ANGLE = ("Abs(sin(beta))", "cos(beta)", "Abs(beta)", "Max(Abs(beta) - beta_0, 0)")
 DEPTH = ("z/r", "z**2/r**2", "log(Max(z/r, 1/1000))", "Max(z/r - z_0, 0)")
 LOAD = ("W/W_1", "log(Max(W/W_1, 1/1000))")
@@ -126,8 +148,10 @@ def _force(axis: str) -> str:
 
 _TORQUE = "dataclasses.replace(value, moment=value.moment._replace(y=value.moment.y - extra))"
 _GRIP = "dataclasses.replace(value, grip=factor if value.grip is None else value.grip * factor)"
-_EXPONENT = ("dataclasses.replace(value, n=value.n + extra, k_c=value.k_c * ctx.geometry.radius ** -extra, "
-             "k_phi=value.k_phi * ctx.geometry.radius ** -extra)")  # fmt: skip
+_EXPONENT = (
+    "dataclasses.replace(value, n=value.n + extra, k_c=value.k_c * ctx.geometry.radius ** -extra, "
+    "k_phi=value.k_phi * ctx.geometry.radius ** -extra)"
+)
 
 STIFFNESS = _scaled("soil", "stiffness", "k", 0.5, "k_c", "k_phi")
 STRENGTH = _scaled("soil", "shear strength", "tau", 0.2, "cohesion", "tan_phi")
@@ -143,8 +167,9 @@ def carried(base: Target, carrier: str, sizes: Mapping[str, float]) -> Target:
     return dataclasses.replace(base, carrier=carrier, unit="1", size=sizes.get(carrier, 0.1))
 
 
-RESIST = Target("wheel_normal", "resistance", "R", "N", 5.0, "1",
-                "dataclasses.replace(value, resistance=value.resistance + extra)")  # fmt: skip
+RESIST = Target(
+    "wheel_normal", "resistance", "R", "N", 5.0, "1", "dataclasses.replace(value, resistance=value.resistance + extra)"
+)
 ALONG = Target("wheel_shear", "longitudinal force", "F_x", "N", 5.0, "d", _force("x"))
 LEFT = Target("wheel_shear", "lateral force", "F_y", "N", 5.0, "1", _force("y"))
 AGAINST = Target("wheel_shear", "lateral force", "F_y", "N", 5.0, "-side", _force("y"))
@@ -156,19 +181,30 @@ def wheel_targets(port: str) -> tuple[Target, ...]:
     """All that formulas may change at a port of a wheel: fields one by one, and what has their unit with every product
     of forces and lengths that matches it."""
     if port == "soil":
-        one = [_scaled("soil", "angle of friction", "tan_phi", 0.2, "tan_phi"),
-               _scaled("soil", "longitudinal shear modulus", "K_x", 0.5, "shear_modulus_x"),
-               _scaled("soil", "lateral shear modulus", "K_y", 0.5, "shear_modulus_y"),
-               Target("soil", "cohesion", "c", "Pa", 500.0, "1",
-                      "dataclasses.replace(value, cohesion=jnp.maximum(value.cohesion + extra, 0.0))"),
-               Target("soil", "sinkage exponent", "n", "1", 0.2, "1", _EXPONENT, bound=5.0)]  # fmt: skip
+        one = [
+            _scaled("soil", "angle of friction", "tan_phi", 0.2, "tan_phi"),
+            _scaled("soil", "longitudinal shear modulus", "K_x", 0.5, "shear_modulus_x"),
+            _scaled("soil", "lateral shear modulus", "K_y", 0.5, "shear_modulus_y"),
+            Target(
+                "soil",
+                "cohesion",
+                "c",
+                "Pa",
+                500.0,
+                "1",
+                "dataclasses.replace(value, cohesion=jnp.maximum(value.cohesion + extra, 0.0))",
+            ),
+            Target("soil", "sinkage exponent", "n", "1", 0.2, "1", _EXPONENT, bound=5.0),
+        ]
         return (STIFFNESS, STRENGTH, MODULUS, *one)
     named = {q.name: q for q in SEEN[port]}
     if port == "wheel_normal":
         loads = matching((1, 0), [(named["W"], (1, 0)), (named["R"], (1, 0))], named["r"])
         return (CARRIED, RESIST, *(carried(RESIST, c, {}) for c in loads))
-    forces = [(named[n], unit) for n, unit in (("W", (1, 0)), ("R", (1, 0)), ("F_x", (1, 0)), ("F_y", (1, 0)),
-                                               ("M_y", (1, 1)))]  # fmt: skip
+    forces = [
+        (named[n], unit)
+        for n, unit in (("W", (1, 0)), ("R", (1, 0)), ("F_x", (1, 0)), ("F_y", (1, 0)), ("M_y", (1, 1)))
+    ]
     found = [GRIP, dataclasses.replace(GRIP, words="friction", carrier="q"), SHEAR]
     for base, unit in ((ALONG, (1, 0)), (LEFT, (1, 0)), (AGAINST, (1, 0)), (DRIVE, (1, 1))):
         own = "" if base.carrier == "1" else f"{base.carrier}*"

@@ -88,8 +88,10 @@ def with_amount(
         if found is None:
             continue
         # a search may end beyond the bounds that a term is given at first
-        low, high = (b(float(found[n]), value * s) for b, n, s in ((min, 3, 0.1 if value > 0.0 else 10.0),
-                                                                   (max, 4, 10.0 if value > 0.0 else 0.1)))  # fmt: skip
+        low, high = (
+            b(float(found[n]), value * s)
+            for b, n, s in ((min, 3, 0.1 if value > 0.0 else 10.0), (max, 4, 10.0 if value > 0.0 else 0.1))
+        )
         low, high = (min(low, -high), max(high, -low)) if found[2] == "0.0" else (low, high)
         text = text.replace(found[0], f"{key}=Parameter({value:.6g}, {found[2]}, ({low!r}, {high!r})", 1)
     return text.replace('source="suggested"', f"source={provenance!r}")
@@ -103,9 +105,15 @@ def terms(port: str, sensors: Sequence[str] = ()) -> list[Term]:
       sensors: kinds of channels for the port `sensor`, such as `motor_drive_current_A`.
     """
     makers = {
-        "soil": _soil, "wheel_normal": _normal, "wheel_shear": _shear, "motor_torque": _motor, "heat": _heat,
-        "command": _command, "body_wrench": _body, "geometry": _geometry,
-    }  # fmt: skip
+        "soil": _soil,
+        "wheel_normal": _normal,
+        "wheel_shear": _shear,
+        "motor_torque": _motor,
+        "heat": _heat,
+        "command": _command,
+        "body_wrench": _body,
+        "geometry": _geometry,
+    }
     return list(_sensor(sensors)) if port == "sensor" else list(makers[port]())
 
 
@@ -153,8 +161,9 @@ def _file(made: Term, lines: Sequence[str], change: str, bound: float = 1e3, ord
     body = "\n".join(f"    {line}" for line in (*lines, f"return {change}"))
     given = "".join(
         f'    {name}=Parameter({n!r}, None, {b!r}, "{u}", "{m}", "choice"),\n'
-        for name, (n, b, u, m, _) in CONSTANTS.items() if re.search(rf"\bp\.{name}\b", body)
-    )  # fmt: skip
+        for name, (n, b, u, m, _) in CONSTANTS.items()
+        if re.search(rf"\bp\.{name}\b", body)
+    )
     limit = bound * made.size
     source = f'''{SUGGESTED}: {made.target}, {made.formula}."""
 
@@ -177,8 +186,20 @@ def {made.name}(ctx, p, x, value):
     return dataclasses.replace(made, source=source)
 
 
-_FEW = ("1", "s", "Max(s, 0)", "Max(-s, 0)", "s**2", "Abs(sin(beta))", "sin(beta)**2", "z/r", "z**2/r**2",
-        "Abs(s)*z/r", "Abs(s)*Abs(sin(beta))", "Abs(sin(beta))*z/r")  # fmt: skip
+_FEW = (
+    "1",
+    "s",
+    "Max(s, 0)",
+    "Max(-s, 0)",
+    "s**2",
+    "Abs(sin(beta))",
+    "sin(beta)**2",
+    "z/r",
+    "z**2/r**2",
+    "Abs(s)*z/r",
+    "Abs(s)*Abs(sin(beta))",
+    "Abs(sin(beta))*z/r",
+)
 """Factors of a wheel's terms where each has to be simulated by itself."""
 _HEAVY = "log(Max(W/W_1, 1/1000))"
 """Where a table holds one load only, such a term is a change of the soil."""
@@ -217,22 +238,42 @@ def _joints(port: str, words: str, symbol: str, unit: str, change: str, carrier:
 
 def _motor() -> Iterator[Term]:
     target = _joints("motor_torque", "torque", "tau", "N m", "value + extra", "-1")
-    for factor in (_SIGN, "omega", "omega*Abs(omega)", f"{_SIGN}*Abs(I)", "I", "I*Abs(I)", f"omega*{_WARM}",
-                   f"{_SIGN}*{_WARM}", f"I*{_WARM}", f"I*{_WOUND}", "I*Abs(omega)", "1"):  # fmt: skip
+    for factor in (
+        _SIGN,
+        "omega",
+        "omega*Abs(omega)",
+        f"{_SIGN}*Abs(I)",
+        "I",
+        "I*Abs(I)",
+        f"omega*{_WARM}",
+        f"{_SIGN}*{_WARM}",
+        f"I*{_WARM}",
+        f"I*{_WOUND}",
+        "I*Abs(omega)",
+        "1",
+    ):
         yield term(dataclasses.replace(target, size=3.0 if "I" in factor else 0.3), factor)
 
 
 def _heat() -> Iterator[Term]:
     for node in ("winding", "housing"):
-        target = _joints("heat", f"heat into the {node}", "Q", "W", f"dataclasses.replace(value, {node}=value.{node} + "
-                         "extra)")  # fmt: skip
+        target = _joints(
+            "heat", f"heat into the {node}", "Q", "W", f"dataclasses.replace(value, {node}=value.{node} + extra)"
+        )
         for factor in ("1", "Abs(omega)", "omega**2", "Abs(I)", "I**2", "Abs(I*omega)", _WARM, _WOUND):
             yield term(target, factor)
 
 
 def _command() -> Iterator[Term]:
-    target = Target("command", "motor current", "I", "1", 0.05, "I", "dataclasses.replace(value, current=value.current "
-                    f"+ {_DRIVEN.format('extra')})")  # fmt: skip
+    target = Target(
+        "command",
+        "motor current",
+        "I",
+        "1",
+        0.05,
+        "I",
+        f"dataclasses.replace(value, current=value.current + {_DRIVEN.format('extra')})",
+    )
     for factor in ("1", "Abs(omega)", _WARM, _WOUND):
         yield term(target, factor)
 
@@ -246,10 +287,26 @@ def _body() -> Iterator[Term]:
 
 
 def _geometry() -> Iterator[Term]:
-    yield term(Target("geometry", "wheel radius", "r", "1", 0.02, "1", "dataclasses.replace(value, "
-                      "radius=value.radius * factor)", bound=10.0), "1", linear=True)  # fmt: skip
-    yield term(Target("geometry", "toe", "toe", "rad", 0.02, "1", "dataclasses.replace(value, toe=value.toe + extra)",
-                      bound=10.0), "1")  # fmt: skip
+    yield term(
+        Target(
+            "geometry",
+            "wheel radius",
+            "r",
+            "1",
+            0.02,
+            "1",
+            "dataclasses.replace(value, radius=value.radius * factor)",
+            bound=10.0,
+        ),
+        "1",
+        linear=True,
+    )
+    yield term(
+        Target(
+            "geometry", "toe", "toe", "rad", 0.02, "1", "dataclasses.replace(value, toe=value.toe + extra)", bound=10.0
+        ),
+        "1",
+    )
 
 
 def _sensor(kinds: Sequence[str]) -> Iterator[Term]:
@@ -259,21 +316,37 @@ def _sensor(kinds: Sequence[str]) -> Iterator[Term]:
         test = " and ".join([f"name.startswith({first!r} + '_')", *(f"{('_' + w)!r} in name" for w in words)])
         pick = [f"chosen = [name for name in value.channels if {test}]"]
         for shown, code, per, size in (
-            ("a", "jnp.ones_like(value.channels[name])", unit, 0.05), ("a*y", "value.channels[name]", "1", 0.02),
+            ("a", "jnp.ones_like(value.channels[name])", unit, 0.05),
+            ("a*y", "value.channels[name]", "1", 0.02),
             ("a*dy/dt", "slope(value.channels[name], value.time)", "s", 0.05),
             ("a*t", "value.time", f"{unit}/s", 0.005),
-        ):  # fmt: skip
+        ):
             made = Term("sensor", kind, f"y += {shown}", per, size, "", f"y += {shown}", len(shown), shown)
             changed = f"changed = {{name: value.channels[name] + p.amount * {code} for name in chosen}}"
             found = _file(made, [*pick, changed], "value.with_channels(changed)")
-            yield dataclasses.replace(found, source=found.source.replace(
-                "from lunar_mjx.effects import Parameter, effect",
-                "from lunar_mjx.effects import Parameter, effect\nfrom lunar_mjx.effects.sensor.channels import slope",
-            ))  # fmt: skip
+            yield dataclasses.replace(
+                found,
+                source=found.source.replace(
+                    "from lunar_mjx.effects import Parameter, effect",
+                    "from lunar_mjx.effects import Parameter, effect\n"
+                    "from lunar_mjx.effects.sensor.channels import slope",
+                ),
+            )
 
 
-_UNITS = {"m": "m", "s": "m/s", "s2": "m/s2", "rad": "rad", "deg": "deg", "A": "A", "V": "V", "Nm": "N m", "N": "N",
-          "degC": "K", "ratio": "1"}  # fmt: skip
+_UNITS = {
+    "m": "m",
+    "s": "m/s",
+    "s2": "m/s2",
+    "rad": "rad",
+    "deg": "deg",
+    "A": "A",
+    "V": "V",
+    "Nm": "N m",
+    "N": "N",
+    "degC": "K",
+    "ratio": "1",
+}
 
 
 def _unit_of(kind: str) -> str:

@@ -41,14 +41,23 @@ def panels(result: Result) -> list[Block]:
     channels, units = list(dict.fromkeys(c for c, _ in cells)), sorted({u for _, u in cells})
     rms = {key: float(np.sqrt(np.nanmean(residual[at] ** 2))) for key, at in cells.items()}
     z = [[rms.get((c, u)) for u in units] for c in channels]
-    figure = go.Figure(go.Heatmap(
-        x=[plot_text(o.unit_names[u], 30) for u in units], y=[plot_text(channel_label(c)) for c in channels],
-        z=[[None if v is None else float(np.log10(max(v, 0.3))) for v in line] for line in z],
-        text=[[shown(v) if v is not None else "" for v in line] for line in z], texttemplate="%{text}",
-        customdata=[[_key(c, u) for u in units] for c in channels], colorscale=SHADES, zmin=np.log10(0.7),
-        zmax=max(np.log10(3.0), np.log10(max(rms.values()))), showscale=False, xgap=1, ygap=1,
-        hovertemplate="%{y}, %{x}: %{text} sigma<extra></extra>",
-    ))  # fmt: skip
+    figure = go.Figure(
+        go.Heatmap(
+            x=[plot_text(o.unit_names[u], 30) for u in units],
+            y=[plot_text(channel_label(c)) for c in channels],
+            z=[[None if v is None else float(np.log10(max(v, 0.3))) for v in line] for line in z],
+            text=[[shown(v) if v is not None else "" for v in line] for line in z],
+            texttemplate="%{text}",
+            customdata=[[_key(c, u) for u in units] for c in channels],
+            colorscale=SHADES,
+            zmin=np.log10(0.7),
+            zmax=max(np.log10(3.0), np.log10(max(rms.values()))),
+            showscale=False,
+            xgap=1,
+            ygap=1,
+            hovertemplate="%{y}, %{x}: %{text} sigma<extra></extra>",
+        )
+    )
     finish(figure, 170 + 22 * len(channels), margin={"l": 270, "r": 16, "t": 36, "b": 110})
     figure.update_yaxes(autorange="reversed", showgrid=False, type="category")
     figure.update_xaxes(tickangle=-35, showgrid=False, type="category")
@@ -85,11 +94,18 @@ def dependence(result: Result) -> list[Block]:
             mine = np.concatenate([np.arange(s.start, s.stop) for s in o.series if s.channel == channel])
             x, mean, error = _binned(covariate[mine], residual[mine])
             figure.add_scatter(
-                x=x, y=mean, error_y={"type": "data", "array": error, "thickness": 1, "width": 2}, mode="lines+markers",
-                name=plot_text(channel_label(channel)), legendgroup=channel, showlegend=n == 0,
-                line={"color": look.colour, "dash": look.dash}, marker={"color": look.colour, "symbol": look.symbol},
-                hovertemplate="%{x:.3g}: %{y:.3g} sigma<extra></extra>", **at,
-            )  # fmt: skip
+                x=x,
+                y=mean,
+                error_y={"type": "data", "array": error, "thickness": 1, "width": 2},
+                mode="lines+markers",
+                name=plot_text(channel_label(channel)),
+                legendgroup=channel,
+                showlegend=n == 0,
+                line={"color": look.colour, "dash": look.dash},
+                marker={"color": look.colour, "symbol": look.symbol},
+                hovertemplate="%{x:.3g}: %{y:.3g} sigma<extra></extra>",
+                **at,
+            )
         figure.update_xaxes(title_text=name, **at)
     finish(figure, 120 + 260 * rows, margin={"l": 62, "r": 16, "t": 70, "b": 52})
     figure.update_yaxes(title_text="mean residual, sigma", col=1)
@@ -120,22 +136,42 @@ def gallery(result: Result) -> list[Block]:
         return []
     columns = min(2, len(drawn))
     rows = -(-len(drawn) // columns)
-    titles = [f"{plot_text(e)}<br>{plot_text(channel_label(c))}, {plot_text(o.unit_names[u], 30)}"
-              for e, (c, u, _) in drawn.items()]  # fmt: skip
+    titles = [
+        f"{plot_text(e)}<br>{plot_text(channel_label(c))}, {plot_text(o.unit_names[u], 30)}"
+        for e, (c, u, _) in drawn.items()
+    ]
     figure = make_subplots(rows, columns, subplot_titles=titles, vertical_spacing=0.42 / rows, horizontal_spacing=0.08)
     for n, (effect, (_, _, at)) in enumerate(drawn.items()):
         x, name = _abscissa(traces, at)
         place: dict[str, Any] = {"row": n // columns + 1, "col": n % columns + 1}
-        figure.add_scatter(x=x, y=residual[at], mode="markers", name="residual of the refitted model",
-                           marker={"color": INK, "size": 4}, showlegend=n == 0, legendgroup="r", **place)  # fmt: skip
         figure.add_scatter(
-            x=x, y=shapes[effect][at], mode="lines" if o.place is None else "markers", name="the effect alone",
-            line={"color": ORANGE, "width": 2.5}, marker={"color": ORANGE, "size": 8, "symbol": "triangle-up-open"},
-            showlegend=n == 0, legendgroup="s", **place,
-        )  # fmt: skip
+            x=x,
+            y=residual[at],
+            mode="markers",
+            name="residual of the refitted model",
+            marker={"color": INK, "size": 4},
+            showlegend=n == 0,
+            legendgroup="r",
+            **place,
+        )
+        figure.add_scatter(
+            x=x,
+            y=shapes[effect][at],
+            mode="lines" if o.place is None else "markers",
+            name="the effect alone",
+            line={"color": ORANGE, "width": 2.5},
+            marker={"color": ORANGE, "size": 8, "symbol": "triangle-up-open"},
+            showlegend=n == 0,
+            legendgroup="s",
+            **place,
+        )
         figure.update_xaxes(title_text=name, **place)
-    finish(figure, 110 + 300 * rows, margin={"l": 62, "r": 16, "t": 110, "b": 52},
-           legend={"orientation": "h", "x": 0.0, "y": 1.0 + 0.22 / rows, "yanchor": "bottom"})  # fmt: skip
+    finish(
+        figure,
+        110 + 300 * rows,
+        margin={"l": 62, "r": 16, "t": 110, "b": 52},
+        legend={"orientation": "h", "x": 0.0, "y": 1.0 + 0.22 / rows, "yanchor": "bottom"},
+    )
     figure.update_yaxes(title_text="sigma", col=1)
     caption = (
         "Shapes of missing effects: what the simulator says each would add at the amount that fits best, less what a "
@@ -175,11 +211,22 @@ def _panel(traces: Traces, channel: str, unit: int, at: np.ndarray) -> dict[str,
     at, x = at[order], x[order]
     o, row = traces.observations, _baseline(traces)
     models = [row, len(traces.labels) - 1] if row < len(traces.labels) - 1 else [row]
-    y = [o.value[at], *(traces.predicted[m][at] for m in models), *([] for _ in range(2 - len(models))),
-         *(traces.residual[m][at] for m in models), *([] for _ in range(2 - len(models)))]  # fmt: skip
+    y = [
+        o.value[at],
+        *(traces.predicted[m][at] for m in models),
+        *([] for _ in range(2 - len(models))),
+        *(traces.residual[m][at] for m in models),
+        *([] for _ in range(2 - len(models))),
+    ]
     name = f"{channel_label(channel)}: {o.unit_names[unit]}"
-    return {"label": name, "title": plot_text(name, 100), "x": _plain(x), "y": [_plain(v) for v in y],
-            "x_title": x_title, "y_title": plot_text(channel_label(channel))}  # fmt: skip
+    return {
+        "label": name,
+        "title": plot_text(name, 100),
+        "x": _plain(x),
+        "y": [_plain(v) for v in y],
+        "x_title": x_title,
+        "y_title": plot_text(channel_label(channel)),
+    }
 
 
 def _plain(values: np.ndarray | list) -> list[float | None]:
@@ -191,19 +238,40 @@ def _detail(traces: Traces) -> go.Figure:
     figure = make_subplots(2, 1, shared_xaxes=True, row_heights=[0.64, 0.36], vertical_spacing=0.06)
     table = traces.observations.place is not None
     improved = traces.labels[-1] if _baseline(traces) < len(traces.labels) - 1 else "-"
-    looks = [("measured", MEASURED.colour, "circle", "solid"), (traces.labels[_baseline(traces)], ORANGE, "triangle-up",
-             "dot"), (improved, BLUE, "square", "solid")]  # fmt: skip
+    looks = [
+        ("measured", MEASURED.colour, "circle", "solid"),
+        (traces.labels[_baseline(traces)], ORANGE, "triangle-up", "dot"),
+        (improved, BLUE, "square", "solid"),
+    ]
     for n, (name, colour, symbol, dash) in enumerate(looks):
         figure.add_scatter(
-            x=[], y=[], name=plot_text(name), mode="markers" if n == 0 or table else "lines", showlegend=name != "-",
-            marker={"color": colour, "symbol": symbol, "size": 5}, line={"color": colour, "dash": dash, "width": 2},
-            row=1, col=1,
-        )  # fmt: skip
+            x=[],
+            y=[],
+            name=plot_text(name),
+            mode="markers" if n == 0 or table else "lines",
+            showlegend=name != "-",
+            marker={"color": colour, "symbol": symbol, "size": 5},
+            line={"color": colour, "dash": dash, "width": 2},
+            row=1,
+            col=1,
+        )
     for name, colour, symbol, _ in looks[1:]:
-        figure.add_scatter(x=[], y=[], name=plot_text(f"residual, {name}"), mode="markers", showlegend=False,
-                           marker={"color": colour, "symbol": symbol, "size": 4}, row=2, col=1)  # fmt: skip
-    finish(figure, 480, margin={"l": 70, "r": 16, "t": 90, "b": 52},
-           title={"x": 0.0, "xanchor": "left", "font": {"size": 14}})  # fmt: skip
+        figure.add_scatter(
+            x=[],
+            y=[],
+            name=plot_text(f"residual, {name}"),
+            mode="markers",
+            showlegend=False,
+            marker={"color": colour, "symbol": symbol, "size": 4},
+            row=2,
+            col=1,
+        )
+    finish(
+        figure,
+        480,
+        margin={"l": 70, "r": 16, "t": 90, "b": 52},
+        title={"x": 0.0, "xanchor": "left", "font": {"size": 14}},
+    )
     figure.update_yaxes(title_text="residual, sigma", row=2, col=1)
     return figure
 
@@ -214,9 +282,11 @@ def _covariates(traces: Traces) -> Mapping[str, np.ndarray]:
     if o.place is not None:
         return dict(zip(("slip ratio", "slip angle, deg", "load, N"), o.place.T, strict=False))
     wanted = {
-        "speed of the wheels, rad/s": ("joint_", "drive_speed_rad_s"), "pitch, deg": ("pitch_deg", ""),
-        "winding temperature, °C": ("winding_", "_degC"), "position x, m": ("position_x_m", ""),
-    }  # fmt: skip
+        "speed of the wheels, rad/s": ("joint_", "drive_speed_rad_s"),
+        "pitch, deg": ("pitch_deg", ""),
+        "winding temperature, °C": ("winding_", "_degC"),
+        "position x, m": ("position_x_m", ""),
+    }
     out = {"time, s": traces.time}
     for name, (begin, end) in wanted.items():
         out[name] = _along(o, begin, end)

@@ -37,30 +37,47 @@ def waterfall(
     ):
         if mask.any():
             figure.add_bar(
-                x=[x[i] for i in np.flatnonzero(mask)], base=low[mask].tolist(), y=(high - low)[mask].tolist(),
-                name=name, marker={"color": colour, "line": {"color": INK, "width": 1},
-                                   "pattern": {"shape": pattern, "fgcolor": INK, "fillmode": "overlay", "size": 7}},
+                x=[x[i] for i in np.flatnonzero(mask)],
+                base=low[mask].tolist(),
+                y=(high - low)[mask].tolist(),
+                name=name,
+                marker={
+                    "color": colour,
+                    "line": {"color": INK, "width": 1},
+                    "pattern": {"shape": pattern, "fgcolor": INK, "fillmode": "overlay", "size": 7},
+                },
                 hoverinfo="skip",
-            )  # fmt: skip
+            )
     figure.add_scatter(
-        x=x, y=value.tolist(), mode="markers+text", name=f"{measure} manoeuvres, with 95 % interval",
-        text=[f" {shown(v)}" for v in value], textposition="middle right", textfont={"size": 14},
+        x=x,
+        y=value.tolist(),
+        mode="markers+text",
+        name=f"{measure} manoeuvres, with 95 % interval",
+        text=[f" {shown(v)}" for v in value],
+        textposition="middle right",
+        textfont={"size": 14},
         marker={"color": INK, "size": 9, "symbol": "diamond"},
-        error_y=_interval(judged), hovertemplate="%{y:.4g} sigma<extra></extra>",
-    )  # fmt: skip
+        error_y=_interval(judged),
+        hovertemplate="%{y:.4g} sigma<extra></extra>",
+    )
     known = [(a, e) for a, e in zip(x, fitted, strict=True) if e is not None]
     if measure != "fitted" and known:
         figure.add_scatter(
-            x=[a for a, _ in known], y=[e.value for _, e in known], mode="markers", name="fitted manoeuvres",
+            x=[a for a, _ in known],
+            y=[e.value for _, e in known],
+            mode="markers",
+            name="fitted manoeuvres",
             marker={"color": ORANGE, "size": 11, "symbol": "triangle-up", "line": {"color": INK, "width": 1}},
-            error_y=_interval([e for _, e in known]), hovertemplate="%{y:.4g} sigma<extra></extra>",
-        )  # fmt: skip
+            error_y=_interval([e for _, e in known]),
+            hovertemplate="%{y:.4g} sigma<extra></extra>",
+        )
     _level(figure, x, 1.0, "noise floor, 1 sigma", "solid")
     if top is not None:
         _level(figure, x, top.value, plot_text(f"ceiling, {shown(top.value)} sigma: {top.label}"), "dash")
     finish(figure, 480, barmode="overlay", bargap=0.45, margin={"t": 90, "b": 80, "l": 62, "r": 16})
-    figure.update_yaxes(title_text="root mean square residual, sigma", type="log" if logarithmic else "linear",
-                        rangemode="tozero")  # fmt: skip
+    figure.update_yaxes(
+        title_text="root mean square residual, sigma", type="log" if logarithmic else "linear", rangemode="tozero"
+    )
     if logarithmic:
         most = max([e.high if np.isfinite(e.high) else e.value for e in (*judged, *(e for _, e in known))])
         figure.update_yaxes(range=[np.log10(bottom), np.log10(1.3 * most)], dtick="D2", minor={"ticks": "outside"})
@@ -75,8 +92,14 @@ def _interval(errors: Sequence[Error]) -> dict:
 
 
 def _level(figure: go.Figure, x: Sequence[str], y: float, name: str, dash: str) -> None:
-    figure.add_scatter(x=[x[0], x[-1]] if len(x) > 1 else x, y=[y] * min(len(x), 2), mode="lines", name=name,
-                       line={"color": MUTED, "dash": dash, "width": 2}, hoverinfo="skip")  # fmt: skip
+    figure.add_scatter(
+        x=[x[0], x[-1]] if len(x) > 1 else x,
+        y=[y] * min(len(x), 2),
+        mode="lines",
+        name=name,
+        line={"color": MUTED, "dash": dash, "width": 2},
+        hoverinfo="skip",
+    )
     figure.add_hline(y=y, line={"color": MUTED, "dash": dash, "width": 2})
 
 

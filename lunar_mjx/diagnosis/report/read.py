@@ -95,8 +95,13 @@ def read_result(folder: Path) -> Result:
     if run is None or run.get("format") != FORMAT:
         raise bad_input(path, "format", (run or {}).get("format"), "is not known", f"give a run of format {FORMAT}")
     names = (COMPARISON_FILE, VERDICT_FILE, FITS_FILE, AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE)
-    return Result(folder.resolve().name, run, *(_json(folder / n) for n in names),
-                  traces=_traces(folder / SERIES_FILE), signatures=_signatures(folder / SIGNATURES_FILE))  # fmt: skip
+    return Result(
+        folder.resolve().name,
+        run,
+        *(_json(folder / n) for n in names),
+        traces=_traces(folder / SERIES_FILE),
+        signatures=_signatures(folder / SIGNATURES_FILE),
+    )
 
 
 def _json(path: Path) -> dict[str, Any] | None:

@@ -68,8 +68,11 @@ def chain(results: Sequence[Result]) -> list[Step]:
                 steps.append(Step(*words, result.name, result, row))
             elif last:
                 names = label.removeprefix("with ")
-                steps.append(Step(f"with {names}, as the diagnosis proposes", f"+ {names}<br>(proposed)", result.name,
-                                  result, row))  # fmt: skip
+                steps.append(
+                    Step(
+                        f"with {names}, as the diagnosis proposes", f"+ {names}<br>(proposed)", result.name, result, row
+                    )
+                )
     return steps
 
 

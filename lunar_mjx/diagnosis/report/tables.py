@@ -58,24 +58,46 @@ def effects(result: Result) -> list[Block]:
         )
         gain = e.get("held_out_gain")
         share = e.get("separable_share")
-        tested.append([
-            e["effect"], e.get("status", ""), e.get("reason", ""), shown(e.get("separable_sigma")),
-            "-" if share is None else f"{100.0 * share:.1f}", shown(e.get("z")), shown(e.get("chi2")),
-            shown(e.get("p"), 2), "-" if gain is None else plus_minus(gain, e.get("held_out_se")),
-            values or "-", nearest,
-        ])  # fmt: skip
+        tested.append(
+            [
+                e["effect"],
+                e.get("status", ""),
+                e.get("reason", ""),
+                shown(e.get("separable_sigma")),
+                "-" if share is None else f"{100.0 * share:.1f}",
+                shown(e.get("z")),
+                shown(e.get("chi2")),
+                shown(e.get("p"), 2),
+                "-" if gain is None else plus_minus(gain, e.get("held_out_se")),
+                values or "-",
+                nearest,
+            ]
+        )
     blocks: list[Block] = []
     if tested:
-        blocks.append(Table(
-            "Every effect that these logs can test",
-            ["effect", "status", "because", "separable, sigma", "of its signal, %", "score z", "chi-square taken off",
-             "family-wise p", "held-out gain", "parameters, SI", "nearest confounder (|cos|)"],
-            tested,
-            "Separable: length of the effect's signature at nominal size that a refit of the model cannot absorb. "
-            "Score and p: robust score test, the largest over all effects by bootstrap. Held-out gain: expected log "
-            "density on manoeuvres left out, with its standard error. Parameters with one standard deviation.",
-            texts=3,
-        ))  # fmt: skip
+        blocks.append(
+            Table(
+                "Every effect that these logs can test",
+                [
+                    "effect",
+                    "status",
+                    "because",
+                    "separable, sigma",
+                    "of its signal, %",
+                    "score z",
+                    "chi-square taken off",
+                    "family-wise p",
+                    "held-out gain",
+                    "parameters, SI",
+                    "nearest confounder (|cos|)",
+                ],
+                tested,
+                "Separable: length of the effect's signature at nominal size that a refit of the model cannot absorb. "
+                "Score and p: robust score test, the largest over all effects by bootstrap. Held-out gain: expected "
+                "log density on manoeuvres left out, with its standard error. Parameters with one standard deviation.",
+                texts=3,
+            )
+        )
     by_reason: dict[str, list[str]] = {}
     for n in (verdict.get("details") or {}).get("not_tested") or []:
         by_reason.setdefault(str(n.get("reason", "")), []).append(str(n.get("effect", "")))
@@ -121,14 +143,25 @@ def by_channel(result: Result) -> list[Block]:
     worst = sorted(rows, key=lambda r: -(r.get("refitted") or 0.0))[:_MOST_ROWS]
     if not worst:
         return []
-    return [Table(
-        f"Worst channels and manoeuvres of {result.name}, root mean square residual in sigma",
-        ["manoeuvre", "split", "channel", "samples", "as given", "refitted"],
-        [[str(r["manoeuvre"]), str(SPLIT_NAMES.get(r["split"], r["split"])), channel_label(r["channel"]),
-          str(r["samples"]),
-          shown(r["as_given"]), shown(r["refitted"])] for r in worst],
-        f"The {len(worst)} worst of {len(rows)}." if len(rows) > len(worst) else "", texts=3,
-    )]  # fmt: skip
+    return [
+        Table(
+            f"Worst channels and manoeuvres of {result.name}, root mean square residual in sigma",
+            ["manoeuvre", "split", "channel", "samples", "as given", "refitted"],
+            [
+                [
+                    str(r["manoeuvre"]),
+                    str(SPLIT_NAMES.get(r["split"], r["split"])),
+                    channel_label(r["channel"]),
+                    str(r["samples"]),
+                    shown(r["as_given"]),
+                    shown(r["refitted"]),
+                ]
+                for r in worst
+            ],
+            f"The {len(worst)} worst of {len(rows)}." if len(rows) > len(worst) else "",
+            texts=3,
+        )
+    ]
 
 
 def findings(result: Result) -> list[Block]:
@@ -153,8 +186,17 @@ def provenance(results: Sequence[Result]) -> list[Block]:
         details = (r.verdict or {}).get("details") or {}
         problems = "; ".join(test.get("problems") or []) or ("complete" if test else "-")
         added = ", ".join(r.run.get("added") or []) or "-"
-        rows.append([r.name, str(r.run.get("version")), str(r.run.get("seed")), added, chosen, problems,
-                     shown(details.get("alpha"))])  # fmt: skip
+        rows.append(
+            [
+                r.name,
+                str(r.run.get("version")),
+                str(r.run.get("seed")),
+                added,
+                chosen,
+                problems,
+                shown(details.get("alpha")),
+            ]
+        )
     header = ["run", "version", "seed", "effects added", "splits by the user", "certificate of the fit", "alpha"]
     blocks.append(Table("Runs", header, rows, texts=6))
     blocks += [*_splits(results[-1]), *_openings(results)]
@@ -182,8 +224,15 @@ def _openings(results: Sequence[Result]) -> list[Block]:
             seen.setdefault(str(entry.get("model")), Counter())[str(entry.get("fit"))] += 1
         for model, fits in seen.items():
             times = len(fits)
-            rows.append([r.name, model, str(times), str(sum(fits.values())),
-                         "once" if times == 1 else f"reopened {times - 1} time{'s' if times > 2 else ''}"])  # fmt: skip
+            rows.append(
+                [
+                    r.name,
+                    model,
+                    str(times),
+                    str(sum(fits.values())),
+                    "once" if times == 1 else f"reopened {times - 1} time{'s' if times > 2 else ''}",
+                ]
+            )
     if not rows:
         text = "No error on a test split was computed: these runs keep none, or were made before that was recorded."
         return [Text([text])]

@@ -58,8 +58,10 @@ def _verdict(results: Sequence[Result], judge: Result, steps: Sequence[Step]) ->
         first, end = error(steps[0], splits), error(steps[-1], splits)
         if first and end:
             verb = "falls" if end.value < first.value else "rises"
-            lines.append(f"From {steps[0].label} to {steps[-1].label}, the error on {measure} manoeuvres {verb} from "
-                         f"{shown(first.value)} to {shown(end.value)} sigma; the noise is 1.")  # fmt: skip
+            lines.append(
+                f"From {steps[0].label} to {steps[-1].label}, the error on {measure} manoeuvres {verb} from "
+                f"{shown(first.value)} to {shown(end.value)} sigma; the noise is 1."
+            )
     lines.append(_audit_line(judge))
     return lines
 
@@ -69,8 +71,10 @@ def _audit_line(result: Result) -> str:
     if audit.get("sentence"):
         older = audit.get("version", __version__) != __version__
         return str(audit["sentence"]) + (f" (Measured with version {audit['version']}.)" if older else "")
-    return (f"How often this tool is wrong on logs like these has not been measured; lunar-mjx why {result.name} "
-            "--audit 30 measures it in 30 minutes.")  # fmt: skip
+    return (
+        f"How often this tool is wrong on logs like these has not been measured; lunar-mjx why {result.name} "
+        "--audit 30 measures it in 30 minutes."
+    )
 
 
 def _error_section(steps: Sequence[Step], results: Sequence[Result]) -> Section:

@@ -278,8 +278,19 @@ def _observations(
             # what a known discrepancy adds is no noise, and follows no chain
             if own.correlation and follows.any() and not extra_sigma.get(quantity, 0.0):
                 chain = Chain(order, follows, own.correlation, own.innovation)
-            series.append(Series(number, QUANTITIES[quantity][0], at, at + n, None, white, level=own.level, chain=chain,
-                                 dependence=1.0 if chain else own.dependence))  # fmt: skip
+            series.append(
+                Series(
+                    number,
+                    QUANTITIES[quantity][0],
+                    at,
+                    at + n,
+                    None,
+                    white,
+                    level=own.level,
+                    chain=chain,
+                    dependence=1.0 if chain else own.dependence,
+                )
+            )
             value.append(measured)
             unit.append(group + len(unit_names))
             place.append(covariates)

@@ -36,9 +36,12 @@ def _table_columns(problem: TableProblem, fit: Fit) -> dict[str, np.ndarray]:
     ]
     probes = {label: unknown_input(label, 1, 1.0) for label in labels}
     other = TableProblem(
-        problem.logs, problem.fitted_bed(fit.u), {p.name: p for p in probes.values()}, problem.splits,
+        problem.logs,
+        problem.fitted_bed(fit.u),
+        {p.name: p for p in probes.values()},
+        problem.splits,
         extra_sigma=problem.extra_sigma,
-    )  # fmt: skip
+    )
     observations = problem.observations
     modes = _smooth_modes(observations.place)
     which = np.array([other.candidates[probes[label].name][0] for label in labels])
@@ -49,8 +52,7 @@ def _table_columns(problem: TableProblem, fit: Fit) -> dict[str, np.ndarray]:
 def _smooth_modes(place: np.ndarray | None) -> np.ndarray:
     """(n, modes) principal modes of a smooth random function of the points, together of unit variance."""
     assert place is not None
-    scaled = np.column_stack([place[:, 0] / _LENGTHS[0], place[:, 1] / _LENGTHS[1],
-                              np.log(place[:, 2]) / _LENGTHS[2]])  # fmt: skip
+    scaled = np.column_stack([place[:, 0] / _LENGTHS[0], place[:, 1] / _LENGTHS[1], np.log(place[:, 2]) / _LENGTHS[2]])
     unique, inverse = np.unique(np.round(scaled, 6), axis=0, return_inverse=True)
     distance = np.sum((unique[:, None] - unique[None]) ** 2, axis=-1)
     values, vectors = np.linalg.eigh(np.exp(-0.5 * distance))

@@ -24,9 +24,23 @@ TRAFFIC = 2.0
 """Additions that take as long as to store a number, or to read it again."""
 
 _MOVES = {"broadcast_in_dim", "convert_element_type", "copy", "reshape", "slice", "squeeze", "stop_gradient"}
-_ADDITIONS = {"div": 4.0, "sqrt": 4.0, "rsqrt": 4.0, "gather": 8.0, "exp": 12.0, "log": 12.0, "tanh": 12.0,
-              "expm1": 15.0, "log1p": 15.0, "sin": 15.0, "cos": 15.0, "tan": 30.0, "asin": 30.0, "atan2": 30.0,
-              "pow": 30.0}  # fmt: skip
+_ADDITIONS = {
+    "div": 4.0,
+    "sqrt": 4.0,
+    "rsqrt": 4.0,
+    "gather": 8.0,
+    "exp": 12.0,
+    "log": 12.0,
+    "tanh": 12.0,
+    "expm1": 15.0,
+    "log1p": 15.0,
+    "sin": 15.0,
+    "cos": 15.0,
+    "tan": 30.0,
+    "asin": 30.0,
+    "atan2": 30.0,
+    "pow": 30.0,
+}
 """How many additions an operation costs, about; 1 if it is not named here."""
 
 

@@ -163,12 +163,7 @@ class StructuredEngine:
                 at_v.append(link.dof)
         return assemble(positions, at_q), assemble(speeds, at_v)
 
-    def _kinematics(
-        self,
-        numbers: list[LegGroup],
-        legs: list[LegState],
-        base: Base,
-    ) -> Kinematics:
+    def _kinematics(self, numbers: list[LegGroup], legs: list[LegState], base: Base) -> Kinematics:
         angles, speeds, drives = [], [], []
         for group, leg in zip(numbers, legs, strict=True):
             for k, link in enumerate(group.links):

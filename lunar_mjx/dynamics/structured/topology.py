@@ -309,8 +309,9 @@ def _body(masses: list[list[tuple[float, np.ndarray, np.ndarray]]], aligns: list
     moments = np.array([a.T @ i @ a for (_, _, i), a in zip(fused, aligns, strict=True)])
     size = max(float(np.abs(moments).max()), 1e-30)
     entries = np.stack([moments[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
-    best = min((entries[k] for k in range(3)), key=lambda s: sum(np.abs(entries[k] - s).max() > 1e-13 * size
-                                                                for k in range(3)))  # fmt: skip
+    best = min(
+        (entries[k] for k in range(3)), key=lambda s: sum(np.abs(entries[k] - s).max() > 1e-13 * size for k in range(3))
+    )
     rest = entries - best * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
     rest[np.abs(rest) < 1e-13 * size] = 0.0
     return Body(

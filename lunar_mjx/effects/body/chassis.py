@@ -48,8 +48,7 @@ def wheel_radius_error(ctx, p, x, geometry):
 
 
 @effect(
-    "geometry",
-    angle=Parameter(0.0, 0.0, (-0.5, 0.5), "rad", "toe angle, positive to the left", _HERE, axis="wheel"),
+    "geometry", angle=Parameter(0.0, 0.0, (-0.5, 0.5), "rad", "toe angle, positive to the left", _HERE, axis="wheel")
 )
 def steering_toe(ctx, p, x, geometry):
     """Each wheel's heading differs from its steering angle by a constant toe (misalignment)."""
@@ -60,9 +59,15 @@ def steering_toe(ctx, p, x, geometry):
     "geometry",
     transient=True,
     state={"distance": StateVariable(0.0, "m", "distance rolled by the rim since reset", rate=True)},
-    wear=Parameter(1e-4, 0.0, (-1e-2, 1e-2), "1", "radius lost per distance rolled; negative where soil cakes",
-                   "choice: caking and packing, 0.1 mm per m; abrasion alone is a thousand times slower"),
-)  # fmt: skip
+    wear=Parameter(
+        1e-4,
+        0.0,
+        (-1e-2, 1e-2),
+        "1",
+        "radius lost per distance rolled; negative where soil cakes",
+        "choice: caking and packing, 0.1 mm per m; abrasion alone is a thousand times slower",
+    ),
+)
 def wheel_wear(ctx, p, x, geometry):
     """r(d) = r_0 - w d with d the distance rolled: wheels that wear, or grow as soil cakes on them (Archard 1953)."""
     rolled = geometry.radius * jnp.abs(ctx.wheel_angular_velocity.dot(ctx.wheel_axle))
@@ -72,9 +77,15 @@ def wheel_wear(ctx, p, x, geometry):
 
 @effect(
     "geometry",
-    relative=Parameter(0.02, 0.0, (-0.5, 0.5), "1", "gravity beyond the stated one, relative to it",
-                       "choice: order of an accelerometer's scale error"),
-)  # fmt: skip
+    relative=Parameter(
+        0.02,
+        0.0,
+        (-0.5, 0.5),
+        "1",
+        "gravity beyond the stated one, relative to it",
+        "choice: order of an accelerometer's scale error",
+    ),
+)
 def gravity_error(ctx, p, x, geometry):
     """g (1 + epsilon) on every body of the rover, and in the weight of the soil that it pushes.
 

@@ -20,11 +20,24 @@ def _resist(ctx, wrench, group, torque, speed_scale):
 
 @effect(
     "body_wrench",
-    torque=Parameter(5.0, 0.0, (0.0, 1e4), "N m", "Coulomb friction of a suspension joint",
-                     "choice: some per cent of a corner's weight times its arm", axis="joint"),
-    speed_scale=Parameter(0.01, None, (1e-4, 10.0), "rad/s", "joint speed of full friction",
-                          "choice: stable with explicit torques at 2 ms"),
-)  # fmt: skip
+    torque=Parameter(
+        5.0,
+        0.0,
+        (0.0, 1e4),
+        "N m",
+        "Coulomb friction of a suspension joint",
+        "choice: some per cent of a corner's weight times its arm",
+        axis="joint",
+    ),
+    speed_scale=Parameter(
+        0.01,
+        None,
+        (1e-4, 10.0),
+        "rad/s",
+        "joint speed of full friction",
+        "choice: stable with explicit torques at 2 ms",
+    ),
+)
 def suspension_friction(ctx, p, x, wrench):
     """tau = -tau_c tanh(omega/omega_0) at the suspension joints: Coulomb friction, smoothed (Andersson et al. 2007).
 
@@ -35,10 +48,16 @@ def suspension_friction(ctx, p, x, wrench):
 
 @effect(
     "body_wrench",
-    torque=Parameter(1e-4, 0.0, (0.0, 1e-3), "N m", "drag at a drive joint",
-                     "electrostatic adhesion of dust and pressure of sunlight: far below 1 mN m"),
+    torque=Parameter(
+        1e-4,
+        0.0,
+        (0.0, 1e-3),
+        "N m",
+        "drag at a drive joint",
+        "electrostatic adhesion of dust and pressure of sunlight: far below 1 mN m",
+    ),
     speed_scale=Parameter(0.01, None, (1e-4, 10.0), "rad/s", "joint speed of full drag", "choice"),
-)  # fmt: skip
+)
 def dust_charging(ctx, p, x, wrench):
     """tau = -tau_d tanh(omega/omega_0) at the drive joints, at most 1 mN m: charged dust, sunlight (Lunar Sourcebook).
 

@@ -32,24 +32,43 @@ iron_loss = Effect(
     name="iron_loss",
     ports={"motor_torque": _iron_drag, "heat": _iron_heat},
     parameters={
-        "coefficient": Parameter(1e-6, 0.0, (0.0, 1e-3), "W s2/rad2", "iron loss per square of the rotor's speed K_fe",
-                                 "no-load current 0.052 A at 48 V and 670 rad/s, a fifth of the loss; choice", "joint"),
-        "drag": Parameter(1.0, None, (0.0, 1.0), "1", "share of the loss that brakes the rotor; 1 conserves energy",
-                          "conservation of energy"),
+        "coefficient": Parameter(
+            1e-6,
+            0.0,
+            (0.0, 1e-3),
+            "W s2/rad2",
+            "iron loss per square of the rotor's speed K_fe",
+            "no-load current 0.052 A at 48 V and 670 rad/s, a fifth of the loss; choice",
+            "joint",
+        ),
+        "drag": Parameter(
+            1.0,
+            None,
+            (0.0, 1.0),
+            "1",
+            "share of the loss that brakes the rotor; 1 conserves energy",
+            "conservation of energy",
+        ),
     },
     order=15,
     doc="""Eddy currents: P += K_fe omega_m^2 with the rotor's speed omega_m = N omega, into the winding's node.
 
     The rotor is braked by what it heats: -N^2 K_fe omega at the joint (drag = 1); with drag = 0 the heat comes from
     nowhere, as where a log's model knows iron loss as heat alone. Source: MuJoCo's dcmotor note (thermal).""",
-)  # fmt: skip
+)
 
 
 @effect(
     "heat",
-    share=Parameter(1.0, 0.0, (0.0, 1.0), "1", "share of the gear's and bearings' loss that heats the housing",
-                    "conservation of energy"),
-)  # fmt: skip
+    share=Parameter(
+        1.0,
+        0.0,
+        (0.0, 1.0),
+        "1",
+        "share of the gear's and bearings' loss that heats the housing",
+        "conservation of energy",
+    ),
+)
 def gear_friction_heat(ctx, p, x, heat):
     """P_S += (N K I - tau) omega: what the rotor gives less what the joint gets: gear and friction.
 
@@ -67,18 +86,33 @@ def gear_friction_heat(ctx, p, x, heat):
 
 @effect(
     "heat",
-    absorptivity=Parameter(0.4, 0.0, (0.0, 1.0), "1", "solar absorptivity of the housing",
-                           "white paint aged by dust; choice"),
-    area=Parameter(0.0024, None, (1e-6, 1.0), "m2", "area of the housing seen from straight ahead of its normal",
-                   "22 mm x 110 mm motor with gearhead from the side", axis="joint"),
-    facing=Parameter(1.5707963267948966, None, (-6.3, 6.3), "rad",
-                     "heading of the housing's normal in the body, from forward to the left",
-                     "choice: left; give one per joint", axis="joint"),
-    sun_azimuth=Parameter(0.0, None, (-6.3, 6.3), "rad", "the Sun's azimuth from north (y) clockwise to east (x)",
-                          "the site and time"),
+    absorptivity=Parameter(
+        0.4, 0.0, (0.0, 1.0), "1", "solar absorptivity of the housing", "white paint aged by dust; choice"
+    ),
+    area=Parameter(
+        0.0024,
+        None,
+        (1e-6, 1.0),
+        "m2",
+        "area of the housing seen from straight ahead of its normal",
+        "22 mm x 110 mm motor with gearhead from the side",
+        axis="joint",
+    ),
+    facing=Parameter(
+        1.5707963267948966,
+        None,
+        (-6.3, 6.3),
+        "rad",
+        "heading of the housing's normal in the body, from forward to the left",
+        "choice: left; give one per joint",
+        axis="joint",
+    ),
+    sun_azimuth=Parameter(
+        0.0, None, (-6.3, 6.3), "rad", "the Sun's azimuth from north (y) clockwise to east (x)", "the site and time"
+    ),
     sun_elevation=Parameter(0.0873, None, (-1.6, 1.6), "rad", "the Sun's elevation", "5 deg, lunar south pole"),
     flux=Parameter(1361.0, None, (0.0, 1e4), "W/m2", "solar irradiance q_sun", "Kopp & Lean 2011, at 1 au"),
-)  # fmt: skip
+)
 def solar_flux(ctx, p, x, heat):
     """P_S += alpha A q_sun max(0, cos theta), theta from the housing's normal, which turns with the rover, to the Sun.
 
@@ -94,14 +128,33 @@ def solar_flux(ctx, p, x, heat):
 
 @effect(
     "heat",
-    area=Parameter(0.0064, 0.0, (0.0, 1.0), "m2", "emissivity times area of the housing",
-                   "0.8 x 0.008 m2 of housing_radiation", axis="joint"),
-    view=Parameter(0.5, None, (0.0, 1.0), "1", "view factor F_g from the housing to the ground; the rest sees the sky",
-                   "a small body above a plane"),
-    ground_temperature=Parameter(220.0, None, (20.0, 450.0), "K", "temperature of the ground in sight",
-                                 "sunlit regolith near the pole, 200 to 250 K; choice"),
+    area=Parameter(
+        0.0064,
+        0.0,
+        (0.0, 1.0),
+        "m2",
+        "emissivity times area of the housing",
+        "0.8 x 0.008 m2 of housing_radiation",
+        axis="joint",
+    ),
+    view=Parameter(
+        0.5,
+        None,
+        (0.0, 1.0),
+        "1",
+        "view factor F_g from the housing to the ground; the rest sees the sky",
+        "a small body above a plane",
+    ),
+    ground_temperature=Parameter(
+        220.0,
+        None,
+        (20.0, 450.0),
+        "K",
+        "temperature of the ground in sight",
+        "sunlit regolith near the pole, 200 to 250 K; choice",
+    ),
     sky_temperature=Parameter(3.0, None, (0.0, 400.0), "K", "temperature of the sky in sight", "deep space"),
-)  # fmt: skip
+)
 def regolith_infrared(ctx, p, x, heat):
     """P_S += eps A sigma (F_g T_g^4 + (1 - F_g) T_sky^4 - T_A^4): ground and sky in place of the ambient temperature.
 

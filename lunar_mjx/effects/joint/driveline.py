@@ -37,9 +37,15 @@ def _delay_memory() -> dict[str, StateVariable]:
     "command",
     order=-10,
     state=_delay_memory(),
-    delay=Parameter(0.05, 0.0, (0.0, 2.0), "s", "delay between command and action",
-                    "choice: a bus cycle and a control cycle of 20 Hz equipment"),
-)  # fmt: skip
+    delay=Parameter(
+        0.05,
+        0.0,
+        (0.0, 2.0),
+        "s",
+        "delay between command and action",
+        "choice: a bus cycle and a control cycle of 20 Hz equipment",
+    ),
+)
 def actuator_delay(ctx, p, x, command):
     """u(t - delta): the joints act on the command of delta ago; within the step in which it arrives, on its mean.
 
@@ -74,9 +80,16 @@ def _loop_gains(rover: Any) -> tuple[Any, Any, Any]:
     "command",
     order=51,
     state={"current": StateVariable(0.0, "A", "current that winds the driveline up", axis="joint")},
-    compliance=Parameter(2e-4, 0.0, (0.0, 0.1), "rad/(N m)", "wind-up of the driveline per torque, 1/k_s",
-                         "choice: 5000 N m/rad, gearhead and shaft of a drive", axis="joint"),
-)  # fmt: skip
+    compliance=Parameter(
+        2e-4,
+        0.0,
+        (0.0, 0.1),
+        "rad/(N m)",
+        "wind-up of the driveline per torque, 1/k_s",
+        "choice: 5000 N m/rad, gearhead and shaft of a drive",
+        axis="joint",
+    ),
+)
 def driveline_compliance(ctx, p, x, command):
     """theta_motor/N = theta + c tau: the controller holds the motor, and the joint lags behind by the wind-up.
 
@@ -94,9 +107,16 @@ def driveline_compliance(ctx, p, x, command):
     "command",
     order=52,
     state={"gap": StateVariable(0.0, "rad", "motor ahead of the joint within the play", axis="joint")},
-    half_gap=Parameter(0.007, 0.0, (0.0, 0.2), "rad", "half of the play between motor and joint, at the joint",
-                       "maxon planetary gearheads: about 1 deg of play at no load; choice 0.8 deg", axis="joint"),
-)  # fmt: skip
+    half_gap=Parameter(
+        0.007,
+        0.0,
+        (0.0, 0.2),
+        "rad",
+        "half of the play between motor and joint, at the joint",
+        "maxon planetary gearheads: about 1 deg of play at no load; choice 0.8 deg",
+        axis="joint",
+    ),
+)
 def backlash(ctx, p, x, command):
     """Play operator: theta_motor/N - theta = g within +-delta; torque and current pass only at either end.
 

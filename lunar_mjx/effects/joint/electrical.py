@@ -31,9 +31,15 @@ def voltage_of(limit: float) -> float:
     "command",
     order=55,
     state={"correction": StateVariable(0.0, "A", "current taken away by the limit", axis="joint")},
-    limit=Parameter(1.0, 0.0, (0.0, 1e6), "1", "(48 V/V_bus)^8, with V_bus the largest voltage of the amplifier",
-                    "48 V bus, the winding's nominal voltage; 24 V is 256, 30 V is 42.9, 60 V is 0.168"),
-)  # fmt: skip
+    limit=Parameter(
+        1.0,
+        0.0,
+        (0.0, 1e6),
+        "1",
+        "(48 V/V_bus)^8, with V_bus the largest voltage of the amplifier",
+        "48 V bus, the winding's nominal voltage; 24 V is 256, 30 V is 42.9, 60 V is 0.168",
+    ),
+)
 def voltage_saturation(ctx, p, x, command):
     """|R I + K N omega| <= V_bus: V' = V/(1 + |V/V_bus|^8)^(1/8), and the current is that of V'.
 
@@ -71,11 +77,13 @@ def _limited(voltage, limit):
 @effect(
     "sensor",
     order=-10,
-    resistance=Parameter(0.1, 0.0, (0.0, 5.0), "ohm", "internal resistance of the battery and bus",
-                         "choice: 5 % of 48 V at 24 A"),
-    voltage=Parameter(BUS_VOLTAGE, None, (1.0, 500.0), "V", "voltage of the unloaded bus",
-                      "the winding's nominal voltage"),
-)  # fmt: skip
+    resistance=Parameter(
+        0.1, 0.0, (0.0, 5.0), "ohm", "internal resistance of the battery and bus", "choice: 5 % of 48 V at 24 A"
+    ),
+    voltage=Parameter(
+        BUS_VOLTAGE, None, (1.0, 500.0), "V", "voltage of the unloaded bus", "the winding's nominal voltage"
+    ),
+)
 def bus_droop(ctx, p, x, signals):
     """V_bus = V_0 - R_b P/V_0 with P = sum V_m I_m of the motors (lossless amplifiers): the channel bus_voltage_V.
 

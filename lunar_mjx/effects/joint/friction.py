@@ -37,19 +37,30 @@ def speed_sign(ctx, level: Any, scale: Any) -> Any:
 
 
 _SPEED = Parameter(
-    0.02, None, (1e-4, 1.0), "rad/s", "speed of the joint at which friction has nearly its full size",
-    "choice: stable at 2 ms, 1/20 of a drive's speed", axis="joint",
-)  # fmt: skip
+    0.02,
+    None,
+    (1e-4, 1.0),
+    "rad/s",
+    "speed of the joint at which friction has nearly its full size",
+    "choice: stable at 2 ms, 1/20 of a drive's speed",
+    axis="joint",
+)
 
 
 @effect(
     "motor_torque",
     order=10,
-    torque=Parameter(0.4, 0.0, (0.0, 50.0), "N m", "Coulomb friction at the joint",
-                     "no-load current of the maxon ECX TORQUE 22 XL 48 V (0.052 A) through 243:1, with seals; choice",
-                     axis="joint"),
+    torque=Parameter(
+        0.4,
+        0.0,
+        (0.0, 50.0),
+        "N m",
+        "Coulomb friction at the joint",
+        "no-load current of the maxon ECX TORQUE 22 XL 48 V (0.052 A) through 243:1, with seals; choice",
+        axis="joint",
+    ),
     speed=_SPEED,
-)  # fmt: skip
+)
 def coulomb_friction(ctx, p, x, torque):
     """tau_f = tau_c tanh(omega/omega_s) against the speed. It creeps at standstill: no break-away force is held.
 
@@ -61,12 +72,26 @@ def coulomb_friction(ctx, p, x, torque):
 @effect(
     "motor_torque",
     order=11,
-    torque=Parameter(0.3, 0.0, (0.0, 50.0), "N m", "static friction beyond Coulomb's, at low speed",
-                     "choice: static friction 1.75 times the sliding one", axis="joint"),
-    stribeck_speed=Parameter(0.1, None, (1e-3, 10.0), "rad/s", "speed over which static friction fades",
-                             "choice: a tenth of the largest speed of a drive", axis="joint"),
+    torque=Parameter(
+        0.3,
+        0.0,
+        (0.0, 50.0),
+        "N m",
+        "static friction beyond Coulomb's, at low speed",
+        "choice: static friction 1.75 times the sliding one",
+        axis="joint",
+    ),
+    stribeck_speed=Parameter(
+        0.1,
+        None,
+        (1e-3, 10.0),
+        "rad/s",
+        "speed over which static friction fades",
+        "choice: a tenth of the largest speed of a drive",
+        axis="joint",
+    ),
     speed=_SPEED,
-)  # fmt: skip
+)
 def stribeck_friction(ctx, p, x, torque):
     """tau_f = (tau_s - tau_c) exp(-(omega/omega_st)^2) tanh(omega/omega_s), beside Coulomb's.
 
@@ -79,9 +104,10 @@ def stribeck_friction(ctx, p, x, torque):
 @effect(
     "motor_torque",
     order=12,
-    damping=Parameter(0.3, 0.0, (0.0, 500.0), "N m s/rad", "viscous friction at the joint",
-                      "choice: 0.3 N m at 1 rad/s", axis="joint"),
-)  # fmt: skip
+    damping=Parameter(
+        0.3, 0.0, (0.0, 500.0), "N m s/rad", "viscous friction at the joint", "choice: 0.3 N m at 1 rad/s", axis="joint"
+    ),
+)
 def viscous_friction(ctx, p, x, torque):
     """tau_f = b omega (MuJoCo's dcmotor note)."""
     return torque - jnp.minimum(p.damping, largest_damping(ctx)) * ctx.joint_speed
@@ -90,11 +116,24 @@ def viscous_friction(ctx, p, x, torque):
 @effect(
     "motor_torque",
     order=13,
-    damping=Parameter(0.1, 0.0, (0.0, 100.0), "N m s/rad", "viscous friction of the grease at 25 degC",
-                      "choice: a third of all viscous friction", axis="joint"),
-    rate=Parameter(0.025, None, (0.0, 0.1), "1/K", "growth of the grease's viscosity with cold",
-                   "choice: tenfold from 25 to -67 degC, a low-temperature space grease"),
-)  # fmt: skip
+    damping=Parameter(
+        0.1,
+        0.0,
+        (0.0, 100.0),
+        "N m s/rad",
+        "viscous friction of the grease at 25 degC",
+        "choice: a third of all viscous friction",
+        axis="joint",
+    ),
+    rate=Parameter(
+        0.025,
+        None,
+        (0.0, 0.1),
+        "1/K",
+        "growth of the grease's viscosity with cold",
+        "choice: tenfold from 25 to -67 degC, a low-temperature space grease",
+    ),
+)
 def cold_grease(ctx, p, x, torque):
     """tau_f = b_0 exp(-kappa (T_S - T_0)) omega with the housing's temperature and T_0 = 25 degC.
 
@@ -108,11 +147,25 @@ def cold_grease(ctx, p, x, torque):
 @effect(
     "motor_torque",
     order=5,
-    asymmetry=Parameter(1.0, 0.0, (0.0, 1.5), "1", "0: eta both ways; 1: eta driving, 1/eta when driven back",
-                        "MuJoCo's dcmotor note: tau_o = N tau eta^sgn(tau omega)", axis="joint"),
-    speed=Parameter(0.05, None, (1e-4, 1.0), "rad/s", "speed of the joint at which the direction is decided",
-                    "choice: stable at 2 ms", axis="joint"),
-)  # fmt: skip
+    asymmetry=Parameter(
+        1.0,
+        0.0,
+        (0.0, 1.5),
+        "1",
+        "0: eta both ways; 1: eta driving, 1/eta when driven back",
+        "MuJoCo's dcmotor note: tau_o = N tau eta^sgn(tau omega)",
+        axis="joint",
+    ),
+    speed=Parameter(
+        0.05,
+        None,
+        (1e-4, 1.0),
+        "rad/s",
+        "speed of the joint at which the direction is decided",
+        "choice: stable at 2 ms",
+        axis="joint",
+    ),
+)
 def directional_gear_efficiency(ctx, p, x, torque):
     """tau_o = N tau eta^sgn(tau omega), with tanh(omega/omega_s) for sgn(omega).
 
@@ -127,8 +180,15 @@ def directional_gear_efficiency(ctx, p, x, torque):
 
 
 def _ripple(part: str) -> Parameter:
-    return Parameter(0.2, 0.0, (-20.0, 20.0), "N m", f"{part} part of the ripple's amplitude at the joint",
-                     "choice: 1 % of a drive's largest torque", axis="joint")  # fmt: skip
+    return Parameter(
+        0.2,
+        0.0,
+        (-20.0, 20.0),
+        "N m",
+        f"{part} part of the ripple's amplitude at the joint",
+        "choice: 1 % of a drive's largest torque",
+        axis="joint",
+    )
 
 
 @effect(
@@ -136,9 +196,15 @@ def _ripple(part: str) -> Parameter:
     order=14,
     sine=_ripple("sine"),
     cosine=_ripple("cosine"),
-    cycles=Parameter(17.0, None, (1.0, 1e5), "1", "ripples per revolution of the joint",
-                     "choice: teeth of the last sun wheel; gear ratio times slots for the motor's own cogging"),
-)  # fmt: skip
+    cycles=Parameter(
+        17.0,
+        None,
+        (1.0, 1e5),
+        "1",
+        "ripples per revolution of the joint",
+        "choice: teeth of the last sun wheel; gear ratio times slots for the motor's own cogging",
+    ),
+)
 def cogging(ctx, p, x, torque):
     """tau = A sin(N_p theta) + B cos(N_p theta) with the joint's angle, linear in both parts.
 

@@ -111,10 +111,14 @@ def _motor_heat(ctx, p, x, heat):
     "motor_torque",
     order=1,
     beta_2=Parameter(
-        -2e-6, 0.0, (-1.2e-5, 1.2e-5), "1/K2", "quadratic temperature coefficient of the magnet",
+        -2e-6,
+        0.0,
+        (-1.2e-5, 1.2e-5),
+        "1/K2",
+        "quadratic temperature coefficient of the magnet",
         "choice: NdFeB loses 2 % more than linearly at 125 degC",
     ),
-)  # fmt: skip
+)
 def magnet_nonlinearity(ctx, p, x, torque):
     """K = K_0 (1 + beta dT + beta_2 dT^2), dT = T_R - 25 degC, in torque and back-EMF.
 

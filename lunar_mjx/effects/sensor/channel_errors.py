@@ -25,8 +25,14 @@ def _entry(value: Any, index: int) -> Any:
 
 
 def _offset(name: str) -> Parameter:
-    return Parameter(0.05, 0.0, (-5.0, 5.0), "s", f"how late the {name} channels are stamped", "choice: one telemetry "
-                     "interval at 20 Hz")  # fmt: skip
+    return Parameter(
+        0.05,
+        0.0,
+        (-5.0, 5.0),
+        "s",
+        f"how late the {name} channels are stamped",
+        "choice: one telemetry interval at 20 Hz",
+    )
 
 
 _OFFSETS: dict[str, Any] = {name: _offset(name) for name in FAMILIES}
@@ -44,8 +50,14 @@ def clock_offset(ctx, p, x, signals):
 
 
 def _rate(name: str) -> Parameter:
-    return Parameter(1e-3, 0.0, (-0.1, 0.1), "1", f"drift of the {name} clock, s per s",
-                     "choice: exaggerated; crystals drift by 1e-5 to 1e-4")  # fmt: skip
+    return Parameter(
+        1e-3,
+        0.0,
+        (-0.1, 0.1),
+        "1",
+        f"drift of the {name} clock, s per s",
+        "choice: exaggerated; crystals drift by 1e-5 to 1e-4",
+    )
 
 
 _RATES: dict[str, Any] = {name: _rate(name) for name in FAMILIES}
@@ -137,11 +149,18 @@ def encoder_quantisation(ctx, p, x, signals):
 @effect(
     "sensor",
     order=30,
-    heading=Parameter(0.002, 0.0, (-0.5, 0.5), "rad/m", "turn of the odometry's heading per distance travelled",
-                      "choice: visual odometry, 0.1 deg/m"),
-    vertical=Parameter(0.01, 0.0, (-0.5, 0.5), "1", "rise of the odometry per distance travelled",
-                       "choice: visual odometry, 1 %"),
-)  # fmt: skip
+    heading=Parameter(
+        0.002,
+        0.0,
+        (-0.5, 0.5),
+        "rad/m",
+        "turn of the odometry's heading per distance travelled",
+        "choice: visual odometry, 0.1 deg/m",
+    ),
+    vertical=Parameter(
+        0.01, 0.0, (-0.5, 0.5), "1", "rise of the odometry per distance travelled", "choice: visual odometry, 1 %"
+    ),
+)
 def odometry_drift(ctx, p, x, signals):
     """Dead reckoning drifts: each increment of position is turned by psi = k s, and z rises by k_z s.
 
@@ -242,13 +261,31 @@ def _turned_quaternion(q: list[Any], roll: Any, pitch: Any) -> list[Any]:
 @effect(
     "sensor",
     order=10,
-    winding=Parameter(5.0, 0.0, (0.0, 1e3), "s", "time constant of the winding's thermistor",
-                      "choice: thermistor potted into the winding"),
-    housing=Parameter(20.0, 0.0, (0.0, 1e3), "s", "time constant of the housing's thermistor",
-                      "choice: thermistor glued to the housing"),
-    self_heating=Parameter(0.2, 0.0, (0.0, 20.0), "K", "rise of a thermistor by its own measuring current",
-                           "choice: 0.2 mW at 1 mW/K, in vacuum"),
-)  # fmt: skip
+    winding=Parameter(
+        5.0,
+        0.0,
+        (0.0, 1e3),
+        "s",
+        "time constant of the winding's thermistor",
+        "choice: thermistor potted into the winding",
+    ),
+    housing=Parameter(
+        20.0,
+        0.0,
+        (0.0, 1e3),
+        "s",
+        "time constant of the housing's thermistor",
+        "choice: thermistor glued to the housing",
+    ),
+    self_heating=Parameter(
+        0.2,
+        0.0,
+        (0.0, 20.0),
+        "K",
+        "rise of a thermistor by its own measuring current",
+        "choice: 0.2 mW at 1 mW/K, in vacuum",
+    ),
+)
 def thermistor_lag(ctx, p, x, signals):
     """tau dT_m/dt = T + dT - T_m, from equilibrium at the first sample; exact for T straight between the samples."""
     changed = {}
@@ -264,9 +301,16 @@ def thermistor_lag(ctx, p, x, signals):
 @effect(
     "sensor",
     order=0,
-    resistance=Parameter(0.2, 0.0, (0.0, 20.0), "ohm", "resistance of the harness to a motor",
-                         "5 m of AWG 24 copper out and back at 25 degC: 0.84 ohm; thicker wire chosen", axis="joint"),
-)  # fmt: skip
+    resistance=Parameter(
+        0.2,
+        0.0,
+        (0.0, 20.0),
+        "ohm",
+        "resistance of the harness to a motor",
+        "5 m of AWG 24 copper out and back at 25 degC: 0.84 ohm; thicker wire chosen",
+        axis="joint",
+    ),
+)
 def harness_resistance(ctx, p, x, signals):
     """The voltage read at the amplifier is V_m = V + R_w I; a motor with controlled current does not feel it.
 
@@ -283,11 +327,18 @@ def harness_resistance(ctx, p, x, signals):
 @effect(
     "sensor",
     order=25,
-    axis=Parameter(0.01, 0.0, (-0.2, 0.2), "1", "cross-axis sensitivity of the IMU",
-                   "choice: MEMS datasheets, 1 to 2 %"),
-    current=Parameter(0.05, 0.0, (-10.0, 10.0), "K/A", "temperature read per ampere of motor current",
-                      "choice: 0.5 mV/A of common ground over 10 mV/K"),
-)  # fmt: skip
+    axis=Parameter(
+        0.01, 0.0, (-0.2, 0.2), "1", "cross-axis sensitivity of the IMU", "choice: MEMS datasheets, 1 to 2 %"
+    ),
+    current=Parameter(
+        0.05,
+        0.0,
+        (-10.0, 10.0),
+        "K/A",
+        "temperature read per ampere of motor current",
+        "choice: 0.5 mV/A of common ground over 10 mV/K",
+    ),
+)
 def cross_talk(ctx, p, x, signals):
     """A channel hears its neighbour: x + k y, y + k z, z + k x of the IMU's axes; T + k_I |I| of the winding."""
     changed = {}

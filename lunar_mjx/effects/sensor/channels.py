@@ -178,11 +178,7 @@ def shift_smoothly(time: Any, values: Any, at: Any) -> Any:
     t0, t1, y0, y1 = _take(time, i), _take(time, i + 1), _take(values, i), _take(values, i + 1)
     m0, m1, h = _take(rate, i), _take(rate, i + 1), t1 - t0
     s = jnp.where(at < t0, 0.0, jnp.where(at > t1, 1.0, (at - t0) / h))
-    inside = (
-        y0
-        + s * s * (3.0 - 2.0 * s) * (y1 - y0)
-        + h * s * (1.0 - s) * ((1.0 - s) * m0 - s * m1)
-    )  # fmt: skip
+    inside = y0 + s * s * (3.0 - 2.0 * s) * (y1 - y0) + h * s * (1.0 - s) * ((1.0 - s) * m0 - s * m1)
     return jnp.where(at < t0, y0 + (at - t0) * m0, jnp.where(at > t1, y1 + (at - t1) * m1, inside))
 
 

@@ -48,11 +48,7 @@ def _remember(ctx, ground, p, x):
     def push(old, new):
         return jnp.where(drop, jnp.concatenate([new[None], old[:-1]]), old)
 
-    return {
-        "place_x": push(x.place_x, here.x),
-        "place_y": push(x.place_y, here.y),
-        "depth": push(x.depth, depth),
-    }
+    return {"place_x": push(x.place_x, here.x), "place_y": push(x.place_y, here.y), "depth": push(x.depth, depth)}
 
 
 def _place(axis: str) -> StateVariable:
@@ -68,11 +64,23 @@ def _place(axis: str) -> StateVariable:
         "place_y": _place("y"),
         "depth": StateVariable(0.0, "m", "sinkage of the wheel at those places", slots=PLACES),
     },
-    plastic=Parameter(0.8, 0.0, (0.0, 0.95), "1", "share of the sinkage that remains when the wheel has passed",
-                      "choice: k_0 + A_u z_u of dry sand (Wong 2008, ch. 4) unloads almost vertically"),
-    spacing=Parameter(0.1, None, (0.02, 2.0), "m", "distance between remembered places",
-                      "choice: half a wheel's width, a track then being twice that to either side"),
-)  # fmt: skip
+    plastic=Parameter(
+        0.8,
+        0.0,
+        (0.0, 0.95),
+        "1",
+        "share of the sinkage that remains when the wheel has passed",
+        "choice: k_0 + A_u z_u of dry sand (Wong 2008, ch. 4) unloads almost vertically",
+    ),
+    spacing=Parameter(
+        0.1,
+        None,
+        (0.02, 2.0),
+        "m",
+        "distance between remembered places",
+        "choice: half a wheel's width, a track then being twice that to either side",
+    ),
+)
 def multipass(ctx, p, x, ground):
     """Wheels that come later (the rear ones, or the same on another pass) roll in ruts of compacted soil.
 

@@ -26,11 +26,23 @@ _SOFTER = (0.0, 5.0)
 
 @effect(
     "soil",
-    driving=Parameter(1.0, 0.0, _SOFTER, "1", "growth n_1 of the sinkage exponent with slip when driving",
-                      "choice: 3 to 7 times the static sinkage at a slip of 0.6 (Ding et al. 2010; Lyasko 2010)"),
-    skid=Parameter(0.5, 0.0, _SOFTER, "1", "growth n_2 of the sinkage exponent with slip when skidding",
-                   "choice: half of that when driving"),
-)  # fmt: skip
+    driving=Parameter(
+        1.0,
+        0.0,
+        _SOFTER,
+        "1",
+        "growth n_1 of the sinkage exponent with slip when driving",
+        "choice: 3 to 7 times the static sinkage at a slip of 0.6 (Ding et al. 2010; Lyasko 2010)",
+    ),
+    skid=Parameter(
+        0.5,
+        0.0,
+        _SOFTER,
+        "1",
+        "growth n_2 of the sinkage exponent with slip when skidding",
+        "choice: half of that when driving",
+    ),
+)
 def slip_sinkage(ctx, p, x, ground):
     """n = n_0 + n_1 s when driving, n_0 + n_2 |s| when skidding: the sheared soil is carried out from under the wheel.
 
@@ -55,9 +67,15 @@ _STILL = 2e-3
 
 @effect(
     "soil",
-    lateral=Parameter(1.0, 0.0, _SOFTER, "1", "growth of the sinkage exponent with lateral slip",
-                      "choice: sinkage threefold at 75 deg (CMU single-wheel test bed: 14 to 42 mm)"),
-)  # fmt: skip
+    lateral=Parameter(
+        1.0,
+        0.0,
+        _SOFTER,
+        "1",
+        "growth of the sinkage exponent with lateral slip",
+        "choice: sinkage threefold at 75 deg (CMU single-wheel test bed: 14 to 42 mm)",
+    ),
+)
 def angle_sinkage(ctx, p, x, ground):
     """Soil sheared across the wheel is carried out from under it as is soil sheared along it.
 

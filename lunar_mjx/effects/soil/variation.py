@@ -16,13 +16,31 @@ _EXPONENT = (-2.0, 2.0)
 @effect(
     "soil",
     order=-55,
-    stiffness=Parameter(1.0, 0.0, _EXPONENT, "1", "exponent of gravity in k_phi",
-                        "Reece 1965: gamma b k_phi; sinkage of one mass is the same at any g (Kobayashi et al. 2010)"),
-    cohesion=Parameter(0.5, 0.0, _EXPONENT, "1", "exponent of gravity in cohesion and k_c",
-                       "choice; soil that settled in less gravity is looser"),
-    reference=Parameter(9.80665, None, (0.1, 100.0), "m/s2", "gravity in which the soil's parameters were measured",
-                        "standard gravity of the Earth"),
-)  # fmt: skip
+    stiffness=Parameter(
+        1.0,
+        0.0,
+        _EXPONENT,
+        "1",
+        "exponent of gravity in k_phi",
+        "Reece 1965: gamma b k_phi; sinkage of one mass is the same at any g (Kobayashi et al. 2010)",
+    ),
+    cohesion=Parameter(
+        0.5,
+        0.0,
+        _EXPONENT,
+        "1",
+        "exponent of gravity in cohesion and k_c",
+        "choice; soil that settled in less gravity is looser",
+    ),
+    reference=Parameter(
+        9.80665,
+        None,
+        (0.1, 100.0),
+        "m/s2",
+        "gravity in which the soil's parameters were measured",
+        "standard gravity of the Earth",
+    ),
+)
 def gravity_soil(ctx, p, x, ground):
     """k_phi (g/g_ref)^a, and k_c and c times (g/g_ref)^b: gravity changes the soil, not only the weight upon it.
 
@@ -39,11 +57,23 @@ def gravity_soil(ctx, p, x, ground):
 @effect(
     "soil",
     order=-60,
-    stiffness=Parameter(0.5, 0.0, (-5.0, 5.0), "1", "loss of stiffness at the angle of repose, as a logarithm",
-                        "choice: 40 % less at repose"),
-    friction=Parameter(0.1, 0.0, (-5.0, 5.0), "1", "loss of friction at the angle of repose, as a logarithm",
-                       "choice: 10 % less at repose"),
-)  # fmt: skip
+    stiffness=Parameter(
+        0.5,
+        0.0,
+        (-5.0, 5.0),
+        "1",
+        "loss of stiffness at the angle of repose, as a logarithm",
+        "choice: 40 % less at repose",
+    ),
+    friction=Parameter(
+        0.1,
+        0.0,
+        (-5.0, 5.0),
+        "1",
+        "loss of friction at the angle of repose, as a logarithm",
+        "choice: 10 % less at repose",
+    ),
+)
 def slope_stiffness(ctx, p, x, ground):
     """k exp(-a m) and tan phi exp(-b m) with m = (tan alpha/tan phi)^2, the share of strength that the slope takes.
 
@@ -72,15 +102,21 @@ def _patch_parameters() -> dict[str, Parameter]:
     for i in range(PATCHES):
         # Nominal: one soft patch 3 m ahead of the origin.
         parameters[f"amplitude_{i}"] = Parameter(
-            -0.7 if i == 2 else 0.0, 0.0, (-4.0, 4.0), "1", f"logarithm of the soil's stiffness factor at place {i}",
-            "choice: half as stiff at place 2")  # fmt: skip
+            -0.7 if i == 2 else 0.0,
+            0.0,
+            (-4.0, 4.0),
+            "1",
+            f"logarithm of the soil's stiffness factor at place {i}",
+            "choice: half as stiff at place 2",
+        )
     for i in range(PATCHES):
         where = f"of place {i}; see `places_along` for those of a track"
         parameters[f"x_{i}"] = Parameter(1.5 * i, None, (-1e6, 1e6), "m", "x " + where, "choice: every 1.5 m along x")
         parameters[f"y_{i}"] = Parameter(0.0, None, (-1e6, 1e6), "m", "y " + where, "choice: along x")
     parameters["width"] = Parameter(1.0, None, (0.01, 1e4), "m", "standard deviation of a patch", "choice")
     parameters["cohesive"] = Parameter(
-        0.5, None, (-2.0, 2.0), "1", "exponent by which cohesion follows the stiffness", "choice")  # fmt: skip
+        0.5, None, (-2.0, 2.0), "1", "exponent by which cohesion follows the stiffness", "choice"
+    )
     return parameters
 
 
@@ -93,10 +129,7 @@ def _soil_patches(ctx, p: SimpleNamespace, x, ground):
     total = jnp.clip(total, -5.0, 5.0)
     firm = jnp.exp(total)
     return dataclasses.replace(
-        ground,
-        k_c=ground.k_c * firm,
-        k_phi=ground.k_phi * firm,
-        cohesion=ground.cohesion * jnp.exp(p.cohesive * total),
+        ground, k_c=ground.k_c * firm, k_phi=ground.k_phi * firm, cohesion=ground.cohesion * jnp.exp(p.cohesive * total)
     )
 
 

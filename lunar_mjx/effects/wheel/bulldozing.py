@@ -30,13 +30,21 @@ def passive_pressure(soil, weight, depth, depth_squared):
 @effect(
     "wheel_shear",
     order=5,
-    front=Parameter(1.0, 0.0, (0.0, 10.0), "1", "share of the bulldozing resistance in front of the wheel",
-                    "Wong 2008: 1"),
-    side=Parameter(1.0, 0.0, (0.0, 10.0), "1", "share of the bulldozing resistance beside the wheel",
-                   "Ishigami et al. 2007: 1"),
-    density=Parameter(1600.0, None, (500.0, 5000.0), "kg/m3", "bulk density of the soil",
-                      "Lunar Sourcebook: 1500 to 1700 near the surface"),
-)  # fmt: skip
+    front=Parameter(
+        1.0, 0.0, (0.0, 10.0), "1", "share of the bulldozing resistance in front of the wheel", "Wong 2008: 1"
+    ),
+    side=Parameter(
+        1.0, 0.0, (0.0, 10.0), "1", "share of the bulldozing resistance beside the wheel", "Ishigami et al. 2007: 1"
+    ),
+    density=Parameter(
+        1600.0,
+        None,
+        (500.0, 5000.0),
+        "kg/m3",
+        "bulk density of the soil",
+        "Lunar Sourcebook: 1500 to 1700 near the surface",
+    ),
+)
 def bulldozing(ctx, p, x, wheel):
     """Passive earth pressure on the front and on the side wall: R = D_1 (c h + D_2 rho g h^2/2) per width (Hegedus).
 
@@ -64,11 +72,18 @@ def bulldozing(ctx, p, x, wheel):
 @effect(
     "wheel_shear",
     order=15,
-    coefficient=Parameter(0.05, 0.0, (0.0, 1.0), "1", "lever of the rolling resistance over the wheel's radius",
-                          "choice: flexible metal wheel on firm ground; rigid wheels have about 0.01"),
-    speed_scale=Parameter(0.01, None, (1e-5, 1.0), "m/s", "rim speed of full resistance",
-                          "choice: well below driving speed"),
-)  # fmt: skip
+    coefficient=Parameter(
+        0.05,
+        0.0,
+        (0.0, 1.0),
+        "1",
+        "lever of the rolling resistance over the wheel's radius",
+        "choice: flexible metal wheel on firm ground; rigid wheels have about 0.01",
+    ),
+    speed_scale=Parameter(
+        0.01, None, (1e-5, 1.0), "m/s", "rim speed of full resistance", "choice: well below driving speed"
+    ),
+)
 def rolling_resistance(ctx, p, x, wheel):
     """M_y = -f r W tanh(r omega/v_0): the wheel's own deformation puts the load ahead of the axle by f r (Wong 2008).
 

@@ -82,8 +82,14 @@ def normal_damping_force(ctx, coefficient, theta_1):
     return coefficient * area * ctx.contact.sinkage_rate
 
 
-_DAMPING = Parameter(9e4, None, (0.0, 1e7), "Pa s/m", "damping of the normal contact per area",
-                     "choice: about half critical for a 110 kg quarter rover")  # fmt: skip
+_DAMPING = Parameter(
+    9e4,
+    None,
+    (0.0, 1e7),
+    "Pa s/m",
+    "damping of the normal contact per area",
+    "choice: about half critical for a 110 kg quarter rover",
+)
 
 
 @effect("wheel_normal", damping=_DAMPING)
@@ -139,11 +145,23 @@ def contact_length(ctx, normal):
         "slip_y": StateVariable(0.0, "1", "shear displacement across the wheel over the contact length"),
         "direction": StateVariable(0.0, "1", "where the contact arc leans: 1 forward, -1 backward, 0 upright"),
     },
-    damping_time=Parameter(0.1, 0.0, (0.0, 10.0), "s", "damping of the sheared soil while it is loaded",
-                           "choice: 0.2-0.4 of critical for a parked rover"),
-    rock_length=Parameter(0.2, None, (1e-3, 10.0), "m", "rolling distance over which contact on rock renews itself",
-                          "choice: order of the wheel's radius"),
-)  # fmt: skip
+    damping_time=Parameter(
+        0.1,
+        0.0,
+        (0.0, 10.0),
+        "s",
+        "damping of the sheared soil while it is loaded",
+        "choice: 0.2-0.4 of critical for a parked rover",
+    ),
+    rock_length=Parameter(
+        0.2,
+        None,
+        (1e-3, 10.0),
+        "m",
+        "rolling distance over which contact on rock renews itself",
+        "choice: order of the wheel's radius",
+    ),
+)
 def shear_state(ctx, p, x, wheel):
     """Shear displacement as a state: static friction at standstill, eqs. 8 and 9 when rolling (flaw 4).
 

@@ -37,10 +37,11 @@ _ANGLES = "Wong & Reece 1967, J. Terramechanics 4(1):81"
     order=1,
     c1=Parameter(0.4, 0.5, (0.05, 0.95), "1", "theta_m/theta_1 without slip", "Ishigami et al. 2007: a_0 = 0.4"),
     c2=Parameter(0.15, 0.0, (-0.5, 0.5), "1", "its growth with slip", "Ishigami et al. 2007: a_1 = 0.15"),
-    c3=Parameter(0.2, 0.0, (0.0, 0.9), "1", "-theta_2/theta_1 without slip",
-                 "choice: rear contact of dry sand, " + _ANGLES),
+    c3=Parameter(
+        0.2, 0.0, (0.0, 0.9), "1", "-theta_2/theta_1 without slip", "choice: rear contact of dry sand, " + _ANGLES
+    ),
     c4=Parameter(0.1, 0.0, (-0.9, 0.9), "1", "its growth with slip", "choice"),
-)  # fmt: skip
+)
 def exit_angle(ctx, p, x, normal):
     """theta_m = (c_1 + c_2 s) theta_1 and theta_2 = -(c_3 + c_4 s) theta_1 (Wong & Reece 1967).
 
@@ -83,9 +84,15 @@ def exit_angle(ctx, p, x, normal):
     "wheel_normal",
     order=5,
     transient=True,
-    rate=Parameter(2.0, 0.0, (0.0, 100.0), "s/m", "growth of the pressure with the rate of sinking",
-                   "choice: 40 % at 0.2 m/s, as when a wheel drops off a stone"),
-)  # fmt: skip
+    rate=Parameter(
+        2.0,
+        0.0,
+        (0.0, 100.0),
+        "s/m",
+        "growth of the pressure with the rate of sinking",
+        "choice: 40 % at 0.2 m/s, as when a wheel drops off a stone",
+    ),
+)
 def dynamic_sinkage(ctx, p, x, normal):
     """p = k z^n (1 + c dz/dt), never negative: the soil resists fast sinking with its whole pressure.
 

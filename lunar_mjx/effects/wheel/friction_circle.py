@@ -12,9 +12,15 @@ from lunar_mjx.effects.base import Parameter, effect
 @effect(
     "wheel_shear",
     order=-5,
-    share=Parameter(1.0, 0.0, (0.0, 1.0), "1", "0: each direction has the whole shear strength; 1: they share it",
-                    "friction acts against the sliding, whatever its direction"),
-)  # fmt: skip
+    share=Parameter(
+        1.0,
+        0.0,
+        (0.0, 1.0),
+        "1",
+        "0: each direction has the whole shear strength; 1: they share it",
+        "friction acts against the sliding, whatever its direction",
+    ),
+)
 def friction_circle(ctx, p, x, wheel):
     """(tau_x, tau_y) = (c + sigma tan phi)(1 - exp(-q)) (q_x, q_y)/q with q_i = j_i/K_i and q^2 = q_x^2 + q_y^2.
 

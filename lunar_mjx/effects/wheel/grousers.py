@@ -16,11 +16,23 @@ _TURN = 6.283185307179586
     order=-5,
     height=Parameter(0.015, 0.0, (0.0, 0.1), "m", "height of the grousers", "VIPER: 10 to 25 mm"),
     count=Parameter(24.0, None, (0.0, 200.0), "1", "number of grousers around the wheel", "VIPER: 24"),
-    area_share=Parameter(1.0, None, (0.0, 1.0), "1", "share mu of the shearing that takes place at the tips",
-                         "choice: soil between the tips turns with the wheel"),
-    largest=Parameter(1.5, None, (1.0, 5.0), "1", "largest factor of the shear stress",
-                      "choice: beyond it the tips stand too close to fill with soil"),
-)  # fmt: skip
+    area_share=Parameter(
+        1.0,
+        None,
+        (0.0, 1.0),
+        "1",
+        "share mu of the shearing that takes place at the tips",
+        "choice: soil between the tips turns with the wheel",
+    ),
+    largest=Parameter(
+        1.5,
+        None,
+        (1.0, 5.0),
+        "1",
+        "largest factor of the shear stress",
+        "choice: beyond it the tips stand too close to fill with soil",
+    ),
+)
 def grousers(ctx, p, x, wheel):
     """Soil between the tips turns with the wheel: it shears at r_s = r + mu h_g, with 1 + N_g h_g/(2 pi r) the stress.
 
@@ -33,8 +45,15 @@ def grousers(ctx, p, x, wheel):
 
 
 def _amplitude(which: str, nominal: float) -> Parameter:
-    return Parameter(nominal, 0.0, (-0.9, 0.9), "1", f"relative amplitude of the soil's stiffness, {which} part",
-                     "choice: drawbar pull oscillates by some 10 % (Irani et al. 2011)", axis="wheel")  # fmt: skip
+    return Parameter(
+        nominal,
+        0.0,
+        (-0.9, 0.9),
+        "1",
+        f"relative amplitude of the soil's stiffness, {which} part",
+        "choice: drawbar pull oscillates by some 10 % (Irani et al. 2011)",
+        axis="wheel",
+    )
 
 
 @effect(

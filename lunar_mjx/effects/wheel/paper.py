@@ -59,11 +59,18 @@ def printed_slip_angle(contact):
 @effect(
     "wheel_normal",
     replaces=("pressure_sinkage",),
-    stiffness=Parameter(5e4, None, (1e2, 1e8), "N/m", "contact stiffness k_N",
-                        "paper's release: 5e4 to 1e6; lower end chosen"),
-    damping=Parameter(300.0, 0.0, (0.0, 1e6), "N s/m", "contact damping c_N",
-                      "paper's release: 1e2 to 1e5; chosen stable for a 1 kg wheel at 2 ms"),
-)  # fmt: skip
+    stiffness=Parameter(
+        5e4, None, (1e2, 1e8), "N/m", "contact stiffness k_N", "paper's release: 5e4 to 1e6; lower end chosen"
+    ),
+    damping=Parameter(
+        300.0,
+        0.0,
+        (0.0, 1e6),
+        "N s/m",
+        "contact damping c_N",
+        "paper's release: 1e2 to 1e5; chosen stable for a 1 kg wheel at 2 ms",
+    ),
+)
 def penalty_contact(ctx, p, x, normal):
     """F_N = k_N z + c_N zdot on every ground (flaw 2): 0.02 to 0.4 mm deep, where the soil carries next to nothing."""
     contact, geometry = ctx.contact, ctx.geometry
@@ -137,9 +144,15 @@ def printed_shear(ctx, p, x, wheel):
     "wheel_shear",
     order=10,
     mu=Parameter(0.8, 0.0, (0.0, 2.0), "1", "friction coefficient of the ground", "paper's release: 0.7 to 0.9"),
-    speed_scale=Parameter(0.05, None, (1e-4, 1.0), "m/s", "sliding speed v_e of full friction",
-                          "choice: stable with explicit forces at 2 ms"),
-)  # fmt: skip
+    speed_scale=Parameter(
+        0.05,
+        None,
+        (1e-4, 1.0),
+        "m/s",
+        "sliding speed v_e of full friction",
+        "choice: stable with explicit forces at 2 ms",
+    ),
+)
 def engine_friction(ctx, p, x, wheel):
     """f = mu F_N against the sliding of the rim, on rock and soil alike: the physics engine's own contact friction.
 

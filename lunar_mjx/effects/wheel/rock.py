@@ -59,13 +59,19 @@ hard_ground = Effect(
         "stiffness": _STIFFNESS,
         "damping": _DAMPING,
         "mu": _MU,
-        "slip_scale": Parameter(0.01, None, (1e-4, 1.0), "1", "slip at which friction on rock is 63 % mobilised",
-                                "choice: order of a rigid wheel's"),
+        "slip_scale": Parameter(
+            0.01,
+            None,
+            (1e-4, 1.0),
+            "1",
+            "slip at which friction on rock is 63 % mobilised",
+            "choice: order of a rigid wheel's",
+        ),
     },
     order=10,
     doc="""Wheel on rock: F_N = k_N z + c_N zdot and friction mu F_N against the slip (seed paper III-C4), where the
     map says rock. Friction saturates in the slip that the shear state carries, hence holds a parked wheel.""",
-)  # fmt: skip
+)
 
 
 def _closest_point_to_sphere(center: Vec3, wheel_center: Vec3, axle: Vec3, radius, width) -> tuple[Vec3, Vec3, Any]:
@@ -92,8 +98,9 @@ def _sliding_friction(velocity: Vec3, normal: Vec3, mu, load, speed_scale) -> Ve
     return tangential * (-mu * load * jnp.tanh(speed / speed_scale) / speed)
 
 
-_SPEED = Parameter(0.05, None, (1e-4, 1.0), "m/s", "sliding speed of full friction",
-                   "choice: stable with explicit forces at 2 ms")  # fmt: skip
+_SPEED = Parameter(
+    0.05, None, (1e-4, 1.0), "m/s", "sliding speed of full friction", "choice: stable with explicit forces at 2 ms"
+)
 
 
 @effect("wheel_shear", order=20, stiffness=_STIFFNESS, damping=_DAMPING, mu=_MU, speed_scale=_SPEED)
@@ -112,9 +119,7 @@ def boulders(ctx, p, x, wheel):
     force = toward * -load + _sliding_friction(velocity, toward, p.mu, load, p.speed_scale)
     frame = Frame(contact.forward, contact.left, contact.normal)
     return dataclasses.replace(
-        wheel,
-        force=wheel.force + frame.from_world(force),
-        moment=wheel.moment + frame.from_world(closest.cross(force)),
+        wheel, force=wheel.force + frame.from_world(force), moment=wheel.moment + frame.from_world(closest.cross(force))
     )
 
 

@@ -35,29 +35,39 @@ def scaled_stress(ctx, normal, factor):
     """The normal stress times `factor(theta)`: at every node where it is integrated, else at its maximum."""
     if normal.stress is None:
         f = factor(normal.theta_m)
-        return dataclasses.replace(normal, sigma_m=normal.sigma_m * f, load=normal.load * f,
-                                   resistance=normal.resistance * f)  # fmt: skip
+        return dataclasses.replace(
+            normal, sigma_m=normal.sigma_m * f, load=normal.load * f, resistance=normal.resistance * f
+        )
     # Nodes along a first axis: written out one by one they take minutes to compile.
-    theta, weight, old = (jnp.stack([v + 0.0 * normal.load for v in values])
-                          for values in (normal.stress.theta, normal.stress.weight, normal.stress.sigma))  # fmt: skip
+    theta, weight, old = (
+        jnp.stack([v + 0.0 * normal.load for v in values])
+        for values in (normal.stress.theta, normal.stress.weight, normal.stress.sigma)
+    )
     f = factor(theta)
     change = ctx.geometry.radius * ctx.geometry.width * weight * old * (f - 1.0)
     # What changes is added, so that nothing is rounded where nothing changes.
     return dataclasses.replace(
-        normal, sigma_m=normal.sigma_m * factor(normal.theta_m),
+        normal,
+        sigma_m=normal.sigma_m * factor(normal.theta_m),
         load=normal.load + jnp.sum(change * jnp.cos(theta), axis=0),
         resistance=normal.resistance + jnp.sum(change * jnp.sin(theta), axis=0),
         stress=dataclasses.replace(normal.stress, sigma=tuple(old * f)),
-    )  # fmt: skip
+    )
 
 
 @effect(
     "soil",
     order=5,
-    softening=Parameter(0.7, 0.0, (0.0, 20.0), "1", "loss of stiffness by sliding as fast as the wheel moves",
-                        "choice: stress of a plate that moves along itself, about half of one that moves into the "
-                        "ground (Li, Zhang & Goldman 2013)"),
-)  # fmt: skip
+    softening=Parameter(
+        0.7,
+        0.0,
+        (0.0, 20.0),
+        "1",
+        "loss of stiffness by sliding as fast as the wheel moves",
+        "choice: stress of a plate that moves along itself, about half of one that moves into the "
+        "ground (Li, Zhang & Goldman 2013)",
+    ),
+)
 def slide_softening(ctx, p, x, ground):
     """k_c and k_phi over 1 + a S, S = |(r omega - v_x, v_y)|/max(r omega, V): soil slid over carries less.
 
@@ -154,9 +164,15 @@ def shear_softening(ctx, p, x, normal):
 @effect(
     "wheel_normal",
     order=4,
-    lost=Parameter(1.0, 0.0, (0.0, 1.0), "1", "share of the contact behind the axle lost by moving broadside",
-                   "1: the rim only rises away from soil that enters behind the axle"),
-)  # fmt: skip
+    lost=Parameter(
+        1.0,
+        0.0,
+        (0.0, 1.0),
+        "1",
+        "share of the contact behind the axle lost by moving broadside",
+        "1: the rim only rises away from soil that enters behind the axle",
+    ),
+)
 def side_exit(ctx, p, x, normal):
     """Stress behind the axle times 1 - lambda |v_y|/max(r omega, V): broadside, a wheel loses its rear contact.
 
@@ -212,17 +228,37 @@ def wall_bearing(tan_phi, tan_delta):
 @effect(
     "wheel_shear",
     order=-9,
-    pressure=Parameter(1.4, 0.0, (0.0, 10.0), "1", "factor of Coulomb's passive earth pressure on the flank",
-                       "1: a long wall; walls not much longer than deep have 1.3 to 2 (McKyes 1985), measured 1.4"),
-    friction=Parameter(0.6667, None, (0.0, 1.0), "1", "friction of the flank over the soil's own",
-                       "steel on sand, two thirds"),
-    build_up=Parameter(4.0, None, (0.1, 50.0), "1", "sideways way over K_y at which 63 % of the pressure have built up",
-                       "choice: a wedge needs more way than a shear band"),
-    density=Parameter(1600.0, None, (500.0, 5000.0), "kg/m3", "bulk density of the soil",
-                      "Lunar Sourcebook: 1500 to 1700 near the surface"),
-    speed_scale=Parameter(2e-3, None, (1e-5, 1.0), "m/s", "speed of full friction on the flank",
-                          "choice: well below driving speed"),
-)  # fmt: skip
+    pressure=Parameter(
+        1.4,
+        0.0,
+        (0.0, 10.0),
+        "1",
+        "factor of Coulomb's passive earth pressure on the flank",
+        "1: a long wall; walls not much longer than deep have 1.3 to 2 (McKyes 1985), measured 1.4",
+    ),
+    friction=Parameter(
+        0.6667, None, (0.0, 1.0), "1", "friction of the flank over the soil's own", "steel on sand, two thirds"
+    ),
+    build_up=Parameter(
+        4.0,
+        None,
+        (0.1, 50.0),
+        "1",
+        "sideways way over K_y at which 63 % of the pressure have built up",
+        "choice: a wedge needs more way than a shear band",
+    ),
+    density=Parameter(
+        1600.0,
+        None,
+        (500.0, 5000.0),
+        "kg/m3",
+        "bulk density of the soil",
+        "Lunar Sourcebook: 1500 to 1700 near the surface",
+    ),
+    speed_scale=Parameter(
+        2e-3, None, (1e-5, 1.0), "m/s", "speed of full friction on the flank", "choice: well below driving speed"
+    ),
+)
 def side_wall(ctx, p, x, wheel):
     """The leading flank pushes a wedge of soil aside, which rises along it: a blade that the wheel's turning rubs.
 
@@ -256,8 +292,9 @@ def side_wall(ctx, p, x, wheel):
     drag = tan_delta * jnp.abs(push) / speed
     d_x, d_z = -drag * u_x, -drag * u_z
     force = Vec3(jnp.sum(d_x, axis=0), -jnp.sum(push, axis=0), jnp.sum(d_z, axis=0))
-    moment = Vec3(-jnp.sum(arm * push, axis=0), -jnp.sum(arm * d_x + place * d_z, axis=0),
-                  -jnp.sum(place * push, axis=0))  # fmt: skip
+    moment = Vec3(
+        -jnp.sum(arm * push, axis=0), -jnp.sum(arm * d_x + place * d_z, axis=0), -jnp.sum(place * push, axis=0)
+    )
     return dataclasses.replace(wheel, force=wheel.force + force, moment=wheel.moment + moment)
 
 

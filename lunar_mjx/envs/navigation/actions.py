@@ -70,8 +70,13 @@ def action_map(
     rover = model.rover
     for group in ("drive",) if mode.startswith("joint") else ("drive", "steer", "suspension"):
         if rover.group(group) is None:
-            raise bad_input("navigation", "action", mode, f"drives {group} motors, which {rover.name} lacks",
-                            "use joint_torque, joint_current or joint_velocity")  # fmt: skip
+            raise bad_input(
+                "navigation",
+                "action",
+                mode,
+                f"drives {group} motors, which {rover.name} lacks",
+                "use joint_torque, joint_current or joint_velocity",
+            )
     limits = _limits(model, mode, top_speed, load_share)
     groups = [g.name for g in rover.groups for _ in g.joints]
     if mode.startswith("joint"):

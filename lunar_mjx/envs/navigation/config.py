@@ -96,16 +96,29 @@ def _check(c: NavigationConfig) -> None:
         value = getattr(c, name)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise bad_input("navigation", name, value, "is not a whole number of at least 1", "give one")
-    for name in ("top_speed", "load_share", "goal_radius", "episode_time", "most_tilt", "stuck_time",
-                 "stuck_distance", "steepest"):  # fmt: skip
+    for name in (
+        "top_speed",
+        "load_share",
+        "goal_radius",
+        "episode_time",
+        "most_tilt",
+        "stuck_time",
+        "stuck_distance",
+        "steepest",
+    ):
         if require_finite("navigation", name, getattr(c, name)) <= 0.0:
             raise bad_input("navigation", name, getattr(c, name), "is not positive", "give a number above zero")
     for name in ("success", "failure", "edge", "start_yaw"):
         require_finite("navigation", name, getattr(c, name))
     low, high = c.goal_distance
     if not c.goal_radius < low <= high < np.inf:
-        raise bad_input("navigation", "goal_distance", c.goal_distance, f"is not a range above goal_radius = "
-                        f"{c.goal_radius}", "give least and greatest distance in m")  # fmt: skip
+        raise bad_input(
+            "navigation",
+            "goal_distance",
+            c.goal_distance,
+            f"is not a range above goal_radius = {c.goal_radius}",
+            "give least and greatest distance in m",
+        )
     for name, allowed in (("action", ACTION_MODES), ("divergence", DIVERGENCE)):
         if getattr(c, name) not in allowed:
             raise bad_input("navigation", name, getattr(c, name), "does not exist", f"use one of {', '.join(allowed)}")
@@ -119,8 +132,18 @@ def _check(c: NavigationConfig) -> None:
         require_finite("navigation", f"weights.{name}", weight)
 
 
-EGOCENTRIC = ("goal_body", "up", "body_velocity", "body_rates", "acceleration", "joints", "slip", "last_action",
-              "waited", "height_scan")  # fmt: skip
+EGOCENTRIC = (
+    "goal_body",
+    "up",
+    "body_velocity",
+    "body_rates",
+    "acceleration",
+    "joints",
+    "slip",
+    "last_action",
+    "waited",
+    "height_scan",
+)
 """What the tuned policies see: nothing depends on where in the world the rover is or which way north lies."""
 
 SOIL_RANGES = (

@@ -128,8 +128,9 @@ class NavigationEnv:
         self.observation_size = shapes.obs.shape[1]
         self.privileged_size = shapes.privileged.shape[1]
 
-    def place(self, model: Model | None = None, ranges: Sequence[randomise.Range] | None = None, seed: int | None = None
-              ) -> NavigationParams:  # fmt: skip
+    def place(
+        self, model: Model | None = None, ranges: Sequence[randomise.Range] | None = None, seed: int | None = None
+    ) -> NavigationParams:
         """Parameters for another terrain, other ranges of the same parameters, or other places.
 
         Args:
@@ -147,12 +148,23 @@ class NavigationEnv:
         if [(r.parameter, r.scale, r.relative) for r in ranges] != [
             (r.parameter, r.scale, r.relative) for r in c.randomise
         ]:
-            raise bad_input("navigation", "ranges", [r.parameter for r in ranges], "are not those of the task",
-                            "give the same parameters and scales in the same order")  # fmt: skip
+            raise bad_input(
+                "navigation",
+                "ranges",
+                [r.parameter for r in ranges],
+                "are not those of the task",
+                "give the same parameters and scales in the same order",
+            )
         starts, goals = draw_places(
-            model.terrain, c.places, c.goal_distance, c.place_seed if seed is None else seed,
-            clearance=0.5 + 2.0 * self._ride, margin=c.edge + 1.0, steepest=c.steepest, within=c.start_within,
-        )  # fmt: skip
+            model.terrain,
+            c.places,
+            c.goal_distance,
+            c.place_seed if seed is None else seed,
+            clearance=0.5 + 2.0 * self._ride,
+            margin=c.edge + 1.0,
+            steepest=c.steepest,
+            within=c.start_within,
+        )
         bounds = np.array([(r.low, r.high) for r in ranges], np.float32).reshape(-1, 2)
         gains = kalman.gains(c.kalman, c.decimation * model.timestep).astype(np.float32)
         return NavigationParams(
@@ -163,8 +175,9 @@ class NavigationEnv:
         """Begins an episode in every environment; `keys` (env, 2) raw random keys."""
         # the first episode and the prepared one in one batch: half the program to compile
         both = self._begin(params, jnp.concatenate([keys, _split(keys)[:, 0]]))
-        first, ready = (jax.tree.map(lambda a, p=part: a[p], both) for part in
-                        (slice(keys.shape[0]), slice(keys.shape[0], None)))  # fmt: skip
+        first, ready = (
+            jax.tree.map(lambda a, p=part: a[p], both) for part in (slice(keys.shape[0]), slice(keys.shape[0], None))
+        )
         obs, privileged, inner = first.obs, first.privileged, first.inner
         zero, no = jnp.zeros(keys.shape[0], obs.dtype), jnp.zeros(keys.shape[0], bool)
         terms = (f"reward_{n}" for n in self.config.weights)
@@ -184,9 +197,15 @@ class NavigationEnv:
         inner, view = self._advance(params, inner, action)
         to_goal = inner.goal - view.position[:, :2]
         transition = rewards.Transition(
-            before, to_goal, view.roll, view.pitch, view.yaw, view.filtered.acceleration[:, 2], action,
+            before,
+            to_goal,
+            view.roll,
+            view.pitch,
+            view.yaw,
+            view.filtered.acceleration[:, 2],
+            action,
             state.inner.last_action,
-        )  # fmt: skip
+        )
         terms = {name: weight * rewards.TERMS[name](transition) for name, weight in c.weights.items()}
         ends = self._ends(params, inner, view, to_goal)
         success = ends["reached"]
@@ -207,12 +226,27 @@ class NavigationEnv:
         final_obs, final_privileged = self._observe(params, inner, view)
         if c.divergence == "reset":
             # the successor of a state that is gone carries no value, but must not poison a batch
-            final_obs, final_privileged = (jnp.nan_to_num(a, posinf=0.0, neginf=0.0) for a in
-                                           (final_obs, final_privileged))  # fmt: skip
-        return side_by_side(self._restart(params, inner, State(
-            final_obs, final_privileged, reward, terminated, truncated, final_obs, final_privileged, metrics,
-            self._info(view), inner,
-        )))  # fmt: skip
+            final_obs, final_privileged = (
+                jnp.nan_to_num(a, posinf=0.0, neginf=0.0) for a in (final_obs, final_privileged)
+            )
+        return side_by_side(
+            self._restart(
+                params,
+                inner,
+                State(
+                    final_obs,
+                    final_privileged,
+                    reward,
+                    terminated,
+                    truncated,
+                    final_obs,
+                    final_privileged,
+                    metrics,
+                    self._info(view),
+                    inner,
+                ),
+            )
+        )
 
     def _restart(self, params: NavigationParams, inner: Inner, state: State) -> State:
         """Begins anew where the episode ended, keeping the final observations.
@@ -248,9 +282,15 @@ class NavigationEnv:
         system, axes = randomise.apply(params.system, inner.drawn)
         controls = self.actions.controls(action)
         physics, (slip, sinkage) = self.system.rollout_batch(
-            system, inner.physics, controls[:, None], c.decimation, axes, lambda seen: (seen.slip, seen.sinkage),
-            one_body=True, last=True,
-        )  # fmt: skip
+            system,
+            inner.physics,
+            controls[:, None],
+            c.decimation,
+            axes,
+            lambda seen: (seen.slip, seen.sinkage),
+            one_body=True,
+            last=True,
+        )
         return physics, slip[:, 0], sinkage[:, 0]
 
     def _advance(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Inner, View]:
@@ -329,9 +369,16 @@ class NavigationEnv:
 
     def _view(self, inner: Inner) -> View:
         return read(
-            self._reader, inner.physics, slip=inner.slip, sinkage=inner.sinkage, origin=inner.origin, goal=inner.goal,
-            filtered=inner.filtered, last_action=inner.last_action, waited=inner.waited,
-        )  # fmt: skip
+            self._reader,
+            inner.physics,
+            slip=inner.slip,
+            sinkage=inner.sinkage,
+            origin=inner.origin,
+            goal=inner.goal,
+            filtered=inner.filtered,
+            last_action=inner.last_action,
+            waited=inner.waited,
+        )
 
     def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:
         scene = Scene(params.system.terrain, inner.drawn, self._ride, self._scale)

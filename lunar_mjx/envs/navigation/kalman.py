@@ -39,8 +39,13 @@ class KalmanConfig:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             if require_finite("KalmanConfig", field.name, getattr(self, field.name)) <= 0.0:
-                raise bad_input("KalmanConfig", field.name, getattr(self, field.name), "is not positive",
-                                "give a standard deviation above zero")  # fmt: skip
+                raise bad_input(
+                    "KalmanConfig",
+                    field.name,
+                    getattr(self, field.name),
+                    "is not positive",
+                    "give a standard deviation above zero",
+                )
 
 
 @pytree
@@ -61,11 +66,7 @@ def transition(dt: float) -> np.ndarray:
 def process_noise(dt: float, jerk: float) -> np.ndarray:
     """Covariance that white jerk of spectral density `jerk`^2 adds over `dt` (Bar-Shalom 2001, eq. 6.2.3-7)."""
     return jerk**2 * np.array(
-        [
-            [dt**5 / 20, dt**4 / 8, dt**3 / 6],
-            [dt**4 / 8, dt**3 / 3, dt**2 / 2],
-            [dt**3 / 6, dt**2 / 2, dt],
-        ]
+        [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
     )
 
 

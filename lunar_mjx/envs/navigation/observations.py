@@ -131,10 +131,25 @@ def drawn(v: View, s: Scene) -> Any:
 BLOCKS: dict[str, Block] = {
     f.__name__: f
     for f in (
-        position, euler, velocity, angular_velocity, acceleration, goal, goal_body, up, body_velocity, body_rates,
-        joints, temperatures, slip, sinkage, last_action, waited, drawn,
+        position,
+        euler,
+        velocity,
+        angular_velocity,
+        acceleration,
+        goal,
+        goal_body,
+        up,
+        body_velocity,
+        body_rates,
+        joints,
+        temperatures,
+        slip,
+        sinkage,
+        last_action,
+        waited,
+        drawn,
     )
-} | {"height_scan": scan}  # fmt: skip
+} | {"height_scan": scan}
 """All blocks by name."""
 
 SCAN_POINTS = len(SCAN_AHEAD) * len(SCAN_ASIDE)

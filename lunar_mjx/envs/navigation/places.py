@@ -85,9 +85,13 @@ def draw_places(
             if have >= count:
                 break
     if have < count:
-        raise bad_input("navigation", "goal_distance", distance,
-                        f"leaves too few places on {terrain.name} ({have} of {count} found)",
-                        "shorten it, or take a larger terrain")  # fmt: skip
+        raise bad_input(
+            "navigation",
+            "goal_distance",
+            distance,
+            f"leaves too few places on {terrain.name} ({have} of {count} found)",
+            "shorten it, or take a larger terrain",
+        )
     return tuple(np.concatenate(a)[:count].astype(np.float32) for a in (starts, goals))  # type: ignore[return-value]
 
 

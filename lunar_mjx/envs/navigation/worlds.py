@@ -22,8 +22,15 @@ _BOULDERS = {"abundance": 0.07, "smallest": 0.5, "largest": 2.4, "gap": 3.2}
 cover about the same (0.8 and 0.9 %)."""
 
 
-def _world(seed: int, deviation: float, density: float, deepest: float, abundance: float, extent: float,
-           rocks: dict[str, float] = _ROVER_SIZED) -> Any:  # fmt: skip
+def _world(
+    seed: int,
+    deviation: float,
+    density: float,
+    deepest: float,
+    abundance: float,
+    extent: float,
+    rocks: dict[str, float] = _ROVER_SIZED,
+) -> Any:
     return {
         "seed": seed,
         "surface": {

@@ -8,18 +8,7 @@ import numpy as np
 
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log
-from lunar_mjx.logs.series import (
-    Agreement,
-    agreement,
-    at,
-    edges,
-    guess,
-    increments,
-    integrals,
-    means,
-    sigma,
-    span,
-)
+from lunar_mjx.logs.series import Agreement, agreement, at, edges, guess, increments, integrals, means, sigma, span
 
 NORM_TOLERANCE = 0.02
 """A quaternion of four components with 1 % noise has a norm within 2 %."""

@@ -58,8 +58,10 @@ def _coincidences(log: SteadyLog) -> float:
 
     number, whole = pairs([group]), pairs([group, *log.table.measured.values()])
     # a copied row must not count as proof that instruments repeat themselves
-    shares = [max((pairs([group, values]) - whole) / max(number, 1.0), _agree(values, group))
-              for values in log.table.measured.values()]  # fmt: skip
+    shares = [
+        max((pairs([group, values]) - whole) / max(number, 1.0), _agree(values, group))
+        for values in log.table.measured.values()
+    ]
     return number * float(np.prod(shares))
 
 

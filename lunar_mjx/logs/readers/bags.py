@@ -33,14 +33,17 @@ def messages(path: Path, topics: Collection[str]) -> Iterator[Message]:
     elif path.is_dir() or path.suffix in (".db3", ".bag"):
         yield from _rosbag(path, topics)
     else:
-        raise UserError(f"{path}: is no recording that is known here; give an .mcap, .db3 or .bag file, or the folder "
-                        "of a ROS 2 bag.")  # fmt: skip
+        raise UserError(
+            f"{path}: is no recording that is known here; give an .mcap, .db3 or .bag file, or the folder "
+            "of a ROS 2 bag."
+        )
 
 
 def _need(package: str, path: Path, what: str) -> None:
     if importlib.util.find_spec(package) is None:
-        raise UserError(f"{path}: {what} needs the package {package.replace('_', '-')}; install the extra "
-                        "lunar-mjx[ros].")  # fmt: skip
+        raise UserError(
+            f"{path}: {what} needs the package {package.replace('_', '-')}; install the extra lunar-mjx[ros]."
+        )
 
 
 def _need_topics(path: Path, wanted: Collection[str], there: Collection[str]) -> None:
@@ -113,8 +116,13 @@ class _Decoders:
             if decode is not None:
                 return decode
         kind = f"{channel.message_encoding} with schema {schema.encoding if schema else 'none'}"
-        raise bad_input(self.path, f"encoding of {channel.topic}", kind, "is not read here",
-                        "record JSON or ROS 2 messages with msg definitions")  # fmt: skip
+        raise bad_input(
+            self.path,
+            f"encoding of {channel.topic}",
+            kind,
+            "is not read here",
+            "record JSON or ROS 2 messages with msg definitions",
+        )
 
 
 def _first(error: Exception) -> str:

@@ -21,12 +21,35 @@ ANSWER = ".answer.toml"
 ENVIRONMENT = ("ambient_temperature_degC", "sun_azimuth_deg", "sun_elevation_deg")
 ROVER_CHANGES = ("payload_kg", "payload_position_m", "com_offset_m", "wheel_radius_offset_m")
 INITIAL = {
-    "position_m": 3, "quaternion": 4, "roll_deg": 1, "pitch_deg": 1, "yaw_deg": 1, "world_velocity_m_s": 3,
-    "angular_velocity_rad_s": 3, "winding_temperature_degC": 1, "housing_temperature_degC": 1,
-}  # fmt: skip
+    "position_m": 3,
+    "quaternion": 4,
+    "roll_deg": 1,
+    "pitch_deg": 1,
+    "yaw_deg": 1,
+    "world_velocity_m_s": 3,
+    "angular_velocity_rad_s": 3,
+    "winding_temperature_degC": 1,
+    "housing_temperature_degC": 1,
+}
 """Initial values by name and number of entries; a channel of one joint may be named as well."""
-TOP = ("format", "kind", "rover", "manoeuvre", "gravity_m_s2", "terrain", "terrain_origin_m", "split", "environment",
-       "rover_changes", "initial", "imu", "tables", "noise", "source", "commitment")  # fmt: skip
+TOP = (
+    "format",
+    "kind",
+    "rover",
+    "manoeuvre",
+    "gravity_m_s2",
+    "terrain",
+    "terrain_origin_m",
+    "split",
+    "environment",
+    "rover_changes",
+    "initial",
+    "imu",
+    "tables",
+    "noise",
+    "source",
+    "commitment",
+)
 
 
 def read_log(folder: str | Path) -> Log | SteadyLog:
@@ -135,13 +158,19 @@ def _tables(folder: Path, top: Fields, extra: dict[str, str], problems: list[Fin
     for key, table in tables.items():
         for channel in table.channels:
             if channel in owner:
-                raise bad_input(top.path, "tables", f"{owner[channel]}, {key}", f"both hold {channel}",
-                                "keep it in one table")  # fmt: skip
+                raise bad_input(
+                    top.path, "tables", f"{owner[channel]}, {key}", f"both hold {channel}", "keep it in one table"
+                )
             owner[channel] = key
     for key, column in extra.items():
         if key not in owner:
-            raise bad_input(top.path, f"environment.{key}", column, "is no column of any table",
-                            "give a number or the name of a column")  # fmt: skip
+            raise bad_input(
+                top.path,
+                f"environment.{key}",
+                column,
+                "is no column of any table",
+                "give a number or the name of a column",
+            )
     return tables
 
 
@@ -157,8 +186,13 @@ def _environment(fields: Fields) -> tuple[dict[str, float | str], dict[str, str]
             values[key] = fields.number(key)
     ambient = values.get("ambient_temperature_degC")
     if isinstance(ambient, float) and not -273.15 < ambient < 1000.0:
-        raise bad_input(fields.path, fields.field("ambient_temperature_degC"), ambient, "is no temperature in degC",
-                        "give degrees Celsius above -273.15")  # fmt: skip
+        raise bad_input(
+            fields.path,
+            fields.field("ambient_temperature_degC"),
+            ambient,
+            "is no temperature in degC",
+            "give degrees Celsius above -273.15",
+        )
     return values, columns
 
 
@@ -168,8 +202,9 @@ def _rover_changes(fields: Fields) -> dict[str, Any]:
     for key in fields.values:
         changes[key] = fields.vector(key, 3) if key in ("payload_position_m", "com_offset_m") else fields.number(key)
     if changes.get("payload_kg", 0.0) < 0.0:
-        raise bad_input(fields.path, fields.field("payload_kg"), changes["payload_kg"], "is negative",
-                        "give the mass in kg")  # fmt: skip
+        raise bad_input(
+            fields.path, fields.field("payload_kg"), changes["payload_kg"], "is negative", "give the mass in kg"
+        )
     return changes
 
 
@@ -179,8 +214,13 @@ def _initial(fields: Fields) -> dict[str, Any]:
         count = INITIAL.get(key)
         column = parse_column(key, str(fields.path)) if count is None else None
         if count is None and (column is None or column.problem or column.name != key):
-            raise bad_input(fields.path, fields.field(key), value, "is an unknown key",
-                            f"use one of {', '.join(INITIAL)}, or a channel's name")  # fmt: skip
+            raise bad_input(
+                fields.path,
+                fields.field(key),
+                value,
+                "is an unknown key",
+                f"use one of {', '.join(INITIAL)}, or a channel's name",
+            )
         initial[key] = fields.number(key) if count in (None, 1) else fields.vector(key, count)
     return initial
 

@@ -134,8 +134,13 @@ def import_log(recording: str | Path, folder: str | Path, mapping: str | Path | 
     for name, found in rows.items():
         if len(found) < 2:
             topic = mapping.tables[name].topic
-            raise bad_input(recording, f"messages of {topic}", len(found), "are too few for a table",
-                            f"record more, or leave [tables.{name}] out of the map")  # fmt: skip
+            raise bad_input(
+                recording,
+                f"messages of {topic}",
+                len(found),
+                "are too few for a table",
+                f"record more, or leave [tables.{name}] out of the map",
+            )
     origin = min(t for found in times.values() for t in found)
     tables = {}
     for name, found in rows.items():
@@ -157,8 +162,13 @@ def _time(message: Any, path: str, mapping: ImportMap, table: str) -> int:
     try:
         return stamp(field(message, path))
     except KeyError as error:
-        raise bad_input(mapping.path, f"tables.{table}.time", path, f"is not in the messages: {error.args[0]}",
-                        f'name another field, or write time = "{RECORDED}"') from None  # fmt: skip
+        raise bad_input(
+            mapping.path,
+            f"tables.{table}.time",
+            path,
+            f"is not in the messages: {error.args[0]}",
+            f'name another field, or write time = "{RECORDED}"',
+        ) from None
 
 
 def _number(message: Any, channel: str, source: Source, mapping: ImportMap, table: str) -> float:
@@ -166,13 +176,19 @@ def _number(message: Any, channel: str, source: Source, mapping: ImportMap, tabl
     try:
         value = field(message, source.field)
     except KeyError as error:
-        raise bad_input(mapping.path, where, source.field, f"is not in the messages: {error.args[0]}",
-                        "mend the map") from None  # fmt: skip
+        raise bad_input(
+            mapping.path, where, source.field, f"is not in the messages: {error.args[0]}", "mend the map"
+        ) from None
     if value is None:
         return math.nan
     try:
         number = float(value)
     except (TypeError, ValueError):
-        raise bad_input(mapping.path, where, source.field, f"holds a {type(value).__name__}, not a number",
-                        "name a number within it") from None  # fmt: skip
+        raise bad_input(
+            mapping.path,
+            where,
+            source.field,
+            f"holds a {type(value).__name__}, not a number",
+            "name a number within it",
+        ) from None
     return source.scale * number + source.offset if math.isfinite(number) else math.nan

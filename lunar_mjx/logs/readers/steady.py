@@ -17,8 +17,20 @@ from lunar_mjx.toml_fields import Fields
 from lunar_mjx.wheel_bed.bed import SLIP_DEFINITIONS
 from lunar_mjx.wheel_bed.table import QUANTITIES, SteadyStateTable
 
-TOP = ("format", "kind", "file", "tables", "wheel", "slip_definition", "noise", "split", "gravity_m_s2", "source",
-       "manoeuvre", "commitment")  # fmt: skip
+TOP = (
+    "format",
+    "kind",
+    "file",
+    "tables",
+    "wheel",
+    "slip_definition",
+    "noise",
+    "split",
+    "gravity_m_s2",
+    "source",
+    "manoeuvre",
+    "commitment",
+)
 REQUIRED = ("slip_ratio", "slip_angle_deg", "normal_load_N")
 WHEEL = ("radius_m", "width_m", "grouser_count", "grouser_height_m")
 _SUFFIX = re.compile(r"_(ratio|deg|N|m_s|Nm|m)$")
@@ -81,8 +93,9 @@ def _file(top: Fields) -> str:
     if not tables.values:
         return top.text("file")
     if len(tables.values) > 1:
-        raise bad_input(top.path, "tables", ", ".join(tables.values), "are several",
-                        "give one table per steady-state log")  # fmt: skip
+        raise bad_input(
+            top.path, "tables", ", ".join(tables.values), "are several", "give one table per steady-state log"
+        )
     entry = tables.table(next(iter(tables.values)))
     entry.known(("file",))
     return entry.text("file")
@@ -99,8 +112,17 @@ def _columns(path: Path, log: str, problems: list[Finding]) -> tuple[dict[str, n
     for column in map(str, frame.columns):
         found = _steady_column(column.strip(), str(path))
         if found is None:
-            problems.append(Finding(log, path.stem, None, column, "unknown",
-                                    "is no column of a steady-state table and is ignored", WARNING))  # fmt: skip
+            problems.append(
+                Finding(
+                    log,
+                    path.stem,
+                    None,
+                    column,
+                    "unknown",
+                    "is no column of a steady-state table and is ignored",
+                    WARNING,
+                )
+            )
             continue
         name, is_std, scale, offset, problem = found
         if problem:
@@ -113,8 +135,16 @@ def _columns(path: Path, log: str, problems: list[Finding]) -> tuple[dict[str, n
         values, wrong = numbers(frame, column)
         if wrong is not None:
             shown = str(frame[column].iloc[wrong])[:40]
-            problems.append(Finding(log, path.stem, wrong, column, "number", f"holds {shown!r}, which is neither a "
-                                    "number nor a gap; correct the cell"))  # fmt: skip
+            problems.append(
+                Finding(
+                    log,
+                    path.stem,
+                    wrong,
+                    column,
+                    "number",
+                    f"holds {shown!r}, which is neither a number nor a gap; correct the cell",
+                )
+            )
         into[name] = np.abs(scale) * values if is_std else scale * values + offset
     for name in REQUIRED:
         if name not in columns and name not in bad_units:
@@ -153,8 +183,16 @@ def _usable(log: str, table: str, columns: Mapping[str, np.ndarray], problems: l
         ("slip_ratio", np.abs(slip) > 1.0 + 1e-6, "range", "is outside [-1, 1]; give slip as a ratio, not in percent"),
         ("slip_angle_deg", np.abs(angle) > 90.0, "range", "is beyond 90 deg; give the slip angle in degrees"),
     ]
-    rules += [(c, ~np.isfinite(columns[c]), "gap", "is empty, but a run cannot be repeated without it; leave the row "
-               "out or fill it in") for c in REQUIRED if np.isfinite(columns[c]).any()]  # fmt: skip
+    rules += [
+        (
+            c,
+            ~np.isfinite(columns[c]),
+            "gap",
+            "is empty, but a run cannot be repeated without it; leave the row out or fill it in",
+        )
+        for c in REQUIRED
+        if np.isfinite(columns[c]).any()
+    ]
     for c in ("rim_speed_m_s", "travel_speed_m_s"):
         if c in columns:
             rules.append((c, columns[c] < 0.0, "range", "is negative; give the magnitude in m/s"))
@@ -170,7 +208,16 @@ def _usable(log: str, table: str, columns: Mapping[str, np.ndarray], problems: l
     for column in (c for c, _, _ in QUANTITIES.values() if c in columns):
         gaps = keep & ~np.isfinite(columns[column])
         if gaps.any():
-            problems.append(Finding(log, table, int(np.argmax(gaps)), column, "gap", f"is empty in {int(gaps.sum())} "
-                                    "rows, which are left out", WARNING))  # fmt: skip
+            problems.append(
+                Finding(
+                    log,
+                    table,
+                    int(np.argmax(gaps)),
+                    column,
+                    "gap",
+                    f"is empty in {int(gaps.sum())} rows, which are left out",
+                    WARNING,
+                )
+            )
             keep &= ~gaps
     return keep

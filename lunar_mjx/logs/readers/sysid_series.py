@@ -94,21 +94,35 @@ def from_time_series(
     used = set()
     for table, one in series.items():
         if one.signal_mapping is None:
-            raise bad_input("from_time_series", "series", table, "has no signal mapping",
-                            "make it with TimeSeries.from_custom_map or from_names")  # fmt: skip
+            raise bad_input(
+                "from_time_series",
+                "series",
+                table,
+                "has no signal mapping",
+                "make it with TimeSeries.from_custom_map or from_names",
+            )
         columns: dict[str, np.ndarray] = {"time_s": np.asarray(one.times, float)}
         for signal, (_, places) in one.signal_mapping.items():
             used.add(signal)
             wanted: str | Sequence[str] = (names or {}).get(signal) or signal
             channels = [wanted] if isinstance(wanted, str) else list(wanted)
             if len(channels) != len(places):
-                raise bad_input("from_time_series", f"names[{signal!r}]", channels,
-                                f"has not one channel for each of {len(places)} columns",
-                                "name one for each")  # fmt: skip
+                raise bad_input(
+                    "from_time_series",
+                    f"names[{signal!r}]",
+                    channels,
+                    f"has not one channel for each of {len(places)} columns",
+                    "name one for each",
+                )
             for channel, place in zip(channels, places, strict=True):
                 if find_channel(channel) is None and parse_column(channel, table) is None:
-                    raise bad_input("from_time_series", "signal", signal, "is no channel",
-                                    f"name its channel: names={{{signal!r}: ...}}")  # fmt: skip
+                    raise bad_input(
+                        "from_time_series",
+                        "signal",
+                        signal,
+                        "is no channel",
+                        f"name its channel: names={{{signal!r}: ...}}",
+                    )
                 columns[channel] = np.asarray(one.data, float)[:, place]
         tables[table] = pd.DataFrame(columns)
     for signal in names or ():

@@ -105,8 +105,17 @@ def read_log_table(
             found = parse_column(column, str(path))
             if found is None:
                 ignored.append(column)
-                problems.append(Finding(log, name, None, column, "unknown", "is no channel of the schema and is "
-                                        "ignored; correct its name if it should be one", WARNING))  # fmt: skip
+                problems.append(
+                    Finding(
+                        log,
+                        name,
+                        None,
+                        column,
+                        "unknown",
+                        "is no channel of the schema and is ignored; correct its name if it should be one",
+                        WARNING,
+                    )
+                )
                 continue
             if found.problem:
                 problems.append(Finding(log, name, None, column, "unit", found.problem))
@@ -134,8 +143,14 @@ def read_log_table(
 
 def _no_number(log: str, table: str, row: int, column: str, frame: pd.DataFrame) -> Finding:
     value = str(frame[column].iloc[row])
-    return Finding(log, table, row, column, "number", f"holds {value[:40]!r}, which is neither a number nor a gap; "
-                   "leave the cell empty or correct it")  # fmt: skip
+    return Finding(
+        log,
+        table,
+        row,
+        column,
+        "number",
+        f"holds {value[:40]!r}, which is neither a number nor a gap; leave the cell empty or correct it",
+    )
 
 
 def _rate(time: np.ndarray) -> float:

@@ -143,18 +143,18 @@ def record(
         written |= set(mine)
     for channel in recording.bias:
         if channel not in written:
-            raise bad_input("log simulate", "--bias", channel, "is not a channel that is recorded",
-                            f"use one of {', '.join(sorted(written)[:8])}, ...")  # fmt: skip
+            raise bad_input(
+                "log simulate",
+                "--bias",
+                channel,
+                "is not a channel that is recorded",
+                f"use one of {', '.join(sorted(written)[:8])}, ...",
+            )
     return tables
 
 
 def _measured(
-    channel: str,
-    when: np.ndarray,
-    time: np.ndarray,
-    values: np.ndarray,
-    recording: Recording,
-    rng: np.random.Generator,
+    channel: str, when: np.ndarray, time: np.ndarray, values: np.ndarray, recording: Recording, rng: np.random.Generator
 ) -> np.ndarray:
     values = np.asarray(values, float)
     if channel.startswith("command_"):

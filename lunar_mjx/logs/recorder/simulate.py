@@ -126,8 +126,13 @@ def _hide(base: Model, effects: Sequence[Hidden]) -> tuple[Model, list[dict[str,
         name = spec.name if isinstance(spec, Effect) else spec
         if name in base.effect_names:
             if not values:
-                raise bad_input("log simulate", "--effect", name, "is in the model already",
-                                f"give other values, as in {name}:parameter=value")  # fmt: skip
+                raise bad_input(
+                    "log simulate",
+                    "--effect",
+                    name,
+                    "is in the model already",
+                    f"give other values, as in {name}:parameter=value",
+                )
             base = base.set(name, "log simulate", **values)
             answers.append({"name": name, "added": False, "parameters": dict(values)})
             continue

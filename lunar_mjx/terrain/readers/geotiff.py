@@ -67,9 +67,12 @@ def _grid(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> t
         return 0.0, raster.height * cell, cell
     if crs is not None and crs.is_geographic:
         raise bad_input(
-            path, "projection", "geographic (degrees)", "has no metres",
+            path,
+            "projection",
+            "geographic (degrees)",
+            "has no metres",
             "reproject it to a projection in metres, such as lunar polar stereographic, with gdalwarp",
-        )  # fmt: skip
+        )
     if transform.b or transform.d:
         raise bad_input(path, "transform", "rotated", "is not north up", "resample it with gdalwarp")
     if transform.a <= 0 or transform.e >= 0:
@@ -92,10 +95,13 @@ def _pixels(raster: rasterio.DatasetReader, crop: Window | None, west: float, no
     r0, r1 = ((north - crop.y + s * crop.height / 2) / cell for s in (-1, 1))
     if not (c0 >= -1 and r0 >= -1 and c1 <= raster.width + 1 and r1 <= raster.height + 1):
         raise bad_input(
-            raster.name, "crop", f"x {crop.x:g}, y {crop.y:g}, {crop.width:g} x {crop.height:g} m", "leaves the DEM",
+            raster.name,
+            "crop",
+            f"x {crop.x:g}, y {crop.y:g}, {crop.width:g} x {crop.height:g} m",
+            "leaves the DEM",
             f"stay within x {west:g} .. {west + raster.width * cell:g} m, "
             f"y {north - raster.height * cell:g} .. {north:g} m",
-        )  # fmt: skip
+        )
     c0, r0 = max(0, int(c0) - 1), max(0, int(r0) - 1)
     c1, r1 = min(raster.width, int(np.ceil(c1)) + 1), min(raster.height, int(np.ceil(r1)) + 1)
     return PixelWindow(c0, r0, c1 - c0, r1 - r0)  # pyright: ignore[reportCallIssue]

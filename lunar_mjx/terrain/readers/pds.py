@@ -17,11 +17,23 @@ from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size
 from lunar_mjx.terrain.readers.options import ReadOptions
 
 _KINDS = {
-    "LSB_INTEGER": "<i", "PC_INTEGER": "<i", "VAX_INTEGER": "<i", "MSB_INTEGER": ">i", "INTEGER": ">i",
-    "SUN_INTEGER": ">i", "MAC_INTEGER": ">i", "LSB_UNSIGNED_INTEGER": "<u", "PC_UNSIGNED_INTEGER": "<u",
-    "MSB_UNSIGNED_INTEGER": ">u", "UNSIGNED_INTEGER": ">u", "PC_REAL": "<f", "IEEE_REAL": ">f", "REAL": ">f",
-    "SUN_REAL": ">f", "FLOAT": ">f",
-}  # fmt: skip
+    "LSB_INTEGER": "<i",
+    "PC_INTEGER": "<i",
+    "VAX_INTEGER": "<i",
+    "MSB_INTEGER": ">i",
+    "INTEGER": ">i",
+    "SUN_INTEGER": ">i",
+    "MAC_INTEGER": ">i",
+    "LSB_UNSIGNED_INTEGER": "<u",
+    "PC_UNSIGNED_INTEGER": "<u",
+    "MSB_UNSIGNED_INTEGER": ">u",
+    "UNSIGNED_INTEGER": ">u",
+    "PC_REAL": "<f",
+    "IEEE_REAL": ">f",
+    "REAL": ">f",
+    "SUN_REAL": ">f",
+    "FLOAT": ">f",
+}
 _LENGTHS = {"M": 1.0, "METER": 1.0, "METERS": 1.0, "KM": 1e3, "KILOMETER": 1e3, "KILOMETERS": 1e3}
 _PAIR = re.compile(r"^\s*(\^?[A-Z][A-Z0-9_:]*)\s*=\s*(.*)$")
 _MOST_LABEL_BYTES = 1 << 20
@@ -113,9 +125,12 @@ def _samples(image: Path, label_path: Path, label: Label, rows: int, cols: int) 
     present, needed = image.stat().st_size, start + rows * cols * dtype.itemsize
     if present < needed:
         raise bad_input(
-            image, "size", f"{present} bytes", f"is less than the {needed} that {label_path.name} announces",
+            image,
+            "size",
+            f"{present} bytes",
+            f"is less than the {needed} that {label_path.name} announces",
             "fetch the whole file again",
-        )  # fmt: skip
+        )
     data = np.fromfile(image, dtype, rows * cols, offset=start)
     return data.reshape(rows, cols)
 
@@ -164,9 +179,12 @@ def _cell(path: Path, label: Label, options: ReadOptions) -> float:
         )
     if label.get("MAP_PROJECTION_TYPE", "").upper() in ("SIMPLE CYLINDRICAL", "SIMPLE_CYLINDRICAL"):
         raise bad_input(
-            path, "MAP_PROJECTION_TYPE", "SIMPLE CYLINDRICAL", "is a grid of degrees",
+            path,
+            "MAP_PROJECTION_TYPE",
+            "SIMPLE CYLINDRICAL",
+            "is a grid of degrees",
             "reproject it to metres, such as polar stereographic, with gdalwarp",
-        )  # fmt: skip
+        )
     # The standard's own unit is km per pixel where a label says none.
     return require_cell(str(path), "MAP_SCALE", value * _length(path, "MAP_SCALE", unit.group(1) if unit else "KM"))
 

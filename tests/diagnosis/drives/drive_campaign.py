@@ -26,9 +26,13 @@ PROFILES: tuple[Profile, ...] = (
 
 
 def drive_campaign(
-    folder: Path, hooks: Sequence[Hook] = (), seconds: float = 3.0, seed: int = 0, noise: float = 1.0,
+    folder: Path,
+    hooks: Sequence[Hook] = (),
+    seconds: float = 3.0,
+    seed: int = 0,
+    noise: float = 1.0,
     forms: Sequence[str] = (),
-) -> Path:  # fmt: skip
+) -> Path:
     """Writes one log per profile under `folder`: commands, motion, motors, with white noise; returns the folder.
 
     `forms` names effects that take the place of some of the model's.
@@ -45,9 +49,16 @@ def drive_campaign(
             stated[channel] = Noise(std, "datasheet")
             frame[channel] += rng.normal(0.0, std, len(frame))
         write_log(
-            folder / f"drive{number}", {"drive": frame}, rover="luvmi_x", noise=stated, manoeuvre=f"drive{number}",
-            gravity_m_s2=model.gravity, terrain="flat", environment={"ambient_temperature_degC": 25.0}, split="fit",
-        )  # fmt: skip
+            folder / f"drive{number}",
+            {"drive": frame},
+            rover="luvmi_x",
+            noise=stated,
+            manoeuvre=f"drive{number}",
+            gravity_m_s2=model.gravity,
+            terrain="flat",
+            environment={"ambient_temperature_degC": 25.0},
+            split="fit",
+        )
     return folder
 
 

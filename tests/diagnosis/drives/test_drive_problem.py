@@ -35,8 +35,9 @@ def _problem(folder, engine="auto"):
     logs = read_campaign([folder])
     assert not is_bad(check(logs))
     candidates = {n: catalogue.get(n) for n in CANDIDATES}
-    return DriveProblem(logs, make_model("luvmi_x", terrain="flat", timestep=0.0025), candidates, baseline=BASELINE,
-                        engine=engine)  # fmt: skip
+    return DriveProblem(
+        logs, make_model("luvmi_x", terrain="flat", timestep=0.0025), candidates, baseline=BASELINE, engine=engine
+    )
 
 
 @pytest.fixture(scope="module")

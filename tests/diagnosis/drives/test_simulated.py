@@ -31,8 +31,15 @@ def logs(tmp_path_factory):
     for number in range(2):
         still = dict.fromkeys((*command_channels(model), "position_x_m"), np.zeros(20))
         tables = {"drive": pd.DataFrame({"time_s": time, **still})}
-        log = write_log(folder / f"log{number}", tables, rover="luvmi_x", noise={"position_x_m": Noise(0.01, "rest")},
-                        manoeuvre=f"still{number}", gravity_m_s2=model.gravity, terrain="flat")  # fmt: skip
+        log = write_log(
+            folder / f"log{number}",
+            tables,
+            rover="luvmi_x",
+            noise={"position_x_m": Noise(0.01, "rest")},
+            manoeuvre=f"still{number}",
+            gravity_m_s2=model.gravity,
+            terrain="flat",
+        )
         found.append(read_log(log))
     return found
 

@@ -57,8 +57,15 @@ def test_it_is_a_nuisance_where_the_ground_is_inclined_and_it_shows(tmp_path, mo
     time = 0.1 * np.arange(20)
     still = dict.fromkeys((*command_channels(model), "position_x_m"), np.zeros(20))
     tables, noise = {"drive": pd.DataFrame({"time_s": time, **still})}, {"position_x_m": Noise(0.01, "rest")}
-    log = write_log(tmp_path / "log", tables, rover="luvmi_x", noise=noise, manoeuvre="still",
-                    gravity_m_s2=model.gravity, terrain=terrain)  # fmt: skip
+    log = write_log(
+        tmp_path / "log",
+        tables,
+        rover="luvmi_x",
+        noise=noise,
+        manoeuvre="still",
+        gravity_m_s2=model.gravity,
+        terrain=terrain,
+    )
     runs = []
 
     def run(self, rows, values, observations, progress, windows=False):

@@ -92,8 +92,11 @@ def test_every_one_at_the_noise_is_judged_with_the_step_error_at_its_own_fit():
     far = dataclasses.replace(delayed, effects=("far",), fit=worse)
     # reached the noise first, with a step error that is that of the model as given
     first = candidate(Stepped(0.0))
-    first = dataclasses.replace(first, effects=("other",), fit=dataclasses.replace(
-        first.fit, chi2=delayed.fit.chi2 - 1.0, u=np.array([0.5, 0.0]), step_error=given))  # fmt: skip
+    first = dataclasses.replace(
+        first,
+        effects=("other",),
+        fit=dataclasses.replace(first.fit, chi2=delayed.fit.chi2 - 1.0, u=np.array([0.5, 0.0]), step_error=given),
+    )
     tried = {frozenset(c.effects): c for c in (first, delayed, far)}
     base = fit(problem, problem.free(), starts=1, certify=False)
     nothing = Candidate((), base, noise_test(problem, base), 0.0, 0.0)

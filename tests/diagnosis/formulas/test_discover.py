@@ -130,8 +130,13 @@ def _table(folder):
     frame = pd.DataFrame({"slip_ratio": slip, "slip_angle_deg": angle, "normal_load_N": load})
     for (name, std), values in zip(STD.items(), columns, strict=True):
         frame[name] = values + std * rng.standard_normal(len(frame))
-    write_steady_log(folder, frame, wheel={"radius_m": 0.0625, "width_m": 0.05}, slip_definition="wheel_frame",
-                     noise={c: Noise(s, "datasheet") for c, s in STD.items()})  # fmt: skip
+    write_steady_log(
+        folder,
+        frame,
+        wheel={"radius_m": 0.0625, "width_m": 0.05},
+        slip_definition="wheel_frame",
+        noise={c: Noise(s, "datasheet") for c, s in STD.items()},
+    )
 
 
 @pytest.mark.slow

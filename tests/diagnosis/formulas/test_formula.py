@@ -101,11 +101,25 @@ def _moment(port):
         return jnp.asarray(values, float)
 
     contact = SimpleNamespace(slip=of(-0.1, 0.2, 0.6), slip_angle=of(0.0, -0.3, 0.5), sinkage=of(0.01, 0.02, 0.04))
-    soil = Soil(of(1e3, 1e3, 1e3), of(8e5, 8e5, 8e5), of(1.0, 1.1, 0.9), of(170.0, 200.0, 300.0), of(0.6, 0.7, 0.5),
-                of(0.02, 0.02, 0.01), of(0.02, 0.03, 0.01), of(0.0, 0.0, 0.0))  # fmt: skip
+    soil = Soil(
+        of(1e3, 1e3, 1e3),
+        of(8e5, 8e5, 8e5),
+        of(1.0, 1.1, 0.9),
+        of(170.0, 200.0, 300.0),
+        of(0.6, 0.7, 0.5),
+        of(0.02, 0.02, 0.01),
+        of(0.02, 0.03, 0.01),
+        of(0.0, 0.0, 0.0),
+    )
     normal = initial_normal(of(0.0, 0.0, 0.0))
-    normal = type(normal)(**{**vars(normal), "load": of(50.0, 80.0, 120.0), "resistance": of(5.0, 8.0, 20.0),
-                             "sigma_m": of(2e3, 4e3, 9e3)})  # fmt: skip
+    normal = type(normal)(
+        **{
+            **vars(normal),
+            "load": of(50.0, 80.0, 120.0),
+            "resistance": of(5.0, 8.0, 20.0),
+            "sigma_m": of(2e3, 4e3, 9e3),
+        }
+    )
     force, moment = Vec3(of(5.0, 9.0, 20.0), of(0.1, -4.0, 9.0), of(50.0, 80.0, 120.0)), Vec3(*[of(0.1, -0.5, 2.0)] * 3)
     wheel = WheelForce(of(0.1, 0.2, 0.3), of(0.0, -0.3, 0.4), of(1.0, 1.0, -1.0), force, moment)
     ctx = SimpleNamespace(contact=contact, geometry=SimpleNamespace(radius=of(0.2, 0.2, 0.2)), soil=soil, normal=normal)
@@ -121,9 +135,16 @@ def test_a_slot_does_what_the_effect_file_does(choice):
         ctx, value = _moment(choice.port)
         own, slots = effect_of(choice.term), slots_effect(choice.early)
         amount, scale = 0.3, targets()[choice.target].size
-        numbers = {**slots.null(), "amount_1": amount, "scale_1": scale, "target_1": float(choice.target),
-                   "first_1": float(choice.first), "second_1": float(choice.second), "linear_1": float(choice.linear),
-                   "target_0": float(choice.target)}  # fmt: skip
+        numbers = {
+            **slots.null(),
+            "amount_1": amount,
+            "scale_1": scale,
+            "target_1": float(choice.target),
+            "first_1": float(choice.first),
+            "second_1": float(choice.second),
+            "linear_1": float(choice.linear),
+            "target_0": float(choice.target),
+        }
         given = SimpleNamespace(**{k: jnp.asarray(v, float) for k, v in numbers.items()})
         alone = SimpleNamespace(**{**own.null(), "amount": amount * scale})
         got = jax.tree.leaves(slots.ports[choice.port](ctx, given, None, value))

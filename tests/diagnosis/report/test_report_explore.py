@@ -18,8 +18,10 @@ CHANNELS = ("pitch_deg", "motor_lf_drive_current_A")
 @pytest.fixture(scope="module")
 def result():
     """Two logs of two channels; the second channel of the second log misfits, and one effect has just that shape."""
-    series = tuple(Series(log, c, n * 60, (n + 1) * 60, TIME, 0.1) for n, (log, c) in enumerate(
-        (log, c) for log in range(2) for c in CHANNELS))  # fmt: skip
+    series = tuple(
+        Series(log, c, n * 60, (n + 1) * 60, TIME, 0.1)
+        for n, (log, c) in enumerate((log, c) for log in range(2) for c in CHANNELS)
+    )
     unit = np.repeat([0, 1], 120)
     o = Observations(np.zeros(240), series, ("a", "b"), ("fit", "fit"), unit, ("fit", "fit"), ("flat", "climb"))
     rng = np.random.default_rng(0)
@@ -30,8 +32,9 @@ def result():
     residual[0, 3] = np.nan
     traces = Traces(o, ("as given", "refitted", "with drag"), -0.1 * residual, residual, np.tile(TIME, 4))
     evidence = [{"effect": "drag", "status": "accepted"}, {"effect": "faint", "status": "not tested"}]
-    return Result("run", {}, None, {"evidence": evidence}, None, None, None, None, traces,
-                  {"drag": shape, "faint": 0.0 * shape})  # fmt: skip
+    return Result(
+        "run", {}, None, {"evidence": evidence}, None, None, None, None, traces, {"drag": shape, "faint": 0.0 * shape}
+    )
 
 
 def test_every_channel_of_every_manoeuvre_has_a_panel_and_the_worst_comes_first(result):

@@ -72,9 +72,11 @@ def test_replicates_shrink_the_noise_and_the_scatter_beats_what_is_stated(table)
     few = table.select(np.arange(3))
     assert np.allclose(points(log_of(few))[1]["drawbar_pull"], 0.5 / np.sqrt(few.replicates))
     twice = dataclasses.replace(
-        few, test={k: np.tile(v, 2) for k, v in few.test.items()}, replicates=np.ones(6, int),
+        few,
+        test={k: np.tile(v, 2) for k, v in few.test.items()},
+        replicates=np.ones(6, int),
         measured={q: np.concatenate([v - 1.0, v + 1.0]) for q, v in few.measured.items()},
-    )  # fmt: skip
+    )
     mean, noise = points(log_of(twice))
     assert len(mean) == 3
     # deviations of +-1 about the mean of two: variance 2 with one degree of freedom a point
