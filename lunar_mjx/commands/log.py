@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +24,7 @@ def register(app: typer.Typer) -> None:
     log_app.command("simulate")(simulate)
     log_app.command("unseal")(unseal)
     log_app.command("manoeuvres")(manoeuvres)
+    log_app.command("channels")(channels)
     app.add_typer(log_app, name="log")
 
 
@@ -39,14 +41,83 @@ def new(
 
 
 def import_(
-    recording: Annotated[Path, typer.Argument(help="MCAP file, bag of ROS 1, file or folder of a ROS 2 bag.")],
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(help="CSV, TXT, Parquet or MATLAB files or folders of them; or bags of ROS and MCAP files."),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the log; must not exist or be empty.")],
-    mapping: Annotated[Path, typer.Option("--map", help="TOML file: which field of which topic is which channel.")],
+    mapping: Annotated[
+        str, typer.Option("--map", help="TOML file: which column or field is which channel; or a shipped map's name.")
+    ],
+    change: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Key of log.toml over the map's, as ground=snow or imu.attitude=true."),
+    ] = None,
+    split_at_gaps: Annotated[
+        float | None, typer.Option(min=0.0, help="Begin a new drive where nothing is recorded for so many seconds.")
+    ] = None,
+    split_at_rest: Annotated[
+        float | None, typer.Option(min=0.0, help="Begin a new drive within rests that last so many seconds.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print folders and notes as JSON.")] = False,
 ) -> None:
-    """Make a log from a recording of ROS or MCAP; check it next."""
-    from lunar_mjx.logs import import_log
+    """Make a log, or a campaign of logs, from recordings; check it next."""
+    from lunar_mjx.logs import import_drives
 
-    print(import_log(recording, out, mapping))
+    found = import_drives(
+        recordings,
+        out,
+        mapping,
+        changes=_settings(change),
+        split_at_gaps_s=split_at_gaps,
+        split_at_rest_s=split_at_rest,
+    )
+    if as_json:
+        drives = [{"log": str(f), "seconds": s} for f, s in zip(found.logs, found.seconds, strict=True)]
+        notes = [{"drive": name, "note": note} for name, note in found.notes]
+        copies = list(found.copies)
+        print(json.dumps({"folder": str(found.folder), "drives": drives, "copies": copies, "notes": notes}, indent=2))
+        return
+    for name, note in found.notes:
+        print(f"{name}: {note}")
+    for note in found.copies:
+        print(note)
+    print(f"{len(found.logs)} drive{'s' if len(found.logs) > 1 else ''}, {sum(found.seconds):.0f} s")
+    print(found.folder)
+
+
+def _settings(changes: list[str] | None) -> dict[str, Any]:
+    """KEY=VALUE pairs as a tree of settings; a value that is not TOML is a text."""
+    tree: dict[str, Any] = {}
+    for pair in changes or []:
+        key, equals, text = pair.partition("=")
+        if not equals or not re.fullmatch(r"[\w.]+", key.strip()):
+            raise bad_input("lunar-mjx log import", "--set", pair, "is not key=value", "write it as ground=snow")
+        try:
+            value = tomllib.loads(f"value = {text.strip()}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text.strip()
+        *parents, last = key.strip().split(".")
+        place = tree
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[last] = value
+    return tree
+
+
+def channels() -> None:
+    """List every channel of a log: name, unit, physical range."""
+    from lunar_mjx.logs.schema import CHANNELS, CORNERS, KINDS, SIDES
+    from lunar_mjx.model.describe import make_console, make_table
+
+    table = make_table("channel", "unit", "family", "from", "to")
+    for channel in CHANNELS:
+        name = channel.stem + (f"_{channel.suffix}" if channel.suffix else "")
+        table.add_row(name, channel.unit, channel.family, f"{channel.low:g}", f"{channel.high:g}")
+    console = make_console()
+    console.print(table)
+    console.print(f"{{c}} a corner: {', '.join(CORNERS)}; before _drive also a side: {', '.join(SIDES)}")
+    console.print(f"{{j}} a joint: {', '.join(KINDS)}. {{x}} an axis: x, y, z. {{q}} w, x, y, z of a quaternion")
 
 
 def check(

@@ -11,7 +11,8 @@ from lunar_mjx.logs.log import Noise as Noise
 from lunar_mjx.logs.log import SteadyLog as SteadyLog
 from lunar_mjx.logs.readers.folder import read_campaign as read_campaign
 from lunar_mjx.logs.readers.folder import read_log as read_log
-from lunar_mjx.logs.readers.importers import import_log as import_log
+from lunar_mjx.logs.readers.import_log import import_drives as import_drives
+from lunar_mjx.logs.readers.import_log import import_log as import_log
 from lunar_mjx.logs.readers.sysid_series import from_time_series as from_time_series
 from lunar_mjx.logs.readers.sysid_series import to_time_series as to_time_series
 from lunar_mjx.logs.recorder.instruments import Recording as Recording

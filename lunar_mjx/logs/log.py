@@ -30,10 +30,21 @@ class Noise:
 
 @dataclasses.dataclass(frozen=True)
 class Imu:
-    """Where the IMU is mounted: position m in the chassis frame; quaternion w, x, y, z from its frame to the body's."""
+    """How the IMU is mounted.
+
+    Attributes:
+      position_m: in the chassis frame.
+      quaternion: w, x, y, z from the IMU's frame to the body's. Gyroscope and accelerometer channels are in the IMU's
+        frame; so are roll, pitch, yaw and the quaternion where `attitude` says so.
+      mounting_std_deg: standard deviation of the mounting about the body's x, y and z: how well `quaternion` is known.
+        180 says that nothing is known.
+      attitude: whether the attitude channels are the IMU's own and not the chassis's.
+    """
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    mounting_std_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    attitude: bool = False
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,6 +94,11 @@ class Log:
       tables: by name. noise: by channel.
       source: who, licence, citation.
       problems: what reading found wrong; `check` passes them on.
+      imposed: "wheel_speed" where the measured wheel speeds are taken as what the wheels did; None where the commands
+        are what drove the rover.
+      magnitudes: channels that hold a size without its sign.
+      ground: what was driven on, in the user's words; nothing is computed from it.
+      geodetic_origin: latitude_deg, longitude_deg and projection of the point from which positions count, if stated.
     """
 
     folder: Path
@@ -101,6 +117,10 @@ class Log:
     source: Mapping[str, str]
     terrain_origin_m: tuple[float, float] = (0.0, 0.0)
     problems: tuple[Finding, ...] = ()
+    imposed: str | None = None
+    magnitudes: frozenset[str] = frozenset()
+    ground: str = ""
+    geodetic_origin: Mapping[str, float | str] = dataclasses.field(default_factory=dict)
 
     def channel(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Common time s and values of a channel without its gaps; None if no table has it."""

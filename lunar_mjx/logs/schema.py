@@ -7,17 +7,26 @@ import functools
 import re
 from collections.abc import Mapping
 
-from lunar_mjx.errors import UserError
+from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.units import to_unit
 
 FORMAT = "lunar-mjx-log/1"
 CORNERS = ("lf", "rf", "lm", "rm", "lr", "rr")
 """Left and right, front, middle (six wheels) and rear."""
 KINDS = ("drive", "steer", "sus")
+SIDES = ("left", "right")
+"""In the place of a corner: one reading for all wheels of a side, which one motor or one command drives together.
+
+A side's current is what its one motor draws, whatever number of wheels it turns; a side's speed is that of each of its
+wheels. A reading that stands for a side is written once, under the side's name: a copy for each wheel would count as
+independent readings.
+"""
 SPLITS = ("fit", "select", "test")
 NOISE_SOURCES = ("datasheet", "rest", "replicate")
-MIRROR = {"lf": "rf", "rf": "lf", "lm": "rm", "rm": "lm", "lr": "rr", "rr": "lr"}
-"""The corner on the other side."""
+MIRROR = {"lf": "rf", "rf": "lf", "lm": "rm", "rm": "lm", "lr": "rr", "rr": "lr", "left": "right", "right": "left"}
+"""The corner on the other side, or the other side."""
+IMPOSED = ("wheel_speed",)
+"""What a log may declare as imposed: measured, and taken as what the rover did, so that it is no observation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +34,8 @@ class Channel:
     """A channel, or a family of channels that differ in axis, corner or joint.
 
     Attributes:
-      stem: pattern of the name without its unit; `{c}` a corner, `{j}` drive, steer or sus, `{x}` an axis.
+      stem: pattern of the name without its unit; `{c}` a corner (before `_drive` a side as well), `{j}` drive, steer or
+        sus, `{x}` an axis, `{q}` a component of a quaternion.
       suffix: unit as the name ends; empty for pure numbers that the stem already names.
       unit: the same in the grammar of `lunar_mjx.units`.
       family: position, attitude, velocity, imu, joint, electrical, torque, temperature, wheel, force or command.
@@ -43,7 +53,9 @@ class Channel:
 
     @functools.cached_property
     def pattern(self) -> re.Pattern[str]:
-        corner, joint = f"(?P<corner>{'|'.join(CORNERS)})", f"(?P<joint>{'|'.join(KINDS)})"
+        joint = f"(?P<joint>{'|'.join(KINDS)})"
+        side = f"(?:{'|'.join(SIDES)})(?=_drive)" if "{c}_{j}" in self.stem else ""
+        corner = f"(?P<corner>{'|'.join(CORNERS)}{'|' if side else ''}{side})"
         text = self.stem.replace("{c}", corner).replace("{j}", joint).replace("{x}", "(?P<axis>[xyz])")
         return re.compile(text.replace("{q}", "(?P<axis>[wxyz])"))
 
@@ -126,6 +138,61 @@ class Column:
     scale: float = 1.0
     offset: float = 0.0
     problem: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelName:
+    """A channel's name in its parts.
+
+    Attributes:
+      quantity: what is measured, such as `motor_current`, `joint_speed`, `position` or `wheel_force`.
+      corner: `lf` .. `rr`, a side (`left`, `right`), or "" for what belongs to the whole rover.
+      joint: drive, steer, sus or "".
+      axis: x, y, z, a component w, x, y, z of a quaternion, or "".
+      unit: as the name ends (`rad_s`); "" for pure numbers that carry none.
+    """
+
+    quantity: str
+    corner: str = ""
+    joint: str = ""
+    axis: str = ""
+    unit: str = ""
+
+    @property
+    def side(self) -> str:
+        """`left`, `right`, or "" where the channel belongs to neither."""
+        if self.corner in SIDES:
+            return self.corner
+        return {"l": "left", "r": "right"}.get(self.corner[:1], "")
+
+    @property
+    def whole_side(self) -> bool:
+        """Whether one reading stands for all wheels of a side."""
+        return self.corner in SIDES
+
+    def at(self, corner: str) -> ChannelName:
+        """The channel of the same quantity at another corner or side."""
+        return dataclasses.replace(self, corner=corner)
+
+    def __str__(self) -> str:
+        head, _, tail = self.quantity.partition("_")
+        parts = (head, self.corner, self.joint, tail, self.axis, self.unit)
+        return "_".join(p for p in parts if p)
+
+
+def channel_name(name: str) -> ChannelName:
+    """The parts of a channel's name.
+
+    Raises:
+      UserError: the name is no channel of the schema.
+    """
+    found = find_channel(name)
+    if found is None:
+        raise bad_input("channel", "name", name, "is no channel", "list them with lunar-mjx log channels")
+    channel, match = found
+    parts = match.groupdict()
+    quantity = re.sub(r"_?\{.\}", "", channel.stem)
+    return ChannelName(quantity, *(parts.get(k) or "" for k in ("corner", "joint", "axis")), channel.suffix)
 
 
 def find_channel(name: str) -> tuple[Channel, re.Match[str]] | None:

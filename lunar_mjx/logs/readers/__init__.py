@@ -1,1 +1,1 @@
-"""Reads measurement logs from folders, tables and recordings of other tools."""
+"""Reads logs from folders, plain tables, MATLAB and Parquet files, and recordings of other tools."""

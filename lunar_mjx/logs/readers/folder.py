@@ -12,7 +12,7 @@ from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Imu, Log, LogTable, Noise, SteadyLog
 from lunar_mjx.logs.readers.steady import read_steady
 from lunar_mjx.logs.readers.table import read_log_table
-from lunar_mjx.logs.schema import FORMAT, NOISE_SOURCES, SPLITS, parse_column
+from lunar_mjx.logs.schema import FORMAT, IMPOSED, NOISE_SOURCES, SPLITS, find_channel, parse_column
 from lunar_mjx.toml_fields import Fields
 
 LOG_FILE = "log.toml"
@@ -49,6 +49,10 @@ TOP = (
     "noise",
     "source",
     "commitment",
+    "imposed",
+    "magnitudes",
+    "ground",
+    "geodetic_origin",
 )
 
 
@@ -141,7 +145,55 @@ def _read_drive(folder: Path, top: Fields) -> Log:
         noise=_noise(top.table("noise"), names),
         source={k: str(v) for k, v in top.table("source").values.items()},
         problems=tuple(problems),
+        imposed=_imposed(top, names),
+        magnitudes=_magnitudes(top, names),
+        ground=top.text("ground", ""),
+        geodetic_origin=_geodetic_origin(top.table("geodetic_origin")),
     )
+
+
+def _imposed(top: Fields, channels: Sequence[str]) -> str | None:
+    imposed = top.choice("imposed", IMPOSED)
+    if imposed is not None and not any(c.startswith("joint_") and c.endswith("_drive_speed_rad_s") for c in channels):
+        raise bad_input(
+            top.path,
+            "imposed",
+            imposed,
+            "needs measured wheel speeds, and no table holds any",
+            "add joint_left_drive_speed_rad_s and joint_right_drive_speed_rad_s, or leave imposed out",
+        )
+    return imposed
+
+
+def _magnitudes(top: Fields, channels: Sequence[str]) -> frozenset[str]:
+    """Channels without sign; a pattern with `*` means all that it matches."""
+    stated = top.values.get("magnitudes", [])
+    if not isinstance(stated, list) or not all(isinstance(v, str) for v in stated):
+        raise bad_input(
+            top.path,
+            "magnitudes",
+            stated,
+            "is not a list of channels",
+            'write magnitudes = ["motor_left_drive_current_A"]',
+        )
+    found = []
+    for name in stated:
+        matches = [c for c in channels if fnmatchcase(c, name)]
+        if not matches and find_channel(name) is None:
+            raise bad_input(top.path, "magnitudes", name, "is no channel", "correct its name or leave it out")
+        found += matches
+    return frozenset(found)
+
+
+def _geodetic_origin(fields: Fields) -> dict[str, float | str]:
+    fields.known(("latitude_deg", "longitude_deg", "projection"))
+    if not fields.values:
+        return {}
+    return {
+        "latitude_deg": fields.number("latitude_deg"),
+        "longitude_deg": fields.number("longitude_deg"),
+        "projection": fields.choice("projection", ("tangent", "utm")) or "tangent",
+    }
 
 
 def _tables(folder: Path, top: Fields, extra: dict[str, str], problems: list[Finding]) -> dict[str, LogTable]:
@@ -226,12 +278,31 @@ def _initial(fields: Fields) -> dict[str, Any]:
 
 
 def _imu(fields: Fields) -> Imu:
-    fields.known(("position_m", "quaternion"))
+    fields.known(("position_m", "quaternion", "mounting_std_deg", "attitude"))
     p, q = fields.vector("position_m", 3, (0.0,) * 3), fields.vector("quaternion", 4, (1.0, 0.0, 0.0, 0.0))
     norm = sum(v * v for v in q) ** 0.5
     if abs(norm - 1.0) > 1e-3:
         raise bad_input(fields.path, fields.field("quaternion"), list(q), f"has the norm {norm:.4g}", "normalise it")
-    return Imu((p[0], p[1], p[2]), (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm))
+    std = fields.vector("mounting_std_deg", 3, (0.0,) * 3)
+    if min(std) < 0.0:
+        raise bad_input(
+            fields.path,
+            fields.field("mounting_std_deg"),
+            list(std),
+            "has a negative entry",
+            "give zero or more degrees about x, y and z",
+        )
+    attitude = fields.values.get("attitude", False)
+    if not isinstance(attitude, bool):
+        raise bad_input(
+            fields.path,
+            fields.field("attitude"),
+            attitude,
+            "is neither true nor false",
+            "write attitude = true where roll, pitch and yaw are the IMU's own",
+        )
+    turn = (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+    return Imu((p[0], p[1], p[2]), turn, (std[0], std[1], std[2]), attitude)
 
 
 def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:

@@ -1,0 +1,112 @@
+"""Held samples: rows that repeat a reading of a slower sensor, which are no readings of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+FEWEST_CHANGES = 6
+"""Renewals below which nothing is said: a channel that hardly ever changes may just be steady."""
+SLOWER = 1.5
+"""A channel is held only if its typical change comes later than this many rows."""
+REGULAR, ON_TIME = 0.15, 0.75
+"""Renewals are regular if `ON_TIME` of the time lies in intervals within `REGULAR` of whole multiples of one period, of
+at least `REGULAR_ROWS` rows: of intervals at random a third would."""
+REGULAR_ROWS = 3.0
+COARSE = 8.0
+"""Typical change in steps of the channel's resolution from which an exact repeat is no chance: below, a channel written
+in few digits repeats itself honestly."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Held:
+    """What a group of channels shows.
+
+    Attributes:
+      period_s: typical time between renewals. readings: (n,) whether a row is a reading of its own.
+    """
+
+    period_s: float
+    readings: np.ndarray
+
+
+def held_samples(time: np.ndarray, values: np.ndarray) -> Held | None:
+    """Finds out whether the rows of some channels repeat a slower sensor's readings.
+
+    Channels of a group are renewed together (both wheels of one message, latitude and longitude). A repeat counts as a
+    copy where renewals come at a steady period of several rows, or where the readings' resolution is so fine that a
+    repeat by chance is out of the question. Zeros of a rover at rest are not judged.
+
+    Args:
+      time: (n,) s. values: (n, channels), NaN at gaps.
+
+    Returns:
+      Period and readings; None where every row may be a reading. A copy that stands for longer than the period is kept
+      once per period, since it may have been renewed with the same value.
+    """
+    there = np.isfinite(values).all(axis=1) & np.isfinite(time)
+    rows = np.flatnonzero(there)
+    if len(rows) < 3 * FEWEST_CHANGES:
+        return None
+    t, v = time[rows], values[rows]
+    step = float(np.median(np.diff(t)))
+    changed = np.concatenate([[True], (np.diff(v, axis=0) != 0.0).any(axis=1)])
+    at = np.flatnonzero(changed)
+    if len(at) < FEWEST_CHANGES + 1 or step <= 0.0:
+        return None
+    intervals = np.diff(t[at])
+    # while a rover stands its speeds are 0 and its fixes the same: those intervals tell nothing of the sensor
+    moving = (v[at[:-1]] != 0.0).any(axis=1)
+    intervals = intervals[moving & (intervals > 0.0)]
+    if len(intervals) < FEWEST_CHANGES:
+        return None
+    middle = _weighted_median(intervals)
+    if middle < SLOWER * step:
+        return None
+    # readings that happen to be equal make an interval twice as long: the shortest period that fits is the sensor's
+    candidates = sorted([*np.quantile(intervals, (0.1, 0.25, 0.5)), middle])
+    period = next((float(c) for c in candidates if _regular(intervals, float(c), step)), None)
+    if period is None:
+        period = float(np.median(intervals))
+        if period < SLOWER * step or not _fine(v):
+            return None
+    else:
+        period = float(np.median(intervals[np.round(intervals / period) == 1.0]))
+    keep, last = np.zeros(len(t), bool), -np.inf
+    for k in range(len(t)):
+        if changed[k] or t[k] - last > 1.5 * period:
+            keep[k], last = True, t[k]
+    readings = np.zeros(len(time), bool)
+    readings[rows] = keep
+    return Held(period, readings)
+
+
+def _weighted_median(intervals: np.ndarray) -> float:
+    """The interval in which the middle of the time lies."""
+    order = np.sort(intervals)
+    total = np.cumsum(order)
+    return float(order[np.searchsorted(total, 0.5 * total[-1])])
+
+
+def _regular(intervals: np.ndarray, period: float, step: float) -> bool:
+    if period < REGULAR_ROWS * step:
+        return False
+    multiple = intervals / period
+    near = np.abs(multiple - np.round(multiple)) < REGULAR * np.maximum(np.round(multiple), 1.0)
+    near &= np.round(multiple) >= 1.0
+    return int(near.sum()) >= FEWEST_CHANGES and float(intervals[near].sum()) > ON_TIME * float(intervals.sum())
+
+
+def _fine(values: np.ndarray) -> bool:
+    """Whether every channel that changes does so by many steps of its resolution."""
+    found = []
+    for column in values.T:
+        jumps = np.abs(np.diff(column))
+        jumps = jumps[jumps > 0.0]
+        steps = np.diff(np.unique(column))
+        steps = steps[steps > 1e-9 * max(1e-12, float(np.abs(column).max()))]
+        if jumps.size and steps.size:
+            # the smallest of many differences of real numbers is far below any resolution: a low quantile is not
+            found.append(float(np.median(jumps)) > COARSE * float(np.quantile(steps, 0.05)))
+    return bool(found) and all(found)

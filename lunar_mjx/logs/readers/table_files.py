@@ -1,0 +1,166 @@
+"""Tables as loggers write them: CSV and TXT with any separator, with or without a header; Parquet and MATLAB files."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from lunar_mjx.errors import UserError, bad_input, require_file
+
+SEPARATORS: Mapping[str, str] = {"comma": ",", "semicolon": ";", "tab": "\t", "blank": r"\s+", ",": ",", ";": ";"}
+"""Names of separators in a map, and what pandas calls them; `blank` is any run of blanks and tabs."""
+SUFFIXES = (".csv", ".txt", ".dat", ".tsv", ".log", ".parquet", ".pq", ".mat")
+_SNIFFED_BYTES = 65536
+"""Enough for a header and hundreds of rows, from which the separator is guessed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """How a plain file is laid out.
+
+    Attributes:
+      header: whether the first row names the columns; without one, columns are called by their place, "0", "1", ...
+      separator: a key of `SEPARATORS`, or "" to guess it. decimal: "." or ",".
+      skip_rows: rows before the header or the first row. comment: a sign after which the rest of a line is ignored.
+    """
+
+    header: bool = True
+    separator: str = ""
+    decimal: str = "."
+    skip_rows: int = 0
+    comment: str = ""
+
+
+def read_table_file(path: Path, layout: Layout, wanted: Sequence[str] = ()) -> pd.DataFrame:
+    """A file as a frame whose columns are called by text; cells that are not numbers stay text.
+
+    Args:
+      path: of the file. layout: of a text file.
+      wanted: columns that will be used; they choose among the variables of a MATLAB file, which differ in length.
+
+    Raises:
+      UserError: the file is missing, of an unknown kind, not a table, or needs a package that is missing.
+    """
+    require_file(path, "the recording")
+    suffix = path.suffix.lower()
+    if suffix in (".parquet", ".pq"):
+        frame = _parquet(path)
+    elif suffix == ".mat":
+        frame = _matlab(path, wanted)
+    else:
+        frame = _text(path, layout)
+    frame.columns = [str(c).strip() for c in frame.columns]
+    twice = frame.columns[frame.columns.duplicated()]
+    if len(twice):
+        raise bad_input(path, "column", twice[0], "occurs twice", "rename one of them, or read the file without header")
+    return frame
+
+
+def _text(path: Path, layout: Layout) -> pd.DataFrame:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            start = stream.read(_SNIFFED_BYTES)
+    except (UnicodeDecodeError, OSError) as error:
+        raise UserError(f"{path}: is not a text table ({error}); give CSV, TXT, Parquet or MATLAB files.") from None
+    if not start.strip():
+        raise UserError(f"{path}: is empty; record it again or leave it out.")
+    separator = SEPARATORS[layout.separator] if layout.separator else guess_separator(start, layout.decimal)
+    try:
+        return pd.read_csv(
+            path,
+            sep=separator,
+            header=0 if layout.header else None,
+            decimal=layout.decimal,
+            skiprows=layout.skip_rows,
+            comment=layout.comment or None,
+            index_col=False,
+            skipinitialspace=True,
+            encoding="utf-8-sig",
+            low_memory=False,
+        )
+    except (ValueError, pd.errors.ParserError) as error:
+        shown = str(error).strip().split("\n")[0]
+        raise UserError(f"{path}: is not a table of even rows ({shown}); state its separator and skip_rows.") from None
+
+
+def guess_separator(start: str, decimal: str = ".") -> str:
+    """The separator of a text table, as pandas calls it: the one that splits most rows into equally many cells.
+
+    Args:
+      start: the first rows. decimal: sign in numbers, which is then no separator.
+    """
+    lines = [line for line in start.splitlines()[1:200] if line.strip()] or start.splitlines()
+    best, most = r"\s+", 1
+    for sign in (",", ";", "\t"):
+        if sign == decimal:
+            continue
+        counts = [len(next(csv.reader([line], delimiter=sign))) for line in lines]
+        typical = int(np.median(counts))
+        if typical > most and np.mean(np.array(counts) == typical) > 0.9:
+            best, most = sign, typical
+    return best
+
+
+def _parquet(path: Path) -> pd.DataFrame:
+    if importlib.util.find_spec("pyarrow") is None:
+        raise UserError(f"{path}: a Parquet file needs the package pyarrow; install lunar-mjx[parquet] or save as CSV.")
+    try:
+        return pd.read_parquet(path, engine="pyarrow")
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: is not a Parquet table ({error}); save it again, or as CSV.") from None
+
+
+def _matlab(path: Path, wanted: Sequence[str]) -> pd.DataFrame:
+    """Variables of a MATLAB file (up to version 7) as columns: `gyro[0]` of a matrix, `imu.gyro[0]` of one in a struct.
+
+    Those as long as the wanted ones, else of the most frequent length, are the columns of one table.
+    """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        loaded = loadmat(path, squeeze_me=True, struct_as_record=False)
+    except NotImplementedError:
+        raise UserError(
+            f"{path}: is a MATLAB file of version 7.3; save it with save(file, '-v7'), or as CSV."
+        ) from None
+    except (MatReadError, ValueError, OSError, TypeError) as error:
+        raise UserError(f"{path}: is not a MATLAB file ({error}); save it again, or as CSV.") from None
+    columns: dict[str, np.ndarray] = {}
+    for name, value in loaded.items():
+        if not name.startswith("__"):
+            _flatten(name, value, columns)
+    if not columns:
+        raise UserError(f"{path}: holds no series of numbers; save vectors or matrices with one row per sample.")
+    mine = {name: len(columns[name]) for name in wanted if name in columns}
+    if len(set(mine.values())) > 1:
+        shown = ", ".join(f"{name} {count}" for name, count in mine.items())
+        raise bad_input(path, "rows", shown, "differ", "put variables of different length into tables of their own")
+    lengths = list(mine.values()) or [len(v) for v in columns.values()]
+    rows = max(set(lengths), key=lambda n: (lengths.count(n), n))
+    return pd.DataFrame({k: v for k, v in columns.items() if len(v) == rows})
+
+
+def _flatten(name: str, value: Any, columns: dict[str, np.ndarray]) -> None:
+    fields: Sequence[str] | None = getattr(value, "_fieldnames", None)
+    if fields is not None:
+        for field in fields:
+            _flatten(f"{name}.{field}", getattr(value, field), columns)
+        return
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiubU" or array.ndim not in (1, 2) or max(array.shape) < 2:
+        return
+    if array.ndim == 1:
+        columns[name] = array
+        return
+    # MATLAB keeps samples in either direction; there are more samples than signals
+    array = array if array.shape[0] >= array.shape[1] else array.T
+    for k in range(array.shape[1]):
+        columns[f"{name}[{k}]"] = array[:, k]

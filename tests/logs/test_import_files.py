@@ -1,0 +1,318 @@
+"""Logs from plain files: what loggers write is imported by a map and read back, and nothing is taken twice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from cli_harness import Run
+from scipy.io import savemat
+
+from lunar_mjx.errors import UserError
+from lunar_mjx.logs import Log, import_drives, read_log
+from lunar_mjx.logs.readers.clocks import TimeColumn, seconds
+from lunar_mjx.logs.readers.geodesy import tangent_plane, utm, utm_zone
+from lunar_mjx.logs.readers.held import held_samples
+from lunar_mjx.logs.readers.import_map import read_map, shipped_maps
+
+MAP = """
+[log]
+rover = "luvmi_x"
+gravity_m_s2 = 9.81
+[tables.drive]
+file = "{drive}.txt"
+header = false
+separator = "blank"
+missing = [-1000]
+time = { column = 3, clock = true }
+[tables.drive.channels]
+joint_left_drive_speed_rad_s = { column = 0, scale = 0.5, offset = 0.1 }
+joint_right_drive_speed_rad_s = { sum = [{ column = 0, scale = 0.5 }, { column = 1, scale = -1.0 }] }
+motor_left_drive_current_mA = 2
+"""
+
+
+def write_map(folder: Path, text: str = MAP, name: str = "map.toml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def drive(folder: Path) -> Log:
+    log = read_log(folder)
+    assert isinstance(log, Log)
+    return log
+
+
+def test_blanks_sentinels_clocks_and_sums(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text(
+        "2.0  1.0   500 23:59:59.50\n4.0 -1000 600 23:59:59.75\n 6.0 2.0 -1000 00:00:00.00\n", encoding="utf-8"
+    )
+    found = import_drives(tmp_path / "a.txt", tmp_path / "log", write_map(tmp_path))
+    log = drive(found.folder)
+    table = log.tables["drive"]
+    np.testing.assert_allclose(table.time_s, [0.0, 0.25, 0.5])
+    np.testing.assert_allclose(table.channels["joint_left_drive_speed_rad_s"], [1.1, 2.1, 3.1])
+    np.testing.assert_allclose(table.channels["joint_right_drive_speed_rad_s"], [0.0, np.nan, 1.0])
+    np.testing.assert_allclose(table.channels["motor_left_drive_current_A"], [0.5, 0.6, np.nan])
+    assert log.source["files"] == "a.txt"
+
+
+@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), (" ", ".")])
+def test_the_separator_is_guessed(tmp_path: Path, separator: str, decimal: str) -> None:
+    rows = [("time", "speed", "note"), *((f"{0.1 * k:.2f}", f"{k + 0.5:.3f}", f"{k}") for k in range(30))]
+    text = "\n".join(separator.join(v.replace(".", decimal) for v in row) for row in rows)
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    mapping = write_map(
+        tmp_path,
+        f"""
+[log]
+rover = "luvmi_x"
+[tables.drive]
+file = "a.csv"
+decimal = "{decimal}"
+time = "time"
+[tables.drive.channels]
+joint_lf_drive_speed_rad_s = "speed"
+""",
+    )
+    found = import_drives(tmp_path / "a.csv", tmp_path / "log", mapping)
+    time, values = drive(found.folder).channel("joint_lf_drive_speed_rad_s") or (None, None)
+    np.testing.assert_allclose(values, np.arange(30) + 0.5)
+    np.testing.assert_allclose(time, 0.1 * np.arange(30))
+    assert any("note" in note for _, note in found.notes), "a column that nobody reads is named"
+
+
+TWO = """
+[log]
+rover = "luvmi_x"
+[tables.drive]
+file = "pro_{drive}.csv"
+time = { column = "t", unit = "ms" }
+[tables.drive.channels]
+motor_left_drive_current_A = "c"
+[tables.imu]
+file = "imu_{drive}.csv"
+time = "t"
+start = "own"
+clock_offset_std_s = 0.05
+[tables.imu.channels]
+gyro_z_rad_s = "w"
+"""
+
+
+def test_files_of_several_drives_with_clocks_of_their_own(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for name in ("01", "02"):
+        pd.DataFrame({"t": 1000.0 + 200.0 * np.arange(20), "c": rng.normal(size=20)}).to_csv(
+            tmp_path / f"pro_{name}.csv", index=False
+        )
+    pd.DataFrame({"t": 77.0 + 0.01 * np.arange(300), "w": rng.normal(size=300)}).to_csv(
+        tmp_path / "imu_01.csv", index=False
+    )
+    found = import_drives(tmp_path, tmp_path / "out", write_map(tmp_path, TWO), changes={"ground": "sand"})
+    assert [p.name for p in found.logs] == ["01", "02"]
+    first, second = map(drive, found.logs)
+    assert set(first.tables) == {"drive", "imu"} and set(second.tables) == {"drive"}
+    assert first.tables["imu"].time_s[0] == 0.0 and first.tables["imu"].rate_hz == pytest.approx(100.0)
+    assert first.tables["drive"].rate_hz == pytest.approx(5.0)
+    assert first.tables["imu"].clock_offset_std_s == 0.05 and first.ground == "sand"
+    assert any(name == "02" and "imu" in note for name, note in found.notes)
+
+
+def test_matlab_structs_of_different_length(tmp_path: Path) -> None:
+    t = 0.1 * np.arange(40)
+    savemat(tmp_path / "run.mat", {"imu": {"t": t, "w": np.stack([t, 2 * t, 3 * t])}, "other": np.arange(99.0)})
+    mapping = write_map(
+        tmp_path,
+        """
+[log]
+rover = "luvmi_x"
+[tables.imu]
+file = "*.mat"
+time = "imu.t"
+[tables.imu.channels]
+gyro_z_rad_s = "imu.w[2]"
+""",
+    )
+    found = import_drives(tmp_path / "run.mat", tmp_path / "log", mapping)
+    np.testing.assert_allclose(drive(found.folder).tables["imu"].channels["gyro_z_rad_s"], 3 * t)
+
+
+def test_parquet(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", reason="needs pyarrow")
+    frame = pd.DataFrame({"t": 0.1 * np.arange(40), "w": np.arange(40.0)})
+    frame.to_parquet(tmp_path / "run.parquet")
+    text = '[log]\nrover = "luvmi_x"\n[tables.imu]\nfile = "*.parquet"\ntime = "t"\n'
+    mapping = write_map(tmp_path, text + '[tables.imu.channels]\ngyro_z_rad_s = "w"\n')
+    found = import_drives(tmp_path / "run.parquet", tmp_path / "log", mapping)
+    np.testing.assert_allclose(drive(found.folder).tables["imu"].channels["gyro_z_rad_s"], np.arange(40.0))
+
+
+def test_copies_of_a_slow_sensor_are_no_readings(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    t = 0.1 * np.arange(900)
+    slow = np.repeat(np.round(20.0 + rng.normal(size=18), 1), 50)
+    frame = pd.DataFrame({"t": t, "w": slow, "c": rng.normal(size=900)})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    text = '[log]\nrover = "luvmi_x"\n[tables.drive]\nfile = "a.csv"\ntime = "t"\n[tables.drive.channels]\n'
+    text += 'joint_left_drive_speed_rad_s = "w"\nmotor_left_drive_current_A = "c"\n'
+    found = import_drives(tmp_path / "a.csv", tmp_path / "log", write_map(tmp_path, text))
+    log = drive(found.folder)
+    held = log.table_of("joint_left_drive_speed_rad_s")
+    assert held is not None and len(held) == 18 and held.rate_hz == pytest.approx(0.2)
+    assert len(log.tables["drive"]) == 900
+    assert len(found.copies) == 1 and "renewed every 5 s" in found.copies[0] and "18 of 900" in found.copies[0]
+    text = text.replace('time = "t"', 'time = "t"\nheld = "never"')
+    kept = import_drives(tmp_path / "a.csv", tmp_path / "whole", write_map(tmp_path, text))
+    assert len(drive(kept.folder).tables["drive"].channels["joint_left_drive_speed_rad_s"]) == 900
+
+
+def _steps(rng: np.random.Generator) -> np.ndarray:
+    """A command followed closely: constant but for ramps, in few digits."""
+    return np.round(np.repeat(rng.choice([0.0, 0.2, 0.5], 12), 30) + 0.008 * rng.integers(-1, 2, 360), 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "held"),
+    [
+        (lambda rng: rng.normal(size=360), False),
+        (lambda rng: np.round(rng.normal(size=360), 1), False),
+        (_steps, False),
+        (lambda rng: np.full(360, 0.24), False),
+        (lambda rng: np.repeat(rng.normal(size=180), 2), True),
+        (lambda rng: np.repeat(rng.normal(size=180), rng.integers(1, 4, 180))[:360], True),
+        (lambda rng: np.repeat(np.round(5.0 + 0.1 * rng.normal(size=36), 1), 10), True),
+    ],
+)
+def test_what_counts_as_held(make: Callable[[np.random.Generator], np.ndarray], held: bool) -> None:
+    for seed in range(5):
+        values = make(np.random.default_rng(seed))
+        found = held_samples(0.1 * np.arange(len(values)), values[:, None])
+        assert (found is not None) == held, seed
+        if found is not None:
+            changes = np.flatnonzero(np.diff(values) != 0.0) + 1
+            assert found.readings[changes].all()
+
+
+def test_places_in_metres(tmp_path: Path) -> None:
+    easting, northing = utm(np.array(43.642567), np.array(-79.387139), utm_zone(-79.387139))
+    assert utm_zone(-79.387139) == 17
+    # the CN Tower on the grid of zone 17, as published (630,084 m east, 4,833,438 m north)
+    assert abs(float(easting) - 630084.0) < 1.0 and abs(float(northing) - 4833439.0) < 1.0
+    assert float(utm(np.array(-33.0), np.array(-70.0), 19)[1]) > 5e6
+    # a degree of latitude is 111,133 m at 45 degrees and one of longitude 78,847 m (WGS84)
+    east, north = tangent_plane(np.array([45.0005, 45.0]), np.array([8.0, 8.0005]), (45.0, 8.0))
+    assert abs(north[0] - 0.0005 * 111132.1) < 1e-3 and abs(east[1] - 0.0005 * 78846.8) < 1e-3
+    rows = "\n".join(f"{0.2 * k:.1f} {45.0 + 1e-6 * k:.7f} {8.0 + 2e-6 * k:.7f} {k % 7}" for k in range(40))
+    (tmp_path / "a.txt").write_text("0.0 0 0 1\n" + rows.replace("0.0 45", "0.1 45", 1), encoding="utf-8")
+    mapping = write_map(
+        tmp_path,
+        """
+[log]
+rover = "luvmi_x"
+[tables.gps]
+file = "a.txt"
+header = false
+time = 0
+[tables.gps.channels]
+yaw_deg = 3
+[tables.gps.geodetic]
+latitude = 1
+longitude = 2
+""",
+    )
+    log = drive(import_drives(tmp_path / "a.txt", tmp_path / "log", mapping).folder)
+    assert log.geodetic_origin == {"latitude_deg": 45.0, "longitude_deg": 8.0, "projection": "tangent"}
+    _, x = log.channel("position_x_m") or (None, np.zeros(0))
+    _, y = log.channel("position_y_m") or (None, np.zeros(0))
+    assert len(x) == 40, "a receiver's zeros are no fix"
+    np.testing.assert_allclose(y[-1], 39e-6 * 111132.1, atol=1e-3)
+    np.testing.assert_allclose(x[-1], 78e-6 * 78846.8, atol=1e-3)
+
+
+def test_cut_at_gaps_and_rests_and_nothing_is_lost(tmp_path: Path) -> None:
+    t = 0.1 * np.arange(600)
+    t[300:] += 60.0
+    speed = np.where((np.arange(600) % 300 > 100) & (np.arange(600) % 300 < 200), 0.0, 1.0)
+    rng = np.random.default_rng(2)
+    pd.DataFrame({"t": t, "w": speed, "c": rng.normal(size=600)}).to_csv(tmp_path / "a.csv", index=False)
+    text = '[log]\nrover = "luvmi_x"\n[tables.drive]\nfile = "a.csv"\ntime = "t"\n[tables.drive.channels]\n'
+    text += 'joint_left_drive_speed_rad_s = "w"\nmotor_left_drive_current_A = "c"\n'
+    mapping = write_map(tmp_path, text)
+    for name, options, count in (
+        ("whole", {}, 1),
+        ("gaps", {"split_at_gaps_s": 10.0}, 2),
+        ("rests", {"split_at_rest_s": 5.0}, 3),
+        ("both", {"split_at_gaps_s": 10.0, "split_at_rest_s": 5.0}, 4),
+    ):
+        found = import_drives(tmp_path / "a.csv", tmp_path / name, mapping, **options)
+        assert len(found.logs) == count, name
+        logs = [drive(f) for f in found.logs]
+        assert sum(len(log.tables["drive"]) for log in logs) == 600
+        assert all(log.tables["drive"].time_s[0] == 0.0 for log in logs)
+
+
+def test_groups_are_drives_that_begin_in_motion(tmp_path: Path) -> None:
+    frame = pd.DataFrame({"w": np.repeat([0, 1, 2], 20), "t": np.tile(0.05 * np.arange(20), 3), "y": np.arange(60.0)})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    text = '[log]\nrover = "luvmi_x"\n[tables.drive]\nfile = "a.csv"\ntime = "t"\ngroup = "w"\n'
+    mapping = write_map(tmp_path, text + '[tables.drive.channels]\nyaw_deg = "y"\n')
+    found = import_drives(tmp_path / "a.csv", tmp_path / "log", mapping)
+    assert [len(drive(f).tables["drive"]) for f in found.logs] == [20, 20, 20]
+    np.testing.assert_allclose(drive(found.logs[1]).tables["drive"].channels["yaw_deg"], np.arange(20.0, 40.0))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('file = "{drive}.txt"', 'topic = "/a"\nfile = "b"', ("tables.drive", "either a topic or a file")),
+        ('file = "{drive}.txt"', "", ("either a topic or a file",)),
+        ('file = "{drive}.txt"', 'file = "b.txt"', ("a.txt", "matches no table")),
+        ("header = false", "header = 3", ("tables.drive.header", "true nor false")),
+        ('"blank"', '"comma"', ("a.txt", "is no column")),
+        ("column = 0, scale = 0.5, offset = 0.1", "column = 9", ("a.txt", "= '9' is no column", "0, 1")),
+        ("missing = [-1000]", "missing = -1000", ("missing", "is not a list")),
+        ("clock = true", 'unit = "s"', ("no number", "clock = true")),
+        ("time = { column = 3, clock = true }", "", ("tables.drive.time", "is missing")),
+        ("time = { column = 3, clock = true }", "time = { rate_hz = 5, column = 3 }", ("states a rate and more",)),
+        ("motor_left_drive_current_mA = 2", "motor_left_steer_current_A = 2", ("is no channel", "log channels")),
+        ("sum = [{ column = 0, scale = 0.5 }, { column = 1, scale = -1.0 }]", "sum = []", ("sum", "list of columns")),
+        ("motor_left_drive_current_mA = 2", "motor_left_drive_current_mA = { column = 3 }", ("neither a number",)),
+        ('rover = "luvmi_x"', 'rover = "luvmi_x"\nimposed = "all"', ("imposed", "wheel_speed")),
+        ('rover = "luvmi_x"', 'rover = "luvmi_x"\nmagnitudes = ["motor"]', ("magnitudes", "is no channel")),
+    ],
+)
+def test_bad_maps_are_answered_in_one_sentence(
+    run: Run, tmp_path: Path, old: str, new: str, words: tuple[str, ...]
+) -> None:
+    rows = "\n".join(f"{0.5 * k:.1f} 1.0 {k % 9} 12:00:{k:02d}.5" for k in range(40))
+    (tmp_path / "a.txt").write_text(rows, encoding="utf-8")
+    assert old in MAP
+    mapping = write_map(tmp_path, MAP.replace(old, new, 1))
+    result = run("log", "import", tmp_path / "a.txt", "-o", tmp_path / "log", "--map", mapping)
+    told = " ".join(result.err.split())
+    assert result.status == 2 and all(w in told for w in words), told
+
+
+def test_shipped_maps_are_read_by_name(tmp_path: Path) -> None:
+    assert {"husky_borealtc", "husky_drive", "cuadriga_camis"} <= set(shipped_maps())
+    for name in shipped_maps():
+        assert read_map(name).tables
+    with pytest.raises(UserError, match=r"neither a map file nor a shipped map; shipped are .*husky_borealtc"):
+        read_map("no_such_map")
+
+
+def test_dates_count_from_the_first(tmp_path: Path) -> None:
+    frame = pd.DataFrame({"t": ["2020-11-03T11:41:07.5", "2020-11-03T11:41:09"]})
+    np.testing.assert_allclose(np.diff(seconds(frame, TimeColumn("t", clock=True), tmp_path)), 1.5, atol=1e-6)
+    with pytest.raises(UserError, match="neither a time of day nor a date"):
+        seconds(pd.DataFrame({"t": ["noon", "11:00"]}), TimeColumn("t", clock=True), tmp_path)
+
+
+def test_channels_are_listed(run: Run) -> None:
+    result = run("log", "channels")
+    assert result.status == 0 and "motor_{c}_{j}_current_A" in result.out and "left, right" in result.out
