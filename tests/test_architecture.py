@@ -48,27 +48,9 @@ ONLY_IN = {"typer": frozenset({"commands"}), "mujoco.mjx": frozenset({"_quiet"})
 LATE_CIRCLES: dict[frozenset[str], str] = {}
 """Circles closed by an import inside a function that are borne, with the reason."""
 
-WORDS = frozenset(
-    [
-        "rover",
-        "rovers",
-        "wheel",
-        "wheels",
-        "joint",
-        "joints",
-        "port",
-        "ports",
-        "channel",
-        "channels",
-        "soil",
-        "motor",
-        "slip",
-        "gear",
-        "encoder",
-        "imu",
-    ]
-)
-"""Words of rovers, ports and channels: no name in `inference` holds one."""
+WORDS = frozenset({"rover", "wheel", "port", "channel", "soil", "motor", "slip", "gear", "encoder", "imu"})
+"""Words of rovers, ports and channels, in the singular: no name in `inference` holds one. (A joint is also what several
+hypotheses have in common, so that word says nothing.)"""
 WORDS_BORNE = {
     "observations.py": "channel",  # the name of a measured series, which inference never takes apart
     "held_out.py": "channel",  # groups residuals by the names of their series
@@ -198,8 +180,8 @@ def test_inference_names_no_rover_port_or_channel() -> None:
                 name = getattr(node, field, None)
                 if not isinstance(name, str):
                     continue
-                for word in WORDS & set(re.split(r"_+", name.lower())):
-                    if word.rstrip("s") != WORDS_BORNE.get(path.name):
+                for word in WORDS & {w.removesuffix("s") for w in re.split(r"_+", name.lower())}:
+                    if word != WORDS_BORNE.get(path.name):
                         wrong.append(f"{path.name}: {name}")
     assert not wrong, sorted(set(wrong))
 
@@ -226,3 +208,11 @@ def test_tests_mirror_the_package() -> None:
     folders = {p.name for p in (ROOT / "tests").iterdir() if p.is_dir() and any(p.rglob("*.py"))}
     rooms = {room(m) for m in modules()}
     assert folders <= rooms | {"benchmarks", "docs"}, folders - rooms
+
+
+def test_the_picture_shows_every_room() -> None:
+    """`python docs/hooks/rooms.py` draws it anew."""
+    picture = (ROOT / "docs" / "figures" / "rooms.svg").read_text(encoding="utf-8")
+    shown = set(re.findall(r">([^<]+)</text>", picture))
+    words = {word for text in shown for word in text.split()}
+    assert {room(m) for m in modules()} - {PACKAGE, "cli"} <= words
