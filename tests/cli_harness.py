@@ -20,9 +20,7 @@ Run = Callable[..., Result]
 
 
 def subprocess_run(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, timeout=60
-    )
+    return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True)
 
 
 MAIN = "from lunar_mjx.cli import main; main()"

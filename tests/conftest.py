@@ -7,11 +7,16 @@ import sys
 
 import jax
 import pytest
+from hypothesis import settings
 
 from lunar_mjx import cli
 from tests.cli_harness import Result, Run
 
 FAST_COMPILE = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0").lower() in ("1", "true", "yes", "on")
+
+# A busy machine is no error, and the examples are the same in every run.
+settings.register_profile("any machine", deadline=None, derandomize=True)
+settings.load_profile("any machine")
 
 
 @pytest.hookimpl(tryfirst=True)

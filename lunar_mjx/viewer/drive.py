@@ -190,35 +190,44 @@ class Pace:
     """Drives in real time in a thread of its own, and hands every picture to a function.
 
     Args:
-      drive: what drives. show: called after every tick, in the thread.
+      drive: what drives. show: called after every tick. clock: s, monotonic.
+
+    Attributes:
+      lock: held while the drive changes. failure: what ended the thread, if anything did.
     """
 
-    def __init__(self, drive: LiveDrive, show: Callable[[], None]) -> None:
-        self.drive, self.lock, self._show = drive, threading.Lock(), show
+    def __init__(self, drive: LiveDrive, show: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self.drive, self.lock, self.clock, self._show = drive, threading.Lock(), clock, show
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="drive", daemon=True)
+        self._last = clock()
         self.failure: BaseException | None = None
 
     def start(self) -> None:
+        """Starts the thread."""
         self._thread.start()
 
     def stop(self) -> None:
         """Ends the thread and waits for it."""
         self._stop.set()
         if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
+            self._thread.join()
+
+    def tick(self) -> None:
+        """Drives until the time that the clock shows, and shows the picture."""
+        now = self.clock()
+        with self.lock:
+            driven = self.drive.advance(now - self._last)
+            # a mean over about a second: single ticks hold whole control intervals only
+            self.drive.rate += 0.05 * (driven / (now - self._last) - self.drive.rate)
+        self._last = now
+        self._show()
 
     def _run(self) -> None:
-        last = time.monotonic()
+        self._last = self.clock()
         try:
-            while not self._stop.wait(max(0.0, last + TICK - time.monotonic())):
-                now = time.monotonic()
-                with self.lock:
-                    driven = self.drive.advance(now - last)
-                    # a mean over about a second: single ticks hold whole control intervals only
-                    self.drive.rate += 0.05 * (driven / (now - last) - self.drive.rate)
-                last = now
-                self._show()
+            while not self._stop.wait(max(0.0, self._last + TICK - self.clock())):
+                self.tick()
         except Exception as failure:
             self.failure = failure
             self._show()

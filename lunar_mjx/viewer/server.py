@@ -6,10 +6,14 @@ and `Sec-Fetch-Site`; and a foreign name that was made to point here (DNS rebind
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import socket
 import threading
 import time
+from collections import OrderedDict
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from typing import Any
@@ -37,6 +41,8 @@ _FILES = {
 } | {f"/{name}.js": (f"{name}.js", _SCRIPT) for name in ("main", "maths", "panel", "render", "shapes")}
 _LONGEST = 4096
 """Bytes of a message from the page."""
+_MOST_CONNECTIONS = 64
+"""Connections, and threads, at once: a page needs three. Beyond it the idlest one is closed."""
 
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -58,7 +64,7 @@ class Viewer(ThreadingHTTPServer):
     """Serves one drive.
 
     Args:
-      drive: what is driven. port: 0 for any that is free. sun: the light.
+      drive: what is driven. port: 0 for any that is free. sun: the light. clock: s, monotonic.
 
     Raises:
       UserError: a port that is no port, or taken.
@@ -67,16 +73,23 @@ class Viewer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     allow_reuse_port = False
+    request_queue_size = 1024
+    """Connections that wait to be taken: one that finds no place tries again only after a second."""
 
-    def __init__(self, drive: LiveDrive, port: int = PORT, sun: Sun | None = None) -> None:
+    def __init__(
+        self, drive: LiveDrive, port: int = PORT, sun: Sun | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         check_port(port)
         self.drive = drive
         self.terrain = jax.device_get(drive.model.terrain)
         self.scene = json.dumps(rover_scene(drive.model, sun or Sun()))
-        self.pace = Pace(drive, self._show)
+        self.pace = Pace(drive, self._show, clock)
         self._fresh = threading.Condition()
         self._picture, self._count, self._closed = "", 0, False
         self._let_go = math.inf
+        self._connections: OrderedDict[Any, bool] = OrderedDict()
+        self._counting = threading.Lock()
+        self._slots = threading.BoundedSemaphore(_MOST_CONNECTIONS)
         try:
             super().__init__((LOOPBACK, port), _Handler)
         except OSError as error:
@@ -115,7 +128,7 @@ class Viewer(ThreadingHTTPServer):
         """Takes the keys that are held down, for `DEAD_MAN` s."""
         with self.pace.lock:
             self.drive.pilot.hold(keys)
-            self._let_go = time.monotonic() + DEAD_MAN
+            self._let_go = self.pace.clock() + DEAD_MAN
 
     def reset(self) -> None:
         """Puts the rover back to its start."""
@@ -133,7 +146,7 @@ class Viewer(ThreadingHTTPServer):
 
     def _show(self) -> None:
         with self.pace.lock:
-            if time.monotonic() > self._let_go:
+            if self.pace.clock() > self._let_go:
                 self.drive.pilot.hold([])
             readings = self.drive.readings()
             bodies = self.drive.bodies()
@@ -143,6 +156,39 @@ class Viewer(ThreadingHTTPServer):
         with self._fresh:
             self._picture, self._count = text, self._count + 1
             self._fresh.notify_all()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Gives a connection its thread; closes the idlest one if there are too many."""
+        with self._counting:
+            self._connections[request] = False
+            if len(self._connections) > _MOST_CONNECTIONS:
+                # the longest silent one of those that have asked for nothing yet; if all have, of all
+                idlest = min(self._connections, key=self._connections.__getitem__)
+                del self._connections[idlest]
+                with contextlib.suppress(OSError):
+                    idlest.shutdown(socket.SHUT_RDWR)  # its thread reads the end and goes
+        self._slots.acquire()
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """What the thread of a connection does."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._slots.release()
+
+    def heard_of(self, request: Any) -> None:
+        """Marks a connection as in use."""
+        with self._counting:
+            if request in self._connections:
+                self._connections[request] = True
+                self._connections.move_to_end(request)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Closes a connection."""
+        with self._counting:
+            self._connections.pop(request, None)
+        super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A page that went away is no error."""
@@ -196,6 +242,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _welcome(self) -> bool:
         """Whether a request comes from this page, this machine's programs or the address bar."""
+        self.server.heard_of(self.connection)
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         if host not in self.server.hosts:
             self._refuse(403, f"open this page as {self.server.address}")
@@ -234,6 +281,7 @@ class _Handler(BaseHTTPRequestHandler):
                 if not text:
                     return
                 self.wfile.write(f"data: {text}\n\n".encode())
+                self.server.heard_of(self.connection)
         except OSError:
             return
 

@@ -1,8 +1,10 @@
 """Trains in the physics-free environment, as a process of its own: to be killed, resumed, and spread over devices.
 
-    python point_run.py FOLDER [--steps N] [--coordinator HOST:PORT --processes N --process I]
+    python point_run.py FOLDER [--steps N] [--kill epoch:N | --kill file:N]
+                        [--coordinator HOST:PORT --processes N --process I]
 
-Prints the parameters' fingerprint and the last success rate as JSON.
+Prints the parameters' fingerprint and the curve as JSON. `--kill` sends itself SIGKILL: after the N-th epoch
+and before its checkpoint, or at the N-th opening, making, renaming or removing of a file under the checkpoints.
 """
 
 from __future__ import annotations
@@ -10,16 +12,41 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
+import signal
+import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
+
+FILE_EVENTS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link"}
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_at_file(folder: Path, count: int) -> None:
+    """Counts what Python does to files under a folder; dies just before the `count`-th."""
+    seen = 0
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        nonlocal seen
+        if event in FILE_EVENTS and str(arguments[0]).startswith(str(folder)):
+            seen += 1
+            if seen == count:
+                die()
+
+    sys.addaudithook(hook)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder")
     parser.add_argument("--steps", type=int, default=16_000)
+    parser.add_argument("--kill", default=":0")
     parser.add_argument("--coordinator")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--process", type=int, default=0)
@@ -35,8 +62,19 @@ def main() -> None:
     config = override(get_training("point"), epoch_steps=25).train
     learner = Learner(make("point"), config)
     folder = None if args.folder == "-" else Path(args.folder)
-    print("begin", flush=True)
-    result = train(learner, RunConfig(args.steps, checkpoint_every=0.0, quiet=True), folder)
+    where, _, number = args.kill.partition(":")
+    if where == "file":
+        assert folder is not None
+        die_at_file(folder.resolve() / "checkpoints", int(number))
+    left = int(number)
+
+    def after(*_: object) -> None:
+        nonlocal left
+        left -= 1
+        if where == "epoch" and left == 0:
+            die()
+
+    result = train(learner, RunConfig(args.steps, checkpoint_every=0.0, quiet=True), folder, callback=after)
     digest = hashlib.sha256()
     actor, statistics = jax.device_get(learner.policy(result.state))
     for leaf in jax.tree.leaves((actor, statistics)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,20 +28,25 @@ def _together(threads):
 
 
 def test_what_falls_far_short_of_one_that_is_at_the_noise_is_left_meanwhile(monkeypatch):
-    leading, left = {}, threading.Event()
+    leading, ended, known = {}, {}, []
+    leads, looked = threading.Event(), threading.Event()
 
     def one(problem, parent, effects, scored, memory, rival, start, eager, outdone):
         name = effects[-1]
         leading[name] = eager
         chi2 = 1000.0 - DROPS[name]
         at = Descent(np.zeros(0), np.zeros(0), np.zeros((0, 0)), chi2, 0.0)
-        end = time.monotonic() + 10.0
-        while name != "best" and not np.isfinite(rival.chi2) and time.monotonic() < end:
-            time.sleep(1e-3)
-        if outdone(at):
-            left.set()
+        if name != "best":
+            leads.wait()
+        ended[name] = outdone(at)
+        if name == "best":
+            known.append(rival.chi2)
+            leads.set()
+            looked.wait()  # the others look before the best is done
+        elif len(ended) == len(DROPS):
+            looked.set()
+        if ended[name]:
             raise Outdone
-        assert name != "best" or left.wait(10.0)  # before the best is done
         return SimpleNamespace(
             effects=effects, fit=SimpleNamespace(chi2=chi2), noise=SimpleNamespace(passes=name == "best")
         )
@@ -57,6 +61,7 @@ def test_what_falls_far_short_of_one_that_is_at_the_noise_is_left_meanwhile(monk
     new = [Score(e, np.zeros((0, 1)), 10.0, 1.0, np.ones(1), drop, 9.0) for e, drop in DROPS.items()]
     found = refit_all(problem, parent, new, Settings(), Memory())  # type: ignore[arg-type]
     assert [c.effects for c in found] == [("best",), ("near",)]
+    assert np.isfinite(known).all() and ended == {"best": False, "near": False, "far": True}
     assert leading == {"best": True, "near": False, "far": False}
 
 

@@ -39,7 +39,7 @@ def test_agrees_with_scipy_at_random_points(x64):
     np.testing.assert_allclose(height(field, x, y), expected, rtol=1e-12, atol=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(-1.9, 3.4), st.floats(1.1, 4.9))
 def test_derivatives_match_finite_differences(x, y):
     with jax.enable_x64(True):

@@ -26,7 +26,7 @@ def live(rocks):
     return np.asarray(rocks.centers)[radii > 0], radii[radii > 0]
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(st.integers(0, 10_000))
 def test_a_wheel_near_a_rock_finds_it(seed):
     with jax.enable_x64(True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 
 import jax
 import jax.numpy as jnp
@@ -49,9 +48,7 @@ def test_planes_are_exact():
 
 
 def test_shipped_terrains_load_at_true_scale():
-    start = time.perf_counter()
     plain = load_terrain("lunar_plain")
-    assert time.perf_counter() - start < 3.0
     field = plain.field
     assert field.heights.shape == (801, 801) and float(field.cell) == pytest.approx(0.1)
     assert plain.rocks is not None and 24 <= int((plain.rocks.radii > 0).sum()) <= 100

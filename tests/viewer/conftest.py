@@ -1,4 +1,4 @@
-"""A drive that is served."""
+"""Drives that are served: one whose time a test tells, and one in real time."""
 
 from __future__ import annotations
 
@@ -10,14 +10,32 @@ import pytest
 from lunar_mjx.model import make_model
 from lunar_mjx.viewer.drive import LiveDrive
 from lunar_mjx.viewer.server import Viewer
+from tests.viewer.viewer_client import Clock
 
 
 @pytest.fixture(scope="module")
-def viewer() -> Iterator[Viewer]:
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture(scope="module")
+def viewer(clock: Clock) -> Iterator[Viewer]:
+    """Stands still until a test moves the clock and calls `viewer.pace.tick`."""
+    served = Viewer(LiveDrive(make_model("luvmi_x", "lunar_plain"), "native"), port=0, clock=clock)
+    thread = threading.Thread(target=served.serve_forever, kwargs={"poll_interval": 0.1})
+    thread.start()
+    yield served
+    served.shutdown()
+    served.close()
+    thread.join()
+
+
+@pytest.fixture(scope="module")
+def live_viewer() -> Iterator[Viewer]:
+    """Drives in real time."""
     served = Viewer(LiveDrive(make_model("luvmi_x", "lunar_plain"), "native"), port=0)
     thread = threading.Thread(target=served.run)
     thread.start()
     yield served
     served.shutdown()
-    thread.join(timeout=10)
-    assert not thread.is_alive()
+    thread.join()

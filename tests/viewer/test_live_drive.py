@@ -6,16 +6,17 @@ import os
 import signal
 import subprocess
 import sys
-import time
+import threading
 
 import numpy as np
 import pytest
 
 from lunar_mjx.model import make_model
 from lunar_mjx.viewer import window
-from lunar_mjx.viewer.drive import LiveDrive, Pace
+from lunar_mjx.viewer.drive import HOLD, TICK, LiveDrive, Pace
 from lunar_mjx.viewer.pilot import Pilot, drivable
 from tests.cli_harness import MAIN
+from tests.viewer.viewer_client import Clock
 
 
 @pytest.fixture(scope="module")
@@ -132,16 +133,38 @@ def test_a_rover_on_its_back_is_said(drive):
 
 
 def test_pace_is_that_of_the_clock(model):
-    shown = []
-    pace = Pace(LiveDrive(model, "native"), lambda: shown.append(time.monotonic()))
-    begin, start = time.monotonic(), pace.drive.time
+    clock, shown = Clock(), []
+    pace = Pace(LiveDrive(model, "native"), lambda: shown.append(pace.drive.time), clock)
+    start = pace.drive.time
+    for _ in range(30):
+        clock.now += TICK
+        pace.tick()
+    assert shown[-1] - start == pytest.approx(30 * TICK, abs=HOLD)
+    assert len(shown) == 30 and pace.drive.rate == pytest.approx(1.0, abs=0.01)
+    clock.now += 60.0  # a machine that was asleep falls behind rather than stops
+    pace.tick()
+    assert 0.1 < shown[-1] - shown[-2] < 0.25
+
+
+def test_pace_goes_on_in_its_thread_until_stopped(model):
+    several = threading.Semaphore(0)
+    pace = Pace(LiveDrive(model, "native"), several.release)
     pace.start()
-    time.sleep(1.5)
+    for _ in range(3):
+        several.acquire()
     pace.stop()
-    lasted = time.monotonic() - begin
-    assert not pace._thread.is_alive() and pace.failure is None
-    assert 0.4 * lasted < pace.drive.time - start <= lasted + 0.1  # a busy machine may fall behind
-    assert len(shown) > 8
+    assert not pace._thread.is_alive() and pace.failure is None and pace.drive.time > 0.0
+
+
+def test_pace_shows_what_ended_it(model):
+    shown = threading.Event()
+    drive = LiveDrive(model, "native")
+    drive.advance = None  # type: ignore[assignment]
+    pace = Pace(drive, shown.set)
+    pace.start()
+    shown.wait()
+    assert isinstance(pace.failure, TypeError)
+    pace.stop()
 
 
 def test_window_needs_a_screen(monkeypatch, drive):
@@ -190,7 +213,7 @@ def test_control_c_ends_it_cleanly():
             assert process.stdout is not None
             assert "http://127.0.0.1:" in process.stdout.readline()
             process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=30)
+            out, err = process.communicate()
         finally:
             process.kill()
     assert process.returncode == 0 and not err and "luvmi_x drove 0.0 m" in out

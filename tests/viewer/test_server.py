@@ -7,15 +7,15 @@ import json
 import re
 import socket
 import threading
-import time
 
 import numpy as np
 import pytest
-from viewer_client import ask, pictures
 
 from lunar_mjx.errors import UserError
 from lunar_mjx.terrain import sample
+from lunar_mjx.viewer.drive import TICK
 from lunar_mjx.viewer.server import DEAD_MAN, Viewer
+from tests.viewer.viewer_client import ask, pictures
 
 PATHS = ("/", "/main.js", "/scene", "/ground?x=0&y=0", "/pictures", "/nothing")
 
@@ -25,7 +25,7 @@ def test_listens_on_the_loopback_address_only(viewer):
     assert host == "127.0.0.1"
     for other in ("127.0.0.2", socket.gethostbyname(socket.gethostname())):
         if other != host:
-            with pytest.raises(OSError), socket.create_connection((other, port), timeout=2):
+            with pytest.raises(OSError), socket.create_connection((other, port)):
                 pass
 
 
@@ -130,30 +130,69 @@ def test_ground_is_the_terrains(viewer):
     assert json.loads(ask(viewer, "GET", "/ground?x=1e9&y=0")[2])["near"]["cols"] > 1  # off the map: its edge
 
 
-def _until(viewer, condition, seconds=20.0):
-    end = time.monotonic() + seconds
-    for picture in pictures(viewer):
-        if condition(picture):
-            return picture
-        assert time.monotonic() < end, picture
-    raise AssertionError("the pictures ended")
+def _drive(viewer, clock, seconds):
+    """Lets time go by, tick by tick; returns the pictures."""
+    shown = []
+    for _ in range(round(seconds / TICK)):
+        clock.now += TICK
+        viewer.pace.tick()
+        shown.append(json.loads(viewer.next_picture(0)[1]))
+    return shown
 
 
-def test_keys_move_the_rover_and_a_silent_page_lets_go(viewer):
+def test_keys_move_the_rover_and_a_silent_page_lets_go(viewer, clock):
     ask(viewer, "POST", "/reset", {})
-    still = next(iter(pictures(viewer)))
+    still = _drive(viewer, clock, 1.0)[-1]
     assert still["path_m"] < 0.05 and still["asked_m_s"] == 0.0
     assert ask(viewer, "POST", "/keys", {"held": ["forward", "left"]})[0] == 200
-    driven = _until(viewer, lambda p: p["path_m"] > 0.1)
-    assert driven["asked_m_s"] > 0 and driven["speed_m_s"] > 0.05 and 0.0 < driven["heading_deg"] < 90.0
-    assert driven["bodies"][1][0] > still["bodies"][1][0] + 0.05
-    assert len(driven["slip"]) == len(driven["sinkage_mm"]) == len(driven["winding_degC"]) == 4
-    assert max(driven["sinkage_mm"]) > 1.0 and driven["hottest_degC"] > 20.0
+    driven = _drive(viewer, clock, DEAD_MAN)
+    assert all(p["asked_m_s"] > 0 for p in driven[:-1])
+    assert ask(viewer, "POST", "/keys", {"held": ["forward", "left"]})[0] == 200
+    last = _drive(viewer, clock, 0.9 * DEAD_MAN)[-1]
+    assert last["asked_m_s"] > 0 and last["speed_m_s"] > 0.05 and 0.0 < last["heading_deg"] < 90.0
+    assert last["path_m"] > 0.1 and last["bodies"][1][0] > still["bodies"][1][0] + 0.05
+    assert len(last["slip"]) == len(last["sinkage_mm"]) == len(last["winding_degC"]) == 4
+    assert max(last["sinkage_mm"]) > 1.0 and last["hottest_degC"] > 20.0
     # nothing more is said: after DEAD_MAN the keys are let go and the rover stops
-    released = _until(viewer, lambda p: p["asked_m_s"] == 0.0, seconds=DEAD_MAN + 5)
-    _until(viewer, lambda p: p["time_s"] > released["time_s"] + 1.0 and p["speed_m_s"] < 0.05)
+    silent = _drive(viewer, clock, 3.0)
+    released = next(p for p in silent if p["asked_m_s"] == 0.0)
+    assert released["time_s"] == pytest.approx(last["time_s"] + 0.1 * DEAD_MAN, abs=2 * TICK)
+    assert all(p["asked_m_s"] == 0.0 for p in silent if p["time_s"] > released["time_s"])
+    assert silent[-1]["speed_m_s"] < 0.05
     ask(viewer, "POST", "/reset", {})
-    assert _until(viewer, lambda p: p["time_s"] < 1.0)["path_m"] < 0.05
+    assert _drive(viewer, clock, TICK)[-1]["path_m"] < 0.05
+
+
+def test_the_page_gets_every_new_picture(viewer, clock):
+    _drive(viewer, clock, TICK)
+    stream = pictures(viewer)
+    for _ in range(5):
+        time_s = next(stream)["time_s"]
+        assert time_s == pytest.approx(viewer.drive.time, abs=1e-4)
+        _drive(viewer, clock, TICK)
+    stream.close()
+
+
+def test_many_who_connect_and_say_nothing_do_not_shut_the_page_out(viewer, clock):
+    """Neither do they get threads without bound; a page that listens meanwhile is not cut off."""
+    _drive(viewer, clock, TICK)
+    stream = pictures(viewer)
+    next(stream)
+    before = threading.active_count()
+    silent = [socket.create_connection(viewer.server_address) for _ in range(600)]
+    for i, connection in enumerate(silent):
+        if i % 2:
+            connection.send(b"GET / HTTP/1.1\r\nHost: ")
+    most = 0
+    for _ in range(5):
+        assert ask(viewer, "GET", "/style.css")[0] == 200
+        most = max(most, threading.active_count())
+        _drive(viewer, clock, TICK)
+        assert next(stream)["time_s"] == pytest.approx(viewer.drive.time, abs=1e-4)
+    assert most <= before + 64
+    for connection in silent:
+        connection.close()
+    stream.close()
 
 
 def test_a_taken_port_is_one_sentence(viewer):
@@ -166,15 +205,11 @@ def test_a_taken_port_is_one_sentence(viewer):
 def test_pictures_end_with_the_drive(viewer):
     served = Viewer(viewer.drive, 0)
     served._show()
-    reader: list[dict] = []
-    thread = threading.Thread(target=lambda: reader.extend(pictures(served)))
-    runner = threading.Thread(target=served.serve_forever)
+    runner = threading.Thread(target=served.serve_forever, kwargs={"poll_interval": 0.1})
     runner.start()
-    thread.start()
-    time.sleep(0.3)
+    stream = pictures(served)
+    assert next(stream)
     served.shutdown()
     served.close()
-    for t in (thread, runner):
-        t.join(timeout=5)
-        assert not t.is_alive()
-    assert reader
+    assert not list(stream)
+    runner.join()

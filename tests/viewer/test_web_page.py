@@ -21,8 +21,8 @@ def _number(browser, element):
     return float(browser.value(f"document.getElementById('{element}').textContent").split()[0].replace("−", "-"))
 
 
-def test_keys_drive_what_the_page_shows(viewer, browser, tmp_path):
-    browser.open(viewer.address)
+def test_keys_drive_what_the_page_shows(live_viewer, browser, tmp_path):
+    browser.open(live_viewer.address)
     browser.wait("Number(document.body?.dataset.pictures) > 3")
     assert browser.value("document.getElementById('title').textContent") == "luvmi_x on lunar_plain"
     assert browser.value("document.querySelectorAll('#wheels tbody tr').length") == 4
@@ -49,13 +49,13 @@ def test_keys_drive_what_the_page_shows(viewer, browser, tmp_path):
     assert not browser.problems
 
 
-def test_a_page_from_elsewhere_can_neither_read_nor_drive(viewer, browser):
+def test_a_page_from_elsewhere_can_neither_read_nor_drive(live_viewer, browser):
     """The browser's own rules and the server's together, from a page without an origin of ours."""
-    viewer.drive.pilot.hold([])
+    live_viewer.drive.pilot.hold([])
     browser.open("data:text/html,<p>elsewhere")
     browser.wait("document.body?.textContent === 'elsewhere'")
     forward = "{method: 'POST', mode: 'no-cors', body: '{\"held\": [\"forward\"]}'}"
     for path, options in (("scene", "{}"), ("scene", "{mode: 'no-cors'}"), ("keys", forward)):
-        ask = f"fetch('{viewer.address}{path}', {options}).then(r => r.text(), () => '')"
+        ask = f"fetch('{live_viewer.address}{path}', {options}).then(r => r.text(), () => '')"
         assert browser.value(ask) == ""
-    assert viewer.drive.pilot.throttle == 0.0
+    assert live_viewer.drive.pilot.throttle == 0.0

@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -87,13 +86,10 @@ class Browser:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
-    def wait(self, expression: str, seconds: float = 60.0) -> Any:
-        """Waits until an expression is true."""
-        end = time.monotonic() + seconds
-        while not (value := self.value(expression)):
-            assert time.monotonic() < end, f"{expression} did not come true; {self.problems}"
-            time.sleep(0.2)
-        return value
+    def wait(self, expression: str) -> Any:
+        """Waits until an expression is true; the page looks each time that it is drawn."""
+        look = f"const look = () => {{ const v = {expression}; v ? done(v) : requestAnimationFrame(look); }}; look();"
+        return self.value(f"new Promise(done => {{ {look} }})")
 
     def key(self, kind: str, code: str, key: str) -> None:
         """`kind` is keyDown or keyUp."""
@@ -105,9 +101,5 @@ class Browser:
 
     def close(self) -> None:
         os.close(self._write)  # Chromium ends when its pipe does
-        try:
-            self._process.wait(timeout=10)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._process.wait()
         os.close(self._read)

@@ -10,9 +10,19 @@ from typing import Any
 from lunar_mjx.viewer.server import Viewer
 
 
+class Clock:
+    """A clock that stands still until it is moved."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 def ask(viewer: Viewer, method: str, path: str, body: Any = None, **headers: str) -> tuple[int, dict[str, str], bytes]:
     """Status, headers and body of an answer; underscores in the names of `headers` are hyphens."""
-    connection = http.client.HTTPConnection("127.0.0.1", viewer.server_address[1], timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", viewer.server_address[1])
     sent = {k.replace("_", "-"): v for k, v in headers.items()}
     text = None
     if body is not None:
@@ -28,7 +38,7 @@ def ask(viewer: Viewer, method: str, path: str, body: Any = None, **headers: str
 
 def pictures(viewer: Viewer) -> Iterator[dict[str, Any]]:
     """The drive's pictures as the page gets them."""
-    connection = http.client.HTTPConnection("127.0.0.1", viewer.server_address[1], timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", viewer.server_address[1])
     connection.request("GET", "/pictures")
     answer = connection.getresponse()
     try:

@@ -14,12 +14,19 @@ from lunar_mjx.criticism import average, fit, load_figures, read_table, replicat
 from lunar_mjx.errors import UserError
 from lunar_mjx.wheel_bed.comparison import compare
 from lunar_mjx.wheel_bed.soil_fit import Free
+from tests.measured_data import measured_file
 
 ROOT = Path(__file__).resolve().parents[2]
-RUNS = ROOT.parent / "shared" / "data" / "cmu_single_wheel" / "smooth_wheel_trials.csv"
 PUBLISHED = {"drawbar_pull": 0.80, "side_force": 0.76, "sinkage": 0.65e-3}
 
-needs_runs = pytest.mark.skipif(not RUNS.is_file(), reason="the test bed's single runs are not here")
+
+@pytest.fixture
+def single_runs() -> Path:
+    """The 189 runs that the shipped figures are means of."""
+    return measured_file(
+        "cmu_single_wheel/smooth_wheel_trials.csv",
+        "the processed runs of C. Pavlov's 3d-terramechanics, Carnegie Mellon University, MIT",
+    )
 
 
 def test_the_figures_cover_the_campaign(figures):
@@ -33,9 +40,8 @@ def test_the_figures_cover_the_campaign(figures):
     assert figures.source["licence"] == "MIT"
 
 
-@needs_runs
-def test_the_figures_are_those_of_the_runs(figures):
-    runs = read_table(RUNS, 0.0625, 0.05, "travel_speed")
+def test_the_figures_are_those_of_the_runs(figures, single_runs):
+    runs = read_table(single_runs, 0.0625, 0.05, "travel_speed")
     mean = average(runs)
     for quantity, sigma in mean.sigma.items():
         assert sigma == pytest.approx(figures.sigma[quantity], rel=1e-6)
@@ -44,13 +50,12 @@ def test_the_figures_are_those_of_the_runs(figures):
         np.testing.assert_allclose(mean.test[column], values, rtol=1e-6, atol=1e-9)
 
 
-@needs_runs
-def test_the_script_writes_what_is_committed():
+def test_the_script_writes_what_is_committed(single_runs):
     spec = importlib.util.spec_from_file_location("cmu_figures", ROOT / "benchmarks" / "cmu_figures.py")
     assert spec is not None and spec.loader is not None
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    frame, about = script.figures(RUNS)
+    frame, about = script.figures(single_runs)
     committed = pd.read_csv(script.FOLDER / "cmu_smooth_wheel.csv")
     pd.testing.assert_frame_equal(frame.reset_index(drop=True), committed, check_dtype=False, rtol=1e-5)
     assert about["sigma"]["drawbar_pull_N"] == pytest.approx(0.7991853)
