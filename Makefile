@@ -17,7 +17,7 @@ export PIP_NO_COMPILE ?= 1
 FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$(XLA_FLAGS) --xla_cpu_use_fusion_emitters=false"
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test fast-tests test-all lint docs clean
+.PHONY: demo test fast-tests test-all lint docs foreign-tune foreign-report clean
 
 demo: $(VENV)/run.stamp
 	$(BIN)/lunar-mjx demo -o runs/demo
@@ -39,6 +39,22 @@ lint: $(VENV)/dev.stamp
 docs: $(VENV)/run.stamp
 	$(PIP) install --quiet --progress-bar on -r requirements-docs.txt
 	$(BIN)/mkdocs build --strict --site-dir build/docs
+
+# Foreign worlds: what criticism says of wheels that share no law with the tool. Both go on where they were stopped. The
+# report's tables are drawn from the commit: each commit has a folder and tables of its own.
+FOREIGN_TABLES ?= 60
+FOREIGN_REPORT_TABLES ?= 600
+foreign-tune: FOREIGN := build/foreign/tune
+foreign-tune: $(VENV)/run.stamp
+	$(BIN)/python -m benchmarks.foreign make --set tune --tables $(FOREIGN_TABLES) -o $(FOREIGN)
+	$(BIN)/python -m benchmarks.foreign run $(FOREIGN)
+	$(BIN)/python -m benchmarks.foreign score $(FOREIGN)
+
+foreign-report: FOREIGN = build/foreign/report-$(shell git rev-parse --short HEAD)
+foreign-report: $(VENV)/run.stamp
+	$(BIN)/python -m benchmarks.foreign make --set report --tables $(FOREIGN_REPORT_TABLES) -o $(FOREIGN)
+	$(BIN)/python -m benchmarks.foreign run $(FOREIGN)
+	$(BIN)/python -m benchmarks.foreign score $(FOREIGN)
 
 clean:
 	rm -rf $(VENV) build runs

@@ -1,0 +1,127 @@
+"""Foreign worlds: make logs with sealed truths, ask the tool about them, and score what it says.
+
+    python -m benchmarks.foreign make --set tune --tables 60 -o build/foreign/tune
+    python -m benchmarks.foreign run   build/foreign/tune
+    python -m benchmarks.foreign score build/foreign/tune
+
+`run` goes on where it was stopped. The report set's seed is drawn from the commit under test, so that nobody can have
+seen its tables before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+from . import bed, cases, told
+from .work import ask, commit
+
+TUNE_SEED = 20261123
+TWIN_EVERY = 5
+"""One table of so many is also written with stated noise 30 % too large and 30 % too small."""
+TWINS = {"loud": 1.3, "quiet": 1.0 / 1.3}
+
+
+def make(args: argparse.Namespace) -> None:
+    """Writes logs and sealed truths; goes on where it was stopped."""
+    folder: Path = args.out
+    folder.mkdir(parents=True, exist_ok=True)
+    about = _campaign(folder, args.set, args.seed)
+    seed = int(about["seed"])
+    jobs = cases.plan(args.set, args.tables)
+    for number, (group, hidden) in enumerate(jobs):
+        name = f"{args.set}-{number:03d}"
+        sealed = folder / "truth" / f"{name}.json"
+        if sealed.is_file():
+            continue
+        case = cases.draw(args.set, seed, number, group, hidden)
+        truth = cases.summary(case) | {"separable": told.separable(case)}
+        bed.write(case, folder / "logs" / name)
+        twins = []
+        if number % TWIN_EVERY == 0 and case.replicates == 1:
+            for word, factor in TWINS.items():
+                bed.write(case, folder / "logs" / f"{name}-{word}", factor)
+                twins.append(f"{name}-{word}")
+        truth["twins"] = twins
+        sealed.parent.mkdir(exist_ok=True)
+        sealed.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+        said = ", ".join(f"{k} {v['sigma']:.0f} ({v['sigma_blind']:.0f}) sigma" for k, v in truth["separable"].items())
+        print(f"{name}  {group:<8} {case.world.law:<9} {said or 'nothing hidden'}", flush=True)
+
+
+def _campaign(folder: Path, which: str, seed: int | None) -> dict[str, object]:
+    path = folder / "campaign.json"
+    if path.is_file():
+        about = json.loads(path.read_text(encoding="utf-8"))
+        if about["set"] != which or (seed is not None and int(about["seed"]) != seed):
+            raise SystemExit(f"{path}: holds set {about['set']} of seed {about['seed']}; name another folder.")
+        return about
+    head, dirty = commit()
+    drawn = TUNE_SEED if which == "tune" else int.from_bytes(hashlib.sha256(head.encode()).digest()[:6], "big")
+    about = {
+        "set": which,
+        "seed": str(drawn if seed is None else seed),
+        "seed_given": seed is not None,
+        "commit": head,
+        "uncommitted_changes": dirty,
+        "made": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+    path.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    return about
+
+
+def run(args: argparse.Namespace) -> None:
+    """Asks the tool."""
+    names = sorted(p.name for p in (args.folder / "logs").iterdir() if p.is_dir())
+    names = [n for n in names if args.only in n][: args.first]
+    first, _, of = args.share.partition("/")
+    mine = names[int(first) :: int(of)]
+    number = ask(args.folder, mine, args.limit, args.minutes)
+    print(f"asked about {number} of {len(mine)}")
+
+
+def score(args: argparse.Namespace) -> None:
+    """Scores what was answered."""
+    from .score import report, text
+
+    found = report(args.folder)
+    out = args.out or args.folder / "score.json"
+    out.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    print(text(found))
+    print(f"written to {out}")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    whole = argparse.ArgumentParser(
+        prog="benchmarks.foreign", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    verbs = whole.add_subparsers(dest="verb", required=True)
+    made = verbs.add_parser("make", help="write logs and sealed truths")
+    made.add_argument("--set", choices=("tune", "report"), required=True)
+    made.add_argument("--tables", type=int, default=60)
+    made.add_argument("--seed", type=int, help="else fixed for tune, and drawn from the commit for report")
+    made.add_argument("-o", "--out", type=Path, required=True)
+    made.set_defaults(do=make)
+    asked = verbs.add_parser("run", help="ask the tool by its own verbs")
+    asked.add_argument("folder", type=Path)
+    asked.add_argument("--limit", type=float, default=900.0, help="seconds for one case")
+    asked.add_argument("--minutes", type=float, default=1e6, help="after which no case is begun")
+    asked.add_argument("--only", default="", help="cases whose name has this in it")
+    asked.add_argument("--first", type=int, help="so many cases only")
+    asked.add_argument("--share", default="0/1", help="K/N: every Nth case from the Kth, for several processes")
+    asked.set_defaults(do=run)
+    scored = verbs.add_parser("score", help="score the answers")
+    scored.add_argument("folder", type=Path)
+    scored.add_argument("-o", "--out", type=Path)
+    scored.set_defaults(do=score)
+    return whole
+
+
+if __name__ == "__main__":
+    arguments = parser().parse_args(sys.argv[1:])
+    arguments.do(arguments)
