@@ -12,7 +12,7 @@ from .laws import LAWS, Rim
 from .misfit import Field, coordinates
 
 NODES = 10
-"""Gauss points on either side of the most pressed place; 40 change no force of a test by 1e-3 of the load."""
+"""Gauss points on either side of the most pressed place; 40 change no force by 4e-4 of the load, no sinkage by 0.3 %."""
 DEEPEST = 0.9
 """Largest sinkage looked at, over the radius."""
 
