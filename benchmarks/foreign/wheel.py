@@ -12,7 +12,7 @@ from .laws import LAWS, Rim
 from .misfit import Field, coordinates
 
 NODES = 10
-"""Gauss points on either side of the most pressed place; 40 change no force by 4e-4 of the load, no sinkage by 0.3 %."""
+"""Gauss points on either side of theta_m; 40 change no force by 4e-4 of the load and no sinkage by 0.3 %."""
 DEEPEST = 0.9
 """Largest sinkage looked at, over the radius."""
 
