@@ -17,7 +17,6 @@ from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
 from lunar_mjx.model.ambient import SYNODIC_DAY
 from lunar_mjx.model.model import (
     GAINS,
-    LUNAR_GRAVITY,
     ZERO_CELSIUS,
     Model,
     check_effects,
@@ -82,7 +81,7 @@ def load_model(path: str | Path) -> Model:
     model = dataclasses.replace(
         model,
         terrain_spec=settled("terrain", terrain, _MARKERS["terrain"]),
-        gravity=_number(path, "gravity_m_s2", data.get("gravity_m_s2", LUNAR_GRAVITY)),
+        gravity=_number(path, "gravity_m_s2", data.get("gravity_m_s2", model.gravity)),
         timestep=_number(path, "timestep_s", data.get("timestep_s", model.timestep)),
         thermal_integrator=_text(path, "thermal_integrator", data.get("thermal_integrator", model.thermal_integrator)),
         ambient=ambient,

@@ -7,6 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lunar_mjx.effects import catalogue, presets
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.joint.motor import MODES, WINDINGS
@@ -398,6 +400,7 @@ def make_model(
         preset=preset,
         thermal_integrator="euler" if preset == "paper" else "heun",
         modes=modes,
+        gravity=LUNAR_GRAVITY if loaded.gravity is None else loaded.gravity,
         effect_files={e.name: e.name for e in effects},
     )
     model = preset_values(rover_motors(model))
@@ -429,23 +432,40 @@ def _gains_of_gear(model: Model, rover: Rover) -> dict[str, tuple[float, float]]
     for group in rover.groups:
         ratio = ratios[rover.joints.index(group.joints[0])]
         inertia = float(compiled.dof_M0[compiled.joint(group.joints[0]).dofadr[0]])
-        reflected = group.rotor_inertia * (ratio**2 - group.gear_ratio**2)
+        rotor = group.rotor_inertia / rover.wheels_per_motor(group.joints[0])
+        reflected = rotor * (ratio**2 - group.gear_ratio**2)
         scale = (inertia + reflected) / inertia
         gains[group.name] = (group.position_gain * scale, group.velocity_gain * scale)
     return gains
 
 
 def rover_motors(model: Model) -> Model:
-    """Motor parameters that the rover's folder states for each joint group."""
+    """Motor parameters that the rover's folder states for each joint group.
+
+    A motor that drives n wheels is the same as n motors side by side, one at each wheel, each with 1/n of the current
+    and of the rotor's inertia and n times the resistance: the currents of its wheels add up to the motor's.
+    """
     groups = model.rover.groups
-    windings = {g.name: WINDINGS[g.winding] for g in groups}
+    windings = {
+        g.name: {
+            k: WINDINGS[g.winding][k] if (own := getattr(g, k)) is None else own
+            for k in ("resistance", "torque_constant", "current_limit")
+        }
+        for g in groups
+    }
+    driven = np.array([model.rover.wheels_per_motor(j) for j in model.rover.joints], float)
+
+    def by_joint(values: Mapping[str, float]) -> np.ndarray:
+        return np.array([values[g.name] for g in groups for _ in g.joints])
+
     model = model.set(
         "motor",
         str(model.rover.folder),
         gear_ratio={g.name: g.gear_ratio for g in groups},
         gear_efficiency={g.name: g.gear_efficiency for g in groups},
-        rotor_inertia={g.name: g.rotor_inertia for g in groups},
-        resistance={n: w["resistance"] for n, w in windings.items()},
+        rotor_inertia=by_joint({g.name: g.rotor_inertia for g in groups}) / driven,
+        resistance=by_joint({n: w["resistance"] for n, w in windings.items()}) * driven,
         torque_constant={n: w["torque_constant"] for n, w in windings.items()},
     )
-    return model.set("joint_control", current_limit={n: w["current_limit"] for n, w in windings.items()})
+    limits = by_joint({n: w["current_limit"] for n, w in windings.items()}) / driven
+    return model.set("joint_control", current_limit=limits)

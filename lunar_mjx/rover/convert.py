@@ -19,9 +19,9 @@ from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.rover.description import GROUPS, Description, read_description
 from lunar_mjx.rover.load import FORMAT, MARKER, load_rover
 from lunar_mjx.rover.loops import PlacedLoop, place_loops
-from lunar_mjx.rover.mjcf import build_spec, to_xml, write_scene
+from lunar_mjx.rover.mjcf import build_spec, ties, to_xml, write_scene
 from lunar_mjx.rover.roles import Roles, assign_roles
-from lunar_mjx.rover.rover import Rover
+from lunar_mjx.rover.rover import DriveGroup, Rover
 from lunar_mjx.rover.statics import gains, level_springs
 from lunar_mjx.rover.tree import Body, bodies_of
 from lunar_mjx.rover.urdf import Geometry, Urdf, read_urdf
@@ -53,17 +53,18 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
     bodies = bodies_of(source)
     roles = assign_roles(source, bodies, told)
     loops = place_loops(source, roles.bodies, told)
+    driven = place_drive_groups(source, roles, told)
     height, height_notes = _standing_height(roles)
     try:
-        spec = build_spec(name, roles, loops, told, height)
+        spec = build_spec(name, roles, loops, told, height, driven)
     except ValueError as error:
         raise _uncompilable(source, error) from None
     model = _compile(source, spec)
     level_springs(spec, model, roles, told)
     model = _compile(source, spec)
     xml = to_xml(spec)
-    _assert_nothing_lost(source, roles, loops, mujoco.MjModel.from_xml_string(xml))
-    record = _record(source, name, roles, loops, told, model, height, height_notes)
+    _assert_nothing_lost(source, roles, loops, driven, mujoco.MjModel.from_xml_string(xml))
+    record = _record(source, name, roles, loops, told, model, height, height_notes, driven)
     out = Path(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -119,7 +120,9 @@ def _standing_height(roles: Roles) -> tuple[float, list[str]]:
     return round(float(-bottoms.min()), 9), notes
 
 
-def _assert_nothing_lost(urdf: Urdf, roles: Roles, loops: tuple[PlacedLoop, ...], model: mujoco.MjModel) -> None:
+def _assert_nothing_lost(
+    urdf: Urdf, roles: Roles, loops: tuple[PlacedLoop, ...], driven: tuple[DriveGroup, ...], model: mujoco.MjModel
+) -> None:
     """Compares the MJCF, read back from its text, with the URDF.
 
     Raises:
@@ -143,7 +146,7 @@ def _assert_nothing_lost(urdf: Urdf, roles: Roles, loops: tuple[PlacedLoop, ...]
     if model.body_mass[1:].min() <= 0 or model.body_inertia[1:].min() <= 0:
         raise bad_input(urdf.path, "inertia", model.body_inertia[1:].min(), "is not positive", "report this")
     motors = [model.actuator(i).name for i in range(model.nu)]
-    if motors != [j for g in GROUPS for j in roles.group(g)] or model.neq != len(loops):
+    if motors != [j for g in GROUPS for j in roles.group(g)] or model.neq != len(loops) + ties(driven):
         raise bad_input(urdf.path, "motors", ", ".join(motors), "are not one for each joint in a role", "report this")
 
 
@@ -156,6 +159,7 @@ def _record(
     model: mujoco.MjModel,
     height: float,
     notes: list[str],
+    driven: tuple[DriveGroup, ...],
 ) -> dict[str, Any]:
     """The contents of `rover.toml`."""
     base = roles.bodies[0]
@@ -180,6 +184,14 @@ def _record(
             "rotor_inertia": told.rotor_inertia_kg_m2,
             "winding": told.winding,
         }
+        motor = ("torque_constant", told.torque_constant_Nm_A), ("resistance", told.resistance_ohm)
+        stated = {k: v for k, v in (*motor, ("current_limit", told.current_limit_A)) if v is not None}
+        groups[group].update(stated)
+        if group not in description.stated:
+            notes.append(
+                f"{group}: assumed the motor maxon ECX TORQUE 22 XL, {told.winding} V, behind a gear of "
+                f"{told.gear_ratio:g}; state the real one in [joints.{group}] of the description"
+            )
     return {
         "format": FORMAT,
         "name": name,
@@ -187,11 +199,13 @@ def _record(
         "mjcf": f"{name}.xml",
         "mass": float(f"{model.body_mass.sum():.12g}"),
         "standing_height": height,
+        "gravity": description.gravity,
         "chassis": base.name,
         "chassis_points": [[round(float(v), 6) + 0.0 for v in p] for p in points],
         "notes": [*urdf.notes, *roles.notes, *_passive_notes(roles, loops), *notes, *point_notes],
         "groups": groups,
         "wheels": wheels,
+        **({"drive_groups": [{"name": g.name, "joints": list(g.joints)} for g in driven]} if driven else {}),
         "loops": [
             {
                 "body1": x.body1,
@@ -202,6 +216,26 @@ def _record(
             for x in loops
         ],
     }
+
+
+def place_drive_groups(urdf: Urdf, roles: Roles, description: Description) -> tuple[DriveGroup, ...]:
+    """The drive joints of every group of wheels that share a motor.
+
+    Raises:
+      UserError: a corner that no wheel has, or that is in two groups.
+    """
+    joints = {w.corner: w.drive for w in roles.wheels}
+    taken: list[str] = []
+    found = []
+    for i, group in enumerate(description.drive_groups):
+        for corner in group.wheels:
+            if corner not in joints or corner in taken:
+                reason = "is in two groups" if corner in taken else "is no wheel of the rover"
+                raise bad_input(description.path or urdf.path, f"drive_groups[{i}].wheels", corner, reason,
+                                f"use {', '.join(joints)}, each once")  # fmt: skip
+            taken.append(corner)
+        found.append(DriveGroup(group.name, tuple(joints[c] for c in group.wheels)))
+    return tuple(found)
 
 
 def _passive_notes(roles: Roles, loops: tuple[PlacedLoop, ...]) -> list[str]:

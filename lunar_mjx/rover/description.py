@@ -17,12 +17,16 @@ from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
 
 GROUPS = ("drive", "steer", "suspension")
 MODES = ("position", "velocity", "torque", "current")
+MOTOR_KEYS = ("torque_constant_Nm_A", "resistance_ohm", "current_limit_A")
 WINDINGS = (12, 18, 24, 36, 48)  # nominal voltages of the maxon ECX TORQUE 22 XL
 
 
 @dataclass(frozen=True)
 class GroupDescription:
     """One joint group as described; None means that the converter chooses (see `statics.default_gains`).
+
+    `torque_constant_Nm_A`, `resistance_ohm` and `current_limit_A` state a motor that is none of the windings; what they
+    leave out is that of `winding`.
 
     `stiffness` N m/rad, `damping` N m s/rad and `spring_reference` rad describe a passive spring and damper on the
     joint; the reference "level" is computed such that the rover stands level at zero angles.
@@ -35,6 +39,9 @@ class GroupDescription:
     gear_efficiency: float = 0.75
     rotor_inertia_kg_m2: float = 9e-7  # estimate for a brushless motor of 22 mm
     winding: int = 48
+    torque_constant_Nm_A: float | None = None
+    resistance_ohm: float | None = None
+    current_limit_A: float | None = None
     stiffness: float = 0.0
     damping: float = 0.0
     spring_reference: float | str = 0.0
@@ -50,6 +57,14 @@ class WheelDescription:
     width: float | None = None
     steer: str | None = None
     suspension: str | None = None
+
+
+@dataclass(frozen=True)
+class DriveGroupDescription:
+    """Wheels, by corner, that one motor drives through chains or belts, so that they turn at one speed."""
+
+    name: str
+    wheels: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -72,7 +87,7 @@ def _default_groups() -> dict[str, GroupDescription]:
 
 @dataclass(frozen=True)
 class Description:
-    """Everything the converter is told beyond the URDF."""
+    """Everything the converter is told beyond the URDF; `stated` are the joint groups that it describes."""
 
     path: Path | None = None
     name: str | None = None
@@ -83,10 +98,23 @@ class Description:
     passive_damping: float = 0.0
     wheels: tuple[WheelDescription, ...] = ()
     loops: tuple[LoopDescription, ...] = ()
+    drive_groups: tuple[DriveGroupDescription, ...] = ()
     groups: dict[str, GroupDescription] = field(default_factory=_default_groups)
+    stated: frozenset[str] = frozenset()
 
 
-_TOP = {"name", "gravity", "timestep", "solref", "solimp", "passive_damping", "wheels", "loops", "joints"}
+_TOP = {
+    "name",
+    "gravity",
+    "timestep",
+    "solref",
+    "solimp",
+    "passive_damping",
+    "wheels",
+    "loops",
+    "drive_groups",
+    "joints",
+}
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -118,12 +146,14 @@ def read_description(path: str | Path) -> Description:
             given[key] = numbers(path, key, data[key], count)
     given["wheels"] = tuple(_wheel(path, f"wheels[{i}]", w) for i, w in enumerate(tables(path, "wheels", data)))
     given["loops"] = tuple(_loop(path, f"loops[{i}]", x) for i, x in enumerate(tables(path, "loops", data)))
+    driven = tables(path, "drive_groups", data)
+    given["drive_groups"] = tuple(_drive_group(path, f"drive_groups[{i}]", g) for i, g in enumerate(driven))
     joints = data.get("joints", {})
     check_keys(path, "joints", joints, set(GROUPS))
     groups = _default_groups()
     for name, table in joints.items():
         groups[name] = _group(path, f"joints.{name}", table, groups[name])
-    return Description(**given, groups=groups)
+    return Description(**given, groups=groups, stated=frozenset(joints))
 
 
 def _wheel(path: Path, where: str, table: Mapping[str, Any]) -> WheelDescription:
@@ -135,6 +165,15 @@ def _wheel(path: Path, where: str, table: Mapping[str, Any]) -> WheelDescription
         k: text(path, f"{where}.{k}", table[k]) for k in ("link", "corner", "steer", "suspension") if k in table
     }
     return WheelDescription(**names, **lengths)
+
+
+def _drive_group(path: Path, where: str, table: Mapping[str, Any]) -> DriveGroupDescription:
+    check_keys(path, where, table, {"name", "wheels"}, {"name", "wheels"})
+    wheels = table["wheels"]
+    if not isinstance(wheels, list) or len(wheels) < 2:
+        raise bad_input(path, f"{where}.wheels", wheels, "are not two or more corners", 'write ["lf", "lr"]')
+    corners = tuple(text(path, f"{where}.wheels", corner) for corner in wheels)
+    return DriveGroupDescription(text(path, f"{where}.name", table["name"]), corners)
 
 
 def _loop(path: Path, where: str, table: Mapping[str, Any]) -> LoopDescription:
@@ -161,7 +200,8 @@ def _group(path: Path, where: str, table: Mapping[str, Any], default: GroupDescr
         elif key == "spring_reference":
             given[key] = "level" if value == "level" else number(path, field_name, value)
         else:
-            given[key] = at_least(path, field_name, value, 0.0, strict=key in ("gear_ratio", "gear_efficiency"))
+            strict = key in ("gear_ratio", "gear_efficiency", *MOTOR_KEYS)
+            given[key] = at_least(path, field_name, value, 0.0, strict=strict)
     if given.get("gear_efficiency", 1.0) > 1:
         raise bad_input(path, f"{where}.gear_efficiency", given["gear_efficiency"], "is above 1", "give a fraction")
     group = GroupDescription(**{**default.__dict__, **given})

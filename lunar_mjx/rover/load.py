@@ -16,7 +16,7 @@ from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.resources import find, shipped
 from lunar_mjx.rover import description as toml
 from lunar_mjx.rover.description import GROUPS, MODES, WINDINGS
-from lunar_mjx.rover.rover import JointGroup, Loop, Rover, Wheel
+from lunar_mjx.rover.rover import DriveGroup, JointGroup, Loop, Rover, Wheel
 
 FORMAT = "lunar-mjx-rover/1"
 MARKER = "rover.toml"
@@ -35,7 +35,10 @@ _TOP = {
     "wheels",
     "groups",
     "loops",
+    "drive_groups",
+    "gravity",
 }
+_MOTOR_KEYS = ("torque_constant", "resistance", "current_limit")
 _GROUP_KEYS = set(JointGroup.__dataclass_fields__) - {"name"}
 
 
@@ -59,7 +62,7 @@ def load_rover(name_or_path: str | Path) -> Rover:
     folder = find("models", name_or_path, MARKER)
     path = folder / MARKER
     data = toml.read_toml(path, "the rover file")
-    toml.check_keys(path, "", data, _TOP, _TOP - {"source", "notes", "loops"})
+    toml.check_keys(path, "", data, _TOP, _TOP - {"source", "notes", "loops", "drive_groups", "gravity"})
     toml.one_of(path, "format", data["format"], (FORMAT,))
     file = toml.text(path, "mjcf", data["mjcf"])
     if Path(file).name != file:
@@ -93,6 +96,11 @@ def load_rover(name_or_path: str | Path) -> Rover:
         mass=mass,
         standing_height=toml.number(path, "standing_height", data["standing_height"]),
         notes=tuple(toml.text(path, "notes", n) for n in data.get("notes", [])),
+        drive_groups=tuple(
+            _drive_group(path, f"drive_groups[{i}]", g, {w.drive for w in wheels})
+            for i, g in enumerate(toml.tables(path, "drive_groups", data))
+        ),
+        gravity=toml.at_least(path, "gravity", data["gravity"], 0.0, strict=False) if "gravity" in data else None,
     )
 
 
@@ -132,7 +140,8 @@ def _groups(path: Path, data: Any, model: mujoco.MjModel) -> tuple[JointGroup, .
     groups = []
     for name in (g for g in GROUPS if g in data):
         table, where = data[name], f"groups.{name}"
-        toml.check_keys(path, where, table, _GROUP_KEYS, _GROUP_KEYS)
+        toml.check_keys(path, where, table, _GROUP_KEYS, _GROUP_KEYS - set(_MOTOR_KEYS))
+        motor = {k: toml.at_least(path, f"{where}.{k}", table[k], 0.0, strict=True) for k in _MOTOR_KEYS if k in table}
         groups.append(
             JointGroup(
                 name=name,
@@ -148,6 +157,7 @@ def _groups(path: Path, data: Any, model: mujoco.MjModel) -> tuple[JointGroup, .
                 ),
                 rotor_inertia=toml.at_least(path, f"{where}.rotor_inertia", table["rotor_inertia"], 0.0, strict=False),
                 winding=toml.one_of(path, f"{where}.winding", table["winding"], WINDINGS),
+                **motor,
             )
         )
     listed = [joint for group in groups for joint in group.joints]
@@ -161,6 +171,12 @@ def _check_wheels_against_groups(path: Path, wheels: tuple[Wheel, ...], groups: 
     driven = next(g.joints for g in groups if g.name == "drive")
     if tuple(w.drive for w in wheels) != driven:
         raise bad_input(path, "groups.drive.joints", ", ".join(driven), "are not the wheels' joints", _CONVERT_AGAIN)
+
+
+def _drive_group(path: Path, where: str, table: Any, driven: set[str]) -> DriveGroup:
+    toml.check_keys(path, where, table, {"name", "joints"}, {"name", "joints"})
+    joints = tuple(_known(path, f"{where}.joints", j, driven, "drive joint") for j in _list(path, "joints", table))
+    return DriveGroup(toml.text(path, f"{where}.name", table["name"]), joints)
 
 
 def _loop(path: Path, where: str, table: Any, bodies: set[str]) -> Loop:

@@ -14,6 +14,7 @@ import numpy as np
 from lunar_mjx.rover.description import GROUPS, Description
 from lunar_mjx.rover.loops import PlacedLoop
 from lunar_mjx.rover.roles import Roles
+from lunar_mjx.rover.rover import DriveGroup
 from lunar_mjx.rover.tree import Body
 
 _TYPES = {
@@ -24,7 +25,12 @@ _TYPES = {
 
 
 def build_spec(
-    name: str, roles: Roles, loops: tuple[PlacedLoop, ...], description: Description, standing_height: float
+    name: str,
+    roles: Roles,
+    loops: tuple[PlacedLoop, ...],
+    description: Description,
+    standing_height: float,
+    driven: tuple[DriveGroup, ...] = (),
 ) -> mujoco.MjSpec:
     """Builds the model: free base, hinges, motors in the order drive, steer, suspension, and loop closures.
 
@@ -51,6 +57,12 @@ def build_spec(
             motor.set_to_motor()
     for i, loop in enumerate(loops):
         _add_connect(spec, f"loop_{i}", loop, description)
+    for group in driven:
+        for joint in group.joints[1:]:
+            _add_tie(spec, f"{group.name}_{joint}", joint, group.joints[0], description)
+        for joint in group.joints:
+            # One rotor turns with all wheels of the group.
+            spec.joint(joint).armature = spec.joint(joint).armature / len(group.joints)
     return spec
 
 
@@ -119,6 +131,21 @@ def _add_connect(spec: mujoco.MjSpec, name: str, loop: PlacedLoop, description: 
     data[:3] = loop.anchor1
     equality.data = data
     equality.solref, equality.solimp = description.solref, description.solimp
+
+
+def _add_tie(spec: mujoco.MjSpec, name: str, joint: str, leader: str, description: Description) -> None:
+    """One angle for two joints that a chain ties together."""
+    equality = spec.add_equality(name=name, type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT)
+    equality.name1, equality.name2 = joint, leader
+    data = np.zeros_like(equality.data)
+    data[1] = 1.0
+    equality.data = data
+    equality.solref, equality.solimp = description.solref, description.solimp
+
+
+def ties(driven: tuple[DriveGroup, ...]) -> int:
+    """Number of constraints that tie the wheels of groups together."""
+    return sum(len(group.joints) - 1 for group in driven)
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:

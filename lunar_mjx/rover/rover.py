@@ -46,6 +46,19 @@ class Loop:
 
 
 @dataclass(frozen=True)
+class DriveGroup:
+    """Wheels that one motor drives at one speed, such as those of a side.
+
+    Attributes:
+      name: such as left.
+      joints: drive joints of its wheels.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class JointGroup:
     """The actuated joints of one kind, their nominal control and their motors.
 
@@ -59,6 +72,7 @@ class JointGroup:
       gear_efficiency: fraction.
       rotor_inertia: kg m2 at the motor; the MJCF's armature is this times the squared gear ratio.
       winding: nominal voltage of the motor's winding, V.
+      torque_constant: N m/A, resistance: ohm, current_limit: A; of the winding where None.
     """
 
     name: str
@@ -70,6 +84,9 @@ class JointGroup:
     gear_efficiency: float
     rotor_inertia: float
     winding: int
+    torque_constant: float | None = None
+    resistance: float | None = None
+    current_limit: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +105,8 @@ class Rover:
       loops: pins that close kinematic loops.
       mass: kg.
       standing_height: m, height of the chassis frame above flat ground that the wheels just touch at zero angles.
+      drive_groups: wheels that share a motor; those that are in none have a motor each.
+      gravity: m/s2 that it was made for; None where its folder does not say.
       notes: what the conversion assumed, reversed or left out.
     """
 
@@ -103,6 +122,8 @@ class Rover:
     mass: float
     standing_height: float
     notes: tuple[str, ...] = ()
+    drive_groups: tuple[DriveGroup, ...] = ()
+    gravity: float | None = None
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -112,6 +133,10 @@ class Rover:
     def group(self, name: str) -> JointGroup | None:
         """The group called `name`, or None if the rover has no such joints."""
         return next((g for g in self.groups if g.name == name), None)
+
+    def wheels_per_motor(self, joint: str) -> int:
+        """How many wheels the motor of a joint drives."""
+        return next((len(g.joints) for g in self.drive_groups if joint in g.joints), 1)
 
     def spec(self) -> mujoco.MjSpec:
         """A fresh `MjSpec` of the rover, free to be edited."""

@@ -12,6 +12,7 @@ axes and offsets are constant. The derivation is in docs/structured_engine.md.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -37,6 +38,7 @@ from lunar_mjx.dynamics.structured.legs import (
     LegState,
     cast_group,
     forward_kinematics,
+    impose,
     joint_speeds,
     joint_turns,
     leg_block,
@@ -116,6 +118,16 @@ class StructuredEngine:
         whole = not isinstance(qpos, Pieces)
         if whole:
             qpos, qvel = self.split(qpos, qvel)
+        numbers, legs, base = self._kinematic_state(qpos, qvel)
+
+        def finish(forces: Forces) -> tuple[Any, Any]:
+            new = self._finish(params, numbers, legs, base, forces)
+            return self.join(*new) if whole else new
+
+        return self._kinematics(numbers, legs, base), finish
+
+    def _kinematic_state(self, qpos: Pieces, qvel: Pieces) -> tuple[list[LegGroup], list[LegState], Base]:
+        """The legs' numbers in the state's type, what their forward pass leaves, and the chassis."""
         numbers = [cast_group(group, qpos.dtype) for group in self.structure.groups]
         position, velocity = Vector(*qpos.base[:3]), Vector(*qvel.base[:3])
         quaternion = normalized(list(qpos.base[3:]))
@@ -125,12 +137,7 @@ class StructuredEngine:
             forward_kinematics(n, base.motion, angle, speed)
             for n, angle, speed in zip(numbers, qpos.joints, qvel.joints, strict=True)
         ]
-
-        def finish(forces: Forces) -> tuple[Any, Any]:
-            new = self._finish(params, numbers, legs, base, forces)
-            return self.join(*new) if whole else new
-
-        return self._kinematics(numbers, legs, base), finish
+        return numbers, legs, base
 
     def split(self, qpos: Float[Array, "nq"], qvel: Float[Array, "nv"]) -> tuple[Pieces, Pieces]:
         """The coordinates as the pieces that the engine computes with; dependent joints are left out."""
@@ -200,22 +207,80 @@ class StructuredEngine:
             wheel_angular_velocity=of_wheels(spins),
         )
 
+    def forward_imposed(self, params: Any, qpos: Pieces, qvel: Pieces) -> tuple[Kinematics, Any]:
+        """Kinematics, and a function from forces and imposed joint accelerations to the next state and the torques.
+
+        The joints' motion is given, the base is free: torques come out instead of going in.
+
+        Args:
+          params, qpos, qvel: as for `forward`, the coordinates as `split` gives them.
+
+        Returns:
+          The kinematics, and `finish(forces, joint_acceleration, up)` with accelerations of the actuated joints,
+          (joint,), rad/s2, and the specific force of gravity in the chassis frame, m/s2 (at rest on level ground
+          (0, 0, g)); it returns positions, velocities, the actuators' torques (joint,), N m, and the acceleration of
+          the chassis frame's origin in its own frame, m/s2.
+
+        Raises:
+          UnsuitableError: a leg has more joints than its wheel's.
+        """
+        if any(len(group.links) > 1 or group.links[0].actuated is None for group in self.structure.groups):
+            raise UnsuitableError("imposed motion needs a rover whose wheels' drives are its only joints.")
+        numbers, legs, base = self._kinematic_state(qpos, qvel)
+
+        def finish(forces: Forces, joint_acceleration: Any, up: Vector) -> tuple[Pieces, Pieces, Any, Vector]:
+            return self._finish_imposed(params, numbers, legs, base, forces, joint_acceleration, up)
+
+        return self._kinematics(numbers, legs, base), finish
+
+    def _finish_imposed(
+        self,
+        params: Any,
+        numbers: list[LegGroup],
+        legs: list[LegState],
+        base: Base,
+        forces: Forces,
+        joint_acceleration: Any,
+        up: Vector,
+    ) -> tuple[Pieces, Pieces, Any, Vector]:
+        dtype = forces.joint_torque.dtype
+        armature = _reflected_inertia(params, self._joints, dtype)
+        unpowered = dataclasses.replace(forces, joint_torque=jnp.zeros_like(forces.joint_torque))
+        blocks = [leg_block(n, leg, up, unpowered, base.frame, armature, self.timestep)
+                  for n, leg in zip(numbers, legs, strict=True)]  # fmt: skip
+        rates = [mul(n.links[0].numbers.sign, select(joint_acceleration, n.links[0].actuated)) for n in numbers]
+        acceleration, torques = impose(*self._chassis(base, forces, up), blocks, rates)
+        stepped = self._integrate(numbers, legs, base, acceleration, [[rate] for rate in rates])
+        signed = [_over_legs(mul(n.links[0].numbers.sign, t), n.count) for n, t in zip(numbers, torques, strict=True)]
+        linear = acceleration.linear + base.motion.angular.cross(base.motion.linear)
+        return *stepped, assemble(signed, [n.links[0].actuated for n in numbers]), linear
+
     def _finish(
         self, params: Any, numbers: list[LegGroup], legs: list[LegState], base: Base, forces: Forces
     ) -> tuple[Pieces, Pieces]:
         """Accelerations from the forces, and a step of semi-implicit Euler."""
-        dtype, dt = forces.joint_torque.dtype, self.timestep
-        frame, motion = base.frame, base.motion
+        dtype, dt, frame = forces.joint_torque.dtype, self.timestep, base.frame
         gravity = params.gravity if forces.geometry.gravity is None else forces.geometry.gravity
         up = frame.undo(Vector(0.0, 0.0, jnp.asarray(gravity, dtype)))
         armature = _reflected_inertia(params, self._joints, dtype)
         blocks = [
             leg_block(group, leg, up, forces, frame, armature, dt) for group, leg in zip(numbers, legs, strict=True)
         ]
-        chassis = _chassis_inertia(self.structure.base, forces)
-        applied = Force(frame.undo(Vector(*forces.chassis_moment)), frame.undo(Vector(*forces.chassis_force)))
-        force = chassis.apply(Motion(ZERO, up)) + motion.cross_force(chassis.apply(motion)) - applied
-        acceleration, rates = solve(chassis, force, blocks)
+        acceleration, rates = solve(*self._chassis(base, forces, up), blocks)
+        return self._integrate(numbers, legs, base, acceleration, rates)
+
+    def _chassis(self, base: Base, forces: Forces, up: Vector) -> tuple[Inertia, Force]:
+        """The chassis' inertia, and the force that it needs to move as it does."""
+        chassis, motion = _chassis_inertia(self.structure.base, forces), base.motion
+        moment, push = Vector(*forces.chassis_moment), Vector(*forces.chassis_force)
+        applied = Force(base.frame.undo(moment), base.frame.undo(push))
+        return chassis, chassis.apply(Motion(ZERO, up)) + motion.cross_force(chassis.apply(motion)) - applied
+
+    def _integrate(
+        self, numbers: list[LegGroup], legs: list[LegState], base: Base, acceleration: Motion, rates: list[list[Any]]
+    ) -> tuple[Pieces, Pieces]:
+        """A step of semi-implicit Euler."""
+        frame, motion, dt = base.frame, base.motion, self.timestep
         # the classical acceleration of the chassis frame's origin
         linear = acceleration.linear + motion.angular.cross(motion.linear)
         velocity = base.velocity + frame.apply(linear) * dt

@@ -79,6 +79,7 @@ class LegBlock(NamedTuple):
     torque: list[Any]
     inertia: Inertia
     force: Force
+    ties: tuple[np.ndarray, ...] = ()
 
 
 def cast_group(group: LegGroup, dtype: Any) -> LegGroup:
@@ -187,7 +188,7 @@ def leg_block(
         else:
             composite[link.parent] = composite[link.parent] + composite[k]
             force[link.parent] = force[link.parent] + force[k]
-    return _project(n, leg, LegBlock(mass, coupling, torque, *hung))
+    return _project(n, leg, LegBlock(mass, coupling, torque, *hung, n.ties))
 
 
 def _wheel_forces(n: LegGroup, leg: LegState, forces: Forces, frame: Rotation) -> dict[int, Force]:
@@ -253,7 +254,12 @@ def solve(chassis: Inertia, force: Force, blocks: list[LegBlock]) -> tuple[Motio
             Symmetric(*(_sum_over_legs(c, count) for c in block.inertia.moments)),
         )
         columns = [block.torque, *([row[i] for row in block.coupling] for i in range(6))]
-        solved = solve_positive(block.mass_matrix, columns)
+        mass = block.mass_matrix
+        if block.ties:
+            # Tied legs are one joint with their masses, couplings and torques together.
+            mass = [[_over_ties(m, block) for m in row] for row in mass]
+            columns = [[_over_ties(c, block) for c in column] for column in columns]
+        solved = solve_positive(mass, columns)
         rows = range(len(block.coupling))
         hung = [*block.force.moment, *block.force.force]
         for i in range(6):
@@ -270,6 +276,51 @@ def solve(chassis: Inertia, force: Force, blocks: list[LegBlock]) -> tuple[Motio
         [sub(s[0][k], total(*(mul(s[1 + i][k], a[i]) for i in range(6)))) for k in range(len(s[0]))] for s in eliminated
     ]
     return Motion(Vector(*a[:3]), Vector(*a[3:])), rates
+
+
+def impose(chassis: Inertia, force: Force, blocks: list[LegBlock], rates: list[Any]) -> tuple[Motion, list[Any]]:
+    """The base's acceleration, and the torques that legs of one joint need, for given joint accelerations.
+
+    The first row of the equation of motion gives a_0, the second the torques (hybrid dynamics, Featherstone 2008,
+    sec. 9.2).
+
+    Args:
+      chassis, force, blocks: as for `solve`; the blocks' torques are without the actuators.
+      rates: accelerations of the legs' joints in the links' own sense, (leg,) by group, rad/s2.
+
+    Returns:
+      The base's spatial acceleration, and the actuators' torques in the links' own sense, (leg,) by group, N m.
+    """
+    whole, applied = chassis, [*force.moment, *force.force]
+    for block, rate in zip(blocks, rates, strict=True):
+        count = _legs_of(block)
+        whole = whole + Inertia(
+            _sum_over_legs(block.inertia.mass, count),
+            Vector(*(_sum_over_legs(c, count) for c in block.inertia.h)),
+            Symmetric(*(_sum_over_legs(c, count) for c in block.inertia.moments)),
+        )
+        hung = [*block.force.moment, *block.force.force]
+        for i in range(6):
+            pushed = mul(block.coupling[0][i], rate)
+            applied[i] = add(applied[i], _sum_over_legs(add(hung[i], pushed), count))
+    matrix = _matrix(whole)
+    lower = [[matrix[i][j] if j <= i else 0.0 for j in range(6)] for i in range(6)]
+    (a,) = solve_positive(lower, [[neg(f) for f in applied]])
+    torques = [
+        sub(
+            total(mul(block.mass_matrix[0][0], rate), *(mul(block.coupling[0][i], a[i]) for i in range(6))),
+            block.torque[0],
+        )
+        for block, rate in zip(blocks, rates, strict=True)
+    ]
+    return Motion(Vector(*a[:3]), Vector(*a[3:])), torques
+
+
+def _over_ties(value: Any, block: LegBlock) -> Any:
+    """The sum over the legs that are tied together, by leg."""
+    if np.ndim(value) == 0:
+        return len(block.ties) * value
+    return total(*(select(value, index) for index in block.ties))
 
 
 def _legs_of(block: LegBlock) -> int:

@@ -102,8 +102,11 @@ def _others(model: mujoco.MjModel) -> list[str]:
         if getattr(model, count):
             problems.append(what)
     for i in range(model.neq):
-        if model.eq_type[i] != mujoco.mjtEq.mjEQ_CONNECT:
-            problems.append(f"the equality constraint {model.eq(i).name!r}, which is no connect")
+        if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT:
+            if not np.array_equal(model.eq_data[i, :5], [0.0, 1.0, 0.0, 0.0, 0.0]) or not model.eq_active0[i]:
+                problems.append(f"the joint equality {model.eq(i).name!r}, which does not make two angles one")
+        elif model.eq_type[i] != mujoco.mjtEq.mjEQ_CONNECT:
+            problems.append(f"the equality constraint {model.eq(i).name!r}, which is neither connect nor joint")
         elif model.eq_objtype[i] != mujoco.mjtObj.mjOBJ_BODY:
             problems.append(f"the connect {model.eq(i).name!r} between sites")
         elif not model.eq_active0[i]:

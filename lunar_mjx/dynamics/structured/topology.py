@@ -44,12 +44,19 @@ class WheelSlot:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LegGroup:
-    """Legs of one pattern."""
+    """Legs of one pattern.
+
+    Attributes:
+      count: of legs. links, wheels, loop: what every leg has.
+      ties: where the legs' only joints turn as one (a side's wheels behind one motor): for every leg the numbers of the
+        legs tied to it, itself among them, as arrays of shape (leg,), one for each; empty where legs are free.
+    """
 
     count: int
     links: tuple[Link, ...]
     wheels: tuple[WheelSlot, ...]
     loop: FourBar | None
+    ties: tuple[np.ndarray, ...] = ()
 
     @property
     def free(self) -> list[int]:
@@ -179,7 +186,7 @@ class _Pin(NamedTuple):
 
 def _pins(model: mujoco.MjModel, places: list[_Place]) -> list[_Pin]:
     pins = []
-    for i in range(model.neq):
+    for i in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT):
         on = places[model.eq_obj1id[i]], places[model.eq_obj2id[i]]
         given = model.eq_data[i, :3], model.eq_data[i, 3:6]
         anchors = tuple(p.shift + p.turn @ a for p, a in zip(on, given, strict=True))
@@ -277,7 +284,35 @@ def _group(model: mujoco.MjModel, legs: list[_Leg], actuated: dict[int, int], na
             for leg, p in zip(legs, pins, strict=True)
         ]
         loop = read_fourbar(made, count, pins[0].links, moved, f"{name}: the loop {pins[0].name!r}")
-    return LegGroup(count, tuple(made), tuple(slots), loop)
+    return LegGroup(count, tuple(made), tuple(slots), loop, _ties(model, legs, made, loop, name))
+
+
+def _ties(
+    model: mujoco.MjModel, legs: list[_Leg], links: list[Link], loop: FourBar | None, name: str
+) -> tuple[np.ndarray, ...]:
+    """Legs whose joints are one, by leg (see `LegGroup`)."""
+    own = {link.joint: (i, k) for i, leg in enumerate(legs) for k, link in enumerate(leg.links)}
+    cluster = np.arange(len(legs))
+    tied = False
+    for i in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        ends = [own.get(int(joint)) for joint in (model.eq_obj1id[i], model.eq_obj2id[i])]
+        if ends == [None, None]:
+            continue
+        if None in ends or loop is not None or len(links) > 1:
+            raise UnsuitableError(
+                f"{name}: the joint equality {model.eq(i).name!r} ties legs that have more joints than these, "
+                "or differ in pattern; the structured engine ties legs of one joint."
+            )
+        (first, _), (second, _) = ends  # type: ignore[misc]
+        cluster[cluster == cluster[second]] = cluster[first]
+        tied = True
+    if not tied:
+        return ()
+    members = [np.flatnonzero(cluster == c) for c in cluster]
+    sign = np.broadcast_to(np.asarray(links[0].numbers.sign), len(legs))
+    if len({len(m) for m in members}) > 1 or any(np.ptp(sign[m]) for m in members):
+        raise UnsuitableError(f"{name}: legs are tied in groups of different sizes or senses of rotation.")
+    return tuple(np.array([m[k] for m in members]) for k in range(len(members[0])))
 
 
 def _coordinate_axis(links: list[_RawLink]) -> int:
