@@ -213,15 +213,9 @@ def terrain_export(
 @effect_app.command("list")
 def effect_list() -> None:
     """List the catalogue of effects."""
-    from lunar_mjx.effects.catalogue import CATALOGUE
-    from lunar_mjx.effects.presets import PRESETS
-    from lunar_mjx.model.describe import make_console, make_table
+    from lunar_mjx.model.describe import make_console, print_catalogue
 
-    table = make_table("effect", "ports", *PRESETS, "what")
-    for effect in CATALOGUE.values():
-        marks = ["x" if effect.name in names else "" for names in PRESETS.values()]
-        table.add_row(effect.name, ", ".join(effect.ports), *marks, effect.doc.split("\n")[0])
-    make_console().print(table)
+    print_catalogue(make_console())
 
 
 @effect_app.command("show")

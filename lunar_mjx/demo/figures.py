@@ -16,6 +16,7 @@ from lunar_mjx.demo.drive import Drive
 from lunar_mjx.demo.wheel import Case, dense_curves
 from lunar_mjx.report.style import BLUE, INK, MEASURED, SERIES, VERMILION, Series, faded, finish
 from lunar_mjx.terrain import Terrain
+from lunar_mjx.wheel_bed.soil_fit import APART_ANGLES, FIT_ANGLES
 
 ROVERS = {"viper": ("VIPER", BLUE), "luvmi_x": ("LUVMI-X", VERMILION)}
 _MARGIN = 5.0
@@ -79,7 +80,7 @@ def paths_figure(drives: Sequence[Drive], terrain: Terrain) -> go.Figure:
                 "line": {"color": colour, "width": 2},
             },
         )
-    finish(figure, 820)
+    finish(figure, 640, margin={"l": 52, "r": 8, "t": 64, "b": 46})
     figure.update_xaxes(title_text="east, m", range=[west, east], constrain="domain", showgrid=False)
     figure.update_yaxes(
         title_text="north, m", range=[south, north], scaleanchor="x", constrain="domain", showgrid=False
@@ -136,6 +137,54 @@ def _add_rocks(figure: go.Figure, terrain: Terrain, box: tuple[float, float, flo
         figure.add_scatter(x=[None], y=[None], mode="markers", name="rock", marker={"color": "#3a3a3a", "size": 9})
 
 
+CASE_LABELS = {
+    "paper": "seed paper's equations, nominal soil",
+    "paper, refitted": "seed paper's equations, soil refitted",
+    "consistent": "corrected equations, nominal soil",
+    "consistent, refitted": "corrected equations, soil refitted",
+}
+"""What the page calls each wheel model."""
+
+
+def headline_figure(cases: Sequence[Case]) -> go.Figure:
+    """How far each wheel model is from the measurements that no fit saw, in scatter of single runs; 1 is perfect."""
+    names = [CASE_LABELS.get(c.name, c.name) for c in cases]
+    figure = go.Figure()
+    for key, label, look in (
+        ("held out, inside", "slip angles between the fitted ones", SERIES[1]),
+        ("held out, beyond", "slip angles beyond the fitted ones", SERIES[2]),
+    ):
+        values = [c.scores()[key] for c in cases]
+        figure.add_scatter(
+            x=values,
+            y=names,
+            mode="markers+text",
+            name=label,
+            text=[f"{v:.1f}" for v in values],
+            textposition="top center",
+            cliponaxis=False,
+            hovertemplate="%{y}: %{x:.1f}<extra></extra>",
+            marker={"color": look.colour, "symbol": look.symbol, "size": 13, "line": {"color": INK, "width": 1}},
+        )
+    finish(figure, 110 + 52 * len(names), margin={"l": 24, "r": 24, "t": 48, "b": 52})
+    figure.add_scatter(
+        x=[1.0, 1.0],
+        y=[names[0], names[-1]],
+        mode="lines",
+        name="a repeated run",
+        hoverinfo="skip",
+        line={"color": MEASURED.colour, "width": 3},
+    )
+    figure.update_xaxes(
+        type="log",
+        title_text="root mean square error, in scatter of single runs",
+        range=[-0.12, 1.9],
+        tickvals=[1, 2, 5, 10, 20, 50],
+    )
+    figure.update_yaxes(type="category", autorange="reversed", automargin=True, showgrid=False)
+    return figure
+
+
 def history_figure(drives: Sequence[Drive], individuals: int = 3) -> go.Figure:
     """Slip, sinkage and winding temperature over time: median and range over the batch, and a few individuals."""
     rows = ("mean slip", "deepest sinkage, mm", "hottest winding, °C")
@@ -144,14 +193,14 @@ def history_figure(drives: Sequence[Drive], individuals: int = 3) -> go.Figure:
         cols=len(drives),
         shared_xaxes=True,
         vertical_spacing=0.05,
-        horizontal_spacing=0.08,
+        horizontal_spacing=0.12,
         column_titles=[ROVERS.get(d.rover, (d.rover, INK))[0] for d in drives],
     )
     for column, d in enumerate(drives, 1):
         colour = ROVERS.get(d.rover, (d.rover, INK))[1]
         for row, values in enumerate((d.mean_slip, 1e3 * d.sinkage.max(axis=-1), d.winding_degC), 1):
             _band(figure, d.time, values, colour, row, column, individuals, legend=row == 1 and column == 1)
-    finish(figure, 760, margin={"l": 70, "r": 16, "t": 90, "b": 52})
+    finish(figure, 640, margin={"l": 62, "r": 8, "t": 84, "b": 46})
     figure.update_layout(legend={"y": 1.06})
     for row, title in enumerate(rows, 1):
         figure.update_yaxes(title_text=title, row=row, col=1)
@@ -202,6 +251,14 @@ def _band(figure, time, values, colour, row, column, individuals, legend) -> Non
     )
 
 
+def _split_of(angle_deg: float) -> str:
+    """Whether the points at a slip angle were fitted."""
+    for angles, name in ((FIT_ANGLES, "fitted"), (APART_ANGLES, "set apart")):
+        if any(abs(angle_deg - a) < 0.01 for a in angles):
+            return name
+    return "held out"
+
+
 def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequence[float], beds: Sequence) -> go.Figure:
     """Drawbar pull, side force and sinkage over slip, a column per slip angle; error bars: replicates."""
     rows = [row for row in WHEEL_ROWS if row[0] in table.measured]
@@ -214,7 +271,7 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
         shared_yaxes=True,
         vertical_spacing=0.035,
         horizontal_spacing=0.012,
-        column_titles=[f"{a:g}°" for a in angles],
+        column_titles=[f"{a:g}°<br>{_split_of(a)}" for a in angles],
     )
     for column, angle in enumerate(angles, 1):
         here = np.abs(table.test["slip_angle_deg"] - angle) < 0.01
@@ -226,7 +283,7 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
                     x=curve["slip_ratio"].round(3),
                     y=(scale * curve[quantity][column - 1]).round(3),
                     mode="lines",
-                    name=case.name,
+                    name=CASE_LABELS.get(case.name, case.name),
                     line={"color": style.colour, "dash": style.dash, "width": 2},
                     showlegend=legend,
                     legendgroup=case.name,
@@ -250,8 +307,25 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
                 hovertemplate="measured: %{y}<extra></extra>",
                 **place,
             )
-    finish(figure, 820, margin={"l": 66, "r": 12, "t": 96, "b": 52})
-    figure.update_layout(legend={"y": 1.06})
+    finish(figure, 820, margin={"l": 66, "r": 12, "t": 130, "b": 52})
+    figure.update_layout(legend={"y": 1.08})
+    # what no fit saw stands on a tinted ground
+    for column, angle in enumerate(angles, 1):
+        for row in range(1, len(rows) + 1) if _split_of(angle) != "fitted" else ():
+            at = (row - 1) * len(angles) + column
+            axes = "" if at == 1 else str(at)
+            figure.add_shape(
+                type="rect",
+                xref=f"x{axes} domain",
+                yref=f"y{axes} domain",
+                x0=0,
+                x1=1,
+                y0=0,
+                y1=1,
+                line={"width": 0},
+                fillcolor=faded(BLUE, 0.08),
+                layer="below",
+            )
     for row, (_, title, _) in enumerate(rows, 1):
         figure.update_yaxes(title_text=title, row=row, col=1)
     for row, (quantity, _, scale) in enumerate(rows, 1):

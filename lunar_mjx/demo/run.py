@@ -13,7 +13,15 @@ import numpy as np
 
 from lunar_mjx.demo.drive import Drive, drive
 from lunar_mjx.demo.figures import ROVERS
-from lunar_mjx.demo.sections import driving_section, provenance_section, verdict, versions, wheel_section
+from lunar_mjx.demo.sections import (
+    LEAD,
+    driving_section,
+    headline_section,
+    provenance_section,
+    verdict,
+    versions,
+    wheel_section,
+)
 from lunar_mjx.demo.wheel import Case, wheel_cases
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import DEFAULT_TERRAIN
@@ -21,7 +29,7 @@ from lunar_mjx.report.page import write_page
 from lunar_mjx.report.progress import Reporter, console_progress
 from lunar_mjx.terrain import load_terrain
 
-TITLE = "lunar-mjx: a batch of rovers on the Moon, and the wheel model against measurements"
+TITLE = "lunar-mjx demonstration"
 _SHARES = {"viper": 0.45, "luvmi_x": 0.35}
 """Measured share of each rover's drive in the whole, compilation included; the wheel takes the rest."""
 
@@ -78,7 +86,7 @@ def _write(out: Path, drives: Sequence[Drive], cases: Sequence[Case], terrain: A
         wheel_section(cases),
         provenance_section(cases[0].comparison.table, terrain.name, seed),
     ]
-    page = write_page(out / "demo.html", TITLE, verdict(drives, cases), sections)
+    page = write_page(out / "demo.html", TITLE, verdict(drives, cases), [headline_section(cases), *sections], LEAD)
     numbers = {
         "verdict": verdict(drives, cases),
         "drives": [summary(d) for d in drives],

@@ -93,7 +93,8 @@ def _compare(run: Run, progress: Progress) -> Run:
     problem.foresee(problem.origin()[None], problem.free())
     start = whitened_residuals(problem, problem.origin()[None])[0]
     fitted = fit_baseline(problem, Settings(seed=run.seed), memory, progress)
-    run.save(COMPARISON_FILE, comparison(problem, start, fitted))
+    stated = {log.name: log.split for log in campaign if log.split}
+    run.save(COMPARISON_FILE, {**comparison(problem, start, fitted), "log_splits": stated})
     _save_series(run, problem, start, {"refitted": fitted})
     _record_test(run, "compare", problem, {"refitted": fitted})
     return run

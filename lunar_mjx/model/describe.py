@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import inspect
+from collections.abc import Hashable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -16,6 +18,8 @@ from lunar_mjx.effects.wheel.paper import REGULARISATIONS
 from lunar_mjx.model.model import Model, Value, preset_values, rover_motors
 from lunar_mjx.rover.load import MARKER
 from lunar_mjx.terrain import Terrain
+
+Entry = TypeVar("Entry", bound=Hashable)
 
 
 def make_console() -> Console:
@@ -54,38 +58,35 @@ def origins(model: Model, effect: Effect, key: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _by_group(entries: Sequence[str], model: Model) -> str:
-    """One text for entries that are all alike, or else one per joint group or wheel."""
+def by_group(entries: Sequence[Entry], model: Model) -> list[tuple[str, Entry]]:
+    """Entries with the joint groups or wheels that they belong to; one without a name where all are alike."""
     if len(set(entries)) == 1:
-        return entries[0]
+        return [("", entries[0])]
     names = [g.name for g in model.rover.groups for _ in g.joints]
     if len(entries) != len(names):
         names = [w.corner for w in model.rover.wheels]
-    groups: dict[str, list[str]] = {}
-    for name, entry in zip(names, entries, strict=True):
-        groups.setdefault(name, []).append(entry)
-    alike: dict[str, list[str]] = {}
-    for name, found in groups.items():
-        alike.setdefault(", ".join(dict.fromkeys(found)), []).append(name)
-    return "; ".join(f"{', '.join(names)}: {text}" for text, names in alike.items())
-
-
-def _shown(value: Value, model: Model) -> str:
-    return _by_group([f"{v:g}" for v in (value if isinstance(value, tuple) else (value,))], model)
+    alike: dict[Entry, list[str]] = {}
+    for name, entry in dict.fromkeys(zip(names, entries, strict=True)):
+        alike.setdefault(entry, []).append(name)
+    return [(", ".join(found), entry) for entry, found in alike.items()]
 
 
 def print_preset(model: Model, console: Console) -> None:
     """Every effect of a model with its values and sources; for the paper, what it leaves unsaid and undefined."""
-    table = make_table("effect", "parameter", "value", "unit", "source", title=f"preset {model.preset}", names=2)
+    table = make_table("effect and parameter", "value", "source", title=f"preset {model.preset}", names=2)
     for effect in model.effects:
-        first = effect.name
-        if not effect.parameters:
-            table.add_row(first, "", "", "", "")
+        table.add_row(effect.name, "", "")
         for name, parameter in effect.parameters.items():
             value = model.parameters[effect.name][name]
-            source = _by_group(origins(model, effect, name), model)
-            table.add_row(first, name, _shown(value, model), parameter.unit, source)
-            first = ""
+            values = [f"{v:g}" for v in (value if isinstance(value, tuple) else (value,))]
+            sources = origins(model, effect, name)
+            sources = sources * (len(values) // len(sources))
+            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            groups = by_group(list(zip(values, sources, strict=True)), model)
+            if len(groups) > 1:
+                table.add_row(f"  {name}", "", "")
+            for group, (number, source) in groups:
+                table.add_row(f"    {group}" if group else f"  {name}", number + unit, source)
     console.print(table)
     if model.preset == "paper":
         for title, rows in (
@@ -96,23 +97,53 @@ def print_preset(model: Model, console: Console) -> None:
             for what, choice in rows.items():
                 table.add_row(what, choice)
             console.print(table)
-    table = make_table("no.", "where", "paper", "consistent", "effect", title="differences between the presets")
+    console.print("\ndifferences between the presets")
     for flaw in FLAWS:
-        table.add_row(str(flaw.number), flaw.where, flaw.paper, flaw.consistent, flaw.mended_by)
+        table = make_table("", "", names=1)
+        table.show_header = False
+        for what, text in (("paper", flaw.paper), ("consistent", flaw.consistent), ("effect", flaw.mended_by)):
+            table.add_row(f"  {what}", text)
+        console.print(f"{flaw.number} {flaw.where}")
+        console.print(table)
+
+
+def print_catalogue(console: Console) -> None:
+    """The catalogue of effects by port: name, presets that hold it, and what it does."""
+    width = max(map(len, CATALOGUE)) + 2
+    table = make_table("effect", "in", "what it does", names=2)
+    table.columns[0].min_width = width
+    by_ports: dict[str, list[Effect]] = {}
+    for effect in CATALOGUE.values():
+        by_ports.setdefault(", ".join(effect.ports), []).append(effect)
+    for ports, effects in by_ports.items():
+        table.add_row(ports, "", "", style="bold")
+        for effect in effects:
+            presets = " ".join(name[0] for name, listed in PRESETS.items() if effect.name in listed)
+            table.add_row(f"  {effect.name}", presets, effect.doc.split("\n")[0])
     console.print(table)
+    console.print(
+        "In: " + ", ".join(f"{name[0]} preset {name}" for name in PRESETS) + ". Bold: the ports that an "
+        "effect acts at. `lunar-mjx effect show NAME` gives equation, bounds and sources."
+    )
 
 
 def print_effect(effect: Effect, console: Console) -> None:
     """An effect's equation, ports, parameters and state."""
     console.print(f"{effect.name}: {', '.join(effect.ports)}", style="bold")
-    console.print(effect.doc)
+    console.print(inspect.cleandoc(effect.doc))
     if effect.replaces:
         console.print(f"replaces {', '.join(effect.replaces)}")
-    table = make_table("parameter", "nominal", "null", "bounds", "unit", "meaning", "source")
     for name, p in effect.parameters.items():
-        null = "" if p.null is None else f"{p.null:g}"
-        table.add_row(name, f"{p.nominal:g}", null, f"{p.bounds[0]:g} .. {p.bounds[1]:g}", p.unit, p.meaning, p.source)
-    console.print(table)
+        console.print(f"\n{name}: {p.meaning}")
+        table = make_table("", "", names=1)
+        table.show_header = False
+        unit = "" if p.unit == "1" else f" {p.unit}"
+        table.add_row("  nominal", f"{p.nominal:g}{unit}")
+        table.add_row("  bounds", f"{p.bounds[0]:g} .. {p.bounds[1]:g}{unit}")
+        if p.null is not None:
+            table.add_row("  no effect at", f"{p.null:g}{unit}")
+        table.add_row("  source", p.source)
+        console.print(table)
     for name, s in effect.state.items():
         console.print(f"state {name} ({s.unit}, per {s.axis}): {s.meaning}")
 

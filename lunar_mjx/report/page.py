@@ -13,12 +13,37 @@ import jinja2
 import plotly.graph_objects as go
 import plotly.offline
 
+from lunar_mjx.report.style import DARK
+
 
 class Figure(NamedTuple):
     """A figure with its caption."""
 
     figure: go.Figure
     caption: str = ""
+
+
+class Pair(NamedTuple):
+    """Two figures side by side where the page is wide enough, one above the other where it is not."""
+
+    left: Figure
+    right: Figure
+
+
+class Lead(NamedTuple):
+    """What a reader should know before anything else.
+
+    Attributes:
+      badge: one or two words, such as "effect named"; none if empty.
+      tone: of the badge: "good", "open" or "bad".
+      sentence: the finding in plain words.
+      next: what to do now, a command or a sentence each.
+    """
+
+    badge: str
+    tone: str
+    sentence: str
+    next: Sequence[str] = ()
 
 
 class Explorer(NamedTuple):
@@ -36,13 +61,17 @@ class Explorer(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table; numbers are given as text, in the digits to show. The first `texts` columns hold words."""
+    """A table; numbers are given as text, in the digits to show. The first `texts` columns hold words.
+
+    A `folded` table shows its caption alone until it is opened.
+    """
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
     texts: int = 1
+    folded: bool = False
 
 
 class Text(NamedTuple):
@@ -57,7 +86,7 @@ class Facts(NamedTuple):
     pairs: Sequence[tuple[str, str]]
 
 
-Block = Figure | Explorer | Table | Text | Facts
+Block = Figure | Pair | Explorer | Table | Text | Facts
 
 
 class Section(NamedTuple):
@@ -89,7 +118,9 @@ def _json(value: str) -> str:
     return value.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def write_page(path: Path, title: str, verdict: Sequence[str], sections: Sequence[Section]) -> Path:
+def write_page(
+    path: Path, title: str, verdict: Sequence[str], sections: Sequence[Section], lead: Lead | None = None
+) -> Path:
     """Writes a report.
 
     Args:
@@ -97,6 +128,7 @@ def write_page(path: Path, title: str, verdict: Sequence[str], sections: Sequenc
       title: of the page.
       verdict: its findings in a sentence each; they come first.
       sections: the rest, in order.
+      lead: stands above the findings: badge, plain sentence, what to do next.
 
     Returns:
       The path.
@@ -108,10 +140,12 @@ def write_page(path: Path, title: str, verdict: Sequence[str], sections: Sequenc
     shown = [{"title": s.title, "blocks": [_block(b, figures) for b in s.blocks]} for s in sections]
     html = environment.get_template("page.html.j2").render(
         title=title,
+        lead=lead,
         verdict=verdict,
         sections=shown,
         figures=figures,
         config=_json(json.dumps(_CONFIG)),
+        dark=_json(json.dumps(DARK)),
         plotly=_script(),
     )
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -123,6 +157,8 @@ def _block(block: Block, figures: list[str]) -> dict[str, Any]:
     kind = type(block).__name__.lower()
     if isinstance(block, Figure):
         return {"kind": kind, "caption": block.caption, **_placed(block.figure, figures)}
+    if isinstance(block, Pair):
+        return {"kind": kind, "parts": [_block(part, figures) for part in block]}
     if isinstance(block, Explorer):
         return {
             "kind": kind,

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import plotly.graph_objects as go
 
 INK, MUTED, RULE, PAPER = "#1b1f24", "#57606a", "#d0d7de", "#ffffff"
+DARK = {INK: "#e6edf3", MUTED: "#9aa4ae", RULE: "#39414a", PAPER: "#0d1117"}
+"""What takes the place of each of these colours on a dark page."""
 FONT = "system-ui, -apple-system, 'Segoe UI', Helvetica, Arial, sans-serif"
 
 

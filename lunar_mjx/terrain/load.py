@@ -56,6 +56,10 @@ def load_terrain(
     path = Path(spec)
     if path.suffix.lower() in SUFFIXES:
         return terrain_from_dem(read_dem(path), path.stem, dtype)
+    if path.suffix and path.suffix != ".toml" and not path.is_dir():
+        if path.is_file():
+            read_dem(path)  # which says that this format is not read, and which ones are
+        raise UserError(f"{path}: is not there; check the path or its spelling.")
     if path.suffix != ".toml":
         path = find("terrain", spec, CONFIG) / CONFIG
     config = read_config(path)

@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon
 
 from lunar_mjx.dynamics.signals import joint_channels
-from lunar_mjx.report.style import BLUE, GREEN, INK, ORANGE, RULE, VERMILION
-from lunar_mjx.terrain import Terrain
+from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, RULE, VERMILION
+from lunar_mjx.terrain import Terrain, surface
 from lunar_mjx.visual.recorded import RecordedDrive
 from lunar_mjx.visual.relief import relief, rocks_within
 
@@ -27,8 +27,25 @@ WHEEL_STYLES = {
 }
 """Sides by colour, front, middle and rear by the line: legible without colour."""
 
+CORNER_WORDS = {
+    "lf": "left front",
+    "rf": "right front",
+    "lm": "left middle",
+    "rm": "right middle",
+    "lr": "left rear",
+    "rr": "right rear",
+}
+"""Corners of a rover in words."""
+
 _MARGIN = 0.12
 _LEAST = 2.0
+"""Least width of a map, m."""
+_SLIM = 0.75
+"""Height over width below which a map leaves room for a profile."""
+_SLIMMEST = 0.45
+"""Least height of a map over its width: a straight drive shows some ground beside it."""
+_LEAST_CONTRAST = 0.08
+"""Least range of shades that a relief is stretched from: even ground stays even."""
 
 
 def style(axes: Axes, y: str, x: str = "") -> None:
@@ -49,16 +66,34 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray, contours: bool = True) -> None:
-    """Draws shaded ground with rocks, and contours of height."""
+    """Draws shaded ground with rocks, and contours of height, whose spacing stands in the corner."""
     ground = relief(terrain, low, high)
     extent = (ground.west, ground.east, ground.south, ground.north)
-    axes.imshow(ground.grey, cmap="gray", vmin=0, vmax=1, extent=extent, origin="lower", interpolation="bilinear")
+    dark, bright = (float(v) for v in np.percentile(ground.grey, (1.0, 99.0)))
+    spare = max(0.0, 0.5 * (_LEAST_CONTRAST - (bright - dark)))
+    # gentle ground is stretched to most of the shades, so that its shape shows
+    span = {"vmin": dark - spare - 0.35 * (bright - dark + 2 * spare), "vmax": bright + spare + 0.15 * (bright - dark)}
+    axes.imshow(ground.grey, cmap="gray", extent=extent, origin="lower", interpolation="bicubic", **span)
     if contours and np.ptp(ground.heights) > 1e-6:
         rows, cols = ground.heights.shape
         x = np.linspace(ground.west, ground.east, cols)
         y = np.linspace(ground.south, ground.north, rows)
-        lines = axes.contour(x, y, ground.heights, levels=8, colors="white", linewidths=0.5, alpha=0.55)
-        axes.clabel(lines, fontsize=6, fmt="%.3g m")
+        step = _round_step(float(np.ptp(ground.heights)) / 8.0)
+        levels = np.arange(np.floor(ground.heights.min() / step), np.ceil(ground.heights.max() / step) + 1) * step
+        axes.contour(x, y, ground.heights, levels=levels, colors="white", linewidths=0.7, alpha=0.6)
+        text = f"contours every {1e3 * step:g} mm" if step < 0.1 else f"contours every {step:g} m"
+    else:
+        text = "level ground" if contours else ""
+    if text:
+        axes.text(
+            0.01,
+            0.015,
+            text,
+            transform=axes.transAxes,
+            fontsize=8,
+            color="white",
+            bbox={"facecolor": INK, "alpha": 0.65, "edgecolor": "none", "pad": 2.5},
+        )
     stones = [Circle((x, y), r) for x, y, r in rocks_within(terrain, low, high)]
     axes.add_collection(PatchCollection(stones, facecolor="#3a3a3a", edgecolor="#222222", linewidth=0.4))
     axes.set_aspect("equal")
@@ -66,10 +101,27 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray,
     axes.set_ylabel("north, m")
 
 
-def bounds(places: np.ndarray, margin: float = _MARGIN) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a square around places (n, 2), with a margin."""
+def _round_step(step: float) -> float:
+    """The next larger of 1, 2 and 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(step))
+    return float(power * next(k for k in (1.0, 2.0, 5.0, 10.0) if k * power >= step * (1.0 - 1e-9)))
+
+
+def bounds(
+    places: np.ndarray, margin: float = _MARGIN, slimmest: float = 1.0, pad: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a rectangle around places (n, 2), with a margin.
+
+    Args:
+      places: (n, 2) m.
+      margin: on every side, as a share of the longer side.
+      slimmest: shorter side over the longer one at least; 1 gives a square.
+      pad: more ground on every side, m.
+    """
     low, high = places.min(axis=0), places.max(axis=0)
-    half = 0.5 * max(float((high - low).max()), _LEAST) * (1.0 + 2.0 * margin)
+    extent = high - low + 2.0 * pad
+    longest = max(float(extent.max()), _LEAST)
+    half = 0.5 * (np.maximum(extent, slimmest * longest) + 2.0 * margin * longest)
     middle = 0.5 * (low + high)
     return middle - half, middle + half
 
@@ -78,12 +130,16 @@ def drive_summary(drive: RecordedDrive) -> Figure:
     """The path on shaded relief, and over time slope, slip, sinkage, temperature and power."""
     figure = Figure(figsize=(13.0, 7.4), layout="constrained")
     grid = figure.add_gridspec(5, 2, width_ratios=(1.15, 1.0))
-    ground = figure.add_subplot(grid[:, 0])
-    low, high = bounds(drive.position[:, :2])
+    reach = float(np.abs(np.asarray(drive.model.rover.chassis_points)[:, :2]).max())
+    low, high = bounds(drive.position[:, :2], 0.08, _SLIMMEST, reach)
+    slim = float((high - low)[1] / (high - low)[0]) < _SLIM
+    ground = figure.add_subplot(grid[:4, 0] if slim else grid[:, 0])
     draw_relief(ground, drive.terrain, low, high)
     ground.set_xlim(low[0], high[0])
     ground.set_ylim(low[1], high[1])
     _draw_path(figure, ground, drive)
+    if slim:  # what a long, slim map leaves free below shows the ground along the path
+        _profile(figure.add_subplot(grid[4, 0]), drive)
     first = None
     for row, draw in enumerate((_slope, _slip, _sinkage, _temperature, _power)):
         axes = figure.add_subplot(grid[row, 1], sharex=first)
@@ -105,10 +161,47 @@ def drive_summary(drive: RecordedDrive) -> Figure:
     return figure
 
 
+def _profile(axes: Axes, drive: RecordedDrive) -> None:
+    """Height of the ground along the path."""
+    x, y = drive.position[:, 0], drive.position[:, 1]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    height = np.asarray(surface(drive.model.terrain, x, y), float)
+    axes.fill_between(
+        way, height, height.min() - 0.05 * max(np.ptp(height), 0.02), color=MUTED, alpha=0.35, linewidth=0
+    )
+    axes.plot(way, height, color=INK, linewidth=1.2)
+    style(axes, "ground, m", "along the path, m")
+
+
+def _outline(drive: RecordedDrive, row: int) -> np.ndarray:
+    """Corners of the rover seen from above at a row of the drive, (4, 2) m: around chassis and wheels."""
+    points = np.asarray(drive.model.rover.chassis_points, float)[:, :2]
+    low, high = points.min(axis=0), points.max(axis=0)
+    corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    yaw = np.radians(drive.columns(["yaw_deg"])[row, 0])
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    return drive.position[row, :2] + corners @ turn.T
+
+
 def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
     """The path, coloured by mean slip and outlined so that it shows in grey; start and end."""
     place = drive.position[:, :2]
     slip = np.nanmean(np.abs(drive.per_wheel("wheel_{}_slip_ratio")), axis=1)
+    for n, track in enumerate(drive.tracks()):
+        axes.plot(
+            *track.places.T, color="black", linewidth=1.0, alpha=0.55, zorder=2, label="wheels" if n == 0 else None
+        )
+    axes.add_patch(
+        Polygon(
+            _outline(drive, -1),
+            closed=True,
+            fill=False,
+            edgecolor=INK,
+            linewidth=1.4,
+            zorder=3,
+            label="rover at the end",
+        )
+    )
     axes.plot(*place.T, color="black", linewidth=4.5, solid_capstyle="round")
     dots = axes.scatter(*place.T, c=np.clip(slip, 0.0, 1.0), cmap="cividis", vmin=0.0, vmax=1.0, s=7, zorder=3)
     figure.colorbar(dots, ax=axes, label="mean |slip ratio| of the wheels", shrink=0.6, pad=0.01)
@@ -128,13 +221,23 @@ def _slope(axes: Axes, drive: RecordedDrive) -> None:
 def _wheels(axes: Axes, drive: RecordedDrive, values: np.ndarray) -> None:
     for i, corner in enumerate(drive.corners):
         colour, line = WHEEL_STYLES.get(corner, (INK, "-"))
-        axes.plot(drive.time, values[:, i], color=colour, linestyle=line, linewidth=1.1, label=corner)
+        # left wheels lie as broad lines under right ones, so that both show where they agree
+        width = 3.2 if corner.startswith("l") else 1.3
+        axes.plot(
+            drive.time,
+            values[:, i],
+            color=colour,
+            linestyle=line,
+            linewidth=width,
+            zorder=2 if width > 2 else 3,
+            label=CORNER_WORDS.get(corner, corner),
+        )
 
 
 def _slip(axes: Axes, drive: RecordedDrive) -> None:
     _wheels(axes, drive, drive.per_wheel("wheel_{}_slip_ratio"))
     style(axes, "slip ratio")
-    axes.legend(fontsize=7, frameon=False, ncols=4)
+    axes.legend(fontsize=7, frameon=False, ncols=4, handlelength=3.4)
 
 
 def _sinkage(axes: Axes, drive: RecordedDrive) -> None:

@@ -73,11 +73,25 @@ def test_usage_errors(run: Run) -> None:
 
 def test_effect_list(run: Run) -> None:
     result = run("effect", "list")
-    lines = {line.split()[0]: line.rstrip() for line in result.out.splitlines()[1:] if line.strip()}
-    assert result.status == 0 and set(CATALOGUE) <= set(lines)
-    for name in CATALOGUE:
-        marks = lines[name].removesuffix(CATALOGUE[name].doc.split("\n")[0]).split()[2:].count("x")
-        assert marks == sum(name in names for names in PRESETS.values()), name
+    assert result.status == 0
+    column = result.out.splitlines()[0].index(" in ") + 1
+    for name, effect in CATALOGUE.items():
+        line = next(text for text in result.out.splitlines() if text.split()[:1] == [name] and text.startswith("   "))
+        marks = line[column : column + 2 * len(PRESETS)].split()
+        for preset, listed in PRESETS.items():
+            assert (preset[0] in marks) == (name in listed), (name, preset)
+        assert plain(effect.doc.split("\n")[0]) in plain(result.out)
+
+
+@pytest.mark.parametrize("command", [["effect", "list"], ["effect", "show", "slip_sinkage"], ["preset", "paper"]])
+def test_tables_read_well_on_a_narrow_terminal(command: list[str], run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is cut at 80 columns, and no column of words is squeezed until each line holds one or two of them."""
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = run(*command).out.splitlines()
+    assert max(map(len, lines)) <= 80
+    words = [len(line.split()) for line in lines if line.strip()]
+    assert np.mean(words) > 3.5
+    assert len(lines) < (200 if command[0] != "effect" or command[1] == "show" else 3 * len(CATALOGUE) + 20)
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -87,8 +101,10 @@ def test_effect_show(name: str, run: Run) -> None:
     assert result.status == 0 and result.out.startswith(f"{name}: {', '.join(effect.ports)}")
     assert plain(effect.doc) in plain(result.out)
     for key, parameter in effect.parameters.items():
-        line = next(text for text in result.out.splitlines() if text.split()[:1] == [key])
-        assert f"{parameter.nominal:g}" in line and parameter.meaning in line and parameter.unit in line
+        about = plain(result.out).split(f"{key}: {plain(parameter.meaning)}")[1]
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        assert about.startswith(f" nominal {parameter.nominal:g}{unit} bounds {parameter.bounds[0]:g} ..")
+        assert f"source {plain(parameter.source)}" in about
 
 
 def test_show_a_users_effect_with_brackets_in_its_text(run: Run, tmp_path: Path) -> None:
@@ -112,7 +128,7 @@ def test_preset_paper(run: Run) -> None:
         for what, choice in rows.items():
             assert plain(f"{what} {choice}") in text, what
     for flaw in FLAWS:
-        assert plain(f"{flaw.number} {flaw.where} {flaw.paper} {flaw.consistent}") in text
+        assert plain(f"{flaw.number} {flaw.where} paper {flaw.paper} consistent {flaw.consistent}") in text
 
 
 def test_preset_consistent(run: Run) -> None:
@@ -122,19 +138,27 @@ def test_preset_consistent(run: Run) -> None:
         assert re.search(rf"^ {name} ", result.out, re.MULTILINE), name
 
 
-def source_of(text: str, key: str) -> str:
-    return plain(next(line for line in text.splitlines() if f" {key} " in line))
+def rows_of(text: str, key: str) -> str:
+    """What is printed from a parameter's line to the one before the next parameter's."""
+    after = text[text.index(f"\n   {key} ") :].splitlines()[1:]
+    rows = [after[0]]
+    for line in after[1:]:
+        if len(line) - len(line.lstrip()) < 5:
+            break
+        rows.append(line)
+    return plain("\n".join(rows))
 
 
 def test_sources_are_those_of_the_values_shown(run: Run) -> None:
     paper, own = run("preset", "paper").out, run("preset", "consistent").out
     ratio = load_rover("viper").groups[1].gear_ratio
-    assert source_of(paper, "cohesion").endswith("cohesion 462.3 Pa preset paper")
-    assert source_of(own, "cohesion").endswith(CATALOGUE["soil"].parameters["cohesion"].source)
-    assert source_of(paper, "alpha").endswith(CATALOGUE["motor"].parameters["alpha"].source)
-    assert f"drive: 62; steer, suspension: {ratio:g} " in source_of(paper, "gear_ratio")
-    assert source_of(paper, "gear_ratio").endswith("drive: preset paper; steer, suspension: rover.toml of viper")
-    assert "preset" not in source_of(own, "gear_ratio") and "rover.toml of viper" in source_of(own, "gear_ratio")
+    assert rows_of(paper, "cohesion") == "cohesion 462.3 Pa preset paper"
+    assert rows_of(own, "cohesion").endswith(CATALOGUE["soil"].parameters["cohesion"].source)
+    assert rows_of(paper, "alpha").endswith(CATALOGUE["motor"].parameters["alpha"].source)
+    assert rows_of(paper, "gear_ratio") == (
+        f"gear_ratio drive 62 preset paper steer, suspension {ratio:g} rover.toml of viper"
+    )
+    assert "preset" not in rows_of(own, "gear_ratio") and "rover.toml of viper" in rows_of(own, "gear_ratio")
 
 
 def test_preset_save(run: Run, tmp_path: Path) -> None:

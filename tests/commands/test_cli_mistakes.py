@@ -169,6 +169,12 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {"model.toml": toml('effect_list = ["motor", "mine.py"]'), "mine.py": "x = (\n"},
         ["model.toml: effect_list = 'mine.py'", "does not run", "SyntaxError"],
     ),
+    "terrain is a table": (
+        ["terrain", "info", "FILES/ground.csv"],
+        {"ground.csv": "x,y,z\n0,0,0\n"},
+        ["ground.csv", "suffix = '.csv'", ".tif", ".asc"],
+    ),
+    "terrain file missing": (["terrain", "info", "FILES/ground.tiff2"], {}, ["ground.tiff2", "not there"]),
     "preset unknown": (["preset", "best"], {}, ["'best'", "consistent, paper"]),
     "preset of an unknown rover": (["preset", "paper", "--rover", "moonbuggy"], {}, ["moonbuggy", "viper"]),
     "preset saved nowhere": (["preset", "paper", "--save", "FILES/no/m.toml"], {}, ["m.toml", "cannot be written"]),

@@ -8,7 +8,7 @@ import re
 import plotly.graph_objects as go
 from rich.console import Console
 
-from lunar_mjx.report import Facts, Figure, Section, Table, Text, console_progress, write_page
+from lunar_mjx.report import Facts, Figure, Lead, Pair, Section, Table, Text, console_progress, write_page
 from lunar_mjx.report.style import finish
 
 HOSTILE = '</script><script>alert("x")</script>&<b>'
@@ -21,8 +21,11 @@ def page(tmp_path) -> str:
         Figure(figure, HOSTILE),
         Facts([(HOSTILE, HOSTILE)]),
         Table(HOSTILE, [HOSTILE], [[HOSTILE]], HOSTILE),
+        Pair(Figure(figure), Figure(figure, HOSTILE)),
+        Table(HOSTILE, [HOSTILE], [[HOSTILE]], HOSTILE, folded=True),
     ]
-    path = write_page(tmp_path / "sub" / "page.html", HOSTILE, [HOSTILE], [Section(HOSTILE, blocks)])
+    lead = Lead(HOSTILE, "good", HOSTILE, [HOSTILE])
+    path = write_page(tmp_path / "sub" / "page.html", HOSTILE, [HOSTILE], [Section(HOSTILE, blocks)], lead)
     return path.read_text(encoding="utf-8")
 
 
@@ -37,7 +40,8 @@ def test_text_from_outside_is_escaped(tmp_path):
     html = page(tmp_path)
     assert "alert(" in html
     assert HOSTILE not in html and "<script>alert" not in html and "<b>" not in html
-    assert html.count("<script") == html.count("</script>") == 3
+    assert html.count("<script") == html.count("</script>") == 5  # plotly, three figures, and what draws them
+    assert html.count("<details>") == 1
 
 
 def test_progress_without_a_terminal_is_plain_lines():

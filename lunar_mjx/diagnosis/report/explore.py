@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,11 @@ from plotly.subplots import make_subplots
 
 from lunar_mjx.diagnosis.report.figures import SHADES
 from lunar_mjx.diagnosis.report.read import Result, Traces
-from lunar_mjx.diagnosis.report.words import channel_label, plot_text, shown
+from lunar_mjx.diagnosis.report.steps import Step
+from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, plot_text, shown
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.report.page import Block, Explorer, Figure
-from lunar_mjx.report.style import BLUE, INK, MEASURED, MUTED, ORANGE, SERIES, finish
+from lunar_mjx.report.style import BLUE, INK, MEASURED, MUTED, ORANGE, SERIES, faded, finish
 
 _MOST_VALUES = 250_000
 """Numbers in the panels of one page; longer series are thinned."""
@@ -24,51 +25,89 @@ _FEW = 4
 """Observations that make a shape."""
 _LINES = 5
 """Channels drawn over a covariate."""
+_MAPS = 6
+"""Models of a chain whose heat maps are shown; of longer chains the first five and the last."""
 _SHAPES = 6
 """Effects in the gallery."""
 
 
-def panels(result: Result) -> list[Block]:
-    """Heat map of the refitted model's residual, channel by manoeuvre; a click shows the traces."""
-    traces = result.traces
-    if traces is None or not len(traces.observations):
-        return []
-    row = _baseline(traces)
-    o, residual = traces.observations, traces.residual[row]
-    cells = {(c, u): at for c, u, at in _cells(o) if np.isfinite(residual[at]).any()}
+def panels(steps: Sequence[Step]) -> list[Block]:
+    """Heat maps of the residual, channel by manoeuvre, one for each model of a chain; a click shows the traces.
+
+    All models must have been held against the same measurements.
+    """
+    o = steps[0].observations
+    cells = {(c, u): at for c, u, at in _cells(o) if any(np.isfinite(s.residual[at]).any() for s in steps)}
     if not cells:
         return []
     channels, units = list(dict.fromkeys(c for c, _ in cells)), sorted({u for _, u in cells})
-    rms = {key: float(np.sqrt(np.nanmean(residual[at] ** 2))) for key, at in cells.items()}
-    z = [[rms.get((c, u)) for u in units] for c in channels]
-    figure = go.Figure(
-        go.Heatmap(
-            x=[plot_text(o.unit_names[u], 30) for u in units],
+    shown_steps = [*steps[: _MAPS - 1], steps[-1]] if len(steps) > _MAPS else list(steps)
+    rms = [{key: _rms(s.residual[at]) for key, at in cells.items()} for s in shown_steps]
+    most = max(v for row in rms for v in row.values() if v is not None)
+    titles = [f"{_number(steps, s)}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for s in shown_steps]
+    height = 24 * len(channels)
+    gap = 34 / (height * len(rms) + 34 * (len(rms) - 1))
+    figure = make_subplots(len(rms), 1, shared_xaxes=True, subplot_titles=titles, vertical_spacing=gap)
+    for n, found in enumerate(rms, 1):
+        figure.add_heatmap(
+            x=[_unit_label(o, u) for u in units],
             y=[plot_text(channel_label(c)) for c in channels],
-            z=[[None if v is None else float(np.log10(max(v, 0.3))) for v in line] for line in z],
-            text=[[shown(v) if v is not None else "" for v in line] for line in z],
+            z=[[_depth(found.get((c, u))) for u in units] for c in channels],
+            text=[[shown(found[c, u]) if found.get((c, u)) is not None else "" for u in units] for c in channels],
             texttemplate="%{text}",
             customdata=[[_key(c, u) for u in units] for c in channels],
             colorscale=SHADES,
             zmin=np.log10(0.7),
-            zmax=max(np.log10(3.0), np.log10(max(rms.values()))),
+            zmax=max(np.log10(3.0), np.log10(most)),
             showscale=False,
             xgap=1,
             ygap=1,
             hovertemplate="%{y}, %{x}: %{text} sigma<extra></extra>",
+            row=n,
+            col=1,
         )
-    )
-    finish(figure, 170 + 22 * len(channels), margin={"l": 270, "r": 16, "t": 36, "b": 110})
+    finish(figure, 100 + (height + 34) * len(rms), margin={"l": 200, "r": 16, "t": 36, "b": 64})
     figure.update_yaxes(autorange="reversed", showgrid=False, type="category")
-    figure.update_xaxes(tickangle=-35, showgrid=False, type="category")
+    figure.update_xaxes(tickangle=0 if len(units) <= 8 else -45, showgrid=False, type="category", automargin=True)
+    figure.update_annotations(x=0.0, xanchor="left")
     thin = max(1, int(np.ceil(len(o) * 5 / _MOST_VALUES)))
-    worst = sorted(cells, key=lambda key: -rms[key])
-    found = {_key(*key): _panel(traces, *key, cells[key][::thin]) for key in worst}
+    worst = sorted(cells, key=lambda key: -(rms[0][key] or 0.0))
+    models = _compared(steps)
+    found = {_key(*key): _panel(models, *key, cells[key][::thin]) for key in worst}
+    left = f" {len(steps) - _MAPS} models in between are left out." if len(steps) > _MAPS else ""
     caption = (
-        f"Root mean square residual of the model {traces.labels[row]}, in sigma: 1 is the noise. Click a field, or "
-        "choose from the list, to see what was measured, what the models say, and what they leave."
+        "Root mean square residual in sigma, 1 is the noise: one map for each model of the chain, in one scale of "
+        f"shades.{left} What is held out was never fitted. Click a field, or choose from the list, to see what was "
+        "measured, what the models say, and what they leave."
     )
-    return [Explorer(figure, _detail(traces), found, caption)]
+    return [Explorer(figure, _detail(models), found, caption)]
+
+
+def _number(steps: Sequence[Step], step: Step) -> int:
+    return next(i for i, s in enumerate(steps, 1) if s is step)
+
+
+def _rms(residual: np.ndarray) -> float | None:
+    known = residual[np.isfinite(residual)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else None
+
+
+def _depth(rms: float | None) -> float | None:
+    """Shade of a field: the logarithm of its error, even below a third of the noise."""
+    return None if rms is None else float(np.log10(max(rms, 0.3)))
+
+
+def _unit_label(o: Observations, unit: int) -> str:
+    """A manoeuvre's name, and below it whether it was held out."""
+    split, name = o.unit_split[unit], plot_text(o.unit_names[unit], 30)
+    return name if split == "fit" else f"{name}<br><i>{SPLIT_NAMES.get(split, split)}</i>"
+
+
+def _compared(steps: Sequence[Step]) -> list[Step]:
+    """The two models whose traces are drawn: the first refit of the chain, and its last model."""
+    refits = [s for s in steps if s.short == "refitted"]
+    first = refits[0] if refits else steps[0]
+    return [first] if first is steps[-1] else [first, steps[-1]]
 
 
 def dependence(result: Result) -> list[Block]:
@@ -149,7 +188,7 @@ def gallery(result: Result) -> list[Block]:
             y=residual[at],
             mode="markers",
             name="residual of the refitted model",
-            marker={"color": INK, "size": 4},
+            marker={"color": INK, "size": 7},
             showlegend=n == 0,
             legendgroup="r",
             **place,
@@ -205,17 +244,18 @@ def _abscissa(traces: Traces, at: np.ndarray) -> tuple[np.ndarray, str]:
     return (place[at, 0], "slip ratio") if place is not None else (traces.time[at], "time, s")
 
 
-def _panel(traces: Traces, channel: str, unit: int, at: np.ndarray) -> dict[str, Any]:
+def _panel(models: Sequence[Step], channel: str, unit: int, at: np.ndarray) -> dict[str, Any]:
+    traces = models[0].result.traces
+    assert traces is not None
     x, x_title = _abscissa(traces, at)
     order = np.argsort(x, kind="stable")
     at, x = at[order], x[order]
-    o, row = traces.observations, _baseline(traces)
-    models = [row, len(traces.labels) - 1] if row < len(traces.labels) - 1 else [row]
+    o = traces.observations
     y = [
         o.value[at],
-        *(traces.predicted[m][at] for m in models),
+        *(m.predicted[at] for m in models),
         *([] for _ in range(2 - len(models))),
-        *(traces.residual[m][at] for m in models),
+        *(m.residual[at] for m in models),
         *([] for _ in range(2 - len(models))),
     ]
     name = f"{channel_label(channel)}: {o.unit_names[unit]}"
@@ -233,39 +273,45 @@ def _plain(values: np.ndarray | list) -> list[float | None]:
     return [float(f"{v:.5g}") if np.isfinite(v) else None for v in values]
 
 
-def _detail(traces: Traces) -> go.Figure:
+def _detail(models: Sequence[Step]) -> go.Figure:
     """Measured and predicted above, residuals below; the panels fill it."""
     figure = make_subplots(2, 1, shared_xaxes=True, row_heights=[0.64, 0.36], vertical_spacing=0.06)
-    table = traces.observations.place is not None
-    improved = traces.labels[-1] if _baseline(traces) < len(traces.labels) - 1 else "-"
+    table = models[0].observations.place is not None
+    names = [plot_text(m.label) for m in models] + ["-"] * (2 - len(models))
     looks = [
         ("measured", MEASURED.colour, "circle", "solid"),
-        (traces.labels[_baseline(traces)], ORANGE, "triangle-up", "dot"),
-        (improved, BLUE, "square", "solid"),
+        (names[0], ORANGE, "triangle-up", "dot"),
+        (names[1], BLUE, "square", "solid"),
     ]
     for n, (name, colour, symbol, dash) in enumerate(looks):
         figure.add_scatter(
             x=[],
             y=[],
-            name=plot_text(name),
+            name=name,
             mode="markers" if n == 0 or table else "lines",
             showlegend=name != "-",
-            marker={"color": colour, "symbol": symbol, "size": 5},
+            marker={"color": colour, "symbol": symbol, "size": 10 if table else 5},
             line={"color": colour, "dash": dash, "width": 2},
             row=1,
             col=1,
         )
     for name, colour, symbol, _ in looks[1:]:
+        look = {"color": colour, "symbol": symbol, "size": 9 if table else 4}
         figure.add_scatter(
-            x=[],
-            y=[],
-            name=plot_text(f"residual, {name}"),
-            mode="markers",
-            showlegend=False,
-            marker={"color": colour, "symbol": symbol, "size": 4},
-            row=2,
-            col=1,
+            x=[], y=[], name=f"residual, {name}", mode="markers", showlegend=False, marker=look, row=2, col=1
         )
+    figure.add_shape(
+        type="rect",
+        xref="x2 domain",
+        yref="y2",
+        x0=0,
+        x1=1,
+        y0=-2.0,
+        y1=2.0,
+        line={"width": 0},
+        fillcolor=faded(BLUE, 0.12),
+        layer="below",
+    )
     finish(
         figure,
         480,

@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 
 from lunar_mjx.diagnosis.report.steps import Ceiling, Error, Step
 from lunar_mjx.diagnosis.report.words import plot_text, port_label, shown
-from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, SKY, VERMILION, faded, finish
+from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, VERMILION, faded, finish
 
 SHADES = ((0.0, "#f7fbff"), (0.25, "#c6dbef"), (0.5, "#6baed6"), (0.75, "#2171b5"), (1.0, "#08306b"))
 """One hue from light to dark: in grey it reads the same."""
@@ -18,70 +18,59 @@ SHADES = ((0.0, "#f7fbff"), (0.25, "#c6dbef"), (0.5, "#6baed6"), (0.75, "#2171b5
 def waterfall(
     steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[Error | None], measure: str, top: Ceiling | None
 ) -> go.Figure:
-    """The error of each model of the chain, and what every step takes off or puts on."""
-    labels = [plot_text(s.short, 80).replace("&lt;br&gt;", "<br>") for s in steps]
-    x = [f"{i + 1}. {label}" for i, label in enumerate(labels)]
-    value = np.array([e.value for e in judged])
-    logarithmic = bool(value.max() > 15.0 * max(value.min(), 0.5))
-    bottom = 0.5 * min(1.0, float(value.min())) if logarithmic else 0.0
-    before = np.concatenate([[value[0]], value[:-1]])
-    whole = np.zeros(len(value), bool)
-    whole[[0, -1]] = True
-    low = np.where(whole, bottom, np.minimum(value, before))
-    high = np.where(whole, value, np.maximum(value, before))
+    """The error of each model of the chain, a row each from the first to the last, with its interval."""
+    names = [f"{i}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for i, s in enumerate(steps, 1)]
+    value = [e.value for e in judged]
+    known = [(name, e) for name, e in zip(names, fitted, strict=True) if e is not None and measure != "fitted"]
+    highest = max(e.high if np.isfinite(e.high) else e.value for e in (*judged, *(e for _, e in known)))
+    logarithmic = bool(max(value) > 15.0 * max(min(value), 0.5))
     figure = go.Figure()
-    for name, mask, colour, pattern in (
-        ("error", whole, BLUE, ""),
-        ("taken off by the step", ~whole & (value <= before), SKY, "\\"),
-        ("put on by the step", ~whole & (value > before), VERMILION, "x"),
-    ):
-        if mask.any():
-            figure.add_bar(
-                x=[x[i] for i in np.flatnonzero(mask)],
-                base=low[mask].tolist(),
-                y=(high - low)[mask].tolist(),
-                name=name,
-                marker={
-                    "color": colour,
-                    "line": {"color": INK, "width": 1},
-                    "pattern": {"shape": pattern, "fgcolor": INK, "fillmode": "overlay", "size": 7},
-                },
-                hoverinfo="skip",
-            )
-    figure.add_scatter(
-        x=x,
-        y=value.tolist(),
-        mode="markers+text",
+    figure.add_bar(
+        x=value,
+        y=names,
+        orientation="h",
+        width=0.5,
         name=f"{measure} manoeuvres, with 95 % interval",
-        text=[f" {shown(v)}" for v in value],
-        textposition="middle right",
-        textfont={"size": 14},
-        marker={"color": INK, "size": 9, "symbol": "diamond"},
-        error_y=_interval(judged),
-        hovertemplate="%{y:.4g} sigma<extra></extra>",
+        marker={
+            "color": [faded(BLUE, 0.45)] * (len(value) - 1) + [faded(VERMILION, 0.6)],
+            "line": {"color": INK, "width": 1},
+        },
+        error_x={**_interval(judged)},
+        hovertemplate="%{x:.4g} sigma<extra></extra>",
     )
-    known = [(a, e) for a, e in zip(x, fitted, strict=True) if e is not None]
-    if measure != "fitted" and known:
+    if known:
         figure.add_scatter(
-            x=[a for a, _ in known],
-            y=[e.value for _, e in known],
+            x=[e.value for _, e in known],
+            y=[name for name, _ in known],
             mode="markers",
             name="fitted manoeuvres",
             marker={"color": ORANGE, "size": 11, "symbol": "triangle-up", "line": {"color": INK, "width": 1}},
-            error_y=_interval([e for _, e in known]),
-            hovertemplate="%{y:.4g} sigma<extra></extra>",
+            hovertemplate="%{x:.4g} sigma<extra></extra>",
         )
-    _level(figure, x, 1.0, "noise floor, 1 sigma", "solid")
+    for name, e in zip(names, judged, strict=True):
+        # numbers stand in a column of their own at the right, where no mark can be
+        figure.add_annotation(
+            xref="paper",
+            x=1.01,
+            y=name,
+            text=f"<b>{shown(e.value)}</b> sigma",
+            showarrow=False,
+            xanchor="left",
+            font={"size": 14},
+        )
+    _level(figure, names, 1.0, "noise floor, 1 sigma", "solid")
     if top is not None:
-        _level(figure, x, top.value, plot_text(f"ceiling, {shown(top.value)} sigma: {top.label}"), "dash")
-    finish(figure, 480, barmode="overlay", bargap=0.45, margin={"t": 90, "b": 80, "l": 62, "r": 16})
-    figure.update_yaxes(
-        title_text="root mean square residual, sigma", type="log" if logarithmic else "linear", rangemode="tozero"
+        _level(figure, names, top.value, plot_text(f"ceiling, {shown(top.value)} sigma: {top.label}"), "dash")
+    finish(figure, 150 + 42 * len(names), margin={"t": 74, "b": 52, "l": 24, "r": 96})
+    figure.update_yaxes(type="category", autorange="reversed", automargin=True, showgrid=False)
+    figure.update_xaxes(
+        title_text="root mean square residual, sigma",
+        type="log" if logarithmic else "linear",
+        range=[0.0, 1.05 * max(highest, 1.2)],
     )
     if logarithmic:
-        most = max([e.high if np.isfinite(e.high) else e.value for e in (*judged, *(e for _, e in known))])
-        figure.update_yaxes(range=[np.log10(bottom), np.log10(1.3 * most)], dtick="D2", minor={"ticks": "outside"})
-    figure.update_xaxes(type="category", categoryorder="array", categoryarray=x)
+        low = np.log10(0.5 * min(1.0, *value))
+        figure.update_xaxes(range=[low, np.log10(1.2 * highest)], dtick="D2")
     return figure
 
 
@@ -91,16 +80,17 @@ def _interval(errors: Sequence[Error]) -> dict:
     return {"type": "data", "array": up, "arrayminus": down, "color": INK, "thickness": 1.5, "width": 6}
 
 
-def _level(figure: go.Figure, x: Sequence[str], y: float, name: str, dash: str) -> None:
+def _level(figure: go.Figure, names: Sequence[str], x: float, name: str, dash: str) -> None:
+    """A line across all rows, with an entry in the legend."""
     figure.add_scatter(
-        x=[x[0], x[-1]] if len(x) > 1 else x,
-        y=[y] * min(len(x), 2),
+        x=[x, x],
+        y=[names[0], names[-1]],
         mode="lines",
         name=name,
-        line={"color": MUTED, "dash": dash, "width": 2},
         hoverinfo="skip",
+        line={"color": MUTED, "dash": dash, "width": 2},
     )
-    figure.add_hline(y=y, line={"color": MUTED, "dash": dash, "width": 2})
+    figure.add_vline(x=x, line={"color": MUTED, "dash": dash, "width": 2})
 
 
 def bars(values: Mapping[str, float | None], title: str, named: str = "") -> go.Figure:

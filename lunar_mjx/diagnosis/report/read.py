@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,15 @@ from lunar_mjx.diagnosis.runs import (
     COMPARISON_FILE,
     FITS_FILE,
     FORMAT,
+    MODEL_FILE,
     RUN_FILE,
     SERIES_FILE,
     SIGNATURES_FILE,
     VERDICT_FILE,
 )
 from lunar_mjx.errors import UserError, bad_input, require_file
-from lunar_mjx.inference.observations import Observations, Series
+from lunar_mjx.model import Model
+from lunar_mjx.model.file import load_model
 
 AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE = "audit.json", "unknown.json", "next.json"
 
@@ -70,6 +73,7 @@ class Result:
       comparison, verdict, fits, audit, unknown, next: contents of the other files, None where not written.
       traces: measurements and predictions, None where not written.
       signatures: whitened signature of each effect that was scored, over the fitted observations, in sigma.
+      folder: where it lies; None for one made in memory.
     """
 
     name: str
@@ -82,6 +86,17 @@ class Result:
     next: dict[str, Any] | None
     traces: Traces | None
     signatures: dict[str, np.ndarray]
+    folder: Path | None = None
+
+    @functools.cached_property
+    def model(self) -> Model | None:
+        """The model that was compared; None where it cannot be loaded any more, such as without a user's effect."""
+        if self.folder is None or not (self.folder / MODEL_FILE).is_file():
+            return None
+        try:
+            return load_model(self.folder / MODEL_FILE)
+        except UserError:
+            return None
 
 
 def read_result(folder: Path) -> Result:
@@ -95,12 +110,10 @@ def read_result(folder: Path) -> Result:
     if run is None or run.get("format") != FORMAT:
         raise bad_input(path, "format", (run or {}).get("format"), "is not known", f"give a run of format {FORMAT}")
     names = (COMPARISON_FILE, VERDICT_FILE, FITS_FILE, AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE)
+    comparison, verdict, fits, audit, unknown, following = (_json(folder / name) for name in names)
+    traces, signatures = _traces(folder / SERIES_FILE), _signatures(folder / SIGNATURES_FILE)
     return Result(
-        folder.resolve().name,
-        run,
-        *(_json(folder / n) for n in names),
-        traces=_traces(folder / SERIES_FILE),
-        signatures=_signatures(folder / SIGNATURES_FILE),
+        folder.resolve().name, run, comparison, verdict, fits, audit, unknown, following, traces, signatures, folder
     )
 
 

@@ -64,15 +64,16 @@ def chain(results: Sequence[Result]) -> list[Step]:
                     steps.append(Step("the model as given", "as given", result.name, result, row))
             elif label == "refitted":
                 names = ", ".join(new)
-                words = ("the model refitted", "refitted") if not names else (f"with {names}, refitted", f"+ {names}")
+                words = (
+                    ("the model refitted", "refitted")
+                    if not names
+                    else (f"the model with {names}, refitted", f"+ {names}")
+                )
                 steps.append(Step(*words, result.name, result, row))
             elif last:
                 names = label.removeprefix("with ")
-                steps.append(
-                    Step(
-                        f"with {names}, as the diagnosis proposes", f"+ {names}<br>(proposed)", result.name, result, row
-                    )
-                )
+                words = (f"the model with {names}, as the diagnosis proposes", f"+ {names}<br>(proposed)")
+                steps.append(Step(*words, result.name, result, row))
     return steps
 
 

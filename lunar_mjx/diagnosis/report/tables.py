@@ -12,6 +12,7 @@ from lunar_mjx import __version__
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error, Step
 from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, shown
+from lunar_mjx.model.describe import by_group
 from lunar_mjx.report.page import Block, Facts, Table, Text
 
 _MOST_ROWS = 30
@@ -34,7 +35,7 @@ def error_rows(steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[
         "tables); the last column counts the blocks."
     )
     header = ["model", "run", f"{measure}, sigma", "change", "fitted, sigma", "blocks"]
-    return Table("Error of each model", header, rows, note, texts=2)
+    return Table("Error of each model in numbers", header, rows, note, texts=2, folded=True)
 
 
 def _with_interval(e: Error | None) -> str:
@@ -103,7 +104,9 @@ def effects(result: Result) -> list[Block]:
         by_reason.setdefault(str(n.get("reason", "")), []).append(str(n.get("effect", "")))
     silent += [[", ".join(names), f"cannot be tested with these logs: {reason}"] for reason, names in by_reason.items()]
     if silent:
-        blocks.append(Table("Effects that these logs cannot test", ["effect", "why"], silent, texts=2))
+        blocks.append(
+            Table("Effects that these logs cannot test, and why", ["effect", "why"], silent, texts=2, folded=True)
+        )
     return blocks
 
 
@@ -120,21 +123,61 @@ def parameters(first: Result, last: Result) -> list[Block]:
             sa, sb = ((t.get("std") or {}).get(name) for t in (old, new))
             unit = (found.get("unit") or {}).get(name, "")
             given = (old.get("given") or {}).get(name)
-            bias, strength = "-", "-"
-            if a is not None and b is not None and a != b:
-                bias = shown(a - b) + (f" ({100.0 * (a / b - 1.0):+.0f} %)" if b else "")
-                strength = shown(abs(a - b) / sa, 2) if sa else "-"
-            rows.append([f"{effect}.{name}", unit, shown(given), plus_minus(a, sa), plus_minus(b, sb), bias, strength])
+            strength = shown(abs(a - b) / sa, 2) if a is not None and b is not None and a != b and sa else "-"
+            for label, own, now in _sizes(first, last, effect, name, unit):
+                # values before are in units of the first run's model, values after in those of the last one's
+                (g, a_, sa_), (b_, sb_) = _scaled(own, given, a, sa), _scaled(now, b, sb)
+                bias = "-"
+                if a_ is not None and b_ is not None and a != b:
+                    bias = shown(a_ - b_) + (f" ({100.0 * (a_ / b_ - 1.0):+.0f} %)" if b_ else "")
+                unit_ = _unit(first, last, effect, name, unit)
+                rows.append([label, unit_, shown(g), plus_minus(a_, sa_), plus_minus(b_, sb_), bias, strength])
     if not rows:
         return []
     note = (
         "Bias: the refitted value before less the value with the effects named, that is, what the parameter had taken "
         "up for the missing physics; the last column is its size in standard deviations of the value before. Standard "
-        "deviations are those of the noise alone: while the residual is above the noise they are too small. The unit "
-        "factor marks a factor on the model's own values, which differ between wheels or joints."
+        "deviations are those of the noise alone: while the residual is above the noise they are too small."
     )
     header = ["parameter", "unit", "as given", "refitted, before", "with the effects", "bias before", "bias, std"]
     return [Table("Parameters before and after", header, rows, note, texts=2)]
+
+
+def _scaled(own: float, *values: float | None) -> list[float | None]:
+    return [None if v is None else own * v for v in values]
+
+
+def _unit(first: Result, last: Result, effect: str, name: str, unit: str) -> str:
+    """Unit of a parameter; of one that is fitted as a common factor, the unit of the values that it multiplies."""
+    if unit != "factor":
+        return "" if unit == "1" else unit
+    model = last.model or first.model
+    known = {e.name: e for e in model.effects} if model else {}
+    if effect not in known:
+        return "times the model's own"
+    found = known[effect].parameters[name].unit
+    return "" if found == "1" else found
+
+
+def _sizes(first: Result, last: Result, effect: str, name: str, unit: str) -> list[tuple[str, float, float]]:
+    """Rows of a parameter: label, and what its values in the first and in the last run are to be multiplied with.
+
+    A factor on values that differ between wheels or joints gives a row for each group of them that agree.
+    """
+    label = f"{effect}.{name}"
+    if unit != "factor":
+        return [(label, 1.0, 1.0)]
+    owns = []
+    for result in (first, last):
+        model = result.model
+        value = (model.parameters.get(effect) or {}).get(name) if model else None
+        owns.append(None if value is None else value if isinstance(value, tuple) else (value,))
+    before, after = (own or other for own, other in ((owns[0], owns[1]), (owns[1], owns[0])))
+    model = last.model or first.model
+    if model is None or not before or not after or len(before) != len(after):
+        return [(label, 1.0, 1.0)]
+    groups = by_group(list(zip(before, after, strict=True)), model)
+    return [(f"{label} ({group})" if group else label, *pair) for group, pair in groups]
 
 
 def by_channel(result: Result) -> list[Block]:
@@ -160,6 +203,7 @@ def by_channel(result: Result) -> list[Block]:
             ],
             f"The {len(worst)} worst of {len(rows)}." if len(rows) > len(worst) else "",
             texts=3,
+            folded=True,
         )
     ]
 
@@ -182,7 +226,7 @@ def provenance(results: Sequence[Result]) -> list[Block]:
     rows = []
     for r in results:
         test = (r.comparison or {}).get("certificate") or {}
-        chosen = ", ".join(f"{k} = {v}" for k, v in (r.run.get("splits") or {}).items()) or "default"
+        chosen = ", ".join(f"{k} = {v}" for k, v in (r.run.get("splits") or {}).items()) or "none"
         details = (r.verdict or {}).get("details") or {}
         problems = "; ".join(test.get("problems") or []) or ("complete" if test else "-")
         added = ", ".join(r.run.get("added") or []) or "-"
@@ -213,7 +257,25 @@ def _splits(result: Result) -> list[Block]:
     for name, split in zip(o.unit_names, o.unit_split, strict=True):
         groups.setdefault(split, []).append(name)
     rows = [[SPLIT_NAMES.get(k, k), str(int(o.in_split(k).sum())), ", ".join(v)] for k, v in groups.items()]
-    return [Table("Splits", ["split", "observations", "manoeuvres or groups of points"], rows, texts=3)]
+    header = ["split", "observations", "manoeuvres or groups of points"]
+    return [Table("Splits", header, rows, _who_split(result, o.unit_names), texts=3)]
+
+
+def _who_split(result: Result, units: Sequence[str]) -> str:
+    """Who decided which manoeuvres are held out: the user, the logs, or the default rule."""
+    own = [u for u in units if u in (result.run.get("splits") or {})]
+    stated = (result.comparison or {}).get("log_splits") or {}
+    parts = []
+    if stated:
+        said = ", ".join(f"{log} ({SPLIT_NAMES.get(split, split)})" for log, split in stated.items())
+        parts.append(f"Stated by the logs themselves: {said}.")
+    if own:
+        parts.append(f"Chosen by the user with --split: {', '.join(own)}.")
+    if not stated and not own:
+        parts.append("By the default rule: no log states a split, and none was chosen with --split.")
+    elif len(own) < len(units) and result.traces is not None and len(stated) < len(result.traces.observations.logs):
+        parts.append("The others by the default rule.")
+    return " ".join(parts)
 
 
 def _openings(results: Sequence[Result]) -> list[Block]:

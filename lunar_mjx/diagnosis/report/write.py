@@ -7,6 +7,7 @@ from pathlib import Path
 
 from lunar_mjx import __version__
 from lunar_mjx.diagnosis.report import explore, figures, tables
+from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result, read_result
 from lunar_mjx.diagnosis.report.steps import Step, ceiling, chain, comparable, error, judged
 from lunar_mjx.diagnosis.report.words import and_list, shown
@@ -36,20 +37,21 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
     if (judge.verdict or {}).get("verdict") == "BAD_DATA":
         sections.append(Section("Why the logs cannot be used", tables.findings(judge)))
     if steps:
-        sections += [_error_section(steps, results), _where(judge)]
+        sections += [_error_section(steps, results), _where(judge, steps)]
     if judge.verdict:
         sections.append(_why(judge, results))
     sections.append(Section("Parameters", tables.parameters(results[0], results[-1])))
     sections.append(Section("Provenance", tables.provenance(results)))
     logs = list(dict.fromkeys(Path(p).name for p in results[-1].run.get("logs") or []))
     title = f"Criticism of a model: {and_list(logs[:4])}" + (f" and {len(logs) - 4} more" if len(logs) > 4 else "")
-    return write_page(Path(out), title, _verdict(results, judge, steps), [s for s in sections if s.blocks])
+    shown_sections = [s for s in sections if s.blocks]
+    return write_page(Path(out), title, _verdict(results, judge, steps), shown_sections, lead(results, judge))
 
 
 def _verdict(results: Sequence[Result], judge: Result, steps: Sequence[Step]) -> list[str]:
     lines = []
     if judge.verdict:
-        lines.append(f"{judge.verdict.get('verdict')}: {judge.verdict.get('sentence')}")
+        lines.append(f"Verdict on {judge.name}, {judge.verdict.get('verdict')}: {judge.verdict.get('sentence')}")
     if not judge.verdict or judge is not results[-1]:
         last = results[-1].name
         lines.append(f"{last} has been compared, not diagnosed; ask lunar-mjx why {last} for its verdict.")
@@ -100,8 +102,9 @@ def _error_section(steps: Sequence[Step], results: Sequence[Result]) -> Section:
     return Section("The error, step by step", blocks)
 
 
-def _where(judge: Result) -> Section:
-    blocks: list[Block] = [*explore.panels(judge), *tables.by_channel(judge), *explore.dependence(judge)]
+def _where(judge: Result, steps: Sequence[Step]) -> Section:
+    mapped = steps if comparable(steps) else chain([judge])
+    blocks: list[Block] = [*explore.panels(mapped), *tables.by_channel(judge), *explore.dependence(judge)]
     verdict = judge.verdict or {}
     ports = verdict.get("ports") or {}
     if ports:

@@ -5,6 +5,9 @@ const byId = (id) => document.getElementById(id);
 const number = (v, digits) =>
   v === null ? "–" : (Number(v.toFixed(digits)) || 0).toFixed(digits).replace("-", "−");   // no minus before zero
 
+const WORDS = { lf: "left front", rf: "right front", lm: "left middle", rm: "right middle", lr: "left rear",
+  rr: "right rear" };
+
 export class Panel {
   constructor(scene) {
     byId("title").textContent = `${scene.rover} on ${scene.terrain}`;
@@ -17,12 +20,20 @@ export class Panel {
       cell.scope = "col";
       head.append(cell);
     }
+    // the bars' scale: braked and locked, rolling freely, spinning on the spot
+    const scale = table.tHead.insertRow(), ticks = document.createElement("div");
+    scale.className = "scale";
+    scale.insertCell();
+    scale.insertCell().append(ticks);
+    ticks.title = "-1: locked, 0: rolling without slip, 1: spinning on the spot";
+    for (const text of ["−1", "0", "1"]) ticks.append(Object.assign(document.createElement("span"), { textContent: text }));
     const body = table.createTBody();
     this.rows = scene.wheels.map((wheel) => {
       const row = body.insertRow();
       row.dataset.wheel = wheel.corner;
       const [name, slip, sinkage, winding] = [0, 1, 2, 3].map(() => row.insertCell());
-      name.textContent = wheel.corner;
+      name.textContent = WORDS[wheel.corner] ?? wheel.corner;
+      name.title = wheel.corner;
       const bar = document.createElement("span"), fill = document.createElement("i"), text = document.createElement("span");
       bar.className = "bar";
       bar.append(fill);

@@ -109,14 +109,17 @@ void main() {
     // grousers and spokes, so that the eye sees it roll
     float turn = atan(own.y, own.x) / 6.2831853;
     float rim = step(abs(fract(24.0 * turn) - 0.5), 0.16), spoke = step(abs(fract(6.0 * turn) - 0.5), 0.10);
-    base *= 1.0 + 1.2 * (edgewise > 0.5 ? spoke : rim);
+    // bright metal is drawn no brighter than sunlit soil, which the picture is exposed for
+    base = min(base, vec3(0.34)) * (0.75 + 0.75 * (edgewise > 0.5 ? spoke : rim));
   }
   float facingSun = max(dot(n, sun), 0.0), light = facingSun > 0.0 ? (kind == 2 ? 1.0 : lit()) : 0.0;  // else the seam would cast one
   float shine = gloss * pow(max(dot(n, normalize(sun + toEye)), 0.0), 40.0);
   // fill: light thrown back by the ground, so that shadows are dark but not holes
   float fill = 0.06 + 0.05 * (1.0 - n.z);
   vec3 sum = base * (exposure * 1.35 * facingSun * light + fill) + vec3(shine * light * exposure);
-  pixel = vec4(pow(1.25 * sum / (1.0 + 0.6 * sum), vec3(1.0 / 2.0)), 1.0);
+  // a filmic shoulder: the brightest parts of the rover keep their shading
+  vec3 film = sum * (2.51 * 0.62 * sum + 0.03 * 2.0) / (0.62 * sum * (2.43 * 0.62 * sum + 0.59) + 0.14) * 0.62;
+  pixel = vec4(pow(clamp(film, 0.0, 1.0), vec3(1.0 / 2.0)), 1.0);
 }`;
 
 const STAR_VERTEX = `#version 300 es

@@ -9,6 +9,7 @@ import pytest
 
 from lunar_mjx.diagnosis.report import explore
 from lunar_mjx.diagnosis.report.read import Result, Traces
+from lunar_mjx.diagnosis.report.steps import chain
 from lunar_mjx.inference.observations import Observations, Series
 
 TIME = np.arange(60) * 0.5
@@ -38,7 +39,7 @@ def result():
 
 
 def test_every_channel_of_every_manoeuvre_has_a_panel_and_the_worst_comes_first(result):
-    (block,) = explore.panels(result)
+    (block,) = explore.panels(chain([result]))
     assert len(block.panels) == 4
     first = next(iter(block.panels.values()))
     assert first["label"] == "motor lf drive current, A: climb"
@@ -47,7 +48,12 @@ def test_every_channel_of_every_manoeuvre_has_a_panel_and_the_worst_comes_first(
     np.testing.assert_allclose(left, result.traces.residual[1, 180:], rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(less, result.traces.residual[2, 180:], rtol=1e-4, atol=1e-4)
     assert len(refitted) == len(improved) == len(first["x"]) == 60
-    assert {str(k) for row in block.figure.data[0].customdata for k in row} == set(block.panels)
+    maps = block.figure.data
+    assert len(maps) == 3  # as given, refitted, with drag: one for each model of the chain
+    for heat, residual in zip(maps, result.traces.residual, strict=True):
+        assert {str(k) for row in heat.customdata for k in row} == set(block.panels)
+        worst = float(np.log10(np.sqrt(np.nanmean(residual[180:] ** 2))))
+        assert heat.z[1][1] == pytest.approx(max(worst, np.log10(0.3)))
     json.dumps(block.panels, allow_nan=False)
 
 

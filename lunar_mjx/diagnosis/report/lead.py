@@ -1,0 +1,91 @@
+"""What a report says first: a badge, one plain sentence, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lunar_mjx.diagnosis.report.read import Result
+from lunar_mjx.diagnosis.report.words import and_list
+from lunar_mjx.report.page import Lead
+
+_TONES = {
+    "NOISE_ONLY": ("nothing missing", "good"),
+    "KNOWN": ("effect named", "good"),
+    "MULTIPLE": ("effects named", "good"),
+    "KNOWN_CLASS": ("still ambiguous", "open"),
+    "UNKNOWN": ("unknown effect", "open"),
+    "UNDECIDABLE": ("cannot be decided", "open"),
+    "BAD_FIT": ("fit not trusted", "bad"),
+    "BAD_DATA": ("logs not usable", "bad"),
+}
+"""Words and tone of the badge of each verdict."""
+
+
+def lead(results: Sequence[Result], judge: Result) -> Lead:
+    """Badge, sentence and next steps for a chain of runs, of which `judge` is the last one diagnosed."""
+    last, added = results[-1], list(results[-1].run.get("added") or [])
+    if not judge.verdict:
+        return Lead(
+            "not diagnosed",
+            "open",
+            "The model has been compared with the logs. Nobody has asked yet why it fails.",
+            [f"lunar-mjx why {last.name}"],
+        )
+    name = str(judge.verdict.get("verdict"))
+    named = [str(e) for e in judge.verdict.get("effects") or []]
+    badge, tone = _TONES.get(name, (name, "open"))
+    sentence = _sentence(name, named, str(judge.verdict.get("port") or ""), added)
+    steps = _next(name, named, judge)
+    if judge is not last:
+        steps = [f"lunar-mjx why {last.name}  (this model has not been diagnosed since {_and(added)} was added)"]
+    return Lead(badge, tone, sentence, steps)
+
+
+def _sentence(name: str, named: Sequence[str], port: str, added: Sequence[str]) -> str:
+    where = f" at the port {port}" if port else ""
+    since = f" now that it has {_and(added)}" if added else ""
+    return {
+        "NOISE_ONLY": f"The model explains these measurements down to their noise{since}.",
+        "KNOWN": f"The model lacks one effect, and it can be named: {_and(named)}.",
+        "MULTIPLE": f"The model lacks several effects: {_and(named)}.",
+        "KNOWN_CLASS": f"The model lacks one of {_or(named)}; these measurements cannot tell them apart."
+        if len(named) > 1
+        else f"The model lacks {_and(named)}, or something that is on no list.",
+        "UNKNOWN": f"The model lacks something{where} that no effect of the catalogue explains.",
+        "UNDECIDABLE": "These measurements hold no trace that could decide about the effect asked for.",
+        "BAD_FIT": "The fit of the model did not converge, so nothing is said about physics.",
+        "BAD_DATA": "The logs contradict themselves, so nothing is said about physics.",
+    }.get(name, "")
+
+
+def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
+    run = judge.name
+    log = next(iter(judge.run.get("logs") or ["LOG"]))
+    return {
+        "NOISE_ONLY": [
+            f"Use the fitted model: lunar-mjx simulate --model {run}/model.toml",
+            "Test it on a manoeuvre that no fit has seen; that is where the next missing effect shows.",
+        ],
+        "KNOWN": [f"lunar-mjx add {run} {' '.join(named)} -o NEXT_RUN", "lunar-mjx why NEXT_RUN"],
+        "MULTIPLE": [f"lunar-mjx add {run} {' '.join(named)} -o NEXT_RUN", "lunar-mjx why NEXT_RUN"],
+        "KNOWN_CLASS": [
+            f"lunar-mjx next {run}  (names the manoeuvre that tells them apart)",
+            "Drive that manoeuvre, and compare with its log too.",
+        ],
+        "UNKNOWN": [f"lunar-mjx unknown {run}  (suggests a formula, as a ready effect file)"],
+        "UNDECIDABLE": [f"lunar-mjx next {run}  (names the manoeuvre that would show it)"],
+        "BAD_FIT": [
+            "Free fewer parameters or add manoeuvres, and compare again; the certificate under Provenance "
+            "says what failed."
+        ],
+        "BAD_DATA": ["Mend what the findings below name.", f"lunar-mjx log check {log}"],
+    }.get(name, [])
+
+
+def _and(names: Sequence[str]) -> str:
+    return and_list([n.replace("_", " ") for n in names])
+
+
+def _or(names: Sequence[str]) -> str:
+    words = [n.replace("_", " ") for n in names]
+    return ", ".join(words[:-1]) + " and " + words[-1] if len(words) > 1 else "".join(words)

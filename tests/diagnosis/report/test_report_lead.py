@@ -1,0 +1,95 @@
+"""What the report says first: a badge, a plain sentence and the next command, for every verdict."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lunar_mjx.diagnosis.report import figures, tables
+from lunar_mjx.diagnosis.report.lead import lead
+from lunar_mjx.diagnosis.report.read import Result
+from lunar_mjx.diagnosis.report.steps import Error
+from lunar_mjx.diagnosis.verdict import Verdict
+
+
+def result(name: str, verdict: dict | None, comparison: dict | None = None, **run) -> Result:
+    return Result(name, run, comparison, verdict, None, None, None, None, None, {})
+
+
+@pytest.mark.parametrize("verdict", Verdict)
+def test_every_verdict_has_a_sentence_and_says_what_to_do_next(verdict: Verdict):
+    judge = result("run1", {"verdict": verdict.label, "effects": ["slip_sinkage"], "port": "soil"}, logs=["mine"])
+    found = lead([judge], judge)
+    assert found.badge and found.badge != verdict.label and found.sentence.endswith(".") and found.next
+    assert found.tone in ("good", "open", "bad")
+
+
+def test_what_was_named_is_added_by_the_command_that_follows():
+    judge = result("run1", {"verdict": "KNOWN", "effects": ["slip_sinkage"]})
+    found = lead([judge], judge)
+    assert "slip sinkage" in found.sentence
+    assert found.next[0] == "lunar-mjx add run1 slip_sinkage -o NEXT_RUN"
+
+
+def test_a_run_that_was_not_diagnosed_asks_for_it():
+    judge = result("run1", {"verdict": "KNOWN", "effects": ["grousers"]})
+    last = result("run2", None, added=["grousers"])
+    assert lead([judge, last], judge).next[0].startswith("lunar-mjx why run2 ")
+    assert lead([last], last).next == ["lunar-mjx why run2"]
+
+
+class Named:
+    """A step as the figure reads it."""
+
+    def __init__(self, short: str):
+        self.short = short
+
+
+def test_labels_of_the_waterfall_stand_in_places_of_their_own():
+    steps = [Named("as given"), Named("refitted"), Named("+ slip_sinkage<br>(proposed)")]
+    errors = [Error(v, 0.9 * v, 1.2 * v, 10, 5) for v in (12.8, 8.4, 1.2)]
+    figure = figures.waterfall(steps, errors, [None] * 3, "held-out", None)  # type: ignore[arg-type]
+    bars = figure.data[0]
+    assert list(bars.x) == [12.8, 8.4, 1.2] and len(set(bars.y)) == 3
+    notes = [a for a in figure.layout.annotations if "sigma" in a.text]
+    assert [a.y for a in notes] == list(bars.y)
+    assert all(a.xref == "paper" and a.x > 1.0 for a in notes)  # beyond every mark
+
+
+def test_a_common_factor_is_shown_in_the_unit_of_what_it_multiplies(tmp_path):
+    from lunar_mjx.model import make_model
+    from lunar_mjx.model.file import save_model
+
+    model = make_model("viper", "flat", "consistent")
+    save_model(model, tmp_path / "model.toml")
+    fitted = {
+        "motor": {
+            "value": {"gear_ratio": 1.1},
+            "std": {"gear_ratio": 0.01},
+            "given": {"gear_ratio": 1.0},
+            "unit": {"gear_ratio": "factor"},
+        }
+    }
+    run = Result("run1", {}, {"parameters": fitted}, None, None, None, None, None, None, {}, tmp_path)
+    (table,) = tables.parameters(run, run)
+    own = np.unique(np.asarray(model.parameters["motor"]["gear_ratio"], float))
+    assert len(table.rows) == len(own) > 1
+    shown = sorted(float(row[2]) for row in table.rows)
+    np.testing.assert_allclose(shown, own, rtol=5e-3)
+    after = sorted(float(row[4].split(" ")[0]) for row in table.rows)
+    np.testing.assert_allclose(after, 1.1 * own, rtol=5e-3)
+    assert not any("factor" in cell for row in table.rows for cell in row)
+
+
+@pytest.mark.parametrize(
+    ("comparison", "splits", "words"),
+    [
+        ({}, {}, "default rule"),
+        ({"log_splits": {"a": "fit", "b": "test"}}, {}, "Stated by the logs"),
+        ({"log_splits": {"a": "fit"}}, {"b": "select"}, "--split: b"),
+    ],
+)
+def test_who_decided_the_splits_is_said(comparison: dict, splits: dict, words: str):
+    said = tables._who_split(result("run1", None, comparison, splits=splits), ["a", "b"])
+    assert words in said
+    assert ("no log states a split" in said) == (not comparison and not splits)
