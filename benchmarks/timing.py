@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import platform
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,14 @@ def sharded(function: Callable[[Any], Any], state: Any, devices: list[Any]) -> t
     split = jax.sharding.PartitionSpec("batch")
     state = jax.device_put(state, jax.sharding.NamedSharding(mesh, split))
     return jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=split, check_vma=False), state
+
+
+def commit() -> str:
+    """Commit of the checkout, with "+" where files differ from it."""
+    root = Path(__file__).parent
+    head = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
+    changed = subprocess.run(["git", "diff", "--quiet", "HEAD"], cwd=root).returncode
+    return head.stdout.strip() + ("+" if changed else "")
 
 
 def cpu_name() -> str:

@@ -9,7 +9,7 @@ from typing import Any
 from lunar_mjx.effects.base import PORTS, Effect
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.joint.motor import WINDINGS
-from lunar_mjx.effects.presets import FLAWS, PRESETS, UNSAID
+from lunar_mjx.effects.presets import FIELD_CHANGES, FLAWS, PRESETS, UNSAID
 from lunar_mjx.effects.soil.ground import SOILS
 from lunar_mjx.effects.wheel.paper import REGULARISATIONS
 
@@ -85,6 +85,12 @@ def flaws() -> str:
     return table(["", "where", "`paper`", "`consistent`", "mended by"], rows)
 
 
+def field() -> str:
+    """What `consistent` leaves out and `field` computes."""
+    rows = [[cell(text) for text in change] for change in FIELD_CHANGES]
+    return table(["where", "`consistent`", "`field`", "mended by"], rows)
+
+
 def unsaid() -> str:
     """What the paper leaves unsaid, and where it needs regularising."""
     rows = [[cell(k), cell(str(v)), "unsaid"] for k, v in UNSAID.items()]
@@ -108,6 +114,7 @@ TABLES = {
     "effects": effects,
     "presets": presets,
     "flaws": flaws,
+    "field": field,
     "unsaid": unsaid,
     "soils": soils,
     "windings": windings,

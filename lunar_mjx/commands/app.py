@@ -150,7 +150,7 @@ def simulate(
 
 @app.command()
 def preset(
-    name: Annotated[str, typer.Argument(help="consistent or paper")],
+    name: Annotated[str, typer.Argument(help="consistent, field or paper")],
     rover: RoverOption = "viper",
     save: Annotated[Path | None, typer.Option(help="Write the preset as a model.toml.")] = None,
 ) -> None:

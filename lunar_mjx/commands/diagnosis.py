@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 RunArgument = Annotated[Path, typer.Argument(help="Run folder that `compare` or `add` wrote.")]
 LogsArgument = Annotated[list[Path], typer.Argument(help="Logs, or folders of logs; all drives or all wheel tables.")]
 ModelOption = Annotated[Path | None, typer.Option(help="model.toml; by default the preset on the logs' rover.")]
-PresetOption = Annotated[str, typer.Option(help="consistent or paper, where no --model is given.")]
+PresetOption = Annotated[str, typer.Option(help="consistent, field or paper, where no --model is given.")]
 EffectsOption = Annotated[
     list[str] | None, typer.Option("--effects", help="Your own effects to consider too, as my_effects.py:name.")
 ]

@@ -189,7 +189,7 @@ def simulate(
     effects: Annotated[
         list[str] | None, typer.Option(help="Hidden effect from your own file, as my_effects.py:name.")
     ] = None,
-    preset: Annotated[str, typer.Option(help="consistent or paper.")] = "consistent",
+    preset: Annotated[str, typer.Option(help="consistent, field or paper.")] = "consistent",
     model: Annotated[Path | None, typer.Option(help="model.toml; overrides --rover and --preset.")] = None,
     terrain: Annotated[str | None, typer.Option(help="In place of the manoeuvre's terrain.")] = None,
     gravity: Annotated[float | None, typer.Option(help="m/s2")] = None,

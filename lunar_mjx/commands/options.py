@@ -12,7 +12,7 @@ from lunar_mjx.errors import bad_input
 
 RoverOption = Annotated[str, typer.Option(help="Name of a shipped rover, or folder that `convert` wrote.")]
 TerrainOption = Annotated[str, typer.Option(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")]
-PresetOption = Annotated[str, typer.Option(help="consistent or paper.")]
+PresetOption = Annotated[str, typer.Option(help="consistent, field or paper.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 

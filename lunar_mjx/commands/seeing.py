@@ -82,7 +82,7 @@ def view(
     terrain: Annotated[
         str, typer.Option(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")
     ] = "lunar_plain",
-    preset: Annotated[str, typer.Option(help="consistent or paper.")] = "consistent",
+    preset: Annotated[str, typer.Option(help="consistent, field or paper.")] = "consistent",
     model: ModelOption = None,
     effects: Annotated[
         list[str] | None, typer.Option(help="Effect to add: catalogue name, my_effects.py or my_effects.py:name.")

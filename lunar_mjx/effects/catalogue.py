@@ -50,6 +50,7 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         stress_integral.stress_integral,
         rock.hard_ground,
         rock.boulders,
+        rock.static_boulders,
         rock.chassis_contact,
         rock.joint_limits,
         paper.penalty_contact,

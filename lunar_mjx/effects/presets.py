@@ -1,4 +1,4 @@
-"""The two presets: what is in each, what the paper leaves unsaid, and every difference between them by name."""
+"""The presets: what is in each, what the paper leaves unsaid, and every difference between them by name."""
 
 from __future__ import annotations
 
@@ -27,6 +27,32 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
         "housing_conduction",
         "housing_radiation",
     ),
+    "field": (
+        "joint_control",
+        "voltage_saturation",
+        "thermal_cutoff",
+        "motor",
+        "directional_gear_efficiency",
+        "soil",
+        "surface_type",
+        "slip_sinkage",
+        "multipass",
+        "stress_integral",
+        "shear_state",
+        "skid_shear",
+        "friction_circle",
+        "bulldozing",
+        "hard_ground",
+        "rolling_resistance",
+        "static_boulders",
+        "chassis_contact",
+        "joint_limits",
+        "winding_conduction",
+        "rotor_stator_path",
+        "gear_friction_heat",
+        "housing_conduction",
+        "housing_radiation",
+    ),
     "paper": (
         "joint_control",
         "thermal_cutoff",
@@ -43,12 +69,15 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
         "housing_convection",
     ),
 }
-"""Effects of each preset: `consistent`, the corrected physics and default, and `paper`, the equations as printed."""
+"""Effects of each preset: `consistent`, the paper's equations mended, `field`, what a drive outdoors needs beyond them,
+and `paper`, the equations as printed."""
 
 _PAPER_WINDING = WINDINGS[12]
 
 PRESET_PARAMETERS: Mapping[str, Mapping[str, Mapping[str, float | Mapping[str, float]]]] = {
     "consistent": {},
+    # the whole contact time of a braked wheel, hence j = r[(theta_1 - theta) - (sin theta_1 - sin theta)/(1 + s)]
+    "field": {"skid_shear": {"share": 1.0}},
     "paper": {
         "thermal_cutoff": {"hysteresis": 500.0},
         "joint_control": {"current_limit": _PAPER_WINDING["current_limit"]},
@@ -62,6 +91,11 @@ PRESET_PARAMETERS: Mapping[str, Mapping[str, Mapping[str, float | Mapping[str, f
     },
 }
 """Where a preset departs from the nominal values; a table gives one value per joint group."""
+
+PRESET_AMBIENT: Mapping[str, tuple[float, float]] = {"field": (230.0, 90.0)}
+"""Noon and night temperature, K, of presets whose ambient follows the lunar day, which begins at noon: a sunlit ridge
+near the south pole, where VIPER was to drive; chosen within what Diviner maps there (Paige et al. 2010, Science
+330:479)."""
 
 UNSAID: Mapping[str, str] = {
     "time step": "2 ms",
@@ -171,3 +205,57 @@ FLAWS: tuple[Flaw, ...] = (
     ),
 )
 """Every flaw of the paper as a named difference (numbers as in the project's physics notes)."""
+
+
+class Change(NamedTuple):
+    """One flaw that `consistent` keeps and `field` mends, or that `field` keeps as well."""
+
+    where: str
+    consistent: str
+    field: str
+    mended_by: str
+
+
+FIELD_CHANGES: tuple[Change, ...] = (
+    Change(
+        "normal and shear stress",
+        "closed form: drawbar pull at 40 % slip 6 % high in lunar soil",
+        "integrated over the contact arc",
+        "stress_integral for pressure_sinkage and closed_form_shear",
+    ),
+    Change(
+        "braking wheel",
+        "displacement of eq. 8: the soil of a skidding wheel stays too little mobilised",
+        "displacement over the wheel's own turning, 1/(1 + s)",
+        "skid_shear, share = 1",
+    ),
+    Change(
+        "shear strength",
+        "whole along and whole across: up to sqrt(2) times Mohr-Coulomb",
+        "one strength for both",
+        "friction_circle",
+    ),
+    Change("slipping wheel", "sinks no deeper, cannot dig in", "exponent n_0 + n_1 s", "slip_sinkage"),
+    Change("rear wheels", "meet virgin soil", "roll in the ruts of the front wheels", "multipass"),
+    Change("soil before and beside the wheel", "not pushed", "passive earth pressure", "bulldozing"),
+    Change("rolling", "costs compaction alone", "and deforms the wheel", "rolling_resistance"),
+    Change("motor voltage", "without limit: any speed", "within 48 V", "voltage_saturation"),
+    Change("gear driven back", "gives more power than it takes up", "loses both ways", "directional_gear_efficiency"),
+    Change("gear loss", "vanishes", "heats the housing", "gear_friction_heat"),
+    Change(
+        "friction of wheels on boulders",
+        "creeps: tanh of the sliding speed",
+        "holds up to mu F_N",
+        "static_boulders for boulders",
+    ),
+    Change("ambient temperature", "25 degC for ever", "lunar day and night near the pole", "the model's ambient"),
+    Change("chassis on ground and boulders", "friction creeps", "friction creeps", "nothing yet"),
+    Change("wheel contact", "one plane under the axle: load steps at facet edges", "as `consistent`", "nothing yet"),
+    Change(
+        "dug soil",
+        "no rut stays in the terrain",
+        "remembered by the wheels alone (multipass, 64 places each)",
+        "nothing yet",
+    ),
+)
+"""What `consistent` leaves out and `field` has, and what both leave out."""

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.effects.presets import FLAWS, PRESETS, UNSAID
+from lunar_mjx.effects.presets import FIELD_CHANGES, FLAWS, PRESETS, UNSAID
 from lunar_mjx.effects.wheel.paper import REGULARISATIONS
 from lunar_mjx.model.model import Model, Value, preset_values, rover_motors
 from lunar_mjx.rover.load import MARKER
@@ -97,14 +97,24 @@ def print_preset(model: Model, console: Console) -> None:
             for what, choice in rows.items():
                 table.add_row(what, choice)
             console.print(table)
-    console.print("\ndifferences between the presets")
+    console.print("\nwhat the paper has wrong, and consistent right")
     for flaw in FLAWS:
-        table = make_table("", "", names=1)
-        table.show_header = False
-        for what, text in (("paper", flaw.paper), ("consistent", flaw.consistent), ("effect", flaw.mended_by)):
-            table.add_row(f"  {what}", text)
-        console.print(f"{flaw.number} {flaw.where}")
-        console.print(table)
+        told = (("paper", flaw.paper), ("consistent", flaw.consistent), ("effect", flaw.mended_by))
+        _print_difference(f"{flaw.number} {flaw.where}", told, console)
+    console.print("\nwhat consistent leaves out, and field has")
+    for change in FIELD_CHANGES:
+        told = (("consistent", change.consistent), ("field", change.field), ("effect", change.mended_by))
+        _print_difference(change.where, told, console)
+
+
+def _print_difference(title: str, told: Sequence[tuple[str, str]], console: Console) -> None:
+    """A heading, and below it what each preset does."""
+    table = make_table("", "", names=1)
+    table.show_header = False
+    for what, text in told:
+        table.add_row(f"  {what}", text)
+    console.print(title)
+    console.print(table)
 
 
 def print_catalogue(console: Console) -> None:

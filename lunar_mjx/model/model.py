@@ -379,7 +379,7 @@ def make_model(
     Args:
       rover: name or folder of a rover, or a rover.
       terrain: name, file or folder of a terrain, the tables of a `terrain.toml` as a dict, or a terrain.
-      preset: "consistent" or "paper".
+      preset: "consistent", "field" or "paper".
       **changes: attributes of `Model` that differ (gravity, timestep, ambient, modes, gains, ...); `modes` and `gains`
         may name some of the joint groups only.
 
@@ -403,6 +403,8 @@ def make_model(
         gravity=LUNAR_GRAVITY if loaded.gravity is None else loaded.gravity,
         effect_files={e.name: e.name for e in effects},
     )
+    if preset in presets.PRESET_AMBIENT:
+        model = dataclasses.replace(model, ambient=(*presets.PRESET_AMBIENT[preset], 0.0, SYNODIC_DAY))
     model = preset_values(rover_motors(model))
     model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded))
     return model.replace(**changes, gains=given_gains)

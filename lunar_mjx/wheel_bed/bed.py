@@ -171,7 +171,7 @@ class WheelBed:
 
     @classmethod
     def of_preset(cls, preset: str) -> WheelBed:
-        """The wheel of a preset, "consistent" or "paper", with the preset's parameters.
+        """The wheel of a preset, "consistent", "field" or "paper", with the preset's parameters.
 
         Raises:
           UserError: no such preset.

@@ -93,6 +93,25 @@ def test_a_drive_stays_within_tolerance_and_noise(luvmi):
     }
 
 
+def test_every_effect_of_field_agrees_with_native():
+    """Ruts, slip-sinkage, skidding, bulldozing, boulders that hold, voltage and gear: JAX against NumPy, to rounding.
+
+    Six states and a drive of 3 s on soft ground with boulders, which the front wheels run over.
+    """
+    study = run_study("luvmi_x", "field", ["structured"], 3.0, 6, grounds=("boulders, soft",))
+    assert [p.failed for p in study.pairs] == [[]]
+    samples = study.runs["native"].steps["boulders, soft"][0]
+    assert np.abs(samples["wheel_force"]).max() > 10.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rover", ["luvmi_x", "viper"])
+def test_field_drives_agree_for_twenty_seconds(rover):
+    """Craters, soft and hard."""
+    study = run_study(rover, "field", ["structured"], 20.0, 6, grounds=("crater, soft", "crater, hard"))
+    assert [p.failed for p in study.pairs] == [[]]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["consistent", "paper"])
 @pytest.mark.parametrize("engine", ["structured", "mjx", "structured:float32"])

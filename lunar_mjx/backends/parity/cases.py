@@ -56,6 +56,7 @@ def cases(rover: Rover, names: Collection[str] | None = None) -> list[Case]:
         "slope, soft": (slope, 0.0, None),
         "slope, hard": (slope, 1.0, None),
         "crater, soft": (crater, 0.0, None),
+        "crater, hard": (crater, 1.0, None),
         "boulders, soft": (level, 0.0, _stones(rover)),
     }
     made = [_terrain(name, at, *ground) for name, ground in grounds.items()]

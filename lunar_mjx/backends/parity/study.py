@@ -106,7 +106,7 @@ def run_study(
     """Compares engines with native MuJoCo, and the structured engine with MJX, on one rover and preset.
 
     Args:
-      rover: name or folder. preset: "consistent" or "paper".
+      rover: name or folder. preset: "consistent", "field" or "paper".
       engines: some of `ENGINES`. duration: of the drives, s. samples: states per ground for levels 1 and 2.
       grounds: names of the grounds, all if None.
       report: told of the progress.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.backends.hooks import Hooks
-from lunar_mjx.backends.physics import hard, motor, printed, soil
+from lunar_mjx.backends.physics import hard, motor, outdoors, printed, soil
 from lunar_mjx.backends.physics.contact import momentary_slip, wheel_contact
 from lunar_mjx.backends.physics.context import Context, Values
 from lunar_mjx.backends.physics.ground import Ground
@@ -31,6 +31,9 @@ _SHEAR: dict[str, Callable] = {
     "engine_friction": printed.engine_friction,
     "hard_ground": hard.rock_shear,
     "boulders": hard.boulders,
+    "skid_shear": outdoors.skid_shear,
+    "bulldozing": outdoors.bulldozing,
+    "rolling_resistance": outdoors.rolling_resistance,
 }
 _BODY: dict[str, Callable] = {"chassis_contact": hard.chassis_contact, "joint_limits": hard.joint_limits}
 
@@ -84,6 +87,9 @@ class ForceModel:
             "shear_state": {k: wheel.copy() for k in ("slip_x", "slip_y", "direction")},
             "thermal_cutoff": {"tripped": joint.copy()},
             "parking_brake": {"angle": joint.copy()},
+            "voltage_saturation": {"correction": joint.copy()},
+            "multipass": outdoors.no_places(*wheel.shape),
+            "static_boulders": outdoors.no_bristles(*wheel.shape),
         }
         return {k: v for k, v in every.items() if k in self.numbers}
 
@@ -136,11 +142,16 @@ class ForceModel:
                 resistance, constant = changed["resistance"], changed["torque_constant"]
             c.resistance, c.torque_constant = resistance, constant
         c.current = hooks.call("current", c, current) if "current" in hooks else current
+        if "voltage_saturation" in effects:
+            p = effects["voltage_saturation"]
+            new["voltage_saturation"] = motor.voltage_limit(c, p, state["voltage_saturation"])
         if "thermal_cutoff" in effects:
             new["thermal_cutoff"] = motor.cut_off(c, effects["thermal_cutoff"], state["thermal_cutoff"])
         if "motor" in effects:
             p = effects["motor"]
             c.torque = (p.gear_ratio * p.gear_efficiency) * c.torque_constant * c.current
+        if "directional_gear_efficiency" in effects:
+            motor.gear_losses(c, effects["directional_gear_efficiency"])
         if "torque" in hooks:
             c.torque = hooks.call("torque", c, c.torque)
 
@@ -167,6 +178,10 @@ class ForceModel:
             kept = state["shear_state"]
             c.contact["soil_slip"] = clamp(kept["direction"] * kept["slip_x"], -1.0, 1.0)
         c.soil = soil.local_soil(c, self._uniform, self._soil)
+        if "slip_sinkage" in effects:
+            outdoors.slip_sinkage(c, effects["slip_sinkage"], c.soil)
+        if "multipass" in effects:
+            new["multipass"] = outdoors.multipass(c, effects["multipass"], c.soil, state["multipass"])
         if "soil" in hooks:
             c.soil = hooks.call("soil", c, {k: v.copy() for k, v in c.soil.items()})
         zero = np.zeros(c.wheel_position.shape[:-1])
@@ -193,6 +208,9 @@ class ForceModel:
         c.wheel = {"force": np.zeros(c.wheel_position.shape), "moment": np.zeros(c.wheel_position.shape)}
         for function, p in self._shear:
             function(c, p)
+        if "static_boulders" in effects:
+            p = effects["static_boulders"]
+            new["static_boulders"] = outdoors.static_boulders(c, p, state["static_boulders"])
         if "shear" in hooks:
             c.wheel = hooks.call("shear", c, c.wheel)
 

@@ -63,14 +63,19 @@ def _dragged(velocity: np.ndarray, normal: np.ndarray, load: np.ndarray, p: Simp
     return tangent * (-p.mu * load * np.tanh(speed / p.speed_scale) / speed)[..., None]
 
 
-def boulders(c: Context, p: SimpleNamespace) -> None:
-    """Wheels (cylinders) against boulders: penalty along the line between the nearest points, and friction."""
+def boulder_touch(c: Context, p: SimpleNamespace) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Where each wheel (a cylinder) is nearest to its boulder, and how hard it presses; None if no wheel touches one.
+
+    Returns:
+      That point from the wheel's centre, unit vector into the boulder, velocity of the wheel there, (rover, wheel, 3),
+      and the normal force, (rover, wheel), N.
+    """
     if not c.ground.has_rocks:
-        return
+        return None
     place, axle = c.wheel_position, c.wheel_axle
     center, radius = c.ground.rock(place[..., 0], place[..., 1])
     if not radius.any():
-        return
+        return None
     gap = center - place
     axial = dot(gap, axle)
     radial = gap - axle * axial[..., None]
@@ -82,14 +87,26 @@ def boulders(c: Context, p: SimpleNamespace) -> None:
     distance = np.maximum(np.sqrt(dot(apart, apart)), 1e-9)
     depth = np.where(radius > 0.0, radius - distance, -1.0)
     if not (depth > 0.0).any():
-        return
+        return None
     toward = apart / distance[..., None]
     velocity = c.wheel_velocity + cross(c.wheel_angular_velocity, closest)
-    load = _pushed(depth, dot(velocity, toward), p)
-    force = _dragged(velocity, toward, load, p) - toward * load[..., None]
+    return closest, toward, velocity, _pushed(depth, dot(velocity, toward), p)
+
+
+def push_wheels(c: Context, point: np.ndarray, force: np.ndarray) -> None:
+    """Adds forces in world coordinates at points from the wheels' centres, (rover, wheel, 3)."""
     axes = np.stack([c.contact[k] for k in ("forward", "left", "normal")], axis=-2)
     c.wheel["force"] = c.wheel["force"] + np.einsum("...ij,...j->...i", axes, force)
-    c.wheel["moment"] = c.wheel["moment"] + np.einsum("...ij,...j->...i", axes, cross(closest, force))
+    c.wheel["moment"] = c.wheel["moment"] + np.einsum("...ij,...j->...i", axes, cross(point, force))
+
+
+def boulders(c: Context, p: SimpleNamespace) -> None:
+    """Wheels against boulders: penalty along the line between the nearest points, and friction that creeps."""
+    touch = boulder_touch(c, p)
+    if touch is None:
+        return
+    closest, toward, velocity, load = touch
+    push_wheels(c, closest, _dragged(velocity, toward, load, p) - toward * load[..., None])
 
 
 def chassis_contact(c: Context, p: SimpleNamespace) -> None:

@@ -41,6 +41,35 @@ def winding(motor: SimpleNamespace, temperature: np.ndarray) -> tuple[np.ndarray
     return motor.resistance * (1.0 + motor.alpha * rise), motor.torque_constant * (1.0 + motor.beta * rise)
 
 
+def largest_damping(c: Context) -> np.ndarray:
+    """J/dt, N m s/rad: the damping that an explicit step takes without turning a joint around."""
+    motor = c.numbers.effects["motor"]
+    rotor = motor.rotor_inertia * motor.gear_ratio**2
+    return np.maximum(c.numbers.joint_inertia, np.maximum(rotor, 1e-3)) / c.dt
+
+
+def voltage_limit(c: Context, p: SimpleNamespace, state: Values) -> Values:
+    """V' = V/(1 + (V/V_bus)^8)^(1/8) with V = R I + K N omega; what it takes from the current is `correction`, A."""
+    motor = c.numbers.effects["motor"]
+    constant = c.torque_constant * motor.gear_ratio
+    voltage = c.resistance * c.current + constant * c.joint_speed
+    within = voltage * (1.0 + p.limit * np.abs(voltage / 48.0) ** 8) ** -0.125
+    per_ampere = motor.gear_ratio * motor.gear_efficiency * motor.torque_constant
+    stiffness = per_ampere * constant / c.resistance / largest_damping(c)
+    wanted = (within - voltage) / c.resistance
+    correction = state["correction"] + (wanted - state["correction"]) / (1.0 + np.maximum(stiffness - 0.5, 0.0))
+    c.current = c.current + correction
+    return {"correction": correction}
+
+
+def gear_losses(c: Context, p: SimpleNamespace) -> None:
+    """tau eta^sgn(tau omega) in place of tau eta, with tanh(omega/omega_s) for the sign of the speed."""
+    eta = c.numbers.effects["motor"].gear_efficiency
+    level = 0.5 * p.asymmetry * (eta**-2 - 1.0) * np.abs(c.torque)
+    way = np.sign(c.torque) * np.tanh(c.joint_speed / np.maximum(p.speed, level / largest_damping(c)))
+    c.torque = c.torque * (1.0 + p.asymmetry * (eta ** (way - 1.0) - 1.0))
+
+
 def heat_flow(c: Context, winding_K: np.ndarray, housing_K: np.ndarray) -> Values:
     """Net heat into winding and housing, W, and their capacities, J/K, at given temperatures."""
     effects = c.numbers.effects
@@ -65,6 +94,11 @@ def heat_flow(c: Context, winding_K: np.ndarray, housing_K: np.ndarray) -> Value
             squared = housing_K * housing_K
             lost = squared * squared - c.ambient_temperature**4
             into_housing = into_housing - p.emissivity * STEFAN_BOLTZMANN * p.area * lost
+        elif name == "gear_friction_heat":
+            m = effects["motor"]
+            constant = m.torque_constant * (1.0 + m.beta * (winding_K - REFERENCE))
+            given = m.gear_ratio * constant * c.current - c.torque
+            into_housing = into_housing + p.share * given * c.joint_speed
     return {
         "winding": into_winding,
         "housing": into_housing,

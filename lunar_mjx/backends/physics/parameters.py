@@ -34,6 +34,16 @@ SUPPORTED = (
     "engine_friction",
     "hard_ground",
     "boulders",
+    "static_boulders",
+    "voltage_saturation",
+    "directional_gear_efficiency",
+    "slip_sinkage",
+    "multipass",
+    "skid_shear",
+    "friction_circle",
+    "bulldozing",
+    "rolling_resistance",
+    "gear_friction_heat",
     "chassis_contact",
     "joint_limits",
     "parking_brake",
@@ -64,7 +74,7 @@ class Numbers:
       chassis_points: (point, 3) m, where the chassis can touch the ground, in its frame.
       box_center, box_half: (box, 3) m, the chassis' bounding boxes in its frame.
       feet: (wheel, 3) m, wheel centres in the chassis frame at zero joint angles.
-      standing_height: m.
+      standing_height: m. joint_inertia: torque per acceleration of each joint of the rover as drawn, (joint,) kg m2.
     """
 
     effects: dict[str, SimpleNamespace]
@@ -87,6 +97,7 @@ class Numbers:
     box_half: np.ndarray
     feet: np.ndarray
     standing_height: float
+    joint_inertia: np.ndarray
 
     def __contains__(self, effect: str) -> bool:
         return effect in self.effects
@@ -150,6 +161,7 @@ def read_numbers(model: Model, backend: str = "backend") -> Numbers:
         box_half=half,
         feet=_feet(compiled, rover),
         standing_height=float(rover.standing_height),
+        joint_inertia=1.0 / compiled.dof_invweight0[[compiled.joint(j).dofadr[0] for j in rover.joints]],
     )
 
 

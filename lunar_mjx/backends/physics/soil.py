@@ -17,7 +17,8 @@ SHALLOW, DEEP = 1e-9, 1.5
 SHORTEST = 0.05
 """Contact length, in radii, below which soil is too little touched to remember by how far it was sheared."""
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
+"""The nodes of the JAX effect, so that engines agree to rounding; that effect has a test of their error."""
 
 
 def uniform_soil(p: SimpleNamespace | None, like: np.ndarray) -> Values:
@@ -51,6 +52,12 @@ def local_soil(c: Context, uniform: Values, names: tuple[str, ...]) -> Values:
     return soil
 
 
+def below_surface(c: Context) -> np.ndarray:
+    """Depth below the surface that each wheel meets, which is the bottom of a rut where there is one; m."""
+    sinkage = c.contact["sinkage"]
+    return np.maximum(sinkage - c.soil["rut"], 0.0) if "rut" in c.soil else sinkage
+
+
 def entrance(sinkage: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """theta_1, at which the rim enters the soil: cos theta_1 = 1 - z/r; rad."""
     ratio = np.minimum(np.maximum(sinkage / radius, SHALLOW), DEEP)
@@ -75,6 +82,17 @@ def mobilised(displacement: np.ndarray, modulus: np.ndarray) -> np.ndarray:
     return np.copysign(np.expm1(-np.abs(displacement) / modulus), displacement)
 
 
+def shear_stress(c: Context, strength: np.ndarray, q_x: np.ndarray, q_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shear stress along and across after displacements of q moduli, Pa; one strength for both in `friction_circle`."""
+    alone = strength * mobilised(q_x, np.ones(1)), strength * mobilised(q_y, np.ones(1))
+    circle = c.numbers.effects.get("friction_circle")
+    if circle is None:
+        return alone
+    q = np.sqrt(q_x * q_x + q_y * q_y + 1e-24)
+    common = strength * -np.expm1(-q) / q
+    return tuple(t + circle.share * (common * x - t) for t, x in zip(alone, (q_x, q_y), strict=True))  # type: ignore[return-value]
+
+
 def area_damping(c: Context, coefficient: float, theta_1: np.ndarray, load: np.ndarray) -> np.ndarray:
     """c' b r sin(theta_1) zdot, never pulling below zero the sum with the load; N."""
     area = c.geometry["width"] * c.geometry["radius"] * np.sin(np.minimum(theta_1, 0.5 * np.pi))
@@ -84,8 +102,9 @@ def area_damping(c: Context, coefficient: float, theta_1: np.ndarray, load: np.n
 def pressure_sinkage(c: Context, p: SimpleNamespace) -> None:
     """W = r b sigma_m A between theta_2 = 0, theta_m = theta_1/2 and theta_1; resistance r b sigma_m B."""
     r, b = c.geometry["radius"], c.geometry["width"]
-    touching = c.contact["sinkage"] > 0.0
-    theta_1 = entrance(c.contact["sinkage"], r)
+    sinkage = below_surface(c)
+    touching = sinkage > 0.0
+    theta_1 = entrance(sinkage, r)
     theta_m = 0.5 * theta_1
     sigma = peak_stress(c.soil, b, r, np.cos(theta_m), np.cos(theta_1)) * touching
     a_factor, b_factor = arc_factors(theta_m)
@@ -145,8 +164,9 @@ def closed_form_shear(c: Context, p: SimpleNamespace) -> None:
     chord = np.sin(theta_1) - sin_m
     strength = (soil["cohesion"] + normal["sigma_m"] * soil["tan_phi"]) * (c.contact["sinkage"] > 0.0)
     j = r_s * (way * (theta_1 - theta_m - chord) + slip["slip_x"] * chord)
-    tau = strength * mobilised(j, soil["shear_modulus_x"])
-    tau_y = strength * mobilised(r * theta_m * slip["slip_y"], soil["shear_modulus_y"])
+    tau, tau_y = shear_stress(
+        c, strength, j / soil["shear_modulus_x"], r * theta_m * slip["slip_y"] / soil["shear_modulus_y"]
+    )
     pull = r_s * b * tau
     side = -r * b * theta_m * tau_y
     force, moment = c.wheel["force"], c.wheel["moment"]
@@ -161,8 +181,9 @@ def closed_form_shear(c: Context, p: SimpleNamespace) -> None:
 def integral_normal(c: Context, p: SimpleNamespace) -> None:
     """Wong-Reece stress integrated over the arc: load and resistance; the stress at nodes stays in `stress`."""
     r, b, soil = c.geometry["radius"], c.geometry["width"], c.soil
-    touching = c.contact["sinkage"] > 0.0
-    theta_1 = entrance(c.contact["sinkage"], r)
+    sinkage = below_surface(c)
+    touching = sinkage > 0.0
+    theta_1 = entrance(sinkage, r)
     theta_m = 0.5 * theta_1
     share = 0.5 * (1.0 + _NODES)
     rear = theta_m[..., None] * share
@@ -196,9 +217,10 @@ def integral_shear(c: Context, p: SimpleNamespace) -> None:
     touching = (c.contact["sinkage"] > 0.0)[..., None]
     strength = weight * (soil["cohesion"][..., None] + sigma * soil["tan_phi"][..., None]) * touching
     j = r_s[..., None] * (way[..., None] * (theta_1 - theta - chord) + slip["slip_x"][..., None] * chord)
-    tau = strength * mobilised(j, soil["shear_modulus_x"][..., None])
     across = (r * slip["slip_y"])[..., None] * (theta_1 - theta)
-    tau_y = strength * mobilised(across, soil["shear_modulus_y"][..., None])
+    tau, tau_y = shear_stress(
+        c, strength, j / soil["shear_modulus_x"][..., None], across / soil["shear_modulus_y"][..., None]
+    )
     cos, sin = np.cos(theta), np.sin(theta)
     force, moment = c.wheel["force"], c.wheel["moment"]
     force[..., 0] += r_s * b * np.sum(tau * cos, -1) - way * normal["resistance"]

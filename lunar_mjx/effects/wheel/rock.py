@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from lunar_mjx.effects.base import Effect, Parameter, effect
+from lunar_mjx.effects.base import Effect, Parameter, StateVariable, effect
 from lunar_mjx.effects.wheel.closed_form import airborne, entrance_angle
 from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import nearest_rock, sample
@@ -103,12 +103,23 @@ _SPEED = Parameter(
 )
 
 
-@effect("wheel_shear", order=20, stiffness=_STIFFNESS, damping=_DAMPING, mu=_MU, speed_scale=_SPEED)
-def boulders(ctx, p, x, wheel):
-    """Boulders are spheres that a wheel (a cylinder) runs against: penalty force along the line between them."""
-    if ctx.terrain.rocks is None:
-        return wheel
-    geometry, contact, place = ctx.geometry, ctx.contact, ctx.wheel_position
+class _Touch(NamedTuple):
+    """One boulder against each wheel.
+
+    Attributes:
+      point: of the wheel nearest to the boulder's centre, relative to the wheel's centre, world frame, m.
+      toward: unit vector from there into the boulder. velocity: of the wheel at that point, m/s.
+      load: normal force, N; 0 where the wheel does not touch.
+    """
+
+    point: Vec3
+    toward: Vec3
+    velocity: Vec3
+    load: Any
+
+
+def _touch_boulder(ctx, p) -> _Touch:
+    geometry, place = ctx.geometry, ctx.wheel_position
     cx, cy, cz, rock_radius = nearest_rock(ctx.terrain.rocks, place.x, place.y)
     closest, toward, distance = _closest_point_to_sphere(
         Vec3(cx, cy, cz), place, ctx.wheel_axle, geometry.radius, geometry.width
@@ -116,11 +127,76 @@ def boulders(ctx, p, x, wheel):
     velocity = ctx.wheel_velocity + ctx.wheel_angular_velocity.cross(closest)
     depth = jnp.where(rock_radius > 0.0, rock_radius - distance, -1.0)
     load = _penalty(depth, velocity.dot(toward), p.stiffness, p.damping)
-    force = toward * -load + _sliding_friction(velocity, toward, p.mu, load, p.speed_scale)
+    return _Touch(closest, toward, velocity, load)
+
+
+def _push_wheel(ctx, wheel, touch: _Touch, friction: Vec3):
+    """The wheel's force and moment with the boulder's normal force and friction added."""
+    contact = ctx.contact
+    force = touch.toward * -touch.load + friction
     frame = Frame(contact.forward, contact.left, contact.normal)
     return dataclasses.replace(
-        wheel, force=wheel.force + frame.from_world(force), moment=wheel.moment + frame.from_world(closest.cross(force))
+        wheel,
+        force=wheel.force + frame.from_world(force),
+        moment=wheel.moment + frame.from_world(touch.point.cross(force)),
     )
+
+
+@effect("wheel_shear", order=20, stiffness=_STIFFNESS, damping=_DAMPING, mu=_MU, speed_scale=_SPEED)
+def boulders(ctx, p, x, wheel):
+    """Boulders are spheres that a wheel (a cylinder) runs against: penalty force along the line between them."""
+    if ctx.terrain.rocks is None:
+        return wheel
+    touch = _touch_boulder(ctx, p)
+    return _push_wheel(
+        ctx, wheel, touch, _sliding_friction(touch.velocity, touch.toward, p.mu, touch.load, p.speed_scale)
+    )
+
+
+def _bristle(axis: str) -> StateVariable:
+    return StateVariable(0.0, "m", f"{axis}, world frame, of the tangential deflection where a wheel touches a boulder")
+
+
+@effect(
+    "wheel_shear",
+    order=20,
+    transient=True,
+    replaces=("boulders",),
+    state={"bristle_x": _bristle("x"), "bristle_y": _bristle("y"), "bristle_z": _bristle("z")},
+    stiffness=_STIFFNESS,
+    damping=_DAMPING,
+    mu=_MU,
+    tangential_stiffness=Parameter(
+        1e5,
+        None,
+        (1e2, 1e8),
+        "N/m",
+        "tangential stiffness k_t of the contact",
+        "half of k_N; 0.5 to 1 for rough bodies (Johnson 1985, ch. 7.2)",
+    ),
+    tangential_damping=Parameter(
+        200.0, 0.0, (0.0, 1e6), "N s/m", "tangential damping c_t while it sticks", "choice: half of c_N"
+    ),
+)
+def static_boulders(ctx, p, x, wheel):
+    """Boulders as in `boulders`, with friction that holds: a rover that leans on one does not creep.
+
+    The contact deflects by xi, d xi/dt = v_t while it sticks, and F = -k_t xi - c_t v_t within |F| <= mu F_N; where
+    k_t |xi| would pass mu F_N it slides, xi keeping the length mu F_N/k_t (Cundall & Strack 1979). xi turns with the
+    plane of contact and is forgotten when the wheel lifts off.
+    """
+    if ctx.terrain.rocks is None:
+        return wheel, {}
+    touch = _touch_boulder(ctx, p)
+    sliding = touch.velocity - touch.toward * touch.velocity.dot(touch.toward)
+    moved = Vec3(x.bristle_x, x.bristle_y, x.bristle_z) + sliding * ctx.dt
+    moved = moved - touch.toward * moved.dot(touch.toward)
+    most = p.mu * touch.load
+    moved = moved * jnp.minimum(most / (p.tangential_stiffness * moved.norm(1e-9)), 1.0)
+    pull = moved * -p.tangential_stiffness - sliding * p.tangential_damping
+    friction = pull * jnp.minimum(most / pull.norm(1e-9), 1.0)
+    bristles = {"bristle_x": moved.x, "bristle_y": moved.y, "bristle_z": moved.z}
+    return _push_wheel(ctx, wheel, touch, friction), bristles
 
 
 _QUADRANTS = ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5))

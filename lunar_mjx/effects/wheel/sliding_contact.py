@@ -193,10 +193,10 @@ def side_exit(ctx, p, x, normal):
     share=Parameter(
         0.9,
         0.0,
-        (0.0, 0.99),
+        (0.0, 1.0),
         "1",
         "0: contact time of eq. 9; 1: that of the wheel's own turning",
-        "choice: a locked wheel's contact has no end",
+        "choice: a locked wheel's contact has no end; the preset field takes 1",
     ),
 )
 def skid_shear(ctx, p, x, wheel):
@@ -204,13 +204,18 @@ def skid_shear(ctx, p, x, wheel):
 
     The slip of eq. 8, referred to v_x when braking, makes the displacement finite for a locked wheel, and much too
     small. With s = 1 - r omega/v_x: slip_x/(1 - q s) and slip_y/((1 - q s)(1 + q s)), which at q = 1 is the
-    kinematics of Janosi & Hanamoto 1961, j_x = int (v_x - r omega cos) dt and j_y = int v_y dt.
+    kinematics of Janosi & Hanamoto 1961, j_x = int (r omega - v_x cos) dt and j_y = int v_y dt. The stretch ends at
+    100, where the soil of a locked wheel is fully mobilised.
     """
     skid = jnp.clip(-jnp.sign(wheel.direction) * wheel.slip_x, 0.0, 1.0)
-    stretch = 1.0 / (1.0 - p.share * skid)
+    stretch = 1.0 / jnp.maximum(1.0 - p.share * skid, _SHORTEST_TURN)
     return dataclasses.replace(
         wheel, slip_x=wheel.slip_x * stretch, slip_y=wheel.slip_y * stretch / (1.0 + p.share * skid)
     )
+
+
+_SHORTEST_TURN = 0.01
+"""Least 1 + s: beyond a skid of 99 % the displacement is 100 times that of eq. 9 and more, tens of moduli K."""
 
 
 def wall_bearing(tan_phi, tan_delta):

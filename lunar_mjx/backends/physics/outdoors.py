@@ -1,0 +1,132 @@
+"""What the preset `field` adds on the ground: deeper sinking, ruts, skidding, bulldozing, rolling, boulders that hold.
+
+Sources: Ding et al. 2010, Lyasko 2010 (slip-sinkage), Wong 2008 (ruts, rolling), Ishigami et al. 2007 (bulldozing),
+Janosi & Hanamoto 1961 (displacement of a skidding wheel), Cundall & Strack 1979 (friction that holds).
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from lunar_mjx.backends.physics.context import Context, Values
+from lunar_mjx.backends.physics.hard import boulder_touch, push_wheels
+from lunar_mjx.backends.physics.soil import below_surface, mobilised
+from lunar_mjx.backends.physics.vectors import clamp, dot
+
+PLACES = 64
+"""Places that a wheel remembers."""
+NOWHERE = 1e6
+"""Coordinate of a place that has not been visited, m."""
+_OWN_LATEST = 3
+_FAINT = 0.05
+
+
+def slip_sinkage(c: Context, p: SimpleNamespace, soil: Values) -> None:
+    """Sinkage exponent n_0 + n_1 s driving, n_0 + n_2 |s| skidding, with equal pressure at a sinkage of one radius."""
+    s = c.contact["soil_slip"]
+    more = np.where(s > 0.0, p.driving * s, -p.skid * s)
+    scale = c.geometry["radius"] ** -more
+    soil["k_c"], soil["k_phi"], soil["n"] = soil["k_c"] * scale, soil["k_phi"] * scale, soil["n"] + more
+
+
+def no_places(rovers: int, wheels: int) -> Values:
+    """The memory of `multipass` at reset, (rover, place, wheel)."""
+    shape = (rovers, PLACES, wheels)
+    return {"place_x": np.full(shape, NOWHERE), "place_y": np.full(shape, NOWHERE), "depth": np.zeros(shape)}
+
+
+def multipass(c: Context, p: SimpleNamespace, soil: Values, places: Values) -> Values:
+    """Ruts of compacted soil: e z_u deep where a wheel went z_u deep, and (1 - e)^-n times as stiff below."""
+    x, y = c.wheel_position[..., 0], c.wheel_position[..., 1]
+    # (rover, place, wheel that left it, wheel that meets it)
+    gap = (places["place_x"][..., None] - x[:, None, None]) ** 2 + (
+        places["place_y"][..., None] - y[:, None, None]
+    ) ** 2
+    weight = np.maximum(1.0 - gap / (4.0 * p.spacing**2), 0.0) ** 2
+    wheels = np.arange(x.shape[1])
+    weight[:, :_OWN_LATEST, wheels, wheels] = 0.0
+    total = weight.sum(axis=(1, 2))
+    met = np.sum(weight * places["depth"][..., None], axis=(1, 2)) / (total + _FAINT)
+    stiffer = 1.0 + total / (total + _FAINT) * ((1.0 - p.plastic) ** -soil["n"] - 1.0)
+    soil["k_c"], soil["k_phi"], soil["rut"] = soil["k_c"] * stiffer, soil["k_phi"] * stiffer, p.plastic * met
+    sinkage = c.contact["sinkage"]
+    away = (x - places["place_x"][:, 0]) ** 2 + (y - places["place_y"][:, 0]) ** 2
+    new = ((away > p.spacing**2) & (sinkage > 0.0) & (soil["rock"] < 0.5))[:, None]
+
+    def pushed(old: np.ndarray, here: np.ndarray) -> np.ndarray:
+        return np.where(new, np.concatenate([here[:, None], old[:, :-1]], axis=1), old)
+
+    return {
+        "place_x": pushed(places["place_x"], x),
+        "place_y": pushed(places["place_y"], y),
+        "depth": pushed(places["depth"], sinkage),
+    }
+
+
+def skid_shear(c: Context, p: SimpleNamespace) -> None:
+    """A skidding wheel's soil stays under it for its own turning: slips of eqs. 8 and 11 over 1 + s and 1 - s^2."""
+    slip = c.slip
+    skid = clamp(-np.sign(slip["direction"]) * slip["slip_x"], 0.0, 1.0)
+    left = np.maximum(1.0 - p.share * skid, 0.01)
+    slip["slip_x"], slip["slip_y"] = slip["slip_x"] / left, slip["slip_y"] / (left * (1.0 + p.share * skid))
+
+
+def earth_pressure(c: Context, weight: float, depth: np.ndarray, squared: np.ndarray) -> np.ndarray:
+    """Passive pressure per width of a wall, N/m: D_1 (c h + D_2 gamma h^2/2), the wedge breaking out at 45 - phi/2."""
+    tan_phi = c.soil["tan_phi"]
+    phi = np.arctan(tan_phi)
+    wedge = 0.25 * np.pi - 0.5 * phi
+    d_1 = 1.0 / np.tan(wedge) + np.tan(wedge + phi)
+    d_2 = 1.0 / np.tan(wedge) + tan_phi / np.tan(wedge) ** 2
+    return d_1 * (c.soil["cohesion"] * depth + 0.5 * d_2 * weight * squared)
+
+
+def bulldozing(c: Context, p: SimpleNamespace) -> None:
+    """Soil pushed ahead, as far as the wheel travels more than it turns free, and beside, as the shear is mobilised."""
+    sinkage, r = below_surface(c), c.geometry["radius"]
+    soft = (sinkage > 0.0) & (c.soil["rock"] <= 0.5)
+    weight = p.density * c.gravity
+    ahead = clamp(c.slip["direction"] - c.slip["slip_x"], -1.0, 1.0)
+    front = -p.front * soft * c.geometry["width"] * earth_pressure(c, weight, sinkage, sinkage * sinkage) * ahead
+    theta_1 = c.normal["entrance"]
+    length = r * np.sin(np.minimum(theta_1, 0.5 * np.pi))
+    moved = mobilised(r * (theta_1 - c.normal["theta_m"]) * c.slip["slip_y"], c.soil["shear_modulus_y"])
+    wall = earth_pressure(c, weight, sinkage * (2.0 / 3.0), sinkage * sinkage * (8.0 / 15.0))
+    side = -p.side * soft * length * wall * moved
+    force, moment = c.wheel["force"], c.wheel["moment"]
+    force[..., 0] += front
+    force[..., 1] += side
+    moment[..., 0] += r * side
+    moment[..., 2] += 0.375 * length * c.slip["direction"] * side
+
+
+def rolling_resistance(c: Context, p: SimpleNamespace) -> None:
+    """M_y = -f r W tanh(r omega/v_0), with the load W that the wheel carries."""
+    load = np.maximum(c.wheel["force"][..., 2], 0.0)
+    turning = np.tanh(c.contact["rim_speed"] / p.speed_scale)
+    c.wheel["moment"][..., 1] -= p.coefficient * c.geometry["radius"] * load * turning
+
+
+def no_bristles(rovers: int, wheels: int) -> Values:
+    """The deflections of `static_boulders` at reset."""
+    return {f"bristle_{axis}": np.zeros((rovers, wheels)) for axis in "xyz"}
+
+
+def static_boulders(c: Context, p: SimpleNamespace, state: Values) -> Values:
+    """Wheels against boulders, held by a deflection xi with k_t |xi| <= mu F_N."""
+    touch = boulder_touch(c, p)
+    if touch is None:
+        return {name: np.zeros_like(v) for name, v in state.items()} if c.ground.has_rocks else state
+    closest, toward, velocity, load = touch
+    slide = velocity - toward * dot(velocity, toward)[..., None]
+    xi = np.stack([state[f"bristle_{axis}"] for axis in "xyz"], axis=-1) + slide * c.dt
+    xi -= toward * dot(xi, toward)[..., None]
+    most = p.mu * load
+    long = np.maximum(np.sqrt(dot(xi, xi)), 1e-9)
+    xi *= np.minimum(most / (p.tangential_stiffness * long), 1.0)[..., None]
+    pull = -p.tangential_stiffness * xi - p.tangential_damping * slide
+    size = np.maximum(np.sqrt(dot(pull, pull)), 1e-9)
+    push_wheels(c, closest, pull * np.minimum(most / size, 1.0)[..., None] - toward * load[..., None])
+    return {f"bristle_{axis}": xi[..., i] for i, axis in enumerate("xyz")}
