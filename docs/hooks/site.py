@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,26 @@ def field() -> str:
     return table(["where", "`consistent`", "`field`", "mended by"], rows)
 
 
+def field_measured() -> str:
+    """What each effect of `field` does to VIPER, from the kept run."""
+    kept = json.loads((Path(__file__).parents[2] / "benchmarks" / "field.json").read_text(encoding="utf-8"))
+    columns = {
+        "40 % slip at": ("slope_at_40_percent_slip_deg", "{:.1f}°"),
+        "stalls at": ("stall_slope_deg", "{:.1f}°"),
+        "stopping way, m": ("stopping_distance_m", "{:.3f}"),
+        "dig-in, m": ("dig_in_m", "{:.3f}"),
+        "drift": ("drift_across_10_deg", "{:.3f}"),
+        "fastest, m/s": ("fastest_m_s", "{:.2f}"),
+        "at, V": ("largest_voltage_V", "{:.0f}"),
+        "housing warms, K": ("housing_rise_K", "{:.1f}"),
+    }
+    rows = [
+        [cell(name), *("-" if row[k] is None else text.format(row[k]) for k, text in columns.values())]
+        for name, row in kept["rows"].items()
+    ]
+    return table([f"at {kept['commit']}", *columns], rows)
+
+
 def unsaid() -> str:
     """What the paper leaves unsaid, and where it needs regularising."""
     rows = [[cell(k), cell(str(v)), "unsaid"] for k, v in UNSAID.items()]
@@ -115,6 +136,7 @@ TABLES = {
     "presets": presets,
     "flaws": flaws,
     "field": field,
+    "field_measured": field_measured,
     "unsaid": unsaid,
     "soils": soils,
     "windings": windings,

@@ -25,6 +25,7 @@ NO_CANDIDATE = frozenset(
         "surface_type",
         "soil_gradient",
         "boulders",
+        "static_boulders",
         "engine_friction",
         "joint_limits",
         "chassis_contact",

@@ -38,6 +38,7 @@ REMAINS = {
     "hard_ground": "the push of the rock",
     "motor": "a motor without temperature coefficients",
     "penalty_contact": "the contact's stiffness",
+    "static_boulders": "the push of the boulder",
     "shear_state": "the memory of the soil",
     "thermal_cutoff": "a cut-off without hysteresis",
 }
@@ -306,6 +307,7 @@ def test_an_effect_that_is_not_in_the_list_changes_nothing(preset: str) -> None:
 SMOOTH = {
     "consistent": LISTS["consistent"],
     "integral": LISTS["integral"],
+    "field": PRESETS["field"],
     "paper": LISTS["paper"],
     "paper, with all that vanishes": (*LISTS["paper"], *(n for n in VANISHING if n not in LISTS["paper"])),
 }

@@ -37,7 +37,16 @@ BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
 how well soil and motor are known before a drive."""
 
 NOT_MISSING = frozenset(
-    {"parking_brake", "payload", "tether", "hard_surface", "surface_type", "soil_gradient", "boulders"}
+    {
+        "parking_brake",
+        "payload",
+        "tether",
+        "hard_surface",
+        "surface_type",
+        "soil_gradient",
+        "boulders",
+        "static_boulders",
+    }
 )
 """Effects that describe an arrangement of the test, which its user knows, and are never candidates by themselves."""
 
