@@ -12,7 +12,7 @@ import pytest
 from lunar_mjx.model import make_model
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "reinforcement_learning.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "reinforcement_learning_measured.md").read_text(encoding="utf-8")
 
 
 def record(name):
