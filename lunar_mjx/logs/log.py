@@ -56,6 +56,7 @@ class LogTable:
       time_s: (n,) as written. channels: (n,) float64 by name of the schema, NaN at gaps, in the schema's units.
       rate_hz: stated; the median one of `time_s` if nothing is stated.
       clock_offset_s: add it to `time_s` to get the log's common time. clock_offset_std_s: its standard deviation.
+      on_change: rows were written when a reading was new, and not at a rate; then none can be missed.
       columns: name in the file by channel. ignored: columns that are no channel.
     """
 
@@ -68,6 +69,7 @@ class LogTable:
     clock_offset_std_s: float = 0.0
     columns: Mapping[str, str] = dataclasses.field(default_factory=dict)
     ignored: tuple[str, ...] = ()
+    on_change: bool = False
 
     @property
     def common_time_s(self) -> np.ndarray:

@@ -127,6 +127,7 @@ FACTORS = {
     1.0 / 60.0: "seconds for minutes",
     -1.0: "the sign",
     3.6: "km/h for m/s",
+    1.943844: "knots for m/s",
     1.0 / 3.6: "m/s for km/h",
     6.0: "deg/s for rpm",
     1.0 / 6.0: "rpm for deg/s",

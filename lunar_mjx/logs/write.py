@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ def write_log(
     noise: Mapping[str, Noise] | None = None,
     rates_hz: Mapping[str, float] | None = None,
     clock_offsets_s: Mapping[str, tuple[float, float]] | None = None,
+    on_change: Collection[str] = (),
     parquet: bool = False,
     **settings: Any,
 ) -> Path:
@@ -37,6 +38,7 @@ def write_log(
       noise: by channel.
       rates_hz: by table; the median rate of its time if left out.
       clock_offsets_s: offset and its standard deviation, by table.
+      on_change: tables whose rows were written when a reading was new.
       parquet: write Parquet instead of CSV (needs pyarrow).
       **settings: further keys of `log.toml`: manoeuvre, gravity_m_s2, terrain, terrain_origin_m, split, environment,
         rover_changes, initial, imu, source, commitment.
@@ -62,6 +64,8 @@ def write_log(
         write_frame(frame, folder / file)
         rate = (rates_hz or {}).get(name) or float(1.0 / np.median(np.diff(frame["time_s"])))
         entries[name] = {"file": file, "rate_hz": round(rate, 6)}
+        if name in on_change:
+            entries[name]["on_change"] = True
         if name in (clock_offsets_s or {}):
             offset, std = clock_offsets_s[name]  # type: ignore[index]
             entries[name] |= {"clock_offset_s": float(offset), "clock_offset_std_s": float(std)}

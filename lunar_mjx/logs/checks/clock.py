@@ -13,6 +13,9 @@ RATE_TOLERANCE = 0.1
 WINDOW = 25
 """Intervals per window whose median is its rate: jitter of 20 % leaves 5 % in it."""
 
+STEADY, MOSTLY = 0.2, 0.9
+"""Steps count as one and the same, or as multiples of it, if this share of them lie within `STEADY` of it."""
+
 LOST_SHARE = 0.3
 """A log that lost more than this share of its samples is no record any more; links lose a few per cent."""
 
@@ -54,7 +57,8 @@ def _check_table(log: Log, table: LogTable) -> list[Finding]:
                 f"{back.size} rows; sort the rows and drop copies",
             )
         ]
-    return _check_rate(log, table, steps) or _check_jumps(log, table, steps)
+    found = [] if table.on_change else _check_rate(log, table, steps)
+    return found or _check_jumps(log, table, steps)
 
 
 def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
@@ -74,11 +78,10 @@ def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
     if windows is None:
         return []
     rate = np.median(windows, axis=1) / base
-    near = np.maximum(np.round(rate), 1.0)
-    changed = np.abs(rate - 1.0) > RATE_TOLERANCE
-    # Lost samples make some steps multiples of the base; only a run of one and the same step is another rate.
-    steady = (np.abs(windows / base - rate[:, None]) < 0.3).mean(axis=1) > 0.9
-    changed &= (np.abs(rate - near) > 0.05) | steady
+    changed = np.abs(rate - 1.0) > RATE_TOLERANCE + _resolution(table.time_s) / base
+    # Lost samples make some steps multiples of the base, and a sensor that reports when it has news makes all sorts of
+    # steps: only a run of one and the same step is another rate.
+    changed &= (np.abs(windows / base - rate[:, None]) < STEADY * rate[:, None]).mean(axis=1) > MOSTLY
     if not changed.any():
         return []
     row = int(np.argmax(changed)) + WINDOW // 2
@@ -119,7 +122,7 @@ def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
                     )
                 ]
     share = lost / (lost + len(table))
-    if share > LOST_SHARE:
+    if share > LOST_SHARE and not table.on_change and _is_regular(steps, base):
         row = int(np.argmax(steps)) + 1
         return [
             _finding(
@@ -132,6 +135,20 @@ def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
             )
         ]
     return []
+
+
+def _resolution(time: np.ndarray) -> float:
+    """The unit that times are rounded to, s: 0.01 of a clock that tells hundredths."""
+    for digits in range(10):
+        if np.all(np.abs(time - np.round(time, digits)) < 1e-9 * max(1.0, float(np.abs(time).max()))):
+            return 10.0**-digits
+    return 0.0
+
+
+def _is_regular(steps: np.ndarray, base: float) -> bool:
+    """Whether samples come at a rate, some of them lost, and not whenever a sensor has news."""
+    multiples = np.maximum(np.round(steps / base), 1.0)
+    return float((np.abs(steps / base - multiples) < STEADY).mean()) > MOSTLY
 
 
 def _pairs(table: LogTable) -> list[tuple[str, str]]:

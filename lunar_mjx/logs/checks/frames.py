@@ -8,6 +8,7 @@ import numpy as np
 
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log
+from lunar_mjx.logs.schema import SIDES
 from lunar_mjx.logs.series import Agreement, agreement, at, edges, guess, increments, integrals, means, sigma, span
 
 NORM_TOLERANCE = 0.02
@@ -134,8 +135,10 @@ def _gravity(log: Log) -> list[Finding]:
     if limits is None:
         return []
     time = np.linspace(*limits, 400)
-    w, x, y, z = (np.full(1, v) for v in log.imu.quaternion)
-    measured = np.stack([at(log, n, time) for n in names], 1) @ _rotation(w, x, y, z)[0].T  # type: ignore[type-var]
+    measured = np.stack([at(log, n, time) for n in names], 1)  # type: ignore[type-var]
+    if not log.imu.attitude:  # else both are in the IMU's frame
+        w, x, y, z = (np.full(1, v) for v in log.imu.quaternion)
+        measured = measured @ _rotation(w, x, y, z)[0].T
     turn = attitude(log, time)
     up = np.tile([0.0, 0.0, 1.0], (len(time), 1)) if turn is None else turn[:, 2, :]
     force, expected = np.median(measured, axis=0), np.median(up, axis=0)
@@ -194,7 +197,7 @@ def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Ag
 def _velocities(log: Log) -> list[Finding]:
     """Velocities against positions: unit, sign, swapped axes."""
     pairs = {a: (f"position_{a}_m", f"world_velocity_{a}_m_s") for a in "xyz"}
-    found = _paired(log, pairs, "the change of")
+    found = _paired(log, pairs, "the change of") or _ground_speed(log)
     limits = span(log, [f"{k}_velocity_{a}_m_s" for k in ("world", "body") for a in "xy"])
     if found or limits is None:
         return found
@@ -215,6 +218,27 @@ def _velocities(log: Log) -> list[Finding]:
             )
         ]
     return []
+
+
+def _ground_speed(log: Log) -> list[Finding]:
+    """Forward velocity against the way that positions tell, over a tenth of the drive at a time."""
+    names = ("position_x_m", "position_y_m", "body_velocity_x_m_s")
+    limits = span(log, names)
+    if limits is None:
+        return []
+    windows = edges(*limits, count=10, shortest=4.0)
+    way = np.hypot(*(increments(log, n, windows) for n in names[:2]))
+    driven = np.abs(integrals(log, names[2], windows))
+    # a rover that turns within a window goes further than its positions are apart: what goes straight is compared
+    pair = agreement(driven, way, sigma(log, names[0]) / np.sqrt(5.0), least=0.5)
+    if pair is None or pair.cosine < ALIKE or 1.0 / GROUND_SPEED < pair.factor < GROUND_SPEED:
+        return []
+    shown = f"is {pair.factor:.3g} times as fast as the positions change{guess(pair.factor)}"
+    return [_finding(log, names[2], "unit", f"{shown}; correct its unit")]
+
+
+GROUND_SPEED = 1.6
+"""Factor between a velocity and the way in the same time that a winding course does not explain."""
 
 
 def _turning(log: Log) -> list[Finding]:
@@ -289,17 +313,25 @@ def _turn_rate(log: Log) -> tuple[str, str] | None:
     return None
 
 
+def _side_speeds(log: Log) -> tuple[list[str], list[str]]:
+    """Channels of the left and of the right wheels' speeds: by corner where all are there, else by side."""
+    sides = [[SPEED.format(f"{s}{e}") for e in "fr"] for s in "lr"]
+    if span(log, [*sides[0], *sides[1]]) is None:
+        sides = [[SPEED.format(s)] for s in SIDES]
+    return sides[0], sides[1]
+
+
 def _left_right(log: Log) -> list[Finding]:
     """A rover whose right wheels run faster turns left; front wheels steered left turn a forward drive left."""
     turn = _turn_rate(log)
-    sides = [SPEED.format(c) for c in ("lf", "lr", "rf", "rr")]
+    own_left, own_right = _side_speeds(log)
+    sides = [*own_left, *own_right]
     limits = span(log, [*sides, turn[0]]) if turn else None
     if turn is None or limits is None:
         return []
     windows = edges(*limits)
     yaw = integrals(log, turn[0], windows) if turn[1] == "rate" else np.radians(increments(log, turn[0], windows))
-    left, right = (wheel_means(log, windows, c, SPEED) for c in (("lf", "lr"), ("rf", "rr")))
-    assert left is not None and right is not None
+    left, right = (np.mean([means(log, n, windows) for n in names], axis=0) for names in (own_left, own_right))
     if not _steers(log):
         pair = agreement(yaw, right - left, sigma(log, sides[0]))
         if pair is not None and pair.cosine < -0.8:
@@ -334,6 +366,9 @@ def _left_right(log: Log) -> list[Finding]:
     return []
 
 
+UNKNOWN_YAW = 60.0
+"""Standard deviation of the IMU's mounting about z, deg, from which its yaw tells no heading."""
+
 _LEVEL = 2.0
 """deg of pitch up to which no rover slides back on its own."""
 
@@ -357,7 +392,7 @@ def _climbs(log: Log, windows: np.ndarray, spin: np.ndarray) -> np.ndarray:
 def _course(log: Log) -> list[Finding]:
     """A rover that is not steered goes where its wheels drive it, along its heading; unless it slides back downhill."""
     names = ("position_x_m", "position_y_m", "yaw_deg")
-    drives = [SPEED.format(c) for c in ("lf", "rf", "lr", "rr")]
+    drives = [n for side in _side_speeds(log) for n in side]
     limits = span(log, (*names, *drives))
     if limits is None or _steers(log):
         return []
@@ -370,6 +405,10 @@ def _course(log: Log) -> list[Finding]:
     heading = np.radians(means(log, "yaw_deg", windows))
     along, across = east * np.cos(heading) + north * np.sin(heading), north * np.cos(heading) - east * np.sin(heading)
     off = np.degrees(np.arctan2(across * np.sign(spin), along * np.sign(spin)))
+    if log.imu.attitude and log.imu.mounting_std_deg[2] > UNKNOWN_YAW and keep.any():
+        # yaw counts from nowhere: only that the difference stays the same can be asked
+        zero = np.degrees(np.angle(np.mean(np.exp(1j * np.radians(off[keep])))))
+        off = (off - zero + 180.0) % 360.0 - 180.0
     keep &= (np.abs(off) < 90.0) | ~_climbs(log, windows, spin)
     if keep.sum() < 5:
         return []

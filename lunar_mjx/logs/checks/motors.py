@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
 from lunar_mjx.logs.checks.frames import ALIKE, FACTOR_TOLERANCE, UNLIKE, _finding, rate_agreement
-from lunar_mjx.logs.findings import Finding
+from lunar_mjx.logs.findings import WARNING, Finding, is_bad
 from lunar_mjx.logs.log import Log
-from lunar_mjx.logs.schema import CORNERS
-from lunar_mjx.logs.series import agreement, at, continuous, guess, sigma, span
+from lunar_mjx.logs.schema import CORNERS, SIDES
+from lunar_mjx.logs.series import agreement, at, continuous, edges, guess, means, sigma, span
 
 CROSSED = 3.0
 """By how much two joints must fit each other's partner better than their own, before they count as swapped."""
@@ -24,19 +25,49 @@ LEAST_RESISTANCE = 0.02
 
 def check_motors(log: Log) -> list[Finding]:
     """Every joint, and every pair of corners."""
-    found = []
+    found = _against(log)
     for kind in ("drive", "steer", "sus"):
         for quantity in ("speed_rad_s", "angle_rad"):
             found += _follows(log, kind, quantity)
-        if not found:
+        if not is_bad(found):
             found += _angles(log, kind) + _electric(log, kind) + _heat(log, kind)
     return found
 
 
 def _present(log: Log, pattern: str) -> dict[str, str]:
-    """Channels of a pattern by corner."""
-    names = {c: pattern.format(c) for c in CORNERS}
+    """Channels of a pattern by corner, or by side."""
+    names = {c: pattern.format(c) for c in (*CORNERS, *SIDES)}
     return {c: n for c, n in names.items() if continuous(log, n) is not None}
+
+
+AGAINST, DOWNHILL = -0.8, 2.0
+"""Cosine between a motor's current and its wheel's speed below which the motor seems to brake all the way; deg of pitch
+beyond which it may."""
+
+
+def _against(log: Log) -> list[Finding]:
+    """Currents with a sign: a driven rover takes power, so that current and speed have the same sign on average.
+
+    A warning only: a motor may brake all the way down a slope that no channel tells.
+    """
+    current, speed = _present(log, "motor_{}_drive_current_A"), _present(log, "joint_{}_drive_speed_rad_s")
+    found = []
+    for c, name in current.items():
+        limits = span(log, (name, speed[c])) if c in speed and name not in log.magnitudes else None
+        if limits is None:
+            continue
+        windows = edges(*limits)
+        i, w = means(log, name, windows), means(log, speed[c], windows)
+        pitch = means(log, "pitch_deg", windows) if span(log, ("pitch_deg",)) == limits else np.zeros(len(i))
+        keep = (np.abs(w) > 0.05) & (np.sign(w) * pitch < DOWNHILL)
+        if keep.sum() < 8:
+            continue
+        cosine = float(i[keep] @ w[keep] / max(np.linalg.norm(i[keep]) * np.linalg.norm(w[keep]), 1e-12))
+        if cosine < AGAINST:
+            text = f"is negative where {speed[c]} is positive (cosine {cosine:.2f}), as if the motor braked all the way"
+            problem = _finding(log, name, "frame", f"{text}; correct its sign if it drove")
+            found.append(dataclasses.replace(problem, severity=WARNING))
+    return found
 
 
 def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
@@ -55,7 +86,8 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
         noise = max(sigma(log, measured[a]), 1e-3)
         mine, other = wanted[a], seen[a]
         pair = None if mine is None or other is None else agreement(other, mine, noise / 3.0)
-        if pair is None:
+        # one command tells neither sign nor unit: a controller may scale it down, or trade the sides' speeds for a turn
+        if pair is None or len(np.unique(mine[mine != 0.0])) < 2:
             continue
         if pair.cosine > 0.95 and (pair.factor > MANY or 0.01 < pair.factor < 1.0 / (4.0 * MANY)):
             found.append(
@@ -66,7 +98,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
                     f"is {pair.factor:.3g} times its command{guess(pair.factor)}; correct its unit, or the command's",
                 )
             )
-        elif pair.cosine < -ALIKE:
+        elif pair.cosine < -ALIKE and _together(mine, other) < -UNLIKE:
             found.append(
                 _finding(
                     log,
@@ -77,6 +109,13 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
                 )
             )
     return found or _swapped(log, {c: measured[c] for c in corners}, seen, wanted, "command")  # type: ignore[arg-type]
+
+
+def _together(one: np.ndarray, other: np.ndarray) -> float:
+    """Correlation of two series about their means; 0 where one does not change."""
+    a, b = one - np.nanmean(one), other - np.nanmean(other)
+    size = float(np.sqrt(np.nansum(a * a) * np.nansum(b * b)))
+    return float(np.nansum(a * b)) / size if size > 0.0 else 0.0
 
 
 def _held(log: Log, name: str, time: np.ndarray) -> np.ndarray:

@@ -70,7 +70,9 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
         return finding(int(np.argmax(there)), "unit", text)
     if name.startswith("command_"):
         return []
-    stuck = _stuck(log, table, name, values[there])
+    # a receiver that holds its fix at rest, and an encoder that stands, are not broken
+    judged = _judged(log, table, name, there)
+    stuck = _stuck(log, table, name, values[there], judged[there])
     if stuck is not None:
         first, length, value = stuck
         row = int(np.flatnonzero(there)[first])
@@ -82,10 +84,10 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
             f"{what} {value:.6g} for {length} samples in a row, which its noise rules out; "
             "leave these cells empty or the column out",
         )
-    clipped = _clipped(log, name, values[there])
+    clipped = _clipped(log, name, values[there & judged])
     if clipped is not None:
         row = int(np.flatnonzero(there & (values == clipped))[0])
-        count = int((values == clipped).sum())
+        count = int((values[judged] == clipped).sum())
         return finding(
             row,
             "saturated",
@@ -117,24 +119,56 @@ def quantum(values: np.ndarray) -> float:
     return float(steps.min()) if steps.size else 0.0
 
 
-def longest_run(values: np.ndarray) -> tuple[int, int]:
-    """Start and length of the longest run of equal samples."""
+MOVED = ("position", "attitude", "velocity", "joint")
+"""Families of channels that tell motion, and may stand still exactly where there is none."""
+
+STILL = 0.02
+"""rad/s of a wheel that counts as standing: a wheel of 0.25 m then moves by less than 5 mm/s."""
+
+
+def _judged(log: Log, table: LogTable, name: str, there: np.ndarray) -> np.ndarray:
+    """(n,) rows in which a channel would show its noise: all, but those at rest for a channel that tells motion.
+
+    A wheel's own speed is no witness of its rest, but the other wheels' are.
+    """
+    found = find_channel(name)
+    if found is None or found[0].family not in MOVED:
+        return np.ones(len(there), bool)
+    speeds = [c for c in log.channel_names if c.endswith("_drive_speed_rad_s") and c.startswith("joint_") and c != name]
+    speeds = speeds or [c for c in log.channel_names if c.endswith("_drive_speed_rad_s") and c.startswith("command_")]
+    series = [s for c in speeds if (s := log.channel(c)) is not None and s[0].size]
+    if not series:
+        return np.ones(len(there), bool)
+    moving = np.zeros(len(there), bool)
+    for time, speed in series:
+        # between two readings a wheel is known to turn only if it does at both
+        after = np.searchsorted(time, table.common_time_s, side="left")
+        last = len(time) - 1
+        before, after = np.clip(after - 1, 0, last), np.clip(after, 0, last)
+        moving |= np.minimum(np.abs(speed[before]), np.abs(speed[after])) > STILL
+    return moving
+
+
+def longest_run(values: np.ndarray, judged: np.ndarray) -> tuple[int, int]:
+    """Start and length of the longest run of equal samples, as many of them as are judged."""
     changes = np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1, [len(values)]])
-    lengths = np.diff(changes)
+    lengths = np.diff(np.concatenate([[0], np.cumsum(judged)])[changes])
     longest = int(np.argmax(lengths))
     return int(changes[longest]), int(lengths[longest])
 
 
-def _stuck(log: Log, table: LogTable, name: str, values: np.ndarray) -> tuple[int, int, float] | None:
+def _stuck(
+    log: Log, table: LogTable, name: str, values: np.ndarray, judged: np.ndarray
+) -> tuple[int, int, float] | None:
     """Start, length and value of a run that noise rules out, or that its siblings contradict."""
-    first, length = longest_run(values)
+    first, length = longest_run(values, judged)
     if length < SHORTEST_RUN:
         return None
     noise = sigma(log, name)
     step = quantum(values) or _siblings_quantum(table, name)
     if noise > 0.0 and step is not None and length >= _possible_run(noise, step, len(values)):
         return first, length, float(values[first])
-    if length == len(values) and _siblings_move(table, name):
+    if length >= int(judged.sum()) and np.ptp(values) == 0.0 and _siblings_move(table, name):
         return first, length, float(values[0])
     return None
 
@@ -174,8 +208,8 @@ def _siblings_move(table: LogTable, name: str) -> bool:
 
 def _clipped(log: Log, name: str, values: np.ndarray) -> float | None:
     """The extreme value, if far more samples have exactly that than noise allows."""
-    noise, step = sigma(log, name), quantum(values)
-    if noise <= 0.0 or noise < 2.0 * step or len(values) < 100:
+    noise = sigma(log, name)
+    if noise <= 0.0 or len(values) < 100 or noise < 2.0 * (step := quantum(values)):
         return None
     for extreme in (float(values.max()), float(values.min())):
         count = int((values == extreme).sum())

@@ -107,18 +107,27 @@ def _read(name: str, files: Files, mapping: ImportMap) -> Iterator[RecordedDrive
     for t, path in files.items():
         table = mapping.tables[t]
         frame = _frame(path, table, f"{mapping.path}: tables.{t}", notes)
-        if table.geodetic is not None:
-            frame, origin = positions(frame, table.geodetic)
-            settings |= {"geodetic_origin": origin} if origin else {}
         found = {"": frame}
         if table.held == "auto":
             found, left = without_copies(frame, _rising(frame))
             copies += left
+        for key, part in found.items() if table.geodetic is not None else ():
+            if LATITUDE in part:
+                found[key], origin = positions(part, table.geodetic)
+                settings |= {"geodetic_origin": origin} if origin else {}
         parts |= {f"{t}_{k}" if k else t: (t, part) for k, part in found.items()}
     source = {"files": ", ".join(sorted({p.name for p in files.values()}))}
     for key, tables in _groups(parts):
         started = _from_zero(tables, {n: mapping.tables[t].own_start for n, (t, _) in parts.items()})
-        drive = RecordedDrive(f"{name}_{key}" if key else name, started, source, settings, tuple(notes), tuple(copies))
+        drive = RecordedDrive(
+            f"{name}_{key}" if key else name,
+            started,
+            source,
+            settings,
+            tuple(notes),
+            tuple(copies),
+            frozenset(n for n, (t, _) in parts.items() if n != t),
+        )
         yield without_empty(drive)
         notes, copies = [], []
 

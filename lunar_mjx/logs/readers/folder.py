@@ -204,7 +204,7 @@ def _tables(folder: Path, top: Fields, extra: dict[str, str], problems: list[Fin
     tables = {}
     for key in stated.values:
         entry = stated.table(key)
-        entry.known(("file", "rate_hz", "clock_offset_s", "clock_offset_std_s"))
+        entry.known(("file", "rate_hz", "on_change", "clock_offset_s", "clock_offset_std_s"))
         tables[key] = read_log_table(folder, name, key, entry, extra, problems)
     owner: dict[str, str] = {}
     for key, table in tables.items():

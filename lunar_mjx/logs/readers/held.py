@@ -14,6 +14,12 @@ REGULAR, ON_TIME = 0.15, 0.75
 """Renewals are regular if `ON_TIME` of the time lies in intervals within `REGULAR` of whole multiples of one period, of
 at least `REGULAR_ROWS` rows: of intervals at random a third would."""
 REGULAR_ROWS = 3.0
+SPACED, SPACED_MOST, SPACED_SIGMA = 0.5, 5, 5.0
+"""Changes keep a distance if one is followed by another in the next row less than `SPACED` times as often as in one of
+the rows up to `SPACED_MOST` after it, by `SPACED_SIGMA` standard deviations: a slower sensor's readings do."""
+RAMP = 0.8
+"""A channel in few digits that rises or falls steadily changes at steady times, too: by one step, in one direction, in
+more than this share of its changes."""
 COARSE = 8.0
 """Typical change in steps of the channel's resolution from which an exact repeat is no chance: below, a channel written
 in few digits repeats itself honestly."""
@@ -31,7 +37,7 @@ class Held:
     readings: np.ndarray
 
 
-def held_samples(time: np.ndarray, values: np.ndarray) -> Held | None:
+def held_samples(time: np.ndarray, values: np.ndarray, recurs: bool = True) -> Held | None:
     """Finds out whether the rows of some channels repeat a slower sensor's readings.
 
     Channels of a group are renewed together (both wheels of one message, latitude and longitude). A repeat counts as a
@@ -40,10 +46,11 @@ def held_samples(time: np.ndarray, values: np.ndarray) -> Held | None:
 
     Args:
       time: (n,) s. values: (n, channels), NaN at gaps.
+      recurs: whether a reading may come again exactly, as a steady speed in few digits does and a receiver's fix not.
 
     Returns:
       Period and readings; None where every row may be a reading. A copy that stands for longer than the period is kept
-      once per period, since it may have been renewed with the same value.
+      once per period where the sensor may have read the same again.
     """
     there = np.isfinite(values).all(axis=1) & np.isfinite(time)
     rows = np.flatnonzero(there)
@@ -59,7 +66,7 @@ def held_samples(time: np.ndarray, values: np.ndarray) -> Held | None:
     # while a rover stands its speeds are 0 and its fixes the same: those intervals tell nothing of the sensor
     moving = (v[at[:-1]] != 0.0).any(axis=1)
     intervals = intervals[moving & (intervals > 0.0)]
-    if len(intervals) < FEWEST_CHANGES:
+    if len(intervals) < FEWEST_CHANGES or all(_is_ramp(column) for column in v.T):
         return None
     middle = _weighted_median(intervals)
     if middle < SLOWER * step:
@@ -69,13 +76,15 @@ def held_samples(time: np.ndarray, values: np.ndarray) -> Held | None:
     period = next((float(c) for c in candidates if _regular(intervals, float(c), step)), None)
     if period is None:
         period = float(np.median(intervals))
-        if period < SLOWER * step or not _fine(v):
+        if period < SLOWER * step or not (_fine(v) or _spaced(changed)):
             return None
     else:
         period = float(np.median(intervals[np.round(intervals / period) == 1.0]))
     keep, last = np.zeros(len(t), bool), -np.inf
+    # a fine reading that comes again is the old one; a coarse one, and the zero of a rover at rest, may be new
+    may_recur = (np.full(len(t), not _fine(v)) | (v == 0.0).all(axis=1)) & recurs
     for k in range(len(t)):
-        if changed[k] or t[k] - last > 1.5 * period:
+        if changed[k] or (may_recur[k] and t[k] - last > 1.5 * period):
             keep[k], last = True, t[k]
     readings = np.zeros(len(time), bool)
     readings[rows] = keep
@@ -96,6 +105,29 @@ def _regular(intervals: np.ndarray, period: float, step: float) -> bool:
     near = np.abs(multiple - np.round(multiple)) < REGULAR * np.maximum(np.round(multiple), 1.0)
     near &= np.round(multiple) >= 1.0
     return int(near.sum()) >= FEWEST_CHANGES and float(intervals[near].sum()) > ON_TIME * float(intervals.sum())
+
+
+def _spaced(changed: np.ndarray) -> bool:
+    """Whether changes keep a distance of two rows or more from each other."""
+    at = np.flatnonzero(changed[:-SPACED_MOST])
+    if len(at) < 30:
+        return False
+    after = np.array([changed[at + lag].mean() for lag in range(1, SPACED_MOST + 1)])
+    most = float(after.max())
+    error = np.sqrt(most * (1.0 - most) / len(at)) + 1e-12
+    return after[0] < SPACED * most and most - after[0] > SPACED_SIGMA * error
+
+
+def _is_ramp(column: np.ndarray) -> bool:
+    """Whether a channel in few digits just rises or falls steadily."""
+    jumps = np.diff(column)
+    jumps = jumps[jumps != 0.0]
+    if len(jumps) < 2:
+        return True
+    size = float(np.abs(jumps).min())
+    single = np.abs(jumps) < 1.5 * size
+    onwards = np.sign(jumps[1:]) == np.sign(jumps[:-1])
+    return float((single[1:] & single[:-1] & onwards).mean()) > RAMP
 
 
 def _fine(values: np.ndarray) -> bool:

@@ -108,6 +108,7 @@ def import_drives(
                 rover=_rover(mapping, changes),
                 noise=mapping.noise,
                 clock_offsets_s=_offsets(drive, mapping),
+                on_change=drive.on_change,
                 **_settings(drive, mapping, changes),
             )
         )

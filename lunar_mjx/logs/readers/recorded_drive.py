@@ -17,6 +17,7 @@ from lunar_mjx.logs.schema import channel_name, parse_column
 TIME = "time_s"
 LATITUDE, LONGITUDE = "latitude_deg", "longitude_deg"
 """Columns of a frame that `positions` replaces."""
+_PLACES = {LATITUDE: "position_x_m", LONGITUDE: "position_y_m"}
 STILL_RAD_S = 0.02
 """A wheel of 0.25 m that turns slower moves by less than 5 mm/s."""
 
@@ -38,6 +39,7 @@ class RecordedDrive:
     Attributes:
       name: of the drive. tables: frames by name, `time_s` first, channels after it; NaN at gaps.
       source: what goes into `[source]`. settings: keys of `log.toml` that reading has found.
+      on_change: tables that hold the readings of slower sensors, which come when they are new.
       notes: what the user is told, one sentence each. copies: what was left out as copies of readings.
     """
 
@@ -47,6 +49,7 @@ class RecordedDrive:
     settings: Mapping[str, object] = dataclasses.field(default_factory=dict)
     notes: tuple[str, ...] = ()
     copies: tuple[Copies, ...] = ()
+    on_change: frozenset[str] = frozenset()
 
     @property
     def seconds(self) -> float:
@@ -91,6 +94,9 @@ def without_copies(frame: pd.DataFrame, time: np.ndarray) -> tuple[dict[str, pd.
     groups: dict[str, list[str]] = {}
     others = []
     for column in frame.columns:
+        if column in (LATITUDE, LONGITUDE):
+            groups.setdefault("position", []).append(column)
+            continue
         found = parse_column(column, "import")
         if found is None or found.channel is None:
             others.append(column)
@@ -102,11 +108,12 @@ def without_copies(frame: pd.DataFrame, time: np.ndarray) -> tuple[dict[str, pd.
             groups.setdefault(family, []).append(column)
     out, copies, rest = {}, [], frame
     for quantity, columns in groups.items():
-        held = held_samples(time, frame[columns].to_numpy(float))
+        held = held_samples(time, frame[columns].to_numpy(float), recurs=quantity not in ("position", "attitude"))
         if held is not None:
             rest = rest.drop(columns=columns)
             out[quantity] = frame.loc[held.readings, [*others, *columns]].reset_index(drop=True)
-            copies.append(Copies(tuple(columns), held.period_s, int(held.readings.sum()), len(frame)))
+            named = tuple(_PLACES.get(c, c) for c in columns)
+            copies.append(Copies(named, held.period_s, int(held.readings.sum()), len(frame)))
     if len(rest.columns) > len(others) or not out:
         out[""] = rest
     return out, copies

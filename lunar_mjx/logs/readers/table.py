@@ -14,7 +14,7 @@ import pandas as pd
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import LogTable
-from lunar_mjx.logs.schema import parse_column
+from lunar_mjx.logs.schema import limits, parse_column
 from lunar_mjx.toml_fields import Fields
 
 TIME = "time_s"
@@ -126,7 +126,7 @@ def read_log_table(
         values, wrong = numbers(frame, column)
         if wrong is not None:
             problems.append(_no_number(log, name, wrong, column, frame))
-        channels[channel] = scale * values + offset
+        channels[channel] = _without_spikes(scale * values + offset, channel, (log, name, column), problems)
         columns[channel] = column
     return LogTable(
         name=name,
@@ -138,7 +138,37 @@ def read_log_table(
         clock_offset_std_s=entry.number("clock_offset_std_s", 0.0),
         columns=columns,
         ignored=tuple(ignored),
+        on_change=_flag(entry, "on_change"),
     )
+
+
+SPIKES = 1e-3
+"""Share of samples beyond the physical range up to which they are single faults of a receiver or a bus, and become
+gaps; more of them are another unit or a broken sensor, which the gate refuses."""
+
+
+def _without_spikes(
+    values: np.ndarray, channel: str, where: tuple[str, str, str], problems: list[Finding]
+) -> np.ndarray:
+    """The values with gaps in place of single ones that no rover can show, which a warning names."""
+    low, high, why = limits(channel)
+    beyond = np.isfinite(values) & ((values < low) | (values > high))
+    count = int(beyond.sum())
+    if not 0 < count <= SPIKES * len(values):
+        return values
+    row = int(np.argmax(beyond))
+    text = (
+        f"is {values[row]:.6g}, outside [{low:g}, {high:g}] ({why}), in {count} of {len(values)} rows, which are gaps"
+    )
+    problems.append(Finding(*where[:2], row, where[2], "range", text, WARNING))
+    return np.where(beyond, np.nan, values)
+
+
+def _flag(entry: Fields, key: str) -> bool:
+    value = entry.values.get(key, False)
+    if not isinstance(value, bool):
+        raise bad_input(entry.path, entry.field(key), value, "is neither true nor false", f"write {key} = true")
+    return value
 
 
 def _no_number(log: str, table: str, row: int, column: str, frame: pd.DataFrame) -> Finding:

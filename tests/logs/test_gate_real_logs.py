@@ -1,0 +1,130 @@
+"""The gate on what honest recordings of real rovers look like: none is refused, and what is wrong in them is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lunar_mjx.logs import Log, Noise, check, read_log, write_log
+from lunar_mjx.logs.findings import is_bad
+
+TRACK, RADIUS = 1.3, 0.165
+
+
+def skid_steer(seed: int = 0, seconds: float = 120.0) -> dict[str, pd.DataFrame]:
+    """A skid steer on winding ways with stops: speeds of both sides, currents, yaw, GPS at 5 Hz that holds at rest."""
+    rng = np.random.default_rng(seed)
+    t = np.round(0.1 * np.arange(int(10 * seconds)) + 0.01 * rng.integers(-1, 2, int(10 * seconds)), 2)
+    go = ((t > 10.0) & (t < 0.6 * seconds)) | ((t > 0.7 * seconds) & (t < seconds - 10.0))
+    bend = np.repeat(rng.choice([-0.6, -0.3, 0.0, 0.0, 0.3, 0.6], len(t) // 50 + 1), 50)[: len(t)]
+    left, right = go * (3.0 - bend), go * (3.0 + bend)
+    rate = RADIUS * (right - left) / TRACK
+    yaw = np.cumsum(rate) * 0.1
+    speed = 0.5 * RADIUS * (left + right)
+    x, y = np.cumsum(speed * np.cos(yaw)) * 0.1, np.cumsum(speed * np.sin(yaw)) * 0.1
+    noisy = {"left": left + go * 0.05 * rng.normal(size=len(t)), "right": right + go * 0.05 * rng.normal(size=len(t))}
+    drive = {"time_s": t}
+    for side, w in noisy.items():
+        drive[f"joint_{side}_drive_speed_rad_s"] = np.round(w, 2)
+        drive[f"motor_{side}_drive_current_A"] = 4.0 * (w > 0.5) + rng.normal(size=len(t)) * (0.3 + 2.5 * (w > 0.5))
+    drive["yaw_deg"] = np.round(np.degrees(yaw) + 0.1 * rng.normal(size=len(t)), 1)
+    own = np.flatnonzero((np.arange(len(t)) % 2 == 0) & (rng.random(len(t)) > 0.1))
+    still = np.concatenate([[False], speed[own][1:] == 0.0])
+    fix = np.stack([x[own], y[own]]) + 0.02 * rng.normal(size=(2, len(own)))
+    for k in np.flatnonzero(still):
+        fix[:, k] = fix[:, k - 1]
+    gps = {"time_s": t[own], "position_x_m": np.round(fix[0], 2), "position_y_m": np.round(fix[1], 2)}
+    velocity = {"time_s": t[own], "body_velocity_x_m_s": np.abs(speed[own] + 0.02 * rng.normal(size=len(own)))}
+    return {"drive": pd.DataFrame(drive), "gps": pd.DataFrame(gps), "gps_speed": pd.DataFrame(velocity)}
+
+
+def make(folder: Path, change: Callable[[dict[str, pd.DataFrame]], object] | None = None, seed: int = 0) -> Log:
+    tables = skid_steer(seed)
+    if change is not None:
+        change(tables)
+    noise = {f"position_{a}_m": Noise(0.5, "datasheet", 10.0) for a in "xy"}
+    write_log(
+        folder, tables, rover="luvmi_x", gravity_m_s2=9.81, imposed="wheel_speed", noise=noise, on_change=("gps",)
+    )
+    log = read_log(folder)
+    assert isinstance(log, Log)
+    return log
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_honest_recordings_pass(seed: int, tmp_path: Path) -> None:
+    assert check(make(tmp_path / "a", seed=seed)) == []
+
+
+def _swap(table: str, one: str, other: str) -> Callable[[dict[str, pd.DataFrame]], None]:
+    def change(tables: dict[str, pd.DataFrame]) -> None:
+        t = tables[table]
+        t[one], t[other] = t[other].copy(), t[one].copy()
+
+    return change
+
+
+def _scale(table: str, column: str, factor: float) -> Callable[[dict[str, pd.DataFrame]], None]:
+    def change(tables: dict[str, pd.DataFrame]) -> None:
+        tables[table][column] = factor * tables[table][column]
+
+    return change
+
+
+def _freeze(tables: dict[str, pd.DataFrame]) -> None:
+    gps = tables["gps"]
+    driving = slice(100, 250)
+    for column in ("position_x_m", "position_y_m"):
+        gps.iloc[driving, gps.columns.get_loc(column)] = gps[column].iloc[100]
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "column", "bad"),
+    [
+        (
+            _swap("drive", "joint_left_drive_speed_rad_s", "joint_right_drive_speed_rad_s"),
+            "swap",
+            "joint_left_drive_speed_rad_s",
+            True,
+        ),
+        (_scale("gps_speed", "body_velocity_x_m_s", 1.944), "unit", "body_velocity_x_m_s", True),
+        (_scale("drive", "yaw_deg", -1.0), "swap", "joint_left_drive_speed_rad_s", True),
+        (_scale("drive", "motor_right_drive_current_A", -1.0), "frame", "motor_right_drive_current_A", False),
+        (_freeze, "stuck", "position_x_m", True),
+    ],
+)
+def test_what_is_wrong_is_found(
+    change: Callable[[dict[str, pd.DataFrame]], object], kind: str, column: str, bad: bool, tmp_path: Path
+) -> None:
+    for seed in range(3):
+        found = check(make(tmp_path / str(seed), change, seed))
+        matching = [f for f in found if f.kind == kind and f.column == column]
+        assert matching and is_bad(matching) == bad, [(f.where, f.kind, f.message) for f in found]
+
+
+def test_a_single_fault_of_a_receiver_becomes_a_gap(tmp_path: Path) -> None:
+    def spike(tables: dict[str, pd.DataFrame]) -> None:
+        many = pd.concat([tables["gps_speed"]] * 3, ignore_index=True)
+        many["time_s"] = 0.2 * np.arange(len(many))
+        tables["gps_speed"] = many
+        many.loc[77, "body_velocity_x_m_s"] = 20.0
+
+    log = make(tmp_path / "a", spike)
+    assert np.isnan(log.tables["gps_speed"].channels["body_velocity_x_m_s"][77])
+    told = [f for f in check(log) if f.kind == "range"]
+    assert len(told) == 1 and not is_bad(told) and told[0].row == 77
+
+
+def test_one_command_tells_no_sign(tmp_path: Path) -> None:
+    """A controller that trades the sides' speeds for a turn may drive a wheel against its command."""
+    t = 0.05 * np.arange(40)
+    rng = np.random.default_rng(0)
+    for name, command, bad in (("one", np.full(40, 2.0), False), ("many", 2.0 * np.sin(3.0 * t), True)):
+        frame = pd.DataFrame({"time_s": t, "command_left_drive_speed_rad_s": command})
+        frame["joint_left_drive_speed_rad_s"] = -0.8 * command + 0.01 * rng.normal(size=40)
+        write_log(tmp_path / name, {"drive": frame}, rover="luvmi_x")
+        assert is_bad(check(read_log(tmp_path / name))) == bad
