@@ -83,7 +83,7 @@ def loop_parity(model: Model, states: int = 20) -> float:
     gap = 0.0
     for i in range(states):
         exact = reference.hard_loop(qpos[i], qvel[i], {k: f[i] for k, f in forces.items()})
-        found = (new[i] - np.float32(qvel[i])) / reference.engine.timestep
+        found = (new[i] - np.float32(qvel[i])) / reference.timestep
         gap = max(gap, float(np.abs(found - exact)[free].max() / np.abs(exact).max()))
     return gap
 

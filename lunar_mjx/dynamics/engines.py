@@ -18,12 +18,11 @@ Engine = MjxEngine | StructuredEngine
 _log = logging.getLogger(__name__)
 
 
-def make_engine(rover: Rover, timestep: float, engine: str = "auto") -> Engine:
+def make_engine(rover: Rover, engine: str = "auto") -> Engine:
     """Makes the engine of a rover.
 
     Args:
       rover: the rover.
-      timestep: s.
       engine: one of `ENGINES`; `auto` logs one sentence where it falls back to MJX.
 
     Raises:
@@ -32,11 +31,11 @@ def make_engine(rover: Rover, timestep: float, engine: str = "auto") -> Engine:
     if engine not in ENGINES:
         raise UserError(f"build: engine = {engine!r} does not exist; use one of {', '.join(ENGINES)}.")
     if engine == "mjx":
-        return MjxEngine(rover, timestep)
+        return MjxEngine(rover)
     try:
-        return StructuredEngine(rover, timestep)
+        return StructuredEngine(rover)
     except UnsuitableError as error:
         if engine == "structured":
             raise
         _log.warning("%s runs on the slower MJX engine: %s", rover.name, error)
-        return MjxEngine(rover, timestep)
+        return MjxEngine(rover)

@@ -192,7 +192,7 @@ class KinematicDrive:
         """One time step of one rover towards the joint speeds `speed`: ((positions, velocities, states), seen)."""
         system = self.system
         params = dataclasses.replace(params, terrain=system.params.terrain)
-        kinematics, finish = system.engine.forward_imposed(params, q, v)
+        kinematics, finish = system.engine.forward_imposed(params, q, v, system.dt)
         cold = params.ambient.at(0.0) - REFERENCE_TEMPERATURE + jnp.zeros_like(speed)
         temperature = Temperature(cold, jnp.zeros_like(cold), cold, jnp.zeros_like(cold))
         state = State(step=jnp.zeros((), jnp.int32), qpos=q, qvel=v, temperature=temperature, effects=effects)

@@ -34,9 +34,8 @@ class MjxEngine:
 
     name = "mjx"
 
-    def __init__(self, rover: Rover, timestep: float):
+    def __init__(self, rover: Rover):
         model = rover.compile()
-        model.opt.timestep = timestep
         _check_options(model, rover)
         self.mj_model = model
         self.nq, self.nv = model.nq, model.nv
@@ -54,11 +53,12 @@ class MjxEngine:
         self._data = mjx.make_data(model)
 
     @jax.default_matmul_precision("highest")
-    def forward(self, params: Any, qpos: Any, qvel: Any) -> tuple[Kinematics, Finish]:
-        """Kinematics at (qpos, qvel), and a function from forces to the next (qpos, qvel)."""
+    def forward(self, params: Any, qpos: Any, qvel: Any, dt: Any) -> tuple[Kinematics, Finish]:
+        """Kinematics at (qpos, qvel), and a function from forces to (qpos, qvel) a time step of `dt` s later."""
         dtype = qpos.dtype
         m = jax.tree.map(lambda a: _cast(a, dtype), self._mjx)
         d = jax.tree.map(lambda a: _cast(a, dtype), self._data)
+        m = m.replace(opt=m.opt.replace(timestep=jnp.asarray(dt, dtype)))
         m = _with_gravity(m, jnp.asarray(params.gravity, dtype))
         d = d.replace(qpos=qpos, qvel=qvel)
         d = mjx.com_vel(m, mjx.com_pos(m, mjx.kinematics(m, d)))

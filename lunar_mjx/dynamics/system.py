@@ -37,18 +37,21 @@ class System:
       params: the model's parameters, as a pytree of arrays.
       info: the rover as drawn.
       engine: the rigid-body engine.
-      dt: time step, s.
     """
 
     def __init__(self, model: Model, engine: str = "auto"):
         self.model = model
-        self.dt = model.timestep
-        self.engine = make_engine(model.rover, model.timestep, engine)
+        self.engine = make_engine(model.rover, engine)
         self.pipeline = Pipeline(model.effects)
         self.info = rover_info(model)
         self.params = default_params(model)
         steer = [model.rover.joints.index(w.steer) if w.steer else -1 for w in model.rover.wheels]
         self._steer, self._steered = np.maximum(steer, 0), np.array(steer) >= 0
+
+    @property
+    def dt(self) -> float:
+        """Time step of the model, s."""
+        return self.model.timestep
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -122,7 +125,7 @@ class System:
         Returns:
           The state at the end of the step, and what the step saw at its beginning.
         """
-        kinematics, finish = self.engine.forward(params, state.qpos, state.qvel)
+        kinematics, finish = self.engine.forward(params, state.qpos, state.qvel, self.dt)
         ctx = self._context(params, state, kinematics)
         forces, ctx, effects = apply_effects(self.pipeline, ctx, jnp.asarray(control, state.qpos.dtype), state.effects)
         heat, effects, temperature = step_heat(

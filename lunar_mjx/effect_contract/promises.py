@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
@@ -69,6 +70,7 @@ def check_effect(effect: Effect, *, rovers: int = ROVERS, seed: int = 0, overhea
     with jax.enable_x64(True):
         runs = [_subject(effect, wheels, rovers, seed) for wheels in sizes]
         _try(effect, runs[0])
+        checks.append(_requirements(effect))
         checks.append(_null(effect, runs))
         checks += _derivatives(effect, runs, seed)
         checks.append(_homogeneity(effect, rovers, seed))
@@ -121,6 +123,36 @@ def _try(effect: Effect, run: tuple[_Act, Any]) -> None:
     except Exception as error:  # whatever a user's function raises
         reason = " ".join(str(error).split())[:300]
         raise UserError(f"effect {effect.name}: does not run: {type(error).__name__}: {reason}; mend it.") from error
+
+
+class _Noting(dict[str, Any]):
+    """Parameters by effect that note whose were looked up as if they had to be there."""
+
+    def __init__(self, values: Mapping[str, Any], read: set[str]):
+        super().__init__(values)
+        self._read = read
+
+    def __getitem__(self, name: str) -> Any:
+        self._read.add(name)
+        return super().__getitem__(name)
+
+
+def _requirements(effect: Effect) -> Check:
+    """Whether every effect whose parameters it reads is declared; what is asked for by `get` may be missing."""
+    read: set[str] = set()
+
+    def noting(function: Callable[..., Any]) -> Callable[..., Any]:
+        def noted(ctx: Any, p: Any, x: Any, value: Any) -> Any:
+            return function(dataclasses.replace(ctx, parameters=_Noting(ctx.parameters, read)), p, x, value)
+
+        return noted
+
+    watched = dataclasses.replace(effect, ports={port: noting(f) for port, f in effect.ports.items()})
+    act, s = _subject(watched, 4, 1, 0)
+    jax.eval_shape(jax.vmap(functools.partial(act, _numbers(effect.nominal()))), s)
+    missing = sorted(read - {effect.name, *effect.requires})
+    told = f"reads the parameters of {', '.join(missing)}: say requires={tuple(missing)}" if missing else ""
+    return Check("requirements", not missing, told or f"reads of others: {', '.join(effect.requires) or 'nothing'}")
 
 
 def _numbers(values: Mapping[str, float]) -> dict[str, Any]:
@@ -259,9 +291,7 @@ def _watched(effect: Effect, scales: Mapping[str, Rescaling], found: list[tuple[
         return both
 
     ports = {port: watch(port, function) for port, function in effect.ports.items()}
-    return Effect(
-        effect.name, ports, effect.parameters, effect.state, effect.replaces, effect.order, effect.transient, effect.doc
-    )
+    return dataclasses.replace(effect, ports=ports)
 
 
 def _differences(got: Any, want: Any) -> tuple[list[Any], list[Any]]:

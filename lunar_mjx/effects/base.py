@@ -23,13 +23,13 @@ wheels or joints, and knows nothing of the engine that calls it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from lunar_mjx.errors import UserError, require_finite
+from lunar_mjx.errors import UserError, bad_input, require_finite
 
 PORTS = ("command", "motor_torque", "geometry", "soil", "wheel_normal", "wheel_shear", "body_wrench", "heat", "sensor")
 """The ports, in the order in which a step calls them (`sensor` acts on the finished trajectory)."""
@@ -98,7 +98,19 @@ class StateVariable:
         return like + self.initial
 
 
+class Refusal(NamedTuple):
+    """Why values of an effect make no sense together: the parameter to name, what is wrong with it, and a remedy."""
+
+    parameter: str
+    problem: str
+    remedy: str
+
+
 PortFunction = Callable[..., Any]
+Validate = Callable[[Mapping[str, Any], Sequence[float]], Refusal | None]
+"""From values by parameter and the widths of the rover's wheels, m, to a refusal, or None where they are sound."""
+Recall = Callable[[Any, Any], Any]
+"""From an effect's state and the contact of the wheels as it is now to the contact as the soil remembers it."""
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -115,6 +127,10 @@ class Effect:
       order: effects at one port run by rising order, and in list order where equal.
       transient: the effect vanishes on a wheel in steady state, or needs its history or its place, so that a
         steady-state wheel test bed leaves it out.
+      requires: names of effects whose parameters it reads: they must be in the list.
+      validate: refuses values that make no sense together, though each is within its bounds.
+      recall: what its state says about the contact of wheel and ground, for the ports from `soil` on: the only way by
+        which one effect's state is seen by others.
       doc: equation and source.
     """
 
@@ -126,6 +142,9 @@ class Effect:
     order: int = 0
     transient: bool = False
     doc: str = ""
+    requires: tuple[str, ...] = ()
+    validate: Validate | None = None
+    recall: Recall | None = None
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -135,6 +154,8 @@ class Effect:
                 raise UserError(f"effect {self.name}: port = {port!r} does not exist; use one of {', '.join(PORTS)}.")
         if not self.ports:
             raise UserError(f"effect {self.name}: ports is empty; name at least one of {', '.join(PORTS)}.")
+        if self.recall is not None and not self.state:
+            raise UserError(f"effect {self.name}: recall is given without a state; declare the state that it reads.")
 
     def nominal(self) -> dict[str, float]:
         """The nominal value of every parameter."""
@@ -173,6 +194,22 @@ class Effect:
             )
         return number
 
+    def check_together(self, values: Mapping[str, Any], wheel_widths: Sequence[float], source: str) -> None:
+        """Refuses values that make no sense together.
+
+        Args:
+          values: of all parameters, each checked by itself.
+          wheel_widths: of the rover, m.
+          source: file or function to name in the error.
+
+        Raises:
+          UserError: what `validate` refuses.
+        """
+        refusal = None if self.validate is None else self.validate(values, wheel_widths)
+        if refusal is not None:
+            field = f"effects.{self.name}.{refusal.parameter}"
+            raise bad_input(source, field, values[refusal.parameter], refusal.problem, refusal.remedy)
+
 
 def effect(
     port: str,
@@ -181,6 +218,9 @@ def effect(
     replaces: tuple[str, ...] = (),
     order: int = 0,
     transient: bool = False,
+    requires: tuple[str, ...] = (),
+    validate: Validate | None = None,
+    recall: Recall | None = None,
     **parameters: Parameter,
 ) -> Callable[[PortFunction], Effect]:
     """Decorator: makes an `Effect` of a function at one port; the function's docstring states equation and source."""
@@ -195,6 +235,9 @@ def effect(
             order=order,
             transient=transient,
             doc=(function.__doc__ or "").strip(),
+            requires=requires,
+            validate=validate,
+            recall=recall,
         )
 
     return build

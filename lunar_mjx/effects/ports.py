@@ -64,6 +64,13 @@ class Pipeline:
     def __contains__(self, port: str) -> bool:
         return port in self._at
 
+    def recall(self, contact: Contact, state: EffectState) -> Contact:
+        """The contact as the soil remembers it, where an effect's state says so."""
+        for effect in self.effects:
+            if effect.recall is not None and effect.name in state:
+                contact = effect.recall(SimpleNamespace(**state[effect.name]), contact)
+        return contact
+
     def run(self, port: str, ctx: Context, state: EffectState, value: Any) -> tuple[Any, EffectState]:
         """Passes `value` through the effects at `port`; returns it with the effects' new state."""
         for effect in self._at.get(port, ()):
@@ -155,21 +162,9 @@ def initial_wheel(contact: Contact) -> WheelForce:
     )
 
 
-def _remembered(contact: Contact, state: EffectState) -> Contact:
-    """A contact with the slip that the soil remembers, where an effect keeps it.
-
-    The slip of a wheel that creeps changes within a millimetre per second from none to full. Soil that answered to it
-    at once would shake a parked rover for ever; it is displaced over a contact length instead.
-    """
-    for kept in state.values():
-        if {"slip_x", "direction"} <= kept.keys():
-            return dataclasses.replace(contact, soil_slip=jnp.clip(kept["direction"] * kept["slip_x"], -1.0, 1.0))
-    return contact
-
-
 def wheel_ports(pipeline: Pipeline, ctx: Context, state: EffectState) -> tuple[Context, EffectState]:
     """The ports soil, wheel_normal and wheel_shear, for a context that already has its contact."""
-    contact: Contact = _remembered(ctx.contact, state)  # type: ignore[arg-type]
+    contact: Contact = pipeline.recall(ctx.contact, state)  # type: ignore[arg-type]
     ctx = dataclasses.replace(ctx, contact=contact)
     soil, state = pipeline.run("soil", ctx, state, initial_soil(contact.sinkage))
     ctx = dataclasses.replace(ctx, soil=soil)

@@ -133,8 +133,7 @@ class Model:
                 _check_length(self.rover, effect, key, checked, source)
             new[key] = checked
         model = dataclasses.replace(self, parameters={**self.parameters, name: new})
-        if name == "soil" and {"k_c", "k_phi"} <= new.keys():
-            _check_soil(model, source)
+        effect.check_together(new, [wheel.width for wheel in self.rover.wheels], source)
         return model
 
     def replace(self, **changes: Any) -> Model:
@@ -212,49 +211,21 @@ def _check_flat(effect: Effect, key: str, value: Any, source: str) -> None:
         raise bad_input(source, f"effects.{effect.name}.{key}", value, "is nested", "give a flat list of numbers")
 
 
-def _check_soil(model: Model, source: str) -> None:
-    """Refuses a soil that would pull a wheel of the rover down: k_c/b + k_phi must be positive for every width b."""
-    k_c, k_phi = (float(model.parameters["soil"][key]) for key in ("k_c", "k_phi"))  # type: ignore[arg-type]
-    width = min(wheel.width for wheel in model.rover.wheels)
-    if k_c / width + k_phi <= 0.0:
-        raise bad_input(
-            source,
-            "effects.soil.k_c",
-            k_c,
-            f"makes the soil's stiffness k_c/b + k_phi = {k_c / width + k_phi:g} under a wheel {width:g} m "
-            "wide, which is not positive",
-            "give a larger k_c or k_phi, or a rover with wider wheels",
-        )
-
-
-READS_MOTOR = (
-    "joint_control",
-    "winding_conduction",
-    "rotor_stator_path",
-    "iron_loss",
-    "gear_friction_heat",
-    "magnet_nonlinearity",
-    "directional_gear_efficiency",
-    "backlash",
-    "voltage_saturation",
-)
-"""Effects that read the parameters of the effect `motor`."""
-
-
 def check_effects(model: Model, source: str | Path) -> None:
     """Refuses a list of effects that cannot run.
 
     Raises:
       UserError: an effect needs another one that is not in the list.
     """
-    needy = [name for name in READS_MOTOR if name in model.effect_names]
-    if needy and "motor" not in model.effect_names:
+    present = set(model.effect_names)
+    for missing in dict.fromkeys(name for e in model.effects for name in e.requires if name not in present):
+        needy = [e.name for e in model.effects if missing in e.requires]
         raise bad_input(
             source,
             "effect_list",
             ", ".join(model.effect_names),
-            f"lacks motor, which {needy[0]} reads",
-            f"add motor or take out {', '.join(needy)}",
+            f"lacks {missing}, which {needy[0]} reads",
+            f"add {missing} or take out {', '.join(needy)}",
         )
 
 

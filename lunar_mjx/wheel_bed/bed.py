@@ -159,6 +159,10 @@ class WheelBed:
                         "has one value per wheel",
                         "give one number: a test bed has one wheel",
                     )
+        for effect in self.effects:
+            for key, value in given.get(effect.name, {}).items():
+                # Fits hand on arrays and traced values, which are checked where they come from.
+                effect.check(key, value if isinstance(value, int | float) else effect.nominal()[key], "WheelBed")
         ports = {port for e in self.effects for port in e.ports}
         if not {"wheel_normal", "wheel_shear"} <= ports:
             raise UserError(

@@ -1,6 +1,5 @@
 """Native MuJoCo in float64 as the reference for the structured engine: one step under the same forces."""
 
-import copy
 import functools
 from types import SimpleNamespace
 
@@ -23,8 +22,9 @@ class Reference:
 
     def __init__(self, rover: Rover, timestep: float = 0.002):
         self.rover = rover
-        self.engine = StructuredEngine(rover, timestep)
+        self.engine, self.timestep = StructuredEngine(rover), timestep
         self.model = m = self.engine.mj_model
+        m.opt.timestep = timestep
         m.opt.gravity[:] = (0.0, 0.0, -GRAVITY)
         self.data = mujoco.MjData(m)
         self.wheels = [m.body(w.body).id for w in rover.wheels]
@@ -33,7 +33,7 @@ class Reference:
 
     def step(self, qpos, qvel, forces):
         """What the engine sees, and its next state, operation by operation: compiling a step takes far longer."""
-        return jax.vmap(self._step, in_axes=(None, 0, 0, 0))(self.engine.timestep, qpos, qvel, forces)
+        return jax.vmap(self._step, in_axes=(None, 0, 0, 0))(self.timestep, qpos, qvel, forces)
 
     @functools.cached_property
     def fly(self):
@@ -46,9 +46,8 @@ class Reference:
         return jax.jit(lambda dt, count, *state: jax.lax.fori_loop(0, count, lambda _, now: one(dt, now), state))
 
     def _step(self, dt, qpos, qvel, f):
-        engine = copy.copy(self.engine)
-        engine.timestep = dt
-        kinematics, finish = engine.forward(SimpleNamespace(gravity=GRAVITY, effects={}), qpos, qvel)
+        params = SimpleNamespace(gravity=GRAVITY, effects={})
+        kinematics, finish = self.engine.forward(params, qpos, qvel, dt)
         nil, none = jnp.zeros(()), jnp.zeros(len(self.rover.wheels))
         geometry = Geometry(none, none, none, nil, Vec3(nil, nil, nil), Vec3(nil, nil, nil))
         world = (Vec3(*f[k]) for k in ("wheel_force", "wheel_moment", "chassis_force", "chassis_moment"))
@@ -116,7 +115,7 @@ class Reference:
         mass = np.zeros((m.nv, m.nv))
         mujoco.mj_fullM(m, d, mass)
         # damping is implicit in the engine's step
-        mass += self.engine.timestep * np.diag(m.dof_damping)
+        mass += self.timestep * np.diag(m.dof_damping)
         pushed = np.zeros(m.nv)
         self._accumulate(pushed)
         free = d.qfrc_passive + d.qfrc_applied + pushed - d.qfrc_bias

@@ -26,7 +26,7 @@ def test_loops_accelerate_at_given_speeds_as_in_native_mujoco():
     """J' v of VIPER's pins in float64: MJX leaves it out of the reference acceleration, MuJoCo takes it away there."""
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
-        engine = MjxEngine(load_rover("viper"), 0.002)
+        engine = MjxEngine(load_rover("viper"))
         engine.mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         native = mujoco.MjData(engine.mj_model)
         data = jax.tree.map(lambda a: _cast(a, float), engine._data)

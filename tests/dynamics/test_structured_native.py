@@ -81,7 +81,7 @@ def _assert_equals_rigid_loop(rover, states):
     """Accelerations of the base and the independent joints, with implicit damping within the loop."""
     reference = Reference(rover)
     reference.model.opt.jacobian = 0
-    dt = reference.engine.timestep
+    dt = reference.timestep
     qpos, qvel, forces = reference.random(states)
     # short of the dead points of the general loops
     qpos[:, 7:] = np.clip(qpos[:, 7:], -0.15, 0.15)
@@ -180,10 +180,10 @@ def test_refuses_joints_it_cannot_honour(joint, message, tmp_path):
     first = text.index('axis="', text.index("l0_drive"))
     rover.mjcf.write_text(text[:first] + joint + text[text.index('"', first + 6) + 1 :])
     if message is None:
-        StructuredEngine(rover, 0.002)  # limits are off by their flag
+        StructuredEngine(rover)  # limits are off by their flag
         return
     with pytest.raises(UnsuitableError, match=message):
-        StructuredEngine(rover, 0.002)
+        StructuredEngine(rover)
 
 
 @pytest.mark.parametrize(
@@ -207,4 +207,4 @@ def test_refuses_models_it_cannot_honour(old, new, message, tmp_path):
     rover = made.spider(tmp_path, 3, links=1)
     rover.mjcf.write_text(rover.mjcf.read_text().replace(old, new, 1))
     with pytest.raises(UnsuitableError, match=message):
-        StructuredEngine(rover, 0.002)
+        StructuredEngine(rover)

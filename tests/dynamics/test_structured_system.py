@@ -204,7 +204,7 @@ def test_auto_takes_structured_and_says_why_not(tmp_path, caplog):
     text = rover.mjcf.read_text().replace("</worldbody>", '</worldbody><equality><joint joint1="l0_drive"/></equality>')
     rover.mjcf.write_text(text)
     with caplog.at_level(logging.WARNING):
-        assert make_engine(rover, 0.002).name == "mjx"
+        assert make_engine(rover).name == "mjx"
     assert "no connect" in caplog.text and len(caplog.records) == 1
     with pytest.raises(UserError, match="does not exist"):
-        make_engine(rover, 0.002, "warp")
+        make_engine(rover, "warp")

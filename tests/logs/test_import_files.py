@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from cli_harness import Run
 from scipy.io import savemat
 
 from lunar_mjx.errors import UserError
@@ -17,6 +16,7 @@ from lunar_mjx.logs.readers.clocks import TimeColumn, seconds
 from lunar_mjx.logs.readers.geodesy import tangent_plane, utm, utm_zone
 from lunar_mjx.logs.readers.held import held_samples
 from lunar_mjx.logs.readers.import_map import read_map, shipped_maps
+from tests.cli_harness import Run
 
 MAP = """
 [log]

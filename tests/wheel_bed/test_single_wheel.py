@@ -109,6 +109,10 @@ def test_users_mistakes_are_told(consistent):
         WheelBed.of_preset("papre")
     with pytest.raises(UserError, match="no wheel-soil contact"):
         WheelBed(["soil"])
+    with pytest.raises(UserError, match=r"effects\.soil\.kphi is unknown"):
+        WheelBed(consistent.effects, {"soil": {"kphi": 1e6}})
+    with pytest.raises(UserError, match=r"effects\.soil\.n = 9 1 is outside"):
+        WheelBed(consistent.effects, {"soil": {"n": 9.0}})
     with pytest.raises(UserError, match="does not act on this wheel"):
         consistent.with_values({"penalty_contact": {"stiffness": 1.0}})
 

@@ -89,14 +89,12 @@ class StructuredEngine:
 
     name = "structured"
 
-    def __init__(self, rover: Rover, timestep: float):
+    def __init__(self, rover: Rover):
         model = rover.compile()
-        model.opt.timestep = timestep
         check_model(model, str(rover.mjcf))
         self.mj_model = model
         self.nq, self.nv = model.nq, model.nv
         self.qpos0 = np.array(model.qpos0)
-        self.timestep = timestep
         wheels = np.array([model.body(wheel.body).id for wheel in rover.wheels])
         axles = np.array([model.jnt_axis[model.joint(wheel.drive).id] for wheel in rover.wheels])
         chassis = model.body(rover.chassis).id
@@ -105,7 +103,7 @@ class StructuredEngine:
         self.wheel_feet = wheel_feet(model, wheels, chassis)
         self._joints = len(joints)
 
-    def forward(self, params: Any, qpos: Any, qvel: Any) -> tuple[Kinematics, Finish]:
+    def forward(self, params: Any, qpos: Any, qvel: Any, dt: Any) -> tuple[Kinematics, Finish]:
         """Kinematics at (qpos, qvel), and a function from forces to the next (qpos, qvel).
 
         The dependent joints of loops are computed from the independent ones; their entries in `qpos` and `qvel` are
@@ -114,6 +112,7 @@ class StructuredEngine:
         Args:
           params: gravity, and the motors' rotor inertia where there are motors.
           qpos, qvel: MuJoCo's coordinates of shapes (nq,) and (nv,), or both as `split` gives them.
+          dt: time step, s.
         """
         whole = not isinstance(qpos, Pieces)
         if whole:
@@ -121,7 +120,7 @@ class StructuredEngine:
         numbers, legs, base = self._kinematic_state(qpos, qvel)
 
         def finish(forces: Forces) -> tuple[Any, Any]:
-            new = self._finish(params, numbers, legs, base, forces)
+            new = self._finish(params, numbers, legs, base, forces, dt)
             return self.join(*new) if whole else new
 
         return self._kinematics(numbers, legs, base), finish
@@ -207,13 +206,13 @@ class StructuredEngine:
             wheel_angular_velocity=of_wheels(spins),
         )
 
-    def forward_imposed(self, params: Any, qpos: Pieces, qvel: Pieces) -> tuple[Kinematics, Any]:
+    def forward_imposed(self, params: Any, qpos: Pieces, qvel: Pieces, dt: Any) -> tuple[Kinematics, Any]:
         """Kinematics, and a function from forces and imposed joint accelerations to the next state and the torques.
 
         The joints' motion is given, the base is free: torques come out instead of going in.
 
         Args:
-          params, qpos, qvel: as for `forward`, the coordinates as `split` gives them.
+          params, qpos, qvel, dt: as for `forward`, the coordinates as `split` gives them.
 
         Returns:
           The kinematics, and `finish(forces, joint_acceleration, up)` with accelerations of the actuated joints,
@@ -229,7 +228,7 @@ class StructuredEngine:
         numbers, legs, base = self._kinematic_state(qpos, qvel)
 
         def finish(forces: Forces, joint_acceleration: Any, up: Vector) -> tuple[Pieces, Pieces, Any, Vector]:
-            return self._finish_imposed(params, numbers, legs, base, forces, joint_acceleration, up)
+            return self._finish_imposed(params, numbers, legs, base, forces, joint_acceleration, up, dt)
 
         return self._kinematics(numbers, legs, base), finish
 
@@ -242,24 +241,25 @@ class StructuredEngine:
         forces: Forces,
         joint_acceleration: Any,
         up: Vector,
+        dt: Any,
     ) -> tuple[Pieces, Pieces, Any, Vector]:
         dtype = forces.joint_torque.dtype
         armature = _reflected_inertia(params, self._joints, dtype)
         unpowered = dataclasses.replace(forces, joint_torque=jnp.zeros_like(forces.joint_torque))
-        blocks = [leg_block(n, leg, up, unpowered, base.frame, armature, self.timestep)
+        blocks = [leg_block(n, leg, up, unpowered, base.frame, armature, dt)
                   for n, leg in zip(numbers, legs, strict=True)]  # fmt: skip
         rates = [mul(n.links[0].numbers.sign, select(joint_acceleration, n.links[0].actuated)) for n in numbers]
         acceleration, torques = impose(*self._chassis(base, forces, up), blocks, rates)
-        stepped = self._integrate(numbers, legs, base, acceleration, [[rate] for rate in rates])
+        stepped = self._integrate(numbers, legs, base, acceleration, [[rate] for rate in rates], dt)
         signed = [_over_legs(mul(n.links[0].numbers.sign, t), n.count) for n, t in zip(numbers, torques, strict=True)]
         linear = acceleration.linear + base.motion.angular.cross(base.motion.linear)
         return *stepped, assemble(signed, [n.links[0].actuated for n in numbers]), linear
 
     def _finish(
-        self, params: Any, numbers: list[LegGroup], legs: list[LegState], base: Base, forces: Forces
+        self, params: Any, numbers: list[LegGroup], legs: list[LegState], base: Base, forces: Forces, dt: Any
     ) -> tuple[Pieces, Pieces]:
         """Accelerations from the forces, and a step of semi-implicit Euler."""
-        dtype, dt, frame = forces.joint_torque.dtype, self.timestep, base.frame
+        dtype, frame = forces.joint_torque.dtype, base.frame
         gravity = params.gravity if forces.geometry.gravity is None else forces.geometry.gravity
         up = frame.undo(Vector(0.0, 0.0, jnp.asarray(gravity, dtype)))
         armature = _reflected_inertia(params, self._joints, dtype)
@@ -267,7 +267,7 @@ class StructuredEngine:
             leg_block(group, leg, up, forces, frame, armature, dt) for group, leg in zip(numbers, legs, strict=True)
         ]
         acceleration, rates = solve(*self._chassis(base, forces, up), blocks)
-        return self._integrate(numbers, legs, base, acceleration, rates)
+        return self._integrate(numbers, legs, base, acceleration, rates, dt)
 
     def _chassis(self, base: Base, forces: Forces, up: Vector) -> tuple[Inertia, Force]:
         """The chassis' inertia, and the force that it needs to move as it does."""
@@ -277,10 +277,16 @@ class StructuredEngine:
         return chassis, chassis.apply(Motion(ZERO, up)) + motion.cross_force(chassis.apply(motion)) - applied
 
     def _integrate(
-        self, numbers: list[LegGroup], legs: list[LegState], base: Base, acceleration: Motion, rates: list[list[Any]]
+        self,
+        numbers: list[LegGroup],
+        legs: list[LegState],
+        base: Base,
+        acceleration: Motion,
+        rates: list[list[Any]],
+        dt: Any,
     ) -> tuple[Pieces, Pieces]:
         """A step of semi-implicit Euler."""
-        frame, motion, dt = base.frame, base.motion, self.timestep
+        frame, motion = base.frame, base.motion
         # the classical acceleration of the chassis frame's origin
         linear = acceleration.linear + motion.angular.cross(motion.linear)
         velocity = base.velocity + frame.apply(linear) * dt

@@ -15,7 +15,7 @@ def _winding_to_housing(ctx):
     return (ctx.winding_temperature - ctx.housing_temperature) / ctx.parameters["motor"].R_th1
 
 
-@effect("heat")
+@effect("heat", requires=("motor",))
 def winding_conduction(ctx, p, x, heat):
     """The winding loses (T_R - T_S)/R_th1 (eq. 2)."""
     return dataclasses.replace(heat, winding=heat.winding - _winding_to_housing(ctx))
@@ -23,6 +23,7 @@ def winding_conduction(ctx, p, x, heat):
 
 @effect(
     "heat",
+    requires=("motor",),
     share=Parameter(
         1.0, 0.0, (0.0, 1.0), "1", "share of the winding's heat loss that reaches the housing", "conservation of energy"
     ),

@@ -55,11 +55,13 @@ iron_loss = Effect(
 
     The rotor is braked by what it heats: -N^2 K_fe omega at the joint (drag = 1); with drag = 0 the heat comes from
     nowhere, as where a log's model knows iron loss as heat alone. Source: MuJoCo's dcmotor note (thermal).""",
+    requires=("motor",),
 )
 
 
 @effect(
     "heat",
+    requires=("motor",),
     share=Parameter(
         1.0,
         0.0,

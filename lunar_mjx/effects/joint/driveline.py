@@ -105,6 +105,7 @@ def driveline_compliance(ctx, p, x, command):
 
 @effect(
     "command",
+    requires=("motor",),
     order=52,
     state={"gap": StateVariable(0.0, "rad", "motor ahead of the joint within the play", axis="joint")},
     half_gap=Parameter(

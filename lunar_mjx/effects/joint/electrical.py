@@ -29,6 +29,7 @@ def voltage_of(limit: float) -> float:
 
 @effect(
     "command",
+    requires=("motor",),
     order=55,
     state={"correction": StateVariable(0.0, "A", "current taken away by the limit", axis="joint")},
     limit=Parameter(

@@ -146,6 +146,7 @@ def cold_grease(ctx, p, x, torque):
 
 @effect(
     "motor_torque",
+    requires=("motor",),
     order=5,
     asymmetry=Parameter(
         1.0,

@@ -38,6 +38,7 @@ def torque_per_ampere(motor) -> jnp.ndarray:
 
 @effect(
     "command",
+    requires=("motor",),
     order=50,
     current_limit=Parameter(
         11.6, None, (0.0, 1e3), "A", "largest current of the amplifier", _MAXON + ", stall current", axis="joint"
@@ -109,6 +110,7 @@ def _motor_heat(ctx, p, x, heat):
 
 @effect(
     "motor_torque",
+    requires=("motor",),
     order=1,
     beta_2=Parameter(
         -2e-6,

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 
-from lunar_mjx.effects.base import Parameter, effect
+from lunar_mjx.effects.base import Parameter, Refusal, effect
 from lunar_mjx.terrain import rock_fraction
 
 _SOURCEBOOK = "Heiken et al. 1991, Lunar Sourcebook, ch. 9"
@@ -62,9 +64,24 @@ SOILS: dict[str, dict[str, float]] = {
 there); Ding et al. 2011 (shear moduli 0.0097-0.0131 m, middle taken); MarsSim's parameter file; Wong (LETE sand)."""
 
 
+def _positive_stiffness(values: Mapping[str, Any], wheel_widths: Sequence[float]) -> Refusal | None:
+    """Refuses a soil that would pull a wheel down: k_c/b + k_phi must be positive for every width b of a wheel."""
+    narrowest = min(wheel_widths)
+    stiffness = values["k_c"] / narrowest + values["k_phi"]
+    if stiffness > 0.0:
+        return None
+    return Refusal(
+        "k_c",
+        f"makes the soil's stiffness k_c/b + k_phi = {stiffness:g} under a wheel {narrowest:g} m wide, which is not "
+        "positive",
+        "give a larger k_c or k_phi, or a rover with wider wheels",
+    )
+
+
 @effect(
     "soil",
     order=-100,
+    validate=_positive_stiffness,
     k_c=Parameter(1.4e3, None, (-1e7, 1e7), "N/m^(n+1)", "cohesive modulus of sinkage", _SOURCEBOOK),
     k_phi=Parameter(8.2e5, None, (0.0, 1e9), "N/m^(n+2)", "frictional modulus of sinkage", _SOURCEBOOK),
     n=Parameter(1.0, None, (0.1, 3.0), "1", "sinkage exponent", _SOURCEBOOK),

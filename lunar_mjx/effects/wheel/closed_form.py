@@ -136,10 +136,20 @@ def contact_length(ctx, normal):
     return ctx.geometry.radius * sin_difference(normal.entrance, normal.theta_m)
 
 
+def _remembered_slip(x, contact):
+    """The contact with the slip that the soil remembers.
+
+    The slip of a wheel that creeps changes within a millimetre per second from none to full. Soil that answered to it
+    at once would shake a parked rover for ever; it is displaced over a contact length instead.
+    """
+    return dataclasses.replace(contact, soil_slip=jnp.clip(x.direction * x.slip_x, -1.0, 1.0))
+
+
 @effect(
     "wheel_shear",
     order=-10,
     transient=True,
+    recall=_remembered_slip,
     state={
         "slip_x": StateVariable(0.0, "1", "shear displacement along the wheel over the contact length"),
         "slip_y": StateVariable(0.0, "1", "shear displacement across the wheel over the contact length"),
