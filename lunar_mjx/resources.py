@@ -1,4 +1,4 @@
-"""Where the rovers and terrains that ship with the package lie, in a checkout and in an installed wheel alike."""
+"""Where the rovers, terrains and trainings that ship lie, in a checkout and in an installed wheel alike."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def shipped(kind: str) -> Path:
-    """Returns the folder of shipped `models` or `terrain`.
+    """Returns the folder of shipped `models`, `terrain` or `train`.
 
     Raises:
       UserError: the installation lacks the folder.

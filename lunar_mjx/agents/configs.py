@@ -1,14 +1,17 @@
-"""Trainings by name: an environment with its options, how to train in it, and for how long."""
+"""Trainings as files: an environment with its options, how to train in it, and for how long (the folder `train`)."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from lunar_mjx.agents import ddpg, td3
 from lunar_mjx.agents.learner import TrainConfig
 from lunar_mjx.errors import bad_input
+from lunar_mjx.resources import shipped
+from lunar_mjx.toml_fields import Fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,114 +34,75 @@ class Training:
     note: str = ""
 
 
-_LARGE = TrainConfig(
-    td3.TUNED,
-    envs=8192,
-    batch=16384,
-    updates=4,
-    buffer_steps=256,
-    random_steps=8,
-    noise=(0.02, 0.4),
-    normalise=True,
-    epoch_steps=50,
-    episodes=False,
-)
-_SMALL_TD3 = td3.TD3Config(
-    actor_layers=(128, 128),
-    critic_layers=(128, 128),
-    actor_last_scale=0.01,
-    layer_norm=True,
-    actor_rate=3e-4,
-    critic_rate=1e-3,
-    gamma=0.95,
-    tau=0.02,
-    n_step=3,
-    reward_scale=0.02,
-)
-_SHORT_OPTIONS = {
-    "task": "consistent",
-    "action": "velocity",
-    "terrain": "flat",
-    "goal_distance": (3.0, 5.0),
-    "episode_time": 12.0,
-    "decimation": 100,
-    "observations": ("goal_body", "body_velocity", "body_rates"),
-}
-_POINT = TrainConfig(
-    td3.TD3Config(actor_layers=(64, 64), critic_layers=(64, 64), n_step=3, tau=0.02),
-    envs=32,
-    batch=256,
-    updates=2,
-    buffer_steps=1000,
-    random_steps=20,
-    noise=(0.05, 0.4),
-    normalise=True,
-    epoch_steps=100,
-)
-_UNSEEN = {"terrain": "world:heldout", "ranges": "unseen"}
-
-TRAININGS: dict[str, Training] = {
-    "paper-td3": Training(
-        "navigation",
-        {"task": "paper"},
-        TrainConfig(td3.TD3Config(), batch=100, buffer_steps=200_000),
-        120_000,
-        note="section V with SB3's defaults of TD3",
-    ),
-    "paper-ddpg": Training(
-        "navigation",
-        {"task": "paper"},
-        TrainConfig(ddpg.DDPGConfig(), batch=100, buffer_steps=200_000),
-        120_000,
-        note="section V with SB3's defaults of DDPG",
-    ),
-    "large-td3": Training(
-        "navigation",
-        {"task": "large"},
-        _LARGE,
-        60_000_000,
-        _UNSEEN,
-        note="TD3 with thousands of rovers on rough ground, goals 10 to 40 m away",
-    ),
-    "large-ddpg": Training(
-        "navigation",
-        {"task": "large"},
-        dataclasses.replace(_LARGE, algorithm=ddpg.TUNED),
-        60_000_000,
-        _UNSEEN,
-        note="DDPG likewise",
-    ),
-    "short": Training(
-        "navigation",
-        _SHORT_OPTIONS,
-        TrainConfig(
-            _SMALL_TD3,
-            envs=64,
-            batch=256,
-            updates=8,
-            buffer_steps=400,
-            random_steps=10,
-            noise=(0.05, 0.5),
-            normalise=True,
-            epoch_steps=25,
-        ),
-        48_000,
-        note="TD3 on flat ground, goals 3 to 5 m away: learns within minutes on two CPU cores",
-    ),
-    "point": Training("point", {}, _POINT, 96_000, note="a point without physics: seconds"),
-}
-"""Trainings that `lunar-mjx train` knows by name."""
+ALGORITHMS: Mapping[str, type] = {"td3": td3.TD3Config, "ddpg": ddpg.DDPGConfig}
+"""Tables of a training file that name the algorithm and hold its settings."""
+_KEYS = ("note", "environment", "steps", "options", "unseen", "train", *ALGORITHMS)
 
 
-def get_training(name: str) -> Training:
-    """A training by name.
+def training_names() -> tuple[str, ...]:
+    """Names of the trainings that ship: the files of the folder `train`."""
+    return tuple(sorted(p.stem for p in shipped("train").glob("*.toml")))
+
+
+def get_training(name: str | Path) -> Training:
+    """A training by the name of a shipped file, or by the path of a file like those.
 
     Raises:
-      UserError: there is no such training.
+      UserError: there is no such training, or its file says something that no training has.
     """
-    if name not in TRAININGS:
-        raise bad_input("train", "training", name, "does not exist", f"use one of {', '.join(TRAININGS)}")
-    return TRAININGS[name]
+    if str(name) in training_names():
+        return read_training(shipped("train") / f"{name}.toml")
+    if Path(name).suffix == ".toml":
+        return read_training(Path(name))
+    known = ", ".join(training_names())
+    raise bad_input("train", "training", str(name), "does not exist", f"use one of {known}, or a file my_training.toml")
+
+
+def read_training(path: Path) -> Training:
+    """A training from its file; settings that it leaves out have their defaults.
+
+    Raises:
+      UserError: the file is missing, or a field is unknown or of another kind.
+    """
+    fields = Fields.read(path, "the training")
+    fields.known(_KEYS)
+    named = [a for a in ALGORITHMS if a in fields.values]
+    if len(named) != 1:
+        tables = " or ".join(f"[{a}]" for a in ALGORITHMS)
+        raise bad_input(path, "algorithm", " and ".join(named) or "none", "is not one table", f"give one of {tables}")
+    steps = fields.positive("steps")
+    algorithm = _settings(ALGORITHMS[named[0]](), fields.table(named[0]))
+    train = _settings(TrainConfig(algorithm), fields.table("train"))
+    return Training(
+        fields.text("environment"),
+        _tuples(fields.table("options").values),
+        train,
+        int(steps),
+        _tuples(fields.table("unseen").values),
+        fields.text("note", ""),
+    )
+
+
+def _settings(defaults: Any, table: Fields) -> Any:
+    """A dataclass of settings with the values of a table."""
+    table.known([f.name for f in dataclasses.fields(defaults) if f.name != "algorithm"])
+    return dataclasses.replace(defaults, **{k: _as(getattr(defaults, k), table, k) for k in table.values})
+
+
+def _as(old: Any, table: Fields, key: str) -> Any:
+    """A value of the kind that the setting has: a whole number serves for a number, a list for a tuple."""
+    value = table.values[key]
+    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(old, tuple) and isinstance(value, list):
+        return tuple(float(v) if old and isinstance(old[0], float) else v for v in value)
+    if old is not None and type(value) is not type(old):
+        raise bad_input(table.path, table.field(key), value, f"is not like {old}", f"write it like {old}")
+    return value
+
+
+def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
 
 
 def override(training: Training, **values: Any) -> Training:

@@ -65,20 +65,6 @@ class DDPGConfig:
             raise bad_input("DDPGConfig", "value_range", self.value_range, "is empty", "give the least return first")
 
 
-TUNED = DDPGConfig(
-    actor_layers=(512, 256, 128),
-    critic_layers=(512, 256, 128),
-    layer_norm=True,
-    actor_last_scale=0.01,
-    actor_rate=3e-4,
-    critic_rate=5e-4,
-    tau=0.05,
-    n_step=3,
-    reward_scale=0.01,
-)
-"""For thousands of environments, after PQL (Li et al. 2023)."""
-
-
 @pytree
 class DDPGState:
     """Parameters, targets and optimisers; `updates` counts updates."""

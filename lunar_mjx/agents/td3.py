@@ -1,7 +1,7 @@
 """TD3 (Fujimoto et al. 2018), with FastTD3's (Seo et al. 2025) distributional critic as an option.
 
 One agent is three pure functions on a pytree: `init`, `act` and `update`. Observations come normalised, rewards as the
-n-step sums of the replay buffer. SB3's defaults are `TD3Config()`; `TUNED` is for large batches.
+n-step sums of the replay buffer. SB3's defaults are `TD3Config()`; `train/large-td3.toml` is for large batches.
 """
 
 from __future__ import annotations
@@ -73,27 +73,6 @@ class TD3Config:
                 raise bad_input("TD3Config", name, getattr(self, name), "is below 1", "give at least 1")
         if self.atoms > 1 and not self.value_range[0] < self.value_range[1]:
             raise bad_input("TD3Config", "value_range", self.value_range, "is empty", "give the least return first")
-
-
-TUNED = TD3Config(
-    actor_layers=(512, 256, 128),
-    critic_layers=(1024, 512, 256),
-    layer_norm=True,
-    actor_last_scale=0.01,
-    actor_rate=3e-4,
-    critic_rate=3e-4,
-    weight_decay=0.1,
-    gamma=0.995,
-    tau=0.1,
-    target_noise=0.1,
-    target_clip=0.3,
-    n_step=3,
-    atoms=101,
-    value_range=(-3.0, 7.0),
-    reward_scale=0.01,
-)
-"""For thousands of environments and batches of 8,192 and more: a distributional critic, layer norm, AdamW and fast
-targets from FastTD3; n-step returns and a critic wider than the actor from PQL (Li et al. 2023)."""
 
 
 @pytree

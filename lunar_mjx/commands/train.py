@@ -41,7 +41,7 @@ def env_options(texts: list[str] | None) -> dict[str, Any]:
 
 
 def train(
-    training: Annotated[str, typer.Argument(help="Name of a training; see --list.")] = "large-td3",
+    training: Annotated[str, typer.Argument(help="A training by name (--list), or my_training.toml.")] = "large-td3",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to resume from.")] = Path(
         "runs/train"
     ),
@@ -71,11 +71,11 @@ def train(
     select_device(device)
     import dataclasses
 
-    from lunar_mjx.agents.configs import TRAININGS, get_training, override
+    from lunar_mjx.agents.configs import get_training, override, training_names
 
     if list_:
-        for name, known in TRAININGS.items():
-            print(f"{name:12} {known.note}")
+        for name in training_names():
+            print(f"{name:12} {get_training(name).note}")
         return
     chosen = override(get_training(training), **pairs("--set", settings))
     options = env_options(env)

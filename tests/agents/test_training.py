@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.agents import guard
-from lunar_mjx.agents.configs import TRAININGS, get_training, override
+from lunar_mjx.agents.configs import get_training, override, read_training, training_names
 from lunar_mjx.agents.ddpg import DDPGConfig
 from lunar_mjx.agents.evaluate import Evaluator, evaluate, wilson
 from lunar_mjx.agents.learner import Learner, TrainConfig
@@ -197,10 +197,39 @@ def test_overrides_by_name():
     assert (changed.train.envs, changed.train.noise, changed.train.normalise) == (64, (0.1, 0.2), False)
     assert changed.train.algorithm.atoms == 51
     with pytest.raises(UserError, match="is no setting"):
-        override(TRAININGS["point"], speed=1)
+        override(get_training("point"), speed=1)
     with pytest.raises(UserError, match="is not like 8192"):
-        override(TRAININGS["large-td3"], envs="many")
+        override(get_training("large-td3"), envs="many")
     with pytest.raises(UserError, match="does not exist"):
         get_training("fast")
     with pytest.raises(UserError, match="random_steps"):
-        override(TRAININGS["point"], random_steps=1)
+        override(get_training("point"), random_steps=1)
+
+
+def test_every_training_that_ships_is_read():
+    assert set(training_names()) >= {"paper-td3", "paper-ddpg", "large-td3", "large-ddpg", "short", "point"}
+    for name in training_names():
+        training = get_training(name)
+        assert training.note and training.steps > 0
+    large = get_training("large-td3")
+    assert large.train.algorithm.value_range == (-3.0, 7.0) and large.unseen["terrain"] == "world:heldout"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("steps = 10\n[td3]\n", "environment = None is not a text"),
+        (
+            'environment = "point"\nsteps = 10\n',
+            r"algorithm = 'none' is not one table; give one of \[td3\] or \[ddpg\]",
+        ),
+        ('environment = "point"\nsteps = 10\n[td3]\ngama = 0.9\n', r"td3\.gama = 0\.9 is an unknown key"),
+        ('environment = "point"\nsteps = 10\n[td3]\n[train]\nenvs = "many"\n', r"train\.envs = 'many' is not like 1"),
+        ('environment = "point"\nstep = 10\n[td3]\n', "step = 10 is an unknown key"),
+    ],
+)
+def test_mistakes_in_a_training_file_are_told(text, told, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(UserError, match=told):
+        read_training(path)
