@@ -256,6 +256,8 @@ def _print_comparison(run: Any) -> None:
     for label in ("as_given", "refitted"):
         table.add_row(label.replace("_", " "), *(_shown(found[label].get(k)) for k in found["refitted"]))
     console.print(table)
+    if found.get("unused"):
+        console.print(found["unused"], highlight=False)
     worst = sorted(found["by_channel"], key=lambda row: -(row["refitted"] or 0.0))[:8]
     table = make_table("manoeuvre", "split", "channel", "as given", "refitted")
     for row in worst:

@@ -10,7 +10,7 @@ from lunar_mjx.diagnosis.runs import Run
 from lunar_mjx.diagnosis.tables.problem import TableProblem
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
-from lunar_mjx.errors import UserError
+from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.problem import Problem
 from lunar_mjx.logs import SteadyLog
@@ -75,7 +75,14 @@ def build_problem(
         candidates = {n: e for n, e in candidates.items() if n not in FINER_FORMS}
     if isinstance(logs[0], SteadyLog):
         return table_problem(run, logs, candidates)
-    return DriveProblem(logs, run.model, candidates, run.splits, progress=progress)  # type: ignore[arg-type]
+    return DriveProblem(
+        logs,  # type: ignore[arg-type]
+        run.model,
+        candidates,
+        run.splits,
+        progress=progress,
+        discrepancy=run.discrepancy,
+    )
 
 
 def table_problem(run: Run, logs: Sequence[SteadyLog], candidates: Mapping[str, Effect]) -> TableProblem:
@@ -83,6 +90,10 @@ def table_problem(run: Run, logs: Sequence[SteadyLog], candidates: Mapping[str, 
     gravities = {float(log.gravity_m_s2 or EARTH_GRAVITY) for log in logs}
     if len(gravities) > 1:
         raise UserError(f"{logs[0].folder}: tables of different gravity do not go into one run; compare them apart.")
+    known = {q for log in logs for q in log.table.measured}
+    for name in run.discrepancy:
+        if name not in known:
+            raise bad_input("--discrepancy", "quantity", name, "was not measured", f"use one of {', '.join(known)}")
     model = run.model
     bed = WheelBed(model.effects, {name: _single(values) for name, values in model.parameters.items()}, gravities.pop())
     return TableProblem(logs, bed, candidates, run.splits, extra_sigma=run.discrepancy)

@@ -12,6 +12,7 @@ import numpy as np
 
 from lunar_mjx.diagnosis.attribute import diagnose, parameters
 from lunar_mjx.diagnosis.build_problem import build_problem
+from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.fitted_model import fitted_model
 from lunar_mjx.diagnosis.refit import Settings
 from lunar_mjx.diagnosis.runs import (
@@ -94,7 +95,8 @@ def _compare(run: Run, progress: Progress) -> Run:
     start = whitened_residuals(problem, problem.origin()[None])[0]
     fitted = fit_baseline(problem, Settings(seed=run.seed), memory, progress)
     stated = {log.name: log.split for log in campaign if log.split}
-    run.save(COMPARISON_FILE, {**comparison(problem, start, fitted), "log_splits": stated})
+    unused = problem.unused if isinstance(problem, DriveProblem) else ""
+    run.save(COMPARISON_FILE, {**comparison(problem, start, fitted), "log_splits": stated, "unused": unused})
     _save_series(run, problem, start, {"refitted": fitted})
     _record_test(run, "compare", problem, {"refitted": fitted})
     return run

@@ -63,7 +63,11 @@ def joint_channels(rover: Rover) -> list[str]:
 
 
 def observe(
-    system: System, telemetry: Telemetry, params: Params | None = None, imu_position: Sequence[float] | None = None
+    system: System,
+    telemetry: Telemetry,
+    params: Params | None = None,
+    imu_position: Sequence[float] | None = None,
+    imu_quaternion: Sequence[float] | None = None,
 ) -> Signals:
     """The true channels of a drive: what perfect sensors with one clock would write.
 
@@ -76,6 +80,8 @@ def observe(
       telemetry: of `rollout` (time, ...) or `rollout_batch` (batch, time, ...).
       params: the parameters of the drive, for gravity (a number, or one per rover); those of the model if None.
       imu_position: of the accelerometer in the chassis frame, m; the frame's origin if None.
+      imu_quaternion: w, x, y, z from the IMU's axes to the chassis's, for the channels of gyroscope and accelerometer;
+        the same axes if None.
 
     Returns:
       Channels of shape (time,) or (batch, time), named as in a log.
@@ -93,8 +99,12 @@ def observe(
         out[name] = seen.quaternion[..., i]
     for name, part in zip(EULER, seen.euler, strict=True):
         out[name] = part * _RAD_TO_DEG
-    _vector(out, "gyro_{}_rad_s", body.from_world(seen.angular_velocity))
-    _vector(out, "accelerometer_{}_m_s2", _specific_force(seen, body, gravity, imu_position))
+    spin, force = body.from_world(seen.angular_velocity), _specific_force(seen, body, gravity, imu_position)
+    if imu_quaternion is not None:
+        axes = _body_frame(jnp.asarray(imu_quaternion))
+        spin, force = axes.from_world(spin), axes.from_world(force)
+    _vector(out, "gyro_{}_rad_s", spin)
+    _vector(out, "accelerometer_{}_m_s2", force)
     per_joint = {
         "joint_{}_angle_rad": seen.joint_angle,
         "joint_{}_speed_rad_s": seen.joint_speed,
@@ -192,10 +202,14 @@ def apply_sensors(effects: Sequence[Effect], params: Params, signals: Signals, c
 
 
 def measure(
-    system: System, telemetry: Telemetry, params: Params | None = None, imu_position: Sequence[float] | None = None
+    system: System,
+    telemetry: Telemetry,
+    params: Params | None = None,
+    imu_position: Sequence[float] | None = None,
+    imu_quaternion: Sequence[float] | None = None,
 ) -> Signals:
     """What the rover's sensors write: `observe`, and then the effects at the port `sensor`; arguments as there."""
-    signals = observe(system, telemetry, params, imu_position)
+    signals = observe(system, telemetry, params, imu_position, imu_quaternion)
     used = system.params if params is None else params
     return apply_sensors(system.model.effects, used, signals, sensor_context(system, signals, params))
 

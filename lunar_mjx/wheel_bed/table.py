@@ -217,7 +217,8 @@ SAME_LOAD = 0.25
 
 
 def replicate_groups(table: SteadyStateTable) -> np.ndarray:
-    """Which point each run belongs to: same slip angle, same rim and travel speed (or slip ratio to 0.01), same load.
+    """Which point each run belongs to: same slip angle, same rim and travel speed (slip ratio to 0.01 where one of the
+    speeds is not given), same load. Whatever was imposed and differs separates runs.
 
     Loads count as the same where no gap of more than 25 % lies between them.
 
@@ -225,11 +226,8 @@ def replicate_groups(table: SteadyStateTable) -> np.ndarray:
       Group number of each row, counted by rising slip angle, then speeds or slip, then load.
     """
     keys = [np.round(table.test["slip_angle_deg"], 2)]
-    if "rim_speed_m_s" in table.test:
-        keys += [np.round(table.test[c], 4) for c in _SPEEDS if c in table.test]
-        if "travel_speed_m_s" not in table.test:
-            keys.append(np.round(table.test["slip_ratio"], 2))
-    else:
+    keys += [np.round(table.test[c], 4) for c in _SPEEDS if c in table.test]
+    if not all(c in table.test for c in _SPEEDS):
         keys.append(np.round(table.test["slip_ratio"], 2))
     first = np.unique(np.column_stack(keys), axis=0, return_inverse=True)[1].reshape(-1)
     level = np.zeros(len(first), int)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
+from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, log_model
 from lunar_mjx.logs import commands as log_commands
+from lunar_mjx.logs.series import sigma
 from lunar_mjx.model import ZERO_CELSIUS, Model
 from lunar_mjx.terrain.heightfield import slope
 
@@ -24,6 +27,13 @@ _LEVEL = math.radians(1.0)
 """On a steeper slope a rover creeps for seconds, ever slower: how long it has stood may show in its currents."""
 
 
+class ImuMounting(NamedTuple):
+    """Position m in the chassis frame; quaternion w, x, y, z from the IMU's axes to the chassis's."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class LogRun:
     """A log made ready to simulate.
@@ -33,7 +43,9 @@ class LogRun:
       commands: (time, joint). every: time steps per command.
       begin, end: common time of the first command and of the last telemetry, s.
       start: x, y m, yaw rad, temperature K, time it had stood s. unknown: which of these a fit must find.
-      imu_position: m.
+      motion: `moves`, whether the log begins in motion; then `velocity` (2,) world m/s, `yaw_rate` rad/s and
+        `joint_speed` (joint,) rad/s, NaN where unknown.
+      imu: how the IMU is mounted.
     """
 
     model: Model
@@ -43,7 +55,8 @@ class LogRun:
     end: float
     start: Mapping[str, float]
     unknown: tuple[str, ...]
-    imu_position: tuple[float, float, float]
+    motion: Mapping[str, np.ndarray]
+    imu: ImuMounting
 
 
 def log_run(log: Log, model: Model) -> LogRun:
@@ -63,7 +76,9 @@ def log_run(log: Log, model: Model) -> LogRun:
         raise UserError(f"{log.folder}: is too short to simulate ({len(values)} commands); record a longer drive.")
     end = begin + (len(values) - 1) * every * own.timestep
     start, unknown = _start(log, own)
-    return LogRun(own, values, every, begin, end, start, unknown, tuple(log.imu.position_m))  # type: ignore[arg-type]
+    motion = start_motion(log, own, begin, start["yaw"])
+    imu = ImuMounting(log.imu.position_m, log.imu.quaternion)
+    return LogRun(own, values, every, begin, end, start, unknown, motion, imu)
 
 
 def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
@@ -83,10 +98,15 @@ def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
         if value is not None:
             start[axis] = value
             unknown.append(axis)
-    yaw = first("yaw_deg")
+    yaw, said = first("yaw_deg"), _stated_yaw(log)
+    if said is not None:
+        start["yaw"] = said
     if yaw is not None:
         start["yaw"] = float(np.deg2rad(yaw))
         unknown.append("yaw")
+    degrees = [log.initial[k] for k in ("winding_temperature_degC", "housing_temperature_degC") if k in log.initial]
+    if degrees:
+        start["temperature"] = float(np.mean(degrees)) + ZERO_CELSIUS
     temperatures = [first(c) for c in log.channel_names if c.endswith("_temperature_degC")]
     known = [t for t in temperatures if t is not None]
     if known:
@@ -96,3 +116,72 @@ def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
         start[STOOD] = 2.0 * SETTLE
         unknown.append(STOOD)
     return start, tuple(unknown)
+
+
+def _stated_yaw(log: Log) -> float | None:
+    """Yaw at the start as `[initial]` states it, as an angle or by a quaternion, rad; None where it does not."""
+    if "yaw_deg" in log.initial:
+        return math.radians(log.initial["yaw_deg"])
+    if "quaternion" not in log.initial:
+        return None
+    w, x, y, z = log.initial["quaternion"]
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+_NEAR_START, _SIGMAS = 0.5, 5.0
+"""s within which a first sample tells the start; noise that it must exceed to tell motion."""
+STARTS_MOVING = 0.02
+"""m/s of a rover, or of its wheels' rims, from which a log begins in motion: below, noise of a rover at rest."""
+
+
+def start_motion(log: Log, model: Model, begin: float, yaw: float) -> dict[str, np.ndarray]:
+    """Velocities of a rover whose log begins in motion: what `[initial]` states, else what is measured about then.
+
+    Where no velocity is known, the wheels are taken to roll.
+
+    Args:
+      log: of a drive. model: with its rover. begin: common time of the start, s. yaw: then, rad.
+
+    Returns:
+      `moves`, `velocity`, `yaw_rate` and `joint_speed` as in `LogRun`.
+    """
+
+    def measured(*names: str) -> float:
+        """The first sample: a line through several would see a rover that starts at once as one that was moving."""
+        for name in names:
+            found = log.channel(name)
+            if found is not None and len(found[0]) and found[0][0] - begin < _NEAR_START:
+                value = float(found[1][0])
+                return value if abs(value) > _SIGMAS * sigma(log, name) else 0.0
+        return math.nan
+
+    channels = joint_channels(model.rover)
+    pairs = [(c, f"{'left' if c[0] == 'l' else 'right'}_drive" if c.endswith("_drive") else c) for c in channels]
+    spin = np.array([measured(f"joint_{c}_speed_rad_s", f"joint_{s}_speed_rad_s") for c, s in pairs])
+    rims = [spin[channels.index(f"{w.corner}_drive")] * w.radius for w in model.rover.wheels]
+    rolling = float(np.mean(rims)) if np.all(np.isfinite(rims)) else math.nan
+    velocity = _start_velocity(log, measured, yaw)
+    stated = log.initial.get("angular_velocity_rad_s")
+    rate = measured("gyro_z_rad_s") if stated is None else float(stated[2])
+    rate = 0.0 if math.isnan(rate) else rate
+    if velocity is None:
+        ahead = 0.0 if math.isnan(rolling) else rolling
+        velocity = np.array([ahead * math.cos(yaw), ahead * math.sin(yaw)])
+    # one of the two may be noise of a sensor that drifts; a rover in motion shows both where both are measured
+    sizes = [float(np.hypot(*velocity)), *(abs(v) for v in rims if np.isfinite(v))]
+    moves = max(sizes) > STARTS_MOVING and (math.isnan(rolling) or max(np.abs(rims)) > STARTS_MOVING)
+    return {"moves": np.array(moves), "velocity": velocity, "yaw_rate": np.array(rate), "joint_speed": spin}
+
+
+def _start_velocity(log: Log, measured: Callable[..., float], yaw: float) -> np.ndarray | None:
+    """(2,) velocity in the world at the start, m/s; None where neither `[initial]` nor a channel tells it."""
+    if "world_velocity_m_s" in log.initial:
+        return np.array(log.initial["world_velocity_m_s"][:2], float)
+    world = np.array([measured(f"world_velocity_{a}_m_s") for a in "xy"])
+    if np.isfinite(world).all():
+        return world
+    ahead, left = (measured(f"body_velocity_{a}_m_s") for a in "xy")
+    if math.isnan(ahead) or "body_velocity_x_m_s" in log.magnitudes:
+        return None
+    left = 0.0 if math.isnan(left) else left
+    return np.array([ahead * math.cos(yaw) - left * math.sin(yaw), ahead * math.sin(yaw) + left * math.cos(yaw)])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +12,7 @@ import numpy as np
 from lunar_mjx.diagnosis.drives.noise import Noises
 from lunar_mjx.diagnosis.drives.rollouts import Bench
 from lunar_mjx.diagnosis.drives.slip_samples import defined
+from lunar_mjx.errors import bad_input
 from lunar_mjx.inference.observations import Observations, Series
 
 if TYPE_CHECKING:
@@ -59,3 +62,35 @@ def observations_of(
         unit_split=split,
         unit_names=names,
     )
+
+
+DISCREPANCY_TIME_S = 1.0
+"""Correlation time of a known discrepancy where a channel's noise has none: a model errs alike within a manoeuvre's
+phases, which last about a second, and not from sample to sample."""
+
+
+def with_discrepancy(observations: Observations, discrepancy: Mapping[str, float]) -> Observations:
+    """Observations whose noise holds a known unexplained error of the model, as a coloured part.
+
+    Args:
+      observations: of drives. discrepancy: standard deviation by channel, in its unit; a name may hold `*`.
+
+    Raises:
+      UserError: a name that matches no channel that is compared, or a negative size.
+    """
+    names = {s.channel for s in observations.series}
+    for pattern, size in discrepancy.items():
+        if not any(fnmatchcase(n, pattern) for n in names):
+            shown = ", ".join(sorted(names))
+            raise bad_input("--discrepancy", "channel", pattern, "is not compared", f"use one of {shown}")
+        if not 0.0 <= size < np.inf:
+            raise bad_input("--discrepancy", pattern, size, "is no size of an error", "give a number from 0 on")
+
+    def widened(s: Series) -> Series:
+        added = float(np.sqrt(sum(v * v for p, v in discrepancy.items() if fnmatchcase(s.channel, p))))
+        if added == 0.0:
+            return s
+        time = s.correlation_time if s.coloured > 0.0 and s.correlation_time > 0.0 else DISCREPANCY_TIME_S
+        return dataclasses.replace(s, coloured=float(np.hypot(s.coloured, added)), correlation_time=time)
+
+    return dataclasses.replace(observations, series=tuple(map(widened, observations.series)))

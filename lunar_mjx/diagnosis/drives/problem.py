@@ -30,10 +30,11 @@ from lunar_mjx.diagnosis.drives.nuisances import (
     step_error_share,
     unabsorbed,
 )
-from lunar_mjx.diagnosis.drives.observations import observations_of
+from lunar_mjx.diagnosis.drives.observations import observations_of, with_discrepancy
 from lunar_mjx.diagnosis.drives.program import Rows
 from lunar_mjx.diagnosis.drives.rollouts import Bench
 from lunar_mjx.diagnosis.drives.simulated_rows import Key, Simulated, keys_of_rows, stamp_of_observations
+from lunar_mjx.diagnosis.drives.unused import unused_sentence
 from lunar_mjx.diagnosis.effect_coordinates import of_candidate
 from lunar_mjx.diagnosis.fitted_model import fitted_model
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS, SMOOTH, amplitude, smooth_inputs
@@ -72,6 +73,7 @@ class DriveProblem(Problem):
         chunk: int | None = None,
         engine: str = "auto",
         progress: Progress = silent,
+        discrepancy: Mapping[str, float] | None = None,
     ):
         """Makes the problem.
 
@@ -85,9 +87,14 @@ class DriveProblem(Problem):
           chunk: rovers simulated at once.
           engine: of the dynamics.
           progress: told of every chunk.
+          discrepancy: known unexplained error of the model by channel, in its unit; a name may hold `*`.
+
+        Raises:
+          UserError: a discrepancy of a channel that is not compared.
         """
         self.logs, self.model = tuple(logs), model
         self._splits, self._baseline_spec, self._channels = dict(splits or {}), baseline, channels
+        self._discrepancy = dict(discrepancy or {})
         self._start: dict[str, float] = {}
         self.effects, self.not_tested = usable(model.effects, candidates, unfit)
         self.progress = progress
@@ -105,8 +112,9 @@ class DriveProblem(Problem):
         found = baseline_coordinates(model, baseline)
         count = len(found)
         self._noises = Noises(self.logs)
-        self.observations = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
-        self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self.observations.series)
+        self._noise_alone = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
+        self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
+        self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self._noise_alone.series)
         shows = self._standing_shows()
         found.append(step_error_share())
         for number, run in enumerate(self.bench.runs):
@@ -125,6 +133,11 @@ class DriveProblem(Problem):
         self.coordinates = (*found, *of_candidate(self._smooth))
         self._step_error: np.ndarray | None = None
         self._halved: tuple[frozenset[str], np.ndarray, np.ndarray] | None = None
+
+    @property
+    def unused(self) -> str:
+        """What the logs hold and nothing reads, as one sentence; empty if all is read."""
+        return unused_sentence(self.logs, [self.bench.channels(n) for n in range(len(self.logs))])
 
     @property
     def eager(self) -> bool:
@@ -154,6 +167,7 @@ class DriveProblem(Problem):
         model = fitted_model(self, fit, model)
         other = self.with_effects(candidates, progress, model)
         other.observations, other.noise_unlearnt = self.observations, self.noise_unlearnt
+        other._noise_alone = self._noise_alone
         other._start = {self.coordinates[i].key: fit.u[i] for i in self._nuisance}
         return other
 
@@ -171,17 +185,20 @@ class DriveProblem(Problem):
             self.bench.chunk,
             self.bench.engine,
             progress,
+            self._discrepancy,
         )
 
     def instead(self, model: Model, candidates: Mapping[str, Effect], progress: Progress = silent) -> DriveProblem:
         """The same logs, with the noise as it was learnt, against another model of the same rover."""
         other = self.with_effects(candidates, progress, model)
         other.observations, other.noise_unlearnt = self.observations, self.noise_unlearnt
+        other._noise_alone = self._noise_alone
         other._step_error = self.step_error  # of the first order: hardly another, and it costs a program
         return other
 
     def learn_noise(self, u: np.ndarray) -> None:
-        self.observations = self._noises.refined(self.observations, self.observations.value - self.predict(u[None])[0])
+        self._noise_alone = self._noises.refined(self._noise_alone, self.observations.value - self.predict(u[None])[0])
+        self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
         self.noise_unlearnt = False
 
     def origin(self) -> np.ndarray:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.log_run import SETTLE, STOOD, LogRun
+from lunar_mjx.diagnosis.drives.log_run import SETTLE, STOOD, ImuMounting, LogRun
 from lunar_mjx.diagnosis.drives.measured_states import begin_at, measured_states
 from lunar_mjx.dynamics import System, build
 from lunar_mjx.dynamics.signals import joint_channels, measure
@@ -42,9 +42,7 @@ _NUMBERS = itertools.count()
 class Program:
     """One compiled simulation of a chunk of rovers, from rest to the measured channels."""
 
-    def __init__(
-        self, model: Model, every: int, channels: tuple[str, ...], imu: tuple[float, float, float], engine: str
-    ):
+    def __init__(self, model: Model, every: int, channels: tuple[str, ...], imu: ImuMounting, engine: str):
         self.model, self.every, self.channels, self.imu = model, every, channels, imu
         self.number = next(_NUMBERS)
         with jax.enable_x64(True):
@@ -56,6 +54,9 @@ class Program:
         self._drive = jax.jit(self._drive_all, static_argnames="shared")
         self._measure = jax.jit(self._measure_all, static_argnames="shared")
         self._begin_anew = jax.jit(self._begin_all_anew, static_argnames="shared")
+        self._set_moving = jax.jit(jax.vmap(self._in_motion))
+        body = self.system.engine.mj_model
+        self._joint_dofs = np.array([body.jnt_dofadr[body.joint(j).id] for j in model.rover.joints])
 
     def length(self, commands: int) -> int:
         """Number of commands rounded up to whole pieces."""
@@ -83,10 +84,19 @@ class Program:
         seen = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *pieces)
 
         def channels(params: Params, seen: Any) -> Any:
-            found = measure(self.system, seen, params, self.imu if any(self.imu) else None).channels
+            position = self.imu.position if any(self.imu.position) else None
+            turn = self.imu.quaternion if any(self.imu.quaternion[1:]) else None
+            found = measure(self.system, seen, params, position, turn).channels
             return jnp.stack([found[c] for c in self.channels])
 
         return jax.vmap(channels, (self._axes(params, shared), 0))(params, seen)
+
+    def _in_motion(self, state: Any, motion: Mapping[str, Any]) -> Any:
+        """A standing rover's state with the velocities of a log that begins in motion."""
+        spin = motion["joint_speed"]
+        moving = state.qvel.at[:2].set(motion["velocity"]).at[5].set(motion["yaw_rate"])
+        moving = moving.at[self._joint_dofs].set(jnp.where(jnp.isnan(spin), moving[self._joint_dofs], spin))
+        return dataclasses.replace(state, qvel=jnp.where(motion["moves"], moving, state.qvel))
 
     def _begin_all_anew(self, params: Params, state: Any, measured: Mapping[str, Any], shared: bool) -> Any:
         return jax.vmap(begin_at, (self._axes(params, shared), 0, 0))(params, state, measured)
@@ -108,6 +118,8 @@ class Program:
             stood = self._stand(full, state, np.zeros_like(commands[:, : self.segment]), start[STOOD], shared)
             # The clock and the heat begin with the log.
             state = dataclasses.replace(stood, step=state.step, temperature=state.temperature)
+            if logs.motion["moves"].any():
+                state = self._set_moving(state, {name: a[log] for name, a in logs.motion.items()})
             seen = []
             for at in range(0, commands.shape[1], self.segment):
                 if windows and at and at % (WINDOW * self.segment) == 0:
@@ -159,6 +171,7 @@ class Logs:
       params: with a leading axis of logs, but for the ground. start: (logs,) by name.
       terrain: the ground, with a leading axis of logs unless `shared` by all of them.
       commands: (logs, time, joint), the last ones repeated up to whole pieces.
+      motion: (logs, ...) velocities at the start, by name, as in `LogRun`.
       logs: as recorded. begin: (logs,) when the simulations begin on their clocks, s.
     """
 
@@ -169,6 +182,7 @@ class Logs:
     terrain: Any
     shared: bool
     commands: np.ndarray
+    motion: Mapping[str, np.ndarray]
     logs: tuple[Log, ...]
     begin: tuple[float, ...]
 
@@ -218,6 +232,7 @@ def stack_logs(
         terrain=ground,
         shared=shared,
         commands=np.stack([_padded(r.commands, length) for r in runs]),
+        motion={name: np.stack([r.motion[name] for r in runs]) for name in runs[0].motion},
         logs=tuple(logs),
         begin=tuple(r.begin for r in runs),
     )

@@ -68,7 +68,7 @@ class Bench:
     @functools.cached_property
     def stamp(self) -> tuple[Any, ...]:
         """What all that it simulates depends on beside the rows: programs, and what the logs put into them."""
-        given = [(r.commands, dict(r.start), r.begin, r.end, r.every, r.imu_position) for r in self.runs]
+        given = [(r.commands, dict(r.start), dict(r.motion), r.begin, r.end, r.every, r.imu) for r in self.runs]
         return *(logs.program.number for logs in self._groups()), stamp(self.params, given)
 
     def channels(self, number: int) -> list[str]:
@@ -92,13 +92,13 @@ class Bench:
             gains,
             shapes,
             run.every,
-            run.imu_position,
+            run.imu,
             wanted,
         )
         if key not in _PROGRAMS:
             while len(_PROGRAMS) >= _MOST_PROGRAMS:
                 _PROGRAMS.pop(next(iter(_PROGRAMS)))
-            _PROGRAMS[key] = Program(run.model, run.every, wanted, run.imu_position, self.engine)
+            _PROGRAMS[key] = Program(run.model, run.every, wanted, run.imu, self.engine)
         return _PROGRAMS[key]
 
     def _groups(self) -> list[Logs]:
@@ -258,4 +258,6 @@ def _modelled(model: Model) -> frozenset[str]:
     for c in corners:
         names += [f"wheel_{c}_sinkage_m", f"wheel_{c}_slip_ratio"]
         names += [f"wheel_{c}_force_{a}_N" for a in "xyz"] + [f"wheel_{c}_moment_{a}_Nm" for a in "xyz"]
+    if "bus_droop" in model.effect_names:
+        names.append("bus_voltage_V")
     return frozenset(names)

@@ -136,9 +136,8 @@ def _gravity(log: Log) -> list[Finding]:
         return []
     time = np.linspace(*limits, 400)
     measured = np.stack([at(log, n, time) for n in names], 1)  # type: ignore[type-var]
-    if not log.imu.attitude:  # else both are in the IMU's frame
-        w, x, y, z = (np.full(1, v) for v in log.imu.quaternion)
-        measured = measured @ _rotation(w, x, y, z)[0].T
+    w, x, y, z = (np.full(1, v) for v in log.imu.quaternion)
+    measured = measured @ _rotation(w, x, y, z)[0].T
     turn = attitude(log, time)
     up = np.tile([0.0, 0.0, 1.0], (len(time), 1)) if turn is None else turn[:, 2, :]
     force, expected = np.median(measured, axis=0), np.median(up, axis=0)

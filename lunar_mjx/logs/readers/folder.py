@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.logs.attitude import body_attitude, with_angles
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Imu, Log, LogTable, Noise, SteadyLog
 from lunar_mjx.logs.readers.steady import read_steady
@@ -126,6 +127,8 @@ def _read_drive(folder: Path, top: Fields) -> Log:
     problems: list[Finding] = []
     environment, columns = _environment(top.table("environment"))
     tables = _tables(folder, top, columns, problems)
+    imu = _imu(top.table("imu"))
+    tables = body_attitude(tables, imu)
     names = tuple(c for t in tables.values() for c in t.channels)
     origin = top.vector("terrain_origin_m", 2, (0.0, 0.0))
     return Log(
@@ -140,9 +143,9 @@ def _read_drive(folder: Path, top: Fields) -> Log:
         environment=environment,
         rover_changes=_rover_changes(top.table("rover_changes")),
         initial=_initial(top.table("initial")),
-        imu=_imu(top.table("imu")),
+        imu=imu,
         tables=tables,
-        noise=_noise(top.table("noise"), names),
+        noise=with_angles(_noise(top.table("noise"), names), names),
         source={k: str(v) for k, v in top.table("source").values.items()},
         problems=tuple(problems),
         imposed=_imposed(top, names),

@@ -1,0 +1,55 @@
+"""What logs of drives hold and the model cannot use, so that it can be said once, aloud."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+from lunar_mjx.logs import Log
+from lunar_mjx.logs.attitude import EULER, QUATERNION
+
+REASONS: Mapping[str, str] = {
+    "drawbar_pull": "a pull on a tether is no input of the model yet; compare drives without one",
+    "bus_voltage": "the model has no supply; add the effect bus_droop to compare it",
+    "wheel_slip_angle": "no camera's slip angle is compared yet",
+    "motor_left": "the model's rover drives every wheel by a motor of its own",
+    "motor_right": "the model's rover drives every wheel by a motor of its own",
+    "joint_left": "the model's rover drives every wheel by a motor of its own",
+    "joint_right": "the model's rover drives every wheel by a motor of its own",
+}
+"""Why channels are not compared, by the beginning of their names."""
+OTHERWISE = "the model does not predict it"
+
+
+def unused_channels(log: Log, compared: Collection[str]) -> dict[str, str]:
+    """Channels of a log that nothing of a comparison reads, with the reason.
+
+    Commands, imposed speeds, conditions of the environment and quaternions beside their angles are read, though they
+    are not compared.
+
+    Args:
+      log: of a drive. compared: channels that the problem compares.
+    """
+    read = {v for v in log.environment.values() if isinstance(v, str)}
+    if any(e in compared for e in EULER):
+        read |= set(QUATERNION)
+    out = {}
+    for name in log.channel_names:
+        speed = name.startswith("joint_") and name.endswith("_drive_speed_rad_s")
+        if name in compared or name in read or name.startswith("command_") or (log.imposed and speed):
+            continue
+        out[name] = next((why for start, why in REASONS.items() if name.startswith(start)), OTHERWISE)
+    return out
+
+
+def unused_sentence(logs: Sequence[Log], compared: Sequence[Collection[str]]) -> str:
+    """What the logs of a campaign hold and nothing reads, as one sentence; empty if all is read.
+
+    Args:
+      logs: of drives. compared: channels that are compared, by log.
+    """
+    by_reason: dict[str, dict[str, None]] = {}
+    for log, own in zip(logs, compared, strict=True):
+        for name, why in unused_channels(log, own).items():
+            by_reason.setdefault(why, {})[name] = None
+    parts = [f"{', '.join(names)} ({why})" for why, names in by_reason.items()]
+    return f"Not used: {'; '.join(parts)}." if parts else ""
