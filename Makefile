@@ -43,16 +43,18 @@ docs: $(VENV)/run.stamp
 # Foreign worlds: what criticism says of wheels that share no law with the tool. Both go on where they were stopped. The
 # report's tables are drawn from the commit: each commit has a folder and tables of its own.
 FOREIGN_TABLES ?= 60
+FOREIGN_DRIVES ?= 12
 FOREIGN_REPORT_TABLES ?= 600
+FOREIGN_REPORT_DRIVES ?= 60
 foreign-tune: FOREIGN := build/foreign/tune
 foreign-tune: $(VENV)/run.stamp
-	$(BIN)/python -m benchmarks.foreign make --set tune --tables $(FOREIGN_TABLES) -o $(FOREIGN)
+	$(BIN)/python -m benchmarks.foreign make --set tune --tables $(FOREIGN_TABLES) --drives $(FOREIGN_DRIVES) -o $(FOREIGN)
 	$(BIN)/python -m benchmarks.foreign run $(FOREIGN)
 	$(BIN)/python -m benchmarks.foreign score $(FOREIGN)
 
 foreign-report: FOREIGN = build/foreign/report-$(shell git rev-parse --short HEAD)
 foreign-report: $(VENV)/run.stamp
-	$(BIN)/python -m benchmarks.foreign make --set report --tables $(FOREIGN_REPORT_TABLES) -o $(FOREIGN)
+	$(BIN)/python -m benchmarks.foreign make --set report --tables $(FOREIGN_REPORT_TABLES) --drives $(FOREIGN_REPORT_DRIVES) -o $(FOREIGN)
 	$(BIN)/python -m benchmarks.foreign run $(FOREIGN)
 	$(BIN)/python -m benchmarks.foreign score $(FOREIGN)
 

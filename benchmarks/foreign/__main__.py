@@ -1,6 +1,6 @@
 """Foreign worlds: make logs with sealed truths, ask the tool about them, and score what it says.
 
-    python -m benchmarks.foreign make --set tune --tables 60 -o build/foreign/tune
+    python -m benchmarks.foreign make --set tune --tables 60 --drives 12 -o build/foreign/tune
     python -m benchmarks.foreign run   build/foreign/tune
     python -m benchmarks.foreign score build/foreign/tune
 
@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 
 from . import bed, cases, told
-from .work import ask, commit
+from .work import ROOT, ask, commit
 
 TUNE_SEED = 20261123
 TWIN_EVERY = 5
@@ -32,7 +32,13 @@ def make(args: argparse.Namespace) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     about = _campaign(folder, args.set, args.seed)
     seed = int(about["seed"])
-    jobs = cases.plan(args.set, args.tables)
+    _make_tables(args, folder, seed)
+    if args.drives:
+        _make_drives(args, folder, seed)
+
+
+def _make_tables(args: argparse.Namespace, folder: Path, seed: int) -> None:
+    jobs = cases.plan(args.set, args.tables) if args.tables else []
     for number, (group, hidden) in enumerate(jobs):
         name = f"{args.set}-{number:03d}"
         sealed = folder / "truth" / f"{name}.json"
@@ -51,6 +57,27 @@ def make(args: argparse.Namespace) -> None:
         sealed.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
         said = ", ".join(f"{k} {v['sigma']:.0f} ({v['sigma_blind']:.0f}) sigma" for k, v in truth["separable"].items())
         print(f"{name}  {group:<8} {case.world.law:<9} {said or 'nothing hidden'}", flush=True)
+
+
+def _make_drives(args: argparse.Namespace, folder: Path, seed: int) -> None:
+    from . import drive_cases
+    from .rovers import ROVERS
+
+    shipped = [r for r in ROVERS if (ROOT / "models" / r).is_dir()]
+    jobs = drive_cases.plan(args.set, args.drives, shipped)
+    for number, job in enumerate(jobs):
+        name = f"{args.set}-drive-{number:03d}"
+        sealed = folder / "truth" / f"{name}.json"
+        if sealed.is_file():
+            continue
+        case = drive_cases.draw(args.set, seed, number, *job)
+        found, separable = drive_cases.make(case)
+        drive_cases.write(case, found, folder / "logs" / name)
+        truth = drive_cases.summary(case) | {"separable": separable, "twins": []}
+        sealed.parent.mkdir(exist_ok=True)
+        sealed.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+        said = ", ".join(f"{k} {v['sigma']:.0f} sigma" for k, v in separable.items())
+        print(f"{name}  {job[0]:<8} {case.rover.name:<8} {case.world.law:<9} {said or 'nothing hidden'}", flush=True)
 
 
 def _campaign(folder: Path, which: str, seed: int | None) -> dict[str, object]:
@@ -76,7 +103,9 @@ def _campaign(folder: Path, which: str, seed: int | None) -> dict[str, object]:
 
 def run(args: argparse.Namespace) -> None:
     """Asks the tool."""
-    names = sorted(p.name for p in (args.folder / "logs").iterdir() if p.is_dir())
+    # Twins with other stated noise come last: a part of the set is then a small copy of its cases.
+    found = [p.name for p in (args.folder / "logs").iterdir() if p.is_dir()]
+    names = sorted(found, key=lambda n: (n.endswith(tuple(TWINS)), n))
     names = [n for n in names if args.only in n][: args.first]
     first, _, of = args.share.partition("/")
     mine = names[int(first) :: int(of)]
@@ -104,6 +133,7 @@ def parser() -> argparse.ArgumentParser:
     made = verbs.add_parser("make", help="write logs and sealed truths")
     made.add_argument("--set", choices=("tune", "report"), required=True)
     made.add_argument("--tables", type=int, default=60)
+    made.add_argument("--drives", type=int, default=0, help="campaigns of drives")
     made.add_argument("--seed", type=int, help="else fixed for tune, and drawn from the commit for report")
     made.add_argument("-o", "--out", type=Path, required=True)
     made.set_defaults(do=make)

@@ -22,7 +22,8 @@ class Rim:
       radius: m. entry, lowest, leave: angles at which contact begins, is pressed most, and ends, rad.
       theta: of the nodes. weight: of the quadrature over theta.
       turn: v_x/(r omega), travel per rolling. aside: v_y/(r omega).
-      slip: ratio, driving positive. speed: rim speed, m/s. angle: slip angle, rad.
+      slip: ratio, driving positive. speed: rim speed, m/s. angle: slip angle, rad. roll: 1, less where a rover's wheel
+        hardly turns and `turn` and `aside` are held finite. press: speed of sinking over the rim speed.
     """
 
     radius: np.ndarray
@@ -36,6 +37,8 @@ class Rim:
     slip: np.ndarray
     speed: np.ndarray
     angle: np.ndarray
+    roll: np.ndarray | float = 1.0
+    press: float = 0.0
 
     @property
     def mirrored(self) -> np.ndarray:
@@ -50,7 +53,8 @@ class Rim:
 
     def ways(self, shear_radius: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Shear displacement of the soil, m, backward along the rim and across (Janosi & Hanamoto 1961)."""
-        along = (self.entry - self.theta) - self.turn / shear_radius * (np.sin(self.entry) - np.sin(self.theta))
+        travelled = self.turn / shear_radius * (np.sin(self.entry) - np.sin(self.theta))
+        along = self.roll * (self.entry - self.theta) - travelled
         return self.radius * shear_radius * along, self.radius * self.aside * (self.entry - self.theta)
 
 
@@ -274,7 +278,8 @@ def granular(
     sine, cosine = np.sin(rim.theta), np.cos(rim.theta)
     zero = np.zeros_like(sine)
     normal = np.stack([sine, zero, -cosine], axis=-1)
-    motion = np.stack([rim.turn - shear_radius * cosine, rim.aside + zero, -shear_radius * sine], axis=-1)
+    along, sinking = rim.turn - rim.roll * shear_radius * cosine, -rim.roll * shear_radius * sine - rim.press
+    motion = np.stack([along, rim.aside + zero, sinking], axis=-1)
     motion = motion / np.maximum(np.linalg.norm(motion, axis=-1, keepdims=True), 1e-12)
     stress = granular_stress(normal, motion)
     pressure = np.maximum(-np.sum(stress * normal, axis=-1), 0.0)

@@ -6,6 +6,8 @@ import dataclasses
 
 import numpy as np
 
+RIM = 0.5
+"""Share of the contact over which a misfit changes."""
 FEATURES = 10
 """Waves of a field; with their cosines and sines it is nearly a Gaussian process of squared-exponential kernel."""
 
@@ -39,6 +41,18 @@ class Field:
         half = len(self.waves)
         return np.cos(phase) @ self.weights[:half] + np.sin(phase) @ self.weights[half:]
 
+    def by_rows_and_places(self, row: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """Values (row, place) where all rows have the same places: cos(a + b) taken apart, as a product of matrices.
+
+        Args:
+          row: all coordinates but the last, shape (row, coordinate - 1). place: the last one, shape (place,).
+        """
+        half = len(self.waves)
+        even, odd = self.weights[:half], self.weights[half:]
+        a, b = row @ self.waves[:, :-1].T, self.waves[:, -1:] * place
+        cosine, sine = np.cos(a), np.sin(a)
+        return (cosine * even + sine * odd) @ np.cos(b) + (cosine * odd - sine * even) @ np.sin(b)
+
 
 def coordinates(slip: np.ndarray, angle: np.ndarray, load: np.ndarray, rim: np.ndarray) -> np.ndarray:
     """Scaled coordinates of a place under a wheel.
@@ -50,5 +64,5 @@ def coordinates(slip: np.ndarray, angle: np.ndarray, load: np.ndarray, rim: np.n
     Returns:
       Shape (..., 4): a misfit changes over half a unit of slip, 45 degrees, a factor of two in load, and half the arc.
     """
-    parts = np.broadcast_arrays(slip / 0.5, angle / np.radians(45.0), np.log(load) / 0.7, rim / 0.5)
+    parts = np.broadcast_arrays(slip / 0.5, angle / np.radians(45.0), np.log(load) / 0.7, rim / RIM)
     return np.stack(parts, axis=-1)

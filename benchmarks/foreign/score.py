@@ -23,6 +23,9 @@ CALIBRATION = re.compile(r"calibrat|channel_scale|cross_talk|_offset$|_scale$|_b
 """Every bed here has errors of calibration, so that naming them is no mistake, and no find either."""
 UNLISTED = re.compile(r"unlisted|something else|discrepancy|unknown", re.IGNORECASE)
 
+QUIET = ("none", "nothing", "noise", "noise_only", "null", "base", "baseline")
+"""What a hypothesis without any effect may be called."""
+
 Row = dict[str, Any]
 
 
@@ -217,8 +220,9 @@ def _best_pairs(rows: Sequence[Row]) -> list[tuple[float, bool]]:
         if not row["probabilities"]:
             continue
         best, p = max(row["probabilities"].items(), key=lambda item: item[1])
-        listed = {n for n in names_of(best) if n in kinds.KNOWN and not neutral(n, row["truth"])}
-        hidden = {n for n in row["truth"]["hidden"] if n in kinds.KNOWN or n not in kinds.OUTSIDE}
+        listed = {n for n in names_of(best) if re.fullmatch(r"\w+", n) and not UNLISTED.search(n)}
+        listed = {n for n in listed if n not in QUIET and not neutral(n, row["truth"])}
+        hidden = set(row["truth"]["hidden"]) if row["truth"]["group"] != "outside" else set()
         pairs.append((min(max(p, 0.0), 1.0), listed == hidden))
     return pairs
 
@@ -229,98 +233,121 @@ def _median(values: Sequence[float]) -> float | None:
 
 
 def report(folder: Path) -> Row:
-    """All figures of a folder."""
+    """All figures of a folder: of its tables on top, of its drives under `drives`."""
     everything = read(folder)
-    rows = [r for r in everything if r["twin_of"] is None]
-    groups: dict[str, list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[row["truth"]["group"]].append(row)
+    head, dirty = commit()
+    tables = [r for r in everything if r["truth"]["kind"] == "table"]
+    drives = [r for r in everything if r["truth"]["kind"] == "drive"]
+    about = {
+        "campaign": json.loads((folder / "campaign.json").read_text(encoding="utf-8")),
+        "scored_at_commit": head,
+        "uncommitted_changes": dirty,
+        "asked_at_commits": sorted({r["commit"] for r in everything}),
+        "asked_with_uncommitted_changes": any(r["uncommitted_changes"] for r in everything),
+        "cases_made": len(list((folder / "truth").glob("*.json"))),
+        "cases_answered": sum(r["twin_of"] is None for r in everything),
+    }
+    return about | _figures(tables) | ({"drives": _figures(drives)} if drives else {})
 
-    def sigma(row: Row, key: str = "sigma") -> float:
-        return min((v[key] for v in row["truth"]["separable"].values()), default=0.0)
 
-    singles, outside, pairs = groups["single"], groups["outside"], groups["pair"]
-    told = [r for r in singles if sigma(r) > SEPARABLE]
-    by_kind = {}
-    for kind in sorted({r["truth"]["hidden"][0] for r in singles + outside}):
-        mine = [r for r in singles + outside if r["truth"]["hidden"][0] == kind]
-        good = [r["found"] or (kind in kinds.OUTSIDE and r["outside_right"]) for r in mine if sigma(r) > SEPARABLE]
-        by_kind[kind] = {
+def _sigma(row: Row, key: str = "sigma") -> float:
+    """Sigma of the hidden effect that is told worst; 0 where nothing is hidden or nothing is known."""
+    return min((v.get(key, 0.0) for v in row["truth"]["separable"].values()), default=0.0)
+
+
+def _by_kind(rows: Sequence[Row]) -> Row:
+    found = {}
+    for kind in sorted({r["truth"]["hidden"][0] for r in rows}):
+        mine = [r for r in rows if r["truth"]["hidden"][0] == kind]
+        clear = [r for r in mine if _sigma(r) > SEPARABLE]
+        found[kind] = {
             "cases": len(mine),
-            "separable": len(good),
-            "right": sum(good),
+            "separable": len(clear),
+            "right": sum(r["found"] or (r["truth"]["group"] == "outside" and r["outside_right"]) for r in clear),
             "wrong_name": sum(r["wrong_name"] for r in mine),
         }
+    return found
+
+
+def _figures(everything: Sequence[Row]) -> Row:
+    """The figures of tables or of drives."""
+    rows = [r for r in everything if r["twin_of"] is None]
+    groups: dict[str, list[Row]] = defaultdict(list)
+    verdicts: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+    for row in rows:
+        groups[row["truth"]["group"]].append(row)
+        verdicts[row["truth"]["group"]][row["verdict"]] += 1
+    nulls, singles, outside, pairs = (groups[g] for g in ("null", "single", "outside", "pair"))
+    told = [r for r in singles if _sigma(r) > SEPARABLE]
+    clear = [r for r in outside if _sigma(r) > SEPARABLE]
     twins = [(r, next((o for o in rows if o["case"] == r["twin_of"]), None)) for r in everything if r["twin_of"]]
     changed = [(t["verdict"], sorted(t["effects"])) != (o["verdict"], sorted(o["effects"])) for t, o in twins if o]
     times = [r["seconds"] for r in rows if r["seconds"] is not None and not r["first"]]
-    head, dirty = commit()
-    about = json.loads((folder / "campaign.json").read_text(encoding="utf-8"))
-    verdicts: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
-    for row in rows:
-        verdicts[row["truth"]["group"]][row["verdict"]] += 1
-    blind = [r for r in told if sigma(r, "sigma_blind") > SEPARABLE]
-    unseen = [r for r in told if r["truth"]["hidden"][0] not in kinds.TUNE_KNOWN]
+    tuned = {*kinds.TUNE_KNOWN, *DRIVES_TUNED}
+    shares = {
+        "wrong_name_nulls": [r["wrong_name"] for r in nulls],
+        "wrong_name_singles": [r["wrong_name"] for r in singles],
+        "wrong_name_pairs": [r["wrong_name"] for r in pairs],
+        "wrong_name_outside": [r["wrong_name"] for r in outside],
+        "wrong_name_nulls_strict": [r["wrong_strict"] for r in nulls],
+        "wrong_name_singles_strict": [r["wrong_strict"] for r in singles],
+        "separable_singles_found": [r["found"] for r in told],
+        "separable_singles_found_or_partly": [r["found"] or r["partly"] for r in told],
+        "blind_separable_singles_found": [r["found"] for r in told if _sigma(r, "sigma_blind") > SEPARABLE],
+        "separable_singles_never_tuned_on_found": [r["found"] for r in told if r["truth"]["hidden"][0] not in tuned],
+        "all_singles_found": [r["found"] for r in singles],
+        "outside_right": [r["outside_right"] for r in outside],
+        "separable_outside_right": [r["outside_right"] for r in clear],
+        "separable_outside_unknown_or_unlisted": [
+            r["verdict"] == "UNKNOWN" or (r["verdict"] == "KNOWN_CLASS" and r["unlisted"]) for r in clear
+        ],
+        "separable_pairs_found": [r["found"] for r in pairs if _sigma(r) > SEPARABLE],
+        "bad_fit": [r["verdict"] == "BAD_FIT" for r in rows],
+        "bad_data": [r["verdict"] == "BAD_DATA" for r in rows],
+        "crash_or_time_out": [r["verdict"] in ("CRASH", "TIME_OUT") for r in rows],
+        "verdict_changes_with_stated_noise": changed,
+    }
     return {
-        "campaign": about,
-        "scored_at_commit": head,
-        "uncommitted_changes": dirty,
-        "asked_at_commits": sorted({r["commit"] for r in rows}),
-        "asked_with_uncommitted_changes": any(r["uncommitted_changes"] for r in rows),
-        "cases_made": len(list((folder / "truth").glob("*.json"))),
-        "cases_answered": len(rows),
-        "wrong_name_nulls": share(r["wrong_name"] for r in groups["null"]),
-        "wrong_name_singles": share(r["wrong_name"] for r in singles),
-        "wrong_name_pairs": share(r["wrong_name"] for r in pairs),
-        "wrong_name_outside": share(r["wrong_name"] for r in outside),
-        "wrong_name_nulls_strict": share(r["wrong_strict"] for r in groups["null"]),
-        "wrong_name_singles_strict": share(r["wrong_strict"] for r in singles),
-        "separable_singles_found": share(r["found"] for r in told),
-        "separable_singles_found_or_partly": share(r["found"] or r["partly"] for r in told),
-        "blind_separable_singles_found": share(r["found"] for r in blind),
-        "separable_singles_of_kinds_never_tuned_on_found": share(r["found"] for r in unseen),
-        "all_singles_found": share(r["found"] for r in singles),
-        "outside_right": share(r["outside_right"] for r in outside),
-        "separable_outside_right": share(r["outside_right"] for r in outside if sigma(r) > SEPARABLE),
-        "separable_outside_unknown_or_unlisted": share(
-            r["verdict"] == "UNKNOWN" or (r["verdict"] == "KNOWN_CLASS" and r["unlisted"])
-            for r in outside
-            if sigma(r) > SEPARABLE
-        ),
-        "separable_pairs_found": share(r["found"] for r in pairs if sigma(r) > SEPARABLE),
-        "bad_fit": share(r["verdict"] == "BAD_FIT" for r in rows),
-        "bad_data": share(r["verdict"] == "BAD_DATA" for r in rows),
-        "crash_or_time_out": share(r["verdict"] in ("CRASH", "TIME_OUT") for r in rows),
-        "verdict_changes_with_stated_noise": share(changed),
+        **{name: share(flags) for name, flags in shares.items()},
         "reliability_of_inclusion": reliability(_inclusion_pairs(rows)),
         "reliability_of_best_hypothesis": reliability(_best_pairs(rows)),
         "seconds": {"median": _median(times), "largest": max(times, default=None), "number": len(times)},
         "verdicts": {g: dict(v) for g, v in verdicts.items()},
-        "by_kind": by_kind,
-        "cases": [
-            {
-                "case": r["case"],
-                "group": r["truth"]["group"],
-                "kind": r["truth"]["kind"],
-                "law": r["truth"]["law"],
-                "hidden": r["truth"]["hidden"],
-                "holds": r["truth"]["holds"],
-                "sigma": round(sigma(r), 1),
-                "sigma_blind": round(sigma(r, "sigma_blind"), 1),
-                "verdict": r["verdict"],
-                "effects": r["effects"],
-                "unlisted": r["unlisted"],
-                "ports": r["ports"],
-                "wrong_name": r["wrong_name"],
-                "found": r["found"],
-                "outside_right": r["outside_right"],
-                "seconds": r["seconds"],
-                "twin_of": r["twin_of"],
-            }
-            for r in everything
-        ],
+        "by_kind": _by_kind(singles + outside),
+        "cases": [_case(r) for r in everything],
     }
 
+
+def _case(row: Row) -> Row:
+    """A row for the record."""
+    truth = row["truth"]
+    kept = (
+        "case",
+        "verdict",
+        "effects",
+        "unlisted",
+        "ports",
+        "wrong_name",
+        "found",
+        "outside_right",
+        "seconds",
+        "twin_of",
+    )
+    return {
+        "group": truth["group"],
+        "law": truth["law"],
+        "rover": truth.get("rover"),
+        "hidden": truth["hidden"],
+        "true_ports": truth["ports"],
+        "holds": truth["holds"],
+        "sigma": round(_sigma(row), 1),
+        "sigma_blind": round(_sigma(row, "sigma_blind"), 1),
+        **{k: row[k] for k in kept},
+    }
+
+
+DRIVES_TUNED = ("coulomb_friction", "actuator_delay", "slip_sinkage", "com_offset", "wheel_radius_error", "imu_bias")
+"""Kinds of the tuning set's drives."""
 
 TARGETS = {
     "wrong_name_nulls": "<= 2 %",
@@ -334,18 +361,22 @@ TARGETS = {
 
 def text(found: Mapping[str, Any]) -> str:
     """The figures for a reader."""
-    lines = [
-        f"set {found['campaign']['set']}, seed {found['campaign']['seed']}: {found['cases_answered']} of "
-        f"{found['cases_made']} cases answered at {', '.join(c[:9] for c in found['asked_at_commits'])}"
-    ]
+    campaign = found["campaign"]
+    asked = ", ".join(c[:9] for c in found["asked_at_commits"])
+    answered = f"{found['cases_answered']} of {found['cases_made']} cases answered at {asked}"
+    lines = [f"set {campaign['set']}, seed {campaign['seed']}: {answered}", "tables", *_lines(found)]
+    if "drives" in found:
+        lines += ["drives", *_lines(found["drives"])]
+    return "\n".join(lines)
+
+
+def _lines(found: Mapping[str, Any]) -> list[str]:
+    lines = []
     for key, value in found.items():
-        if isinstance(value, Mapping) and set(value) == {"hits", "of", "interval"}:
-            low, high = value["interval"]
-            part = f"{100.0 * value['hits'] / value['of']:5.1f} %" if value["of"] else "      -"
-            lines.append(
-                f"  {key:<50} {value['hits']:>4} of {value['of']:<4} {part}  ({100 * low:.0f} to {100 * high:.0f} %)"
-                f"  {TARGETS.get(key, '')}"
-            )
+        if isinstance(value, Mapping) and set(value) == {"hits", "of", "interval"} and value["of"]:
+            low, high = (100.0 * b for b in value["interval"])
+            part = f"{value['hits']:>4} of {value['of']:<4} {100.0 * value['hits'] / value['of']:5.1f} %"
+            lines.append(f"  {key:<42} {part}  ({low:.0f} to {high:.0f} %)  {TARGETS.get(key, '')}")
     for key in ("reliability_of_inclusion", "reliability_of_best_hypothesis"):
         table = found[key]
         lines.append(f"  {key}: {table['number']} statements, Brier {table['brier']}")
@@ -353,7 +384,5 @@ def text(found: Mapping[str, Any]) -> str:
             f"      stated {t['stated']:.3f}  frequency {t['frequency']:.3f}  ({t['number']})" for t in table["tenths"]
         ]
     lines.append(f"  seconds: median {found['seconds']['median']}, largest {found['seconds']['largest']}")
-    lines += [
-        f"  {group}: " + ", ".join(f"{k} {v}" for k, v in sorted(v.items())) for group, v in found["verdicts"].items()
-    ]
-    return "\n".join(lines)
+    groups = found["verdicts"].items()
+    return lines + [f"  {group}: " + ", ".join(f"{k} {v}" for k, v in sorted(v.items())) for group, v in groups]
