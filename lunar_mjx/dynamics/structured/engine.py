@@ -44,7 +44,7 @@ from lunar_mjx.dynamics.structured.legs import (
     leg_block,
     solve,
 )
-from lunar_mjx.dynamics.structured.suitability import check_model
+from lunar_mjx.dynamics.structured.suitability import UnsuitableError, check_model
 from lunar_mjx.dynamics.structured.topology import LegGroup, Structure, read_structure
 from lunar_mjx.effects.ports import Forces
 from lunar_mjx.pytree import pytree
