@@ -263,8 +263,11 @@ def _print_comparison(run: Any) -> None:
     for row in worst:
         table.add_row(row["manoeuvre"], row["split"], row["channel"], _shown(row["as_given"]), _shown(row["refitted"]))
     console.print(table)
-    problems = found["certificate"]["problems"]
-    console.print("Certificate of the fit: " + ("; ".join(problems) if problems else "complete"), highlight=False)
+    if "certificate" in found:
+        problems = found["certificate"]["problems"]
+        console.print("Certificate of the fit: " + ("; ".join(problems) if problems else "complete"), highlight=False)
+    if remains := found.get("discrepancy"):
+        console.print("The model as refitted: " + "; ".join(d["text"] for d in remains.values()), highlight=False)
     console.print(f"{run.folder}", highlight=False)
 
 
@@ -285,14 +288,16 @@ def _finish(diagnosis: Diagnosis, as_json: bool) -> None:
     console.print(f"{diagnosis.verdict.label}{effects}", style="bold", highlight=False)
     console.print(diagnosis.sentence, highlight=False)
     tested = [e for e in diagnosis.evidence if e.status != "not tested"]
-    if tested:
+    if diagnosis.probabilities:
+        _print_probabilities(diagnosis, console)
+    elif tested:
         table = make_table("effect", "status", "separable", "chi2", "p", "gain", names=6)
         for e in tested[:15]:
             gain = "-" if e.held_out_gain != e.held_out_gain else f"{e.held_out_gain:.0f} +- {e.held_out_se:.0f}"
             table.add_row(e.effect, e.status, f"{e.separable_sigma:.1f}", f"{e.chi2:.0f}", f"{e.p:.2g}", gain)
         console.print(table)
     for e in tested:
-        if e.values:
+        if e.values and (not diagnosis.probabilities or e.probability >= WORTH_PRINTING):
             fitted = ", ".join(f"{k} {v:.3g} +- {e.std.get(k, 0.0):.1g}" for k, v in e.values.items())
             near = f"; nearest {e.nearest[0]}, cosine {e.nearest[1]:.2f}" if e.nearest[0] else ""
             console.print(f"fitted {e.effect}: {fitted}{near}", highlight=False)
@@ -301,6 +306,33 @@ def _finish(diagnosis: Diagnosis, as_json: bool) -> None:
     for finding in diagnosis.details.get("findings", [])[:20]:
         console.print(f"  {finding['message']}", highlight=False)
     raise typer.Exit(diagnosis.verdict.exit_status)
+
+
+WORTH_PRINTING = 0.005
+"""Probability below which a hypothesis is left to the JSON."""
+
+
+def _print_probabilities(diagnosis: Diagnosis, console: Any) -> None:
+    from lunar_mjx.model.describe import make_table
+
+    table = make_table("hypothesis", "probability", names=1)
+    for name, p in diagnosis.probabilities.items():
+        if p >= WORTH_PRINTING:
+            table.add_row(name, f"{p:.3f}")
+    console.print(table)
+    if len(diagnosis.forms) > 1:
+        console.print("Contact law: " + ", ".join(f"{n} {p:.3f}" for n, p in diagnosis.forms.items()), highlight=False)
+    remains = "; ".join(
+        f"{d['text']} ({100.0 * d['low']:.2g} to {100.0 * d['high']:.2g} %)" for d in diagnosis.discrepancy.values()
+    )
+    console.print(f"What remains, by port: {remains}", highlight=False)
+    held = diagnosis.details.get("held_out", {})
+    if held.get("manoeuvres"):
+        console.print(
+            f"Held out: log predictive density {held['gain']:+.1f} +- {held['se']:.1f} over the model as it is "
+            f"({held['manoeuvres']} groups that chose nothing)",
+            highlight=False,
+        )
 
 
 def _write_report(runs: Sequence[Path], out: Path) -> None:

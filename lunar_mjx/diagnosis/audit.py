@@ -21,6 +21,7 @@ from lunar_mjx.diagnosis.build_problem import build_problem
 from lunar_mjx.diagnosis.refit import Settings
 from lunar_mjx.diagnosis.runs import FITS_FILE, MODEL_FILE, Run, folder_hash, load_run
 from lunar_mjx.diagnosis.search import fit_baseline
+from lunar_mjx.diagnosis.tables.simulated import SimulatedTables
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.errors import bad_input
 from lunar_mjx.inference.fit_store import Memory
@@ -28,6 +29,7 @@ from lunar_mjx.inference.fitting import Fit, Progress, silent
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import Problem
 from lunar_mjx.inference.score import SEPARABLE, score, signatures
+from lunar_mjx.logs import SteadyLog
 
 AUDIT_FILE = "audit.json"
 NULL = "nothing"
@@ -76,15 +78,33 @@ def audit(
     stored = run.load(AUDIT_FILE) or {}
     cases: list[dict[str, Any]] = list(stored.get("cases", [])) if stored.get("key") == key else []
     end = time.monotonic() + seconds
-    problem = build_problem(run)
-    base = fit_baseline(problem, settings, Memory(run.load(FITS_FILE)), progress)
-    sizes = _sizes(problem, base, settings)
+    logs = run.campaign()
+    if isinstance(logs[0], SteadyLog):
+        simulated = SimulatedTables(run, logs)  # type: ignore[arg-type]
+
+        def one(number: int) -> dict[str, Any]:
+            truth, amount, said = simulated.case(number)
+            return {
+                "truth": truth or NULL,
+                "amount": amount,
+                "verdict": said.verdict.label,
+                "effects": list(said.effects),
+                "outcome": _outcome(truth or NULL, said.verdict, said.effects),
+            }
+    else:
+        problem = build_problem(run, logs)
+        base = fit_baseline(problem, settings, Memory(run.load(FITS_FILE)), progress)
+        sizes = _sizes(problem, base, settings)
+
+        def one(number: int) -> dict[str, Any]:
+            return _case(problem, base, sizes, number, settings)
+
     begun = time.monotonic()
     done = 0
     while done < 2 or time.monotonic() < end:
         done += 1
         progress(f"auditing, case {len(cases) + 1}", min(1.0, (time.monotonic() - begun) / max(end - begun, 1e-9)))
-        cases.append(_case(problem, base, sizes, len(cases), settings))
+        cases.append(one(len(cases)))
         found = _summary(cases)
         run.save(AUDIT_FILE, {"key": key, "version": __version__, **found.to_dict()})
     return _summary(cases)
@@ -160,6 +180,8 @@ def draw_noise(observations: Observations, rng: np.random.Generator) -> np.ndarr
 def _outcome(truth: str, verdict: Verdict, effects: tuple[str, ...]) -> str:
     if verdict is Verdict.BAD_FIT:
         return "no certificate"
+    if verdict is Verdict.UNDECIDABLE:
+        return "missed" if truth != NULL else "undecided"
     if truth == NULL:
         return "silent, rightly" if verdict is Verdict.NOISE_ONLY else "false alarm"
     if verdict is Verdict.KNOWN and effects == (truth,):

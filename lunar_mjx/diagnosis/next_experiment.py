@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis.build_problem import build_problem, candidate_effects, table_problem
+from lunar_mjx.diagnosis.build_problem import build_problem, candidate_effects
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
-from lunar_mjx.diagnosis.planned import planned_drives, planned_sweeps
+from lunar_mjx.diagnosis.planned import planned_drives
 from lunar_mjx.diagnosis.refit import Settings
 from lunar_mjx.diagnosis.runs import FITS_FILE, VERDICT_FILE, Run, load_run
 from lunar_mjx.diagnosis.search import fit_baseline
+from lunar_mjx.diagnosis.tables.sweeps import rank_sweeps
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.fit_store import Memory
 from lunar_mjx.inference.fitting import Progress, silent
@@ -90,6 +91,16 @@ def next_experiment(
     names = _hypotheses(verdict, between, set(candidate_effects(run)))
     effects = [n for n in names if n != NOTHING]
     logs = run.campaign()
+    if isinstance(logs[0], SteadyLog):
+        held = set(run.model.effect_names)
+        usable = [n for n in names if n not in held]
+        if len(usable) < 2:
+            raise UserError(f"{run.folder}: no two hypotheses are left to tell apart; name effects with --between.")
+        sweeps = rank_sweeps(run, logs, verdict, usable, NOTHING, progress)  # type: ignore[arg-type]
+        ranked = [Plan(*sweep) for sweep in sweeps]
+        found = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
+        run.save(NEXT_FILE, found.to_dict())
+        return found
     problem = build_problem(run, logs, effects, progress)
     usable = [n for n in names if n == NOTHING or n in problem.candidates]
     if len(usable) < 2:
@@ -97,12 +108,8 @@ def next_experiment(
     problem.progress = silent  # type: ignore[attr-defined]
     progress("what the logs say so far", 0.0)
     known = _Knowledge(problem, run, usable)
-    if isinstance(logs[0], SteadyLog):
-        plans = planned_sweeps(logs)  # type: ignore[arg-type]
-        new: Problem = table_problem(run, [p[2] for p in plans], problem.effects)
-    else:
-        plans = planned_drives(logs, run.model, seconds)  # type: ignore[arg-type]
-        new = DriveProblem([p[2] for p in plans], run.model, problem.effects, progress=progress)  # type: ignore[arg-type]
+    plans = planned_drives(logs, run.model, seconds)  # type: ignore[arg-type]
+    new = DriveProblem([p[2] for p in plans], run.model, problem.effects, progress=progress)  # type: ignore[arg-type]
     ranked = _rank(new, known, usable, [(name, text) for name, text, _ in plans])
     found = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
     run.save(NEXT_FILE, found.to_dict())

@@ -23,7 +23,7 @@ from lunar_mjx.model.file import load_model, save_model
 FORMAT = "lunar-mjx-run/1"
 RUN_FILE, MODEL_FILE, FITS_FILE = "run.json", "model.toml", "fits.json"
 COMPARISON_FILE, VERDICT_FILE, SERIES_FILE = "comparison.json", "verdict.json", "series.npz"
-SIGNATURES_FILE = "signatures.npz"
+SIGNATURES_FILE, HYPOTHESES_FILE = "signatures.npz", "hypotheses.json"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

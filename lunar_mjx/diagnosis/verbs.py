@@ -26,13 +26,17 @@ from lunar_mjx.diagnosis.runs import (
     log_folders,
 )
 from lunar_mjx.diagnosis.search import Search, fit_baseline
+from lunar_mjx.diagnosis.tables.loop import better_law, compare_tables, diagnose_tables, grown_model
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
+from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.fit_store import Memory
 from lunar_mjx.inference.fitting import Fit, Progress, silent
 from lunar_mjx.inference.held_out import errors, noise_test
 from lunar_mjx.inference.objective import whitened_residuals
+from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import Problem
+from lunar_mjx.logs import SteadyLog
 from lunar_mjx.logs.findings import is_bad
 from lunar_mjx.model import Model
 
@@ -88,6 +92,12 @@ def compare(
 def _compare(run: Run, progress: Progress) -> Run:
     campaign = gate(run)
     run.write()
+    if isinstance(campaign[0], SteadyLog):
+        tables, refit = compare_tables(run, campaign, progress)
+        own = tables.own
+        rows = {"as given": np.zeros(len(own.coordinates)), "refitted": refit.u}
+        _record_opening(run, "compare", own.data.observations, own.coordinates, own.baseline, rows)
+        return run
     # All candidates are in the problem from the start: `why` then shares the program that is compiled here.
     problem = build_problem(run, campaign, progress=progress)
     memory = _memory(run)
@@ -194,15 +204,27 @@ def _parameter_table(problem: Problem, fitted: Fit) -> dict[str, Any]:
 
 def _record_test(run: Run, verb: str, problem: Problem, fits: Mapping[str, Fit]) -> None:
     """Puts on record which models' errors on the test split have been computed."""
-    if not problem.observations.in_split("test").any():
-        return
     rows = {"as given": problem.origin(), **{label: f.u for label, f in fits.items()}}
+    _record_opening(run, verb, problem.observations, problem.coordinates, problem.baseline, rows)
+
+
+def _record_opening(
+    run: Run,
+    verb: str,
+    observations: Observations,
+    coordinates: Sequence[Coordinate],
+    baseline: np.ndarray,
+    rows: Mapping[str, np.ndarray],
+) -> None:
+    """Puts on record which places' errors on the test split have been computed, by label."""
+    if not observations.in_split("test").any():
+        return
     prints = {}
     for label, u in rows.items():
         moved = [
             f"{c.key} {c.value(v):.9g}"
-            for i, (c, v) in enumerate(zip(problem.coordinates, u, strict=True))
-            if v != 0.0 or i in problem.baseline
+            for i, (c, v) in enumerate(zip(coordinates, u, strict=True))
+            if v != 0.0 or i in baseline
         ]
         prints[label] = hashlib.sha256("\n".join(moved).encode()).hexdigest()[:16]
     run.opened_test(verb, prints)
@@ -275,6 +297,10 @@ def why(
         campaign = gate(run)
     except BadData as bad:
         return bad.diagnosis
+    if isinstance(campaign[0], SteadyLog):
+        diagnosis = diagnose_tables(run, campaign, only, progress)
+        run.save(VERDICT_FILE, diagnosis.to_dict())
+        return diagnosis
     problem = build_problem(run, campaign, only, progress)
     problem.foresee(problem.origin()[None])
     diagnosis, found = diagnose(problem, settings, progress, _memory(run))
@@ -345,6 +371,13 @@ def explain(diagnosis: Diagnosis, effect: str) -> Diagnosis:
             effects=(effect,),
             sentence=f"{effect} leaves no separable signal in these logs: {found.reason}{nearest}.",
         )
+    if found.probability == found.probability:
+        values = ", ".join(f"{k} {v:.3g} +- {found.std.get(k, 0.0):.1g}" for k, v in found.values.items())
+        sentence = (
+            f"{effect} is missing with probability {found.probability:.3f}; it would show with "
+            f"{found.separable_sigma:.1f} sigma at its usual size, its best fit is {values or 'none'}{nearest}."
+        )
+        return dataclasses.replace(diagnosis, sentence=sentence)
     sentence = (
         f"{effect} is {found.status} ({found.reason}): separable {found.separable_sigma:.1f} sigma "
         f"({100.0 * found.separable_share:.1f} % of its signal), z {found.z:.1f}, family-wise p {found.p:.2g}, "
@@ -374,6 +407,12 @@ def add(folder: str | Path | Run, effect: str, out: str | Path, progress: Progre
         raise UserError(
             f"add: the model has {new.name} already; remove it from {run.folder / 'model.toml'} to add it anew."
         )
+    if isinstance(campaign[0], SteadyLog):
+        model = grown_model(run, campaign, effect, values, progress)
+        child = dataclasses.replace(
+            run, folder=Path(out), model=model, added=(*run.added, new.name), parent=str(run.folder.resolve())
+        )
+        return _compare(child, progress)
     model = run.model.add(new if ".py" not in effect else effect, "add", **values)
     replaced = [e for e in run.model.effect_names if e not in model.effect_names]
     if not replaced:
@@ -421,11 +460,20 @@ def improve(
     runs = [run]
     while True:
         diagnosis = why(run, progress=progress)
-        go_on = diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE)
-        go_on = go_on or (keep_going and diagnosis.verdict is Verdict.UNKNOWN and bool(diagnosis.effects))
-        if not go_on or len(runs) > most:
+        name = _next_to_add(diagnosis, run, keep_going)
+        if name is None or len(runs) > most:
             return diagnosis, runs
         specs = {s.rpartition(":")[2]: s for s in effects}
-        name = diagnosis.effects[0]
         run = add(run, specs.get(name, name), out / f"run{len(runs) + 1}", progress)
         runs.append(run)
+
+
+def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> str | None:
+    """What `improve` adds next: another form of the model first, where it is surely better, then what is named."""
+    law = better_law(diagnosis.forms, run.model)
+    if law is not None:
+        return law
+    go_on = diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE)
+    go_on = go_on or (keep_going and diagnosis.verdict is Verdict.UNKNOWN)
+    names = [n for n in diagnosis.effects if not n.startswith("calibration: ")]
+    return names[0] if go_on and names else None

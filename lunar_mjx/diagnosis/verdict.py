@@ -12,21 +12,21 @@ class Verdict(enum.Enum):
     """What the logs say about the model; `exit_status` is the exit status of the command."""
 
     NOISE_ONLY = ("NOISE_ONLY", 0)
-    """Nothing significant is missing, and the global test passes."""
+    """Nothing is missing beyond usual errors of model, sensors and noise."""
     BAD_DATA = ("BAD_DATA", 10)
     """The log itself cannot be used; nothing is said about physics."""
     BAD_FIT = ("BAD_FIT", 11)
-    """The baseline fit has no certificate of convergence; nothing is said about physics."""
+    """The solver failed; nothing is said about physics."""
     KNOWN = ("KNOWN", 20)
-    """One catalogue effect explains the error, separably."""
+    """One catalogue effect is missing, whatever discrepancy remains."""
     KNOWN_CLASS = ("KNOWN_CLASS", 21)
     """One of several effects that these logs cannot tell apart; where one is named, that or something unlisted."""
     MULTIPLE = ("MULTIPLE", 22)
-    """Several effects, each significant given the others."""
+    """Several effects are missing, each of them surely."""
     UNKNOWN = ("UNKNOWN", 30)
-    """Something is missing at a port, and no catalogue effect brings the held-out error to the noise."""
+    """Something is missing at a port that no catalogue effect explains."""
     UNDECIDABLE = ("UNDECIDABLE", 31)
-    """The effect asked about leaves no separable signal in these logs."""
+    """No statement has 95 per cent, or the effect asked about leaves no separable signal in these logs."""
 
     def __init__(self, label: str, exit_status: int):
         self.label = label
@@ -47,6 +47,7 @@ class EffectEvidence:
       held_out_gain, held_out_se: gain of the expected log density on manoeuvres left out, and its standard error; NaN
         where the effect was not refitted.
       values: fitted parameters by name; std: their standard deviations.
+      probability: that the effect is missing, whatever else is; NaN where hypotheses were not weighed.
       nearest: the effect with the most similar projected signature, and |cos| between the two.
       status: "accepted", "rejected", "confounded", "not tested" or "not significant".
       reason: in a few words.
@@ -63,6 +64,7 @@ class EffectEvidence:
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
     std: Mapping[str, float] = dataclasses.field(default_factory=dict)
     nearest: tuple[str, float] = ("", 0.0)
+    probability: float = float("nan")
     status: str = "not significant"
     reason: str = ""
 
@@ -82,6 +84,11 @@ class Diagnosis:
         with the effects named.
       isolability: |cos| between projected signatures, by pairs of effects.
       undecidable: effects that leave no separable signal in these logs.
+      probability: of the verdict as a statement. probabilities: by hypothesis, together 1. inclusion: by effect, that
+        it is missing whatever else is. forms: by form of the model, such as its contact law.
+      unlisted: whether something unlisted at `port` belongs to the statement.
+      discrepancy: what remains, by port: `size` (share of the force or stress there), its 68 % range `low` to `high`,
+        and `text` in the user's terms.
       details: certificate of the fit, seeds, splits and whatever else a report shows.
     """
 
@@ -95,6 +102,12 @@ class Diagnosis:
     error_after: Mapping[str, float] = dataclasses.field(default_factory=dict)
     isolability: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
     undecidable: tuple[str, ...] = ()
+    probability: float = float("nan")
+    probabilities: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    inclusion: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    forms: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    unlisted: bool = False
+    discrepancy: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     details: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:

@@ -43,8 +43,8 @@ on speed, and well above the speed floors that regularise standstill the imposed
 _DEEPEST = 1.5
 """Largest sinkage looked at, in wheel radii: up to there the contact arc is followed."""
 _SHALLOWEST = 1e-6
-_SCAN = 64
-_BISECTIONS = 50
+_SCAN = 48
+_BISECTIONS = 33
 
 Parameters = Mapping[str, Mapping[str, Any]]
 

@@ -220,7 +220,7 @@ def replicate_groups(table: SteadyStateTable) -> np.ndarray:
     """Which point each run belongs to: same slip angle, same rim and travel speed (slip ratio to 0.01 where one of the
     speeds is not given), same load. Whatever was imposed and differs separates runs.
 
-    Loads count as the same where no gap of more than 25 % lies between them.
+    Measured loads count as the same where no gap of more than 25 % lies between them, planned ones where equal.
 
     Returns:
       Group number of each row, counted by rising slip angle, then speeds or slip, then load.
@@ -229,6 +229,8 @@ def replicate_groups(table: SteadyStateTable) -> np.ndarray:
     keys += [np.round(table.test[c], 4) for c in _SPEEDS if c in table.test]
     if not all(c in table.test for c in _SPEEDS):
         keys.append(np.round(table.test["slip_ratio"], 2))
+    if _planned(table.test["normal_load_N"]):
+        keys.append(table.test["normal_load_N"])
     first = np.unique(np.column_stack(keys), axis=0, return_inverse=True)[1].reshape(-1)
     level = np.zeros(len(first), int)
     load = table.test["normal_load_N"]
@@ -237,6 +239,11 @@ def replicate_groups(table: SteadyStateTable) -> np.ndarray:
         order = rows[np.argsort(load[rows], kind="stable")]
         level[order[1:]] = np.cumsum(np.diff(load[order]) > SAME_LOAD * load[order[:-1]])
     return np.unique(np.column_stack([first, level]), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _planned(values: np.ndarray) -> bool:
+    """Whether values are settings of a plan, which repeat, and not readings, which hardly do."""
+    return len(np.unique(values)) <= max(len(values) // 3, 1)
 
 
 def average(table: SteadyStateTable) -> SteadyStateTable:

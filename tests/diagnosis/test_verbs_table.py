@@ -13,9 +13,11 @@ import pytest
 
 from lunar_mjx.criticism import WheelBed, audit, wheel_test
 from lunar_mjx.diagnosis import build_problem, verbs
+from lunar_mjx.diagnosis.tables.port_gains import FIELDS
+from lunar_mjx.diagnosis.tables.wheel_form import WheelForm
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.effects import catalogue
-from lunar_mjx.inference import fitting
+from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.logs import Noise, write_steady_log
 
 FEW = ("friction_circle", "slip_sinkage")
@@ -81,7 +83,7 @@ def test_the_loop_names_the_hidden_effect_and_the_error_falls(run, logs, work):
     found = run("compare", logs / "hidden", "-o", work / "run1")
     assert found.status == 0, found.err
     before = json.loads((work / "run1" / "comparison.json").read_text())
-    assert before["certificate"]["problems"] == []
+    assert before["solver"] == "ended"
     assert before["refitted"]["held_out"] > 1.5
 
     why = run("why", work / "run1", "--json")
@@ -90,7 +92,10 @@ def test_the_loop_names_the_hidden_effect_and_the_error_falls(run, logs, work):
     assert (answer["verdict"], answer["effects"], answer["exit_status"]) == ("KNOWN", ["slip_sinkage"], 20)
     first = answer["evidence"][0]
     assert first["status"] == "accepted"
-    assert first["held_out_gain"] > 2.0 * first["held_out_se"]
+    assert first["probability"] == answer["inclusion"]["slip_sinkage"] > 0.95
+    assert sum(answer["probabilities"].values()) == pytest.approx(1.0)
+    assert set(answer["discrepancy"]) <= set(FIELDS)
+    assert all(0.0 < d["low"] < d["size"] < d["high"] < 0.3 for d in answer["discrepancy"].values())
     value, std = first["values"]["driving"], first["std"]["driving"]
     assert abs(value - HIDDEN) < 5.0 * std < 0.5 * HIDDEN
     assert json.loads((work / "run1" / "verdict.json").read_text()) == answer
@@ -98,8 +103,8 @@ def test_the_loop_names_the_hidden_effect_and_the_error_falls(run, logs, work):
     added = run("add", work / "run1", "slip_sinkage", "-o", work / "run2")
     assert added.status == 0, added.err
     after = json.loads((work / "run2" / "comparison.json").read_text())
-    # 42 points: the noise itself lies within 0.7 and 1.3
-    assert after["refitted"]["held_out"] < min(1.4, 0.5 * before["refitted"]["held_out"])
+    # The fit leaves room for a discrepancy of a per cent, which is two sigma of these precise instruments.
+    assert after["refitted"]["held_out"] < 0.4 * before["refitted"]["held_out"]
     again = run("why", work / "run2")
     assert again.status == Verdict.NOISE_ONLY.exit_status
     assert again.out.startswith("NOISE_ONLY")
@@ -108,7 +113,14 @@ def test_the_loop_names_the_hidden_effect_and_the_error_falls(run, logs, work):
     assert page.status == 0, page.err
     text = (work / "report.html").read_text()
     assert "slip_sinkage" in text
-    for part in ("Click a field", "averaged in bins", "Shapes of missing effects", "noise floor"):
+    for part in (
+        "Click a field",
+        "averaged in bins",
+        "Shapes of missing effects",
+        "noise floor",
+        "Hypotheses",
+        "What remains",
+    ):
         assert part in text, part
     assert len(text) < 5e6
 
@@ -128,33 +140,28 @@ def test_why_can_be_asked_about_one_effect(run, logs, work):
     assert "phlogiston" in wrong.err
 
 
-def test_fits_on_disk_are_not_made_again(logs, work, monkeypatch):
-    folder = work / "null"
-    if not (folder / "fits.json").is_file():
-        pytest.skip("needs the run of a test before")
-    before = json.loads((folder / "fits.json").read_text())
-    assert "" in before
-
-    def refuse(*_args, **_kwargs):
-        raise AssertionError("a fit that is on disk was made again")
-
-    monkeypatch.setattr(fitting, "descend", refuse)
-    assert verbs.why(folder).verdict is Verdict.NOISE_ONLY
-
-
 def test_an_interrupt_leaves_a_usable_folder(run, logs, work, monkeypatch):
     folder = work / "stopped"
     shutil.copytree(work / "null", folder)
-    (folder / "fits.json").unlink()
 
     def stop(*_args, **_kwargs):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "descend", stop)
+        patch.setattr(WheelForm, "refit", stop)
         with pytest.raises(KeyboardInterrupt):
             verbs.why(folder)
     assert verbs.why(folder).verdict is Verdict.NOISE_ONLY
+
+
+def test_a_solver_that_fails_is_bad_fit(run, logs, work, monkeypatch):
+    def fail(*_args, **_kwargs):
+        raise EvidenceError("on purpose")
+
+    monkeypatch.setattr(WheelForm, "refit", fail)
+    found = verbs.why(work / "null")
+    assert found.verdict is Verdict.BAD_FIT
+    assert "on purpose" in found.sentence
 
 
 @pytest.mark.slow

@@ -19,3 +19,13 @@ def test_runs_at_other_speeds_are_no_replicates(column: str) -> None:
     measured = {"drawbar_pull": np.arange(6.0)}
     table = SteadyStateTable("a", test, measured, np.ones(6, int), {}, 0.1, 0.1, "wheel_frame")
     np.testing.assert_array_equal(replicate_groups(table), [0, 0, 1, 1, 2, 2])
+
+
+def test_planned_loads_a_fifth_apart_are_no_replicates_and_measured_ones_are() -> None:
+    test = {"slip_ratio": np.full(6, 0.2), "slip_angle_deg": np.zeros(6)}
+    planned = test | {"normal_load_N": np.array([50.0, 50.0, 50.0, 60.0, 60.0, 60.0])}
+    read = test | {"normal_load_N": np.array([50.1, 52.3, 54.9, 57.2, 59.8, 60.4])}
+    measured = {"drawbar_pull": np.arange(6.0)}
+    for imposed, groups in ((planned, [0, 0, 0, 1, 1, 1]), (read, [0] * 6)):
+        table = SteadyStateTable("a", imposed, measured, np.ones(6, int), {}, 0.1, 0.1, "wheel_frame")
+        np.testing.assert_array_equal(replicate_groups(table), groups)

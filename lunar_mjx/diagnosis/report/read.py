@@ -21,6 +21,7 @@ from lunar_mjx.diagnosis.runs import (
     VERDICT_FILE,
 )
 from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
 from lunar_mjx import __version__
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error, Step
-from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, shown
+from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, port_label, shown
 from lunar_mjx.model.describe import by_group
 from lunar_mjx.report.page import Block, Facts, Table, Text
 
@@ -44,9 +44,42 @@ def _with_interval(e: Error | None) -> str:
     return f"{shown(e.value)} ({shown(e.low)} to {shown(e.high)})"
 
 
+def hypotheses(result: Result) -> list[Block]:
+    """Probabilities of the hypotheses, and what remains at every port; nothing where hypotheses were not weighed."""
+    verdict = result.verdict or {}
+    blocks: list[Block] = []
+    if listed := verdict.get("probabilities"):
+        rows = [[name, f"{p:.4f}"] for name, p in listed.items()]
+        note = (
+            "Probabilities of all hypotheses that were weighed, together 1. Discrepancy of usual size at every port, "
+            "calibration errors of usual size and the noise's uncertain size belong to each of them."
+        )
+        blocks.append(Table("Hypotheses", ["hypothesis", "probability"], rows, note, texts=1))
+    if len(forms := verdict.get("forms") or {}) > 1:
+        rows = [[name, f"{p:.4f}"] for name, p in forms.items()]
+        blocks.append(Table("Contact laws", ["law", "probability"], rows, texts=1))
+    if remains := verdict.get("discrepancy"):
+        rows = [
+            [port_label(port), str(d["text"]), f"{100.0 * d['low']:.2g} to {100.0 * d['high']:.2g} %"]
+            for port, d in remains.items()
+        ]
+        note = "Size of the smooth error that remains in the model at each port, with its 68 % range."
+        blocks.append(Table("What remains", ["port", "the model is", "range"], rows, note, texts=2))
+    held = (verdict.get("details") or {}).get("held_out") or {}
+    if held.get("manoeuvres"):
+        text = (
+            f"On {held['manoeuvres']} groups that chose nothing, the log predictive density of the best hypothesis is "
+            f"{plus_minus(held['gain'], held['se'])} above that of the model as it is."
+        )
+        blocks.append(Text([text]))
+    return blocks
+
+
 def effects(result: Result) -> list[Block]:
     """What the logs say for and against every effect of the catalogue."""
     verdict = result.verdict or {}
+    if verdict.get("probabilities"):
+        return _weighed(verdict)
     tested, silent = [], []
     for e in verdict.get("evidence") or []:
         near = e.get("nearest") or ("", 0.0)
@@ -108,6 +141,34 @@ def effects(result: Result) -> list[Block]:
             Table("Effects that these logs cannot test, and why", ["effect", "why"], silent, texts=2, folded=True)
         )
     return blocks
+
+
+def _weighed(verdict: Mapping[str, Any]) -> list[Block]:
+    """The table of effects where hypotheses were weighed."""
+    rows = []
+    for e in verdict.get("evidence") or []:
+        near = e.get("nearest") or ("", 0.0)
+        values = "; ".join(
+            f"{k} {plus_minus(v, (e.get('std') or {}).get(k))}" for k, v in (e.get("values") or {}).items()
+        )
+        untested = e.get("status") == "not tested"
+        rows.append(
+            [
+                e["effect"],
+                "cannot be tested with these logs" if untested else f"{e.get('probability') or 0.0:.4f}",
+                shown(e.get("separable_sigma")),
+                "-" if untested else values or "-",
+                f"{near[0]} ({near[1]:.2f})" if near[0] else "-",
+            ]
+        )
+    if not rows:
+        return []
+    note = (
+        "Probability: that the effect is missing, whatever else is. Would show: length of its signature at its usual "
+        "size that a refit of the model cannot absorb. Parameters with one standard deviation, SI units."
+    )
+    header = ["effect", "probability", "would show, sigma", "parameters, SI", "nearest confounder (|cos|)"]
+    return [Table("Every effect of the catalogue", header, rows, note, texts=2)]
 
 
 def parameters(first: Result, last: Result) -> list[Block]:

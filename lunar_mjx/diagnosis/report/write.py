@@ -109,11 +109,15 @@ def _where(judge: Result, steps: Sequence[Step]) -> Section:
     ports = verdict.get("ports") or {}
     if ports:
         best = max(ports, key=lambda k: ports[k] or 0.0)
+        weighed = bool(verdict.get("probabilities"))
         caption = (
-            "Gain of the log evidence when something nobody modelled acts at a port, its course free but smooth; "
+            "Probability that something unlisted acts at a port."
+            if weighed
+            else "Gain of the log evidence when something nobody modelled acts at a port, its course free but smooth; "
             "below 3 it is no better than noise."
         )
-        blocks.append(Figure(figures.bars(ports, "gain of log evidence", best), caption))
+        title = "probability" if weighed else "gain of log evidence"
+        blocks.append(Figure(figures.bars(ports, title, best), caption))
     follows = ((verdict.get("details") or {}).get("localise") or {}).get("dependence") or {}
     if follows:
         caption = "Chi-square that a parameter would take off if it followed slip, slip angle or load."
@@ -122,7 +126,7 @@ def _where(judge: Result, steps: Sequence[Step]) -> Section:
 
 
 def _why(judge: Result, results: Sequence[Result]) -> Section:
-    blocks = tables.effects(judge)
+    blocks = [*tables.hypotheses(judge), *tables.effects(judge)]
     table = (judge.verdict or {}).get("isolability") or {}
     if len(table) > 1:
         caption = (

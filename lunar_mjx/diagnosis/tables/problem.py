@@ -82,11 +82,14 @@ def default_units(table: SteadyStateTable) -> tuple[np.ndarray, list[str]]:
 
 
 def default_splits(number: int, apart: Sequence[bool]) -> list[str]:
-    """Every other group is held out, and of eight or more every fourth is kept for the test."""
+    """Every fourth group from the second on is held out to judge, and of eight or more every other of these for a test.
+
+    Held-out groups choose nothing, so that few are kept: what chooses is worth more.
+    """
     out = []
     for i in range(number):
-        held = "select" if number < 8 or i % 4 == 1 else "test"
-        out.append("apart" if apart[i] else "fit" if i % 2 == 0 or number < 3 else held)
+        held = "test" if number >= 8 and i % 8 == 5 else "select"
+        out.append("apart" if apart[i] else held if i % 4 == 1 and number >= 3 else "fit")
     return out
 
 

@@ -94,8 +94,9 @@ def test_slip_angles_are_left_out_together(table):
     assert default_units(straight)[1][0].startswith(("normal_load", "slip"))
 
 
-def test_every_other_group_is_held_out():
-    assert default_splits(5, [False] * 5) == ["fit", "select", "fit", "select", "fit"]
+def test_every_fourth_group_is_held_out():
+    assert default_splits(5, [False] * 5) == ["fit", "select", "fit", "fit", "fit"]
+    assert default_splits(8, [False] * 8) == ["fit", "select", "fit", "fit", "fit", "test", "fit", "fit"]
     assert default_splits(2, [False] * 2) == ["fit", "fit"]
     assert default_splits(9, [False] * 8 + [True])[-1] == "apart"
     assert "test" in default_splits(9, [False] * 9)

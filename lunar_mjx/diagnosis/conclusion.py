@@ -1,0 +1,164 @@
+"""From probabilities of hypotheses to a verdict: a statement that is true with at least 95 per cent."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.inference.weighing.hypotheses import CALIBRATION, EFFECT, UNLISTED, Term
+from lunar_mjx.inference.weighing.search import Hypothesis, ModelSearch
+
+LARGEST_CLASS = 5
+"""Effects of a class at most: "one of six" is no help to its reader."""
+_TOLD = 12
+"""Hypotheses whose probabilities are listed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Conclusion:
+    """What a search allows to say.
+
+    Attributes:
+      verdict: the statement's kind. effects: that it names, most probable first; instruments as "calibration: NAME".
+      unlisted: whether "or something unlisted" belongs to it. port: where, most probably. place: the same with what is
+        wrong there, for a reader.
+      probability: of the statement. sentence: it in words.
+    """
+
+    verdict: Verdict
+    effects: tuple[str, ...]
+    unlisted: bool
+    port: str | None
+    probability: float
+    sentence: str
+    place: str | None = None
+
+
+def conclude(found: ModelSearch, sure: float) -> Conclusion:
+    """The strongest statement that has the probability `sure`.
+
+    In this order: effects that are each sure (KNOWN, MULTIPLE); something unlisted (UNKNOWN); the smallest class that
+    holds what is missing (KNOWN_CLASS); nothing beyond usual discrepancy (NOISE_ONLY); none of these (UNDECIDABLE).
+    """
+    inclusion = found.inclusion()
+    named = [t for t, p in inclusion.items() if p >= sure and t.kind in (EFFECT, CALIBRATION)]
+    unlisted = found.probability_of(lambda h: any(t.kind == UNLISTED for t in h.terms))
+    port, place = _where(found)
+    if named:
+        p = found.probability_of(lambda h: set(named) <= h.terms)
+        names = tuple(map(label, named))
+        many = len(names) > 1
+        said = f"{_list(names)} {'are' if many else 'is'} missing"
+        if all(t.kind == CALIBRATION for t in named):
+            said = f"{_list(names)}: out of order beyond what is usual"
+        if unlisted >= sure:
+            said += f", and something unlisted acts at {place}"
+        verdict = Verdict.MULTIPLE if many else Verdict.KNOWN
+        where = (port, place) if unlisted >= sure else (None, None)
+        return Conclusion(verdict, names, unlisted >= sure, where[0], p, _with(said, p), where[1])
+    if unlisted >= sure:
+        said = f"Something that no listed effect explains acts at {place}"
+        return Conclusion(Verdict.UNKNOWN, _helpful(found), True, port, unlisted, _with(said, unlisted), place)
+    nothing = found.probability_of(lambda h: not any(t.kind in (EFFECT, UNLISTED) for t in h.terms))
+    if nothing >= sure:
+        said = "Nothing is missing beyond usual errors of model, sensors and noise"
+        return Conclusion(Verdict.NOISE_ONLY, (), False, None, nothing, _with(said, nothing))
+    members, p = _smallest(found, [t for t in inclusion if t.kind == EFFECT], sure)
+    effects = tuple(m for m in members if m != _UNLISTED)
+    if members and len(effects) <= LARGEST_CLASS:
+        other = len(effects) < len(members)
+        tail = f", or something unlisted at {place}," if other else ""
+        said = f"One of {_list(effects)}{tail} is missing" if len(effects) > 1 else f"{effects[0]}{tail} is missing"
+        where = (port, place) if other else (None, None)
+        return Conclusion(Verdict.KNOWN_CLASS, effects, other, where[0], p, _with(said, p), where[1])
+    said = f"These data do not settle whether anything is missing (nothing: {_percent(nothing)})"
+    return Conclusion(Verdict.UNDECIDABLE, (), False, None, 0.0, said + ".")
+
+
+def label(term: Term) -> str:
+    """A term's name for a reader."""
+    if term.kind == UNLISTED:
+        return f"unlisted at {term.name}"
+    return f"calibration: {term.name}" if term.kind == CALIBRATION else term.name
+
+
+def title(hypothesis: Hypothesis) -> str:
+    """A hypothesis in words, whatever its form."""
+    order = {EFFECT: 0, UNLISTED: 1, CALIBRATION: 2}
+    terms = sorted(hypothesis.terms, key=lambda t: (order[t.kind], t.name))
+    return " + ".join(map(label, terms)) or "nothing is missing"
+
+
+def probabilities(found: ModelSearch) -> dict[str, float]:
+    """Probability by hypothesis, forms summed, most probable first; the rest of the list as "others"."""
+    total: dict[str, float] = {}
+    for h, p in zip(found.hypotheses, found.probability, strict=True):
+        total[title(h)] = total.get(title(h), 0.0) + float(p)
+    ranked = sorted(total.items(), key=lambda item: -item[1])
+    told = dict(ranked[:_TOLD])
+    rest = sum(p for _, p in ranked[_TOLD:])
+    return {**told, "others": rest} if rest > 0.0 else told
+
+
+def _where(found: ModelSearch) -> tuple[str | None, str | None]:
+    """The port at which something unlisted most probably acts, and the same in full."""
+    ports: dict[str, float] = {}
+    names: dict[str, float] = {}
+    for t, p in found.inclusion().items():
+        if t.kind == UNLISTED:
+            ports[port_of(t.name)] = ports.get(port_of(t.name), 0.0) + p
+            names[t.name] = p
+    if not ports:
+        return None, None
+    port = max(ports, key=lambda n: ports[n])
+    return port, max((n for n in names if port_of(n) == port), key=lambda n: names[n])
+
+
+def port_of(field: str) -> str:
+    """The port of a field such as "soil: stiffness with load"."""
+    return field.partition(":")[0]
+
+
+def _helpful(found: ModelSearch) -> tuple[str, ...]:
+    return tuple(t.name for t, p in found.inclusion().items() if t.kind == EFFECT and p > 0.5)
+
+
+_UNLISTED = ""
+"""Member of a class that stands for something unlisted, wherever it acts."""
+
+
+def _smallest(found: ModelSearch, terms: Sequence[Term], sure: float) -> tuple[list[str], float]:
+    """Fewest effects, one by one the most useful, of which the truth holds at least one with probability `sure`.
+
+    Something unlisted counts as one of them.
+    """
+    members: list[str] = []
+    choice = [t.name for t in terms] + [_UNLISTED]
+
+    def holds(more: Sequence[str]) -> Callable[[Hypothesis], bool]:
+        wanted = set(more)
+        return lambda h: bool(wanted & h.effects) or (_UNLISTED in wanted and any(t.kind == UNLISTED for t in h.terms))
+
+    p = 0.0
+    while p < sure and len(members) < len(choice):
+        rest = [t for t in choice if t not in members]
+        gains = {t: found.probability_of(holds([*members, t])) for t in rest}
+        best = max(rest, key=lambda t: gains[t])
+        if gains[best] <= p:
+            return [], p
+        members.append(best)
+        p = gains[best]
+    return (members, p) if p >= sure else ([], p)
+
+
+def _list(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _percent(p: float) -> str:
+    return f"{100.0 * p:.0f} %" if p < 0.99 else "more than 99 %"
+
+
+def _with(said: str, p: float) -> str:
+    return f"{said} (probability {_percent(p)})."

@@ -1,0 +1,122 @@
+"""Every number that decides about a table, in one tree: name, unit, and what it rests on."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+
+@dataclasses.dataclass(frozen=True)
+class TableSettings:
+    """Sizes, priors and effort of a diagnosis of tables; written to `run.json`."""
+
+    # --- what is usual -----------------------------------------------------------------------------------------------
+    usual_discrepancy: float = 0.05
+    """1; scale of the half-normal prior of each port's discrepancy: no contact law is exact (terramechanics models
+    predict drawbar pull and sinkage to some 5 to 10 per cent, Wong 2008)."""
+    unlisted_discrepancy: float = 0.4
+    """1; the same where something unlisted acts at a port."""
+    following_discrepancy: float = 0.2
+    """1; standard deviation of something unlisted that follows one quantity alone."""
+    sensor_scale: float = 0.02
+    """1; usual error of a sensor's scale."""
+    sensor_zero: float = 0.01
+    """1; usual error of a sensor's zero, over its largest reading."""
+    cross_talk: float = 0.01
+    """1; usual cross-talk between the axes of a force sensor."""
+    slip_zero: float = 0.01
+    """1; usual error of the imposed slip ratio."""
+    angle_zero: float = math.radians(0.5)
+    """rad; usual error of the imposed slip angle."""
+    abscissa_scale: float = 0.01
+    """1; usual error of the scale of slip and slip angle, and of the load's zero over its mean."""
+    wheel_radius: float = 0.005
+    """1; usual error of the wheel's radius: a rigid wheel is measured by calliper, to half a millimetre in 100."""
+    load_scale: float = 0.02
+    """1; usual error of the imposed load, and of the wheel's width."""
+    bad_calibration: float = 5.0
+    """1; how much larger the errors of an instrument are that is out of order."""
+    stated_spread: float = 0.3
+    """1; standard deviation of the logarithm of the noise's size where it is only stated."""
+    replicate_spread: float = 0.15
+    """1; the same beside what the number of replicates allows: between points noise is not quite that between runs."""
+    effect_size: float = 1.0
+    """1; prior standard deviation of an effect's amplitude, over its nominal size."""
+
+    # --- how rare things are -----------------------------------------------------------------------------------------
+    effect_odds: float = 0.01
+    """1; prior odds of each effect of the catalogue: of some fifteen, one is missing in every seventh table."""
+    unlisted_odds: float = 0.003
+    """1; prior odds of something unlisted in each of the six fields of discrepancy."""
+    following_odds: float = 0.0015
+    """1; prior odds of something unlisted that follows one quantity alone, for each field and quantity."""
+    calibration_odds: float = 0.005
+    """1; prior odds of each instrument to be out of order."""
+    sure: float = 0.95
+    """1; probability of a statement that is a verdict."""
+
+    # --- smooth functions of a table's points ------------------------------------------------------------------------
+    slip_length: float = 0.4
+    """1; slip ratio over which a discrepancy changes."""
+    angle_length: float = 30.0
+    """deg; the same of the slip angle."""
+    load_length: float = 0.7
+    """1; the same of the logarithm of the load: a factor of two."""
+    speed_length: float = 0.7
+    """1; the same of the logarithm of the speed."""
+    shape_shares: tuple[float, float, float] = (0.3, 0.3, 0.4)
+    """1; shares of a discrepancy's variance: constant, linear, curved."""
+    mode_share: float = 0.985
+    """1; share of the variance that the modes kept have."""
+    most_modes: int = 20
+    """1; modes kept at most."""
+    least_range: float = 0.25
+    """1; range of a quantity, in its length, below which a table does not vary it."""
+    least_length: float = 0.3
+    """sigma; a direction in which even an unlisted discrepancy is shorter is left out."""
+    steepest_lever: float = math.radians(80.0)
+    """rad; slip angle beyond which the error of a wheel-frame slip grows no further."""
+
+    # --- effort ------------------------------------------------------------------------------------------------------
+    most_rounds: int = 4
+    """1; rounds of refit and re-linearisation."""
+    settled: float = 0.3
+    """nat; change of log evidence by a round below which a refit has settled."""
+    fit_tolerance: float = 1e-4
+    """1; relative fall of the refit's cost below which it ends: less than 0.1 of chi-square at the noise."""
+    most_evaluations: int = 12
+    """1; evaluations of one round of a refit."""
+    most_refits: int = 14
+    """1; refits of a search."""
+    most_terms: int = 7
+    """1; terms of one hypothesis at most, as the real wheel needs."""
+    window: float = 4.0
+    """nat; hypotheses further below the best are not refitted: 2 per cent of its probability."""
+
+    @property
+    def effect_log_odds(self) -> float:
+        """Log of `effect_odds`."""
+        return math.log(self.effect_odds)
+
+    @property
+    def unlisted_log_odds(self) -> float:
+        """Log of `unlisted_odds`."""
+        return math.log(self.unlisted_odds)
+
+    @property
+    def following_log_odds(self) -> float:
+        """Log of `following_odds`."""
+        return math.log(self.following_odds)
+
+    @property
+    def calibration_log_odds(self) -> float:
+        """Log of `calibration_odds`."""
+        return math.log(self.calibration_odds)
+
+    def abscissae(self) -> dict[str, float]:
+        """Usual error of every abscissa."""
+        return {
+            "slip zero": self.slip_zero, "slip scale": self.abscissa_scale, "slip angle zero": self.angle_zero,
+            "slip angle scale": self.abscissa_scale, "load zero": self.abscissa_scale, "load scale": self.load_scale,
+            "wheel radius": self.wheel_radius, "wheel width": self.load_scale,
+        }  # fmt: skip

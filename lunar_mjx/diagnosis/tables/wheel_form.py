@@ -1,0 +1,383 @@
+"""A contact law held against steady-state tables, with all effects that may be missing beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from scipy import linalg, optimize
+
+from lunar_mjx.diagnosis.tables.noise import scatter
+from lunar_mjx.diagnosis.tables.port_gains import FIELDS, GAINS
+from lunar_mjx.diagnosis.tables.settings import TableSettings
+from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE, Imposed, WheelProgram
+from lunar_mjx.inference.coordinates import Coordinate
+from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
+from lunar_mjx.inference.observations import Observations
+from lunar_mjx.inference.weighing.hypotheses import CALIBRATION, EFFECT, UNLISTED, Form, Linear, Refit, Term
+from lunar_mjx.logs import SteadyLog
+from lunar_mjx.wheel_bed.bed import WheelBed, WheelTest
+from lunar_mjx.wheel_bed.table import QUANTITIES
+
+_QUANTITY_OF = {column: i for i, (column, _, _) in enumerate(QUANTITIES.values())}
+_NAMES = tuple(QUANTITIES)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TableData:
+    """Tables as one set of points and one vector of observations.
+
+    Attributes:
+      observations: values, noise, groups of points and their splits.
+      imposed: at every point of all tables.
+      point, quantity: (n,) point and place in `QUANTITIES` of every observation.
+      modes: (points, modes) of a smooth random function of the points, together of unit variance.
+      following: (points, few) the same of one quantity alone, by quantity that the table varies.
+      noise_std: by quantity measured, standard deviation of the logarithm of the noise's size.
+    """
+
+    observations: Observations
+    imposed: Imposed
+    point: np.ndarray
+    quantity: np.ndarray
+    modes: np.ndarray
+    following: Mapping[str, np.ndarray]
+    noise_std: Mapping[int, float]
+
+    @property
+    def measured(self) -> tuple[int, ...]:
+        """Places in `QUANTITIES` of what is measured."""
+        return tuple(self.noise_std)
+
+
+def table_data(
+    logs: Sequence[SteadyLog], observations: Observations, tests: Sequence[WheelTest], settings: TableSettings
+) -> TableData:
+    """Puts the points of all tables in one row.
+
+    Args:
+      logs: tables. observations: their measurements, log by log, quantity by quantity, points in one order.
+      tests: what every table imposes. settings: length scales and sizes.
+    """
+    point, quantity = np.empty(len(observations), int), np.empty(len(observations), int)
+    begin, first = [], 0
+    for test in tests:
+        begin.append(first)
+        first += len(np.atleast_1d(np.asarray(test.slip_angle)))
+    for s in observations.series:
+        point[s.start : s.stop] = begin[s.log] + np.arange(s.stop - s.start)
+        quantity[s.start : s.stop] = _QUANTITY_OF[s.channel]
+    assert observations.place is not None
+    slip = np.empty(first)
+    slip[point] = observations.place[:, 0]
+    stacked = jax.tree.map(lambda *a: np.concatenate([np.atleast_1d(np.asarray(x, float)) for x in a]), *tests)
+    lever = np.concatenate([
+        1.0 / np.cos(np.minimum(np.abs(np.asarray(t.slip_angle, float)), settings.steepest_lever))
+        if log.table.slip_definition == "wheel_frame" else np.ones(len(np.atleast_1d(np.asarray(t.slip_angle))))
+        for log, t in zip(logs, tests, strict=True)
+    ])  # fmt: skip
+    load = np.asarray(stacked.normal_load)
+    imposed = Imposed(stacked, slip, lever, np.full(first, load.mean()))
+    speed = np.concatenate([_speed(log, t) for log, t in zip(logs, tests, strict=True)])
+    features = np.column_stack([
+        slip / settings.slip_length, np.degrees(stacked.slip_angle) / settings.angle_length,
+        np.log(load) / settings.load_length, np.log(speed) / settings.speed_length,
+    ])  # fmt: skip
+    std: dict[int, float] = {}
+    for log in logs:
+        for name, own in scatter(log).items():
+            told = np.hypot(settings.replicate_spread, own.level) if own.level else settings.stated_spread
+            i = _NAMES.index(name)
+            std[i] = max(std.get(i, 0.0), float(told))
+    following = {
+        name: _modes(features[:, [k]], settings)
+        for k, name in enumerate(("slip", "slip angle", "load", "speed"))
+        if np.ptp(features[:, k]) > settings.least_range
+    }
+    return TableData(
+        observations, imposed, point, quantity, _modes(features, settings), following, dict(sorted(std.items()))
+    )
+
+
+def _speed(log: SteadyLog, test: WheelTest) -> np.ndarray:
+    """(points,) larger of rim and travel speed where the table gives any, else 1; m/s."""
+    del test
+    from lunar_mjx.wheel_bed.table import average
+
+    columns = average(log.table).test
+    given = [columns[c] for c in ("rim_speed_m_s", "travel_speed_m_s") if c in columns]
+    return np.maximum(np.max(given, axis=0), 1e-6) if given else np.ones(len(columns["slip_ratio"]))
+
+
+def _modes(features: np.ndarray, settings: TableSettings) -> np.ndarray:
+    """(points, modes): a constant, a plane and a smooth remainder, of given shares of the variance."""
+    unique, inverse = np.unique(np.round(features, 6), axis=0, return_inverse=True)
+    centred = unique - unique.mean(axis=0)
+    plane = centred @ centred.T / max(float(np.mean(np.sum(centred**2, axis=1))), 1e-12)
+    distance = np.sum((unique[:, None] - unique[None]) ** 2, axis=-1)
+    constant, straight, curved = settings.shape_shares
+    values, vectors = np.linalg.eigh(constant + straight * plane + curved * np.exp(-0.5 * distance))
+    order = np.argsort(values)[::-1]
+    share = np.cumsum(values[order]) / values.sum()
+    keep = order[: min(int(np.searchsorted(share, settings.mode_share)) + 1, settings.most_modes)]
+    return (vectors[:, keep] * np.sqrt(values[keep]))[inverse.reshape(-1)]
+
+
+class WheelForm(Form):
+    """One contact law against tables."""
+
+    def __init__(
+        self,
+        name: str,
+        data: TableData,
+        bed: WheelBed,
+        coordinates: Sequence[Coordinate],
+        baseline: np.ndarray,
+        candidates: Mapping[str, np.ndarray],
+        settings: TableSettings,
+        log_prior: float = 0.0,
+    ):
+        """Makes the form.
+
+        Args:
+          name: of the law. data: measurements.
+          bed: the law with all candidates, at their null. coordinates: of the law and of all candidates.
+          baseline: places of the law's own coordinates. candidates: places by effect.
+          settings: sizes and priors. log_prior: log of the form's prior probability.
+        """
+        self.name, self.data, self.settings, self.log_prior = name, data, settings, log_prior
+        self.coordinates, self.baseline, self.candidates = tuple(coordinates), baseline, dict(candidates)
+        self.program = WheelProgram(bed, coordinates)
+        self._fit = data.observations.in_split("fit")
+        names = _instruments(data)
+        self.instruments = names
+        rare = settings
+        self.terms = (
+            *(Term(e, EFFECT, rare.effect_log_odds) for e in self.candidates),
+            *(Term(f, UNLISTED, rare.unlisted_log_odds) for f in FIELDS),
+            *(Term(f"{f} with {q}", UNLISTED, rare.following_log_odds) for f in FIELDS for q in data.following),
+            *(Term(c, CALIBRATION, rare.calibration_log_odds) for c in names),
+        )
+
+    def predict(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predictions (n,) in SI units at a place, and their derivatives (n, width)."""
+        values, slopes = self.program(u, self.data.imposed)
+        at = (self.data.quantity, self.data.point)
+        return values[at], slopes[at]
+
+    def residual(self, u: np.ndarray) -> np.ndarray:
+        """(n,) whitened residuals, measured less predicted."""
+        return self.data.observations.whiten(self.data.observations.value - self.predict(u)[0])
+
+    def linearise(self, u: np.ndarray) -> tuple[Linear, np.ndarray, np.ndarray]:
+        """Everything that hypotheses need around a place; whitened columns (n, k) and residuals (n,) beside it."""
+        data, settings, count = self.data, self.settings, len(self.coordinates)
+        value, slope = self.predict(u)
+        if not np.isfinite(value).all() or not np.isfinite(slope).all():
+            raise EvidenceError("the wheel's predictions or their derivatives are not finite")
+        whiten = data.observations.whiten
+        residual = whiten(data.observations.value - value)
+        own = whiten(slope[:, :count])
+        errors, error_std, instruments = self._calibration(value, slope[:, count + len(GAINS) :])
+        fields, field_of = self._fields(slope[:, count : count + len(GAINS)])
+        unlisted, followed = self._following(slope[:, count : count + len(GAINS)])
+        columns = np.column_stack([own, whiten(errors), fields, unlisted])
+        calibrated = count + np.arange(errors.shape[1])
+        rest = count + errors.shape[1] + np.arange(fields.shape[1])
+        std = np.concatenate(
+            [
+                [c.prior for c in self.coordinates],
+                error_std,
+                np.ones(len(rest)),
+                np.full(unlisted.shape[1], settings.following_discrepancy),
+            ]
+        )
+        for places in self.candidates.values():
+            amplitude = [i for i in places if self.coordinates[i].amplitude]
+            std[amplitude] = settings.effect_size
+        field = np.concatenate([np.full(count + errors.shape[1], -1), field_of, np.full(unlisted.shape[1], -1)])
+        mean = np.zeros(len(std))
+        centre = np.array([c.centre for c in self.coordinates])
+        mean[:count] = centre - u
+        low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
+        for places in self.candidates.values():
+            for i in places:
+                if self.coordinates[i].amplitude:
+                    low[i], high[i] = self.coordinates[i].bounds()
+        low[:count] -= u
+        high[:count] -= u
+        at = np.zeros(len(std))
+        for places in self.candidates.values():
+            at[places] = u[places]
+        group = self.noise_group()
+        kinds = len(data.measured)
+        fit = self._fit
+        held = {}
+        observations = data.observations
+        for number, split in enumerate(observations.unit_split):
+            if split in ("select", "test"):
+                rows = observations.unit == number
+                held[observations.unit_names[number]] = Gram.of(columns[rows], residual[rows], group[rows], kinds)
+        linear = Linear(
+            gram=Gram.of(columns[fit], residual[fit], group[fit], kinds),
+            held_out=held,
+            amplitudes=Amplitudes(std, field, mean),
+            low=low,
+            high=high,
+            always=np.concatenate([self.baseline, calibrated, rest]).astype(int),
+            effects=self.candidates,
+            at=at,
+            calibration={name: calibrated[places] for name, places in instruments.items()},
+            following={name: rest[-1] + 1 + places for name, places in followed.items()},
+            fields=tuple(Field(f, settings.usual_discrepancy) for f in FIELDS),
+            noises=tuple(NoiseSize(_NAMES[q], s) for q, s in data.noise_std.items()),
+            wide=settings.unlisted_discrepancy,
+            far=settings.bad_calibration,
+        )
+        return linear, columns, residual
+
+    def noise_group(self) -> np.ndarray:
+        """(n,) noise group of every observation."""
+        return np.searchsorted(np.array(self.data.measured), self.data.quantity)
+
+    def _fields(self, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened columns (n, m) of all fields, rotated so that few are left, and the field (m,) of each."""
+        columns, number = [], []
+        modes = self.data.modes[self.data.point]
+        for f, field in enumerate(FIELDS):
+            mine = [slope[:, [i]] * gain.share * modes for i, gain in enumerate(GAINS) if gain.field == field]
+            white = self.data.observations.whiten(np.column_stack(mine))
+            left, size, _ = np.linalg.svd(white, full_matrices=False)
+            keep = size * self.settings.unlisted_discrepancy > self.settings.least_length
+            columns.append(left[:, keep] * size[keep])
+            number.append(np.full(int(keep.sum()), f))
+        return np.column_stack(columns), np.concatenate(number)
+
+    def _following(self, slope: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Whitened columns (n, m) of unlisted inputs that follow one quantity alone, and places by a term's name."""
+        columns, places, at = [np.zeros((len(slope), 0))], {}, 0
+        for field in FIELDS:
+            for quantity, modes in self.data.following.items():
+                mine = [
+                    slope[:, [i]] * gain.share * modes[self.data.point]
+                    for i, gain in enumerate(GAINS)
+                    if gain.field == field
+                ]
+                white = self.data.observations.whiten(np.column_stack(mine))
+                columns.append(white)
+                places[f"{field} with {quantity}"] = at + np.arange(white.shape[1])
+                at += white.shape[1]
+        return np.column_stack(columns), places
+
+    def _calibration(self, value: np.ndarray, abscissae: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+        """Columns (n, m) of errors of sensors and abscissae (SI), their usual sizes (m,), and places by instrument."""
+        data, settings = self.data, self.settings
+        columns, std, of = [], [], []
+        observations = data.observations
+        load = data.imposed.test.normal_load[data.point]
+        by_point = np.zeros((len(QUANTITIES), len(data.imposed.slip)))
+        by_point[data.quantity, data.point] = value
+        for q in data.measured:
+            name = QUANTITIES[_NAMES[q]][0]
+            mine = data.quantity == q
+            top = float(np.quantile(np.abs(observations.value[mine]), 0.95))
+            errors = [(value, settings.sensor_scale), (np.full(len(value), top), settings.sensor_zero)]
+            if _NAMES[q] in ("drawbar_pull", "side_force"):
+                other = 1 - q
+                errors.append((load, settings.cross_talk))
+                if other in data.measured:
+                    errors.append((by_point[other][data.point], settings.cross_talk))
+            for column, size in errors:
+                columns.append(np.where(mine, column, 0.0))
+                std.append(size)
+                of.append(name)
+        sizes = settings.abscissae()
+        for i, name in enumerate(ABSCISSAE):
+            columns.append(abscissae[:, i])
+            std.append(sizes[name])
+            of.append(_instrument(name))
+        names = dict.fromkeys(of)
+        return (np.column_stack(columns), np.array(std),
+                {n: np.flatnonzero([o == n for o in of]) for n in names})  # fmt: skip
+
+    def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
+        """See `Form`; Gauss-Newton with a trust region under the covariance of noise, calibration and discrepancy."""
+        settings = self.settings
+        free = np.concatenate([self.baseline, *(p for e, p in self.candidates.items() if e in effects)]).astype(int)
+        u = np.zeros(len(self.coordinates))
+        if start is not None:
+            u[free] = start[free]
+        elif near is not None:
+            u[free] = near.u[free]
+        pairs = np.array([self.coordinates[i].bounds() for i in free], float).reshape(-1, 2)
+        u[free] = np.clip(u[free], *(pairs.T + np.array([[1e-9], [-1e-9]])))
+        terms = frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
+        sizes, before, failed = None, -np.inf, ""
+        linear, columns, _ = self.linearise(u)
+        for _ in range(settings.most_rounds):
+            value, found, _ = linear.evidence(terms, sizes)
+            if abs(value - before) < settings.settled:
+                break
+            before, sizes = value, (found.tau, found.noise)
+            u, failed = self._descend(u, free, pairs, linear, columns, sizes)
+            linear, columns, _ = self.linearise(u)
+        return Refit(self.name, effects, u, linear, failed)
+
+    def _descend(
+        self,
+        u: np.ndarray,
+        free: np.ndarray,
+        bounds: np.ndarray,
+        linear: Linear,
+        columns: np.ndarray,
+        sizes: tuple[np.ndarray, np.ndarray],
+    ) -> tuple[np.ndarray, str]:
+        """The most probable coordinates at given sizes of discrepancy and noise, and why the solver failed or ""."""
+        fit, group = self._fit, self.noise_group()[self._fit]
+        count = len(self.coordinates)
+        tau, noise = sizes
+        scale = linear.amplitudes.std * np.append(tau, 1.0)[linear.amplitudes.field]
+        own = linear.always[linear.always >= count]  # calibration and fields of usual size
+        nuisance = columns[fit][:, own] * scale[own]
+        covariance = nuisance @ nuisance.T
+        covariance[np.diag_indices(len(group))] += noise[group] ** 2
+        factor = linalg.cholesky(covariance, lower=True, check_finite=False)
+        std = linear.amplitudes.std[free]
+        centre = np.array([self.coordinates[i].centre for i in free])
+        kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+        def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            key = x.tobytes()
+            if key not in kept:
+                place = u.copy()
+                place[free] = x
+                value, slope = self.predict(place)
+                whole = np.column_stack([self.data.observations.value - value, -slope[:, free]])
+                white = self.data.observations.whiten(whole)[fit]
+                white = np.where(np.isfinite(white), white, 1e6)
+                solved = linalg.solve_triangular(factor, white, lower=True, check_finite=False)
+                kept.clear()
+                kept[key] = (np.concatenate([solved[:, 0], (x - centre) / std]),
+                             np.vstack([solved[:, 1:], np.diag(1.0 / std)]))  # fmt: skip
+            return kept[key]
+
+        x = np.clip(u[free], bounds[:, 0] + 1e-9, bounds[:, 1] - 1e-9)
+        answer = optimize.least_squares(
+            lambda x: at(x)[0], x, lambda x: at(x)[1], (bounds[:, 0], bounds[:, 1]), method="trf", x_scale="jac",
+            ftol=self.settings.fit_tolerance, xtol=1e-8, gtol=1e-8, max_nfev=self.settings.most_evaluations,
+        )  # fmt: skip
+        out = u.copy()
+        out[free] = answer.x
+        return out, "" if answer.status >= 0 else str(answer.message)
+
+
+def _instrument(abscissa: str) -> str:
+    return abscissa.removesuffix(" zero").removesuffix(" scale")
+
+
+def _instruments(data: TableData) -> tuple[str, ...]:
+    names = [QUANTITIES[_NAMES[q]][0] for q in data.measured]
+    return tuple(dict.fromkeys([*names, *map(_instrument, ABSCISSAE)]))

@@ -1,0 +1,1 @@
+"""Hypotheses about what is missing, weighed against each other by their evidence."""

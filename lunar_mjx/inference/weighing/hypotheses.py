@@ -1,0 +1,181 @@
+"""Hypotheses about what is missing: sets of terms beside one form of a model, and their evidence around a refit.
+
+A term is one thing that may be the matter: an effect (parameters that leave their null), a discrepancy beyond the usual
+size at a port ("unlisted"), or an instrument that errs more than usual ("calibration"). Discrepancy, calibration and
+noise of usual size are part of every hypothesis. A form is a model in its own right, such as another contact law.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lunar_mjx.inference.evidence import Amplitudes, Evidence, Field, Gram, NoiseSize, infer
+
+EFFECT, UNLISTED, CALIBRATION = "effect", "unlisted", "calibration"
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """One thing that may be the matter.
+
+    Attributes:
+      name: of the effect, of the port's field (with what it follows, after " with "), or of the instrument.
+      kind: EFFECT, UNLISTED or CALIBRATION.
+      log_prior: log of its prior odds.
+    """
+
+    name: str
+    kind: str
+    log_prior: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Linear:
+    """A form, linear around a refit: everything that its hypotheses need, whatever the number of measurements.
+
+    Attributes:
+      gram: of fitted measurements, over all columns: parameters of the form, of every effect, calibration, fields.
+      held_out: the same of measurements that choose nothing, by manoeuvre.
+      amplitudes: prior of all columns, relative to the refit. low, high: (k,) bounds relative to the refit; infinite
+        where the prior is not truncated.
+      always: columns of every hypothesis: the form's own parameters, calibration, and fields of usual size.
+      effects: columns by effect; zero amplitude is where the refit stands.
+      at: (k,) where the refit stands, relative to an effect's null; zero for other columns.
+      calibration: columns by instrument, among `always`.
+      following: columns of something unlisted that follows one quantity alone, by the name of its term.
+      fields: discrepancies. noises: of the noise groups.
+      wide: scale of tau's prior where something unlisted acts at a port. far: factor on the prior of an instrument that
+        errs more than usual.
+    """
+
+    gram: Gram
+    held_out: Mapping[str, Gram]
+    amplitudes: Amplitudes
+    low: np.ndarray
+    high: np.ndarray
+    always: np.ndarray
+    effects: Mapping[str, np.ndarray]
+    at: np.ndarray
+    calibration: Mapping[str, np.ndarray]
+    following: Mapping[str, np.ndarray]
+    fields: tuple[Field, ...]
+    noises: tuple[NoiseSize, ...]
+    wide: float
+    far: float
+
+    def evidence(
+        self, terms: frozenset[Term], start: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> tuple[float, Evidence, np.ndarray]:
+        """Log evidence of a set of terms, in linear approximation where its effects are not those of the refit.
+
+        Args:
+          terms: beside the form. start: sizes of discrepancy and noise to begin from.
+
+        Returns:
+          The log evidence with priors truncated to their bounds; sizes and posterior; columns of the posterior.
+
+        Raises:
+          EvidenceError: the sizes did not settle.
+        """
+        named = {t.name for t in terms if t.kind == EFFECT}
+        own = [self.effects[name] for name in self.effects if name in named]
+        unlisted = {t.name for t in terms if t.kind == UNLISTED}
+        own += [self.following[name] for name in self.following if name in unlisted]
+        places = np.concatenate([self.always, *own]).astype(int)
+        # An effect of the refit that is no term of this hypothesis goes back to its null.
+        gone = [p for name, p in self.effects.items() if name not in named and np.any(self.at[p] != 0.0)]
+        gram = self.gram
+        if gone:
+            back = np.zeros(gram.width)
+            for p in gone:
+                back[p] = -self.at[p]
+            gram = shifted(gram, back)
+        std = self.amplitudes.std.copy()
+        for t in terms:
+            if t.kind == CALIBRATION:
+                std[self.calibration[t.name]] *= self.far
+        prior = Amplitudes(std, self.amplitudes.field, self.amplitudes.mean).select(places)
+        fields = tuple(Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields)
+        found = infer(gram.select(places), prior, fields, self.noises, start)
+        bounded = found.log_inside(self.low[places], self.high[places])
+        return found.log_evidence + bounded, found, places
+
+    def shows(self) -> dict[str, float]:
+        """Length in sigma of each effect's signature at its prior size that the form's own parameters cannot absorb.
+
+        Noise is of stated size; discrepancy and calibration are left out: this tells whether anything could be seen.
+        """
+        whole = self.gram.matrix.sum(axis=0)
+        own = self.always[(self.amplitudes.field[self.always] < 0)]
+        own = np.setdiff1d(own, np.concatenate([*self.calibration.values(), np.zeros(0)]).astype(int))
+        scale = self.amplitudes.std
+        inner = np.eye(len(own)) + scale[own, None] * whole[np.ix_(own, own)] * scale[own]
+        found = {}
+        for name, places in self.effects.items():
+            across = scale[own, None] * whole[np.ix_(own, places)] * scale[places]
+            length = scale[places] ** 2 * np.diag(whole)[places]
+            length = length - np.einsum("ij,ij->j", across, np.linalg.solve(inner, across))
+            found[name] = float(np.sqrt(max(length.max(), 0.0))) if len(places) else 0.0
+        return found
+
+    def felt(self) -> dict[str, float]:
+        """Length in sigma of each field's strongest direction at the size of something unlisted; 0 for none."""
+        whole = np.diag(self.gram.matrix.sum(axis=0))[:-1]
+        found = {}
+        for number, field in enumerate(self.fields):
+            own = np.flatnonzero(self.amplitudes.field == number)
+            length = self.wide * self.amplitudes.std[own] * np.sqrt(whole[own])
+            found[field.name] = float(length.max(initial=0.0))
+        for name, places in self.following.items():
+            found[name] = float((self.amplitudes.std[places] * np.sqrt(whole[places])).max(initial=0.0))
+        return found
+
+
+def shifted(gram: Gram, amounts: np.ndarray) -> Gram:
+    """Statistics after the model's amplitudes have been moved by (k,) amounts: residual less columns times amounts."""
+    change = np.eye(gram.width + 1)
+    change[:-1, -1] = -amounts
+    return Gram(gram.count, np.einsum("ji,gjk,kl->gil", change, gram.matrix, change))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Refit:
+    """A form refitted with a set of effects under the covariance of noise, calibration and discrepancy.
+
+    Attributes:
+      form: its name. effects: names. u: coordinates. linear: around them.
+      failed: why the solver failed, or "".
+    """
+
+    form: str
+    effects: frozenset[str]
+    u: np.ndarray
+    linear: Linear
+    failed: str = ""
+
+
+class Form(abc.ABC):
+    """A model in its own right, with the effects that may be missing beside it.
+
+    Attributes:
+      name: of the form. log_prior: log of its prior probability among the forms.
+      terms: everything that may be the matter beside it.
+    """
+
+    name: str
+    log_prior: float
+    terms: Sequence[Term]
+
+    @abc.abstractmethod
+    def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
+        """Refits the form's parameters and those of some effects.
+
+        Args:
+          effects: names.
+          near: refit of a similar set to begin at; the model as given if None.
+          start: (coordinates,) to begin at, in place of that of `near`.
+        """

@@ -1,0 +1,77 @@
+"""The search over sets of terms on a toy: what is hidden, twins, nothing, something unlisted, a failing refit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lunar_mjx.diagnosis.conclusion import conclude, probabilities
+from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.inference.evidence import EvidenceError
+from lunar_mjx.inference.weighing.hypotheses import shifted
+from lunar_mjx.inference.weighing.search import search
+from tests.inference.toy_form import ToyForm, X, measured
+
+
+def look(value, **more):
+    return search([ToyForm(value, **more)], most_refits=12, most_terms=4, window=4.0)
+
+
+def test_nothing_is_found_where_nothing_is_hidden():
+    said = [conclude(look(measured(seed)), 0.95).verdict for seed in range(10)]
+    assert said.count(Verdict.NOISE_ONLY) >= 9
+    assert not {Verdict.KNOWN, Verdict.MULTIPLE} & set(said)
+
+
+def test_a_hidden_effect_is_named_with_its_amount():
+    found = look(measured(0, wave=0.8))
+    said = conclude(found, 0.95)
+    assert (said.verdict, said.effects) == (Verdict.KNOWN, ("wave",))
+    best = found.best
+    assert best.refitted and best.effects == {"wave"}
+    assert best.refit.u[3] == pytest.approx(0.8, abs=0.1)
+
+
+def test_twins_are_a_class():
+    said = conclude(look(measured(1, square=0.6)), 0.95)
+    assert said.verdict is Verdict.KNOWN_CLASS
+    assert set(said.effects) == {"square", "twin"}
+
+
+def test_two_effects_are_both_named():
+    said = conclude(look(measured(2, wave=0.8, square=0.6)), 0.95)
+    assert "wave" in said.effects
+    assert said.verdict in (Verdict.KNOWN, Verdict.MULTIPLE)  # the square has a twin
+
+
+def test_something_unlisted_is_unknown_at_its_port():
+    value = measured(3) + 0.5 * np.where(X > 0.2, X - 0.2, 0.0) * np.cos(6.0 * X)
+    said = conclude(look(value), 0.95)
+    assert said.verdict is Verdict.UNKNOWN
+    assert said.port == "level"
+
+
+def test_a_refit_that_fails_is_no_hypothesis_and_is_told():
+    found = look(measured(0, wave=0.8), broken=("wave",))
+    assert not any("wave" in h.effects for h in found.hypotheses)
+    assert found.failed == ("toy + wave: broken on purpose",)
+    with pytest.raises(EvidenceError, match="not finite"):
+        look(np.full(60, np.nan))
+
+
+def test_probabilities_sum_to_one():
+    found = look(measured(1, square=0.6))
+    assert found.probability.sum() == pytest.approx(1.0)
+    assert sum(probabilities(found).values()) == pytest.approx(1.0)
+
+
+def test_leaving_an_effect_out_agrees_with_its_null():
+    form = ToyForm(measured(0, square=0.4))
+    u = np.array([0.5, -0.4, 0.4, 0.0, 0.0])
+    back = np.zeros(14)
+    back[2] = -0.4
+    moved = shifted(form.linear(u).gram, back)
+    null = form.linear(np.array([0.5, -0.4, 0.0, 0.0, 0.0])).gram
+    keep = [0, 1, 2, 3, 4, 14]  # the gauge's column is the curve itself, which has moved
+    at = np.ix_(keep, keep)
+    np.testing.assert_allclose(moved.matrix[0][at], null.matrix[0][at], rtol=1e-5, atol=0.1)
