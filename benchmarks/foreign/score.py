@@ -19,8 +19,13 @@ SEPARABLE = 8.0
 """Sigma beyond which an effect counts as separable to who is told."""
 CLASS = 3
 """Largest class of effects that still counts as an answer."""
-CALIBRATION = re.compile(r"calibrat|channel_scale|cross_talk|_offset$|_scale$|_bias$|load_cell|encoder")
-"""Every bed here has errors of calibration, so that naming them is no mistake, and no find either."""
+CALIBRATION = re.compile(r"calibration: (?!wheel)|^(channel_scale|cross_talk|slip_offset|load_cell)$")
+"""Every bed here has errors of calibration (not of the wheel's size): naming them is no mistake, and no find either."""
+ALIASES = {
+    "channel_scale": re.compile(r"calibration: (drawbar_pull|side_force|driving_torque|force|torque)"),
+    "wheel_radius_error": re.compile(r"calibration: wheel.radius"),
+}
+"""Further names under which a hidden effect is right."""
 UNLISTED = re.compile(r"unlisted|something else|discrepancy|unknown", re.IGNORECASE)
 
 QUIET = ("none", "nothing", "noise", "noise_only", "null", "base", "baseline")
@@ -58,10 +63,11 @@ def said(answer: Mapping[str, Any], verdict: Mapping[str, Any]) -> Row:
     label = str(answer.get("verdict") or "CRASH")
     raw = [str(e) for e in verdict.get("effects") or answer.get("effects") or []]
     effects = [e for e in raw if not UNLISTED.search(e)]
-    unlisted = len(effects) < len(raw) or (label == "KNOWN_CLASS" and len(effects) == 1)
-    unlisted = unlisted or bool(verdict.get("unlisted"))
+    # Before verdicts said so themselves, a class of one effect meant that effect or something unlisted.
+    said_so = verdict.get("unlisted", label == "KNOWN_CLASS" and len(effects) == 1)
+    unlisted = len(effects) < len(raw) or bool(said_so)
     port = verdict.get("port")
-    ports = [str(p) for p in (port if isinstance(port, list) else [port]) if p]
+    ports = [str(p).partition(":")[0] for p in (port if isinstance(port, list) else [port]) if p]
     return {
         "verdict": label,
         "effects": effects,
@@ -95,9 +101,16 @@ def _numbers(value: Any) -> dict[str, float]:
     return found
 
 
+def right(name: str, truth: Mapping[str, Any]) -> str:
+    """The hidden effect that a name stands for, or ""."""
+    if name in truth["hidden"]:
+        return name
+    return next((h for h in truth["hidden"] if h in ALIASES and ALIASES[h].match(name)), "")
+
+
 def neutral(name: str, truth: Mapping[str, Any]) -> bool:
     """Whether naming an effect is neither right nor wrong: the base law or the bed's calibration earns the name."""
-    return name in truth["holds"] or (bool(CALIBRATION.search(name)) and name not in truth["hidden"])
+    return not right(name, truth) and (name in truth["holds"] or bool(CALIBRATION.search(name)))
 
 
 def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
@@ -113,7 +126,7 @@ def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
     """
     hidden, effects, label = set(truth["hidden"]), list(answer["effects"]), answer["verdict"]
     confident = label in NAMES
-    good = [e for e in effects if e in hidden]
+    good = [e for e in effects if right(e, truth)]
     excused = [e for e in effects if neutral(e, truth)]
     bad = [e for e in effects if e not in good and e not in excused]
     if label == "KNOWN_CLASS":
@@ -126,9 +139,10 @@ def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
     if label == "KNOWN_CLASS":
         found = bool(good) and number <= CLASS
     else:
-        found = confident and bool(good) and not bad and hidden <= set(good)
+        found = confident and bool(good) and not bad and hidden <= {right(e, truth) for e in good}
     right_port = bool(set(answer["ports"]) & set(truth["ports"]))
     by_port = label == "UNKNOWN" and right_port
+    by_more = label in ("KNOWN", "MULTIPLE") and answer["unlisted"] and right_port and not bad
     by_class = label == "KNOWN_CLASS" and answer["unlisted"] and (right_port or bool(good))
     return {
         "wrong_name": wrong,
@@ -136,7 +150,7 @@ def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
         "found": found,
         "partly": confident and bool(good) and not bad,
         "port_right": right_port,
-        "outside_right": by_port or by_class,
+        "outside_right": by_port or by_class or by_more,
     }
 
 
@@ -206,7 +220,7 @@ def reliability(pairs: Sequence[tuple[float, bool]]) -> Row:
 def _inclusion_pairs(rows: Sequence[Row]) -> list[tuple[float, bool]]:
     """Probability of each effect being there against whether it is, names that are neither right nor wrong left out."""
     return [
-        (min(max(p, 0.0), 1.0), name in row["truth"]["hidden"])
+        (min(max(p, 0.0), 1.0), bool(right(name, row["truth"])))
         for row in rows
         for name, p in row["inclusion"].items()
         if not neutral(name, row["truth"]) and not UNLISTED.search(name)
@@ -217,9 +231,10 @@ def _best_pairs(rows: Sequence[Row]) -> list[tuple[float, bool]]:
     """Probability of each case's most probable hypothesis against whether its effects are the hidden ones."""
     pairs = []
     for row in rows:
-        if not row["probabilities"]:
+        if not set(row["probabilities"]) - {"others"}:
             continue
-        best, p = max(row["probabilities"].items(), key=lambda item: item[1])
+        told = {h: p for h, p in row["probabilities"].items() if h != "others"}
+        best, p = max(told.items(), key=lambda item: item[1])
         listed = {n for n in names_of(best) if re.fullmatch(r"\w+", n) and not UNLISTED.search(n)}
         listed = {n for n in listed if n not in QUIET and not neutral(n, row["truth"])}
         hidden = set(row["truth"]["hidden"]) if row["truth"]["group"] != "outside" else set()

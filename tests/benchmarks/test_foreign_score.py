@@ -63,12 +63,23 @@ def test_a_null_is_wronged_by_any_name_that_its_law_does_not_earn() -> None:
     assert not ask(NULL, "UNKNOWN", ["grousers"])["wrong_name"]
 
 
+def test_calibration_is_neutral_but_of_the_wheel_and_names_what_is_hidden() -> None:
+    assert not ask(NULL, "KNOWN", ["calibration: load"])["wrong_name"]
+    assert ask(NULL, "KNOWN", ["calibration: wheel radius"])["wrong_name"]
+    scale = {**TRUTH, "hidden": ["channel_scale"], "ports": ["sensor"]}
+    assert ask(scale, "KNOWN", ["calibration: driving_torque_Nm"])["found"]
+    assert ask({**TRUTH, "hidden": ["wheel_radius_error"]}, "KNOWN", ["calibration: wheel radius"])["found"]
+
+
 def test_outside_needs_the_port_or_a_class_with_unlisted() -> None:
     assert ask(OUTSIDE, "UNKNOWN", port="wheel_shear")["outside_right"]
     assert not ask(OUTSIDE, "UNKNOWN", port="geometry")["outside_right"]
     assert ask(OUTSIDE, "KNOWN_CLASS", ["grousers"], port="wheel_shear")["outside_right"]
     assert not ask(OUTSIDE, "KNOWN_CLASS", ["grousers", "bulldozing"], port="wheel_shear")["outside_right"]
     assert ask(OUTSIDE, "KNOWN", ["grousers"])["wrong_name"]
+    assert ask(OUTSIDE, "KNOWN", ["exit_angle"], port="wheel_shear", unlisted=True)["outside_right"]
+    assert not ask(OUTSIDE, "KNOWN", ["exit_angle"], unlisted=False)["outside_right"]
+    assert not ask(OUTSIDE, "KNOWN_CLASS", ["grousers"], port="wheel_shear", unlisted=False)["outside_right"]
 
 
 def test_wilson_and_reliability() -> None:
