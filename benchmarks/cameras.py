@@ -1,10 +1,12 @@
-"""Images per second: depth and height images in JAX by batch and size, and MuJoCo's renderer beside them.
+"""Images per second: pictures, depth and height images in JAX by batch and size, and MuJoCo's renderer beside them.
 
-    python benchmarks/cameras.py --batches 256,1024,4096 --out benchmarks/cameras_gpu.json
-    python benchmarks/cameras.py --batches 4,16 --sizes 32x24 --repeats 1 --out cameras_cpu.json
+    python benchmarks/cameras.py --batches 256,1024,4096 --out benchmarks/cameras_h200.json
+    python benchmarks/cameras.py --batches 4,16 --sizes 64x48 --repeats 2 --out benchmarks/cameras_2cores.json
 
-A row of the JAX cameras counts only where `median_error` is there: the depth of one picture of the same size against
-MuJoCo's renderer in the same process. Without OpenGL that column is null, and there is no row of the renderer.
+Pictures are colour, depth and labels with shadows. A row of the JAX cameras counts only where `median_error` is there:
+the depth of one picture of the same size against MuJoCo's renderer in the same process; `labels` is the share of pixels
+whose label agrees. Without OpenGL these are null, and there is no row of the renderer. `mebibytes` is what the compiled
+program needs beyond arguments and results.
 """
 
 from __future__ import annotations
@@ -20,14 +22,28 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from timing import commit
 
-from lunar_mjx.cameras import Pinhole, RoverCamera, depth_image, depth_images, front_mount, height_scan, mounted
+from lunar_mjx.cameras import (
+    Pinhole,
+    RoverCamera,
+    depth_image,
+    depth_images,
+    front_mount,
+    height_scan,
+    mounted,
+    pictures,
+)
 from lunar_mjx.dynamics import build
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
 
 TOLERANCE = 0.01
 """Largest median error of a depth image against the renderer's."""
+
+
+LABELS = 0.98
+"""Least share of pixels whose label agrees with the renderer's; below 100 pixels a side, edges are 1 % of all."""
 
 
 def seconds(function: Any, repeats: int) -> tuple[float, float]:
@@ -65,11 +81,50 @@ def renderer_rows(model: Model, sizes: list[Pinhole], qpos: np.ndarray, repeats:
                         "batch": 1,
                         "images_per_s": 1.0 / each,
                         "depth": eye.front().depth,
+                        "labels": eye.front().segmentation,
                     }
                 )
         except UserError as missing:
             print(missing)
             return []
+    return rows
+
+
+def picture_rows(
+    model: Model, camera: Pinhole, qpos: jax.Array, batches: list[int], given: argparse.Namespace, drawn: dict | None
+) -> list[dict]:
+    """Colour, depth and labels with shadows and the rover itself, in JAX."""
+    rows, median, share = [], None, None
+    terrain = jax.device_put(model.terrain)
+    for batch in batches:
+        at_once = max(1, min(batch, given.pixels // (camera.width * camera.height)))
+        look = partial(pictures, rover=model.rover, camera=camera, at_once=at_once if at_once < batch else None)
+        program = jax.jit(lambda t, q, look=look: look(t, qpos=q))
+        started = time.perf_counter()
+        compiled = program.lower(terrain, qpos[:batch]).compile()
+        compiling = time.perf_counter() - started
+        if drawn is not None and median is None:
+            seen = compiled(terrain, qpos[:batch])
+            depth, label = np.asarray(seen.depth[0]), np.asarray(seen.label[0])
+            both = np.isfinite(depth) & np.isfinite(drawn["depth"]) & (label == drawn["labels"])
+            median = float(np.median(np.abs(depth[both] / drawn["depth"][both] - 1.0)))
+            share = float((label == drawn["labels"]).mean())
+            if median > TOLERANCE or share < LABELS:
+                raise SystemExit(f"{camera.width} x {camera.height}: median error {median:.3g}, labels {share:.4f}")
+        _, each = seconds(partial(compiled, terrain, qpos[:batch]), given.repeats)
+        needed = compiled.memory_analysis()
+        rows.append(
+            {
+                "kind": "rgb, depth, labels, JAX",
+                "size": [camera.width, camera.height],
+                "batch": batch,
+                "images_per_s": batch / each,
+                "compile_s": compiling,
+                "mebibytes": None if needed is None else needed.temp_size_in_bytes / 2**20,
+                "median_error": median,
+                "labels": share,
+            }
+        )
     return rows
 
 
@@ -92,7 +147,7 @@ def main() -> None:
     drawn = renderer_rows(model, sizes, np.asarray(qpos[0], float), given.repeats)
     position, rotation = jax.jit(partial(mounted, front_mount(model.rover)))(qpos)
     terrain = jax.device_put(model.terrain)
-    rows: list[dict] = [{k: v for k, v in row.items() if k != "depth"} for row in drawn]
+    rows: list[dict] = [{k: v for k, v in row.items() if k not in ("depth", "labels")} for row in drawn]
     for k, camera in enumerate(sizes):
         error = None
         if drawn:
@@ -115,7 +170,10 @@ def main() -> None:
                     "median_error": error,
                 }
             )
-    shape = tuple(int(n) for n in given.scan.split("x"))
+    for k, camera in enumerate(sizes):
+        rows += picture_rows(model, camera, qpos, batches, given, drawn[k] if drawn else None)
+    rows_, columns = (int(n) for n in given.scan.split("x"))
+    shape = (rows_, columns)
     for batch in batches:
         scan = jax.jit(partial(height_scan, shape=shape))
         yaw = jnp.zeros(batch)
@@ -134,6 +192,7 @@ def main() -> None:
         "rover": given.rover,
         "terrain": given.terrain,
         "device": device.device_kind,
+        "commit": commit(),
         "jax": jax.__version__,
         "processor": platform.processor() or platform.machine(),
         "repeats": given.repeats,

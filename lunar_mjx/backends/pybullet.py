@@ -20,6 +20,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from lunar_mjx.backends.bullet_ground import BulletGround
@@ -196,6 +197,15 @@ class _World:
     """One rover in one Bullet world, with MuJoCo's coordinates outside."""
 
     def __init__(self, p: Any, model: Model, mj: Any, own_contact: bool, ground: Any) -> None:
+        if (mj.eq_type == mujoco.mjtEq.mjEQ_JOINT).any():
+            raise bad_input(
+                "pybullet",
+                "rover",
+                model.rover.name,
+                "has joints in a fixed ratio (a differential, a mimic, wheels behind one motor), which are not coupled "
+                "in Bullet here",
+                "use native, structured or mjx",
+            )
         self._p, self._mj = p, mj
         self._client = p.connect(p.DIRECT)
         self._id = {"physicsClientId": self._client}

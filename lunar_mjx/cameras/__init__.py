@@ -1,27 +1,30 @@
-"""Cameras: pictures through MuJoCo's renderer, and depth and height images of thousands of rovers in pure JAX."""
+"""Cameras: pictures through MuJoCo's renderer, and colour, depth, labels and heights for thousands of rovers in JAX."""
 
-from lunar_mjx.cameras.camera import LABELS, Images, RoverCamera
-from lunar_mjx.cameras.mount import facing, front_mount
-from lunar_mjx.cameras.pinhole import Pinhole, Pose, look_at, orbit, project
-from lunar_mjx.cameras.raymarch import depth_image, depth_images, height_scan, mounted
-from lunar_mjx.cameras.scene import Sun
-from lunar_mjx.cameras.texture import Track
-
-__all__ = [
-    "LABELS",
-    "Images",
-    "Pinhole",
-    "Pose",
-    "RoverCamera",
-    "Sun",
-    "Track",
-    "depth_image",
-    "depth_images",
-    "facing",
-    "front_mount",
-    "height_scan",
-    "look_at",
-    "mounted",
-    "orbit",
-    "project",
-]
+from lunar_mjx.cameras.batch import Light as Light
+from lunar_mjx.cameras.batch import Pictures as Pictures
+from lunar_mjx.cameras.batch import painted as painted
+from lunar_mjx.cameras.batch import picture as picture
+from lunar_mjx.cameras.batch import pictures as pictures
+from lunar_mjx.cameras.batch import stereo as stereo
+from lunar_mjx.cameras.camera import LABELS as LABELS
+from lunar_mjx.cameras.camera import Images as Images
+from lunar_mjx.cameras.camera import RoverCamera as RoverCamera
+from lunar_mjx.cameras.mount import facing as facing
+from lunar_mjx.cameras.mount import front_mount as front_mount
+from lunar_mjx.cameras.photometry import Film as Film
+from lunar_mjx.cameras.photometry import Regolith as Regolith
+from lunar_mjx.cameras.pinhole import Pinhole as Pinhole
+from lunar_mjx.cameras.pinhole import Pose as Pose
+from lunar_mjx.cameras.pinhole import look_at as look_at
+from lunar_mjx.cameras.pinhole import orbit as orbit
+from lunar_mjx.cameras.pinhole import project as project
+from lunar_mjx.cameras.raymarch import depth_image as depth_image
+from lunar_mjx.cameras.raymarch import depth_images as depth_images
+from lunar_mjx.cameras.raymarch import height_scan as height_scan
+from lunar_mjx.cameras.raymarch import mounted as mounted
+from lunar_mjx.cameras.scene import Sun as Sun
+from lunar_mjx.cameras.shapes import Placed as Placed
+from lunar_mjx.cameras.shapes import placed as placed
+from lunar_mjx.cameras.shapes import rover_shapes as rover_shapes
+from lunar_mjx.cameras.shapes import together as together
+from lunar_mjx.cameras.texture import Track as Track

@@ -2,7 +2,7 @@
 
 A ray advances by as much as ground of a slope of `STEEPEST` would let it, and by no less than a fixed share of its
 length, until it is below the surface; bisection then finds where it went in. What is thinner than such a step seen from
-its side, such as the very edge of a rock, can be missed. The rover itself is not in the picture.
+its side, such as the very edge of a rock, can be missed. Rovers and colours are added in `batch`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lunar_mjx.cameras.pinhole import Pinhole, Pose
+from lunar_mjx.cameras.shapes import rotation
 from lunar_mjx.terrain import Terrain, inside, surface
 
 STEEPEST = 1.5
@@ -43,17 +44,40 @@ def depth_image(
     Returns:
       Depth, m. Ground beyond the edge of the grid counts as sky.
     """
-    dtype = position.dtype
-    direction = jnp.asarray(camera.rays(), dtype) @ rotation.T
+    direction = jnp.asarray(camera.rays(), position.dtype) @ rotation.T
+    return march(terrain, position, direction, far, steps)
+
+
+def march(
+    terrain: Terrain,
+    origin: Float[Array, "*ray 3"],
+    direction: Float[Array, "*ray 3"],
+    far: Any,
+    steps: int = STEPS,
+    start: float = START,
+    refine: int = HALVINGS,
+) -> Float[Array, "*ray"]:
+    """Where rays meet the ground or a rock, as a multiple of their direction; infinite if not within `far`.
+
+    Args:
+      terrain: one terrain.
+      origin: (3,) for all, or of each ray, m. direction: of any length.
+      far: largest multiple that is looked for, one for all or of each ray.
+      steps: of the march; more find thinner things. start: where it begins.
+      refine: halvings that find the place; with 0 only whether something is met counts.
+
+    Returns:
+      The multiple. Ground beyond the edge of the grid is not met.
+    """
     dx, dy, dz = (direction[..., i] for i in range(3))
-    ox, oy, oz = position[0], position[1], position[2]
+    ox, oy, oz = (origin[..., i] for i in range(3))
     closing = STEEPEST * jnp.sqrt(dx * dx + dy * dy) - dz
-    grow = (far / START) ** (1.0 / steps) - 1.0
+    grow = (jnp.maximum(far, 2.0 * start) / start) ** (1.0 / steps) - 1.0
 
     def gap(t: Any) -> Any:
         return oz + t * dz - surface(terrain, ox + t * dx, oy + t * dy)
 
-    def march(_: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+    def advance(_: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
         before, t = carry
         above = gap(t)
         step = jnp.maximum(above / jnp.maximum(closing, 1e-3), grow * t)
@@ -67,11 +91,11 @@ def depth_image(
         return jnp.where(above, middle, low), jnp.where(above, high, middle)
 
     zero = jnp.zeros_like(dx)
-    low, high = jax.lax.fori_loop(0, steps, march, (zero, zero + START))
-    hit = gap(high) <= 0.0
-    low, high = jax.lax.fori_loop(0, HALVINGS, halve, (low, high))
+    low, high = jax.lax.fori_loop(0, steps, advance, (zero, zero + start))
+    met = gap(high) <= 0.0
+    low, high = jax.lax.fori_loop(0, refine, halve, (low, high))
     there = inside(terrain.field, ox + high * dx, oy + high * dy)
-    return jnp.where(hit & there & (high <= far), high, jnp.inf)
+    return jnp.where(met & there & (high <= far), high, jnp.inf)
 
 
 def depth_images(
@@ -102,7 +126,7 @@ def mounted(
       mount: its pose in the chassis frame, such as `front_mount(rover)`.
       qpos: the rovers' coordinates; place and orientation of the chassis come first.
     """
-    body = _rotation(qpos[..., 3:7])
+    body = rotation(qpos[..., 3:7])
     arm = jnp.asarray(mount.position, qpos.dtype)
     return qpos[..., :3] + _turned(body, arm), body @ jnp.asarray(mount.rotation, qpos.dtype)
 
@@ -133,17 +157,6 @@ def height_scan(
     place = position[..., None, None, :]
     x, y = place[..., 0] + cos * forward - sin * left, place[..., 1] + sin * forward + cos * left
     return surface(terrain, x, y) - place[..., 2]
-
-
-def _rotation(q: Float[Array, "*rover 4"]) -> Float[Array, "*rover 3 3"]:
-    unit = q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
-    w, x, y, z = (unit[..., i] for i in range(4))
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _turned(rotation: Float[Array, "*rover 3 3"], vector: Float[Array, "3"]) -> Float[Array, "*rover 3"]:

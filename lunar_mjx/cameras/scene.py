@@ -28,6 +28,9 @@ GROUND, FAR_GROUND, ROCK, FRONT = "ground", "far_ground", "rock", "front"
 NODES, FAR_NODES, TEXELS = 420, 160, 2048
 """Most nodes per side of the near and the far height field, and pixels of the ground's picture."""
 
+FAR_ROCKS = 60.0
+"""How far beyond the near ground rocks are drawn, m: as far as the cameras in JAX look."""
+
 _DROP, _SEAM = 3.0, 0.05
 """How far the far ground is lowered under the near one, and everywhere, so that the two never meet, m."""
 
@@ -138,7 +141,7 @@ def build_scene(
     _add_far(spec, terrain, near)
     painter = _painter(near, tracks)
     _add_ground(spec, GROUND, near, painter.paint(0))
-    _add_rocks(spec, terrain, near)
+    _add_rocks(spec, terrain, low - FAR_ROCKS, high + FAR_ROCKS)
     pose = mount or front_mount(rover)
     spec.body(rover.chassis).add_camera(name=FRONT, pos=pose.position, quat=quaternion(pose.rotation), fovy=fovy_deg)
     return spec.compile(), painter
@@ -203,11 +206,11 @@ def _add_far(spec: Any, terrain: Terrain, near: Patch) -> None:
     _add_ground(spec, FAR_GROUND, whole, None, np.where(hidden, _DROP, _SEAM))
 
 
-def _add_rocks(spec: Any, terrain: Terrain, patch: Patch) -> None:
+def _add_rocks(spec: Any, terrain: Terrain, low: np.ndarray, high: np.ndarray) -> None:
+    """All rocks between two corners (2,) m."""
     if terrain.rocks is None:
         return
     centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
-    low, high = np.asarray(patch.low), np.asarray(patch.high)
     spec.add_material(name=ROCK, rgba=[0.5, 0.48, 0.46, 1], specular=0.1, shininess=0.1)
     for i, (center, radius) in enumerate(zip(centers, radii, strict=True)):
         if radius > 0 and (center[:2] > low).all() and (center[:2] < high).all():

@@ -111,6 +111,9 @@ def simulate(
     commands: Annotated[Path | None, typer.Option(help="CSV of commands; overrides --drive and --steer.")] = None,
     drive: Annotated[float, typer.Option(help="Command of every drive joint, in its mode's unit.")] = 0.4,
     steer: Annotated[float, typer.Option(help="Command of every front steering joint, rad.")] = 0.0,
+    cmd_vel: Annotated[
+        str | None, typer.Option(help="Motion of the chassis v_x,v_y,yaw_rate (m/s, m/s, rad/s); overrides --drive.")
+    ] = None,
     duration: Annotated[float, typer.Option(help="s")] = 20.0,
     x: Annotated[float, typer.Option(help="start, m")] = 0.0,
     y: Annotated[float, typer.Option(help="start, m")] = 0.0,
@@ -121,6 +124,7 @@ def simulate(
     check_folder(out)
     check_finite(drive=drive, steer=steer, duration=duration, x=x, y=y, yaw_deg=yaw_deg)
     select_device(device)
+    from lunar_mjx.manoeuvres.cmd_vel import cmd_vel_commands
     from lunar_mjx.model import make_model
     from lunar_mjx.model.file import load_model, save_model
     from lunar_mjx.simulate import channels, constant_commands, front_steering, read_commands
@@ -129,8 +133,12 @@ def simulate(
     built = load_model(model) if model else make_model(rover, terrain, preset)
     for effect in effects or []:
         built = built.add(effect, "--effects")
+    if commands and cmd_vel:
+        raise bad_input("simulate", "--cmd-vel", cmd_vel, "is given beside --commands", "give one of them")
     if commands:
         wanted = read_commands(commands, built)
+    elif cmd_vel:
+        wanted = cmd_vel_commands(built, cmd_vel, duration)
     else:
         wanted = front_steering(built, constant_commands(built, duration, drive=drive), steer)
     keep_compiled()

@@ -16,11 +16,12 @@ import tomli_w
 from scipy.spatial import ConvexHull, QhullError
 
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.rover.couplings import place_couplings
 from lunar_mjx.rover.description import GROUPS, Description, read_description
 from lunar_mjx.rover.load import FORMAT, MARKER, load_rover
 from lunar_mjx.rover.loops import PlacedLoop, place_loops
 from lunar_mjx.rover.mjcf import build_spec, ties, to_xml, write_scene
-from lunar_mjx.rover.roles import Roles, assign_roles
+from lunar_mjx.rover.roles import Roles, assign_roles, without_followers
 from lunar_mjx.rover.rover import DriveGroup, Rover
 from lunar_mjx.rover.statics import gains, level_springs
 from lunar_mjx.rover.tree import Body, bodies_of
@@ -51,19 +52,20 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
     told = _describe(source, description)
     name = _file_name(source, name or told.name or source.name)
     bodies = bodies_of(source)
-    roles = assign_roles(source, bodies, told)
+    roles = without_followers(source, assign_roles(source, bodies, told))
     loops = place_loops(source, roles.bodies, told)
     driven = place_drive_groups(source, roles, told)
+    couplings = place_couplings(source, roles.bodies, told)
     height, height_notes = _standing_height(roles)
     try:
-        spec = build_spec(name, roles, loops, told, height, driven)
+        spec = build_spec(name, roles, loops, told, height, driven, couplings)
     except ValueError as error:
         raise _uncompilable(source, error) from None
     model = _compile(source, spec)
     level_springs(spec, model, roles, told)
     model = _compile(source, spec)
     xml = to_xml(spec)
-    _assert_nothing_lost(source, roles, loops, driven, mujoco.MjModel.from_xml_string(xml))
+    _assert_nothing_lost(source, roles, loops, ties(driven) + len(couplings), mujoco.MjModel.from_xml_string(xml))
     record = _record(source, name, roles, loops, told, model, height, height_notes, driven)
     out = Path(out)
     try:
@@ -121,7 +123,7 @@ def _standing_height(roles: Roles) -> tuple[float, list[str]]:
 
 
 def _assert_nothing_lost(
-    urdf: Urdf, roles: Roles, loops: tuple[PlacedLoop, ...], driven: tuple[DriveGroup, ...], model: mujoco.MjModel
+    urdf: Urdf, roles: Roles, loops: tuple[PlacedLoop, ...], ratios: int, model: mujoco.MjModel
 ) -> None:
     """Compares the MJCF, read back from its text, with the URDF.
 
@@ -146,7 +148,7 @@ def _assert_nothing_lost(
     if model.body_mass[1:].min() <= 0 or model.body_inertia[1:].min() <= 0:
         raise bad_input(urdf.path, "inertia", model.body_inertia[1:].min(), "is not positive", "report this")
     motors = [model.actuator(i).name for i in range(model.nu)]
-    if motors != [j for g in GROUPS for j in roles.group(g)] or model.neq != len(loops) + ties(driven):
+    if motors != [j for g in GROUPS for j in roles.group(g)] or model.neq != len(loops) + ratios:
         raise bad_input(urdf.path, "motors", ", ".join(motors), "are not one for each joint in a role", "report this")
 
 

@@ -68,6 +68,14 @@ class DriveGroupDescription:
 
 
 @dataclass(frozen=True)
+class DifferentialDescription:
+    """Two pivots, such as those of the rockers, that a differential on the chassis turns by opposite angles."""
+
+    joint1: str
+    joint2: str
+
+
+@dataclass(frozen=True)
 class LoopDescription:
     """Two points, each (3,) in m in its link's frame, that a pin holds together."""
 
@@ -99,6 +107,7 @@ class Description:
     wheels: tuple[WheelDescription, ...] = ()
     loops: tuple[LoopDescription, ...] = ()
     drive_groups: tuple[DriveGroupDescription, ...] = ()
+    differentials: tuple[DifferentialDescription, ...] = ()
     groups: dict[str, GroupDescription] = field(default_factory=_default_groups)
     stated: frozenset[str] = frozenset()
 
@@ -113,6 +122,7 @@ _TOP = {
     "wheels",
     "loops",
     "drive_groups",
+    "differentials",
     "joints",
 }
 
@@ -148,6 +158,9 @@ def read_description(path: str | Path) -> Description:
     given["loops"] = tuple(_loop(path, f"loops[{i}]", x) for i, x in enumerate(tables(path, "loops", data)))
     driven = tables(path, "drive_groups", data)
     given["drive_groups"] = tuple(_drive_group(path, f"drive_groups[{i}]", g) for i, g in enumerate(driven))
+    given["differentials"] = tuple(
+        _differential(path, f"differentials[{i}]", d) for i, d in enumerate(tables(path, "differentials", data))
+    )
     joints = data.get("joints", {})
     check_keys(path, "joints", joints, set(GROUPS))
     groups = _default_groups()
@@ -174,6 +187,14 @@ def _drive_group(path: Path, where: str, table: Mapping[str, Any]) -> DriveGroup
         raise bad_input(path, f"{where}.wheels", wheels, "are not two or more corners", 'write ["lf", "lr"]')
     corners = tuple(text(path, f"{where}.wheels", corner) for corner in wheels)
     return DriveGroupDescription(text(path, f"{where}.name", table["name"]), corners)
+
+
+def _differential(path: Path, where: str, table: Mapping[str, Any]) -> DifferentialDescription:
+    check_keys(path, where, table, {"joint1", "joint2"}, {"joint1", "joint2"})
+    first, second = (text(path, f"{where}.{k}", table[k]) for k in ("joint1", "joint2"))
+    if first == second:
+        raise bad_input(path, f"{where}.joint2", second, "is joint1, too", "name the pivot of the other side")
+    return DifferentialDescription(first, second)
 
 
 def _loop(path: Path, where: str, table: Mapping[str, Any]) -> LoopDescription:

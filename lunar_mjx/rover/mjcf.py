@@ -11,6 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from lunar_mjx.rover.couplings import Coupling
 from lunar_mjx.rover.description import GROUPS, Description
 from lunar_mjx.rover.loops import PlacedLoop
 from lunar_mjx.rover.roles import Roles
@@ -31,6 +32,7 @@ def build_spec(
     description: Description,
     standing_height: float,
     driven: tuple[DriveGroup, ...] = (),
+    couplings: tuple[Coupling, ...] = (),
 ) -> mujoco.MjSpec:
     """Builds the model: free base, hinges, motors in the order drive, steer, suspension, and loop closures.
 
@@ -59,10 +61,12 @@ def build_spec(
         _add_connect(spec, f"loop_{i}", loop, description)
     for group in driven:
         for joint in group.joints[1:]:
-            _add_tie(spec, f"{group.name}_{joint}", joint, group.joints[0], description)
+            _add_tie(spec, f"{group.name}_{joint}", Coupling(joint, group.joints[0], 1.0, 0.0), description)
         for joint in group.joints:
             # One rotor turns with all wheels of the group.
             spec.joint(joint).armature = spec.joint(joint).armature / len(group.joints)
+    for coupling in couplings:
+        _add_tie(spec, f"{coupling.follower}_follows_{coupling.leader}", coupling, description)
     return spec
 
 
@@ -133,12 +137,12 @@ def _add_connect(spec: mujoco.MjSpec, name: str, loop: PlacedLoop, description: 
     equality.solref, equality.solimp = description.solref, description.solimp
 
 
-def _add_tie(spec: mujoco.MjSpec, name: str, joint: str, leader: str, description: Description) -> None:
-    """One angle for two joints that a chain ties together."""
+def _add_tie(spec: mujoco.MjSpec, name: str, coupling: Coupling, description: Description) -> None:
+    """A fixed ratio of two joints' angles: wheels behind one motor, a differential, a mimic."""
     equality = spec.add_equality(name=name, type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT)
-    equality.name1, equality.name2 = joint, leader
+    equality.name1, equality.name2 = coupling.follower, coupling.leader
     data = np.zeros_like(equality.data)
-    data[1] = 1.0
+    data[:2] = coupling.offset, coupling.multiplier
     equality.data = data
     equality.solref, equality.solimp = description.solref, description.solimp
 

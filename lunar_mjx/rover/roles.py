@@ -77,6 +77,29 @@ def assign_roles(urdf: Urdf, bodies: tuple[Body, ...], description: Description)
     return Roles(tuple(wheels), bodies, tuple(notes + flips))
 
 
+def without_followers(urdf: Urdf, roles: Roles) -> Roles:
+    """The roles without motors on joints that mimic others, which the joint that they follow moves.
+
+    Raises:
+      UserError: a wheel's own joint mimics another.
+    """
+    followers = {j.name for j in urdf.joints if j.mimic is not None}
+    wheels, notes = [], list(roles.notes)
+    for wheel in roles.wheels:
+        if wheel.drive in followers:
+            raise bad_input(
+                urdf.path,
+                f"joint '{wheel.drive}' mimic",
+                "a wheel's joint",
+                "has a motor of its own here",
+                "name wheels that share a motor in the description beside the URDF ([[drive_groups]])",
+            )
+        led = {role: None for role in ("steer", "suspension") if getattr(wheel, role) in followers}
+        notes += [f"joint '{getattr(wheel, role)}' follows another joint and has no motor" for role in led]
+        wheels.append(replace(wheel, **led))
+    return replace(roles, wheels=tuple(wheels), notes=tuple(dict.fromkeys(notes)))
+
+
 def _world_axis(body: Body, poses: dict[str, Pose]) -> np.ndarray:
     assert body.joint is not None
     return poses[body.name].rotation @ body.joint.axis

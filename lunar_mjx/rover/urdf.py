@@ -56,6 +56,15 @@ class Link:
 
 
 @dataclass(frozen=True)
+class Mimic:
+    """A joint's angle = `multiplier` times the angle of the joint `leader` + `offset` (rad)."""
+
+    leader: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
 class Joint:
     """A joint; `axis` (3,) is a unit vector in the child frame, `limits` are rad (m if prismatic), infinite if none."""
 
@@ -66,6 +75,7 @@ class Joint:
     pose: Pose
     axis: np.ndarray
     limits: tuple[float, float]
+    mimic: Mimic | None = None
 
 
 @dataclass(frozen=True)
@@ -250,9 +260,21 @@ class _Reader:
             if lower > upper:
                 raise bad_input(self.path, f"{where} limit lower", lower, f"is above upper = {upper}", "swap the two")
             limits = (lower, upper)
-        if element.find("mimic") is not None:
-            self.notes.append(f"{where}: its <mimic> was left out; the joint moves freely")
-        return Joint(name, kind, ends[0], ends[1], self.pose(element, where), axis / max(length, 1e-9), limits)
+        mimic = self.mimic(element.find("mimic"), where)
+        return Joint(name, kind, ends[0], ends[1], self.pose(element, where), axis / max(length, 1e-9), limits, mimic)
+
+    def mimic(self, element: ET.Element | None, where: str) -> Mimic | None:
+        if element is None:
+            return None
+        leader = element.get("joint", "")
+        if not leader:
+            raise bad_input(self.path, f"{where} mimic joint", "", "is missing", "name the joint that it follows")
+        multiplier = float(self.numbers(element, "multiplier", "1", f"{where} mimic", 1)[0])
+        if multiplier == 0.0:
+            raise bad_input(
+                self.path, f"{where} mimic multiplier", 0.0, "holds the joint still", "make the joint fixed"
+            )
+        return Mimic(leader, multiplier, float(self.numbers(element, "offset", "0", f"{where} mimic", 1)[0]))
 
 
 def _check_tree(path: Path, links: dict[str, Link], joints: list[Joint]) -> str:

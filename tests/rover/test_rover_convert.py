@@ -82,6 +82,9 @@ def test_drives_forward_under_inferred_gains(name: str, data: Path, tmp_path: Pa
     assert drive.data.qpos[0] > 0.3
     assert abs(drive.data.qpos[1]) < 0.1 * drive.data.qpos[0]
     assert np.isfinite(drive.data.qpos).all() and not drive.data.warning.number.any()
+    turned = np.zeros(9)
+    mujoco.mju_quat2Mat(turned, drive.data.qpos[3:7])
+    assert np.arccos(turned[8]) < np.deg2rad(2.0)  # rocker_bogie.rover.toml has its differential
     if "suspension" in drive.q:
         assert np.abs(drive.angles("suspension")).max() < 0.05
 

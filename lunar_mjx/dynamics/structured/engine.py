@@ -44,7 +44,7 @@ from lunar_mjx.dynamics.structured.legs import (
     leg_block,
     solve,
 )
-from lunar_mjx.dynamics.structured.suitability import check_model
+from lunar_mjx.dynamics.structured.suitability import UnsuitableError, check_model
 from lunar_mjx.dynamics.structured.topology import LegGroup, Structure, read_structure
 from lunar_mjx.effects.ports import Forces
 from lunar_mjx.pytree import pytree
@@ -266,7 +266,7 @@ class StructuredEngine:
         blocks = [
             leg_block(group, leg, up, forces, frame, armature, dt) for group, leg in zip(numbers, legs, strict=True)
         ]
-        acceleration, rates = solve(*self._chassis(base, forces, up), blocks)
+        acceleration, rates = solve(*self._chassis(base, forces, up), blocks, self.structure.couplings)
         return self._integrate(numbers, legs, base, acceleration, rates, dt)
 
     def _chassis(self, base: Base, forces: Forces, up: Vector) -> tuple[Inertia, Force]:
@@ -293,13 +293,31 @@ class StructuredEngine:
         spin = motion.angular + acceleration.angular * dt
         position = base.position + velocity * dt
         quaternion = integrate(base.quaternion, spin, dt)
-        angles, speeds = [], []
-        for n, leg, rate in zip(numbers, legs, rates, strict=True):
-            speed = [leg.speed[k] + dt * r for k, r in zip(n.free, rate, strict=True)]
-            angle = [leg.angle[k] + dt * w for k, w in zip(n.free, speed, strict=True)]
-            speeds.append(tuple(speed))
-            angles.append(joint_turns(n, angle))
+        speeds = [
+            [leg.speed[k] + dt * r for k, r in zip(n.free, rate, strict=True)]
+            for n, leg, rate in zip(numbers, legs, rates, strict=True)
+        ]
+        speeds = self._coupled(speeds)
+        free = [
+            [leg.angle[k] + dt * w for k, w in zip(n.free, speed, strict=True)]
+            for n, leg, speed in zip(numbers, legs, speeds, strict=True)
+        ]
+        angles = [joint_turns(n, angle) for n, angle in zip(numbers, self._coupled(free), strict=True)]
+        speeds = [tuple(speed) for speed in speeds]
         return Pieces((*position, *quaternion), tuple(angles)), Pieces((*velocity, *spin), tuple(speeds))
+
+    def _coupled(self, values: list[list[Any]]) -> list[list[Any]]:
+        """Angles or speeds by group and independent joint, with those of followers taken from their leaders.
+
+        The accelerations agree already; what this takes away is the rounding that would add up over a drive.
+        """
+        for coupling in self.structure.couplings:
+            follower, leader = coupling.follower, coupling.leader
+            led = jnp.sum(jnp.where(leader.leg, values[leader.group][leader.free], 0.0))
+            factor = coupling.multiplier * leader.sign * follower.sign
+            own = values[follower.group][follower.free]
+            values[follower.group][follower.free] = jnp.where(follower.leg, factor * led, own)
+        return values
 
 
 def _reflected_inertia(params: Any, joints: int, dtype: Any) -> Any:

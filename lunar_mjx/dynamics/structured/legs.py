@@ -30,7 +30,7 @@ from lunar_mjx.dynamics.spatial_algebra import (
     sub,
     total,
 )
-from lunar_mjx.dynamics.structured.topology import CHASSIS, LegGroup
+from lunar_mjx.dynamics.structured.topology import CHASSIS, Coupling, LegGroup
 from lunar_mjx.effects.ports import Forces
 
 STILL = Motion(ZERO, ZERO)
@@ -237,15 +237,22 @@ def _project(n: LegGroup, leg: LegState, block: LegBlock) -> LegBlock:
     return block._replace(mass_matrix=mass, coupling=coupling, torque=[project(block.torque, a) for a in free])
 
 
-def solve(chassis: Inertia, force: Force, blocks: list[LegBlock]) -> tuple[Motion, list[list[Any]]]:
+def solve(
+    chassis: Inertia, force: Force, blocks: list[LegBlock], couplings: tuple[Coupling, ...] = ()
+) -> tuple[Motion, list[list[Any]]]:
     """Eliminates the legs, solves for the base, and substitutes back: the block-arrow equation of motion.
 
     [I_c  F][a_0]   [-p_c]
     [F^T  H][u' ] = [tau ]
+
+    Couplings J u' = 0 add J^T lambda to tau. The response to each row of J is one more right side of the same
+    factorisation, and J u' = 0 gives the lambda of all of them.
     """
+    pulls = [_pull(coupling, blocks) for coupling in couplings]
     total_inertia, total_force = chassis, [*force.moment, *force.force]
     corrections: list[list[Any]] = [[0.0] * 6 for _ in range(6)]
-    eliminated = []
+    pulled: list[list[Any]] = [[0.0] * 6 for _ in pulls]
+    eliminated: list[list[list[Any]]] = []
     for block in blocks:
         count = _legs_of(block)
         total_inertia = total_inertia + Inertia(
@@ -253,7 +260,8 @@ def solve(chassis: Inertia, force: Force, blocks: list[LegBlock]) -> tuple[Motio
             Vector(*(_sum_over_legs(c, count) for c in block.inertia.h)),
             Symmetric(*(_sum_over_legs(c, count) for c in block.inertia.moments)),
         )
-        columns = [block.torque, *([row[i] for row in block.coupling] for i in range(6))]
+        rows_of_j = [pull[len(eliminated)] for pull in pulls]
+        columns = [block.torque, *([row[i] for row in block.coupling] for i in range(6)), *rows_of_j]
         mass = block.mass_matrix
         if block.ties:
             # Tied legs are one joint with their masses, couplings and torques together.
@@ -268,14 +276,56 @@ def solve(chassis: Inertia, force: Force, blocks: list[LegBlock]) -> tuple[Motio
             for j in range(i + 1):
                 through = total(*(mul(block.coupling[k][i], solved[1 + j][k]) for k in rows))
                 corrections[i][j] = add(corrections[i][j], _sum_over_legs(through, count))
+            for c in range(len(pulls)):
+                through = total(*(mul(block.coupling[k][i], solved[7 + c][k]) for k in rows))
+                pulled[c][i] = add(pulled[c][i], _sum_over_legs(through, count))
         eliminated.append(solved)
     matrix = _matrix(total_inertia)
     schur = [[sub(matrix[i][j], corrections[i][j]) if j <= i else 0.0 for j in range(6)] for i in range(6)]
-    (a,) = solve_positive(schur, [[neg(f) for f in total_force]])
-    rates = [
-        [sub(s[0][k], total(*(mul(s[1 + i][k], a[i]) for i in range(6)))) for k in range(len(s[0]))] for s in eliminated
-    ]
+    a, *responses = solve_positive(schur, [[neg(f) for f in hung] for hung in (total_force, *pulled)])
+    rates = _substituted(eliminated, 0, a)
+    if not pulls:
+        return Motion(Vector(*a[:3]), Vector(*a[3:])), rates
+    answers = [_substituted(eliminated, 7 + c, response) for c, response in enumerate(responses)]
+    gaps = [_gap(pull, rates) for pull in pulls]
+    compliance = [[_gap(pull, answer) for answer in answers] for pull in pulls]
+    (forces,) = solve_positive(compliance, [[neg(gap) for gap in gaps]])
+    for force_of, response, answer in zip(forces, responses, answers, strict=True):
+        a = [add(old, mul(force_of, more)) for old, more in zip(a, response, strict=True)]
+        rates = [
+            [add(old, mul(force_of, more)) for old, more in zip(own, extra, strict=True)]
+            for own, extra in zip(rates, answer, strict=True)
+        ]
     return Motion(Vector(*a[:3]), Vector(*a[3:])), rates
+
+
+def _substituted(eliminated: list[list[list[Any]]], column: int, a: list[Any]) -> list[list[Any]]:
+    """Joint accelerations by block, for one right side and the base's acceleration with it."""
+    return [
+        [sub(s[column][k], total(*(mul(s[1 + i][k], a[i]) for i in range(6)))) for k in range(len(s[0]))]
+        for s in eliminated
+    ]
+
+
+def _pull(coupling: Coupling, blocks: list[LegBlock]) -> list[list[Any]]:
+    """A row of J: by block and independent joint 0.0 or an array (leg,)."""
+    row: list[list[Any]] = [[0.0] * len(block.torque) for block in blocks]
+    for end, share in ((coupling.follower, 1.0), (coupling.leader, -coupling.multiplier)):
+        dtype = next(jnp.result_type(t) for block in blocks for t in block.torque if not isinstance(t, float))
+        row[end.group][end.free] = add(row[end.group][end.free], jnp.asarray(share * end.sign * end.leg, dtype))
+    return row
+
+
+def _gap(pull: list[list[Any]], rates: list[list[Any]]) -> Any:
+    """A row of J times joint accelerations."""
+    return total(
+        *(
+            jnp.sum(mul(p, r))
+            for own, rate in zip(pull, rates, strict=True)
+            for p, r in zip(own, rate, strict=True)
+            if not isinstance(p, float)
+        )
+    )
 
 
 def impose(chassis: Inertia, force: Force, blocks: list[LegBlock], rates: list[Any]) -> tuple[Motion, list[Any]]:

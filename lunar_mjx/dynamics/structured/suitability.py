@@ -103,8 +103,10 @@ def _others(model: mujoco.MjModel) -> list[str]:
             problems.append(what)
     for i in range(model.neq):
         if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT:
-            if not np.array_equal(model.eq_data[i, :5], [0.0, 1.0, 0.0, 0.0, 0.0]) or not model.eq_active0[i]:
-                problems.append(f"the joint equality {model.eq(i).name!r}, which does not make two angles one")
+            multiplier = model.eq_data[i, 1]
+            linear = np.array_equal(model.eq_data[i, :5], [0.0, multiplier, 0.0, 0.0, 0.0]) and multiplier != 0.0
+            if not linear or not model.eq_active0[i] or model.eq_obj2id[i] < 0:
+                problems.append(f"the joint equality {model.eq(i).name!r}, which is no fixed ratio of two angles")
         elif model.eq_type[i] != mujoco.mjtEq.mjEQ_CONNECT:
             problems.append(f"the equality constraint {model.eq(i).name!r}, which is neither connect nor joint")
         elif model.eq_objtype[i] != mujoco.mjtObj.mjOBJ_BODY:

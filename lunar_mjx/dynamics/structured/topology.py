@@ -66,6 +66,25 @@ class LegGroup:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class End:
+    """One joint of a coupling: its group, its place among the group's independent joints, its leg, and its sense."""
+
+    group: int
+    free: int
+    leg: np.ndarray
+    sign: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Coupling:
+    """Two joints, of one leg or of two: angle of `follower` = `multiplier` times angle of `leader`."""
+
+    follower: End
+    leader: End
+    multiplier: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Structure:
     """A floating base with legs; `base` in the chassis frame."""
 
@@ -73,6 +92,7 @@ class Structure:
     groups: tuple[LegGroup, ...]
     free_qpos: int
     free_dof: int
+    couplings: tuple[Coupling, ...] = ()
 
 
 @dataclasses.dataclass(eq=False)
@@ -125,17 +145,49 @@ def read_structure(
     for members in legs:
         leg = _leg(members, links, places, pins, wheels, axles, order)
         patterns.setdefault(leg.pattern, []).append(leg)
-    groups = []
+    groups, members = [], []
     for same in patterns.values():
         same.sort(key=lambda leg: [w[0] for w in leg.wheels] or [leg.links[0].joint])
         groups.append(_group(model, same, order, name))
+        members.append(same)
     free = int(model.body_jntadr[chassis])
     return Structure(
         base=_body([base_masses], [np.eye(3)]),
         groups=tuple(groups),
         free_qpos=int(model.jnt_qposadr[free]),
         free_dof=int(model.jnt_dofadr[free]),
+        couplings=_couplings(model, groups, members, name),
     )
+
+
+def _couplings(
+    model: mujoco.MjModel, groups: list[LegGroup], members: list[list[_Leg]], name: str
+) -> tuple[Coupling, ...]:
+    """The joint equalities that `_ties` has not taken: differentials, and joints that mimic others."""
+    place = {
+        link.joint: (g, k, i) for g, legs in enumerate(members) for i, leg in enumerate(legs)
+        for k, link in enumerate(leg.links)
+    }  # fmt: skip
+
+    def end(joint: int, equality: str) -> End:
+        g, k, i = place[joint]
+        group = groups[g]
+        if k not in group.free:
+            raise UnsuitableError(
+                f"{name}: the joint equality {equality!r} holds the joint {model.joint(joint).name!r}, which a loop "
+                "holds already; the structured engine couples joints that are free otherwise."
+            )
+        sign = np.broadcast_to(np.asarray(group.links[k].numbers.sign), group.count)[i]
+        return End(g, group.free.index(k), np.arange(group.count) == i, float(sign))
+
+    found = []
+    for e in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
+        if any(groups[place[j][0]].ties for j in ends):
+            continue
+        follower, leader = (end(j, model.eq(e).name) for j in ends)
+        found.append(Coupling(follower, leader, float(model.eq_data[e, 1])))
+    return tuple(found)
 
 
 def _matrix(quaternion: np.ndarray) -> np.ndarray:
@@ -296,13 +348,9 @@ def _ties(
     tied = False
     for i in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
         ends = [own.get(int(joint)) for joint in (model.eq_obj1id[i], model.eq_obj2id[i])]
-        if ends == [None, None]:
+        # what ties legs of several joints, or not one to one, is a coupling (see `_couplings`)
+        if None in ends or loop is not None or len(links) > 1 or model.eq_data[i, 1] != 1.0:
             continue
-        if None in ends or loop is not None or len(links) > 1:
-            raise UnsuitableError(
-                f"{name}: the joint equality {model.eq(i).name!r} ties legs that have more joints than these, "
-                "or differ in pattern; the structured engine ties legs of one joint."
-            )
         (first, _), (second, _) = ends  # type: ignore[misc]
         cluster[cluster == cluster[second]] = cluster[first]
         tied = True

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar_mjx.cameras import Pinhole, Sun
 from lunar_mjx.envs.navigation.actions import ACTION_MODES
 from lunar_mjx.envs.navigation.kalman import KalmanConfig
 from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION, check_blocks
@@ -45,6 +46,9 @@ class NavigationConfig:
       steepest: slope at start and goal.
       randomise: parameters drawn for every episode.
       kalman: the acceleration filter's tuning.
+      camera_width, camera_height: pixels of the blocks camera/rgb, camera/depth and camera/labels.
+      camera_fovy_deg: vertical angle of view. camera_far: how far the camera looks, m.
+      sun_azimuth_deg, sun_elevation_deg: where the Sun stands, clockwise from north (y).
       divergence: what follows a state that is not finite: "stop" lets it through, so that a trainer's guard stops and
         dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`.
     """
@@ -73,10 +77,26 @@ class NavigationConfig:
     steepest: float = np.radians(20.0)
     randomise: tuple[Range, ...] = ()
     kalman: KalmanConfig = dataclasses.field(default_factory=KalmanConfig)
+    camera_width: int = 64
+    camera_height: int = 48
+    camera_fovy_deg: float = 60.0
+    camera_far: float = 60.0
+    sun_azimuth_deg: float = 135.0
+    sun_elevation_deg: float = 15.0
     divergence: str = "stop"
 
     def __post_init__(self) -> None:
         _check(self)
+
+    @property
+    def camera(self) -> Pinhole:
+        """Optics of the front camera."""
+        return Pinhole(self.camera_width, self.camera_height, self.camera_fovy_deg)
+
+    @property
+    def sun(self) -> Sun:
+        """Where the light comes from."""
+        return Sun(self.sun_azimuth_deg, self.sun_elevation_deg)
 
     def replace(self, **changes: Any) -> NavigationConfig:
         """A copy with other values, checked.
@@ -105,6 +125,7 @@ def _check(c: NavigationConfig) -> None:
         "stuck_time",
         "stuck_distance",
         "steepest",
+        "camera_far",
     ):
         if require_finite("navigation", name, getattr(c, name)) <= 0.0:
             raise bad_input("navigation", name, getattr(c, name), "is not positive", "give a number above zero")
@@ -122,6 +143,8 @@ def _check(c: NavigationConfig) -> None:
     for name, allowed in (("action", ACTION_MODES), ("divergence", DIVERGENCE)):
         if getattr(c, name) not in allowed:
             raise bad_input("navigation", name, getattr(c, name), "does not exist", f"use one of {', '.join(allowed)}")
+    # the optics and the light refuse values that make no sense, in words of their own
+    _ = c.camera, c.sun
     check_blocks(c.observations, "observations")
     check_blocks(c.privileged, "privileged")
     if not c.observations:

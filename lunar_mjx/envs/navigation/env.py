@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lunar_mjx.cameras.batch import Light, pictures
 from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.envs.core import State, side_by_side, where
 from lunar_mjx.envs.navigation import kalman, randomise, rewards
 from lunar_mjx.envs.navigation.actions import action_map
 from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
-from lunar_mjx.envs.navigation.observations import Scene, observe
+from lunar_mjx.envs.navigation.observations import CAMERA, Scene, observe
 from lunar_mjx.envs.navigation.places import draw_places
 from lunar_mjx.envs.navigation.view import SCAN_SCALE, Reader, View, goal_in_body, read
 from lunar_mjx.envs.navigation.worlds import PREFIX, world
@@ -381,7 +382,12 @@ class NavigationEnv:
         )
 
     def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:
-        scene = Scene(params.system.terrain, inner.drawn, self._ride, self._scale)
+        c, terrain = self.config, params.system.terrain
+        seen = None
+        if any(name.startswith(CAMERA) for name in (*c.observations, *c.privileged)):
+            light = Light(sun=c.sun)
+            seen = pictures(terrain, self.model.rover, view.qpos, c.camera, light=light, far=c.camera_far)
+        scene = Scene(terrain, inner.drawn, self._ride, self._scale, seen, c.camera_far)
         return observe(self.config.observations, view, scene), observe(self.config.privileged, view, scene)
 
     def _info(self, view: View) -> dict[str, Any]:

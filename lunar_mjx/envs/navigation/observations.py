@@ -7,6 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from lunar_mjx.cameras.batch import Pictures
 from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, View, goal_in_body, height_scan
 from lunar_mjx.errors import bad_input
 from lunar_mjx.pytree import pytree, static
@@ -24,12 +25,15 @@ class Scene:
       terrain: the ground.
       drawn: parameters drawn for the episode, by name.
       ride: standing height of the chassis frame, m. scan_scale: of the height scan's pattern.
+      seen: what the front cameras see, where a block asks for it. far: depth that counts as 1, m.
     """
 
     terrain: Terrain
     drawn: dict[str, Any]
     ride: float = static(default=0.0)
     scan_scale: float = static(default=1.0)
+    seen: Pictures | None = None
+    far: float = static(default=60.0)
 
 
 Block = Callable[[View, Scene], Any]
@@ -112,6 +116,30 @@ def scan(v: View, s: Scene) -> Any:
     return jnp.clip(height_scan(s.terrain, v, s.scan_scale, s.ride), -1.0, 1.0)
 
 
+def camera_rgb(v: View, s: Scene) -> Any:
+    """Front camera's picture, 0 to 1: rows from the top, pixels from the left, red, green, blue."""
+    return _flat(_seen(s).rgb)
+
+
+def camera_depth(v: View, s: Scene) -> Any:
+    """Front camera's depth as a share of the farthest, pixel by pixel; 1 in the sky."""
+    return _flat(jnp.minimum(_seen(s).depth / s.far, 1.0))
+
+
+def camera_labels(v: View, s: Scene) -> Any:
+    """What each pixel of the front camera shows: 0 sky, 1 ground, 2 rock, 3 rover."""
+    return _flat(_seen(s).label.astype(v.position.dtype))
+
+
+def _seen(s: Scene) -> Pictures:
+    assert s.seen is not None, "the environment draws the pictures that its blocks ask for"
+    return s.seen
+
+
+def _flat(pictures: Any) -> Any:
+    return pictures.reshape(pictures.shape[0], -1)
+
+
 def last_action(v: View, s: Scene) -> Any:
     """The action before."""
     return v.last_action
@@ -149,8 +177,11 @@ BLOCKS: dict[str, Block] = {
         waited,
         drawn,
     )
-} | {"height_scan": scan}
+} | {"height_scan": scan, "camera/rgb": camera_rgb, "camera/depth": camera_depth, "camera/labels": camera_labels}
 """All blocks by name."""
+
+CAMERA = "camera/"
+"""What the names of blocks begin with that are pictures."""
 
 SCAN_POINTS = len(SCAN_AHEAD) * len(SCAN_ASIDE)
 

@@ -39,6 +39,7 @@ class View:
       filtered: the Kalman filter's estimates.
       last_action: in [-1, 1].
       waited: time since the rover left the place that it is said to be stuck at, s.
+      qpos: coordinates of the rover's MJCF.
     """
 
     position: Float[Array, "env 3"]
@@ -61,6 +62,7 @@ class View:
     filtered: KalmanState
     last_action: Float[Array, "env action"]
     waited: Float[Array, "env"]
+    qpos: Float[Array, "env nq"]
 
 
 def rotation(quaternion: Float[Array, "env 4"]) -> Float[Array, "env 3 3"]:
@@ -102,6 +104,7 @@ class Reader:
             "joint_angle": physics.qpos[:, self._qpos],
             "joint_speed": physics.qvel[:, self._qvel],
             "winding_temperature": physics.temperature.winding_kelvin,
+            "qpos": physics.qpos,
         }
 
 

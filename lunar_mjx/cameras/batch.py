@@ -1,0 +1,278 @@
+"""Colour, depth and labels of many cameras in pure JAX: rays marched over ground and rocks, and onto rovers' shapes.
+
+One ray a pixel finds what is seen, a second one whether the Sun reaches it: shadows are hard, from ground, rocks and
+rovers, at any height of the Sun. Light that sunlit ground throws onto what faces it stands in for what a path tracer
+would gather; Earth shines without shadows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from lunar_mjx.cameras.mount import front_mount
+from lunar_mjx.cameras.photometry import Film, Regolith
+from lunar_mjx.cameras.pinhole import Pinhole, Pose
+from lunar_mjx.cameras.raymarch import STEPS, march, mounted
+from lunar_mjx.cameras.scene import Sun
+from lunar_mjx.cameras.shapes import Placed, hit, normal, placed, rover_shapes, together
+from lunar_mjx.cameras.texture import ALBEDO
+from lunar_mjx.rover import Rover
+from lunar_mjx.terrain import HeightField, Terrain, sample
+from lunar_mjx.terrain.rocks import nearest_rock
+
+SKY, GROUND, ROCK, ROVER = range(4)
+"""Labels, as `LABELS` names them."""
+
+TINT = ALBEDO / ALBEDO[0]
+"""Colour of regolith, red first."""
+ROCK_BRIGHTNESS = 1.5
+"""Of rocks over that of soil: their surfaces are less dusty. A choice."""
+_SKIN = 0.012
+"""How far before a surface its shadow ray begins, m: bilinear patches and the smooth normals on them differ by less."""
+SHADOW_STEPS = 48
+"""Of the march towards the Sun."""
+_FAR_SHADOW = 150.0
+"""Longest way on which ground is looked for towards the Sun, m."""
+_LIT_GROUND = 0.12
+"""Share of sunlight that ground throws back to all sides."""
+_HORIZON = 0.02
+"""Share of the sky that lit slopes fill, as level ground sees it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Light:
+    """Where light comes from.
+
+    Attributes:
+      sun: where the Sun stands.
+      earth: towards Earth, (3,), of any length. earthshine: its light over the Sun's. A full Earth gives 1e-4.
+      soil: how the ground reflects. film: how the camera exposes.
+    """
+
+    sun: Sun = dataclasses.field(default_factory=Sun)
+    earth: tuple[float, float, float] = (0.0, -1.0, 0.15)
+    earthshine: float = 1e-4
+    soil: Regolith = dataclasses.field(default_factory=Regolith)
+    film: Film = dataclasses.field(default_factory=Film)
+
+
+class Pictures(NamedTuple):
+    """What cameras see.
+
+    Attributes:
+      rgb: 0 to 1, as shown on a screen. depth: m along the optical axis, infinite in the sky. label: into `LABELS`.
+    """
+
+    rgb: Float[Array, "*camera height width 3"]
+    depth: Float[Array, "*camera height width"]
+    label: Int[Array, "*camera height width"]
+
+
+def picture(
+    terrain: Terrain,
+    position: Float[Array, "3"],
+    turn: Float[Array, "3 3"],
+    camera: Pinhole,
+    light: Light | None = None,
+    rovers: Placed | None = None,
+    sun: Any = None,
+    paint: HeightField | None = None,
+    key: Any = None,
+    far: float = 60.0,
+    steps: int = STEPS,
+    shadow_steps: int = SHADOW_STEPS,
+) -> Pictures:
+    """What one camera sees.
+
+    Args:
+      terrain: ground and rocks.
+      position, turn: of the camera, as in `Pose`; see `mounted`.
+      camera: optics. light: what shines, and how the camera exposes.
+      rovers: shapes in the world, see `placed` and `together`; none if None.
+      sun: (3,) unit vector towards the Sun in place of `light.sun`, so that it may differ between cameras of a batch.
+      paint: brightness of the ground over that of plain soil, such as mottling and wheel tracks; see `painted`.
+      key: random key of the noise; no noise if None.
+      far: largest depth that is looked for, m. steps, shadow_steps: of the marches; more find thinner things.
+    """
+    light = light or Light()
+    dtype = position.dtype
+    to_sun = jnp.asarray(light.sun.direction if sun is None else sun, dtype)
+    rays = jnp.asarray(camera.rays(), dtype)
+    direction = jnp.sum(turn * rays[..., None, :], axis=-1)
+    depth = march(terrain, position, direction, far, steps)
+    label = jnp.where(jnp.isfinite(depth), GROUND, SKY)
+    which = jnp.zeros(depth.shape, jnp.int32)
+    if rovers is not None:
+        near, which = hit(rovers, position, direction)
+        on_rover = (near < depth) & (near > camera.near)
+        depth, label = jnp.where(on_rover, near, depth), jnp.where(on_rover, ROVER, label)
+    there = jnp.where(jnp.isfinite(depth), depth, 1.0)
+    point = position + there[..., None] * direction
+    face, on_rock = _surface_normal(terrain, point)
+    label = jnp.where((label == GROUND) & on_rock, ROCK, label)
+    if rovers is not None:
+        face = jnp.where((label == ROVER)[..., None], normal(rovers, which, point), face)
+    to_eye = -direction / jnp.sqrt(jnp.sum(direction**2, axis=-1, keepdims=True))
+    lit = _sunlit(terrain, point + _SKIN * face, to_sun, rovers, shadow_steps)
+    bright = _brightness(terrain, light, label, face, to_eye, to_sun, lit, point, paint)
+    if rovers is not None:
+        colour = rovers.colour[which]
+        bright = jnp.where((label == ROVER)[..., None], bright * colour, bright * jnp.asarray(TINT, dtype))
+    else:
+        bright = bright * jnp.asarray(TINT, dtype)
+    bright = jnp.where((label == SKY)[..., None], 0.0, bright)
+    return Pictures(_exposed(bright, light, camera, to_sun, key), depth, label)
+
+
+def pictures(
+    terrain: Terrain,
+    rover: Rover,
+    qpos: Float[Array, "rover nq"],
+    camera: Pinhole | None = None,
+    mount: Pose | None = None,
+    light: Light | None = None,
+    others: Float[Array, "rover other nq"] | None = None,
+    at_once: int | None = None,
+    **more: Any,
+) -> Pictures:
+    """What the front cameras of many rovers see of ground, rocks, themselves and each other.
+
+    Args:
+      terrain: one for all.
+      rover: what they are. qpos: their coordinates.
+      camera: optics. mount: the camera's pose in the chassis frame; `front_mount` if None. light: see `Light`.
+      others: coordinates of other rovers of the kind that each camera may see.
+      at_once: how many pictures are in memory at once (all if None).
+      more: `far`, `steps`, `shadow_steps`, `paint` of `picture`.
+    """
+    shapes, optics = rover_shapes(rover), camera or Pinhole(64, 48)
+    where = mount or front_mount(rover)
+
+    def one(given: tuple) -> Pictures:
+        position, turn = mounted(where, given[0])
+        seen = placed(shapes, rover, given[0])
+        if others is not None:
+            seen = together(seen, *(placed(shapes, rover, given[1][i]) for i in range(others.shape[1])))
+        return picture(terrain, position, turn, optics, light, seen, **more)
+
+    given = (qpos,) if others is None else (qpos, others)
+    if at_once is None:
+        return jax.vmap(lambda *a: one(a))(*given)
+    return jax.lax.map(one, given, batch_size=at_once)
+
+
+def stereo(mount: Pose, baseline: float) -> tuple[Pose, Pose]:
+    """Left and right camera `baseline` m apart, about a mount, looking the same way."""
+    aside = 0.5 * baseline * mount.rotation[:, 0]
+    return Pose(mount.position - aside, mount.rotation), Pose(mount.position + aside, mount.rotation)
+
+
+def painted(shade: np.ndarray, low: Any, metres: Any) -> HeightField:
+    """Brightness of the ground for `picture`, from a square picture with north up.
+
+    Args:
+      shade: (rows, cols) brightness, 1 for plain soil. low: west and south edge, m. metres: extent of a side, m.
+    """
+    cols = shade.shape[1]
+    cell = float(np.ravel(metres)[0]) / cols
+    values = jnp.asarray(np.asarray(shade, np.float32)[::-1])
+    return HeightField(
+        values,
+        jnp.asarray(low[0] + 0.5 * cell, jnp.float32),
+        jnp.asarray(low[1] + 0.5 * cell, jnp.float32),
+        jnp.asarray(cell, jnp.float32),
+    )
+
+
+def _surface_normal(terrain: Terrain, point: Any) -> tuple[Any, Any]:
+    """Unit normals of ground or rock at points on them, and whether it is rock.
+
+    The ground's slope is that of smooth shading: a central difference over two cells, not the patch's own.
+    """
+    x, y = point[..., 0], point[..., 1]
+    cell = terrain.field.cell
+    east = (sample(terrain.field, x + cell, y)[0] - sample(terrain.field, x - cell, y)[0]) / (2.0 * cell)
+    north = (sample(terrain.field, x, y + cell)[0] - sample(terrain.field, x, y - cell)[0]) / (2.0 * cell)
+    size = jnp.sqrt(1.0 + east**2 + north**2)
+    face = jnp.stack([-east / size, -north / size, 1.0 / size], axis=-1)
+    if terrain.rocks is None:
+        return face, jnp.zeros(x.shape, bool)
+    cx, cy, cz, radius = nearest_rock(terrain.rocks, x, y)
+    away = jnp.stack([x - cx, y - cy, point[..., 2] - cz], axis=-1)
+    flat = away[..., 0] ** 2 + away[..., 1] ** 2
+    above = cz + jnp.sqrt(jnp.maximum(radius**2 - flat, 0.0)) > sample(terrain.field, x, y)[0]
+    on_rock = (flat < radius**2 * 1.0001) & above & (radius > 0.0)
+    stone = away / jnp.maximum(jnp.sqrt(jnp.sum(away**2, axis=-1, keepdims=True)), 1e-9)
+    return jnp.where(on_rock[..., None], stone, face), on_rock
+
+
+def _sunlit(terrain: Terrain, point: Any, to_sun: Any, rovers: Placed | None, steps: int) -> Any:
+    """Whether nothing stands between points and the Sun; all rays at once."""
+    towards = jnp.broadcast_to(to_sun, point.shape)
+    # nothing is in the way once a ray is above all ground and all rocks
+    top = jnp.max(terrain.field.heights)
+    if terrain.rocks is not None:
+        top = jnp.maximum(top, jnp.max(terrain.rocks.centers[:, 2] + terrain.rocks.radii))
+    end = jnp.clip((top - point[..., 2]) / jnp.maximum(to_sun[2], 1e-4), 0.0, _FAR_SHADOW)
+    blocked = jnp.isfinite(march(terrain, point, towards, end, steps, start=0.03, refine=0))
+    if rovers is not None:
+        blocked |= jnp.isfinite(hit(rovers, point, towards)[0])
+    return ~blocked & (to_sun[2] > 0.0)
+
+
+def _brightness(
+    terrain: Terrain,
+    light: Light,
+    label: Any,
+    face: Any,
+    to_eye: Any,
+    to_sun: Any,
+    lit: Any,
+    point: Any,
+    paint: HeightField | None,
+) -> Any:
+    """I/F of what is seen, (..., 1), before its colour."""
+    soil = light.soil
+    earth = np.asarray(light.earth, float) / np.linalg.norm(light.earth)
+    mu = jnp.sum(face * to_eye, axis=-1)
+
+    def under(to_light: Any) -> Any:
+        mu0 = jnp.sum(face * to_light, axis=-1)
+        ground = soil.radiance_factor(mu0, mu, jnp.sum(to_eye * to_light, axis=-1))
+        ground = ground * jnp.where(label == ROCK, ROCK_BRIGHTNESS, 1.0)
+        return jnp.where(label == ROVER, jnp.maximum(mu0, 0.0), ground)
+
+    direct = under(to_sun) * lit + light.earthshine * under(jnp.asarray(earth, face.dtype))
+    # sunlit ground fills the half of the sky below a wall, and a little of it above level ground
+    seen = 0.5 * (1.0 - face[..., 2]) + _HORIZON
+    thrown = seen * _LIT_GROUND * jnp.maximum(to_sun[2], 0.0)
+    diffuse = jnp.where(label == ROVER, 1.0, soil.radiance_factor(0.5, 1.0, 0.5) / 0.5)
+    bright = direct + thrown * diffuse
+    if paint is not None:
+        value, _, _ = sample(paint, point[..., 0], point[..., 1])
+        bright = bright * jnp.where(label == GROUND, value, 1.0)
+    return bright[..., None]
+
+
+def _exposed(bright: Any, light: Light, camera: Pinhole, to_sun: Any, key: Any) -> Any:
+    """From I/F to what a screen shows: optics, exposure, noise, gamma."""
+    film = light.film
+    value = bright * film.gain(light.soil, to_sun[2])
+    if film.vignetting:
+        # cos^4 of the angle to the optical axis; rays have length 1 along it
+        rays = camera.rays()
+        value = value * jnp.asarray(1.0 / np.sum(rays**2, axis=-1, keepdims=True) ** 2, value.dtype)
+    if film.dust > 0.0:
+        veil = jnp.mean(value, axis=(-3, -2), keepdims=True)
+        value = (1.0 - film.dust) * value + film.dust * veil
+    if key is not None and film.full_well > 0.0:
+        electrons = film.full_well * jnp.maximum(value, 0.0)
+        spread = jnp.sqrt(electrons + film.read_noise**2) / film.full_well
+        value = value + spread * jax.random.normal(key, value.shape, value.dtype)
+    return jnp.clip(value, 0.0, 1.0) ** (1.0 / film.gamma)

@@ -1,0 +1,91 @@
+"""Joints that turn in a fixed ratio: the differential of a rocker-bogie, and the <mimic> of a URDF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lunar_mjx.errors import bad_input
+from lunar_mjx.rover.description import Description
+from lunar_mjx.rover.tree import Body, world_poses
+from lunar_mjx.rover.urdf import Urdf
+
+_PARALLEL = 0.999
+"""Least |cosine| between the axes of a differential's pivots."""
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Angle of the joint `follower` = `multiplier` times that of `leader` + `offset`, rad, in the signs of the MJCF."""
+
+    follower: str
+    leader: str
+    multiplier: float
+    offset: float
+
+
+def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Description) -> tuple[Coupling, ...]:
+    """The couplings of the URDF and of its description, for joints whose axes the roles may have reversed.
+
+    Args:
+      urdf: as read. bodies: with their axes as in the MJCF. description: what URDF cannot say.
+
+    Raises:
+      UserError: a joint that does not exist or does not move, pivots that are not parallel, or a chain of followers.
+    """
+    moving = {b.joint.name: b for b in bodies if b.joint is not None}
+    written = {j.name: j for j in urdf.joints}
+    found: list[Coupling] = []
+
+    def sense(joint: str) -> float:
+        """-1 where the conversion has reversed the joint's axis, which also turns frames; told by the limits' axis."""
+        body = moving[joint]
+        assert body.joint is not None
+        pose = world_poses(bodies)[body.name].rotation @ body.joint.axis
+        return 1.0 if _drawn_axis(urdf, joint) @ pose > 0.0 else -1.0
+
+    for joint in urdf.joints:
+        if joint.mimic is None:
+            continue
+        where = f"joint '{joint.name}' mimic joint"
+        if joint.mimic.leader not in moving or joint.mimic.leader == joint.name:
+            raise bad_input(urdf.path, where, joint.mimic.leader, "is no other moving joint", "correct the name")
+        if written[joint.mimic.leader].mimic is not None:
+            raise bad_input(urdf.path, where, joint.mimic.leader, "follows a joint itself", "follow that joint")
+        own, other = sense(joint.name), sense(joint.mimic.leader)
+        multiplier, offset = own * other * joint.mimic.multiplier, own * joint.mimic.offset
+        found.append(Coupling(joint.name, joint.mimic.leader, multiplier, offset))
+    path = description.path or urdf.path
+    for i, pair in enumerate(description.differentials):
+        for key in ("joint1", "joint2"):
+            if getattr(pair, key) not in moving:
+                raise bad_input(
+                    path, f"differentials[{i}].{key}", getattr(pair, key), "is no moving joint", "correct the name"
+                )
+        poses = world_poses(bodies)
+        axes = [
+            poses[moving[j].name].rotation @ moving[j].joint.axis  # type: ignore[union-attr]
+            for j in (pair.joint1, pair.joint2)
+        ]
+        cosine = float(axes[0] @ axes[1])
+        if abs(cosine) < _PARALLEL:
+            raise bad_input(
+                path, f"differentials[{i}].joint2", pair.joint2, "is not parallel to joint1", "name the rockers' pivots"
+            )
+        found.append(Coupling(pair.joint2, pair.joint1, -1.0 if cosine > 0.0 else 1.0, 0.0))
+    followers = [c.follower for c in found]
+    for name in followers:
+        if followers.count(name) > 1:
+            raise bad_input(path, "joint", name, "follows two joints", "leave one of them out")
+    return tuple(found)
+
+
+def _drawn_axis(urdf: Urdf, joint: str) -> np.ndarray:
+    """Direction (3,) of a joint's axis at zero angles as the URDF has it, in the root's frame."""
+    by_child = {j.child: j for j in urdf.joints}
+    wanted = next(j for j in urdf.joints if j.name == joint)
+    turn, link = wanted.pose.rotation, wanted.parent
+    while link in by_child:
+        turn, link = by_child[link].pose.rotation @ turn, by_child[link].parent
+    return turn @ wanted.axis

@@ -1,0 +1,50 @@
+"""Pictures as observations of the navigation task."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lunar_mjx.envs import make_navigation, split_keys
+from lunar_mjx.errors import UserError
+
+SIZE = {"camera_width": 16, "camera_height": 12}
+
+
+def test_pictures_are_blocks_of_the_observation() -> None:
+    blocks = ("goal_body", "camera/rgb", "camera/depth", "camera/labels")
+    env = make_navigation("consistent", terrain="lunar_plain", decimation=1, places=8, observations=blocks, **SIZE)
+    pixels = 16 * 12
+    assert env.observation_size == 4 + 5 * pixels
+    state = jax.jit(env.reset)(env.params, split_keys(jax.random.PRNGKey(0), 2))
+    obs = np.asarray(state.obs)
+    assert np.isfinite(obs).all()
+    rgb, depth, label = (
+        obs[:, 4 : 4 + 3 * pixels],
+        obs[:, 4 + 3 * pixels : 4 + 4 * pixels].reshape(2, 12, 16),
+        obs[:, 4 + 4 * pixels :].reshape(2, 12, 16),
+    )
+    assert 0.0 <= rgb.min() < rgb.max() <= 1.0
+    assert depth.max() == 1.0 and 0.0 < depth.min() < 0.2
+    assert set(np.unique(label)) <= {0.0, 1.0, 2.0, 3.0} and {0.0, 1.0} <= set(np.unique(label))
+    # the sky is far, dark and above
+    assert (depth[label == 0] == 1.0).all() and label[:, 0].max() == 0.0 and (label[:, -1] > 0).all()
+    after = jax.jit(env.step)(env.params, state, jnp.ones((2, env.action_size)))
+    assert after.obs.shape == state.obs.shape and np.isfinite(np.asarray(after.obs)).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"camera_width": 0}, ("width", "0")),
+        ({"camera_far": -1.0}, ("camera_far", "not positive")),
+        ({"sun_elevation_deg": 120.0}, ("elevation", "120")),
+        ({"observations": ("camera/infrared",)}, ("camera/infrared", "camera/rgb")),
+    ],
+)
+def test_nonsense_is_refused(options: dict, words: tuple[str, ...]) -> None:
+    with pytest.raises(UserError) as refused:
+        make_navigation("consistent", terrain="flat", **options)
+    assert all(word in str(refused.value) for word in words)
