@@ -25,6 +25,7 @@ def register(app: typer.Typer) -> None:
     log_app.command("unseal")(unseal)
     log_app.command("manoeuvres")(manoeuvres)
     log_app.command("channels")(channels)
+    log_app.command("noise")(noise)
     app.add_typer(log_app, name="log")
 
 
@@ -118,6 +119,35 @@ def channels() -> None:
     console.print(table)
     console.print(f"{{c}} a corner: {', '.join(CORNERS)}; before _drive also a side: {', '.join(SIDES)}")
     console.print(f"{{j}} a joint: {', '.join(KINDS)}. {{x}} an axis: x, y, z. {{q}} w, x, y, z of a quaternion")
+
+
+def noise(
+    logs: Annotated[list[Path], typer.Argument(help="Logs of drives, or folders of such logs.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")] = False,
+) -> None:
+    """Tell the noise of every channel: as stated, while the rover drives, and at rest."""
+    import dataclasses
+
+    from lunar_mjx.logs import Log, read_campaign
+    from lunar_mjx.logs.noise import noise_table
+    from lunar_mjx.model.describe import make_console, make_table
+
+    read = [log for log in read_campaign(logs) if isinstance(log, Log)]
+    found = noise_table(read)
+    if as_json:
+        plain = {
+            c: {k: {**dataclasses.asdict(n), "log_std": n.log_std} for k, n in v.items()} for c, v in found.items()
+        }
+        print(json.dumps(plain, indent=2))
+        return
+    table = make_table("channel", "kind", "std", "coloured", "time, s", "std of log")
+    for channel, kinds in found.items():
+        for kind, n in kinds.items():
+            label = kind if kind in (n.source, "rest") else f"{kind}: {n.source}"
+            table.add_row(
+                channel, label, f"{n.std:.3g}", f"{n.share:.2g}", f"{n.correlation_time_s:.2g}", f"{n.log_std:.2g}"
+            )
+    make_console().print(table)
 
 
 def check(

@@ -22,7 +22,8 @@ wheels. A reading that stands for a side is written once, under the side's name:
 independent readings.
 """
 SPLITS = ("fit", "select", "test")
-NOISE_SOURCES = ("datasheet", "rest", "replicate")
+NOISE_SOURCES = ("datasheet", "rest", "replicate", "vibration", "ripple", "estimate")
+"""Where a stated noise comes from; the last three are what a drive shows of an IMU, of currents and of all else."""
 MIRROR = {"lf": "rf", "rf": "lf", "lm": "rm", "rm": "lm", "lr": "rr", "rr": "lr", "left": "right", "right": "left"}
 """The corner on the other side, or the other side."""
 IMPOSED = ("wheel_speed",)

@@ -12,6 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from lunar_mjx.effects.sensor.channels import family
 from lunar_mjx.inference.observations import Observations, Series
+from lunar_mjx.logs.noise import ChannelNoise, noise_of
 
 if TYPE_CHECKING:
     from lunar_mjx.logs import Log
@@ -79,6 +80,14 @@ def stated_or_typical(log: Log, channel: str) -> float:
     return DATASHEET.get(word, 0.01)
 
 
+QUIETEST = 0.1
+"""Share of what its family's sensors have, below which no channel's noise is believed to lie: a simulated log without
+noise would weigh millions of sigma."""
+UNKNOWN_LOG_STD = 0.7
+"""Standard deviation of the logarithm of a noise that nothing tells: what a family's sensors have, within a factor of
+two."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Colour:
     """Share of a noise's variance that is correlated, and its correlation time in s."""
@@ -97,6 +106,7 @@ class Noises:
 
     def __init__(self, logs: Sequence[Log]):
         self.logs = tuple(logs)
+        self._estimates: dict[tuple[int, str], ChannelNoise | None] = {}
         segments: dict[tuple[str, float], list[tuple[np.ndarray, np.ndarray]]] = {}
         for log in logs:
             rests = _rests(log)
@@ -115,13 +125,35 @@ class Noises:
         """Whether a log states a correlation time."""
         return channel in log.noise and log.noise[channel].correlation_time_s > 0.0
 
+    def _known(self, log: Log, channel: str) -> bool:
+        """Whether a channel's colour is stated, or was estimated from the whole drive."""
+        return self._stated(log, channel) or self.estimate(log, channel) is not None
+
     def __call__(self, log: Log, channel: str) -> tuple[float, float, float]:
         """White and coloured standard deviation in the channel's unit, and correlation time in s."""
+        estimate = self.estimate(log, channel)
+        if estimate is not None:
+            size = max(1.0, QUIETEST * stated_or_typical(log, channel) / estimate.std)
+            return size * estimate.white, size * estimate.coloured, estimate.correlation_time_s
         std = stated_or_typical(log, channel)
         if self._stated(log, channel):
             return 0.1 * std, std, log.noise[channel].correlation_time_s
         found = self.colours.get(_kind(log, channel), self.common)
         return std * np.sqrt(1.0 - found.share), std * np.sqrt(found.share), found.correlation_time
+
+    def estimate(self, log: Log, channel: str) -> ChannelNoise | None:
+        """Noise that the log does not state, as the drive itself shows it; None where that is stated or too short."""
+        if channel in log.noise and log.noise[channel].std > 0.0:
+            return None
+        key = id(log), channel
+        if key not in self._estimates:
+            self._estimates[key] = noise_of(log, channel)
+        return self._estimates[key]
+
+    def log_std(self, log: Log, channel: str) -> float:
+        """Standard deviation of the logarithm of a channel's noise: how well its size is known."""
+        found = noise_of(log, channel) if channel in log.noise else self.estimate(log, channel)
+        return UNKNOWN_LOG_STD if found is None else found.log_std
 
     def refined(self, observations: Observations, residual: np.ndarray) -> Observations:
         """The colours that rest has shown, taken anew from a residual, which is longer than any rest.
@@ -134,7 +166,7 @@ class Noises:
         """
         segments: dict[tuple[str, float], list[tuple[np.ndarray, np.ndarray]]] = {}
         mine = [s for s in observations.series if s.time is not None and s.correlation_time > 0.0]
-        mine = [s for s in mine if not self._stated(self.logs[s.log], s.channel)]
+        mine = [s for s in mine if not self._known(self.logs[s.log], s.channel)]
         for s in mine:
             key, time, values = _kind(self.logs[s.log], s.channel), np.asarray(s.time), residual[s.start : s.stop]
             step = float(np.median(np.diff(time)))
