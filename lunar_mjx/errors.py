@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 EXIT_STATUS = 2
+LONGEST_PATH = 4000
+"""Characters; what is longer is no path anywhere."""
 
 
 class UserError(ValueError):
@@ -29,7 +31,12 @@ def bad_input(source: str | Path, field: str, value: Any, problem: str, remedy: 
     Returns:
       The error, to be raised by the caller.
     """
-    shown = f"{value!r}" if isinstance(value, str) else f"{value}"
+    try:
+        shown = f"{value!r}" if isinstance(value, str) else f"{value}"
+    except ValueError:  # whole numbers of more than 4300 digits
+        shown = "a number of thousands of digits"
+    if len(field) > 120:
+        field = field[:117] + "..."
     if len(shown) > 120:
         shown = shown[:117] + "..."
     return UserError(f"{source}: {field} = {shown} {problem}; {remedy}.")
@@ -37,8 +44,12 @@ def bad_input(source: str | Path, field: str, value: Any, problem: str, remedy: 
 
 def require_finite(source: str | Path, field: str, value: Any) -> float:
     """Returns `value` as a float, or raises `UserError` if it is not a finite number."""
+    if isinstance(value, str) and "_" in value:  # Python reads 1_0 as 10
+        raise bad_input(source, field, value, "is not a number", "write it without underscores")
     try:
         number = float(value)
+    except OverflowError:
+        raise bad_input(source, field, value, "is too large", "give a finite number") from None
     except (TypeError, ValueError):
         raise bad_input(source, field, value, "is not a number", "give a finite number") from None
     if not math.isfinite(number):
@@ -46,9 +57,28 @@ def require_finite(source: str | Path, field: str, value: Any) -> float:
     return number
 
 
+def require_within(
+    source: str | Path, field: str, value: Any, low: float, high: float = math.inf, above: bool = False
+) -> float:
+    """Returns a finite number within [low, high], or within (low, high] where `above`; else raises `UserError`."""
+    number = require_finite(source, field, value)
+    if number < low or number > high or (above and number == low):
+        least = f"above {low:g}" if above else f"{low:g} or more"
+        raise bad_input(
+            source,
+            field,
+            value,
+            "is out of range",
+            f"give {least}" + (f", {high:g} at most" if high < math.inf else ""),
+        )
+    return number
+
+
 def require_file(path: str | Path, what: str) -> Path:
     """Returns `path` if it is a readable file, or raises `UserError` saying that `what` is missing there."""
     path = Path(path)
+    if "\0" in str(path) or len(str(path)) > LONGEST_PATH:
+        raise UserError(f"{what} = {str(path)[:60]!r}... is no path; give the path of a file.")
     if path.is_dir():
         raise UserError(f"{path}: {what} is a folder, not a file; give the path of the file itself.")
     if not path.is_file():

@@ -10,6 +10,38 @@ from typing import Any
 
 from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
 
+LONGEST_KEY = 200
+"""Characters of a key: a longer one is an accident, and no message could show it."""
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Contents of a TOML file in UTF-8, with or without a byte order mark.
+
+    Raises:
+      UserError: it is no text, or not TOML.
+    """
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: is not a text file in UTF-8; give a TOML file.") from None
+    except RecursionError:
+        raise UserError(f"{path}: is not valid TOML (nested too deeply); mend the file.") from None
+    except ValueError as error:  # tomllib.TOMLDecodeError, and numbers of thousands of digits
+        reason = str(error)
+        shown = reason if len(reason) <= 200 else f"{reason[:100]} ... {reason[-60:]}"
+        raise UserError(f"{path}: is not valid TOML ({shown}); mend that line.") from None
+    _short_keys(path, found)
+    return found
+
+
+def _short_keys(path: Path, value: Any) -> None:
+    for inner in value.values() if isinstance(value, dict) else value:
+        if isinstance(inner, dict | list):
+            _short_keys(path, inner)
+    for key in value if isinstance(value, dict) else ():
+        if len(key) > LONGEST_KEY:
+            raise bad_input(path, "a key", key[:40] + "...", f"has {len(key)} characters", "give a name of fewer")
+
 
 @dataclasses.dataclass(frozen=True)
 class Fields:
@@ -26,15 +58,7 @@ class Fields:
         Raises:
           UserError: the file is missing or is not TOML.
         """
-        require_file(path, what)
-        try:
-            return cls(path, tomllib.loads(path.read_text(encoding="utf-8")))
-        except UnicodeDecodeError:
-            raise UserError(f"{path}: is not a text file; give a TOML file.") from None
-        except RecursionError:
-            raise UserError(f"{path}: is not valid TOML (nested too deeply); mend the file.") from None
-        except ValueError as error:
-            raise UserError(f"{path}: is not valid TOML ({error}); mend that line.") from None
+        return cls(path, read_toml(require_file(path, what)))
 
     def field(self, key: str) -> str:
         """Full name of a key."""

@@ -16,8 +16,9 @@ PACKAGE = "lunar_mjx"
 FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(floor.split())
     for floor in (
-        "errors pytree spatial _quiet report",
-        "resources units toml_fields inference",
+        "errors",
+        "files pytree spatial trust _quiet",
+        "report resources units toml_fields inference",
         "rover terrain",
         "effects cameras",
         "model",
@@ -37,6 +38,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
 THIRD_PARTY: dict[str, frozenset[str]] = {
     "inference": frozenset({"numpy", "scipy", "jax"}),
     "errors": frozenset(),
+    "files": frozenset(),
     "effects": frozenset({"numpy", "jax", "jaxtyping"}),
     "rover": frozenset({"numpy", "scipy", "mujoco", "trimesh", "tomli_w"}),
 }

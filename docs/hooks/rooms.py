@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "lunar_mjx"
 PICTURE = ROOT / "docs" / "figures" / "rooms.svg"
 
-FOUNDATION = ("errors", "pytree", "spatial", "units", "resources", "toml_fields", "_quiet", "report")
+FOUNDATION = ("errors", "pytree", "spatial", "units", "resources", "toml_fields", "files", "trust", "_quiet", "report")
 """Small helpers that half of the house leans on: drawn as one slab, without arrows."""
 WORDS: Mapping[str, str] = {
     "agents": "DDPG, TD3, training",

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from lunar_mjx.files import replacing
+
 EPISODES = 20
 """Episodes in the moving mean of curves by episode."""
 
@@ -57,7 +59,8 @@ def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str =
     third.set(xlabel="wall time of training, s", ylabel="success on unseen ground, %", ylim=(-3, 103))
     third.axhline(95, color="0.7", lw=0.8, ls="--")
     first.legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=120)
+    with replacing(path) as part:
+        figure.savefig(part, dpi=120)
     return path
 
 
@@ -81,5 +84,6 @@ def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path,
             axes.fill_between(np.arange(1, count + 1), low, high, alpha=0.2)
     axes.set(xlabel="episode", ylabel=f"average return per episode (mean of {EPISODES})")
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=120)
+    with replacing(path) as part:
+        figure.savefig(part, dpi=120)
     return path

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from lunar_mjx._quiet import without_warp_notices
-from lunar_mjx.agents.networks import make_actor, make_critics
+from lunar_mjx.agents.networks import check_rates, make_actor, make_critics
 from lunar_mjx.agents.replay import Batch
 from lunar_mjx.agents.td3 import polyak
 from lunar_mjx.errors import bad_input
@@ -61,6 +61,7 @@ class DDPGConfig:
     def __post_init__(self) -> None:
         if self.n_step < 1:
             raise bad_input("DDPGConfig", "n_step", self.n_step, "is below 1", "give at least 1")
+        check_rates("DDPGConfig", self)
         if not self.value_range[0] < self.value_range[1]:
             raise bad_input("DDPGConfig", "value_range", self.value_range, "is empty", "give the least return first")
 

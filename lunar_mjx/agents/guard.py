@@ -12,6 +12,7 @@ import numpy as np
 
 from lunar_mjx.envs.core import Environment, State
 from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.files import replacing
 from lunar_mjx.pytree import pytree
 
 
@@ -78,7 +79,8 @@ def dump(guard: Guard, path: Path, envs_per_device: int) -> tuple[int, int]:
     number = device * envs_per_device + int(one.env[0])
     leaves = {jax.tree_util.keystr(p): a for p, a in jax.tree_util.tree_leaves_with_path(one.state)}
     note = json.dumps({"environment": number, "iteration": int(one.iteration[0])})
-    np.savez_compressed(path, note=np.array(note), action=one.action, **leaves)
+    with replacing(path) as part:
+        np.savez_compressed(part, note=np.array(note), action=one.action, **leaves)
     return number, int(one.iteration[0])
 
 

@@ -20,7 +20,7 @@ from lunar_mjx.agents.ddpg import DDPG, DDPGConfig
 from lunar_mjx.agents.replay import Batch, ReplayBuffer, ReplayState, Transition
 from lunar_mjx.agents.td3 import TD3, TD3Config
 from lunar_mjx.envs.core import Environment, State
-from lunar_mjx.errors import bad_input
+from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.pytree import pytree
 
 with without_warp_notices():
@@ -66,6 +66,8 @@ class TrainConfig:
         for name in ("envs", "batch", "updates", "buffer_steps", "epoch_steps"):
             if getattr(self, name) < 1:
                 raise bad_input("TrainConfig", name, getattr(self, name), "is below 1", "give at least 1")
+        for value in self.noise:
+            require_within("TrainConfig", "noise", value, 0.0)
         if self.precision not in ("highest", "high", "default"):
             raise bad_input("TrainConfig", "precision", self.precision, "does not exist", "use highest or default")
         if not 0.0 <= self.noise[0] <= self.noise[1]:

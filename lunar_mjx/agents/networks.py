@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from lunar_mjx._quiet import without_warp_notices
-from lunar_mjx.errors import bad_input
+from lunar_mjx.errors import bad_input, require_within
 
 with without_warp_notices():
     from brax.training import networks as brax_networks
@@ -34,6 +34,17 @@ def _mlp(sizes: Sequence[int], activation: str, layer_norm: bool) -> Any:
     return brax_networks.MLP(
         layer_sizes=tuple(sizes), activation=ACTIVATIONS[activation], kernel_init=_TORCH, layer_norm=layer_norm
     )
+
+
+def check_rates(source: str, config: Any) -> None:
+    """Raises `UserError` for learning rates, discount, target share or layers of a config that no learner can take."""
+    for name in ("actor_rate", "critic_rate", "actor_last_scale", "reward_scale"):
+        require_within(source, name, getattr(config, name), 0.0, above=True)
+    require_within(source, "gamma", config.gamma, 0.0, 1.0)
+    require_within(source, "tau", config.tau, 0.0, 1.0, above=True)
+    for name in ("actor_layers", "critic_layers"):
+        for width in getattr(config, name):
+            require_within(source, name, width, 1.0, 1e5)
 
 
 def make_actor(

@@ -16,7 +16,9 @@ from lunar_mjx.envs import NavigationEnv, make, make_agent, split_keys
 from lunar_mjx.envs.render import Camera, TopView
 from lunar_mjx.envs.scripted import AGENTS, Agent
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.files import replacing, write_text
 from lunar_mjx.resources import shipped
+from lunar_mjx.trust import require_trust
 
 VIEWS = ("auto", "camera", "top")
 _FRAMES = 300
@@ -60,6 +62,7 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     policy = load_policy(path)
     made_in = policy.environment
     arguments = {k: tuple(v) if isinstance(v, list) else v for k, v in made_in["options"].items()}
+    require_trust(path, "environment.name", made_in["name"])
     env = make(made_in["name"], **{**arguments, **options})
     if env.observation_size != policy.network["obs"] or env.action_size != policy.network["actions"]:
         raise bad_input(
@@ -123,20 +126,23 @@ class Episode:
             *(f"action_{n}" for n in self.env.actions.names),
         ]
         csv, picture, video = (folder / n for n in ("episode.csv", "path.png", "episode.webp"))
-        np.savetxt(csv, table, delimiter=",", header=",".join(names), comments="", fmt="%.6g")
-        Image.fromarray(still).save(picture)
+        with replacing(csv) as part:
+            np.savetxt(part, table, delimiter=",", header=",".join(names), comments="", fmt="%.6g")
+        with replacing(picture) as part:
+            Image.fromarray(still).save(part)
         stride = max(1, len(self.reward) // _FRAMES)
         images = [Image.fromarray(f) for f in frames]
-        images[0].save(
-            video,
-            save_all=True,
-            append_images=images[1:],
-            loop=0,
-            quality=75,
-            duration=max(20, round(1000 * stride * self.env.control_interval / 4)),
-        )
+        with replacing(video) as part:
+            images[0].save(
+                part,
+                save_all=True,
+                append_images=images[1:],
+                loop=0,
+                quality=75,
+                duration=max(20, round(1000 * stride * self.env.control_interval / 4)),
+            )
         note = {"end": self.end, "goal_m": self.goal.tolist(), "speed_up": 4}
-        (folder / "episode.json").write_text(json.dumps(note) + "\n", encoding="utf-8")
+        write_text(folder / "episode.json", json.dumps(note) + "\n")
         return [csv, picture, video]
 
     def _frames(self, view: str) -> tuple[list[np.ndarray], np.ndarray]:

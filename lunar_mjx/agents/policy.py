@@ -14,6 +14,7 @@ import numpy as np
 from lunar_mjx.agents.learner import Learner, normalised
 from lunar_mjx.agents.networks import make_actor
 from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.files import replacing
 
 FORMAT = "lunar-mjx-policy/1"
 
@@ -66,7 +67,8 @@ def save_policy(policy: Policy, path: Path) -> Path:
     if policy.mean is not None:
         leaves |= {"mean": np.asarray(policy.mean), "deviation": np.asarray(policy.deviation)}
     record = {"format": FORMAT, "network": policy.network, "environment": policy.environment, "notes": policy.notes}
-    np.savez_compressed(path, record=np.array(json.dumps(record)), **leaves)  # pyright: ignore[reportArgumentType]
+    with replacing(path) as part:
+        np.savez_compressed(part, record=np.array(json.dumps(record)), **leaves)  # pyright: ignore[reportArgumentType]
     return path
 
 

@@ -11,6 +11,8 @@ from typing import Any
 
 from rich.console import Console
 
+from lunar_mjx.files import appending, replacing
+
 
 class Record:
     """Rows of numbers, one per epoch, kept in `progress.csv` and `events` in a folder.
@@ -44,7 +46,10 @@ class Record:
         known = list(dict.fromkeys([*self._names, *row]))
         whole = known != self._names
         self._names = known
-        with self._path.open("w" if whole else "a", newline="", encoding="utf-8") as file:
+        with (
+            replacing(self._path) if whole else appending(self._path) as part,
+            part.open("w" if whole else "a", newline="", encoding="utf-8") as file,
+        ):
             writer = csv.DictWriter(file, self._names, restval="")
             if whole:
                 writer.writeheader()

@@ -19,6 +19,7 @@ from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.train import Result, RunConfig, plain, train
 from lunar_mjx.envs import NavigationEnv, make
 from lunar_mjx.envs.navigation.config import UNSEEN_SOIL
+from lunar_mjx.files import write_text
 
 
 def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
@@ -162,7 +163,7 @@ def run_training(
         "unseen": plain(scorer.scores),
         "final": plain(score.record()),
     }
-    (folder / "curve.json").write_text(json.dumps(record), encoding="utf-8")
+    write_text(folder / "curve.json", json.dumps(record))
     plot_progress([record], folder / "curve.png", name)
     if result.episodes["step"]:
         plot_episodes({name: [record]}, folder / "episodes.png")

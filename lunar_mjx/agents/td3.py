@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import optax
 
 from lunar_mjx._quiet import without_warp_notices
-from lunar_mjx.agents.networks import first_critic, make_actor, make_critics
+from lunar_mjx.agents.networks import check_rates, first_critic, make_actor, make_critics
 from lunar_mjx.agents.replay import Batch
-from lunar_mjx.errors import bad_input
+from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.pytree import pytree
 
 with without_warp_notices():
@@ -71,6 +71,9 @@ class TD3Config:
         for name in ("critics", "policy_delay", "n_step", "atoms"):
             if getattr(self, name) < 1:
                 raise bad_input("TD3Config", name, getattr(self, name), "is below 1", "give at least 1")
+        check_rates("TD3Config", self)
+        for name in ("weight_decay", "target_noise", "target_clip"):
+            require_within("TD3Config", name, getattr(self, name), 0.0)
         if self.atoms > 1 and not self.value_range[0] < self.value_range[1]:
             raise bad_input("TD3Config", "value_range", self.value_range, "is empty", "give the least return first")
 

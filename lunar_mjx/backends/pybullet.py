@@ -14,7 +14,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -32,6 +31,7 @@ from lunar_mjx.backends.physics.vectors import cross
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.model import Model
 from lunar_mjx.rover import Rover
+from lunar_mjx.toml_fields import read_toml
 
 CONTACTS = ("numpy", "engine")
 
@@ -180,7 +180,7 @@ def urdf_of(rover: Rover) -> Path:
     Raises:
       UserError: its folder holds none.
     """
-    description = tomllib.loads((rover.folder / "rover.toml").read_text(encoding="utf-8"))
+    description = read_toml(rover.folder / "rover.toml")
     path = rover.folder / description.get("source", f"{rover.name}.urdf")
     if not path.is_file():
         raise bad_input(

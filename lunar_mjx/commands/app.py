@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import sys
@@ -35,8 +36,13 @@ from lunar_mjx.commands.options import (
     select_device,
 )
 from lunar_mjx.errors import EXIT_STATUS, UserError, bad_input
+from lunar_mjx.files import replacing
+from lunar_mjx.trust import trusting
 
 INTERRUPTED = 130
+TRUST = "--trust"
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What a write says to a full disk, a spent quota and a file that may not grow."""
 
 
 class _Interrupted(BaseException):
@@ -44,6 +50,11 @@ class _Interrupted(BaseException):
 
 
 class _Commands(TyperGroup):
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if TRUST in args:  # understood behind the command, too
+            args = [TRUST, *(a for a in args if a != TRUST)]
+        return super().parse_args(ctx, args)
+
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
@@ -62,6 +73,16 @@ terrain_app = typer.Typer(help="Look at terrains and DEMs, and export them as me
 app.add_typer(terrain_app, name="terrain")
 effect_app = typer.Typer(help="List and explain the physical effects.", no_args_is_help=True)
 app.add_typer(effect_app, name="effect")
+
+
+@app.callback()
+def before_every_command(
+    ctx: typer.Context,
+    trust: Annotated[
+        bool, typer.Option(TRUST, help="Run Python code that a received model.toml, run folder or policy names.")
+    ] = False,
+) -> None:
+    ctx.with_resource(trusting(trust))
 
 
 @app.command()
@@ -148,7 +169,8 @@ def simulate(
     folder = make_folder(out)
     table = channels(system, seen, wanted)
     path = folder / "drive.csv"
-    table.to_csv(path, index=False, float_format="%.9g")
+    with replacing(path) as part:
+        table.to_csv(part, index=False, float_format="%.9g")
     save_model(built, folder / "model.toml")
     first, last = table.iloc[0], table.iloc[-1]  # on a slope the chassis leans away from where its wheels were put
     way = math.hypot(last.position_x_m - first.position_x_m, last.position_y_m - first.position_y_m)
@@ -253,7 +275,7 @@ def main() -> None:
     """Entry point of the command."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
-        status = app(prog_name="lunar-mjx", standalone_mode=False)
+        status = usage.strict(typer.main.get_command(app)).main(prog_name="lunar-mjx", standalone_mode=False)
     except usage.UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # Typer has printed the help
             sys.exit(EXIT_STATUS)
@@ -261,9 +283,11 @@ def main() -> None:
     except UserError as error:
         _fail(str(error), EXIT_STATUS)
     except OSError as error:  # unreadable, unwritable, disk full
-        if error.filename is None:
+        if error.filename is not None:
+            _fail(f"{error.filename}: {error.strerror or error}; check the path and its permissions.", EXIT_STATUS)
+        if error.errno not in NO_ROOM:
             raise
-        _fail(f"{error.filename}: {error.strerror or error}; check the path and its permissions.", EXIT_STATUS)
+        _fail(f"{error.strerror}; free some room where it writes, and run it again.", EXIT_STATUS)
     except (_Interrupted, KeyboardInterrupt):
         _fail("interrupted", INTERRUPTED)
     else:

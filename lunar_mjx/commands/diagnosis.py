@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lunar_mjx.commands.compiled import keep_compiled
+from lunar_mjx.commands.options import MOST_SEED
 from lunar_mjx.errors import UserError, bad_input
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ EffectsOption = Annotated[
 SplitOption = Annotated[
     list[str] | None, typer.Option("--split", help="Split of a log (or group of points), as NAME=fit|select|test.")
 ]
-SeedOption = Annotated[int, typer.Option(help="Seed of all random starts.")]
+SeedOption = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of all random starts.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 DiscrepancyOption = Annotated[

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from lunar_mjx.commands.options import MOST_SEED
+
 
 def register(app: typer.Typer) -> None:
     """Adds the command to the group `effect`."""
@@ -17,7 +19,7 @@ def effect_test(
     overhead: Annotated[
         bool, typer.Option(help="Measure the cost too (half the time that this command takes).")
     ] = True,
-    seed: Annotated[int, typer.Option(help="Of the random rovers.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of the random rovers.")] = 0,
 ) -> None:
     """Check an effect's contract: null value, derivatives, units, cost. Exit status 1 where it is broken."""
     from lunar_mjx.effect_contract.promises import check_effect

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lunar_mjx.commands.options import MOST_SEED
 from lunar_mjx.errors import UserError, bad_input
 
 BAD_DATA_STATUS = 10
@@ -230,7 +231,7 @@ def simulate(
     bias: Annotated[list[str] | None, typer.Option(help="Constant added to a channel, as gyro_z_rad_s=0.01.")] = None,
     forces: Annotated[bool, typer.Option(help="With force and torque sensors.")] = False,
     seconds: Annotated[float | None, typer.Option(help="Length of the drive; the manoeuvre's own if left out.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the noise; drawn if left out.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=MOST_SEED, help="Of the noise; drawn if left out.")] = None,
     split: Annotated[str | None, typer.Option(help="fit, select or test.")] = None,
     seal: Annotated[bool, typer.Option(help="Commit to the answer, so that it can be shown later.")] = False,
 ) -> None:

@@ -10,6 +10,8 @@ import typer
 
 from lunar_mjx.errors import bad_input
 
+MOST_SEED = 2**32 - 1
+"""Seeds are 32 bits wide: what JAX takes on every platform."""
 RoverOption = Annotated[str, typer.Option(help="Name of a shipped rover, or folder that `convert` wrote.")]
 TerrainOption = Annotated[str, typer.Option(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")]
 PresetOption = Annotated[str, typer.Option(help="consistent, field or paper.")]
@@ -76,7 +78,9 @@ def check_finite(**options: float) -> None:
 
 SpecArgument = Annotated[str, typer.Argument(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")]
 DemOption = Annotated[Path | None, typer.Option(help="DEM file that takes the place of the configuration's.")]
-SeedOption = Annotated[int | None, typer.Option(min=0, help="Seed that takes the place of the configuration's.")]
+SeedOption = Annotated[
+    int | None, typer.Option(min=0, max=MOST_SEED, help="Seed that takes the place of the configuration's.")
+]
 
 
 def open_terrain(spec: str, dem: Path | None, seed: int | None) -> Any:

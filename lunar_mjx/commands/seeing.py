@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from lunar_mjx.commands.compiled import keep_compiled
+from lunar_mjx.commands.options import MOST_SEED
 from lunar_mjx.errors import bad_input
 
 ModelOption = Annotated[Path | None, typer.Option(help="model.toml; overrides --rover, --terrain and --preset.")]
@@ -32,7 +33,7 @@ def preview(
     spec: Annotated[str, typer.Argument(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("terrain.png"),
     dem: Annotated[Path | None, typer.Option(help="DEM file that takes the place of the configuration's.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed instead of the configuration's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=MOST_SEED, help="Seed instead of the configuration's.")] = None,
 ) -> None:
     """Plot a terrain: shaded relief with rocks, and its slopes."""
     _check_file(out, (".png", ".svg", ".pdf"))

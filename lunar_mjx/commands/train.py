@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from lunar_mjx.errors import bad_input
+from lunar_mjx.commands.options import MOST_SEED
+from lunar_mjx.errors import bad_input, require_within
+from lunar_mjx.files import write_text
 
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 SetOption = Annotated[list[str] | None, typer.Option("--set", help="name=value: a field of the training's settings.")]
@@ -45,7 +48,7 @@ def train(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to resume from.")] = Path(
         "runs/train"
     ),
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; the training's own if left out.")] = None,
     time_limit: Annotated[float | None, typer.Option(help="s after which it saves and stops, to be resumed.")] = None,
     target: Annotated[float | None, typer.Option(help="Success rate on unseen ground at which it stops.")] = None,
@@ -63,11 +66,16 @@ def train(
     device: DeviceOption = "auto",
 ) -> None:
     """Train a policy; resumes from the folder's newest checkpoint."""
-    from lunar_mjx.commands.options import check_finite, check_folder, make_folder, select_device
+    from lunar_mjx.commands.options import check_folder, make_folder, select_device
 
     check_folder(out)
-    limits = {"time_limit": time_limit, "target": target, "eval_every": eval_every}
-    check_finite(**{k: v for k, v in limits.items() if v is not None})
+    require_within("train", "--eval-every", eval_every, 0.0)
+    if math.isnan(checkpoint_every) or checkpoint_every < 0.0:
+        raise bad_input("train", "--checkpoint-every", checkpoint_every, "is no time", "give s, or inf for none")
+    if time_limit is not None:
+        require_within("train", "--time-limit", time_limit, 0.0, above=True)
+    if target is not None:
+        require_within("train", "--target", target, 0.0, 1.0)
     select_device(device)
     import dataclasses
 
@@ -107,7 +115,7 @@ def evaluate(
     agent: AgentArgument = "luvmi_x",
     agent_option: AgentOption = None,
     episodes: Annotated[int, typer.Option(min=1)] = 256,
-    seed: Annotated[int, typer.Option(min=0)] = 54321,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 54321,
     task: TaskOption = "large",
     terrain: Annotated[str | None, typer.Option(help="Terrain; the policy's unseen one if left out.")] = None,
     seen: Annotated[bool, typer.Option(help="On the ground and soil of the training instead.")] = False,
@@ -136,9 +144,7 @@ def evaluate(
     print(", ".join(f"{name} {100 * share:.1f} %" for name, share in score.ends.items()))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(
-            json.dumps({"agent": agent_option or agent, **score.record()}, indent=1) + "\n", encoding="utf-8"
-        )
+        write_text(out, json.dumps({"agent": agent_option or agent, **score.record()}, indent=1) + "\n")
         print(out)
 
 
@@ -146,7 +152,7 @@ def play(
     agent: AgentArgument = "luvmi_x",
     agent_option: AgentOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("runs/play"),
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 0,
     task: TaskOption = "large",
     terrain: Annotated[str | None, typer.Option(help="Terrain; the policy's unseen one if left out.")] = None,
     view: Annotated[str, typer.Option(help="camera (needs OpenGL), top, or auto: camera where it works.")] = "auto",

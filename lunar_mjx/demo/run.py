@@ -24,6 +24,7 @@ from lunar_mjx.demo.sections import (
 )
 from lunar_mjx.demo.wheel import Case, wheel_cases
 from lunar_mjx.errors import UserError
+from lunar_mjx.files import write_text
 from lunar_mjx.model import DEFAULT_TERRAIN
 from lunar_mjx.report.page import write_page
 from lunar_mjx.report.progress import Reporter, console_progress
@@ -96,7 +97,7 @@ def _write(out: Path, drives: Sequence[Drive], cases: Sequence[Case], terrain: A
         "versions": versions(),
         "seconds_wall_clock": round(time.monotonic() - begun, 1),
     }
-    (out / "summary.json").write_text(json.dumps(numbers, indent=1, allow_nan=False), encoding="utf-8")
+    write_text(out / "summary.json", json.dumps(numbers, indent=1, allow_nan=False))
     return page
 
 

@@ -7,13 +7,13 @@ from typing import Any
 
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.runs import Run
-from lunar_mjx.diagnosis.tables.problem import TableProblem
+from lunar_mjx.diagnosis.tables.problem import TableProblem, default_units, points
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.problem import Problem
-from lunar_mjx.logs import SteadyLog
+from lunar_mjx.logs import Log, SteadyLog
 from lunar_mjx.wheel_bed.bed import EARTH_GRAVITY, WheelBed
 
 NO_CANDIDATE = frozenset(
@@ -47,6 +47,20 @@ def candidate_effects(run: Run) -> dict[str, Effect]:
         effect = catalogue.get(spec)
         found[effect.name] = effect
     return found
+
+
+def require_splits(splits: Mapping[str, str], logs: Sequence[Any]) -> None:
+    """Raises `UserError` for a split of a log, or group of points, that is not there."""
+    if not splits:
+        return
+    names = [log.name for log in logs if isinstance(log, Log)]
+    names += [n for log in logs if not isinstance(log, Log) for n in default_units(points(log)[0])[1]]
+    for name, split in splits.items():
+        if name not in names:
+            known = ", ".join(dict.fromkeys(names))
+            raise bad_input(
+                "compare", "--split", f"{name}={split}", "names nothing of these logs", f"use one of {known}"
+            )
 
 
 def build_problem(

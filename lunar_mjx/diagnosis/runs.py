@@ -15,10 +15,12 @@ import numpy as np
 
 from lunar_mjx import __version__
 from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.files import write_text
 from lunar_mjx.logs import Finding, Log, SteadyLog, check, read_campaign
 from lunar_mjx.logs.readers.folder import without_answers
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model, save_model
+from lunar_mjx.trust import require_trust
 
 FORMAT = "lunar-mjx-run/1"
 RUN_FILE, MODEL_FILE, FITS_FILE = "run.json", "model.toml", "fits.json"
@@ -137,6 +139,8 @@ def load_run(folder: str | Path) -> Run:
             raise bad_input(path, "logs", str(log), "is missing", "put the log back, or compare anew")
         if folder_hash(log) != hashes.get(str(log)):
             raise bad_input(path, "logs", str(log), "has changed since the comparison", "compare anew")
+    for candidate in data["candidates"]:
+        require_trust(path, "candidates", candidate)
     model = load_model(folder / MODEL_FILE)
     return Run(
         folder,
@@ -180,9 +184,7 @@ def folder_hash(path: Path) -> str:
 def save_json(path: Path, content: Any) -> None:
     """Writes JSON without NaN (null instead), whole or not at all."""
     text = json.dumps(plain(content), indent=1, allow_nan=False)
-    part = path.with_suffix(path.suffix + ".part")
-    part.write_text(text + "\n", encoding="utf-8")
-    part.replace(path)
+    write_text(path, text + "\n")
 
 
 def plain(value: Any) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.diagnosis.attribute import diagnose, parameters
-from lunar_mjx.diagnosis.build_problem import build_problem
+from lunar_mjx.diagnosis.build_problem import build_problem, require_splits
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.fitted_model import fitted_model
 from lunar_mjx.diagnosis.refit import Settings
@@ -29,6 +29,7 @@ from lunar_mjx.diagnosis.search import Search, fit_baseline
 from lunar_mjx.diagnosis.tables.loop import better_law, compare_tables, diagnose_tables, grown_model
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
+from lunar_mjx.files import replacing
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.fit_store import Memory
 from lunar_mjx.inference.fitting import Fit, Progress, silent
@@ -91,6 +92,7 @@ def compare(
 
 def _compare(run: Run, progress: Progress) -> Run:
     campaign = gate(run)
+    require_splits(run.splits, campaign)
     run.write()
     if isinstance(campaign[0], SteadyLog):
         tables, refit = compare_tables(run, campaign, progress)
@@ -233,11 +235,12 @@ def _record_opening(
 def _save_signatures(run: Run, found: Search) -> None:
     """Projected signatures over the fitted observations, each at its best linear amount, in sigma."""
     scored = [s for s in found.scores if s.signature.size]
-    np.savez_compressed(
-        run.folder / SIGNATURES_FILE,
-        names=np.array([s.effect for s in scored], str),
-        signatures=np.array([s.signature @ s.amount for s in scored], np.float32),
-    )
+    with replacing(run.folder / SIGNATURES_FILE) as part:
+        np.savez_compressed(
+            part,
+            names=np.array([s.effect for s in scored], str),
+            signatures=np.array([s.signature @ s.amount for s in scored], np.float32),
+        )
 
 
 def _save_series(run: Run, problem: Problem, start: np.ndarray, fits: Mapping[str, Fit]) -> None:
@@ -257,23 +260,24 @@ def _save_series(run: Run, problem: Problem, start: np.ndarray, fits: Mapping[st
     time = np.concatenate(
         [np.full(s.stop - s.start, np.nan) if s.time is None else s.time for s in observations.series]
     )
-    np.savez_compressed(
-        run.folder / SERIES_FILE,
-        measured=observations.value,
-        sigma=observations.sigma(),
-        time=time,
-        place=place,
-        unit=observations.unit,
-        unit_names=np.array(observations.unit_names),
-        split=np.array(observations.unit_split),
-        series_start=np.array([s.start for s in observations.series]),
-        series_channel=np.array([s.channel for s in observations.series]),
-        series_log=np.array([s.log for s in observations.series]),
-        logs=np.array(observations.logs),
-        labels=np.array(["as given", *fits]),
-        predicted=predicted,
-        residual=np.vstack([start, *(f.residual for f in fits.values())]),
-    )
+    with replacing(run.folder / SERIES_FILE) as part:
+        np.savez_compressed(
+            part,
+            measured=observations.value,
+            sigma=observations.sigma(),
+            time=time,
+            place=place,
+            unit=observations.unit,
+            unit_names=np.array(observations.unit_names),
+            split=np.array(observations.unit_split),
+            series_start=np.array([s.start for s in observations.series]),
+            series_channel=np.array([s.channel for s in observations.series]),
+            series_log=np.array([s.log for s in observations.series]),
+            logs=np.array(observations.logs),
+            labels=np.array(["as given", *fits]),
+            predicted=predicted,
+            residual=np.vstack([start, *(f.residual for f in fits.values())]),
+        )
 
 
 def why(

@@ -29,6 +29,7 @@ from lunar_mjx.effects.wheel import (
 )
 from lunar_mjx.effects.wheel import closed_form as wheel
 from lunar_mjx.errors import UserError, require_file
+from lunar_mjx.trust import vouch
 
 
 def _by_name(effects: Iterable[Effect]) -> dict[str, Effect]:
@@ -127,6 +128,7 @@ def get(name: str) -> Effect:
       UserError: no such effect; the sentence lists the known ones.
     """
     if ".py" in name:
+        vouch(name)
         file, _, member = name.partition(":")
         found = load_file(file)
         if not member:

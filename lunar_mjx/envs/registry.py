@@ -10,6 +10,7 @@ from typing import Any
 
 from lunar_mjx.envs.core import Environment
 from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.trust import vouch
 
 
 def _navigation(**options: Any) -> Environment:
@@ -84,6 +85,7 @@ def make(name: str, /, **options: Any) -> Environment:
     Raises:
       UserError: no such name, file or maker, options that it does not take, or an object that is no environment.
     """
+    vouch(name)
     maker = _from_file(name) if ".py" in name else _by_name(name)
     try:
         env = maker(**options)

@@ -15,6 +15,7 @@ import tomli_w
 
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.files import write_text
 from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.readers.folder import ANSWER, LOG_FILE, read_log
 from lunar_mjx.toml_fields import Fields
@@ -63,7 +64,7 @@ def answer_path(out: Path) -> Path:
 
 def write_answer(answer: Answer, path: Path) -> None:
     """Writes an answer; `read_answer` gives the same one back."""
-    path.write_text(tomli_w.dumps({"format": FORMAT, **dataclasses.asdict(answer)}), encoding="utf-8")
+    write_text(path, tomli_w.dumps({"format": FORMAT, **dataclasses.asdict(answer)}))
 
 
 def read_answer(path: str | Path) -> Answer:

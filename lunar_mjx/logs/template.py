@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from lunar_mjx.errors import bad_input
+from lunar_mjx.files import write_text
 from lunar_mjx.logs.recorder.instruments import RATES, Recording
 from lunar_mjx.logs.schema import FORMAT
 from lunar_mjx.logs.write import new_folder
@@ -128,9 +129,8 @@ def new_log(folder: str | Path, rover: str = "viper", manoeuvre: str = "speed_st
     tables = noise = ""
     for name, channels in columns.items():
         tables += f'[tables.{name}]\nfile = "{name}.csv"\nrate_hz = {RATES[name]:g}.0\n\n'
-        pd.DataFrame({"time_s": np.zeros(0)} | {c: np.zeros(0) for c in channels}).to_csv(
-            folder / f"{name}.csv", index=False
-        )
+        empty = pd.DataFrame({"time_s": np.zeros(0)} | {c: np.zeros(0) for c in channels})
+        _write(folder / f"{name}.csv", empty.to_csv(index=False))
     for instrument in Recording().instruments:
         if instrument.std and any(instrument.table == n for n in columns):
             noise += f'[noise."{instrument.pattern}"]        # {instrument.source}\n'
@@ -175,4 +175,4 @@ def _columns(rover: str, manoeuvre: str) -> tuple[dict[str, list[str]], dict[str
 
 
 def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    write_text(path, text)

@@ -12,6 +12,7 @@ import pandas as pd
 import tomli_w
 
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.files import replacing, write_text
 from lunar_mjx.logs.log import Noise
 from lunar_mjx.logs.readers.folder import LOG_FILE, TOP, read_log
 from lunar_mjx.logs.schema import FORMAT, parse_column
@@ -71,7 +72,7 @@ def write_log(
             entries[name] |= {"clock_offset_s": float(offset), "clock_offset_std_s": float(std)}
     top["tables"] = entries
     top["noise"] = noise_tables(noise or {})
-    (folder / LOG_FILE).write_text(tomli_w.dumps(top), encoding="utf-8")
+    write_text(folder / LOG_FILE, tomli_w.dumps(top))
     read_log(folder)
     return folder
 
@@ -104,7 +105,7 @@ def write_steady_log(
     top |= {"wheel": {k: _plain(v) for k, v in wheel.items()}, "noise": noise_tables(noise or {})}
     new_folder(folder)
     write_frame(frame, folder / "points.csv")
-    (folder / LOG_FILE).write_text(tomli_w.dumps(top), encoding="utf-8")
+    write_text(folder / LOG_FILE, tomli_w.dumps(top))
     read_log(folder)
     return folder
 
@@ -141,9 +142,11 @@ def write_frame(frame: pd.DataFrame, path: Path) -> None:
     if path.suffix == ".parquet":
         if importlib.util.find_spec("pyarrow") is None:
             raise UserError(f"{path}: Parquet needs the package pyarrow; install lunar-mjx[parquet] or write CSV.")
-        frame.to_parquet(path, index=False, engine="pyarrow")
+        with replacing(path) as part:
+            frame.to_parquet(part, index=False, engine="pyarrow")
         return
-    frame.to_csv(path, index=False, float_format="%.9g")
+    with replacing(path) as part:
+        frame.to_csv(part, index=False, float_format="%.9g")
 
 
 def _check_frame(name: str, frame: pd.DataFrame) -> None:

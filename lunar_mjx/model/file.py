@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,6 +13,7 @@ from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect, Parameter
 from lunar_mjx.effects.presets import PRESETS
 from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+from lunar_mjx.files import write_text
 from lunar_mjx.model.ambient import SYNODIC_DAY
 from lunar_mjx.model.model import (
     GAINS,
@@ -28,6 +28,8 @@ from lunar_mjx.model.model import (
 from lunar_mjx.resources import shipped
 from lunar_mjx.rover import load_rover
 from lunar_mjx.terrain import load_terrain
+from lunar_mjx.toml_fields import read_toml
+from lunar_mjx.trust import require_trust
 from lunar_mjx.units import to_unit
 
 FORMAT = "lunar-mjx-model/1"
@@ -60,7 +62,7 @@ def load_model(path: str | Path) -> Model:
       UserError: one sentence naming the file, the field, the value and the remedy.
     """
     path = require_file(path, "the model file")
-    data = _read(path)
+    data = read_toml(path)
     _known(path, "", data, _TOP)
     if data.get("format") != FORMAT:
         raise bad_input(path, "format", data.get("format"), "is not known", f'write format = "{FORMAT}"')
@@ -105,11 +107,7 @@ def save_model(model: Model, path: str | Path) -> Path:
     """
     path = Path(path)
     text = tomli_w.dumps(_record(model, path))
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}); name a file in a folder that exists.") from None
-    return path
+    return write_text(path, text)
 
 
 def _record(model: Model, path: Path) -> dict[str, Any]:
@@ -224,6 +222,7 @@ def _list_effects(path: Path, names: Any, model: Model) -> Model:
     parameters, effects, files = {}, [], {}
     for name in names:
         near = _near_effect(path, name)
+        require_trust(path, "effect_list", near)
         effect = _named(path, "effect_list", name, catalogue.get, near)
         if effect.name in parameters:
             raise bad_input(path, "effect_list", effect.name, "stands there twice", "name every effect once")
@@ -293,17 +292,6 @@ def _ambient(path: Path, table: Mapping[str, Any], default: tuple[float, ...]) -
         _number(path, "ambient.noon_time_s", table.get("noon_time_s", 0.0)),
         _number(path, "ambient.period_s", table.get("period_s", SYNODIC_DAY)),
     )
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except UnicodeDecodeError:
-        raise UserError(f"{path}: is not a text file; give a model.toml.") from None
-    except RecursionError:
-        raise UserError(f"{path}: is not valid TOML (nested too deeply); mend the file.") from None
-    except ValueError as error:  # tomllib.TOMLDecodeError, and numbers of thousands of digits
-        raise UserError(f"{path}: is not valid TOML ({error}); mend that line.") from None
 
 
 def _named(path: Path, field: str, value: str, load: Callable[[str], T], spec: str) -> T:

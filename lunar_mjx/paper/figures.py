@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from lunar_mjx.effects.presets import UNSAID
 from lunar_mjx.errors import UserError
+from lunar_mjx.files import replacing, write_text
 from lunar_mjx.paper import hot_motor, slope_runs, soft_ground
 
 # Okabe and Ito's colours, told apart by colour-blind eyes; line styles tell them apart in grey.
@@ -36,8 +37,9 @@ def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()
         figure.set_layout_engine("constrained")
         FigureCanvasAgg(figure)
         image, data = out / f"{_FILES[name]}.png", out / f"{_FILES[name]}.json"
-        figure.savefig(image, dpi=120)
-        data.write_text(json.dumps(numbers, indent=1))
+        with replacing(image) as part:
+            figure.savefig(part, dpi=120)
+        write_text(data, json.dumps(numbers, indent=1))
         written += [image, data]
     return written
 

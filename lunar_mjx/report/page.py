@@ -13,6 +13,7 @@ import jinja2
 import plotly.graph_objects as go
 import plotly.offline
 
+from lunar_mjx.files import write_text
 from lunar_mjx.report.style import DARK
 
 
@@ -149,8 +150,7 @@ def write_page(
         plotly=_script(),
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(html, encoding="utf-8")
-    return path
+    return write_text(path, html)
 
 
 def _block(block: Block, figures: list[str]) -> dict[str, Any]:

@@ -16,11 +16,12 @@ import tomli_w
 from scipy.spatial import ConvexHull, QhullError
 
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.files import replacing
 from lunar_mjx.rover.couplings import place_couplings
 from lunar_mjx.rover.description import GROUPS, Description, read_description
 from lunar_mjx.rover.load import FORMAT, MARKER, load_rover
 from lunar_mjx.rover.loops import PlacedLoop, place_loops
-from lunar_mjx.rover.mjcf import build_spec, ties, to_xml, write_scene
+from lunar_mjx.rover.mjcf import build_spec, scene_of, ties, to_xml
 from lunar_mjx.rover.roles import Roles, assign_roles, without_followers
 from lunar_mjx.rover.rover import DriveGroup, Rover
 from lunar_mjx.rover.statics import gains, level_springs
@@ -68,15 +69,18 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
     _assert_nothing_lost(source, roles, loops, ties(driven) + len(couplings), mujoco.MjModel.from_xml_string(xml))
     record = _record(source, name, roles, loops, told, model, height, height_notes, driven)
     out = Path(out)
+    title = f"# Written by `lunar-mjx convert` from {source.path.name}; edit that and convert again.\n"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / f"{name}.xml").write_text(xml, encoding="utf-8")
-        write_scene(out / "scene.xml", name)
-        (out / MARKER).write_text(
-            f"# Written by `lunar-mjx convert` from {source.path.name}; edit that and convert again.\n"
-            + _compact(tomli_w.dumps(record)),
-            encoding="utf-8",
-        )
+        # all or none: a description beside the MJCF of another rover would be a third one
+        with (
+            replacing(out / f"{name}.xml") as model_part,
+            replacing(out / "scene.xml") as scene_part,
+            replacing(out / MARKER) as record_part,
+        ):
+            model_part.write_text(xml, encoding="utf-8")
+            scene_part.write_text(scene_of(name), encoding="utf-8")
+            record_part.write_text(title + _compact(tomli_w.dumps(record)), encoding="utf-8")
     except OSError as error:
         raise UserError(f"{out}: cannot be written ({error.strerror}); give another output folder.") from None
     return load_rover(out.resolve())

@@ -7,13 +7,13 @@ Every key is optional; an unknown key is an error.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+from lunar_mjx import toml_fields
+from lunar_mjx.errors import bad_input, require_file, require_finite
 
 GROUPS = ("drive", "steer", "suspension")
 MODES = ("position", "velocity", "torque", "current")
@@ -129,11 +129,7 @@ _TOP = {
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """Reads a TOML file, or raises `UserError`."""
-    path = require_file(path, what)
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: {what} is not valid TOML ({error}); mend the file at that place.") from None
+    return toml_fields.read_toml(require_file(path, what))
 
 
 def read_description(path: str | Path) -> Description:

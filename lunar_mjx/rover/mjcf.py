@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -222,10 +221,9 @@ def _put(element: ET.Element, key: str, values: np.ndarray, default: np.ndarray)
         element.set(key, digits(values))
 
 
-def write_scene(path: Path, rover: str) -> None:
-    """Writes a scene to look at the rover in MuJoCo's viewer: a plane, a low sun, contacts on."""
-    path.write_text(
-        f"""<mujoco model="{rover} scene">
+def scene_of(rover: str) -> str:
+    """MJCF of a scene to look at the rover in MuJoCo's viewer: a plane, a low sun, contacts on."""
+    return f"""<mujoco model="{rover} scene">
   <include file="{rover}.xml"/>
 
   <!-- The rover's file is made for the library, which computes contact itself; here MuJoCo does. -->
@@ -252,6 +250,4 @@ def write_scene(path: Path, rover: str) -> None:
     <geom name="ground" type="plane" size="0 0 0.05" material="regolith" contype="1" conaffinity="0"/>
   </worldbody>
 </mujoco>
-""",
-        encoding="utf-8",
-    )
+"""

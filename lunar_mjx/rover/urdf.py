@@ -120,7 +120,7 @@ def read_urdf(path: str | Path) -> Urdf:
     path = require_file(path, "the URDF")
     try:
         robot = ET.parse(path).getroot()
-    except (ET.ParseError, UnicodeDecodeError) as error:
+    except (ET.ParseError, ValueError, LookupError, RecursionError) as error:  # LookupError: of the encoding
         raise UserError(f"{path}: the URDF is not well-formed XML ({error}); mend the file at that place.") from None
     if robot.tag != "robot":
         raise bad_input(path, "root element", robot.tag, "is not <robot>", "give a URDF (expand xacro files first)")
@@ -147,6 +147,10 @@ def read_urdf(path: str | Path) -> Urdf:
     return Urdf(path, robot.get("name", path.stem), by_name, tuple(joints), root, tuple(reader.notes))
 
 
+LONGEST_NAME = 200
+"""Characters of a link's or joint's name, which becomes part of channel names."""
+
+
 class _Reader:
     """Reads elements of one file; holds the path for messages and collects the notes."""
 
@@ -171,6 +175,9 @@ class _Reader:
         name = element.get("name", "").strip()
         if not name:
             raise bad_input(self.path, f"{what} name", "", "is missing", f"name every {what}")
+        if not name.isprintable() or len(name) > LONGEST_NAME:
+            remedy = f"give at most {LONGEST_NAME} characters of one line"
+            raise bad_input(self.path, f"{what} name", name, "is no name", remedy)
         return name
 
     def pose(self, element: ET.Element, where: str) -> Pose:

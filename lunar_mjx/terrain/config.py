@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 import types
 import typing
 from pathlib import Path
 from typing import Any
 
-from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
 from lunar_mjx.terrain.craters import Craters
 from lunar_mjx.terrain.readers.options import Window
 from lunar_mjx.terrain.rock_field import RockField
 from lunar_mjx.terrain.roughness import Roughness
+from lunar_mjx.toml_fields import read_toml
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,13 +92,7 @@ def read_config(path: Path) -> TerrainConfig:
     Raises:
       UserError: the file is missing, is not TOML, or holds an unknown key, a wrong type or a value out of bounds.
     """
-    require_file(path, "the terrain's configuration")
-    try:
-        with path.open("rb") as file:
-            table = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: the file is not valid TOML ({error}); repair it.") from None
-    return parse_config(table, str(path))
+    return parse_config(read_toml(require_file(path, "the terrain's configuration")), str(path))
 
 
 def parse_config(table: dict[str, Any], source: str) -> TerrainConfig:
@@ -139,7 +133,7 @@ def _convert(hint: Any, value: Any, source: str, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return _build(hint, value, source, where)  # pyright: ignore[reportArgumentType]
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        value = require_finite(source, where, value)
     kinds = {float: "a number", int: "a whole number", str: "a text in quotes", bool: "true or false"}
     if type(value) is not hint:
         raise bad_input(source, where, value, f"is not {kinds[hint]}", f"give {kinds[hint]}")

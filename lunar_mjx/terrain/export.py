@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.files import replacing
 from lunar_mjx.terrain.terrain import Terrain
 
 SUFFIXES = (".stl", ".obj", ".ply")
@@ -88,5 +89,7 @@ def export_mesh(terrain: Terrain, path: str | Path, **options: bool | float) -> 
         raise bad_input(path, "suffix", path.suffix, "is not a mesh format", f"use one of {', '.join(SUFFIXES)}")
     if not path.parent.is_dir():
         raise UserError(f"{path}: the folder is not there; make it first.")
-    to_mesh(terrain, **options).export(path)  # pyright: ignore[reportArgumentType]
+    with replacing(path) as part:
+        data = to_mesh(terrain, **options).export(file_type=path.suffix[1:].lower())  # pyright: ignore[reportArgumentType]
+        part.write_bytes(data.encode() if isinstance(data, str) else data)
     return path

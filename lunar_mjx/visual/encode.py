@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from lunar_mjx.errors import UserError
+from lunar_mjx.files import replacing
 
 QUALITY = "20"
 """Constant rate factor of H.264: 18 is visually lossless, 23 the encoder's own default."""
@@ -32,13 +33,17 @@ def writer(path: Path, fps: int) -> Iterator[Sink]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".mp4":
-        yield from _mp4(path, fps)
+        with replacing(path) as part:
+            yield from _mp4(part, fps)
         return
     pictures: list[Image.Image] = []
     yield lambda picture: pictures.append(Image.fromarray(picture))
     if pictures:
         options: dict[str, Any] = {"quality": 80} if path.suffix.lower() == ".webp" else {}
-        pictures[0].save(path, save_all=True, append_images=pictures[1:], loop=0, duration=round(1000 / fps), **options)
+        with replacing(path) as part:
+            pictures[0].save(
+                part, save_all=True, append_images=pictures[1:], loop=0, duration=round(1000 / fps), **options
+            )
 
 
 def require_encoder(path: Path) -> Any:

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 
 from lunar_mjx.dynamics.signals import joint_channels
+from lunar_mjx.files import replacing
 from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, RULE, VERMILION
 from lunar_mjx.terrain import Terrain, surface
 from lunar_mjx.visual.recorded import RecordedDrive
@@ -61,7 +62,8 @@ def save(figure: Figure, path: Path) -> Path:
     """Writes a figure as PNG, SVG or PDF."""
     FigureCanvasAgg(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
+    with replacing(path) as part:
+        figure.savefig(part, dpi=120)
     return path
 
 

@@ -164,8 +164,13 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {"model.toml": toml("[effects.soil]", "n = -1.0")},
         ["model.toml: effects.soil.n = -1", "outside [0.1, 3]"],
     ),
-    "model with a broken effect file": (
+    "model with a received effect file": (
         MODEL,
+        {"model.toml": toml('effect_list = ["motor", "mine.py"]'), "mine.py": "raise SystemExit\n"},
+        ["model.toml: effect_list = ", "mine.py' is Python code that would run", "add --trust"],
+    ),
+    "model with a broken effect file": (
+        [*MODEL, "--trust"],
         {"model.toml": toml('effect_list = ["motor", "mine.py"]'), "mine.py": "x = (\n"},
         ["model.toml: effect_list = 'mine.py'", "does not run", "SyntaxError"],
     ),
@@ -197,6 +202,23 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
     "demo on an unknown device": (["demo", "--device", "tpu", "--out", "OUT"], {}, ["--device = 'tpu'"]),
     "port that is no number": (["view", "--port", "abc"], {}, ["view: --port = 'abc' is not a whole number"]),
     "duration that is no number": ([*LUVMI, "--duration=long"], {}, ["--duration = 'long' is not a number"]),
+    "duration with an underscore": ([*LUVMI, "--duration=1_0"], {}, ["--duration = '1_0' is not a number"]),
+    "seed of twenty digits": (
+        ["terrain", "info", "lunar_plain", "--seed", "9" * 20],
+        {},
+        ["--seed = '99999999999999999999' is above 4294967295"],
+    ),
+    "checkpoints never told": (["train", "point", "--checkpoint-every", "nan", "--out", "OUT"], {}, ["is no time"]),
+    "time limit below zero": (["train", "point", "--time-limit", "-5", "--out", "OUT"], {}, ["give above 0"]),
+    "target beyond one": (["train", "point", "--target", "2", "--out", "OUT"], {}, ["--target = 2.0 is out of range"]),
+    "evaluations nowhen": (["train", "point", "--eval-every", "nan", "--out", "OUT"], {}, ["--eval-every = nan"]),
+    "learning rate below zero": (
+        ["train", "point", "--set", "actor_rate=-1", "--out", "OUT"],
+        {},
+        ["actor_rate = -1.0 is out of range; give above 0"],
+    ),
+    "discount beyond one": (["train", "point", "--set", "gamma=1.5", "--out", "OUT"], {}, ["gamma = 1.5", "1 at most"]),
+    "layers without width": (["train", "point", "--set", "actor_layers=0", "--out", "OUT"], {}, ["actor_layers = 0"]),
     "pictures beyond the range": (["render", "OUT", "--fps", "99"], {}, ["render: --fps = '99' is above 60"]),
     "seed below the range": (["terrain", "info", "flat", "--seed", "-1"], {}, ["--seed = '-1' is below 0"]),
     "option without its value": (["figures", "--only"], {}, ["--only", "requires an argument", "--help"]),

@@ -21,6 +21,7 @@ from lunar_mjx.model.file import FORMAT, load_model, save_model
 from lunar_mjx.resources import shipped
 from lunar_mjx.rover import convert
 from lunar_mjx.terrain import flat
+from lunar_mjx.trust import trusting
 
 MY_EFFECT = """
 from lunar_mjx.effects import Parameter, effect
@@ -123,7 +124,8 @@ def test_own_files_beside_the_model_travel_with_it(tmp_path: Path, monkeypatch: 
     assert written["effect_list"][-1] == "./mine.py:my_friction"
     home.rename(away)
     monkeypatch.chdir(tmp_path)
-    moved = load_model(away / "model.toml")
+    with trusting():  # the file has come from elsewhere
+        moved = load_model(away / "model.toml")
     assert moved.rover.mjcf.resolve() == (away / "rover" / "luvmi_x.xml").resolve()
     assert moved.terrain_spec == str(away / "ground")
     elsewhere = tmp_path / "elsewhere"
@@ -324,7 +326,7 @@ def test_mistake(mistake: str, tmp_path: Path) -> None:
 
 
 def assert_refused(path: Path, words: list[str]) -> None:
-    with pytest.raises(UserError) as caught:
+    with trusting(), pytest.raises(UserError) as caught:
         load_model(path)
     text = str(caught.value)
     assert text.startswith(f"{path}: ") and text.endswith(".") and ";" in text and "\n" not in text, text

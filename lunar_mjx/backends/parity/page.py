@@ -13,6 +13,7 @@ from lunar_mjx.backends.parity.cases import ABSOLUTE, DRIVE_EXCEPTIONS, EXCEPTIO
 from lunar_mjx.backends.parity.compare import first_failure, traces
 from lunar_mjx.backends.parity.record import COMPLIANCE, RUNS_DOUBLE, RUNS_SINGLE, SPREAD
 from lunar_mjx.backends.parity.study import Pair, Study
+from lunar_mjx.files import write_text
 from lunar_mjx.report import Figure, Section, Table, Text, write_page
 from lunar_mjx.report.style import INK, SERIES, VERMILION, finish
 
@@ -54,7 +55,7 @@ def write_parity_page(path: Path, studies: Sequence[Study], note: str = "") -> P
         for p in s.pairs
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.with_suffix(".json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    write_text(path.with_suffix(".json"), json.dumps(numbers, indent=1) + "\n")
     return write_page(path, "Parity of the engines", sentences, sections)
 
 

@@ -23,6 +23,7 @@ from lunar_mjx.diagnosis.search import fit_baseline
 from lunar_mjx.diagnosis.tables.problem import TableProblem
 from lunar_mjx.effects.base import PORTS
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.files import write_text
 from lunar_mjx.inference.fit_store import Memory
 from lunar_mjx.inference.fitting import Fit, Progress, silent
 from lunar_mjx.inference.held_out import errors, gain, noise_test
@@ -210,7 +211,7 @@ def _write(run: Run, out: Path | None, port: str, part: int, text: Callable[...,
         made = text(name=name)
         kept = out is None and path.is_file() and path.read_text(encoding="utf-8") != made
         if name not in run.model.effect_names and not kept:
-            path.write_text(made, encoding="utf-8")
+            write_text(path, made)
             return path
     raise AssertionError
 

@@ -17,6 +17,8 @@ from lunar_mjx.logs.schema import FORMAT, IMPOSED, NOISE_SOURCES, SPLITS, find_c
 from lunar_mjx.toml_fields import Fields
 
 LOG_FILE = "log.toml"
+LEAST_NOISE = 1e-12
+"""SI units: what is less is no instrument's noise but a zero, or rounding of double precision."""
 ANSWER = ".answer.toml"
 """How the answer to a sealed log is called, after the log."""
 ENVIRONMENT = ("ambient_temperature_degC", "sun_azimuth_deg", "sun_elevation_deg")
@@ -319,6 +321,9 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
         std, correlation = entry.number("std"), entry.number("correlation_time_s", 0.0)
         if std < 0.0 or correlation < 0.0:
             raise bad_input(fields.path, fields.field(key), entry.values, "has a negative entry", "give zero or more")
+        if std < LEAST_NOISE:
+            remedy = "state what is measured, or a digit's last place over sqrt(12)"
+            raise bad_input(fields.path, f"{fields.field(key)}.std", std, "is less than any instrument's noise", remedy)
         if "*" in key:
             patterns.append((key, Noise(std, source, correlation)))
             continue

@@ -1,0 +1,193 @@
+"""A full disk at any byte leaves the old file as it was, and is told in one sentence."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import random
+import re
+import resource
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+import pytest
+from matplotlib.figure import Figure as Drawing
+
+from lunar_mjx.agents.curves import plot_progress
+from lunar_mjx.agents.policy import Policy, save_policy
+from lunar_mjx.agents.record import Record
+from lunar_mjx.diagnosis.runs import save_json
+from lunar_mjx.errors import UserError
+from lunar_mjx.files import appending, replacing
+from lunar_mjx.logs.seal import Answer, write_answer
+from lunar_mjx.logs.write import write_frame
+from lunar_mjx.model import make_model
+from lunar_mjx.model.file import save_model
+from lunar_mjx.report import Figure, Section, write_page
+from lunar_mjx.rover import convert
+from lunar_mjx.terrain import export_mesh, inclined
+from lunar_mjx.visual.encode import writer
+from lunar_mjx.visual.plots import save
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "lunar_mjx"
+LIMITS = 50
+"""Sizes at which the disk is full, for each kind of output."""
+
+
+@contextlib.contextmanager
+def disk_for(size: int) -> Iterator[None]:
+    """No file of this process may grow beyond `size` bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def _frame() -> pd.DataFrame:
+    return pd.DataFrame(np.random.default_rng(0).normal(size=(200, 4)), columns=list("abcd"))
+
+
+def _video(path: Path) -> None:
+    with writer(path, 10) as put:
+        for i in range(6):
+            put(np.random.default_rng(i).integers(0, 255, (64, 64, 3), np.uint8))
+
+
+def _drawing(path: Path) -> None:
+    drawing = Drawing()
+    drawing.subplots().plot([1, 2])
+    save(drawing, path)
+
+
+def _policy(path: Path) -> None:
+    network = {"kind": "actor", "layers": [8]}
+    weights = {"w": np.random.default_rng(0).normal(size=(40, 40))}
+    save_policy(Policy(weights, None, None, network, {"name": "point", "options": {}}, {}), path)
+
+
+def _page(path: Path) -> None:
+    write_page(path, "page", ["all is well"], [Section("one", [Figure(go.Figure(go.Scatter(y=[1, 2])), "a line")])])
+
+
+def _progress(path: Path) -> None:
+    record = {"seed": 0, "rows": [{"steps": 1, "episode_return": 1.0, "success": 0.5}], "unseen": []}
+    plot_progress([record], path, "title")
+
+
+SMALL_MODEL = make_model("luvmi_x", "flat")
+OUTPUTS: dict[str, Callable[[Path], object]] = {
+    "model.toml": lambda p: save_model(SMALL_MODEL, p),
+    "drive.csv": lambda p: write_frame(_frame(), p),
+    "run.json": lambda p: save_json(p, {"numbers": list(range(500))}),
+    "x.answer.toml": lambda p: write_answer(Answer("log", "0" * 64, 0, "paper", "slope", 1.0, [], {}, "0" * 64), p),
+    "policy.npz": _policy,
+    "report.html": _page,
+    "plane.stl": lambda p: export_mesh(inclined(0.1, extent=8.0), p),
+    "plane.obj": lambda p: export_mesh(inclined(0.1, extent=8.0), p),
+    "plane.ply": lambda p: export_mesh(inclined(0.1, extent=8.0), p),
+    "plot.png": _drawing,
+    "plot.svg": _drawing,
+    "curve.png": _progress,
+    "drive.webp": _video,
+    "drive.gif": _video,
+    "drive.mp4": _video,
+}
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_a_disk_that_is_full_keeps_the_old_file(name, tmp_path):
+    path = tmp_path / name
+    OUTPUTS[name](path)
+    size, old = path.stat().st_size, b"the old file"
+    draw = random.Random(name)
+    limits = {0, size - 1, *(draw.randrange(size) for _ in range(LIMITS))}
+    if path.suffix in (".png", ".svg", ".gif", ".html"):  # each takes a tenth of a second to make
+        limits = set(sorted(limits)[::5])
+    path.write_bytes(old)
+    for limit in sorted(limits):
+        with disk_for(limit), pytest.raises(UserError, match=r"cannot be written \(.*\); name a folder") as error:
+            OUTPUTS[name](path)
+        assert str(path) in str(error.value)
+        assert path.read_bytes() == old and [p.name for p in tmp_path.iterdir()] == [name], limit
+    OUTPUTS[name](path)
+    assert path.stat().st_size >= 0.9 * size
+
+
+def test_a_rover_is_written_with_all_its_files_or_with_none(tmp_path):
+    urdf = ROOT / "tests" / "rover" / "data" / "steered.urdf"
+    out = tmp_path / "rover"
+    convert(urdf, out)
+    old = {p.name: p.read_bytes() for p in out.iterdir()}
+    for limit in (0, 500, max(map(len, old.values())) - 1):
+        with disk_for(limit), pytest.raises(UserError, match="cannot be written"):
+            convert(urdf, out)
+        assert {p.name: p.read_bytes() for p in out.iterdir()} == old
+
+
+def test_progress_keeps_whole_rows(tmp_path):
+    record = Record(tmp_path)
+    row = {"steps": 1, "episode_return": 0.123456789}
+    for i in range(20):
+        record.add({**row, "steps": i})
+    record.close()
+    path = tmp_path / "progress.csv"
+    whole = path.read_bytes()
+    with disk_for(len(whole) + 5), pytest.raises(UserError, match=r"progress\.csv: cannot be written"):
+        record._append({**row, "steps": 20})
+    assert path.read_bytes() == whole
+
+
+def test_what_goes_wrong_in_the_block_goes_on(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(ZeroDivisionError), replacing(path) as part:
+        part.write_text("half")
+        raise ZeroDivisionError
+    assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+    with pytest.raises(UserError, match="No such file or directory"), replacing(tmp_path / "no" / "a.txt") as part:
+        part.write_text("whole")
+    with appending(path) as same:
+        same.write_text("new")
+    assert path.read_text() == "new"
+
+
+def test_the_command_tells_a_full_disk_in_one_sentence(run, tmp_path):
+    out = tmp_path / "model.toml"
+    out.write_text("old")
+    with disk_for(1000):
+        result = run("preset", "consistent", "--rover", "luvmi_x", "--save", out)
+    assert result.status == 2 and "model.toml: cannot be written" in result.err and "Traceback" not in result.err
+    assert out.read_text() == "old"
+
+
+WRITERS = {
+    "write_text",
+    "write_bytes",
+    "to_csv",
+    "to_parquet",
+    "savefig",
+    "savez",
+    "savez_compressed",
+    "savetxt",
+    "export",
+}
+WHOLE = re.compile(r"\b\w*_?part\b|to_csv\(index=False\)|export\(file_type")
+"""A call that names a part of `replacing`, or gives back what it would write."""
+
+
+def test_nothing_else_in_the_package_writes_files():
+    """Every call that writes a file names a `part` of `replacing` or `appending`, or is `files.write_text`."""
+    bare = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+                continue
+            if node.func.attr in WRITERS and not WHOLE.search(ast.unparse(node)):
+                bare.append(f"{path.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)[:80]}")
+    assert not bare
