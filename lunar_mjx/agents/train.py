@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -16,9 +16,13 @@ from lunar_mjx.agents import guard
 from lunar_mjx.agents.learner import EPISODE, Learner, TrainState
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.record import Progress, Record
+from lunar_mjx.errors import UserError
 
 if TYPE_CHECKING:
     from lunar_mjx.agents.checkpoint import Checkpoints
+
+LOCK = ".training"
+"""File in a training's folder that is locked while it is written to."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +76,7 @@ def train(
     folder: Path | None = None,
     environment: dict[str, Any] | None = None,
     callback: Callback | None = None,
+    clock: Callable[[], float] = time.monotonic,
 ) -> Result:
     """Trains until the steps are done or the time is up.
 
@@ -80,13 +85,15 @@ def train(
       run: how long.
       folder: for checkpoints, `progress.csv`, TensorBoard events and `policy.npz`; nothing is written if None.
       environment: name and options of the environment, kept in the policy.
-      callback: called after every epoch.
+      callback: called after every epoch; with several processes in each of them, with the first one's `elapsed_s`.
+      clock: s, monotonic; with several processes the first one's counts.
 
     Raises:
       DivergenceError: a value was not finite; the sentence names the environment and the file for replay.
-      UserError: the folder's checkpoint belongs to other settings.
+      UserError: the folder's checkpoint belongs to other settings, another training writes there, or a checkpoint
+        cannot be written.
     """
-    loop = _Loop(learner, run, folder, environment or {})
+    loop = _Loop(learner, run, folder, environment or {}, clock)
     try:
         return loop.run(callback)
     finally:
@@ -94,46 +101,78 @@ def train(
 
 
 class _Loop:
-    def __init__(self, learner: Learner, run: RunConfig, folder: Path | None, environment: dict[str, Any]):
+    def __init__(
+        self,
+        learner: Learner,
+        run: RunConfig,
+        folder: Path | None,
+        environment: dict[str, Any],
+        clock: Callable[[], float],
+    ):
         self.learner, self.config, self.folder, self.environment = learner, run, folder, environment
         self.per_epoch = learner.config.envs * learner.config.epoch_steps
-        self.checkpoints = _checkpoints(folder / "checkpoints") if folder else None
+        self.lead = jax.process_index() == 0
+        self.clock = clock
+        self.lock = only_writer(folder) if folder and self.lead else None
+        self.checkpoints: Checkpoints | None = None
+        self.record: Record | None = None
+        try:
+            self._begin()
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self) -> None:
+        learner, run, folder = self.learner, self.config, self.folder
+        settings = plain(
+            {"train": dataclasses.asdict(learner.config), "seed": run.seed, "environment": self.environment}
+        )
+        self.checkpoints = _checkpoints(folder / "checkpoints", settings) if folder else None
         self.episodes: dict[str, list[float]] = {name: [] for name in (*EPISODE, "step")}
         self.epochs, self.elapsed, rows = 0, 0.0, []
-        latest = self.checkpoints.latest() if self.checkpoints and run.resume else None
-        if latest is not None and self.checkpoints is not None:
-            self.state, notes = self.checkpoints.restore(latest, learner.abstract())
+        found = None
+        if self.checkpoints and run.resume:
+            found = self.checkpoints.newest(learner.abstract())
+        elif self.checkpoints:
+            self.checkpoints.clear()
+        if found is not None:
+            self.state, notes = found
             self.epochs, self.elapsed, rows = notes["epochs"], notes["elapsed"], notes["rows"]
             self.episodes = notes["episodes"]
         else:
             self.state = learner.init(run.seed)
-        self.lead = jax.process_index() == 0
         self.record = Record(folder, rows) if folder and self.lead else None
         self.rows: list[dict[str, Any]] = self.record.rows if self.record else list(rows)
         self.progress = Progress(run.steps, run.time_limit, run.quiet or not self.lead)
 
     def run(self, callback: Callback | None) -> Result:
         c, total = self.config, max(1, math.ceil(self.config.steps / self.per_epoch))
-        begin = saved = time.monotonic()
+        begin = saved = self.clock()
         before, stop, outside = self.elapsed, False, 0.0
         while self.epochs < total and not stop:
-            tick = time.monotonic()
+            tick = self.clock()
             row = self._epoch()
-            tock = time.monotonic()
-            self.elapsed = before + tock - begin - outside
-            row |= {"elapsed_s": self.elapsed, "steps_per_s": self.per_epoch / (tock - tick)}
-            extra = callback(self.learner, self.state, row) if callback else None
-            outside += time.monotonic() - tock
-            stop = bool((extra or {}).pop("stop", False)) if extra else False
-            row |= extra or {}
+            tock = self.clock()
+            # a process that is a moment behind must neither stop nor save alone: the others would wait for it for ever
+            self.elapsed, rate = (
+                float(v)
+                for v in _of_the_first(before + tock - begin - outside, self.per_epoch / max(tock - tick, 1e-9))
+            )
+            row |= {"elapsed_s": self.elapsed, "steps_per_s": rate}
+            extra = dict(callback(self.learner, self.state, row) or {}) if callback else {}
+            outside += self.clock() - tock
+            asked = bool(extra.pop("stop", False))
+            row |= extra
             self._keep(row)
             self.progress.show(row, final=self.epochs >= total)
-            now = time.monotonic()
+            now = self.clock()
             late = c.time_limit is not None and now - begin >= c.time_limit
+            due = now - saved >= c.checkpoint_every
+            stop, late, due = (bool(v) for v in _of_the_first(asked, late, due))
             last = self.epochs >= total or late or stop
-            if self.checkpoints and math.isfinite(c.checkpoint_every) and (last or now - saved >= c.checkpoint_every):
+            if self.checkpoints and math.isfinite(c.checkpoint_every) and (last or due):
                 self._save()
-                saved = time.monotonic()
+                saved = self.clock()
             if late:
                 break
         return self._result(self.epochs >= total or stop)
@@ -208,13 +247,45 @@ class _Loop:
             self.record.close()
         if self.checkpoints:
             self.checkpoints.close()
+        if self.lock:
+            self.lock.close()
 
 
-def _checkpoints(folder: Path) -> Checkpoints:
+def _of_the_first(*values: float) -> np.ndarray:
+    """Values of the first process, in all processes."""
+    if jax.process_count() == 1:
+        return np.asarray(values)
+    from jax.experimental import multihost_utils
+
+    return np.asarray(multihost_utils.broadcast_one_to_all(np.asarray(values, np.float32)))
+
+
+def only_writer(folder: Path) -> IO[str]:
+    """An open file that keeps other trainings out of a folder until it is closed or its process ends.
+
+    Raises:
+      UserError: another training writes there.
+    """
+    file = (folder / LOCK).open("a+", encoding="utf-8")
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:  # Windows refuses to rename over open files instead
+        pass
+    except OSError:
+        file.close()
+        raise UserError(
+            f"{folder}: another training writes there; wait for it, end it, or train into another folder."
+        ) from None
+    return file
+
+
+def _checkpoints(folder: Path, settings: dict[str, Any]) -> Checkpoints:
     # orbax takes a second to import, and trainings without a folder do without it
     from lunar_mjx.agents.checkpoint import Checkpoints
 
-    return Checkpoints(folder)
+    return Checkpoints(folder, settings)
 
 
 def plain(value: Any) -> Any:

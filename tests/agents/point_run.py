@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,7 @@ def main() -> None:
     parser.add_argument("--coordinator")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--process", type=int, default=0)
+    parser.add_argument("--skew", action="store_true", help="the clock of process I runs 10^I s per look")
     args = parser.parse_args()
     if args.coordinator:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
@@ -74,7 +77,12 @@ def main() -> None:
         if where == "epoch" and left == 0:
             die()
 
-    result = train(learner, RunConfig(args.steps, checkpoint_every=0.0, quiet=True), folder, callback=after)
+    looks = itertools.count()
+    clock = (lambda: 10.0**args.process * next(looks)) if args.skew else time.monotonic
+    limit = 100.0 if args.skew else None
+    every = 30.0 if args.skew else 0.0
+    config = RunConfig(args.steps, time_limit=limit, checkpoint_every=every, quiet=True)
+    result = train(learner, config, folder, callback=after, clock=clock)
     digest = hashlib.sha256()
     actor, statistics = jax.device_get(learner.policy(result.state))
     for leaf in jax.tree.leaves((actor, statistics)):

@@ -123,14 +123,12 @@ def test_two_devices_learn_like_one(whole, spread):
     assert max(late) - min(late) < 0.15 * max(late), "the same learning curve within noise"
 
 
-@pytest.mark.slow
-def test_two_processes_on_loopback_are_two_devices(spread):
+def _two_processes(*arguments: object) -> list[dict]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     lines = [
-        command("-", "--steps", 1600, "--coordinator", f"127.0.0.1:{port}", "--processes", 2, "--process", i)
-        for i in (0, 1)
+        command(*arguments, "--coordinator", f"127.0.0.1:{port}", "--processes", 2, "--process", i) for i in (0, 1)
     ]
     running = [
         subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -143,7 +141,26 @@ def test_two_processes_on_loopback_are_two_devices(spread):
             process.kill()
             process.communicate()
     assert all(p.returncode == 0 for p in running), outputs[0][1][-2000:]
-    two, other = (json.loads(out.splitlines()[-1]) for out, _ in outputs)
+    return [json.loads(out.splitlines()[-1]) for out, _ in outputs]
+
+
+@pytest.mark.slow
+def test_two_processes_whose_clocks_differ_stop_and_save_together(tmp_path):
+    """One that is slower would else go on to the next step, and wait there for the other for ever."""
+    first, second = _two_processes(tmp_path, "--skew")
+    assert first["digest"] == second["digest"] and first["curve"] == second["curve"]
+    assert 2 < len(first["curve"]) < 20, "stopped by the limit of the first process's clock"
+    assert _checkpoints(tmp_path) == len(first["curve"])
+
+
+def _checkpoints(folder: Path) -> int:
+    return max(int(p.name) for p in (folder / "checkpoints").glob("*") if p.name.isdigit())
+
+
+@pytest.mark.slow
+def test_two_processes_on_loopback_are_two_devices(spread):
+    outputs = _two_processes("-", "--steps", 1600)
+    two, other = outputs
     assert two["devices"] == 2
     assert two["digest"] == other["digest"], "both processes hold the same parameters"
     np.testing.assert_allclose(two["curve"], spread["curve"][:2], rtol=0.02)
@@ -170,7 +187,7 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
     config = override(get_training("point"), epoch_steps=5).train
     train(Learner(PointEnv(), config), RunConfig(160, quiet=True), tmp_path)
     other = override(get_training("point"), epoch_steps=5, actor_layers=(32, 32)).train
-    with pytest.raises(UserError, match="does not fit these settings"):
+    with pytest.raises(UserError, match=r"train\.algorithm\.actor_layers = \[32, 32\] is not \[64, 64\]"):
         train(Learner(PointEnv(), other), RunConfig(320, quiet=True), tmp_path)
 
 
