@@ -372,6 +372,7 @@ def make_model(
         thermal_integrator="euler" if preset == "paper" else "heun",
         modes=modes,
         gravity=LUNAR_GRAVITY if loaded.gravity is None else loaded.gravity,
+        timestep=loaded.timestep,
         effect_files={e.name: e.name for e in effects},
     )
     if preset in presets.PRESET_AMBIENT:

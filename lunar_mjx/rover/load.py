@@ -16,11 +16,14 @@ from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.resources import find, shipped
 from lunar_mjx.rover import description as toml
 from lunar_mjx.rover.description import GROUPS, MODES, WINDINGS
+from lunar_mjx.rover.fields import check_sizes, refuse_unused_fields
 from lunar_mjx.rover.rover import DriveGroup, JointGroup, Loop, Rover, Wheel
 
 FORMAT = "lunar-mjx-rover/1"
 MARKER = "rover.toml"
 _MASS_TOLERANCE = 1e-9  # relative
+GRAVITY_TOLERANCE = 1e-9
+"""m/s2, of rounding in the two files."""
 _CONVERT_AGAIN = "convert the URDF again"
 _TOP = {
     "format",
@@ -73,6 +76,7 @@ def load_rover(name_or_path: str | Path) -> Rover:
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{mjcf}: MuJoCo cannot compile it ({reason}); {_CONVERT_AGAIN}.") from None
+    refuse_unused_fields(mjcf, model)
     mass = toml.at_least(path, "mass", data["mass"], 0.0, strict=True)
     total = float(model.body_mass.sum())
     if abs(total - mass) > _MASS_TOLERANCE * mass:
@@ -83,6 +87,9 @@ def load_rover(name_or_path: str | Path) -> Rover:
     groups = _groups(path, data["groups"], model)
     _check_wheels_against_groups(path, wheels, groups)
     points = _list(path, "chassis_points", data)
+    standing_height = toml.number(path, "standing_height", data["standing_height"])
+    check_sizes(path, model, wheels, standing_height)
+    gravity, notes = _gravity(path, data, model)
     return Rover(
         name=toml.text(path, "name", data["name"]),
         folder=folder,
@@ -94,14 +101,27 @@ def load_rover(name_or_path: str | Path) -> Rover:
         chassis_points=np.array([toml.numbers(path, f"chassis_points[{i}]", p, 3) for i, p in enumerate(points)]),
         loops=tuple(_loop(path, f"loops[{i}]", x, bodies) for i, x in enumerate(toml.tables(path, "loops", data))),
         mass=mass,
-        standing_height=toml.number(path, "standing_height", data["standing_height"]),
-        notes=tuple(toml.text(path, "notes", n) for n in data.get("notes", [])),
+        standing_height=standing_height,
+        notes=(*(toml.text(path, "notes", n) for n in data.get("notes", [])), *notes),
         drive_groups=tuple(
             _drive_group(path, f"drive_groups[{i}]", g, {w.drive for w in wheels})
             for i, g in enumerate(toml.tables(path, "drive_groups", data))
         ),
-        gravity=toml.at_least(path, "gravity", data["gravity"], 0.0, strict=False) if "gravity" in data else None,
+        gravity=gravity,
+        timestep=float(model.opt.timestep),
     )
+
+
+def _gravity(path: Path, data: Mapping[str, Any], model: mujoco.MjModel) -> tuple[float | None, tuple[str, ...]]:
+    """Gravity of the file, which must be the MJCF's, and what is to be said about it."""
+    mjcf = model.opt.gravity
+    if "gravity" not in data:
+        return None, (f"the MJCF's gravity {np.linalg.norm(mjcf):g} m/s2 is not used: rover.toml states none",)
+    gravity = toml.at_least(path, "gravity", data["gravity"], 0.0, strict=False)
+    if np.abs(mjcf - [0.0, 0.0, -gravity]).max() > GRAVITY_TOLERANCE:
+        shown = " ".join(f"{v:g}" for v in mjcf)
+        raise bad_input(path, "gravity", gravity, f'is not the MJCF\'s gravity="{shown}"', _CONVERT_AGAIN)
+    return gravity, ()
 
 
 def _list(path: Path, key: str, data: Mapping[str, Any]) -> list[Any]:

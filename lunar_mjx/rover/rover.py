@@ -107,6 +107,7 @@ class Rover:
       standing_height: m, height of the chassis frame above flat ground that the wheels just touch at zero angles.
       drive_groups: wheels that share a motor; those that are in none have a motor each.
       gravity: m/s2 that it was made for; None where its folder does not say.
+      timestep: s, of its MJCF.
       notes: what the conversion assumed, reversed or left out.
     """
 
@@ -124,6 +125,7 @@ class Rover:
     notes: tuple[str, ...] = ()
     drive_groups: tuple[DriveGroup, ...] = ()
     gravity: float | None = None
+    timestep: float = 0.002
 
     @property
     def joints(self) -> tuple[str, ...]:
