@@ -17,7 +17,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(floor.split())
     for floor in (
         "errors",
-        "files pytree spatial trust _quiet",
+        "files pytree spatial trust _quiet _version",
         "report resources units toml_fields inference",
         "rover terrain",
         "effects cameras",

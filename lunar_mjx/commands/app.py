@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lunar_mjx import __version__
+from lunar_mjx._version import __version__
 from lunar_mjx.commands import diagnosis as criticism_commands
 from lunar_mjx.commands import effect_test, usage
 from lunar_mjx.commands import log as log_commands

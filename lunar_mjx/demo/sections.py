@@ -9,7 +9,7 @@ from importlib import metadata
 
 import numpy as np
 
-from lunar_mjx import __version__
+from lunar_mjx._version import __version__
 from lunar_mjx.criticism import SteadyStateTable
 from lunar_mjx.demo.drive import Drive
 from lunar_mjx.demo.figures import CASE_LABELS, ROVERS, headline_figure, history_figure, paths_figure, wheel_figure

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx import __version__
+from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.attribute import diagnose
 from lunar_mjx.diagnosis.build_problem import build_problem
 from lunar_mjx.diagnosis.refit import Settings

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
-from lunar_mjx import __version__
+from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error, Step
 from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, port_label, shown

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from lunar_mjx import __version__
+from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.report import explore, figures, tables
 from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result, read_result
