@@ -21,7 +21,7 @@ from lunar_mjx.dynamics.batching.batch_last import batch_last
 from lunar_mjx.dynamics.indexing import select
 from lunar_mjx.dynamics.spatial_algebra import Vector, mul
 from lunar_mjx.dynamics.state import Params, State, Temperature
-from lunar_mjx.dynamics.structured.engine import Pieces
+from lunar_mjx.dynamics.structured.engine import Pieces, StructuredEngine
 from lunar_mjx.dynamics.structured.legs import cast_group, joint_turns
 from lunar_mjx.dynamics.system import System
 from lunar_mjx.effects.context import Command, Context
@@ -118,6 +118,9 @@ class KinematicDrive:
             model = model.set("shear_state", "imposed motion", damping_time=DAMPING_TIME_S)
         self.model = model.replace(terrain=flat(8.0), timestep=bin_s / self.steps)
         self.system = System(self.model, "structured")
+        engine = self.system.engine
+        assert isinstance(engine, StructuredEngine)
+        self._engine = engine
         self._run = jax.jit(self._run_batch)
 
     def run(self, params: Params, windows: Windows) -> Seen:
@@ -167,7 +170,7 @@ class KinematicDrive:
     def _begin(self, params: Params, speed: Any, up_x: Any, up_y: Any, up_z: Any, yaw_rate: Any) -> Any:
         """Rolling at the wheels' mean speed, standing on the ground: (positions, velocities, states of effects)."""
         del up_x, up_y, up_z
-        system, engine = self.system, self.system.engine
+        system, engine = self.system, self._engine
         zero = jnp.zeros_like(yaw_rate)
         radius = float(np.mean(system.info.wheel_radius))
         forward = radius * jnp.mean(speed)
@@ -175,7 +178,9 @@ class KinematicDrive:
         joints, speeds = [], []
         for group in engine.structure.groups:
             n = cast_group(group, yaw_rate.dtype)
-            own = mul(n.links[0].numbers.sign, select(speed, n.links[0].actuated))
+            drives = n.links[0].actuated
+            assert drives is not None
+            own = mul(n.links[0].numbers.sign, select(speed, drives))
             joints.append(joint_turns(n, [jnp.zeros_like(own)]))
             speeds.append((own,))
         wheel = jnp.zeros_like(speed)
@@ -192,10 +197,11 @@ class KinematicDrive:
         """One time step of one rover towards the joint speeds `speed`: ((positions, velocities, states), seen)."""
         system = self.system
         params = dataclasses.replace(params, terrain=system.params.terrain)
-        kinematics, finish = system.engine.forward_imposed(params, q, v, system.dt)
+        kinematics, finish = self._engine.forward_imposed(params, q, v, system.dt)
         cold = params.ambient.at(0.0) - REFERENCE_TEMPERATURE + jnp.zeros_like(speed)
         temperature = Temperature(cold, jnp.zeros_like(cold), cold, jnp.zeros_like(cold))
-        state = State(step=jnp.zeros((), jnp.int32), qpos=q, qvel=v, temperature=temperature, effects=effects)
+        pieces: tuple[Any, Any] = (q, v)  # as the engine carries them within a loop
+        state = State(jnp.zeros((), jnp.int32), pieces[0], pieces[1], temperature, effects)
         ctx = system._context(params, state, kinematics)
         forces, ctx, effects = apply_effects(system.pipeline, ctx, kinematics.joint_speed, effects)
         acceleration = (speed - kinematics.joint_speed) / ctx.dt

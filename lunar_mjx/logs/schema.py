@@ -193,7 +193,9 @@ def channel_name(name: str) -> ChannelName:
     channel, match = found
     parts = match.groupdict()
     quantity = re.sub(r"_?\{.\}", "", channel.stem)
-    return ChannelName(quantity, *(parts.get(k) or "" for k in ("corner", "joint", "axis")), channel.suffix)
+    return ChannelName(
+        quantity, parts.get("corner") or "", parts.get("joint") or "", parts.get("axis") or "", channel.suffix
+    )
 
 
 def find_channel(name: str) -> tuple[Channel, re.Match[str]] | None:

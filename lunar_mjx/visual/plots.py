@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -74,7 +75,10 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray,
     dark, bright = (float(v) for v in np.percentile(ground.grey, (1.0, 99.0)))
     spare = max(0.0, 0.5 * (_LEAST_CONTRAST - (bright - dark)))
     # gentle ground is stretched to most of the shades, so that its shape shows
-    span = {"vmin": dark - spare - 0.35 * (bright - dark + 2 * spare), "vmax": bright + spare + 0.15 * (bright - dark)}
+    span: dict[str, Any] = {
+        "vmin": dark - spare - 0.35 * (bright - dark + 2 * spare),
+        "vmax": bright + spare + 0.15 * (bright - dark),
+    }
     axes.imshow(ground.grey, cmap="gray", extent=extent, origin="lower", interpolation="bicubic", **span)
     if contours and np.ptp(ground.heights) > 1e-6:
         rows, cols = ground.heights.shape

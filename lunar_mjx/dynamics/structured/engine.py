@@ -223,7 +223,7 @@ class StructuredEngine:
         Raises:
           UnsuitableError: a leg has more joints than its wheel's.
         """
-        if any(len(group.links) > 1 or group.links[0].actuated is None for group in self.structure.groups):
+        if any(len(g.links) != 1 or g.links[0].actuated is None for g in self.structure.groups):
             raise UnsuitableError("imposed motion needs a rover whose wheels' drives are its only joints.")
         numbers, legs, base = self._kinematic_state(qpos, qvel)
 
@@ -248,12 +248,16 @@ class StructuredEngine:
         unpowered = dataclasses.replace(forces, joint_torque=jnp.zeros_like(forces.joint_torque))
         blocks = [leg_block(n, leg, up, unpowered, base.frame, armature, dt)
                   for n, leg in zip(numbers, legs, strict=True)]  # fmt: skip
-        rates = [mul(n.links[0].numbers.sign, select(joint_acceleration, n.links[0].actuated)) for n in numbers]
+        drives = [n.links[0].actuated for n in numbers]
+        places: list[np.ndarray] = [at for at in drives if at is not None]
+        rates = [
+            mul(n.links[0].numbers.sign, select(joint_acceleration, at)) for n, at in zip(numbers, places, strict=True)
+        ]
         acceleration, torques = impose(*self._chassis(base, forces, up), blocks, rates)
         stepped = self._integrate(numbers, legs, base, acceleration, [[rate] for rate in rates], dt)
         signed = [_over_legs(mul(n.links[0].numbers.sign, t), n.count) for n, t in zip(numbers, torques, strict=True)]
         linear = acceleration.linear + base.motion.angular.cross(base.motion.linear)
-        return *stepped, assemble(signed, [n.links[0].actuated for n in numbers]), linear
+        return *stepped, assemble(signed, places), linear
 
     def _finish(
         self, params: Any, numbers: list[LegGroup], legs: list[LegState], base: Base, forces: Forces, dt: Any

@@ -87,7 +87,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
         mine, other = wanted[a], seen[a]
         pair = None if mine is None or other is None else agreement(other, mine, noise / 3.0)
         # one command tells neither sign nor unit: a controller may scale it down, or trade the sides' speeds for a turn
-        if pair is None or len(np.unique(mine[mine != 0.0])) < 2:
+        if pair is None or mine is None or other is None or len(np.unique(mine[mine != 0.0])) < 2:
             continue
         if pair.cosine > 0.95 and (pair.factor > MANY or 0.01 < pair.factor < 1.0 / (4.0 * MANY)):
             found.append(

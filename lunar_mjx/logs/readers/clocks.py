@@ -42,10 +42,10 @@ def seconds(frame: pd.DataFrame, time: TimeColumn, path: Path) -> np.ndarray:
     if time.column not in frame.columns:
         shown = ", ".join(map(str, frame.columns[:20]))
         raise bad_input(path, "time", time.column, "is no column", f"use one of {shown}")
-    cells = frame[time.column]
+    cells = pd.Series(frame[time.column])
     if time.clock:
         return _clock(cells, path)
-    values = pd.to_numeric(cells, errors="coerce").to_numpy(float)
+    values = np.asarray(pd.to_numeric(cells, errors="coerce"), float)
     text = cells.isna().to_numpy() | np.isfinite(values)
     if not text.all():
         row = int(np.argmin(text))

@@ -111,8 +111,8 @@ def _read(name: str, files: Files, mapping: ImportMap) -> Iterator[RecordedDrive
         if table.held == "auto":
             found, left = without_copies(frame, _rising(frame))
             copies += left
-        for key, part in found.items() if table.geodetic is not None else ():
-            if LATITUDE in part:
+        for key, part in found.items():
+            if table.geodetic is not None and LATITUDE in part:
                 found[key], origin = positions(part, table.geodetic)
                 settings |= {"geodetic_origin": origin} if origin else {}
         parts |= {f"{t}_{k}" if k else t: (t, part) for k, part in found.items()}
@@ -163,7 +163,7 @@ def _frame(path: Path, table: TableMap, where: str, notes: list[str]) -> pd.Data
     if table.geodetic is not None:
         g = table.geodetic
         for column, name in ((g.latitude, LATITUDE), (g.longitude, LONGITUDE)):
-            out[name] = _numbers(raw[column], (*table.missing, *g.missing), path, column)
+            out[name] = _numbers(pd.Series(raw[column]), (*table.missing, *g.missing), path, column)
     if table.group:
         out[GROUP] = (raw[table.group] != raw[table.group].shift()).cumsum().to_numpy()
     return pd.DataFrame(out)
@@ -172,12 +172,12 @@ def _frame(path: Path, table: TableMap, where: str, notes: list[str]) -> pd.Data
 def _values(raw: pd.DataFrame, source: Source, missing: tuple[float, ...], path: Path) -> np.ndarray:
     total = np.full(len(raw), source.offset)
     for term in source.terms:
-        total = total + term.scale * _numbers(raw[term.field], (*missing, *source.missing), path, term.field)
+        total = total + term.scale * _numbers(pd.Series(raw[term.field]), (*missing, *source.missing), path, term.field)
     return total
 
 
 def _numbers(cells: pd.Series, missing: tuple[float, ...], path: Path, column: str) -> np.ndarray:
-    values = pd.to_numeric(cells, errors="coerce").to_numpy(float)
+    values = np.asarray(pd.to_numeric(cells, errors="coerce"), float)
     if cells.dtype.kind not in "fiub":
         text = cells.astype(str).str.strip().str.lower()
         wrong = ~np.isfinite(values) & ~text.isin(GAPS).to_numpy(bool)
@@ -200,17 +200,17 @@ def _groups(parts: Mapping[str, tuple[str, pd.DataFrame]]) -> Iterator[tuple[str
     if not any(GROUP in f for f in frames.values()):
         yield "", frames
         return
-    count = max(int(f[GROUP].max()) for f in frames.values())
+    count = max(int(np.max(f[GROUP])) for f in frames.values())
     for key in range(1, count + 1):
-        part = {n: f[f[GROUP] == key].drop(columns=GROUP).reset_index(drop=True) for n, f in frames.items()}
+        part = {n: f.loc[f[GROUP] == key].drop(columns=GROUP).reset_index(drop=True) for n, f in frames.items()}
         yield f"{key:0{len(str(count))}d}", {n: f for n, f in part.items() if len(f)}
 
 
 def _from_zero(tables: Mapping[str, pd.DataFrame], own: Mapping[str, bool]) -> dict[str, pd.DataFrame]:
     """Tables whose time counts from the first sample of the drive, or each from its own where `own` says so."""
-    shared = [float(f[TIME].min()) for n, f in tables.items() if not own[n]]
+    shared = [float(np.min(f[TIME])) for n, f in tables.items() if not own[n]]
     begin = min(shared) if shared else 0.0
     return {
-        n: f.assign(**{TIME: np.round(f[TIME] - (float(f[TIME].min()) if own[n] else begin), 9)})
+        n: f.assign(**{TIME: np.round(f[TIME] - (float(np.min(f[TIME])) if own[n] else begin), 9)})
         for n, f in tables.items()
     }

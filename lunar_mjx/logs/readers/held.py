@@ -136,7 +136,7 @@ def _fine(values: np.ndarray) -> bool:
     for column in values.T:
         jumps = np.abs(np.diff(column))
         jumps = jumps[jumps > 0.0]
-        steps = np.diff(np.unique(column))
+        steps: np.ndarray = np.diff(np.unique(column))
         steps = steps[steps > 1e-9 * max(1e-12, float(np.abs(column).max()))]
         if jumps.size and steps.size:
             # the smallest of many differences of real numbers is far below any resolution: a low quantile is not

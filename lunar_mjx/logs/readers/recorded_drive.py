@@ -55,7 +55,7 @@ class RecordedDrive:
     def seconds(self) -> float:
         """From the first to the last sample of all tables."""
         times = [f[TIME] for f in self.tables.values() if len(f)]
-        return max(float(t.max()) for t in times) - min(float(t.min()) for t in times) if times else 0.0
+        return max(float(np.max(t)) for t in times) - min(float(np.min(t)) for t in times) if times else 0.0
 
 
 def positions(frame: pd.DataFrame, geodetic: Geodetic) -> tuple[pd.DataFrame, dict[str, float | str]]:
@@ -123,7 +123,7 @@ def without_empty(drive: RecordedDrive) -> RecordedDrive:
     """The drive without columns that hold no number at all, which its notes name."""
     tables, notes = {}, list(drive.notes)
     for name, frame in drive.tables.items():
-        empty = [c for c in frame.columns if not frame[c].notna().any()]
+        empty = [c for c in frame.columns if bool(np.all(frame[c].isna()))]
         if empty:
             notes.append(f"{', '.join(empty)}: holds no number in this drive and is left out")
         kept = frame.drop(columns=empty)
