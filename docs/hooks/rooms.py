@@ -14,20 +14,18 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "lunar_mjx"
 PICTURE = ROOT / "docs" / "figures" / "rooms.svg"
 
-FOUNDATION = tuple(
-    [
-        "errors",
-        "files",
-        "pytree",
-        "spatial",
-        "trust",
-        "units",
-        "resources",
-        "toml_fields",
-        "_quiet",
-        "_version",
-        "report",
-    ]
+FOUNDATION = (
+    "errors",
+    "files",
+    "pytree",
+    "spatial",
+    "trust",
+    "units",
+    "resources",
+    "toml_fields",
+    "_quiet",
+    "_version",
+    "report",
 )
 """Small helpers that half of the house leans on: drawn as one slab, without arrows."""
 WORDS: Mapping[str, str] = {
