@@ -27,6 +27,7 @@ def register(app: typer.Typer) -> None:
     log_app.command("manoeuvres")(manoeuvres)
     log_app.command("channels")(channels)
     log_app.command("noise")(noise)
+    log_app.command("example")(example)
     app.add_typer(log_app, name="log")
 
 
@@ -120,6 +121,14 @@ def channels() -> None:
     console.print(table)
     console.print(f"{{c}} a corner: {', '.join(CORNERS)}; before _drive also a side: {', '.join(SIDES)}")
     console.print(f"{{j}} a joint: {', '.join(KINDS)}. {{x}} an axis: x, y, z. {{q}} w, x, y, z of a quaternion")
+
+
+def example(folder: Annotated[Path, typer.Argument(help="Folder to make; must not exist or be empty.")]) -> None:
+    """Copy recordings of a real rover, a Husky on a floor and on sandy loam, to import and try."""
+    from lunar_mjx.logs.example import copy_example
+
+    print(copy_example(folder))
+    print(f"next: lunar-mjx log import {folder} --map husky_borealtc -o runs/husky")
 
 
 def noise(

@@ -128,3 +128,32 @@ def test_one_command_tells_no_sign(tmp_path: Path) -> None:
         frame["joint_left_drive_speed_rad_s"] = -0.8 * command + 0.01 * rng.normal(size=40)
         write_log(tmp_path / name, {"drive": frame}, rover="luvmi_x")
         assert is_bad(check(read_log(tmp_path / name))) == bad
+
+
+@pytest.mark.parametrize(("every", "lost", "bad"), [(5, 0.0, False), (5, 0.1, False), (5, 0.6, True), (1, 0.6, True)])
+def test_a_slower_sensor_in_a_faster_table(every: int, lost: float, bad: bool, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+
+    def change(tables: dict[str, pd.DataFrame]) -> None:
+        t = tables["drive"]
+        filled = np.arange(len(t)) % every == 0
+        filled[rng.permutation(np.flatnonzero(filled))[: int(lost * filled.sum())]] = False
+        t["yaw_deg"] = t["yaw_deg"].where(filled)
+
+    assert is_bad(check(make(tmp_path / "a", change))) == bad
+
+
+def test_the_advice_on_a_sparse_channel_passes_next(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+
+    def sparse(tables: dict[str, pd.DataFrame]) -> None:
+        t = tables["drive"]
+        t["yaw_deg"] = t["yaw_deg"].where(rng.random(len(t)) < 0.1)
+
+    found = check(make(tmp_path / "a", sparse))
+    assert [f.column for f in found] == ["yaw_deg"] and "table of its own with on_change = true" in found[0].message
+    tables = skid_steer(0)
+    yaw = tables["drive"][["time_s", "yaw_deg"]][rng.random(len(tables["drive"])) < 0.1]
+    tables["drive"] = tables["drive"].drop(columns="yaw_deg")
+    write_log(tmp_path / "b", {**tables, "compass": yaw}, rover="luvmi_x", gravity_m_s2=9.81, on_change=("compass",))
+    assert check(read_log(tmp_path / "b")) == []

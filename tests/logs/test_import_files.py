@@ -316,3 +316,24 @@ def test_dates_count_from_the_first(tmp_path: Path) -> None:
 def test_channels_are_listed(run: Run) -> None:
     result = run("log", "channels")
     assert result.status == 0 and "motor_{c}_{j}_current_A" in result.out and "left, right" in result.out
+
+
+def test_the_example_is_imported_and_passes_the_gate(run: Run, tmp_path: Path) -> None:
+    assert run("log", "example", tmp_path / "raw").status == 0
+    assert sum(f.stat().st_size for f in (tmp_path / "raw").iterdir()) < 300_000
+    assert "CC0 1.0" in (tmp_path / "raw" / "LICENSE").read_text(encoding="utf-8")
+    assert run("log", "example", tmp_path / "raw").status == 2, "nobody's files are overwritten"
+    result = run(
+        "log", "import", tmp_path / "raw", "--map", "husky_borealtc", "-o", tmp_path / "log", "--set", "ground=x"
+    )
+    assert result.status == 0 and "2 drives, 40 s" in result.out
+    assert run("log", "check", tmp_path / "log").status == 0
+    floor, sand = drive(tmp_path / "log" / "floor"), drive(tmp_path / "log" / "sand")
+    assert floor.imposed == "wheel_speed" and floor.ground == "x"
+    assert floor.magnitudes == {"motor_left_drive_current_A", "motor_right_drive_current_A"}
+    assert set(floor.tables) == {"drive", "imu"} and sand.tables["imu"].rate_hz == pytest.approx(100.0)
+
+    def vertical(log: Log) -> float:
+        return float(np.mean(log.tables["imu"].channels["accelerometer_z_m_s2"]))
+
+    assert abs(vertical(floor) - 9.81) < 0.1 and abs(vertical(sand) - 9.81) < 0.3

@@ -49,12 +49,13 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
         return finding(None, "dropout", "is empty; leave the column out")
     # a short table whose sensor loses fewer cells than that may still have lost more by chance
     chance = _BY_CHANCE * np.sqrt(LOST_SHARE * (1.0 - LOST_SHARE) / len(there))
-    if (share := float(1.0 - there.mean())) > LOST_SHARE + chance:
+    if (share := _lost(there)) > LOST_SHARE + chance:
         return finding(
             int(np.argmin(there)),
             "dropout",
             f"is empty in {100 * share:.0f} % of its rows (at most "
-            f"{100 * (LOST_SHARE + chance):.0f} % may be); record it anew or leave the column out",
+            f"{100 * (LOST_SHARE + chance):.0f} % may be); record it anew, leave the column out or, if its sensor only "
+            "reports now and then, give it a table of its own with on_change = true",
         )
     low, high, why = limits(name)
     beyond = there & ((values < low) | (values > high))
@@ -117,6 +118,20 @@ def quantum(values: np.ndarray) -> float:
     # what remains of a decimal number written with nine digits is no step
     steps = steps[steps > 1e-8 * max(1e-12, float(np.abs(values).max()))]
     return float(steps.min()) if steps.size else 0.0
+
+
+EVENLY = 0.8
+"""Share of the distances between filled cells that must be one and the same for a column of a slower sensor."""
+
+
+def _lost(there: np.ndarray) -> float:
+    """Share of a column's samples that are lost: of all rows, or of every k-th where a slower sensor fills these."""
+    rows = np.flatnonzero(there)
+    distances = np.diff(rows)
+    every = int(np.median(distances)) if distances.size else 1
+    if every < 2 or float((distances == every).mean()) < EVENLY:
+        return float(1.0 - there.mean())
+    return max(0.0, 1.0 - len(rows) * every / len(there))
 
 
 MOVED = ("position", "attitude", "velocity", "joint")
