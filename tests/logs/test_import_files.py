@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -337,3 +338,24 @@ def test_the_example_is_imported_and_passes_the_gate(run: Run, tmp_path: Path) -
         return float(np.mean(log.tables["imu"].channels["accelerometer_z_m_s2"]))
 
     assert abs(vertical(floor) - 9.81) < 0.1 and abs(vertical(sand) - 9.81) < 0.3
+
+
+def test_the_documented_map_is_read(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "measurement_logs.md").read_text(encoding="utf-8")
+    text = next(b for b in re.findall(r"```toml\n(.*?)```", page, re.DOTALL) if "{drive}_motors.txt" in b)
+    rows = "\n".join(f"14:31:{k:02d}.5 500 {10 + k} -1000 3.0 {k} 36.7157{k:02d} -4.4885" for k in range(40))
+    (tmp_path / "run07_motors.txt").write_text(rows, encoding="utf-8")
+    imu = pd.DataFrame({"t": 5.0 + 0.01 * np.arange(200), "wz": np.sin(np.arange(200.0))})
+    imu.to_csv(tmp_path / "run07_imu.csv", index=False)
+    found = import_drives(
+        tmp_path, tmp_path / "log", write_map(tmp_path, text.replace('rover = "husky"', 'rover = "viper"'))
+    )
+    log = drive(found.folder)
+    assert found.folder == tmp_path / "log" and log.imposed == "wheel_speed"
+    motors = log.tables["motors"].channels
+    np.testing.assert_allclose(motors["motor_left_drive_current_A"], 0.5)
+    np.testing.assert_allclose(motors["joint_left_drive_speed_rad_s"], 0.10472 * (10 + np.arange(40)))
+    np.testing.assert_allclose(motors["command_left_drive_speed_rad_s"], 3.0 - 0.3 * np.arange(40))
+    assert "joint_right_drive_speed_rad_s" not in motors and any("no number" in note for _, note in found.notes)
+    assert np.ptp((log.channel("position_y_m") or (None, np.zeros(1)))[1]) == pytest.approx(39e-6 * 110973.0, rel=0.01)
+    assert log.tables["imu"].clock_offset_std_s == 0.05 and log.tables["imu"].time_s[0] == 0.0
