@@ -5,7 +5,8 @@
 CMU's smooth wheel as it ships with the package: 63 points, each the mean of three runs. Slip angles 0, 30, 60 deg
 are fitted; 15, 45 and 75 deg are held out and choose nothing; 90 deg is apart. This script writes the log, calls the
 verb, and puts what the run folders hold into `real_wheel.json`. Errors are root mean squares in pooled standard
-deviations of single runs, of the model's predictions without any correction by a remaining discrepancy.
+deviations of single runs, of the model's predictions alone, and `corrected`: with what the fitted points taught of the
+discrepancy that remains.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ def write_log(folder: Path) -> None:
     )
 
 
-def errors(series: Any, row: int) -> dict[str, float]:
-    """Root mean square error of a model by part, in pooled standard deviations of single runs."""
+def errors(series: Any, predicted: np.ndarray) -> dict[str, float]:
+    """Root mean square error of predictions (n,) by part, in pooled standard deviations of single runs."""
     from lunar_mjx.wheel_bed.data_files import load_figures
     from lunar_mjx.wheel_bed.table import QUANTITIES
 
@@ -61,7 +62,7 @@ def errors(series: Any, row: int) -> dict[str, float]:
             for start, end, channel in zip(series["series_start"], ends, series["series_channel"], strict=True)
         ]
     )
-    away = (series["measured"] - series["predicted"][row]) / sigma
+    away = (series["measured"] - predicted) / sigma
     angle = np.round(series["place"][:, 1])
     return {part: float(np.sqrt(np.mean(away[np.isin(angle, wanted)] ** 2))) for part, wanted in PARTS.items()}
 
@@ -72,7 +73,8 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     runs = sorted(folder.glob("run*"), key=lambda p: int(p.name.removeprefix("run")))
     for number, run in enumerate(runs):
         about = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        verdict = json.loads((run / "verdict.json").read_text(encoding="utf-8"))
+        path = run / "verdict.json"
+        verdict = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
         added = about["added"][-1] if about["added"] else ""
         with np.load(run / "series.npz") as series:
             labels = [str(label) for label in series["labels"]]
@@ -82,7 +84,10 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
                 if label not in ("as given", "refitted") and number < len(runs) - 1:
                     continue
                 name = f"+ {added}" if label == "refitted" and added else f"the model {label}"
-                rows.append({"run": run.name, "model": name, **errors(series, row)})
+                rows.append({"run": run.name, "model": name, **errors(series, series["predicted"][row])})
+            rows[-1]["corrected"] = errors(series, series["corrected"]) if "corrected" in series.files else None
+        if verdict is None:
+            continue  # several effects are added one after the other before it is asked again
         rows[-1]["verdict"] = verdict["verdict"]
         rows[-1]["sentence"] = verdict["sentence"]
         rows[-1]["probabilities"] = dict(list(verdict["probabilities"].items())[:4])

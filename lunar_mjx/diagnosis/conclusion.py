@@ -116,7 +116,7 @@ def _where(found: ModelSearch) -> tuple[str | None, str | None]:
 
 
 def port_of(field: str) -> str:
-    """The port of a field such as "soil: stiffness with load"."""
+    """The port of a field such as "soil: stiffness"."""
     return field.partition(":")[0]
 
 

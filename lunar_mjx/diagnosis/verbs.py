@@ -440,7 +440,7 @@ def improve(
     effects: Sequence[str] = (),
     splits: Mapping[str, str] | None = None,
     seed: int = 0,
-    most: int = 6,
+    most: int = 8,
     keep_going: bool = False,
     discrepancy: Mapping[str, float] | None = None,
     progress: Progress = silent,
@@ -464,20 +464,19 @@ def improve(
     runs = [run]
     while True:
         diagnosis = why(run, progress=progress)
-        name = _next_to_add(diagnosis, run, keep_going)
-        if name is None or len(runs) > most:
+        names = _next_to_add(diagnosis, run, keep_going)
+        if not names or len(runs) > most:
             return diagnosis, runs
         specs = {s.rpartition(":")[2]: s for s in effects}
-        run = add(run, specs.get(name, name), out / f"run{len(runs) + 1}", progress)
-        runs.append(run)
+        for name in names[: most + 1 - len(runs)]:
+            run = add(run, specs.get(name, name), out / f"run{len(runs) + 1}", progress)
+            runs.append(run)
 
 
-def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> str | None:
-    """What `improve` adds next: another form of the model first, where it is surely better, then what is named."""
+def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> list[str]:
+    """What `improve` adds next: another form of the model first, where it is surely better, then all that is named."""
     law = better_law(diagnosis.forms, run.model)
-    if law is not None:
-        return law
     go_on = diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE)
     go_on = go_on or (keep_going and diagnosis.verdict is Verdict.UNKNOWN)
     names = [n for n in diagnosis.effects if not n.startswith("calibration: ")]
-    return names[0] if go_on and names else None
+    return [*([law] if law else []), *(names if go_on else [])]

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from lunar_mjx.diagnosis import build_problem
 from lunar_mjx.diagnosis.candidates import usable
 from lunar_mjx.diagnosis.conclusion import conclude, label, probabilities, title
-from lunar_mjx.diagnosis.runs import COMPARISON_FILE, HYPOTHESES_FILE, SERIES_FILE, SIGNATURES_FILE, Run
+from lunar_mjx.diagnosis.runs import COMPARISON_FILE, HYPOTHESES_FILE, RUN_FILE, SERIES_FILE, SIGNATURES_FILE, Run
 from lunar_mjx.diagnosis.tables import problem as tables
 from lunar_mjx.diagnosis.tables.port_gains import FIELDS
 from lunar_mjx.diagnosis.tables.settings import TableSettings
@@ -168,6 +168,7 @@ def _single(values: Mapping[str, Any]) -> dict[str, float]:
 def compare_tables(run: Run, logs: Sequence[SteadyLog], progress: Progress) -> tuple[Tables, Refit]:
     """The model as given and refitted against tables; writes `comparison.json` and the series."""
     problem = build_tables(run, logs, rivals=False)
+    run.save(RUN_FILE, {**run.load(RUN_FILE), "settings": dataclasses.asdict(problem.settings)})
     progress("refitting the model", 0.0)
     with threadpool_limits(1, "blas"):
         refit = problem.own.refit(frozenset(), None, None)
@@ -253,8 +254,28 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.2g} %"
 
 
-def save_series(run: Run, own: WheelForm, start: np.ndarray, fits: Mapping[str, tuple[WheelForm, np.ndarray]]) -> None:
-    """Measured and predicted series for the report, as `series.npz` (arrays only, no pickle)."""
+def _corrected(form: WheelForm, best: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions (n,) with what fitted points taught of discrepancy and calibration, and whitened residuals (n,)."""
+    _, columns, residual = form.linearise(best.refit.u)
+    learnt = columns[:, best.places] @ best.evidence.mean
+    observations = form.data.observations
+    return form.predict(best.refit.u)[0] + observations.sigma() * learnt, residual - learnt
+
+
+def save_series(
+    run: Run,
+    own: WheelForm,
+    start: np.ndarray,
+    fits: Mapping[str, tuple[WheelForm, np.ndarray]],
+    corrected: tuple[np.ndarray, np.ndarray] | None = None,
+) -> None:
+    """Measured and predicted series for the report, as `series.npz` (arrays only, no pickle).
+
+    Args:
+      run: to write to. own: the model as given. start: its whitened residuals.
+      fits: form and coordinates by label.
+      corrected: predictions and whitened residuals of the last fit with what the fitted points taught of discrepancy.
+    """
     observations = own.data.observations
     predicted = [own.predict(np.zeros(len(own.coordinates)))[0], *(f.predict(u)[0] for f, u in fits.values())]
     residual = [start, *(f.residual(u) for f, u in fits.values())]
@@ -267,6 +288,7 @@ def save_series(run: Run, own: WheelForm, start: np.ndarray, fits: Mapping[str, 
         series_channel=np.array([s.channel for s in observations.series]),
         series_log=np.array([s.log for s in observations.series]), logs=np.array(observations.logs),
         labels=np.array(["as given", *fits]), predicted=np.vstack(predicted), residual=np.vstack(residual),
+        **({} if corrected is None else dict(zip(("corrected", "corrected_residual"), corrected, strict=True))),
     )  # fmt: skip
 
 
@@ -303,7 +325,7 @@ def diagnose_tables(
     if best.effects or best.form != own.name:
         words = [*([best.form] if best.form != own.name else []), *sorted(best.effects)]
         fits["with " + ", ".join(words)] = (after, best.refit.u)
-    save_series(run, own, start, fits)
+    save_series(run, own, start, fits, _corrected(after, best))
     _save_signatures(run, found.base(best.form).refit, own)
     run.save(HYPOTHESES_FILE, _fits(problem, found))
     return dataclasses.replace(
@@ -358,7 +380,6 @@ def _diagnosis(problem: Tables, found: ModelSearch, best: Hypothesis) -> Diagnos
                 best.evidence.covariance, best.places,
             ),
             "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
-            "settings": dataclasses.asdict(settings),
         },
     )  # fmt: skip
 

@@ -14,7 +14,7 @@ class TableSettings:
     usual_discrepancy: float = 0.05
     """1; scale of the half-normal prior of each port's discrepancy: no contact law is exact (terramechanics models
     predict drawbar pull and sinkage to some 5 to 10 per cent, Wong 2008)."""
-    unlisted_discrepancy: float = 0.4
+    unlisted_discrepancy: float = 0.3
     """1; the same where something unlisted acts at a port."""
     following_discrepancy: float = 0.2
     """1; standard deviation of something unlisted that follows one quantity alone."""
@@ -46,10 +46,10 @@ class TableSettings:
     # --- how rare things are -----------------------------------------------------------------------------------------
     effect_odds: float = 0.01
     """1; prior odds of each effect of the catalogue: of some fifteen, one is missing in every seventh table."""
-    unlisted_odds: float = 0.003
+    unlisted_odds: float = 0.005
     """1; prior odds of something unlisted in each of the six fields of discrepancy."""
     following_odds: float = 0.0015
-    """1; prior odds of something unlisted that follows one quantity alone, for each field and quantity."""
+    """1; prior odds of something unlisted that follows load or speed alone, for each field and quantity."""
     calibration_odds: float = 0.005
     """1; prior odds of each instrument to be out of order."""
     sure: float = 0.95

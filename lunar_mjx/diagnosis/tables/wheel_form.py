@@ -35,7 +35,7 @@ class TableData:
       imposed: at every point of all tables.
       point, quantity: (n,) point and place in `QUANTITIES` of every observation.
       modes: (points, modes) of a smooth random function of the points, together of unit variance.
-      following: (points, few) the same of one quantity alone, by quantity that the table varies.
+      following: (points, few) the same of load or speed alone, where the table varies them.
       noise_std: by quantity measured, standard deviation of the logarithm of the noise's size.
     """
 
@@ -86,17 +86,18 @@ def table_data(
         slip / settings.slip_length, np.degrees(stacked.slip_angle) / settings.angle_length,
         np.log(load) / settings.load_length, np.log(speed) / settings.speed_length,
     ])  # fmt: skip
+    # Slip and slip angle are what the catalogue's effects are about; none of them follows the rate.
+    following = {
+        name: _modes(features[:, [k]], settings)
+        for name, k in (("load", 2), ("speed", 3))
+        if np.ptp(features[:, k]) > settings.least_range
+    }
     std: dict[int, float] = {}
     for log in logs:
         for name, own in scatter(log).items():
             told = np.hypot(settings.replicate_spread, own.level) if own.level else settings.stated_spread
             i = _NAMES.index(name)
             std[i] = max(std.get(i, 0.0), float(told))
-    following = {
-        name: _modes(features[:, [k]], settings)
-        for k, name in enumerate(("slip", "slip angle", "load", "speed"))
-        if np.ptp(features[:, k]) > settings.least_range
-    }
     return TableData(
         observations, imposed, point, quantity, _modes(features, settings), following, dict(sorted(std.items()))
     )
@@ -187,14 +188,9 @@ class WheelForm(Form):
         columns = np.column_stack([own, whiten(errors), fields, unlisted])
         calibrated = count + np.arange(errors.shape[1])
         rest = count + errors.shape[1] + np.arange(fields.shape[1])
-        std = np.concatenate(
-            [
-                [c.prior for c in self.coordinates],
-                error_std,
-                np.ones(len(rest)),
-                np.full(unlisted.shape[1], settings.following_discrepancy),
-            ]
-        )
+        last = columns.shape[1] - unlisted.shape[1]
+        sizes = np.full(unlisted.shape[1], settings.following_discrepancy)
+        std = np.concatenate([[c.prior for c in self.coordinates], error_std, np.ones(len(rest)), sizes])
         for places in self.candidates.values():
             amplitude = [i for i in places if self.coordinates[i].amplitude]
             std[amplitude] = settings.effect_size
@@ -231,7 +227,7 @@ class WheelForm(Form):
             effects=self.candidates,
             at=at,
             calibration={name: calibrated[places] for name, places in instruments.items()},
-            following={name: rest[-1] + 1 + places for name, places in followed.items()},
+            following={name: last + places for name, places in followed.items()},
             fields=tuple(Field(f, settings.usual_discrepancy) for f in FIELDS),
             noises=tuple(NoiseSize(_NAMES[q], s) for q, s in data.noise_std.items()),
             wide=settings.unlisted_discrepancy,

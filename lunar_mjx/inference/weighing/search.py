@@ -143,8 +143,11 @@ def search(
     if not known:
         raise EvidenceError("; ".join(reasons))
     while len(done) < most_refits:
-        best = max(known.values(), key=lambda h: h.log_posterior)
-        near = [h for h in known.values() if h.log_posterior > best.log_posterior - window]
+        # Unlisted inputs are linear and need no refit; effects are not, and gain by theirs. What is unlisted closes the
+        # door on no effect before that has been refitted.
+        listed = [h for h in known.values() if not any(t.kind == UNLISTED for t in h.terms)]
+        best = max(listed, key=lambda h: h.log_posterior)
+        near = [h for h in listed if h.log_posterior > best.log_posterior - window]
         open_ = [h for h in near if (h.form, h.effects) not in done]
         if open_:
             chosen = max(open_, key=lambda h: h.log_posterior)

@@ -1,0 +1,174 @@
+"""A contact law against tables: derivatives, fields that follow their ports, and speeds that differ."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lunar_mjx.diagnosis import build_problem
+from lunar_mjx.diagnosis.conclusion import conclude
+from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.tables.loop import build_tables, contact_laws, with_law
+from lunar_mjx.diagnosis.tables.port_gains import FIELDS, GAINS
+from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE
+from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.effects import catalogue
+from lunar_mjx.inference.weighing.search import search
+from lunar_mjx.logs import Noise, read_campaign, write_steady_log
+from lunar_mjx.model import make_model
+from lunar_mjx.wheel_bed.bed import WheelBed, wheel_test
+
+RADIUS, WIDTH = 0.15, 0.1
+STD = {"drawbar_pull_N": 0.3, "side_force_N": 0.3, "driving_torque_Nm": 0.05, "sinkage_m": 4e-4}
+
+
+def write(folder, change=None, speeds=(0.05,), seed=0):
+    """A table of the closed form; `change(frame)` spoils it, every speed repeats it."""
+    slip, angle, load = (
+        a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.6, 6), [0.0, 15.0, 30.0], [40.0, 80.0], indexing="ij")
+    )
+    result = WheelBed.of_preset("consistent").run(wheel_test(slip, np.radians(angle), load, RADIUS, WIDTH))
+    one = pd.DataFrame(
+        {
+            "slip_ratio": slip,
+            "slip_angle_deg": angle,
+            "normal_load_N": load,
+            "drawbar_pull_N": result.drawbar_pull,
+            "side_force_N": result.side_force,
+            "driving_torque_Nm": result.driving_torque,
+            "sinkage_m": result.sinkage,
+        }
+    )
+    frame = pd.concat([one.assign(travel_speed_m_s=s) for s in speeds], ignore_index=True)
+    frame = frame if change is None else change(frame)
+    rng = np.random.default_rng(seed)
+    for column, std in STD.items():
+        frame[column] += std * rng.standard_normal(len(frame))
+    return write_steady_log(
+        folder,
+        frame,
+        wheel={"radius_m": RADIUS, "width_m": WIDTH},
+        slip_definition="wheel_frame",
+        noise={c: Noise(s, "datasheet") for c, s in STD.items()},
+    )
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    only = {n: catalogue.get(n) for n in ("slip_sinkage", "rolling_resistance")}
+    monkeypatch.setattr(build_problem, "candidate_effects", lambda run: only)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("tables")
+
+
+def tables(folder, name, **how):
+    path = folder / name
+    if not path.exists():
+        write(path, **how)
+    run = Run(folder / "run", (path,), make_model("luvmi_x", terrain="flat", preset="consistent"))
+    return build_tables(run, read_campaign([path]), rivals=False)
+
+
+def weigh(problem):
+    s = problem.settings
+    return search(problem.forms, s.most_refits, s.most_terms, s.window)
+
+
+def test_derivatives_by_coordinates_and_load_agree_with_differences(folder):
+    form = tables(folder, "plain").own
+    u = np.zeros(len(form.coordinates))
+    value, slope = form.predict(u)
+    step = 1e-5
+    for i in form.baseline:
+        up, down = u.copy(), u.copy()
+        up[i] += step
+        down[i] -= step
+        numeric = (form.predict(up)[0] - form.predict(down)[0]) / (2.0 * step)
+        np.testing.assert_allclose(slope[:, i], numeric, rtol=1e-4, atol=1e-4 * np.abs(numeric).max() + 1e-9)
+    test = form.data.imposed.test
+    more = dataclasses.replace(test, normal_load=np.asarray(test.normal_load) * (1.0 + step))
+    moved, _ = form.program(u, form.data.imposed._replace(test=more))
+    numeric = (moved[form.data.quantity, form.data.point] - value) / step
+    column = slope[:, len(u) + len(GAINS) + ABSCISSAE.index("load scale")]
+    np.testing.assert_allclose(column, numeric, rtol=1e-3, atol=1e-3 * np.abs(numeric).max())
+
+
+def test_a_gain_on_the_side_force_moves_the_side_force_alone(folder):
+    form = tables(folder, "plain").own
+    value, slope = form.predict(np.zeros(len(form.coordinates)))
+    number = next(i for i, g in enumerate(GAINS) if g.field == "wheel_shear: lateral force")
+    column = slope[:, len(form.coordinates) + number]
+    aside = form.data.quantity == 1
+    np.testing.assert_allclose(column[aside], value[aside], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(column[~aside], 0.0, atol=1e-12)
+
+
+def test_chunks_of_points_make_no_difference(folder):
+    form = tables(folder, "plain").own
+    u = np.zeros(len(form.coordinates))
+    whole, _ = form.program(u, form.data.imposed)
+    part = form.data.imposed._replace(
+        test=type(form.data.imposed.test)(
+            **{
+                f.name: np.asarray(getattr(form.data.imposed.test, f.name))[:5]
+                for f in dataclasses.fields(form.data.imposed.test)
+            }
+        ),
+        slip=form.data.imposed.slip[:5],
+        lever=form.data.imposed.lever[:5],
+        mean_load=form.data.imposed.mean_load[:5],
+    )
+    np.testing.assert_allclose(form.program(u, part)[0], whole[:, :5], rtol=1e-12)
+
+
+def test_nothing_hidden_and_a_load_cell_off_are_quiet(folder):
+    assert conclude(weigh(tables(folder, "plain")), 0.95).verdict is Verdict.NOISE_ONLY
+
+    def off(frame):
+        return frame.assign(drawbar_pull_N=1.03 * frame["drawbar_pull_N"])
+
+    assert conclude(weigh(tables(folder, "cell", change=off, seed=1)), 0.95).verdict is Verdict.NOISE_ONLY
+
+
+def test_shear_that_depends_on_the_rate_is_unlisted_and_not_noise(folder):
+    def rate(frame):
+        fast = frame["travel_speed_m_s"] > 0.1
+        factor = np.where(fast, 1.3, 1.0)
+        return frame.assign(
+            drawbar_pull_N=frame["drawbar_pull_N"] + (factor - 1.0) * frame["driving_torque_Nm"] / RADIUS,
+            driving_torque_Nm=factor * frame["driving_torque_Nm"],
+            side_force_N=factor * frame["side_force_N"],
+        )
+
+    problem = tables(folder, "rate", change=rate, speeds=(0.02, 0.2), seed=2)
+    assert len(problem.own.data.imposed.slip) == 72, "runs at different speeds were pooled"
+    said = conclude(weigh(problem), 0.95)
+    assert said.verdict is Verdict.UNKNOWN
+    assert said.port in ("soil", "wheel_shear")
+    assert said.place is not None and said.place.endswith("with speed")
+
+
+def test_an_effect_is_named_and_what_remains_is_told_by_port(folder):
+    def resist(frame):
+        return frame.assign(driving_torque_Nm=frame["driving_torque_Nm"] + 0.06 * RADIUS * frame["normal_load_N"])
+
+    found = weigh(tables(folder, "resist", change=resist, seed=3))
+    said = conclude(found, 0.95)
+    assert (said.verdict, said.effects) == (Verdict.KNOWN, ("rolling_resistance",))
+    assert len(found.best.evidence.tau) == len(FIELDS)
+    assert (found.best.evidence.tau < 0.1).all()
+
+
+def test_rival_laws_take_the_place_of_the_models_own():
+    model = make_model("luvmi_x", terrain="flat", preset="consistent")
+    laws = contact_laws(model, rivals=True)
+    assert list(laws) == ["closed form", "stress_integral"]
+    assert "stress_integral" in laws["stress_integral"].effect_names
+    assert not {"pressure_sinkage", "closed_form_shear"} & set(laws["stress_integral"].effect_names)
+    assert list(contact_laws(with_law(model, "stress_integral"), rivals=False)) == ["stress_integral"]
