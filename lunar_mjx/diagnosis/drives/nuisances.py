@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lunar_mjx.diagnosis.drives.instruments import is_instrument
 from lunar_mjx.diagnosis.drives.log_run import SETTLE, STOOD
 from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
 from lunar_mjx.inference.observations import Observations, Series
@@ -106,7 +107,7 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
 
 def is_linear(c: Coordinate) -> bool:
     """Whether a coordinate adds a known vector to the predictions, whatever the others are."""
-    return c.nuisance and (c.name == STEP_ERROR or _ENCODER.fullmatch(c.name) is not None)
+    return c.nuisance and (c.name == STEP_ERROR or _ENCODER.fullmatch(c.name) is not None or is_instrument(c))
 
 
 def direction(c: Coordinate, observations: Observations, step_error: np.ndarray) -> np.ndarray:

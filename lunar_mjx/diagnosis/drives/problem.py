@@ -17,6 +17,7 @@ import numpy as np
 from lunar_mjx.diagnosis.candidates import usable
 from lunar_mjx.diagnosis.drives.baseline import BASELINE, baseline_coordinates, unfit
 from lunar_mjx.diagnosis.drives.differences import STEP, WIDE, Differences
+from lunar_mjx.diagnosis.drives.instruments import instrument_direction, instrument_nuisances, is_instrument
 from lunar_mjx.diagnosis.drives.log_run import STOOD
 from lunar_mjx.diagnosis.drives.noise import Noises
 from lunar_mjx.diagnosis.drives.nuisances import (
@@ -119,6 +120,7 @@ class DriveProblem(Problem):
         found.append(step_error_share())
         for number, run in enumerate(self.bench.runs):
             found += nuisances(number, run, self.observations, number in shows)
+            found += instrument_nuisances(number, self.logs[number], self.observations)
         self.baseline = np.arange(len(found))
         self._nuisance = np.arange(count, len(found))
         self.candidates = {}
@@ -132,6 +134,7 @@ class DriveProblem(Problem):
         self.inputs = {k: np.array([own[n] for n in names]) for k, names in amplitudes.items() if names[0] in own}
         self.coordinates = (*found, *of_candidate(self._smooth))
         self._step_error: np.ndarray | None = None
+        self._instruments: dict[str, np.ndarray] = {}
         self._halved: tuple[frozenset[str], np.ndarray, np.ndarray] | None = None
 
     @property
@@ -254,7 +257,17 @@ class DriveProblem(Problem):
         return self._stamped[1]
 
     def _direction(self, c: Coordinate) -> np.ndarray:
+        if is_instrument(c):
+            return self._instrument(c)
         return direction(c, self.observations, self.step_error if c.name == STEP_ERROR else np.zeros(0))
+
+    def _instrument(self, c: Coordinate) -> np.ndarray:
+        """(n,) what one unit of a clock's or a mounting's error adds, about the predictions of the model as given."""
+        if c.key not in self._instruments:
+            predicted = self._simulated(self.bench, self.origin()[None] * 0.0)
+            found = instrument_direction(c, self.logs[c.log_index], self.observations, predicted)
+            self._instruments[c.key] = np.where(np.isfinite(found), found, 0.0)
+        return self._instruments[c.key]
 
     @property
     def step_error(self) -> np.ndarray:

@@ -121,3 +121,41 @@ def test_a_discrepancy_of_an_unknown_channel_is_refused() -> None:
     for name, size, words in (("speed", 1.0, "is not compared; use one of yaw_deg"), ("yaw_deg", -1.0, "no size")):
         with pytest.raises(UserError, match=words):
             with_discrepancy(seen, {name: size})
+
+
+def test_clocks_and_mountings_known_within_an_error(tmp_path: Path, model: Model) -> None:
+    late, turn = 0.02, np.radians(0.5)
+    speed = {f"command_{c}_drive_speed_rad_s": 1.0 + np.sin(2.0 * TIME) for c in CORNERS}
+    drive = pd.DataFrame({"time_s": TIME, **speed, "world_velocity_x_m_s": 0.1})
+    names = [f"{k}_{a}_{u}" for k, u in (("gyro", "rad_s"), ("accelerometer", "m_s2")) for a in "xyz"]
+    imu = pd.DataFrame({"time_s": TIME[4:-4], **dict.fromkeys(names, 0.1)})
+    mounting = Rotation.from_euler("ZYX", [30.0, -5.0, 4.0], degrees=True)
+    tilted = Rotation.from_rotvec([0.0, turn, 0.0]) * mounting
+
+    def log(name: str, rotation: Rotation, shift: float) -> Log:
+        axes = {"quaternion": rotation.as_quat(scalar_first=True).tolist(), "mounting_std_deg": [0.0, 1.0, 180.0]}
+        tables = {"drive": drive, "imu": imu}
+        offset = {"imu": (shift, 0.01)}
+        write_log(tmp_path / name, tables, rover="luvmi_x", gravity_m_s2=1.625, imu=axes, clock_offsets_s=offset)
+        found = read_log(tmp_path / name)
+        assert isinstance(found, Log)
+        return found
+
+    logs = [log("nominal", mounting, 0.0), log("late", mounting, late), log("turned", tilted, 0.0)]
+    problem = DriveProblem(logs, model, {})
+    own = {c.name: i for i, c in enumerate(problem.coordinates) if c.nuisance and c.log_index == 0}
+    assert {"clock imu", "mounting y"} <= set(own) and "mounting z" not in own
+    rows = np.tile(problem.origin(), (3, 1))
+    rows[1, own["clock imu"]] = late / 0.01
+    rows[2, own["mounting y"]] = turn / np.radians(1.0)
+    predicted = problem.predict(rows)
+    for which, other in ((1, 1), (2, 2)):
+        for s in problem.observations.series:
+            if s.log != 0 or s.channel not in names:
+                continue
+            twin = next(t for t in problem.observations.series if t.log == other and t.channel == s.channel)
+            before, after = predicted[0, s.start : s.stop], predicted[which, s.start : s.stop]
+            truth = predicted[0, twin.start : twin.stop]
+            if np.max(np.abs(truth - before)) > 3e-4:
+                # of the second order in the error, and at the ends of one-sided quotients
+                assert np.median(np.abs(after - truth)) < 0.25 * np.median(np.abs(before - truth)), (s.channel, which)

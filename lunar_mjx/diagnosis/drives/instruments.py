@@ -1,0 +1,92 @@
+"""What a log states of its instruments only within an error: the clocks of its tables, and how the IMU is mounted.
+
+Each is a nuisance of its log whose prior is the stated standard deviation. To first order it adds a known vector to the
+predictions: the derivative by time of a table's channels, or the turn of a vector by a small angle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
+from lunar_mjx.inference.observations import Observations, Series
+from lunar_mjx.logs import Log
+from lunar_mjx.logs.attitude import EULER
+
+CLOCK, MOUNTING = "clock ", "mounting "
+"""Names of these nuisances begin so, and go on with the table or the axis."""
+FARTHEST = 6.0
+"""Standard deviations at which they are bounded."""
+UNKNOWN_DEG = 60.0
+"""A mounting less well known than this is no small angle: its axis tells nothing, and has no nuisance."""
+_VECTORS = {"gyro": "gyro_{}_rad_s", "accelerometer": "accelerometer_{}_m_s2"}
+
+
+def instrument_nuisances(number: int, log: Log, observations: Observations) -> list[Coordinate]:
+    """Coordinates of one log for each clock and mounting angle that it states within an error.
+
+    Args:
+      number: of the log. log: itself. observations: of the campaign.
+    """
+    mine = [s for s in observations.series if s.log == number]
+    found = []
+    for name, table in log.tables.items():
+        if table.clock_offset_std_s > 0.0 and any(s.channel in table.channels for s in mine):
+            found.append(_coordinate(CLOCK + name, table.clock_offset_std_s, "s", number))
+    turned = [s for s in mine if s.channel.partition("_")[0] in _VECTORS or (log.imu.attitude and s.channel in EULER)]
+    for axis, std in zip("xyz", log.imu.mounting_std_deg, strict=True):
+        if turned and 0.0 < std < UNKNOWN_DEG:
+            found.append(_coordinate(MOUNTING + axis, float(np.radians(std)), "rad", number))
+    return found
+
+
+def _coordinate(name: str, std: float, unit: str, number: int) -> Coordinate:
+    far = FARTHEST * std
+    return Coordinate(NUISANCE, name, 0.0, std, -far, far, prior=1.0, physical=True, unit=unit, log_index=number)
+
+
+def is_instrument(c: Coordinate) -> bool:
+    """Whether a coordinate is one of these nuisances."""
+    return c.nuisance and c.name.startswith((CLOCK, MOUNTING))
+
+
+def instrument_direction(c: Coordinate, log: Log, observations: Observations, predicted: np.ndarray) -> np.ndarray:
+    """(n,) what one unit (s, rad) of such a nuisance adds to the predictions.
+
+    Args:
+      c: the nuisance. log: that it belongs to. observations: of the campaign. predicted: (n,) by the model as given.
+    """
+    out = np.zeros(len(observations))
+    series = [s for s in observations.series if s.log == c.log_index]
+    if c.name.startswith(CLOCK):
+        table = log.tables[c.name.removeprefix(CLOCK)]
+        for s in series:
+            if s.channel in table.channels and s.time is not None and len(s.time) > 2:
+                out[s.start : s.stop] = np.gradient(predicted[s.start : s.stop], s.time)
+        return out
+    axis = "xyz".index(c.name.removeprefix(MOUNTING))
+    for s in series:
+        kind, place = s.channel.partition("_")[0], slice(s.start, s.stop)
+        if log.imu.attitude and s.channel == EULER[axis]:
+            out[place] = np.degrees(1.0)  # near level; the attitude's axes are the chassis's
+        elif kind in _VECTORS:
+            out[place] = _turned(kind, s, series, log, axis, predicted)
+    return out
+
+
+def _turned(kind: str, one: Series, series: list[Series], log: Log, axis: int, predicted: np.ndarray) -> np.ndarray:
+    """(samples,) change of one component of a vector, in the IMU's axes, by a turn of the IMU about a body axis.
+
+    With the reading v = R(q)^T b of a body vector b, a further turn by a small angle a changes it by R(q)^T (b x a).
+    """
+    assert one.time is not None
+    mounting = Rotation.from_quat(log.imu.quaternion, scalar_first=True)
+    up = mounting.inv().apply([0.0, 0.0, log.gravity_m_s2]) if kind == "accelerometer" else np.zeros(3)
+    vector = np.tile(up, (len(one.time), 1))
+    for k, letter in enumerate("xyz"):
+        other = next((s for s in series if s.channel == _VECTORS[kind].format(letter)), None)
+        if other is not None and other.time is not None:
+            vector[:, k] = np.interp(one.time, other.time, predicted[other.start : other.stop])
+    change = mounting.inv().apply(np.cross(mounting.apply(vector), np.eye(3)[axis]))
+    return change[:, "xyz".index(one.channel.split("_")[1])]
