@@ -266,6 +266,7 @@ def only_writer(folder: Path) -> IO[str]:
     Raises:
       UserError: another training writes there.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     file = (folder / LOCK).open("a+", encoding="utf-8")
     try:
         import fcntl

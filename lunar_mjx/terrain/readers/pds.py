@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input
-from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size
+from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.options import ReadOptions
 
 _KINDS = {
@@ -49,6 +49,7 @@ def read_pds(path: Path, options: ReadOptions) -> Dem:
     data = _samples(image, label_path, label, rows, cols)
     heights = data.astype(np.float64)
     heights[_missing(data, label_path, label)] = np.nan
+    heights, undeclared = undeclared_nodata(heights, str(image))
     unit = _length(label_path, "UNIT", label.get("UNIT", "METER"))
     offset = _number(label_path, label, "OFFSET", 0.0) * unit
     radius = _number(label_path, label, "A_AXIS_RADIUS", 0.0) * 1e3
@@ -57,6 +58,7 @@ def read_pds(path: Path, options: ReadOptions) -> Dem:
         offset, reference = 0.0, f"sphere of radius {radius:.0f} m"
     heights = heights * (_number(label_path, label, "SCALING_FACTOR", 1.0) * unit) + offset
     heights, notes = fill_holes(heights, str(image))
+    notes = undeclared + notes
     cell = _cell(label_path, label, options)
     # The projection's centre lies at these pixel coordinates (1-based centres shifted by 1, PDS3 Standards Reference).
     column = _number(label_path, label, "SAMPLE_PROJECTION_OFFSET", 0.0)
