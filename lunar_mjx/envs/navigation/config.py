@@ -50,7 +50,8 @@ class NavigationConfig:
       camera_fovy_deg: vertical angle of view. camera_far: how far the camera looks, m.
       sun_azimuth_deg, sun_elevation_deg: where the Sun stands, clockwise from north (y).
       divergence: what follows a state that is not finite: "stop" lets it through, so that a trainer's guard stops and
-        dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`.
+        dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`, and so a rover that is
+        faster or farther from the ground than any can be (`env.plausible`).
     """
 
     decimation: int = 50

@@ -98,6 +98,33 @@ class Inner:
     used: Any = None
 
 
+MOST_SPEED = 30.0
+"""m/s of the chassis: ten times the fastest rover that has driven on the Moon (LRV, 18 km/h), and a fall from 280 m."""
+MOST_TURN = 100.0
+"""rad/s of the chassis and of every joint: a wheel of 0.1 m rim radius at 10 m/s."""
+MOST_HEIGHT = 50.0
+"""m above the highest and below the lowest ground."""
+MOST_VALUE = 1e4
+"""Largest observation and reward that a replay buffer and the normaliser are given."""
+
+
+def plausible(qpos: Any, qvel: Any, ground: Any) -> Any:
+    """Whether rovers are where and as fast as rovers can be, (env,); false for what is not finite.
+
+    Args:
+      qpos: (env, nq), qvel: (env, nv), of a free body and its joints. ground: lowest and highest ground, m.
+    """
+    low, high = ground[0] - MOST_HEIGHT, ground[1] + MOST_HEIGHT
+    there = (qpos[:, 2] > low) & (qpos[:, 2] < high) & (jnp.abs(qpos[:, 7:]) < MOST_VALUE).all(-1)
+    slow = (jnp.abs(qvel[:, :3]) < MOST_SPEED).all(-1) & (jnp.abs(qvel[:, 3:]) < MOST_TURN).all(-1)
+    return there & slow
+
+
+def bounded(a: Any) -> Any:
+    """Values within `MOST_VALUE`; 0 for what is not finite."""
+    return jnp.clip(jnp.nan_to_num(a, nan=0.0, posinf=0.0, neginf=0.0), -MOST_VALUE, MOST_VALUE)
+
+
 class NavigationEnv:
     """Drive to a goal over lunar terrain; see `docs/reinforcement_learning.md` and `NavigationConfig`.
 
@@ -213,7 +240,7 @@ class NavigationEnv:
         terminated = success | ends["rolled_over"] | ends["stuck"] | ends["off_terrain"] | ends["diverged"]
         running = sum(terms.values())
         if c.divergence == "reset":
-            running = jnp.where(ends["diverged"], 0.0, running)
+            running = jnp.where(ends["diverged"], 0.0, bounded(running))
         reward = running + jnp.where(success, c.success, jnp.where(terminated, c.failure, 0.0))
         inner = dataclasses.replace(inner, steps=inner.steps + 1, total=inner.total + reward)
         truncated = ~terminated & (inner.steps >= self.episode_steps)
@@ -227,9 +254,7 @@ class NavigationEnv:
         final_obs, final_privileged = self._observe(params, inner, view)
         if c.divergence == "reset":
             # the successor of a state that is gone carries no value, but must not poison a batch
-            final_obs, final_privileged = (
-                jnp.nan_to_num(a, posinf=0.0, neginf=0.0) for a in (final_obs, final_privileged)
-            )
+            final_obs, final_privileged = bounded(final_obs), bounded(final_privileged)
         return side_by_side(
             self._restart(
                 params,
@@ -319,9 +344,13 @@ class NavigationEnv:
         rows, cols = field.heights.shape
         physics = inner.physics
         fine = jnp.isfinite(physics.qpos).all(-1) & jnp.isfinite(physics.qvel).all(-1)
-        diverged = ~fine if c.divergence == "reset" else jnp.zeros_like(fine)
         x, y = view.position[:, 0], view.position[:, 1]
         east, north = field.x0 + (cols - 1) * field.cell, field.y0 + (rows - 1) * field.cell
+        if c.divergence == "reset":
+            ground = jnp.stack([field.heights.min(), field.heights.max()])
+            diverged = ~(fine & plausible(physics.qpos, physics.qvel, ground))
+        else:
+            diverged = jnp.zeros_like(fine)
         inside = (x > field.x0 + c.edge) & (x < east - c.edge) & (y > field.y0 + c.edge) & (y < north - c.edge)
         found = {
             "diverged": diverged,
