@@ -1,4 +1,5 @@
 # make demo: run the main job. make test: lint, type-check and test; make test-all: the slow tests, too. make docs: the pages.
+# make proofs: slow tests in turn, 90 minutes of them; make all-proofs: all of them, with the table of when each last passed.
 # Each installs all that it needs into .venv.
 
 PYTHON ?= python3
@@ -17,7 +18,7 @@ export PIP_NO_COMPILE ?= 1
 FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$(XLA_FLAGS) --xla_cpu_use_fusion_emitters=false"
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test fast-tests test-all lint docs foreign-tune foreign-report clean
+.PHONY: demo test fast-tests test-all proofs all-proofs lint docs foreign-tune foreign-report clean
 
 demo: $(VENV)/run.stamp
 	$(BIN)/lunar-mjx demo -o runs/demo
@@ -30,6 +31,12 @@ fast-tests: $(VENV)/dev.stamp
 
 test-all: lint
 	$(PYTEST)
+
+proofs: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.proofs --minutes 90
+
+all-proofs: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.proofs --all --record
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

@@ -90,7 +90,7 @@ def replay(env: Environment, path: Path) -> State:
     Raises:
       UserError: the file is missing, or of another environment.
     """
-    with np.load(require_file(path, "the guard's dump"), allow_pickle=False) as data:
+    with require_file(path, "the guard's dump").open("rb") as file, np.load(file, allow_pickle=False) as data:
         shapes = jax.eval_shape(env.reset, env.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
         found = []
         for place, leaf in jax.tree_util.tree_leaves_with_path(shapes):

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from lunar_mjx.agents.learner import Learner, normalised
-from lunar_mjx.agents.networks import make_actor
+from lunar_mjx.agents.networks import ACTIVATIONS, make_actor
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.files import replacing
 
@@ -59,6 +60,32 @@ def policy_of(learner: Learner, state: Any, environment: dict[str, Any], notes: 
     return Policy(params, mean, deviation, network, environment, notes)
 
 
+class _Network(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+    obs: Annotated[int, Field(ge=1, le=100_000)]
+    actions: Annotated[int, Field(ge=1, le=10_000)]
+    layers: Annotated[list[Annotated[int, Field(ge=1, le=100_000)]], Field(max_length=100)]
+    activation: str
+    layer_norm: bool
+
+
+class _Environment(BaseModel):
+    model_config = ConfigDict(strict=True)
+    name: str
+    options: dict[str, Any]
+    unseen: dict[str, Any] = {}
+
+
+class _Record(BaseModel):
+    """What `policy.npz` says of itself."""
+
+    model_config = ConfigDict(strict=True)
+    format: str
+    network: _Network
+    environment: _Environment
+    notes: dict[str, Any]
+
+
 def save_policy(policy: Policy, path: Path) -> Path:
     """Writes a policy as an .npz file without pickles; returns the path."""
     leaves = {
@@ -80,14 +107,28 @@ def load_policy(path: str | Path) -> Policy:
     """
     path = require_file(path, "the policy")
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # NumPy leaves a file open that is no archive
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             record = json.loads(str(data["record"]))
             arrays = {name: data[name] for name in data.files if name != "record"}
-    except (ValueError, KeyError, OSError) as error:
-        raise UserError(f"{path}: is no policy ({error}); give an .npz that `lunar-mjx train` wrote.") from None
+        _Record.model_validate(record)
+    except Exception as error:  # archives, their compression and NumPy's headers raise a dozen kinds
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UserError(f"{path}: is no policy ({reason}); give an .npz that `lunar-mjx train` wrote.") from None
     if record.get("format") != FORMAT:
         raise bad_input(path, "format", record.get("format"), "is not known", f"give a file of format {FORMAT}")
     network = record["network"]
+    if network["activation"] not in ACTIVATIONS:
+        known = ", ".join(ACTIVATIONS)
+        raise bad_input(path, "network.activation", network["activation"], "does not exist", f"use one of {known}")
+    for name, array in arrays.items():
+        wanted = (network["obs"],) if name in ("mean", "deviation") else None
+        if array.dtype.kind != "f" or not np.isfinite(array).all():
+            raise UserError(f"{path}: {name} holds values that are no finite numbers; train anew, or fetch it again.")
+        if (wanted is not None and array.shape != wanted) or (name == "deviation" and (array <= 0.0).any()):
+            raise UserError(f"{path}: {name} does not fit the network's {network['obs']} observations; fetch it again.")
+    if ("mean" in arrays) != ("deviation" in arrays):
+        raise UserError(f"{path}: holds only one of mean and deviation; fetch it again.")
     shapes = jax.eval_shape(make_actor(**network).init, jax.random.PRNGKey(0))
     leaves = []
     for place, leaf in jax.tree_util.tree_leaves_with_path(shapes):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx._version import __version__
+from lunar_mjx.diagnosis.stored import read_stored
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.files import write_text
 from lunar_mjx.logs import Finding, Log, SteadyLog, check, read_campaign
@@ -110,8 +111,7 @@ class Run:
 
     def load(self, name: str) -> Any:
         """Contents of one of the run's JSON files; None if it has not been written yet."""
-        path = self.folder / name
-        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        return read_stored(self.folder / name)
 
     def save(self, name: str, content: Any) -> None:
         """Writes one of the run's JSON files."""
@@ -126,31 +126,28 @@ def load_run(folder: str | Path) -> Run:
     """
     folder = Path(folder)
     path = require_file(folder / RUN_FILE, "the run (made by `lunar-mjx compare`)")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if data.get("format") != FORMAT:
-            raise bad_input(path, "format", data.get("format"), "is not known", f"give a run of format {FORMAT}")
-        logs = tuple(Path(p) for p in data["logs"])
-        hashes = data["hashes"]
-    except (ValueError, KeyError, AttributeError) as error:
-        raise UserError(f"{path}: is not a run ({error}); make it anew with lunar-mjx compare.") from None
+    data = read_stored(path)
+    assert data is not None
+    if data["format"] != FORMAT:
+        raise bad_input(path, "format", data["format"], "is not known", f"give a run of format {FORMAT}")
+    logs, hashes = tuple(Path(p) for p in data["logs"]), data["hashes"]
     for log in logs:
         if not log.exists():
             raise bad_input(path, "logs", str(log), "is missing", "put the log back, or compare anew")
         if folder_hash(log) != hashes.get(str(log)):
             raise bad_input(path, "logs", str(log), "has changed since the comparison", "compare anew")
-    for candidate in data["candidates"]:
+    for candidate in data.get("candidates", ()):
         require_trust(path, "candidates", candidate)
     model = load_model(folder / MODEL_FILE)
     return Run(
         folder,
         logs,
         model,
-        tuple(data["candidates"]),
-        data["splits"],
-        tuple(data["added"]),
-        data["parent"],
-        int(data["seed"]),
+        tuple(data.get("candidates", ())),
+        data.get("splits", {}),
+        tuple(data.get("added", ())),
+        data.get("parent"),
+        data.get("seed", 0),
         data.get("discrepancy", {}),
     )
 

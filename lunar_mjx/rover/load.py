@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -72,8 +73,10 @@ def load_rover(name_or_path: str | Path) -> Rover:
         raise bad_input(path, "mjcf", file, "is not the name of a file beside it", _CONVERT_AGAIN)
     mjcf = require_file(folder / file, "the rover's MJCF")
     try:
-        model = mujoco.MjSpec.from_file(str(mjcf)).compile()
-    except ValueError as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # such as of inertia matrices that are next to singular
+            model = mujoco.MjSpec.from_file(str(mjcf)).compile()
+    except (ValueError, Warning) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{mjcf}: MuJoCo cannot compile it ({reason}); {_CONVERT_AGAIN}.") from None
     refuse_unused_fields(mjcf, model)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,12 @@ from lunar_mjx.diagnosis.runs import (
     SIGNATURES_FILE,
     VERDICT_FILE,
 )
+from lunar_mjx.diagnosis.stored import read_arrays, read_stored
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model
+from lunar_mjx.trust import trusting
 
 AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE = "audit.json", "unknown.json", "next.json"
 
@@ -95,7 +97,8 @@ class Result:
         if self.folder is None or not (self.folder / MODEL_FILE).is_file():
             return None
         try:
-            return load_model(self.folder / MODEL_FILE)
+            with trusting(False):  # a report runs nobody's code
+                return load_model(self.folder / MODEL_FILE)
         except UserError:
             return None
 
@@ -107,49 +110,33 @@ def read_result(folder: Path) -> Result:
       UserError: it is none, or one of its files is damaged.
     """
     path = require_file(folder / RUN_FILE, "the run (made by `lunar-mjx compare`)")
-    run = _json(path)
+    run = read_stored(path)
     if run is None or run.get("format") != FORMAT:
         raise bad_input(path, "format", (run or {}).get("format"), "is not known", f"give a run of format {FORMAT}")
     names = (COMPARISON_FILE, VERDICT_FILE, FITS_FILE, AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE)
-    comparison, verdict, fits, audit, unknown, following = (_json(folder / name) for name in names)
+    comparison, verdict, fits, audit, unknown, following = (read_stored(folder / name) for name in names)
     traces, signatures = _traces(folder / SERIES_FILE), _signatures(folder / SIGNATURES_FILE)
     return Result(
         folder.resolve().name, run, comparison, verdict, fits, audit, unknown, following, traces, signatures, folder
     )
 
 
-def _json(path: Path) -> dict[str, Any] | None:
-    if not path.is_file():
-        return None
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise UserError(f"{path}: is not JSON ({error}); delete it and make it anew.") from None
-    if not isinstance(content, dict):
-        raise UserError(f"{path}: holds no table of names and values; delete it and make it anew.")
-    return content
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
+def _signatures(path: Path) -> dict[str, np.ndarray]:
+    found = read_arrays(path)
+    if not found:
         return {}
     try:
-        with np.load(path, allow_pickle=False) as found:
-            return {name: found[name] for name in found.files}
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read ({error}); make it anew with lunar-mjx why.") from None
-
-
-def _signatures(path: Path) -> dict[str, np.ndarray]:
-    found = _arrays(path)
-    return dict(zip(map(str, found["names"]), found["signatures"], strict=True)) if found else {}
+        return dict(zip(map(str, found["names"]), found["signatures"], strict=True))
+    except (KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: is damaged ({error}); make it anew with lunar-mjx why.") from None
 
 
 def _traces(path: Path) -> Traces | None:
-    found = _arrays(path)
+    found = read_arrays(path)
     if not found:
         return None
     try:
+        _check_shapes(found)
         starts = [*found["series_start"].tolist(), len(found["measured"])]
         independent = np.isnan(found["time"])
         series = []
@@ -171,3 +158,20 @@ def _traces(path: Path) -> Traces | None:
         return Traces(observations, labels, found["predicted"], found["residual"], found["time"])
     except KeyError as error:
         raise UserError(f"{path}: lacks {error}; make it anew with lunar-mjx compare.") from None
+    except (ValueError, TypeError, IndexError) as error:
+        raise UserError(f"{path}: is damaged ({error}); make it anew with lunar-mjx compare.") from None
+
+
+def _check_shapes(found: Mapping[str, np.ndarray]) -> None:
+    """Raises `ValueError` for arrays that do not go with the measurements."""
+    n, models = len(found["measured"]), len(found["labels"])
+    shapes = {"measured": (n,), "sigma": (n,), "time": (n,), "unit": (n,), "predicted": (models, n),
+              "residual": (models, n), "place": (n if len(found["place"]) else 0, 3)}  # fmt: skip
+    for name, shape in shapes.items():
+        if found[name].shape != shape or found[name].dtype.kind not in "fiu":
+            raise ValueError(f"{name} is {found[name].dtype} of shape {found[name].shape}, not numbers of {shape}")
+    start, units = found["series_start"], found["unit"]
+    if start.ndim != 1 or (np.diff(start) < 0).any() or (len(start) and not 0 <= start[0] <= start[-1] <= n):
+        raise ValueError("series_start does not rise within the measurements")
+    if n and not (units.min() >= 0 and units.max() < len(found["unit_names"]) == len(found["split"])):
+        raise ValueError("unit names no manoeuvre")

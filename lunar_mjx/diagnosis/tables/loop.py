@@ -22,6 +22,7 @@ from lunar_mjx.diagnosis.verdict import Diagnosis, EffectEvidence, Verdict
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError
+from lunar_mjx.files import replacing
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.problem import NotTested
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Refit, Term
@@ -280,8 +281,9 @@ def save_series(
     predicted = [own.predict(np.zeros(len(own.coordinates)))[0], *(f.predict(u)[0] for f, u in fits.values())]
     residual = [start, *(f.residual(u) for f, u in fits.values())]
     place = observations.place if observations.place is not None else np.zeros((0, 3))
-    np.savez_compressed(
-        run.folder / SERIES_FILE,
+    with replacing(run.folder / SERIES_FILE) as part:
+        np.savez_compressed(
+        part,
         measured=observations.value, sigma=observations.sigma(), time=np.full(len(observations), np.nan), place=place,
         unit=observations.unit, unit_names=np.array(observations.unit_names), split=np.array(observations.unit_split),
         series_start=np.array([s.start for s in observations.series]),

@@ -19,8 +19,8 @@ def read_npy(path: Path, options: ReadOptions) -> Dem:
     cell = require_cell(str(path), "cell", options.cell)
     try:
         data = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        reason = "it holds pickled objects" if "ickle" in str(error) else str(error).splitlines()[0]
+    except Exception as error:  # NumPy parses the header as Python: anything from SyntaxError to TokenError
+        reason = "it holds pickled objects" if "ickle" in str(error) else " ".join(str(error).split())[:200]
         raise UserError(f"{path}: the array cannot be read ({reason}); save plain numbers with numpy.save.") from None
     if not isinstance(data, np.ndarray) or data.ndim != 2:
         shape = getattr(data, "shape", type(data).__name__)

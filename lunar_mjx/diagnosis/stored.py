@@ -1,0 +1,140 @@
+"""What is read back from a run folder, held against schemas: a damaged file is one sentence, never a traceback.
+
+Fits are a cache: they are dropped where they are damaged, saying so, and made anew.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from lunar_mjx.errors import UserError
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Split = Literal["fit", "select", "test", "apart"]
+
+
+class _Stored(BaseModel):
+    """Fields that are read; what else stands there is for the reader of the file."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class _Run(_Stored):
+    format: str
+    version: str = ""
+    logs: list[str]
+    hashes: dict[str, str]
+    candidates: list[str] = []
+    splits: dict[str, Split] = {}
+    added: list[str] = []
+    parent: str | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+    discrepancy: dict[str, Number] = {}
+    test_opened: list[dict[str, Any]] = []
+
+
+class _Channel(_Stored):
+    manoeuvre: str
+    split: str
+    channel: str
+    as_given: Number | None
+    refitted: Number | None
+
+
+class _Certificate(_Stored):
+    problems: list[str]
+
+
+class _Comparison(_Stored):
+    as_given: dict[str, Number | None]
+    refitted: dict[str, Number | None]
+    by_channel: list[_Channel]
+    certificate: _Certificate
+
+
+class _Verdict(_Stored):
+    verdict: str
+    sentence: str
+    effects: list[str]
+    evidence: list[dict[str, Any]] = []
+    details: dict[str, Any] = {}
+
+
+class _Fit(_Stored):
+    u: dict[str, Number]
+    chi2: Number | None
+    gradient: Number | None
+    starts: list[Any]
+    at_bound: list[str]
+    extra: dict[str, Any]
+    problems: list[str]
+    wide: dict[str, Number] | None = None
+
+
+_SCHEMAS: dict[str, TypeAdapter[Any]] = {
+    "run.json": TypeAdapter(_Run),
+    "comparison.json": TypeAdapter(_Comparison),
+    "verdict.json": TypeAdapter(_Verdict),
+}
+_ANY: TypeAdapter[Any] = TypeAdapter(dict[str, Any])
+_FIT, _PLACE = TypeAdapter(_Fit), TypeAdapter(dict[str, Number])
+FITS = "fits.json"
+
+
+def read_stored(path: Path) -> dict[str, Any] | None:
+    """Contents of a JSON file of a run folder; None if it is not there, or is a store of fits that cannot be used.
+
+    Raises:
+      UserError: it is no JSON, or a field is missing or of another kind.
+    """
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if path.name == FITS:
+            for name, entry in _ANY.validate_python(content).items():
+                (_PLACE if name.startswith("at ") else _FIT).validate_python(entry)
+        else:
+            _SCHEMAS.get(path.name, _ANY).validate_python(content)
+    except (ValueError, RecursionError) as error:  # ValidationError, JSONDecodeError and UnicodeDecodeError are such
+        if path.name == FITS:
+            print(f"{path}: is damaged ({_told(error)}); its fits are made anew", file=sys.stderr)
+            return None
+        raise UserError(
+            f"{path}: is damaged ({_told(error)}); make it anew with lunar-mjx {_MAKERS.get(path.name, 'compare')}."
+        ) from None
+    return content
+
+
+_MAKERS = {"verdict.json": "why", "audit.json": "why --audit", "next.json": "next"}
+
+
+def _told(error: Exception) -> str:
+    """A validation's first problem in a few words."""
+    if isinstance(error, ValidationError):
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the whole"
+        return f"{where}: {first['msg'].lower()}"
+    return " ".join(str(error).split())[:150] or type(error).__name__
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of an `.npz` file without pickles; none if it is not there.
+
+    Raises:
+      UserError: it cannot be read.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        # NumPy leaves a file open that is no archive
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+    except Exception as error:  # zip archives, their compression and NumPy's headers raise a dozen kinds
+        raise UserError(f"{path}: is damaged ({_told(error)}); make it anew with lunar-mjx compare or why.") from None

@@ -1,0 +1,70 @@
+"""Run folders that were damaged: one sentence, and fits are dropped rather than in the way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lunar_mjx.diagnosis.report.read import _traces
+from lunar_mjx.diagnosis.stored import read_stored
+from lunar_mjx.errors import UserError
+
+N, MODELS = 6, 2
+GOOD = {
+    "measured": np.arange(6.0),
+    "sigma": np.ones(6),
+    "time": np.arange(6.0),
+    "place": np.zeros((0, 3)),
+    "unit": np.zeros(6, int),
+    "unit_names": np.array(["a"]),
+    "split": np.array(["fit"]),
+    "series_start": np.array([0, 3]),
+    "series_channel": np.array(["x", "y"]),
+    "series_log": np.array([0, 0]),
+    "logs": np.array(["a"]),
+    "labels": np.array(["as given", "refitted"]),
+    "predicted": np.zeros((2, 6)),
+    "residual": np.zeros((2, 6)),
+}
+BAD = {
+    "predicted": np.zeros((2, 5)),
+    "residual": np.zeros((1, 6)),
+    "sigma": np.array(["x"] * 6),
+    "unit": np.full(6, 7),
+    "series_start": np.array([0, 9]),
+    "time": np.zeros((6, 6)),
+    "series_log": np.array(["x", "y"]),
+    "measured": np.array(3.0),
+    "series_channel": np.array(["x"]),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_series_that_do_not_go_together_are_refused(name, tmp_path):
+    path = tmp_path / "series.npz"
+    np.savez(path, **GOOD)
+    assert _traces(path).predicted.shape == (2, 6)
+    np.savez(path, **{**GOOD, name: BAD[name]})
+    with pytest.raises(UserError, match=r"series\.npz: is damaged .*; make it anew"):
+        _traces(path)
+
+
+def test_a_torn_archive_is_refused(tmp_path):
+    path = tmp_path / "series.npz"
+    np.savez_compressed(path, **GOOD)
+    whole = path.read_bytes()
+    for cut in range(0, len(whole), 97):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(UserError, match=r"series\.npz: is damaged"):
+            _traces(path)
+    path.write_bytes(whole.replace(b"measured", b"mxasured"))
+    with pytest.raises(UserError, match=r"lacks 'measured'|is damaged"):
+        _traces(path)
+
+
+def test_damaged_fits_are_dropped_and_told(tmp_path, capfd):
+    path = tmp_path / "fits.json"
+    for text in ("{", "[]", '{"soil": {"u": {"soil.n": "x"}}}', '{"at a": {"soil.n": null}}', '{"soil": 3}', "\x00"):
+        path.write_text(text)
+        assert read_stored(path) is None
+        assert "fits.json: is damaged" in capfd.readouterr().err
