@@ -71,11 +71,13 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     """Every model of the runs in a folder, with what the diagnosis of each run said."""
     rows = []
     runs = sorted(folder.glob("run*"), key=lambda p: int(p.name.removeprefix("run")))
+    before: set[str] = set()
     for number, run in enumerate(runs):
         about = json.loads((run / "run.json").read_text(encoding="utf-8"))
         path = run / "verdict.json"
         verdict = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-        added = about["added"][-1] if about["added"] else ""
+        added = ", ".join(a for a in about["added"] if a not in before)
+        before |= set(about["added"])
         with np.load(run / "series.npz") as series:
             labels = [str(label) for label in series["labels"]]
             for row, label in enumerate(labels):
@@ -87,7 +89,7 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
                 rows.append({"run": run.name, "model": name, **errors(series, series["predicted"][row])})
             rows[-1]["corrected"] = errors(series, series["corrected"]) if "corrected" in series.files else None
         if verdict is None:
-            continue  # several effects are added one after the other before it is asked again
+            continue
         rows[-1]["verdict"] = verdict["verdict"]
         rows[-1]["sentence"] = verdict["sentence"]
         rows[-1]["probabilities"] = dict(list(verdict["probabilities"].items())[:4])

@@ -412,11 +412,7 @@ def add(folder: str | Path | Run, effect: str, out: str | Path, progress: Progre
             f"add: the model has {new.name} already; remove it from {run.folder / 'model.toml'} to add it anew."
         )
     if isinstance(campaign[0], SteadyLog):
-        model = grown_model(run, campaign, effect, values, progress)
-        child = dataclasses.replace(
-            run, folder=Path(out), model=model, added=(*run.added, new.name), parent=str(run.folder.resolve())
-        )
-        return _compare(child, progress)
+        return _add_to_tables(grown, campaign, [effect], out, progress, values)
     model = run.model.add(new if ".py" not in effect else effect, "add", **values)
     replaced = [e for e in run.model.effect_names if e not in model.effect_names]
     if not replaced:
@@ -468,9 +464,30 @@ def improve(
         if not names or len(runs) > most:
             return diagnosis, runs
         specs = {s.rpartition(":")[2]: s for s in effects}
-        for name in names[: most + 1 - len(runs)]:
-            run = add(run, specs.get(name, name), out / f"run{len(runs) + 1}", progress)
-            runs.append(run)
+        names, place = [specs.get(n, n) for n in names], out / f"run{len(runs) + 1}"
+        campaign = gate(run)
+        if isinstance(campaign[0], SteadyLog):
+            run = _add_to_tables(run, campaign, names, place, progress, {})
+        else:
+            run = add(run, names[0], place, progress)
+        runs.append(run)
+
+
+def _add_to_tables(
+    run: Run,
+    logs: Sequence[SteadyLog],
+    names: Sequence[str],
+    out: str | Path,
+    progress: Progress,
+    values: Mapping[str, float],
+) -> Run:
+    """Adds effects to the model of a run on tables, all at once, and compares anew in another folder."""
+    from lunar_mjx.effects import catalogue
+
+    model = grown_model(run, logs, names, values, progress)
+    added = (*run.added, *(catalogue.get(n).name for n in names))
+    child = dataclasses.replace(run, folder=Path(out), model=model, added=added, parent=str(run.folder.resolve()))
+    return _compare(child, progress)
 
 
 def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> list[str]:

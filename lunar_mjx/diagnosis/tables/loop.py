@@ -515,32 +515,35 @@ def _fits(problem: Tables, found: ModelSearch) -> dict[str, Any]:
 
 
 def grown_model(
-    run: Run, logs: Sequence[SteadyLog], name: str, values: Mapping[str, float], progress: Progress
+    run: Run, logs: Sequence[SteadyLog], names: Sequence[str], values: Mapping[str, float], progress: Progress
 ) -> Model:
-    """The run's model with an effect, or another contact law, at the values of their refit together."""
-    new = name if name in LAWS else catalogue.get(name).name
-    replaces = new in LAWS or bool(set(catalogue.get(name).replaces) & set(run.model.effect_names))
-    if new in LAWS:
-        model = with_law(run.model, new)
-    elif new in {part for parts in LAWS.values() for part in parts}:
-        model = with_law(run.model, next(law for law, parts in LAWS.items() if new in parts))
-    else:
-        model = run.model.add(catalogue.get(name) if ".py" not in name else name, "add", **values)
-    if replaces:
-        grown = dataclasses.replace(run, model=model)
-        problem, effects = build_tables(grown, logs, rivals=False), frozenset()
-    else:
-        specs = (*run.candidates, name) if ".py" in name else run.candidates
-        problem = build_tables(dataclasses.replace(run, candidates=specs), logs, rivals=False)
-        effects = frozenset({new})
-        if new not in problem.own.candidates:
-            return model
-    progress(f"refitting with {new}", 0.0)
+    """The run's model with effects, and another contact law where one is among them, at the values of their refit.
+
+    Args:
+      run: with its model. logs: its tables. names: of effects, or file.py:name; a part of a contact law stands for it.
+      values: parameters to hold at other than their fitted values. progress: told of the refit.
+    """
+    base = run.model
+    for law, parts in LAWS.items():
+        if set(parts) & set(names):
+            base = with_law(base, law)
+    effects = [n for n in names if not any(n in parts for parts in LAWS.values())]
+    specs = tuple(n for n in effects if ".py" in n and n not in run.candidates)
+    grown = dataclasses.replace(run, model=base, candidates=(*run.candidates, *specs))
+    problem = build_tables(grown, logs, rivals=False)
+    model = base
+    for name in effects:
+        model = model.add(name if ".py" in name else catalogue.get(name), "add", **values)
+    new = frozenset(catalogue.get(n).name for n in effects) & set(problem.own.candidates)
+    progress("refitting with " + ", ".join(sorted(new) or [problem.own.name]), 0.0)
+    form = problem.own
+    kept = (run.load(HYPOTHESES_FILE) or {}).get(" + ".join([form.name, *sorted(new)]), {}).get("u")
+    start = None if kept is None else np.array([kept.get(c.key, 0.0) for c in form.coordinates])
     with threadpool_limits(1, "blas"):
-        base = problem.own.refit(frozenset(), None, None)
-        refit = problem.own.refit(effects, base, None) if effects else base
-    for i, c in enumerate(problem.own.coordinates):
-        mine = i in problem.own.baseline or c.effect in effects
+        near = form.refit(frozenset(), None, None) if new and start is None else None
+        refit = form.refit(new, near, start)
+    for i, c in enumerate(form.coordinates):
+        mine = i in form.baseline or c.effect in new
         if mine and c.effect in model.effect_names and c.name not in values:
             value = float(c.value(refit.u[i]))
             old = model.parameters[c.effect][c.name]
