@@ -12,9 +12,9 @@ from threadpoolctl import threadpool_limits
 
 from lunar_mjx.diagnosis import build_problem
 from lunar_mjx.diagnosis.candidates import usable
-from lunar_mjx.diagnosis.conclusion import conclude, label, probabilities, title
 from lunar_mjx.diagnosis.runs import COMPARISON_FILE, HYPOTHESES_FILE, RUN_FILE, SERIES_FILE, SIGNATURES_FILE, Run
 from lunar_mjx.diagnosis.tables import problem as tables
+from lunar_mjx.diagnosis.tables.conclusion import conclude, label, probabilities, title
 from lunar_mjx.diagnosis.tables.port_gains import FIELDS
 from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.tables.wheel_form import WheelForm, table_data

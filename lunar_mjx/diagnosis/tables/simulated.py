@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lunar_mjx.diagnosis.conclusion import Conclusion, conclude
 from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.tables.conclusion import Conclusion, conclude
 from lunar_mjx.diagnosis.tables.loop import build_tables
 from lunar_mjx.diagnosis.tables.wheel_form import WheelForm
 from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, search

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from lunar_mjx.diagnosis import build_problem
-from lunar_mjx.diagnosis.conclusion import conclude
 from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.tables.conclusion import conclude
 from lunar_mjx.diagnosis.tables.loop import build_tables, contact_laws, with_law
 from lunar_mjx.diagnosis.tables.port_gains import FIELDS, GAINS
 from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE
