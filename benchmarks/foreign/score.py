@@ -122,6 +122,7 @@ def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
     Returns:
       `wrong_name`: something is named with confidence that is not there. `wrong_strict`: the same where names that the
       base law earns count as wrong, too. `found`: the hidden effects are named, or in a class of at most three.
+      `at_port`: something unlisted is said to act where the hidden effect does, and nothing wrong beside it.
       `outside_right`: of a case outside the catalogue, its port or its class with "unlisted" is given.
     """
     hidden, effects, label = set(truth["hidden"]), list(answer["effects"]), answer["verdict"]
@@ -143,6 +144,8 @@ def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
     right_port = bool(set(answer["ports"]) & set(truth["ports"]))
     by_port = label == "UNKNOWN" and right_port
     by_more = label in ("KNOWN", "MULTIPLE") and answer["unlisted"] and right_port and not bad
+    # What UNKNOWN lists beside its port helps only; it is no name.
+    at_port = right_port and (label == "UNKNOWN" or (answer["unlisted"] and not bad))
     by_class = label == "KNOWN_CLASS" and answer["unlisted"] and (right_port or bool(good))
     return {
         "wrong_name": wrong,
@@ -150,6 +153,7 @@ def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
         "found": found,
         "partly": confident and bool(good) and not bad,
         "port_right": right_port,
+        "at_port": at_port,
         "outside_right": by_port or by_class or by_more,
     }
 
@@ -308,6 +312,7 @@ def _figures(everything: Sequence[Row]) -> Row:
         "wrong_name_singles_strict": [r["wrong_strict"] for r in singles],
         "separable_singles_found": [r["found"] for r in told],
         "separable_singles_found_or_partly": [r["found"] or r["partly"] for r in told],
+        "separable_singles_found_or_unlisted_at_port": [r["found"] or r["at_port"] for r in told],
         "blind_separable_singles_found": [r["found"] for r in told if _sigma(r, "sigma_blind") > SEPARABLE],
         "separable_singles_never_tuned_on_found": [r["found"] for r in told if r["truth"]["hidden"][0] not in tuned],
         "all_singles_found": [r["found"] for r in singles],

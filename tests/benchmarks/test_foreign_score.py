@@ -82,6 +82,13 @@ def test_outside_needs_the_port_or_a_class_with_unlisted() -> None:
     assert not ask(OUTSIDE, "KNOWN_CLASS", ["grousers"], port="wheel_shear", unlisted=False)["outside_right"]
 
 
+def test_something_unlisted_at_the_port_of_the_hidden_effect_is_told_apart() -> None:
+    assert ask(TRUTH, "UNKNOWN", ["bulldozing"], port="wheel_shear")["at_port"]
+    assert ask(TRUTH, "KNOWN", ["exit_angle"], port="wheel_shear: lateral force", unlisted=True)["at_port"]
+    assert not ask(TRUTH, "KNOWN", ["bulldozing"], port="wheel_shear", unlisted=True)["at_port"]
+    assert not ask(TRUTH, "UNKNOWN", port="soil")["at_port"]
+
+
 def test_wilson_and_reliability() -> None:
     low, high = score.wilson(0, 10)
     assert low == 0.0 and high == pytest.approx(0.2775, abs=1e-3)
