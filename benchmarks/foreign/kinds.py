@@ -139,7 +139,7 @@ OUTSIDE: dict[str, Kind] = {
     "hard_layer": Kind(  # a firm layer some millimetres down (Wong 2008, ch. 2: layered snow and soil)
         lambda r, b: {
             "modulus": _between(r, 3.0, 8.0) * b.pressure / (0.1 * b.radius),
-            "depth": _between(r, 0.04, 0.09),
+            "depth": _between(r, 0.02, 0.05),
         },
         ("wheel_normal", "soil"),
         frozenset({"sinkage", "loads"}),
@@ -149,16 +149,16 @@ OUTSIDE: dict[str, Kind] = {
         lambda r, b: {"share": _between(r, 0.05, 0.12)}, ("geometry",), frozenset({"loads", "torque"})
     ),
     "peak_shear": Kind(  # dense sand: a hump of strength at small displacement
-        lambda r, b: {"height": _between(r, 0.2, 0.5)}, ("wheel_shear", "soil"), frozenset(), _STRESSES
+        lambda r, b: {"height": _between(r, 0.4, 0.9)}, ("wheel_shear", "soil"), frozenset(), _STRESSES
     ),
     "rear_lift": Kind(  # soil lifted by the rear of a spinning rim
-        lambda r, b: {"density": _between(r, 1500, 4000)}, ("wheel_normal",), frozenset({"sinkage", "torque"})
+        lambda r, b: {"density": _between(r, 3000, 8000)}, ("wheel_normal",), frozenset({"sinkage", "torque"})
     ),
     "bearing_side_load": Kind(  # friction of the axle's bearing under side load
-        lambda r, b: {"arm": _between(r, 0.04, 0.12)}, ("wheel_shear", "motor_torque"), _ANGLES | _TORQUE
+        lambda r, b: {"arm": _between(r, 0.08, 0.2)}, ("wheel_shear", "motor_torque"), _ANGLES | _TORQUE
     ),
     "cohesion_lost": Kind(  # cohesion that shearing breaks
-        lambda r, b: {"ways": _between(r, 0.5, 2.0)}, ("soil", "wheel_shear"), frozenset({"cohesive"}), _STRESSES
+        lambda r, b: {"ways": _between(r, 0.2, 1.0)}, ("soil", "wheel_shear"), frozenset({"cohesive"}), _STRESSES
     ),
     "creep_stiffness": Kind(  # soil that yields with time: stiffness grows with the travel speed
         lambda r, b: {"per_decade": _between(r, 0.15, 0.4)}, ("soil", "wheel_normal"), frozenset({"speeds", "sinkage"})

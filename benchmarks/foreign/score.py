@@ -373,7 +373,7 @@ TARGETS = {
     "wrong_name_nulls": "<= 2 %",
     "wrong_name_singles": "<= 2 %",
     "separable_singles_found": ">= 80 %, drives 70 %",
-    "outside_right": ">= 75 %",
+    "separable_outside_right": ">= 75 %",
     "bad_fit": "<= 2 %",
     "verdict_changes_with_stated_noise": "< 2 %",
 }
