@@ -63,8 +63,8 @@ def write_log(
     for name, frame in tables.items():
         file = f"{name}.{'parquet' if parquet else 'csv'}"
         write_frame(frame, folder / file)
-        rate = (rates_hz or {}).get(name) or float(1.0 / np.median(np.diff(frame["time_s"])))
-        entries[name] = {"file": file, "rate_hz": round(rate, 6)}
+        rate = (rates_hz or {}).get(name) or _rate(frame)
+        entries[name] = {"file": file, **({"rate_hz": round(rate, 6)} if rate else {})}
         if name in on_change:
             entries[name]["on_change"] = True
         if name in (clock_offsets_s or {}):
@@ -156,6 +156,13 @@ def _check_frame(name: str, frame: pd.DataFrame) -> None:
         found = parse_column(column, "write_log") if column != "time_s" else None
         if found is not None and found.problem:
             raise bad_input("write_log", f"tables.{name}", column, found.problem, "rename the column")
+
+
+def _rate(frame: pd.DataFrame) -> float:
+    """Median rate of a table's time, Hz; 0 where time nowhere rises, which is for the gate to tell."""
+    steps = np.diff(np.asarray(frame["time_s"], float))
+    steps = steps[steps > 0.0]
+    return float(1.0 / np.median(steps)) if steps.size else 0.0
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,7 @@ import pytest
 from scipy.io import savemat
 
 from lunar_mjx.errors import UserError
-from lunar_mjx.logs import Log, import_drives, read_log
+from lunar_mjx.logs import Log, check, import_drives, read_log
 from lunar_mjx.logs.readers.clocks import TimeColumn, seconds
 from lunar_mjx.logs.readers.geodesy import tangent_plane, utm, utm_zone
 from lunar_mjx.logs.readers.held import held_samples
@@ -359,3 +359,29 @@ def test_the_documented_map_is_read(tmp_path: Path) -> None:
     assert "joint_right_drive_speed_rad_s" not in motors and any("no number" in note for _, note in found.notes)
     assert np.ptp((log.channel("position_y_m") or (None, np.zeros(1)))[1]) == pytest.approx(39e-6 * 110973.0, rel=0.01)
     assert log.tables["imu"].clock_offset_std_s == 0.05 and log.tables["imu"].time_s[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"", "is empty"),
+        (b"t,c\n", "holds no drive"),
+        (b"\x00\xff\xfe\x81", "is not a text table"),
+        (b"t,c\n0,1\n1,2\n2,3,4\n3,4\n", "is not a table of even rows"),
+        (b"t,c\n0,1\n", "short: has 1 rows"),
+        (b"t,c\n0,1\n0,2\n0,3\n", "clock: repeats"),
+        (b"t,c\n3,1\n2,2\n1,3\n", "clock: goes back"),
+        (b"t,c\n,1\n0.1,2\n0.2,\n0.3,4\n", "clock: is empty"),
+        (b"\xef\xbb\xbft,c\r\n0,1\r\n0.1,inf\r\n0.2,3\r\n", ""),
+    ],
+)
+def test_spoilt_files_are_told_by_a_sentence_or_by_the_gate(text: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(text)
+    head = '[log]\nrover = "luvmi_x"\n[tables.d]\nfile = "a.csv"\ntime = "t"\n'
+    mapping = write_map(tmp_path, head + '[tables.d.channels]\nmotor_left_drive_current_A = "c"\n')
+    try:
+        found = check(drive(import_drives(tmp_path / "a.csv", tmp_path / "log", mapping).folder))
+        told = "; ".join(f"{f.kind}: {f.message}" for f in found)
+    except UserError as error:
+        told = str(error)
+    assert words in told if words else told == "", told

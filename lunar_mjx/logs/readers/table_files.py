@@ -17,6 +17,8 @@ from lunar_mjx.errors import UserError, bad_input, require_file
 SEPARATORS: Mapping[str, str] = {"comma": ",", "semicolon": ";", "tab": "\t", "blank": r"\s+", ",": ",", ";": ";"}
 """Names of separators in a map, and what pandas calls them; `blank` is any run of blanks and tabs."""
 SUFFIXES = (".csv", ".txt", ".dat", ".tsv", ".log", ".parquet", ".pq", ".mat")
+MOST_ROWS = 0.6
+"""Share of rows that a separator must split into the same number of cells."""
 _SNIFFED_BYTES = 65536
 """Enough for a header and hundreds of rows, from which the separator is guessed."""
 
@@ -103,7 +105,7 @@ def guess_separator(start: str, decimal: str = ".") -> str:
             continue
         counts = [len(next(csv.reader([line], delimiter=sign))) for line in lines]
         typical = int(np.median(counts))
-        if typical > most and np.mean(np.array(counts) == typical) > 0.9:
+        if typical > most and np.mean(np.array(counts) == typical) > MOST_ROWS:
             best, most = sign, typical
     return best
 
