@@ -1,5 +1,5 @@
 # make demo: run the main job. make test: lint, type-check and test; make test-all: the slow tests, too. make docs: the pages.
-# make proofs: slow tests in turn, 90 minutes of them; make all-proofs: all of them, with the table of when each last passed.
+# make proofs: slow tests in turn, 40 minutes of them; make all-proofs: all of them, with the table of when each last passed.
 # Each installs all that it needs into .venv.
 
 PYTHON ?= python3
@@ -33,7 +33,7 @@ test-all: lint
 	$(PYTEST)
 
 proofs: $(VENV)/dev.stamp
-	$(BIN)/python -m tests.proofs --minutes 90
+	$(BIN)/python -m tests.proofs --minutes 40
 
 all-proofs: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.proofs --all --record
