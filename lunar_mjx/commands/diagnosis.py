@@ -92,6 +92,9 @@ def why(
     audit: Annotated[
         float, typer.Option(help="Minutes to spend on simulated logs like these: how often is it wrong?")
     ] = 0,
+    seconds: Annotated[
+        float | None, typer.Option(help="Time that the search may take, for logs with imposed wheel speeds.", min=1.0)
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Say which effect is missing, where, or that nobody can tell; the exit status is the verdict."""
@@ -100,7 +103,7 @@ def why(
 
     keep_compiled()
     with console_progress() as progress:
-        diagnosis = verbs.why(run, only, progress=progress)
+        diagnosis = verbs.why(run, only, progress=progress, seconds=seconds)
         if audit > 0:
             from lunar_mjx.diagnosis.audit import audit as run_audit
 
@@ -264,6 +267,14 @@ def _print_comparison(run: Any) -> None:
     for row in worst:
         table.add_row(row["manoeuvre"], row["split"], row["channel"], _shown(row["as_given"]), _shown(row["refitted"]))
     console.print(table)
+    if found.get("not_told"):
+        console.print(f"These logs hardly tell {', '.join(found['not_told'])}.", highlight=False)
+    if "windows" in found:
+        used = found["windows"]
+        console.print(
+            f"{used['used']} of {used['of']} windows of {used['seconds']:g} s were used (windows.json).",
+            highlight=False,
+        )
     if "certificate" in found:
         problems = found["certificate"]["problems"]
         console.print("Certificate of the fit: " + ("; ".join(problems) if problems else "complete"), highlight=False)

@@ -22,6 +22,7 @@ NO_CANDIDATE = frozenset(
         "payload",
         "tether",
         "hard_surface",
+        "soft_ground",
         "surface_type",
         "soil_gradient",
         "boulders",

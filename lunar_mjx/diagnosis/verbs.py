@@ -13,6 +13,7 @@ import numpy as np
 from lunar_mjx.diagnosis.attribute import diagnose, parameters
 from lunar_mjx.diagnosis.build_problem import build_problem, require_splits
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
+from lunar_mjx.diagnosis.drives.windows import verbs as windows
 from lunar_mjx.diagnosis.fitted_model import fitted_model
 from lunar_mjx.diagnosis.refit import Settings
 from lunar_mjx.diagnosis.runs import (
@@ -93,6 +94,8 @@ def compare(
 def _compare(run: Run, progress: Progress) -> Run:
     campaign = gate(run)
     require_splits(run.splits, campaign)
+    if windows.imposed(campaign):
+        return windows.compare(run, campaign, progress)
     run.write()
     if isinstance(campaign[0], SteadyLog):
         tables, refit = compare_tables(run, campaign, progress)
@@ -285,15 +288,16 @@ def why(
     only: Sequence[str] | None = None,
     settings: Settings | None = None,
     progress: Progress = silent,
+    seconds: float | None = None,
 ) -> Diagnosis:
     """Localises and attributes the misfit of a run; writes `verdict.json`.
 
     Args:
       folder: of the run. only: candidates to consider; all if None. settings: thresholds and effort.
-      progress: told what is being done.
+      progress: told what is being done. seconds: time that the search may take, for logs with imposed wheel speeds.
 
     Raises:
-      UserError: the folder is no run.
+      UserError: the folder is no run, or a time limit that cannot be kept.
     """
     run = folder if isinstance(folder, Run) else load_run(folder)
     settings = settings or Settings(seed=run.seed)
@@ -301,6 +305,10 @@ def why(
         campaign = gate(run)
     except BadData as bad:
         return bad.diagnosis
+    if windows.imposed(campaign):
+        return windows.why(run, campaign, only, windows.SECONDS if seconds is None else seconds, progress)
+    if seconds is not None:
+        raise UserError("why: --seconds is for logs with imposed wheel speeds; drop it.")
     if isinstance(campaign[0], SteadyLog):
         diagnosis = diagnose_tables(run, campaign, only, progress)
         run.save(VERDICT_FILE, diagnosis.to_dict())
@@ -403,6 +411,8 @@ def add(folder: str | Path | Run, effect: str, out: str | Path, progress: Progre
     """
     run = folder if isinstance(folder, Run) else load_run(folder)
     campaign = gate(run)
+    if windows.imposed(campaign):
+        return windows.add(run, campaign, effect, Path(out), progress)
     from lunar_mjx.effects import catalogue
 
     new = catalogue.get(effect)

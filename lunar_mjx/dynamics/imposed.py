@@ -83,6 +83,16 @@ class Seen:
     acceleration_x: Any
 
 
+def on_a_plane(model: Model) -> Model:
+    """A model with a plane as its ground, and without what cannot act there."""
+    for name in LEFT_OUT:
+        if name in model.effect_names:
+            model = model.remove(name)
+    if "shear_state" in model.effect_names:
+        model = model.set("shear_state", "imposed motion", damping_time=DAMPING_TIME_S)
+    return model.replace(terrain=flat(8.0))
+
+
 class KinematicDrive:
     """A model whose wheels move as they were measured.
 
@@ -111,12 +121,7 @@ class KinematicDrive:
             )
         self.steps = max(1, int(np.ceil(bin_s / longest_step_s - 1e-9)))
         self.bin_s = bin_s
-        for name in LEFT_OUT:
-            if name in model.effect_names:
-                model = model.remove(name)
-        if "shear_state" in model.effect_names:
-            model = model.set("shear_state", "imposed motion", damping_time=DAMPING_TIME_S)
-        self.model = model.replace(terrain=flat(8.0), timestep=bin_s / self.steps)
+        self.model = on_a_plane(model).replace(timestep=bin_s / self.steps)
         self.system = System(self.model, "structured")
         engine = self.system.engine
         assert isinstance(engine, StructuredEngine)

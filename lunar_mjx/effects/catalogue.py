@@ -44,6 +44,7 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         soil.soil,
         soil.surface_type,
         soil.hard_surface,
+        soil.soft_ground,
         soil.soil_gradient,
         wheel.pressure_sinkage,
         wheel.shear_state,

@@ -46,6 +46,7 @@ _TOP = (
     "ambient",
     "control",
     "effects",
+    "priors",
 )
 _AMBIENT = ("temperature_degC", "noon_temperature_degC", "night_temperature_degC", "noon_time_s", "period_s")
 _CONTROL = ("mode", *GAINS)
@@ -93,6 +94,7 @@ def load_model(path: str | Path) -> Model:
     check_settings(model, path)
     model = with_position_gains(model, [g for g, entry in data.get("control", {}).items() if GAINS[0] in entry])
     model = _effects(path, data, model)
+    model = dataclasses.replace(model, priors=_priors(path, _table(path, "priors", data.get("priors", {}))))
     check_effects(model, path)
     return model
 
@@ -160,6 +162,7 @@ def _record(model: Model, path: Path) -> dict[str, Any]:
             for e in model.effects
             if e.parameters
         },
+        **({"priors": {k: {"value": v, "std": s} for k, (v, s) in model.priors.items()}} if model.priors else {}),
     }
 
 
@@ -194,6 +197,19 @@ def _control(path: Path, table: Mapping[str, Any], model: Model) -> tuple[dict[s
             for key, old in zip(GAINS, model.gains[group], strict=True)
         )
     return modes, gains
+
+
+def _priors(path: Path, table: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Value and standard deviation by `effect.parameter` or `calibration.name`, in the parameter's SI unit."""
+    priors = {}
+    for key, entry in table.items():
+        field = f"priors.{key}"
+        _known(path, field, _table(path, field, entry), ("value", "std"))
+        value, std = (_number(path, f"{field}.{k}", entry.get(k)) for k in ("value", "std"))
+        if std < 0.0:
+            raise bad_input(path, f"{field}.std", std, "is negative", "give a standard deviation, or 0 to fix it")
+        priors[key] = (value, std)
+    return priors
 
 
 def _effects(path: Path, data: Mapping[str, Any], model: Model) -> Model:

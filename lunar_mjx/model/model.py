@@ -45,6 +45,8 @@ class Model:
       ambient: noon temperature K, night temperature K, time of noon s, length of the day s; constant if both are equal.
       modes: control mode by joint group. gains: position gain N m/rad and velocity gain N m s/rad by joint group.
       effect_files: catalogue name or /absolute/file.py:name of every effect.
+      priors: value and standard deviation of what is known of a parameter (`effect.parameter`) or of an instrument
+        (`calibration.pitch`) before a fit; a standard deviation of zero fixes it.
     """
 
     rover: Rover
@@ -60,6 +62,7 @@ class Model:
     modes: Mapping[str, str] = dataclasses.field(default_factory=dict)
     gains: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     effect_files: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
     @property
     def effect_names(self) -> tuple[str, ...]:

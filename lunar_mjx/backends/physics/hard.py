@@ -44,7 +44,7 @@ def rock_shear(c: Context, p: SimpleNamespace) -> None:
     k_x, k_y, r = c.slip["slip_x"], c.slip["slip_y"], c.geometry["radius"]
     k = np.sqrt(k_x * k_x + k_y * k_y + 1e-12)
     share = -p.mu * load * np.expm1(-k / p.slip_scale) / k
-    along, side = share * k_x, -share * k_y
+    along, side = share * k_x, -p.side * share * k_y
     where = rock[..., None]
     force, moment = np.stack([along, side, load], -1), np.stack([r * side, -r * along, 0.0 * r], -1)
     c.wheel["force"] = np.where(where, force, c.wheel["force"])

@@ -130,6 +130,40 @@ def hard_surface(ctx, p, x, ground):
     return dataclasses.replace(ground, rock=jnp.maximum(ground.rock, jnp.where(p.fraction > 0.5, 1.0, 0.0)))
 
 
+@effect(
+    "soil",
+    order=-79,
+    replaces=("hard_surface",),
+    stiffness=Parameter(
+        5e5, None, (1e3, 1e9), "N/m^(n+2)", "frictional modulus of sinkage k_phi", "choice: between snow and sandy loam"
+    ),
+    n=Parameter(1.0, None, (0.1, 3.0), "1", "sinkage exponent", "choice: as the Lunar Sourcebook has it"),
+    cohesion=Parameter(1500.0, None, (0.0, 1e5), "Pa", "cohesion", "Wong 2008: sandy loam 1700 Pa, snow 1000 Pa"),
+    friction_angle=Parameter(
+        0.5, None, (0.05, 1.0), "rad", "angle of internal friction", "Wong 2008: sandy loam 29 deg, snow 20 to 30 deg"
+    ),
+    shear_modulus=Parameter(0.025, None, (1e-3, 0.2), "m", "shear deformation modulus", "Wong 2008: 0.01 to 0.05 m"),
+)
+def soft_ground(ctx, p, x, ground):
+    """Ground that gives way under the wheels, in place of a hard surface, with moduli of its own.
+
+    The wheels sink by Bekker's law and pay for it by compaction, and grip by the shear strength of the ground instead
+    of by friction on it (Wong 2008, ch. 2); the laws are those of the effects at the ports after this one.
+    """
+    one = jnp.ones_like(ground.rock)
+    return dataclasses.replace(
+        ground,
+        k_c=0.0 * one,
+        k_phi=p.stiffness * one,
+        n=p.n * one,
+        cohesion=p.cohesion * one,
+        tan_phi=jnp.tan(p.friction_angle) * one,
+        shear_modulus_x=p.shear_modulus * one,
+        shear_modulus_y=p.shear_modulus * one,
+        rock=0.0 * one,
+    )
+
+
 def _slope(direction: str) -> Parameter:
     return Parameter(0.0, 0.0, (-10.0, 10.0), "1/m", f"relative growth of the moduli toward {direction}", "site survey")
 

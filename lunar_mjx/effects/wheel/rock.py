@@ -45,7 +45,7 @@ def _rock_shear(ctx, p, x, wheel):
     load = ctx.normal.load + ctx.normal.damping
     slip = jnp.sqrt(wheel.slip_x**2 + wheel.slip_y**2 + 1e-12)
     friction = -p.mu * load * jnp.expm1(-slip / p.slip_scale) / slip
-    along, side = friction * wheel.slip_x, -friction * wheel.slip_y
+    along, side = friction * wheel.slip_x, -p.side * friction * wheel.slip_y
     radius = ctx.geometry.radius
     force = Vec3(along, side, load)
     moment = Vec3(radius * side, -radius * along, jnp.zeros_like(load))
@@ -67,10 +67,19 @@ hard_ground = Effect(
             "slip at which friction on rock is 63 % mobilised",
             "choice: order of a rigid wheel's",
         ),
+        "side": Parameter(
+            1.0,
+            None,
+            (0.0, 2.0),
+            "1",
+            "friction across the wheel over that along it",
+            "1: a rigid wheel; lugged tyres 0.6",
+        ),
     },
     order=10,
     doc="""Wheel on rock: F_N = k_N z + c_N zdot and friction mu F_N against the slip (seed paper III-C4), where the
-    map says rock. Friction saturates in the slip that the shear state carries, hence holds a parked wheel.""",
+    map says rock. Friction saturates in the slip that the shear state carries, hence holds a parked wheel. A tyre may
+    hold less across than along (an ellipse of friction).""",
 )
 
 
