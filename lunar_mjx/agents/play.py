@@ -10,17 +10,22 @@ from typing import Any
 import jax
 import numpy as np
 from PIL import Image
+from scipy import ndimage
 
 from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.cameras.chase import Chase, wheel_tracks
+from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs import NavigationEnv, make, make_agent, split_keys
-from lunar_mjx.envs.render import Camera, TopView
 from lunar_mjx.envs.scripted import AGENTS, Agent
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.files import replacing, write_text
 from lunar_mjx.resources import shipped
+from lunar_mjx.terrain import height
 from lunar_mjx.trust import require_trust
 
 VIEWS = ("auto", "camera", "top")
+_MARGIN = 4.0
+"""m around path and goal that the map shows."""
 _FRAMES = 300
 """Most frames of a video."""
 
@@ -149,7 +154,7 @@ class Episode:
         terrain, rover = self.params.system.terrain, self.env.model.rover
         places = np.vstack([self.qpos[:, :2], self.goal[None]])
         radius, size = self.env.config.goal_radius, 5.0 * self.env.model.rover.standing_height
-        top = TopView(terrain, places)
+        top = GroundMap(terrain, places.min(axis=0) - _MARGIN, places.max(axis=0) + _MARGIN)
         steps = range(0, len(self.qpos), max(1, len(self.reward) // _FRAMES))
 
         def drawn(i: int) -> np.ndarray:
@@ -158,13 +163,14 @@ class Episode:
         still = drawn(len(self.qpos) - 1)
         if view != "top":
             try:
-                camera = Camera(rover, terrain, places)
+                camera = Chase(rover, terrain, places, tracks=wheel_tracks(rover, self.qpos))
             except UserError:
                 if view == "camera":
                     raise
             else:
-                ground = float(self.qpos[0, 2]) - rover.standing_height
-                frames = [camera.frame(self.qpos[i], float(self.yaw[i]), self.goal, ground) for i in steps]
+                ground = float(height(terrain.field, *self.goal[:2]))
+                yaw = ndimage.gaussian_filter1d(np.unwrap(self.yaw), 1.0 / self.env.control_interval, mode="nearest")
+                frames = [camera.frame(self.qpos[i], float(yaw[i]), self.goal, ground, i) for i in steps]
                 camera.close()
                 return frames, still
         return [drawn(i) for i in steps], still

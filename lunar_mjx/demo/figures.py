@@ -11,6 +11,7 @@ import plotly.graph_objects as go
 from PIL import Image
 from plotly.subplots import make_subplots
 
+from lunar_mjx.cameras.relief import relief, rocks_within
 from lunar_mjx.criticism import SteadyStateTable, replicate_scatter
 from lunar_mjx.demo.drive import Drive
 from lunar_mjx.demo.wheel import Case, dense_curves
@@ -20,8 +21,6 @@ from lunar_mjx.wheel_bed.soil_fit import APART_ANGLES, FIT_ANGLES
 
 ROVERS = {"viper": ("VIPER", BLUE), "luvmi_x": ("LUVMI-X", VERMILION)}
 _MARGIN = 5.0
-_SUN = (np.radians(315.0), np.radians(20.0))
-"""Azimuth (clockwise from north) and elevation of the light that shades the relief."""
 
 CASE_STYLE: dict[str, Series] = {
     "paper": SERIES[0],
@@ -92,46 +91,29 @@ def _relief(
     terrain: Terrain, x: tuple[float, float], y: tuple[float, float]
 ) -> tuple[str, tuple[float, float, float, float]]:
     """Shaded relief as a PNG data URI, and its west, east, south and north, m."""
-    field = terrain.field
-    heights, cell = np.asarray(field.heights, float), float(field.cell)
-    x0, y0 = float(field.x0), float(field.y0)
-    rows, columns = heights.shape
-    i0, i1 = (int(np.clip((v - x0) / cell, 0, columns - 1)) for v in (x[0] - _MARGIN, x[1] + _MARGIN))
-    j0, j1 = (int(np.clip((v - y0) / cell, 0, rows - 1)) for v in (y[0] - _MARGIN, y[1] + _MARGIN))
-    step = max(1, round(max(i1 - i0, j1 - j0) / 700))
-    part = heights[j0 : j1 + 1 : step, i0 : i1 + 1 : step]
-    slope_y, slope_x = np.gradient(part, cell * step)
-    azimuth, elevation = _SUN
-    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    light = (-slope_x * sun[0] - slope_y * sun[1] + sun[2]) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
-    grey = np.clip(150 + 240 * (light - np.sin(elevation)), 60, 235).astype(np.uint8)
+    low, high = (np.array([x[i], y[i]]) + margin for i, margin in ((0, -_MARGIN), (1, _MARGIN)))
+    ground = relief(terrain, low, high)
     file = io.BytesIO()
-    Image.fromarray(grey[::-1]).save(file, "PNG", optimize=True)
+    Image.fromarray((255 * ground.grey[::-1]).astype(np.uint8)).save(file, "PNG", optimize=True)
     uri = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
-    half = 0.5 * cell * step
-    height, width = part.shape
-    west, south = x0 + i0 * cell - half, y0 + j0 * cell - half
-    return uri, (west, west + width * cell * step, south, south + height * cell * step)
+    return uri, (ground.west, ground.east, ground.south, ground.north)
 
 
 def _add_rocks(figure: go.Figure, terrain: Terrain, box: tuple[float, float, float, float]) -> None:
     if terrain.rocks is None:
         return
-    centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
-    shapes = []
-    for (x, y, _), r in zip(centers, radii, strict=True):
-        if r > 0.0 and box[0] < x < box[1] and box[2] < y < box[3]:
-            shapes.append(
-                {
-                    "type": "circle",
-                    "x0": x - r,
-                    "x1": x + r,
-                    "y0": y - r,
-                    "y1": y + r,
-                    "line": {"width": 0.5},
-                    "fillcolor": "#3a3a3a",
-                }
-            )
+    shapes = [
+        {
+            "type": "circle",
+            "x0": x - r,
+            "x1": x + r,
+            "y0": y - r,
+            "y1": y + r,
+            "line": {"width": 0.5},
+            "fillcolor": "#3a3a3a",
+        }
+        for x, y, r in rocks_within(terrain, np.array([box[0], box[2]]), np.array([box[1], box[3]]))
+    ]
     figure.update_layout(shapes=shapes)
     if shapes:
         figure.add_scatter(x=[None], y=[None], mode="markers", name="rock", marker={"color": "#3a3a3a", "size": 9})

@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from lunar_mjx.cameras.chase import Chase
+from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs.core import State
 from lunar_mjx.envs.navigation.env import NavigationEnv
-from lunar_mjx.envs.render import Camera, TopView
 from lunar_mjx.errors import UserError, bad_input
 
 VIEWS = ("auto", "camera", "top")
+_MARGIN = 4.0
+"""m around what the map must show."""
 _FAR = 3.0
 """m beyond start and goal that the map shows, since a rover may leave the straight line."""
 
@@ -30,8 +33,8 @@ class Picture:
         if view not in VIEWS:
             raise bad_input("render", "view", view, "does not exist", f"use one of {', '.join(VIEWS)}")
         self.env, self._view = env, view
-        self._camera: Camera | None = None
-        self._top: TopView | None = None
+        self._camera: Chase | None = None
+        self._top: GroundMap | None = None
         self._qpos = np.zeros(0)
         self._path: list[np.ndarray] = []
 
@@ -69,7 +72,9 @@ class Picture:
         if camera is not None:
             return camera.frame(self._qpos, yaw, self._goal, self._ground)
         if self._top is None:
-            self._top = TopView(self.env.params.system.terrain, self._places())
+            places = self._places()
+            low, high = places.min(axis=0) - _MARGIN, places.max(axis=0) + _MARGIN
+            self._top = GroundMap(self.env.params.system.terrain, low, high)
         size = 5.0 * self.env.model.rover.standing_height
         return self._top.frame(self._qpos, yaw, self._goal, self.env.config.goal_radius, self._path, size)
 
@@ -77,11 +82,11 @@ class Picture:
         ends = np.stack([self._path[0], self._goal])
         return np.concatenate([ends - _FAR, ends + _FAR])
 
-    def _open(self) -> Camera | None:
+    def _open(self) -> Chase | None:
         if self._camera is None and self._view != "top" and not self._tried:
             self._tried = True
             try:
-                self._camera = Camera(self.env.model.rover, self.env.params.system.terrain, self._places())
+                self._camera = Chase(self.env.model.rover, self.env.params.system.terrain, self._places())
             except UserError:
                 if self._view == "camera":
                     raise

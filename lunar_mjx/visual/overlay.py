@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from lunar_mjx.cameras.ground_map import PATH, GroundMap
 from lunar_mjx.visual.plots import WHEEL_STYLES, bounds
 from lunar_mjx.visual.recorded import RecordedDrive
-from lunar_mjx.visual.relief import relief, rocks_within
 
 _GLASS = (10, 12, 16, 170)
 _TEXT, _FAINT, _PATH, _HOT = (240, 240, 240), (150, 155, 160), (120, 190, 255), (255, 140, 70)
@@ -147,45 +147,18 @@ class MapInset:
 
     def __init__(self, drive: RecordedDrive, size: int) -> None:
         self._drive = drive
-        low, high = bounds(drive.position[:, :2], 0.25)
-        ground = relief(drive.terrain, low, high)
-        self._low, self._scale, self._size = low, size / (high - low), size
-        grey = Image.fromarray((255 * ground.grey[::-1]).astype(np.uint8))
-        edges = [
-            (v - a) * s
-            for v, a, s in (
-                (ground.west, low[0], self._scale[0]),
-                (ground.east, low[0], self._scale[0]),
-                (ground.south, low[1], self._scale[1]),
-                (ground.north, low[1], self._scale[1]),
-            )
-        ]
-        west, east, south, north = edges
-        self._base = Image.new("RGBA", (size, size), (30, 30, 30, 255))
-        placed = grey.resize((max(1, round(east - west)), max(1, round(north - south))), Image.Resampling.BICUBIC)
-        self._base.paste(placed.convert("RGBA"), (round(west), round(size - north)))
-        draw = ImageDraw.Draw(self._base)
-        for x, y, radius in rocks_within(drive.terrain, low, high):
-            u, v = self._pixel(np.array([x, y]))
-            r = max(1.0, radius * self._scale[0])
-            draw.ellipse([u - r, v - r, u + r, v + r], fill=(58, 58, 58))
-        self._path = [self._pixel(p) for p in drive.position[:, :2]]
+        self._map = GroundMap(drive.terrain, *bounds(drive.position[:, :2], 0.25), size)
+        self._path = [self._map.pixel(p) for p in drive.position[:, :2]]
+        draw = ImageDraw.Draw(self._map.base)
         draw.line(self._path, fill=(235, 235, 235), width=1)
-        draw.rectangle([0, 0, size - 1, size - 1], outline=(200, 200, 200))
-
-    def _pixel(self, place: np.ndarray) -> tuple[float, float]:
-        u, v = (place - self._low) * self._scale
-        return float(u), float(self._size - v)
+        draw.rectangle([0, 0, self._map.width - 1, self._map.height - 1], outline=(200, 200, 200))
 
     def draw(self, row: int) -> Image.Image:
         """The map at a row of the drive."""
-        image = self._base.copy()
+        image = self._map.base.copy()
         draw = ImageDraw.Draw(image)
         if row:
-            draw.line(self._path[: row + 1], fill=_PATH, width=3)
+            draw.line(self._path[: row + 1], fill=PATH, width=3)
         yaw = np.radians(self._drive.table["yaw_deg"].to_numpy(float)[row])
-        u, v = self._path[row]
-        r = max(5.0, 0.035 * self._size)
-        nose = [(u + k * r * np.cos(yaw + t), v - k * r * np.sin(yaw + t)) for k, t in ((1.4, 0), (1, 2.5), (1, -2.5))]
-        draw.polygon(nose, fill=(255, 196, 60), outline=(40, 30, 0))
-        return image
+        self._map.arrow(draw, self._drive.position[row], float(yaw), max(5.0, 0.035 * self._map.width))
+        return image.convert("RGBA")

@@ -12,12 +12,12 @@ from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 
+from lunar_mjx.cameras.relief import relief, rocks_within
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.files import replacing
 from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, RULE, VERMILION
 from lunar_mjx.terrain import Terrain, surface
 from lunar_mjx.visual.recorded import RecordedDrive
-from lunar_mjx.visual.relief import relief, rocks_within
 
 WHEEL_STYLES = {
     "lf": (BLUE, "-"),

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import pandas as pd
 
+from lunar_mjx.cameras.chase import wheel_places, wheel_tracks
 from lunar_mjx.cameras.texture import Track
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError, bad_input
@@ -125,20 +126,11 @@ class RecordedDrive:
 
     def wheel_places(self) -> np.ndarray:
         """Centres of the wheels, (time, wheel, 3) m."""
-        model = self.model.rover.compile()
-        data = mujoco.MjData(model)
-        bodies = [model.body(w.body).id for w in self.model.rover.wheels]
-        out = np.empty((len(self.table), len(bodies), 3))
-        for row, qpos in enumerate(self.qpos):
-            data.qpos[:] = qpos
-            mujoco.mj_kinematics(model, data)
-            out[row] = data.xpos[bodies]
-        return out
+        return wheel_places(self.model.rover, self.qpos)
 
     def tracks(self) -> list[Track]:
         """Where the wheels rolled, a row of places for each row of the table."""
-        places = self.wheel_places()
-        return [Track(places[:, i, :2], w.width, 0.25 * w.radius) for i, w in enumerate(self.model.rover.wheels)]
+        return wheel_tracks(self.model.rover, self.qpos)
 
 
 def _close(model: Any, data: Any, qpos: np.ndarray, passive: np.ndarray, at: np.ndarray) -> None:

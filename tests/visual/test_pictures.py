@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 from lunar_mjx.cameras import Sun
+from lunar_mjx.cameras.relief import relief
 from lunar_mjx.errors import UserError
 from lunar_mjx.terrain import load_terrain
 from lunar_mjx.visual import encode
 from lunar_mjx.visual.overlay import MapInset
 from lunar_mjx.visual.plots import terrain_preview
 from lunar_mjx.visual.recorded import read_drive
-from lunar_mjx.visual.relief import relief
 from lunar_mjx.visual.video import brightest_side, frame_rows, render_video
 
 

@@ -1,0 +1,102 @@
+"""A camera that follows a rover from behind, with its goal; and the tracks that its wheels leave."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from PIL import Image, ImageDraw
+
+from lunar_mjx.cameras.camera import RoverCamera
+from lunar_mjx.cameras.ground_map import GOAL
+from lunar_mjx.cameras.pinhole import Pinhole, look_at, project
+from lunar_mjx.cameras.scene import Sun
+from lunar_mjx.cameras.texture import Track
+from lunar_mjx.rover import Rover
+from lunar_mjx.terrain import Terrain
+
+_POST = 1.6
+"""Height of the post that marks a goal, m."""
+
+
+def wheel_places(rover: Rover, qpos: np.ndarray) -> np.ndarray:
+    """Centres of a rover's wheels, (time, wheel, 3) m, for coordinates (time, nq) of its MJCF."""
+    model = rover.compile()
+    data = mujoco.MjData(model)
+    bodies = [model.body(w.body).id for w in rover.wheels]
+    out = np.empty((len(qpos), len(bodies), 3))
+    for row, here in enumerate(qpos):
+        data.qpos[:] = here
+        mujoco.mj_kinematics(model, data)
+        out[row] = data.xpos[bodies]
+    return out
+
+
+def wheel_tracks(rover: Rover, qpos: np.ndarray) -> list[Track]:
+    """Where a rover's wheels rolled, a row of places for each row of coordinates (time, nq)."""
+    places = wheel_places(rover, qpos)
+    return [Track(places[:, i, :2], w.width, 0.25 * w.radius) for i, w in enumerate(rover.wheels)]
+
+
+class Chase:
+    """Pictures of a rover on its way to a goal, by MuJoCo's renderer.
+
+    Args:
+      rover, terrain: what drives where.
+      places: (n, 2) m around which the ground is drawn finely.
+      size: width and height, pixels.
+      tracks: of the wheels; see `wheel_tracks`. Rows of them are shown as `frame` is told.
+      sun: where the Sun stands.
+
+    Raises:
+      UserError: no OpenGL works here.
+    """
+
+    def __init__(
+        self,
+        rover: Rover,
+        terrain: Terrain,
+        places: Any,
+        size: tuple[int, int] = (480, 320),
+        tracks: Sequence[Track] = (),
+        sun: Sun | None = None,
+    ) -> None:
+        self._optics = Pinhole(*size, fovy_deg=45.0)
+        self._camera = RoverCamera(
+            rover, terrain, places, self._optics, sun=sun, tracks=tracks, largest=size, untrodden=True
+        )
+        self._away, self._up = 8.0 * rover.standing_height + 2.0, 3.0 * rover.standing_height + 0.8
+        self._tracks = bool(tracks)
+
+    def frame(self, qpos: Any, yaw: float, goal: Any, ground: float, row: int | None = None) -> np.ndarray:
+        """One picture, (height, width, 3) uint8.
+
+        Args:
+          qpos: coordinates of the rover's MJCF. yaw: its heading, rad, smoothed if need be.
+          goal: (2,) m. ground: height there, m.
+          row: wheel tracks are shown up to this row of their places.
+        """
+        self._camera.place(qpos)
+        if row is not None and self._tracks:
+            self._camera.roll(row + 1)
+        at = np.asarray(qpos, float)[:3]
+        behind = np.array([-math.cos(yaw), -math.sin(yaw), 0.0])
+        pose = look_at(at + self._away * behind + np.array([0.0, 0.0, self._up]), at)
+        image = Image.fromarray(self._camera.picture(pose, self._optics))
+        foot = np.array([*np.asarray(goal, float)[:2], ground])
+        top = foot + np.array([0.0, 0.0, _POST])
+        ends = project(pose, self._optics, np.stack([foot, top]))
+        if (ends[:, 2] > 0.1).all():
+            width = max(1, round(0.06 * self._optics.focal / float(ends[0, 2])))
+            ImageDraw.Draw(image).line([tuple(p[:2]) for p in ends], fill=GOAL, width=width)
+        return np.asarray(image)
+
+    def close(self) -> None:
+        """Frees the OpenGL context."""
+        self._camera.close()
