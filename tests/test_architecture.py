@@ -63,10 +63,7 @@ CROWDED = 15
 """Modules of one folder that a reader still takes in."""
 REPEATED = 3
 """Modules of one folder with a first word in common from which that word is a folder."""
-PREFIXES_BORNE = {
-    ("benchmarks", "rl"): "to become a folder with a shared harness",
-    ("benchmarks/hidden", "bed"): "to become a folder beside drives",
-}
+PREFIXES_BORNE = {("benchmarks/hidden", "bed"): "to become a folder beside drives"}
 
 
 def modules() -> dict[str, Path]:

@@ -165,7 +165,7 @@ def figure_6(trainings: Sequence[Path]) -> tuple[Figure, dict]:
     kept = () if trainings else kept_trainings()
     if kept:
         print(
-            f"Fig. 6 draws the trainings kept in {' and '.join(f'benchmarks/{p.name}' for p in kept)}; others: "
+            f"Fig. 6 draws the trainings kept in {' and '.join(f'benchmarks/rl/{p.name}' for p in kept)}; others: "
             "--training.",
             file=sys.stderr,
         )

@@ -17,20 +17,20 @@ from lunar_mjx.report.style import BLUE, GREEN, ORANGE, PURPLE, RULE, SKY, VERMI
 
 CURVE = "curve.json"
 _LOOKS = ((BLUE, "-"), (VERMILION, "--"), (GREEN, "-."), (ORANGE, ":"), (PURPLE, (0, (6, 2, 1, 2))), (SKY, (0, (1, 1))))
-RECORDS = Path(__file__).resolve().parents[2] / "benchmarks"
+RECORDS = Path(__file__).resolve().parents[2] / "benchmarks" / "rl"
 """Where a checkout keeps records of trainings."""
 
 
 def kept_trainings() -> list[Path]:
     """Records that the checkout keeps: of the paper's own task, else of thousands of rovers; none when installed."""
-    return sorted(RECORDS.glob("rl_paper*.json")) or sorted(RECORDS.glob("rl_large_*.json"))
+    return sorted(RECORDS.glob("paper*.json")) or sorted(RECORDS.glob("large_*.json"))
 
 
 def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]]]:
     """Records of trainings by name, one per seed.
 
     Args:
-      paths: folders that `lunar-mjx train` wrote, or JSON files: their `curve.json`, or what `benchmarks/rl_proof.py`
+      paths: folders that `lunar-mjx train` wrote, or JSON files: their `curve.json`, or what `benchmarks/rl/measure.py`
         wrote.
 
     Raises:

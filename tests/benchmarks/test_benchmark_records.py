@@ -16,18 +16,18 @@ PAGE = (ROOT / "docs" / "reinforcement_learning_measured.md").read_text(encoding
 
 
 def record(name):
-    return json.loads((ROOT / "benchmarks" / f"rl_{name}.json").read_text(encoding="utf-8"))
+    return json.loads((ROOT / "benchmarks" / "rl" / f"{name}.json").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def benchmarks():
-    sys.path.insert(0, str(ROOT / "benchmarks"))
+    sys.path.insert(0, str(ROOT / "benchmarks" / "rl"))
     yield
-    sys.path.remove(str(ROOT / "benchmarks"))
+    sys.path.remove(str(ROOT / "benchmarks" / "rl"))
 
 
 def test_the_page_quotes_what_realism_is_worth():
-    from rl_more_figures import percent, realism_cells
+    from tables import percent, realism_cells
 
     cells = realism_cells(record("realism"))
     assert len(cells) == 4
@@ -38,7 +38,7 @@ def test_the_page_quotes_what_realism_is_worth():
 
 
 def test_the_page_quotes_what_boulders_are_to_viper():
-    from rl_more_figures import percent
+    from tables import percent
 
     found = record("large_viper_boulders")
     policy, straight = found["seeds"][0]["final"], found["agents"]["scripted"]
@@ -61,7 +61,7 @@ def test_the_page_quotes_the_rates():
 
 
 def test_the_page_quotes_the_papers_own_task():
-    from rl_more_figures import first_good, variants
+    from tables import first_good, variants
 
     for algorithms in variants(record("paper")).values():
         for runs in algorithms.values():
@@ -77,7 +77,7 @@ def test_the_page_quotes_the_papers_own_task():
 
 
 def test_the_plainer_model_has_neither_heat_nor_soil():
-    from rl_realism import THERMAL, plainer
+    from realism import THERMAL, plainer
 
     model = plainer(make_model("luvmi_x", "flat"))
     assert not set(THERMAL) & set(model.effect_names)

@@ -16,10 +16,10 @@ from lunar_mjx.envs import make
 @pytest.mark.slow
 def test_pybullet_gives_the_same_observations_and_rewards(monkeypatch):
     pytest.importorskip("pybullet")
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks" / "rl"))
     for name in ("JAX_PLATFORMS", "XLA_FLAGS"):  # the script sets them where they are not set
         monkeypatch.setenv(name, "cpu" if name == "JAX_PLATFORMS" else "")
-    from rl_sb3 import BulletNavigation
+    from sb3_bullet import BulletNavigation
 
     options = {
         "task": "large",
@@ -41,4 +41,4 @@ def test_pybullet_gives_the_same_observations_and_rewards(monkeypatch):
         assert reward == pytest.approx(float(state.reward[0]), abs=2e-3)
         assert truncated == (k == 9) and not terminated
     assert metrics["episode_length"] == 10.0 and np.hypot(*obs[:2]) > 0.0
-    sys.modules.pop("rl_sb3")
+    sys.modules.pop("sb3_bullet")

@@ -58,18 +58,18 @@ def test_learning_curves_are_those_of_the_trainings(tmp_path):
 def test_kept_trainings_are_drawn_when_none_is_given(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(training_figure, "RECORDS", tmp_path)
     many = {"rover": "viper", "train": {"envs": 8192}, "seeds": [_record(0, False)]}
-    (tmp_path / "rl_large_viper.json").write_text(json.dumps(many))
+    (tmp_path / "large_viper.json").write_text(json.dumps(many))
     assert "6" in available_figures()
     assert json.loads(make_figures(["6"], tmp_path)[1].read_text())["axis"] == "steps"
-    assert "kept in benchmarks/rl_large_viper.json" in capsys.readouterr().err
+    assert "kept in benchmarks/rl/large_viper.json" in capsys.readouterr().err
 
     episodes = {"episode_return": [float(i) for i in range(60)], "success": [i >= 30 for i in range(60)]}
     runs = {"paper-td3": [{"seed": s, "episodes": episodes, "steps": 900} for s in (0, 1)]}
-    (tmp_path / "rl_paper.json").write_text(json.dumps({"runs": runs}))
+    (tmp_path / "paper.json").write_text(json.dumps({"runs": runs}))
     numbers = json.loads(make_figures(["6"], tmp_path)[1].read_text())
     assert numbers["axis"] == "episode" and list(numbers["trainings"]) == ["paper-td3"]
     assert numbers["trainings"]["paper-td3"][0]["mean_of_last_50_episodes"] == {"episode_return": 34.5, "success": 0.6}
-    figure, _ = figure_6([tmp_path / "rl_paper.json"])
+    figure, _ = figure_6([tmp_path / "paper.json"])
     assert figure.axes[1].get_xlabel() == "episode" and figure.axes[1].lines[0].get_ydata()[-1] == 100.0
 
 

@@ -1,4 +1,4 @@
-"""Part `realism` of rl_proof.py: what training with the thermal and soil effects is worth.
+"""Part `realism` of measure.py: what training with the thermal and soil effects is worth.
 
 TD3 is trained for the same number of steps in two models: the whole one, and one without heat (no temperatures, no
 cut-off, motor constants that do not drift) and without soil (hard ground with Coulomb friction everywhere). Every last
@@ -8,13 +8,22 @@ policy is then scored in both, on unseen ground and goals; in the whole one with
 from __future__ import annotations
 
 import argparse
-import dataclasses
+import functools
 import time
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from rl_common import Clock, save, say
-from rl_large import FINAL, percent, training_of
+from harness import (
+    FINAL,
+    Clock,
+    about_training,
+    compile_judge,
+    episodes_of,
+    in_threads,
+    percent,
+    save,
+    say,
+    training_of,
+)
 
 THERMAL = (
     "thermal_cutoff",
@@ -37,41 +46,29 @@ def plainer(model: Any) -> Any:
 
 
 def realism(args: argparse.Namespace, clock: Clock) -> None:
+    """Trains with and without the effects, seed after seed while time is left."""
     import jax
 
     from lunar_mjx.agents.evaluate import Evaluator
     from lunar_mjx.agents.learner import Learner
     from lunar_mjx.agents.run import learner_agent, unseen_params
-    from lunar_mjx.agents.train import RunConfig, plain, train
+    from lunar_mjx.agents.train import RunConfig, train
     from lunar_mjx.envs import NavigationEnv, make
 
     training = training_of(args)
     whole: Any = make(training.environment, **training.options)
     envs: dict[str, Any] = {"without": NavigationEnv(plainer(whole.model), whole.config), "with": whole}
     learners = {name: Learner(env, training.train) for name, env in envs.items()}
-    episodes = 32 if args.tiny else 1024
-    judges = {name: Evaluator(env, learner_agent(learners[name]), episodes) for name, env in envs.items()}
+    judges = {name: Evaluator(env, learner_agent(learners[name]), episodes_of(args)) for name, env in envs.items()}
     params = {name: unseen_params(env, dict(training.unseen)) for name, env in envs.items()}
-    begin = time.monotonic()
-
-    def compile_judge(name: str) -> None:
-        policy = learners[name].policy(learners[name].abstract())
-        shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), policy)
-        with jax.default_matmul_precision(training.train.precision):
-            judges[name].compile(params[name], shapes)
-
-    with ThreadPoolExecutor() as pool:
-        waits = [pool.submit(learner.compile) for learner in learners.values()]
-        waits += [pool.submit(compile_judge, name) for name in envs]
-        for wait in waits:
-            wait.result()
-    say(f"realism: compiled in {time.monotonic() - begin:.0f} s")
+    calls = [functools.partial(compile_judge, judges[name], learners[name], params[name]) for name in envs]
+    say(f"realism: compiled in {max(in_threads(*(x.compile for x in learners.values()), *calls)):.0f} s")
+    steps = 3200 if args.tiny else STEPS
     record: dict[str, Any] = {
         "rover": args.rover,
-        "environment": {"options": plain(dict(training.options)), "unseen": training.unseen},
-        "train": dataclasses.asdict(training.train),
+        **about_training(training),
         "effects": {n: e.model.effect_names for n, e in envs.items()},
-        "steps": 3200 if args.tiny else STEPS,
+        "steps": steps,
         "seeds": [],
     }
     longest = 0.0
@@ -83,24 +80,13 @@ def realism(args: argparse.Namespace, clock: Clock) -> None:
                 say("realism: no time for more")
                 return
             began = time.monotonic()
-            result = train(learner, RunConfig(record["steps"], seed, None, float("inf"), quiet=True))
-            policy = jax.device_get(learner.policy(result.state))
+            result = train(learner, RunConfig(steps, seed, None, float("inf"), quiet=True))
+            policy, last = jax.device_get(learner.policy(result.state)), result.rows[-1]
             scores = {where: judge(params[where], policy, FINAL).record() for where, judge in judges.items()}
-            last = result.rows[-1]
-            record["seeds"].append(
-                {
-                    "seed": seed,
-                    "trained": name,
-                    "scores": scores,
-                    "train_s": last["elapsed_s"],
-                    "steps": last["steps"],
-                    "episode_return": last["episode_return"],
-                }
-            )
+            row = {"seed": seed, "trained": name, "scores": scores, "train_s": last["elapsed_s"]}
+            record["seeds"].append({**row, "steps": last["steps"], "episode_return": last["episode_return"]})
             longest = max(longest, time.monotonic() - began)
-            say(
-                f"realism: seed {seed}, trained {name} the effects for {last['elapsed_s']:.0f} s: "
-                + ", ".join(f"tested {where} them {percent(s)}" for where, s in scores.items())
-            )
+            told = ", ".join(f"tested {where} them {percent(s)}" for where, s in scores.items())
+            say(f"realism: seed {seed}, trained {name} the effects for {last['elapsed_s']:.0f} s: {told}")
             save(args.out, "realism", record)
             del result

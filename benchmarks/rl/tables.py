@@ -1,4 +1,4 @@
-"""Tables and plots of the parts of rl_proof.py other than `large`; called by rl_figures.py."""
+"""Tables and plots of the parts of measure.py other than `large`; called by figures.py."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import percent
 
 from lunar_mjx.agents.curves import mean_interval, moving_mean, new_figure
 
@@ -14,10 +15,6 @@ LAST = 50
 """Episodes that a training is judged by at its end."""
 DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
 """Variants of the paper's task that the figure shows; the table has all."""
-
-
-def percent(score: dict[str, Any]) -> str:
-    return f"{100 * score['success']:.1f} % ({100 * score['low']:.1f} to {100 * score['high']:.1f})"
 
 
 # The paper's own task

@@ -1,7 +1,7 @@
 """What Stable-Baselines3's TD3 reaches with the seed paper's engine: one rover in PyBullet on the task `large`.
 
-    python benchmarks/rl_sb3.py --out runs/sb3 --cpu-seconds 3600
-    python benchmarks/rl_sb3.py --out runs/sb3 --score 128      # scores that policy on unseen ground
+    python benchmarks/rl/sb3_bullet.py --out runs/sb3 --cpu-seconds 3600
+    python benchmarks/rl/sb3_bullet.py --out runs/sb3 --score 128      # scores that policy on unseen ground
 
 The task, its observations, rewards and ends are those of `lunar_mjx.envs`; only the physics between two actions is
 `PyBulletBackend`, with the NumPy forces that agree with the simulator's. Soil and motors are the model's own in every
@@ -12,7 +12,6 @@ action noise N(0, 0.3). The record is written anew every minute.
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import os
 import time
@@ -26,6 +25,7 @@ import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
+from harness import FINAL, percent, write
 
 from lunar_mjx.backends.pybullet import PyBulletBackend
 from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
@@ -114,7 +114,7 @@ def make_recorder(args: argparse.Namespace, env: BulletNavigation, record: dict[
     """SB3's callback that keeps episodes, writes the record and the policy, and stops in time."""
     from stable_baselines3.common.callbacks import BaseCallback
 
-    begin, stop_at = time.monotonic(), stopping_time(args.until)
+    begin = time.monotonic()
 
     class Recorder(BaseCallback):
         last = 0.0
@@ -135,32 +135,15 @@ def make_recorder(args: argparse.Namespace, env: BulletNavigation, record: dict[
                         "end": end,
                     }
                 )
-            over = cpu >= args.cpu_seconds or (stop_at is not None and time.time() >= stop_at)
+            over = cpu >= args.cpu_seconds
             if over or wall - self.last >= 60.0:
                 self.last = wall
                 record.update(steps=self.num_timesteps, cpu_s=cpu, wall_s=wall, finished=over)
-                write(args.out / "rl_sb3.json", record)
+                write(args.out / "sb3.json", record)
                 keep_policy(self.model, env, args.out / "policy_sb3.npz", record)
             return not over
 
     return Recorder()
-
-
-def stopping_time(text: str | None) -> float | None:
-    """Seconds since the epoch of the next hour:minute like `text`."""
-    if text is None:
-        return None
-    hour, minute = (int(part) for part in text.split(":"))
-    now = datetime.datetime.now()
-    then = now.replace(hour=hour, minute=minute, second=0, microsecond=0)
-    return (then if then > now else then + datetime.timedelta(days=1)).timestamp()
-
-
-def write(path: Path, record: dict[str, Any]) -> None:
-    """Writes a record so that a kill never leaves half of one."""
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(record) + "\n", encoding="utf-8")
-    part.replace(path)
 
 
 def keep_policy(model: Any, env: BulletNavigation, path: Path, record: dict[str, Any]) -> None:
@@ -237,12 +220,12 @@ def score(args: argparse.Namespace) -> None:
     policy = load_policy(args.out / "policy_sb3.npz")
     env = make("navigation", **policy.environment["options"])
     params = unseen_params(env, policy.environment["unseen"])
-    result = Evaluator(env, agent_of(policy), args.score)(params, (), 54321)
-    path = args.out / "rl_sb3.json"
+    result = Evaluator(env, agent_of(policy), args.score)(params, (), FINAL)
+    path = args.out / "sb3.json"
     record = json.loads(path.read_text(encoding="utf-8"))
     record["final"] = result.record()
     write(path, record)
-    print(f"unseen {100 * result.success:.1f} % ({100 * result.low:.1f} to {100 * result.high:.1f}), {result.ends}")
+    print(f"unseen {percent(record['final'])}, {result.ends}")
 
 
 def main() -> None:
@@ -252,7 +235,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=10_000_000)
     parser.add_argument("--cpu-seconds", type=float, default=3600.0, help="of this process, after which it stops")
-    parser.add_argument("--until", help="time of day, hh:mm, at which it stops in any case")
     parser.add_argument("--score", type=int, help="score the policy that lies there, by so many episodes")
     parser.add_argument("--tiny", action="store_true")
     args = parser.parse_args()

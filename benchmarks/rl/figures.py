@@ -1,10 +1,10 @@
-"""Curves, tables and model cards from what rl_proof.py measured; no number is typed in by hand.
+"""Curves, tables and model cards from what measure.py measured; no number is typed in by hand.
 
-python benchmarks/rl_figures.py runs/proof                        # figures to docs/figures, tables to the screen
-python benchmarks/rl_figures.py runs/proof runs/more --ship luvmi_x   # seeds of both runs; also the policy and its card
+python benchmarks/rl/figures.py runs/proof                        # figures to docs/figures, tables to the screen
+python benchmarks/rl/figures.py runs/proof runs/more --ship luvmi_x   # seeds of both runs; also the policy and its card
                                                                   # to models/luvmi_x, the record to benchmarks
-python benchmarks/rl_figures.py runs/proof --keep                 # the other parts' records to benchmarks
-python benchmarks/rl_figures.py benchmarks                        # figures and tables of the records kept there
+python benchmarks/rl/figures.py runs/proof --keep                 # the other parts' records to benchmarks
+python benchmarks/rl/figures.py benchmarks/rl                      # figures and tables of the records kept there
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rl_more_figures as more
-from rl_more_figures import percent
+import tables as more
+from harness import percent
 
 from lunar_mjx.agents.curves import mean_interval, new_figure
 from lunar_mjx.agents.policy import load_policy
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
+KEPT = ROOT / "benchmarks" / "rl"
 TABLES = {
     "paper": more.table_paper,
     "rates": more.table_rates,
@@ -38,7 +39,7 @@ _LIMIT = 2_000_000
 
 
 def read(folder: Path, name: str) -> dict[str, Any] | None:
-    path = folder / f"rl_{name}.json"
+    path = folder / f"{name}.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
 
@@ -54,10 +55,19 @@ def read_large(folders: list[Path]) -> dict[str, Any] | None:
     return first
 
 
+ROWS = ("steps", "elapsed_s", "steps_per_s", "episode_return", "success")
+"""Columns of a training's rows that figures read; the others are not kept."""
+
+
 def rounded(value: Any) -> Any:
-    """Numbers with five digits, which is more than one seed tells."""
+    """What is kept of a record: numbers with five digits, which is more than one seed tells, and rows' `ROWS`."""
     if isinstance(value, dict):
-        return {k: rounded(v) for k, v in value.items()}
+        rows = (
+            {"rows": [{k: r[k] for k in ROWS if k in r} for r in value["rows"]]}
+            if "seed" in value and "rows" in value
+            else {}
+        )
+        return {k: rounded(v) for k, v in {**value, **rows}.items()}
     if isinstance(value, list):
         return [rounded(v) for v in value]
     return float(f"{value:.5g}") if isinstance(value, float) else value
@@ -125,7 +135,8 @@ within the goal's radius before the time is up. Options: `{json.dumps(options)}`
 
 **Training.** TD3 with a distributional critic, {train["envs"]:,} rovers, batches of {train["batch"]:,}, seed
 {seed["seed"]}: {kept["steps"] / 1e6:.1f} M environment steps in {kept["elapsed_s"]:.0f} s on one
-{record["about"]["device"]} (without compilation, {record["compile_epoch_s"]:.0f} s). Script: `benchmarks/rl_proof.py`.
+{record["about"]["device"]} (without compilation, {record["compile_epoch_s"]:.0f} s). Script:
+`benchmarks/rl/measure.py`.
 Of the policies of this training and its other seeds ({", ".join(others) or "none"}), it scored best on the ground and
 soils of the training: {percent(kept["train_score"])}.
 
@@ -154,7 +165,7 @@ def ship(record: dict[str, Any], folders: list[Path], home: Path) -> Path:
     shutil.copyfile(policy, home / "policy.npz")
     (home / "POLICY.md").write_text(card(record, best, policy.stat().st_size), encoding="utf-8")
     text = json.dumps(rounded(record), separators=(",", ":")) + "\n"
-    (ROOT / "benchmarks" / f"rl_large_{record['rover']}.json").write_text(text, encoding="utf-8")
+    (KEPT / f"large_{record['rover']}.json").write_text(text, encoding="utf-8")
     return home / "policy.npz"
 
 
@@ -178,9 +189,9 @@ def main() -> None:
             PLOTS[name](record, args.out / f"rl_{name}.png")
         if args.keep:
             text = json.dumps(rounded(record), separators=(",", ":")) + "\n"
-            (ROOT / "benchmarks" / f"rl_{name}.json").write_text(text, encoding="utf-8")
+            (KEPT / f"{name}.json").write_text(text, encoding="utf-8")
     if "brax" in parts:
-        kept = ROOT / "benchmarks" / f"rl_large_{parts['brax']['rover']}.json"
+        kept = KEPT / f"large_{parts['brax']['rover']}.json"
         compared = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else large
         more.plot_learners(compared, parts["brax"], args.out / "rl_learners.png")
     if args.ship:

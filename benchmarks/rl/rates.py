@@ -1,0 +1,161 @@
+"""Parts `rates` and `scaling` of measure.py: steps per second of the environment, and of training on more devices."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from harness import SMALL_TASK, Clock, in_threads, save, say, training_of, wait
+
+PLAN = (
+    ("17 numbers", 5, (65536, 1024, 2048, 4096, 8192, 16384, 32768, 262144)),
+    ("17 numbers", 50, (65536,)),
+    ("all observations", 50, (65536, 4096)),
+    ("all observations", 5, (65536,)),
+)
+"""Observation, physics steps per action, and numbers of rovers."""
+
+
+def rates(args: argparse.Namespace, clock: Clock) -> None:
+    """Compiles every row in threads, waits for quiet if told to, and measures."""
+    from lunar_mjx.envs import make_navigation
+    from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION
+
+    few = {"observations": PAPER_OBSERVATION, "privileged": ()}
+    plan = [(seen, every, size) for seen, every, sizes in PLAN for size in sizes]
+    plan = [row for row in plan if args.rows is None or f"{row[0][:2]}/{row[1]}/{row[2]}" in args.rows]
+    plan = [("17 numbers", 5, 8)] if args.tiny else plan
+    made = {
+        (seen, every): make_navigation(
+            "large",
+            args.rover,
+            decimation=every,
+            **{"places": 2048, **(few if seen == "17 numbers" else {}), **(SMALL_TASK if args.tiny else {})},
+        )
+        for seen, every in {row[:2] for row in plan}
+    }
+    with ThreadPoolExecutor(8) as pool:
+        steps = {every: 4 if args.tiny else max(20, 1000 // every) for _, every, _ in plan}
+        ready = list(pool.map(lambda row: Rate(made[row[:2]], row[2], steps[row[1]]), plan))
+    say(f"rates: {len(ready)} rows compiled after {clock.spent:.0f} s")
+    wait(args, clock)
+    rows: list[dict[str, Any]] = []
+    for (seen, every, size), rate in zip(plan, ready, strict=True):
+        if clock.left < 2.0:
+            say("rates: no time for more")
+            return
+        row = rate.measure(1 if args.tiny else 5)
+        rows.append({"observation": seen, "decimation": every, "rovers": size, **row})
+        say(
+            f"rates: {seen}, decimation {every}, {size:,} rovers: {row['env_steps_per_s']:,.0f} environment steps/s, "
+            f"bare physics {row['bare_steps_per_s']:,.0f}, ratio {row['ratio']:.3f}"
+        )
+        save(args.out, "rates", {"rover": args.rover, "rows": rows})
+
+
+class Rate:
+    """The environment under random actions, and its physics alone under the same changes; compiled when made."""
+
+    def __init__(self, env: Any, size: int, steps: int):
+        import jax
+        import jax.numpy as jnp
+
+        self.env, self.size, self.steps = env, size, steps
+        decimation, key = env.config.decimation, jax.random.PRNGKey(0)
+
+        def drive(params: Any, state: Any) -> Any:
+            def step(carry: Any, key: Any) -> Any:
+                state, ended = carry
+                action = jax.random.uniform(key, (size, env.action_size), minval=-1.0)
+                state = env.step(params, state, action)
+                # each rover counts: a sum over all, XLA fuses with the environment's last kernel, run by one block then
+                return (state, ended + state.done), None
+
+            start = (state, jnp.zeros(size, jnp.int32))
+            (state, ended), _ = jax.lax.scan(step, start, jax.random.split(key, steps))
+            return state, jnp.sum(ended)
+
+        shares = jax.random.uniform(key, (steps, env.action_size), minval=-1.0)
+        controls = env.actions.controls(shares)
+
+        def bare(params: Any, state: Any) -> Any:
+            return env.system.rollout_batch(params.system, state, controls, decimation, report=lambda t: None)[0]
+
+        keys = jax.ShapeDtypeStruct((size, 2), jnp.uint32)
+        state = jax.eval_shape(env.reset, env.params, keys)
+        self._reset = jax.jit(env.reset).lower(env.params, keys).compile()
+        self._drive = jax.jit(drive, donate_argnums=1).lower(env.params, state).compile()
+        self._bare = jax.jit(bare, donate_argnums=1).lower(env.params, state.inner.physics).compile()
+
+    def measure(self, repeats: int) -> dict[str, Any]:
+        """Best of several repetitions, in turns."""
+        import jax
+        import jax.numpy as jnp
+
+        from lunar_mjx.envs import split_keys
+
+        params = self.env.params
+        state = jax.block_until_ready(self._reset(params, split_keys(jax.random.PRNGKey(0), self.size)))
+        # episodes at every stage, so that as many end in one step as in the next
+        share = jax.random.uniform(jax.random.PRNGKey(1), (self.size,))
+        inner = dataclasses.replace(state.inner, waited=share * self.env.config.stuck_time)
+        state = dataclasses.replace(state, inner=inner)
+        physics = jax.tree.map(jnp.copy, state.inner.physics)
+        held = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / self.size
+        ours, naked, ended = [], [], 0
+        for _ in range(repeats + 1):
+            begin = time.monotonic()
+            state, ended = jax.block_until_ready(self._drive(params, state))
+            middle = time.monotonic()
+            physics = jax.block_until_ready(self._bare(params, physics))
+            ours.append(middle - begin)
+            naked.append(time.monotonic() - middle)
+        steps, best, bare = self.size * self.steps, min(ours[1:]), min(naked[1:])
+        return {
+            "env_steps_per_s": steps / best,
+            "physics_steps_per_s": steps * self.env.config.decimation / best,
+            "bare_steps_per_s": steps / bare,
+            "ratio": bare / best,
+            "resets_per_step": int(ended) / self.steps,
+            "seconds": ours[1:],
+            "bare_seconds": naked[1:],
+            "state_bytes_per_rover": held,
+            "temporary_bytes_per_rover": getattr(self._drive.memory_analysis(), "temp_size_in_bytes", 0) / self.size,
+        }
+
+
+def scaling(args: argparse.Namespace, clock: Clock) -> None:
+    """Whole training epochs per second on more and more devices, the same rovers and transitions on each."""
+    import jax
+    import numpy as np
+    from jax.sharding import Mesh
+
+    from lunar_mjx.agents.learner import AXIS, Learner
+    from lunar_mjx.envs import make
+
+    training = training_of(args)
+    env, own = make(training.environment, **training.options), training.train
+    learners = {}
+    for count in [2**i for i in range(jax.device_count().bit_length())]:
+        config = dataclasses.replace(own, envs=own.envs * count, batch=own.batch * count)
+        learners[count] = Learner(env, config, Mesh(np.array(jax.devices()[:count]), (AXIS,)))
+    in_threads(*(learner.compile for learner in learners.values()))
+    say(f"scaling: compiled after {clock.spent:.0f} s")
+    wait(args, clock)
+    rows: list[dict[str, Any]] = []
+    for count, learner in learners.items():
+        config, state, best = learner.config, learner.init(0), float("inf")
+        for i in range(2 if args.tiny else 9):
+            begin = time.monotonic()
+            state, _ = jax.block_until_ready(learner.epoch(env.params, state))
+            if i:
+                best = min(best, time.monotonic() - begin)
+        rate = config.envs * config.epoch_steps / best
+        row = {"devices": count, "steps_per_s": rate, "updates_per_s": config.updates * config.epoch_steps / best}
+        rows.append({**row, "efficiency": rate / count / (rows[0]["steps_per_s"] if rows else rate)})
+        say(f"scaling: {count} devices, {rate:,.0f} steps/s, efficiency {rows[-1]['efficiency']:.3f}")
+        save(args.out, "scaling", {"rover": args.rover, "rows": rows})
+        del state
