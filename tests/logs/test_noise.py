@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from cli_harness import Run
 
 from lunar_mjx.logs import Log, Noise, read_log, write_log
 from lunar_mjx.logs.noise import estimated_noise, noise_of, noise_table
+from tests.cli_harness import Run
 
 STEP, SECONDS = 0.05, 120.0
 TIME = np.arange(0.0, SECONDS, STEP)
