@@ -22,9 +22,9 @@ from lunar_mjx.agents.play import shipped_policy
 from lunar_mjx.agents.policy import FORMAT as POLICY_FORMAT
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.backends.log_channels import command_channels
+from lunar_mjx.diagnosis.folder.stored import read_stored
 from lunar_mjx.diagnosis.report.read import read_result
 from lunar_mjx.diagnosis.runs import FORMAT as RUN_FORMAT
-from lunar_mjx.diagnosis.stored import read_stored
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 from lunar_mjx.model.file import load_model, save_model

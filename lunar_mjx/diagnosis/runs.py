@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx._version import __version__
-from lunar_mjx.diagnosis.stored import read_stored
+from lunar_mjx.diagnosis.folder.stored import read_stored
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.files import write_text
 from lunar_mjx.logs import Finding, Log, SteadyLog, check, read_campaign

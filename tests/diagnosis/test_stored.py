@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lunar_mjx.diagnosis.folder.stored import read_stored
 from lunar_mjx.diagnosis.report.read import _traces
-from lunar_mjx.diagnosis.stored import read_stored
 from lunar_mjx.errors import UserError
 
 N, MODELS = 6, 2

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar_mjx.diagnosis.folder.stored import read_arrays, read_stored
 from lunar_mjx.diagnosis.runs import (
     COMPARISON_FILE,
     FITS_FILE,
@@ -20,7 +21,6 @@ from lunar_mjx.diagnosis.runs import (
     SIGNATURES_FILE,
     VERDICT_FILE,
 )
-from lunar_mjx.diagnosis.stored import read_arrays, read_stored
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.model import Model
