@@ -147,8 +147,11 @@ def main() -> None:
 
     base = load_model(shipped("models") / "husky" / "hard_floor.toml")
     hard = verbs.compare([args.logs / g for g in HARD], base, args.runs / "hard")
-    result["hard_floors"] = {"errors": tables(hard), "parameters": hard.load("comparison.json")["parameters"],
-                             **black_box(hard, base)}  # fmt: skip
+    result["hard_floors"] = {
+        "errors": tables(hard),
+        "parameters": hard.load("comparison.json")["parameters"],
+        **black_box(hard, base),
+    }
     keep()
     model = load_model(args.runs / "hard" / "fitted.toml")
     for name in SOFT:

@@ -38,8 +38,30 @@ LONGEST = 1500
 """Characters of a refusal."""
 NUMBER = re.compile(rb"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.])")
 WORD = re.compile(rb"[A-Za-z_]{3,}")
-NUMBERS = [b"nan", b"inf", b"-inf", b"-1", b"0", b"1e400", b"1e308", b"-1e-300", b"1_0", b"x", b"", b"true", b"[]",
-           b"9" * 400, b"9" * 5000, b"0x10", b"1,5", b"\xc3\xa9", b"'", b"1e99", b"-32768", b"99999999999"]  # fmt: skip
+NUMBERS = [
+    b"nan",
+    b"inf",
+    b"-inf",
+    b"-1",
+    b"0",
+    b"1e400",
+    b"1e308",
+    b"-1e-300",
+    b"1_0",
+    b"x",
+    b"",
+    b"true",
+    b"[]",
+    b"9" * 400,
+    b"9" * 5000,
+    b"0x10",
+    b"1,5",
+    b"\xc3\xa9",
+    b"'",
+    b"1e99",
+    b"-32768",
+    b"99999999999",
+]
 WORDS = [
     b"",
     b"nobody",
@@ -75,8 +97,19 @@ def torn(good: bytes, rng: random.Random) -> bytes:
         return b"\n".join(lines)
     if way == 10:
         return b"\n".join([*lines, rng.choice(lines)])
-    return rng.choice([b"", b"\xef\xbb\xbf" + good, good.decode("latin-1").encode("utf-16"), b"\x00" * 100,
-                       b"[" * 5000, b"a = " + b"[" * 3000, b"<a>" * 3000, b"{" * 3000, good * 2])  # fmt: skip
+    return rng.choice(
+        [
+            b"",
+            b"\xef\xbb\xbf" + good,
+            good.decode("latin-1").encode("utf-16"),
+            b"\x00" * 100,
+            b"[" * 5000,
+            b"a = " + b"[" * 3000,
+            b"<a>" * 3000,
+            b"{" * 3000,
+            good * 2,
+        ]
+    )
 
 
 def finite(*values: object) -> None:
@@ -142,12 +175,28 @@ rock_fraction = 0.3
 patch = 2.0
 """
 ASC = b"ncols 4\nnrows 3\nxllcorner 10\nyllcorner 20\ncellsize 2.0\nNODATA_value -9999\n1 2 3 4\n5 6 7 8\n9 1 2 3\n"
-RUN = {"format": RUN_FORMAT, "version": "0.1.0", "logs": ["a"], "hashes": {"a": "0" * 64}, "candidates": [],
-       "splits": {}, "added": [], "parent": None, "seed": 3, "discrepancy": {"x": 1.5}, "test_opened": []}  # fmt: skip
-COMPARISON = {"as_given": {"fit": 3.0, "test": None}, "refitted": {"fit": 1.0, "test": 1.1},
-              "by_channel": [{"manoeuvre": "a", "split": "fit", "channel": "c", "as_given": 2.0, "refitted": 1.0}],
-              "certificate": {"chi2": 5.0, "gradient": 1e-3, "starts": [], "at_bound": [], "problems": []},
-              "parameters": {}, "observations": 4, "logs": ["a"]}  # fmt: skip
+RUN = {
+    "format": RUN_FORMAT,
+    "version": "0.1.0",
+    "logs": ["a"],
+    "hashes": {"a": "0" * 64},
+    "candidates": [],
+    "splits": {},
+    "added": [],
+    "parent": None,
+    "seed": 3,
+    "discrepancy": {"x": 1.5},
+    "test_opened": [],
+}
+COMPARISON = {
+    "as_given": {"fit": 3.0, "test": None},
+    "refitted": {"fit": 1.0, "test": 1.1},
+    "by_channel": [{"manoeuvre": "a", "split": "fit", "channel": "c", "as_given": 2.0, "refitted": 1.0}],
+    "certificate": {"chi2": 5.0, "gradient": 1e-3, "starts": [], "at_bound": [], "problems": []},
+    "parameters": {},
+    "observations": 4,
+    "logs": ["a"],
+}
 VERDICT = {
     "verdict": "NOISE_ONLY",
     "sentence": "at the noise",
@@ -156,8 +205,19 @@ VERDICT = {
     "details": {},
     "ports": {},
 }
-FITS = {"soil+slip": {"u": {"soil.n": 0.5}, "chi2": 4.0, "gradient": 1e-3, "starts": [1.0], "at_bound": [], "extra": {},
-                      "problems": [], "wide": None}, "at start": {"soil.n": 0.1}}  # fmt: skip
+FITS = {
+    "soil+slip": {
+        "u": {"soil.n": 0.5},
+        "chi2": 4.0,
+        "gradient": 1e-3,
+        "starts": [1.0],
+        "at_bound": [],
+        "extra": {},
+        "problems": [],
+        "wide": None,
+    },
+    "at start": {"soil.n": 0.1},
+}
 
 
 def _saved_model(folder: Path) -> bytes:
@@ -244,9 +304,12 @@ def test_broken_files_are_refused_or_load_to_finite_numbers(kind, tmp_path, capf
 
 
 def _record(changes: dict) -> dict:
-    record = {"format": POLICY_FORMAT, "network": {"obs": 3, "actions": 2, "layers": [4], "activation": "relu",
-                                                   "layer_norm": False},
-              "environment": {"name": "point", "options": {}, "unseen": {}}, "notes": {}}  # fmt: skip
+    record = {
+        "format": POLICY_FORMAT,
+        "network": {"obs": 3, "actions": 2, "layers": [4], "activation": "relu", "layer_norm": False},
+        "environment": {"name": "point", "options": {}, "unseen": {}},
+        "notes": {},
+    }
     for place, value in changes.items():
         *path, last = place.split(".")
         inner = record
@@ -257,11 +320,14 @@ def _record(changes: dict) -> dict:
 
 
 POLICIES = [
-    *({"network." + k: v} for k in ("obs", "actions", "layers", "activation", "layer_norm")
-      for v in (None, -1, 0, 1e9, "x", [], {}, True, [[]], 10**12)),
+    *(
+        {"network." + k: v}
+        for k in ("obs", "actions", "layers", "activation", "layer_norm")
+        for v in (None, -1, 0, 1e9, "x", [], {}, True, [[]], 10**12)
+    ),
     *({k: v} for k in ("format", "network", "environment", "notes") for v in (None, 1, "x", [], "y" * 50_000)),
     *({"environment." + k: v} for k in ("name", "options") for v in (None, 1, [], {"a": "b"})),
-]  # fmt: skip
+]
 
 
 def test_broken_policies(tmp_path):

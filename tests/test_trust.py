@@ -87,8 +87,19 @@ def _run_folder(mine: Path, candidates: list[str], model: Path) -> Path:
     folder = mine.parent / "run1"
     folder.mkdir(exist_ok=True)
     shutil.copy(model, folder / "model.toml")
-    text = {"format": FORMAT, "logs": [], "hashes": {}, "candidates": candidates, "splits": {}, "added": [],
-            "parent": None, "seed": 0, "version": "0.1.0", "discrepancy": {}, "test_opened": []}  # fmt: skip
+    text = {
+        "format": FORMAT,
+        "logs": [],
+        "hashes": {},
+        "candidates": candidates,
+        "splits": {},
+        "added": [],
+        "parent": None,
+        "seed": 0,
+        "version": "0.1.0",
+        "discrepancy": {},
+        "test_opened": [],
+    }
     (folder / RUN_FILE).write_text(json.dumps(text))
     return folder
 

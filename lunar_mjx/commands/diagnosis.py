@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -287,7 +287,7 @@ def _shown(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def _finish(diagnosis: Diagnosis, as_json: bool) -> None:
+def _finish(diagnosis: Diagnosis, as_json: bool) -> NoReturn:
     """Prints a diagnosis and ends with its exit status."""
     from lunar_mjx.diagnosis.runs import plain
     from lunar_mjx.model.describe import make_console, make_table

@@ -137,6 +137,7 @@ def _starts(
     cells = [(cx, cy) for cy in line for cx in line]
     places = []
     for cx, cy in cells[:count]:
+        x = y = 0.0
         for _ in range(200):
             x, y = np.array([cx, cy]) + rng.uniform(-2.0, 2.0, 2)
             if _good(terrain, x, y):

@@ -25,8 +25,8 @@ _RIVAL = 0.8
 rivals of Coulomb friction in two campaigns eight took off what was promised within 3 % of that effect's share; gravity
 took off 14 % more, grousers nothing.)"""
 
-_MOSTLY = 0.5
-"""Share of the excess over the noise that a refit leaves at most which explains most of it."""
+MAX_LEFT_FRACTION = 0.5
+"""A refit explains most of a misfit if at most this share of the chi-square beyond the noise remains."""
 _RENEWALS = 2
 """Times that the error of the time step is taken anew at most: at a fit with an error of its own it is nearly right."""
 
@@ -212,7 +212,7 @@ def _strayed(parent: Fit, found: Fit, rival: Rival | float) -> bool:
     A baseline that misfits may have gone far along a valley, from where the way back is long.
     """
     count = float(found.fitted.sum())
-    explains = found.chi2 - count < _MOSTLY * max(parent.chi2 - count, 0.0)
+    explains = found.chi2 - count < MAX_LEFT_FRACTION * max(parent.chi2 - count, 0.0)
     reached = rival.chi2 if isinstance(rival, Rival) else rival
     return bool(found.problems) and explains and found.chi2 - 4.0 * found.gradient < reached
 

@@ -21,12 +21,12 @@ from lunar_mjx.inference.scan import foresee_overlooked, overlooked
 from lunar_mjx.inference.score import SEPARABLE, Score, cosines, score, signatures
 from lunar_mjx.inference.shooting import shoot
 
-_HOPELESS = 200.0
-"""Chi-square beyond an effect's from which another that may stand for it is left."""
-_NEAR = 200.0
-"""The same from which another effect is no rival, whatever the error of the time step."""
-_NOISE = "noise"
-"""What the place is called at which the noise's colour was learnt."""
+STAND_IN_GIVE_UP_CHI2 = 200.0
+"""A stand-in is refitted no further this far above the chi-square of the effect that it would replace."""
+RIVAL_GIVE_UP_CHI2 = 200.0
+"""An effect this far above another's chi-square is no rival of it, whatever the error of the time step."""
+NOISE_FIT_KEY = "noise"
+"""Key, in the store of fits, of the fit by which the noise's colour was estimated."""
 _MISFIT = 1.3
 """Root mean square residual of a channel, over what noise allows it, from which a model is far beyond the noise."""
 
@@ -58,11 +58,11 @@ def fit_baseline(problem: Problem, settings: Settings, memory: Memory, progress:
     """
     start, free = None, problem.free()
     if problem.noise_unlearnt:
-        start = memory.place(problem, _NOISE)
+        start = memory.place(problem, NOISE_FIT_KEY)
         if start is None:
             start = shoot(problem, free, problem.origin(), progress)
             start = fit(problem, free, start, starts=1, certify=False, progress=progress).u
-            memory.keep_place(problem, _NOISE, start)
+            memory.keep_place(problem, NOISE_FIT_KEY, start)
         problem.learn_noise(start)
     found = memory.recall(problem, ())
     if found is None:
@@ -106,7 +106,7 @@ def search(
             if not problem.cheap_jacobian:
                 best = _in_own_steps(problem, base, reached, settings, tried)
                 best = _completed(problem, best, settings, tried, memory, progress)
-                best = tried[frozenset(best.effects)] = _looked_at(problem, best, settings)
+                best = tried[frozenset(best.effects)] = _with_pattern_test(problem, best, settings)
             break
         grown = [tried[frozenset(c.effects)] for c in grown]
         better = [c for c in grown if _better(c, best, settings) and _earned(problem, best, c, settings)]
@@ -124,10 +124,10 @@ def search(
         # what was dropped may have stood for a pattern that shows now
         if problem.inputs and pruned.noise.passes and pruned.pattern is None:
             _, pruned = _scores(problem, pruned, settings)
-        pruned = tried[frozenset(pruned.effects)] = _looked_at(problem, pruned, settings)
+        pruned = tried[frozenset(pruned.effects)] = _with_pattern_test(problem, pruned, settings)
     best = pruned
     if not best.effects:
-        base = best = tried[frozenset()] = _looked_at(problem, base, settings)
+        base = best = tried[frozenset()] = _with_pattern_test(problem, base, settings)
     rivals = [c for c in tried.values() if c is not best and _alike(c, best, settings)]
     if not problem.cheap_jacobian:
         rivals = [c for c in rivals if not simpler(best.fit, c.fit)]
@@ -154,7 +154,7 @@ def _reaching(
     """The first that leaves nothing but noise; those looked at replace what was tried."""
     for c in grown:
         if c.noise.passes and _earned(problem, base, c, settings):
-            looked = tried[frozenset(c.effects)] = _looked_at(problem, c, settings)
+            looked = tried[frozenset(c.effects)] = _with_pattern_test(problem, c, settings)
             if looked.at_noise:
                 return looked
     return None
@@ -168,7 +168,7 @@ def _in_own_steps(
     Else what is left of that error looks like a second effect (beside Coulomb friction, like Stribeck's), or another
     effect like a better one.
     """
-    near = [c for c in tried.values() if c.effects and c.fit.chi2 < reached.fit.chi2 + _NEAR]
+    near = [c for c in tried.values() if c.effects and c.fit.chi2 < reached.fit.chi2 + RIVAL_GIVE_UP_CHI2]
     owns = [with_own_step_error(problem, c) for c in dict.fromkeys([reached, *near])]
     tried.update({frozenset(c.effects): c for c in owns})
     # who takes its place must have earned it on manoeuvres left out, as it had
@@ -198,7 +198,9 @@ def _completed(
                 continue
             with problem.focused(stand.effects):
                 start = best_start(problem, stand)
-                c = refit(problem, best, stand.effects, stand.scored, memory, best.fit.chi2 + _HOPELESS, start)
+                c = refit(
+                    problem, best, stand.effects, stand.scored, memory, best.fit.chi2 + STAND_IN_GIVE_UP_CHI2, start
+                )
             tried[frozenset(c.effects)] = c
         plain = [c for c in tried.values() if 0 < len(c.effects) <= len(best.effects) and c.noise.passes]
         plain = [c for c in plain if simpler(c.fit, best.fit)]
@@ -217,8 +219,8 @@ def _completed(
         best = max(better, key=lambda c: gain(problem, best.fit, c.fit)[0])
 
 
-def _looked_at(problem: Problem, c: Candidate, settings: Settings) -> Candidate:
-    """Whether a residual that is small has a pattern, too; for drives only where scores were taken at the fit."""
+def _with_pattern_test(problem: Problem, c: Candidate, settings: Settings) -> Candidate:
+    """The candidate with its residual-pattern test filled in; for drives only where scores were taken at the fit."""
     small = c.noise.passes and np.isfinite(c.fit.chi2)
     if not small or not problem.inputs:
         gain_ = pattern(problem, c.fit) if small else 0.0

@@ -36,7 +36,7 @@ def measure_overhead(without: Sequence[Effect], full: Sequence[Effect]) -> tuple
     times: list[list[float]] = [[], []]
     for _ in range(_REPEATS):
         for run, spent in zip(runs, times, strict=True):
-            start = clock()
+            start, done = clock(), None
             for _ in range(_CALLS):
                 done = run()
             jax.block_until_ready(done)

@@ -18,20 +18,20 @@ SAME_CHI2 = 1.0
 SMALL_GRADIENT = 0.5
 """Largest drop of chi-square that one more Gauss-Newton step may still promise: under a sigma in all directions."""
 MISFIT_SHARE = 0.1
-"""Where a model misfits, all three may be this share of chi-square beyond the noise: a better fit would misfit, too.
+"""Tolerances on equal chi-square, gradient and half time step, as a share of the chi-square beyond the noise.
 Bounds and starts that do not agree are then no faults either; both count in the fit of the model that is named, which
 has to reach the noise. (Scores do not feel a fit that has not quite converged: what it lacks lies in the span of its
 sensitivities, and that is projected out.)"""
 
 _DAMPINGS = np.array([1e-4, 1e-2, 1e-1, 1.0, 1e2])
-_WIDER = 1e2
-"""Factor on the damping after a failed step."""
+DAMPING_GROWTH = 1e2
+"""Factor on the damping of Levenberg-Marquardt after a step of no damping helped."""
 _ITERATIONS = 60
 EDGE = 1e-6
 _PATIENCE = 2
 """Steps in a row that may gain less than matters."""
 _CREEPING = 12
-"""The same at the noise, where the gradient still promises too much for a certificate."""
+"""Steps in a row that may gain less than matters at the noise, where the gradient promises too much to certify."""
 _CREEP = 2.0
 """Drop of chi-square that does not matter where rows are dear: it takes 25 to name an effect."""
 _JUMP = 1e5
@@ -137,6 +137,7 @@ class _Walk:
         """Tries all dampings at once, and goes where chi-square is least; False where it is nowhere less."""
         goal, dampings = self.goal, self.damping * _DAMPINGS
         trials, probes = goal.steps(self.u, downhill, hessian, dampings), np.zeros((0, len(self.u)))
+        ahead = np.zeros((0, len(self.r)))
         if self.curved:
             bent, probes, ahead = goal.bent(self.u, self.r, self.j, hessian, trials, dampings)
             trials = np.concatenate([trials, bent])
@@ -177,7 +178,7 @@ class _Walk:
 
     def _foresee_bending(self, downhill: np.ndarray, hessian: np.ndarray) -> None:
         """What a step asks for first if the one before has failed."""
-        trials = self.goal.steps(self.u, downhill, hessian, _WIDER * self.damping * _DAMPINGS)
+        trials = self.goal.steps(self.u, downhill, hessian, DAMPING_GROWTH * self.damping * _DAMPINGS)
         self.goal.problem.foresee(self.goal.probes(self.u, trials))
 
     def try_again(self) -> bool:
@@ -196,7 +197,7 @@ class _Walk:
         # where rows are dear, two rounds from Gauss-Newton to steepest descent are enough
         if self.damping > 1e8 or (self.failed > 1 and self.dear and self.damping >= 1.0):
             return False
-        self.damping, self.curved = self.damping * _WIDER, True
+        self.damping, self.curved = self.damping * DAMPING_GROWTH, True
         return True
 
 

@@ -40,10 +40,10 @@ _NEARER = 0.3
 
 _ROUGHEST = 25.0
 """Jumps of chi-square that are put up with at most: below what would name an effect."""
-_WIDER, _WIDENED = 1.5, 3
-"""Times the step from which standard errors are taken by wider steps, and how often they are taken at most."""
+STD_GROWTH_LIMIT, MAX_STEP_WIDENINGS = 1.5, 3
+"""Derivatives are taken over wider steps again while standard errors grow by more than this, so many times at most."""
 ROUGH = 4.0
-"""Times the jumps of a rough chi-square that its gradient may promise."""
+"""Largest promise of the gradient, in jumps of chi-square, at a bottom that jumps (wheels at rest in drives)."""
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share that is done, 0 to 1."""
@@ -101,7 +101,7 @@ class Fit:
 
 def _with_own_nuisances(goal: Objective, best: Descent) -> Descent:
     """Fits the starts of logs that are held out to these logs themselves; what all logs share stays where it is."""
-    u = _own_place(goal, best)
+    u = _held_out_nuisance_estimate(goal, best)
     if u is None:
         return best
     residual = goal.residuals(u[None])[0][0]
@@ -110,13 +110,13 @@ def _with_own_nuisances(goal: Objective, best: Descent) -> Descent:
 
 def foreseen_fit(goal: Objective, at: Descent) -> Fit:
     """The fit that a descent would give here, held-out logs fitted to themselves by linear theory."""
-    u = _own_place(goal, at)
+    u = _held_out_nuisance_estimate(goal, at)
     residual = at.residual if u is None else at.residual - at.jacobian @ (u - at.u)[goal.free]
     return Fit(at.u if u is None else u, goal.free, at.chi2, residual, at.jacobian, goal.fitted, at.promise)
 
 
-def _own_place(goal: Objective, best: Descent) -> np.ndarray | None:
-    """(coordinates,) where that is; None where there is nothing to fit."""
+def _held_out_nuisance_estimate(goal: Objective, best: Descent) -> np.ndarray | None:
+    """(coordinates,) u after one Gauss-Newton step of the held-out logs' nuisances; None where no log is held out."""
     problem = goal.problem
     held = {n for n, split in enumerate(problem.observations.split) if split != "fit"}
     own = np.array([problem.coordinates[i].log_index in held for i in goal.free])
@@ -222,10 +222,10 @@ def _for_intervals(goal: Objective, best: Descent) -> tuple[np.ndarray, np.ndarr
     Where what both tell leaves much larger errors, they are the next steps.
     """
     jacobian, std = best.jacobian, goal.standard_errors(best.u, best.jacobian)
-    for _ in range(_WIDENED):
+    for _ in range(MAX_STEP_WIDENINGS):
         jacobian = goal.without_jumps(jacobian, goal.wide_jacobian(best.u, std))
         told = goal.standard_errors(best.u, jacobian)
-        if np.all(told <= _WIDER * std):
+        if np.all(told <= STD_GROWTH_LIMIT * std):
             break
         std = np.maximum(std, told)
     return jacobian, std
@@ -239,7 +239,7 @@ def _foresee_end(goal: Objective, first: Descent, certify: bool) -> None:
     """What will be asked for if no other start descends further."""
     if not goal.problem.eager:
         return
-    own = _own_place(goal, first)
+    own = _held_out_nuisance_estimate(goal, first)
     if own is not None:
         goal.problem.foresee(own[None])
     if certify:

@@ -60,7 +60,7 @@ class Problem(abc.ABC):
 
     @property
     def eager(self) -> bool:
-        """See above."""
+        """Whether rows cost no time (one batch of a GPU), so that Jacobians are taken before they are needed."""
         return False
 
     @abc.abstractmethod

@@ -14,9 +14,9 @@ from lunar_mjx.inference.score import Score
 AMOUNTS = np.array([0.1, 0.3, 1.0, 2.0, 3.0])
 """Amounts of a candidate, in terms of its nominal one, that are tried where derivatives may mislead."""
 _USUAL = np.array([1.0, 2.0])
-"""The same for candidates that scores have ranked low."""
-_MOSTLY = 0.5
-"""Share of chi-square that such an amount may leave, without any refit, for a refit of the candidate to be worth it."""
+"""Amounts, in terms of the nominal one, that are tried of candidates which scores have ranked low."""
+MAX_LEFT_FRACTION = 0.5
+"""A refit of a candidate is tried if an amount of it, without any refit, leaves at most this share of chi-square."""
 _FEW = 2
 """Candidates that are refitted for that."""
 _FAR = 4.0
@@ -78,7 +78,7 @@ def overlooked(problem: Problem, fit: Fit, effects: Sequence[str], others: Seque
     if not owner:
         return []
     _, chi2 = Objective(problem, problem.free(effects), fit.fitted).residuals(np.concatenate(blocks))
-    ahead = [(float(c), k) for k, c in enumerate(chi2) if c < _MOSTLY * fit.chi2]
+    ahead = [(float(c), k) for k, c in enumerate(chi2) if c < MAX_LEFT_FRACTION * fit.chi2]
     return list(dict.fromkeys(owner[k] for _, k in sorted(ahead)))[:_FEW]
 
 

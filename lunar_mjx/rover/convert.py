@@ -237,8 +237,13 @@ def place_drive_groups(urdf: Urdf, roles: Roles, description: Description) -> tu
         for corner in group.wheels:
             if corner not in joints or corner in taken:
                 reason = "is in two groups" if corner in taken else "is no wheel of the rover"
-                raise bad_input(description.path or urdf.path, f"drive_groups[{i}].wheels", corner, reason,
-                                f"use {', '.join(joints)}, each once")  # fmt: skip
+                raise bad_input(
+                    description.path or urdf.path,
+                    f"drive_groups[{i}].wheels",
+                    corner,
+                    reason,
+                    f"use {', '.join(joints)}, each once",
+                )
             taken.append(corner)
         found.append(DriveGroup(group.name, tuple(joints[c] for c in group.wheels)))
     return tuple(found)

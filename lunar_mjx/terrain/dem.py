@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -249,7 +250,7 @@ def _across(heights: np.ndarray, hole: np.ndarray) -> np.ndarray:
     enclosed = weight > 0.0
     value[enclosed] /= weight[enclosed]
     if not enclosed.all():
-        nearest = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
+        nearest: Any = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
         value[~enclosed] = heights[tuple(axis[hole][~enclosed] for axis in nearest)]
     return value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -90,6 +91,6 @@ def export_mesh(terrain: Terrain, path: str | Path, **options: bool | float) -> 
     if not path.parent.is_dir():
         raise UserError(f"{path}: the folder is not there; make it first.")
     with replacing(path) as part:
-        data = to_mesh(terrain, **options).export(file_type=path.suffix[1:].lower())  # pyright: ignore[reportArgumentType]
+        data: Any = to_mesh(terrain, **options).export(file_type=path.suffix[1:].lower())  # pyright: ignore[reportArgumentType]
         part.write_bytes(data.encode() if isinstance(data, str) else data)
     return path

@@ -131,7 +131,7 @@ def _without_means(detail: np.ndarray, ratio: int, coarse: tuple[int, int]) -> n
     """Takes the smooth surface off that carries the means over the coarse cells."""
     rows, cols = detail.shape
     carrier = np.zeros(coarse)
-    wanted = cell_means(detail, ratio)
+    wanted = rest = cell_means(detail, ratio)
     # The means of a spline through the means are not quite the means: correct by what is left, until little is.
     for _ in range(_ROUNDS):
         taken = spline(carrier, rows, cols, 1 / ratio)

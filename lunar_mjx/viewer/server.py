@@ -195,7 +195,7 @@ class Viewer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: Viewer
+    server: Viewer  # pyright: ignore[reportIncompatibleVariableOverride]
     server_version, sys_version = "lunar-mjx", ""
     protocol_version = "HTTP/1.1"
     timeout = 30.0

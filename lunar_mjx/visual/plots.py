@@ -154,7 +154,8 @@ def drive_summary(drive: RecordedDrive) -> Figure:
         axes.set_xlim(drive.time[0], drive.time[-1])
         if row < 4:
             axes.tick_params(labelbottom=False)
-    axes.set_xlabel("time, s")
+        else:
+            axes.set_xlabel("time, s")
     name, model = drive.model.rover.name, drive.model
     length = float(np.hypot(*np.diff(drive.position[:, :2], axis=0).T).sum())
     figure.suptitle(

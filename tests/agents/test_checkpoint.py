@@ -47,8 +47,11 @@ def _two(folder: Path, settings: dict | None = None) -> Checkpoints:
 
 
 def _damages() -> list[tuple[str, str]]:
-    return [(name, how) for how in ("cut", "emptied", "flipped", "removed")
-            for name in ("metadata", "_METADATA", "d/*", "manifest.ocdbt")]  # fmt: skip
+    return [
+        (name, how)
+        for how in ("cut", "emptied", "flipped", "removed")
+        for name in ("metadata", "_METADATA", "d/*", "manifest.ocdbt")
+    ]
 
 
 @pytest.mark.parametrize(("name", "how"), _damages())
@@ -80,8 +83,10 @@ def test_a_damaged_newest_checkpoint_gives_way_to_the_one_before(tmp_path, capfd
 
 def test_a_checkpoint_of_other_settings_is_refused_by_name(tmp_path):
     _two(tmp_path, {"train": {"envs": 8}, "seed": 0}).close()
-    for settings, said in (({"train": {"envs": 8}, "seed": 1}, "seed = 1 is not 0"),
-                           ({"train": {"envs": 16}, "seed": 0}, "train.envs = 16 is not 8")):  # fmt: skip
+    for settings, said in (
+        ({"train": {"envs": 8}, "seed": 1}, "seed = 1 is not 0"),
+        ({"train": {"envs": 16}, "seed": 0}, "train.envs = 16 is not 8"),
+    ):
         other = Checkpoints(tmp_path, settings)
         with pytest.raises(UserError, match=said):
             other.newest(LIKE)

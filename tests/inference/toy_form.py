@@ -61,10 +61,21 @@ class ToyForm(Form):
         rows = (self.value - curve(u)) / NOISE
         free = np.full(14, np.inf)
         return Linear(
-            Gram.of(columns, rows), {}, amplitudes, -free, free, np.r_[0, 1, 5:14],
-            {e: np.array([p]) for e, p in EFFECTS.items()}, at, {"gauge": np.array([5])}, {},
-            (Field("level", 0.02),), (NoiseSize("y", 0.3),), 0.5, 5.0,
-        )  # fmt: skip
+            Gram.of(columns, rows),
+            {},
+            amplitudes,
+            -free,
+            free,
+            np.r_[0, 1, 5:14],
+            {e: np.array([p]) for e, p in EFFECTS.items()},
+            at,
+            {"gauge": np.array([5])},
+            {},
+            (Field("level", 0.02),),
+            (NoiseSize("y", 0.3),),
+            0.5,
+            5.0,
+        )
 
 
 def measured(seed, **effects):

@@ -67,7 +67,7 @@ class Choice:
 
     @functools.cached_property
     def term(self) -> Term:
-        """It as a term."""
+        """This choice of a formula as a `Term`."""
         of = features(self.port)
         return term(targets()[self.target], of[self.first] * of[self.second], self.linear)
 

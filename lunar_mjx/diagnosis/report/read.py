@@ -165,8 +165,15 @@ def _traces(path: Path) -> Traces | None:
 def _check_shapes(found: Mapping[str, np.ndarray]) -> None:
     """Raises `ValueError` for arrays that do not go with the measurements."""
     n, models = len(found["measured"]), len(found["labels"])
-    shapes = {"measured": (n,), "sigma": (n,), "time": (n,), "unit": (n,), "predicted": (models, n),
-              "residual": (models, n), "place": (n if len(found["place"]) else 0, 3)}  # fmt: skip
+    shapes = {
+        "measured": (n,),
+        "sigma": (n,),
+        "time": (n,),
+        "unit": (n,),
+        "predicted": (models, n),
+        "residual": (models, n),
+        "place": (n if len(found["place"]) else 0, 3),
+    }
     for name, shape in shapes.items():
         if found[name].shape != shape or found[name].dtype.kind not in "fiu":
             raise ValueError(f"{name} is {found[name].dtype} of shape {found[name].shape}, not numbers of {shape}")

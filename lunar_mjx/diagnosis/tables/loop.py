@@ -40,8 +40,9 @@ LAWS: Mapping[str, tuple[str, ...]] = {
 }
 """Contact laws that are rivals of each other, and the effects that make them up. (The forms that the seed paper printed
 are none: they are kept to reproduce it.)"""
-_CONTACT = frozenset({"pressure_sinkage", "closed_form_shear", "stress_integral", "penalty_contact", "printed_shear",
-                      "engine_friction"})  # fmt: skip
+_CONTACT = frozenset(
+    {"pressure_sinkage", "closed_form_shear", "stress_integral", "penalty_contact", "printed_shear", "engine_friction"}
+)
 _SPLITS = {
     "fit": ("fit",),
     "select": ("select",),
@@ -188,11 +189,16 @@ def comparison(form: WheelForm, start: np.ndarray, refit: Refit) -> dict[str, An
         part = slice(s.start, s.stop)
         for unit in np.unique(observations.unit[part]):
             keep = np.arange(s.start, s.stop)[observations.unit[part] == unit]
-            rows.append({
-                "manoeuvre": observations.unit_names[unit], "split": observations.unit_split[unit],
-                "channel": s.channel, "samples": len(keep), "as_given": _rms(start[keep]),
-                "refitted": _rms(residual[keep]),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "manoeuvre": observations.unit_names[unit],
+                    "split": observations.unit_split[unit],
+                    "channel": s.channel,
+                    "samples": len(keep),
+                    "as_given": _rms(start[keep]),
+                    "refitted": _rms(residual[keep]),
+                }
+            )
     value, found, places = refit.linear.evidence(_terms(form, refit.effects))
     del value
     return {
@@ -246,8 +252,12 @@ def _discrepancy(tau: np.ndarray, log_std: np.ndarray, felt: Mapping[str, float]
         if felt[field] < LEAST_SIGNAL:
             continue
         low, high = size * math.exp(-spread), size * math.exp(spread)
-        found[field] = {"size": float(size), "low": float(low), "high": float(high),
-                        "text": f"{words} good to {_percent(size)}"}  # fmt: skip
+        found[field] = {
+            "size": float(size),
+            "low": float(low),
+            "high": float(high),
+            "text": f"{words} good to {_percent(size)}",
+        }
     return found
 
 
@@ -283,15 +293,23 @@ def save_series(
     place = observations.place if observations.place is not None else np.zeros((0, 3))
     with replacing(run.folder / SERIES_FILE) as part:
         np.savez_compressed(
-        part,
-        measured=observations.value, sigma=observations.sigma(), time=np.full(len(observations), np.nan), place=place,
-        unit=observations.unit, unit_names=np.array(observations.unit_names), split=np.array(observations.unit_split),
-        series_start=np.array([s.start for s in observations.series]),
-        series_channel=np.array([s.channel for s in observations.series]),
-        series_log=np.array([s.log for s in observations.series]), logs=np.array(observations.logs),
-        labels=np.array(["as given", *fits]), predicted=np.vstack(predicted), residual=np.vstack(residual),
-        **({} if corrected is None else dict(zip(("corrected", "corrected_residual"), corrected, strict=True))),
-    )  # fmt: skip
+            part,
+            measured=observations.value,
+            sigma=observations.sigma(),
+            time=np.full(len(observations), np.nan),
+            place=place,
+            unit=observations.unit,
+            unit_names=np.array(observations.unit_names),
+            split=np.array(observations.unit_split),
+            series_start=np.array([s.start for s in observations.series]),
+            series_channel=np.array([s.channel for s in observations.series]),
+            series_log=np.array([s.log for s in observations.series]),
+            logs=np.array(observations.logs),
+            labels=np.array(["as given", *fits]),
+            predicted=np.vstack(predicted),
+            residual=np.vstack(residual),
+            **({} if corrected is None else dict(zip(("corrected", "corrected_residual"), corrected, strict=True))),
+        )
 
 
 # --- why ---
@@ -375,15 +393,22 @@ def _diagnosis(problem: Tables, found: ModelSearch, best: Hypothesis) -> Diagnos
             "place": said.place,
             "held_out": {"gain": gain, "se": se, "manoeuvres": units},
             "noise": {n.name: float(s) for n, s in zip(best.refit.linear.noises, best.evidence.noise, strict=True)},
-            "search": {"refits": found.refits, "complete": found.complete, "failed": list(found.failed),
-                       "hypotheses": len(found.hypotheses)},
+            "search": {
+                "refits": found.refits,
+                "complete": found.complete,
+                "failed": list(found.failed),
+                "hypotheses": len(found.hypotheses),
+            },
             "parameters": parameter_table(
-                next(f for f in problem.forms if f.name == best.form), best.refit, best.evidence.mean,
-                best.evidence.covariance, best.places,
+                next(f for f in problem.forms if f.name == best.form),
+                best.refit,
+                best.evidence.mean,
+                best.evidence.covariance,
+                best.places,
             ),
             "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
         },
-    )  # fmt: skip
+    )
 
 
 def _averaged(found: ModelSearch) -> dict[str, dict[str, Any]]:
@@ -445,11 +470,20 @@ def _evidence(
             status, reason = "rejected", f"probability {p:.2g}"
         rows.append(
             EffectEvidence(
-                effect=name, separable_sigma=length, separable_share=float("nan"), chi2=float("nan"),
+                effect=name,
+                separable_sigma=length,
+                separable_share=float("nan"),
+                chi2=float("nan"),
                 z=math.copysign(math.sqrt(2.0 * abs(log_ratio)), log_ratio) if math.isfinite(log_ratio) else -99.0,
-                p=1.0 - p, values=values, std=std, nearest=nearest, probability=p, status=status, reason=reason,
+                p=1.0 - p,
+                values=values,
+                std=std,
+                nearest=nearest,
+                probability=p,
+                status=status,
+                reason=reason,
             )
-        )  # fmt: skip
+        )
     order = {name: i for i, name in enumerate(named)}
     rows.sort(key=lambda e: (order.get(e.effect, len(order)), -e.probability, -e.z))
     return tuple(rows), tuple(e.effect for e in rows if e.status == "not tested")
@@ -509,8 +543,9 @@ def _fits(problem: Tables, found: ModelSearch) -> dict[str, Any]:
         if h.refitted:
             key = " + ".join([h.form, *sorted(h.effects)])
             keys = [c.key for c in by_name[h.form].coordinates]
-            out.setdefault(key, {"u": dict(zip(keys, map(float, h.refit.u), strict=True)),
-                                 "log_posterior": h.log_posterior})  # fmt: skip
+            out.setdefault(
+                key, {"u": dict(zip(keys, map(float, h.refit.u), strict=True)), "log_posterior": h.log_posterior}
+            )
     return out
 
 

@@ -116,7 +116,12 @@ class TableSettings:
     def abscissae(self) -> dict[str, float]:
         """Usual error of every abscissa."""
         return {
-            "slip zero": self.slip_zero, "slip scale": self.abscissa_scale, "slip angle zero": self.angle_zero,
-            "slip angle scale": self.abscissa_scale, "load zero": self.abscissa_scale, "load scale": self.load_scale,
-            "wheel radius": self.wheel_radius, "wheel width": self.load_scale,
-        }  # fmt: skip
+            "slip zero": self.slip_zero,
+            "slip scale": self.abscissa_scale,
+            "slip angle zero": self.angle_zero,
+            "slip angle scale": self.abscissa_scale,
+            "load zero": self.abscissa_scale,
+            "load scale": self.load_scale,
+            "wheel radius": self.wheel_radius,
+            "wheel width": self.load_scale,
+        }

@@ -74,18 +74,25 @@ def table_data(
     slip = np.empty(first)
     slip[point] = observations.place[:, 0]
     stacked = jax.tree.map(lambda *a: np.concatenate([np.atleast_1d(np.asarray(x, float)) for x in a]), *tests)
-    lever = np.concatenate([
-        1.0 / np.cos(np.minimum(np.abs(np.asarray(t.slip_angle, float)), settings.steepest_lever))
-        if log.table.slip_definition == "wheel_frame" else np.ones(len(np.atleast_1d(np.asarray(t.slip_angle))))
-        for log, t in zip(logs, tests, strict=True)
-    ])  # fmt: skip
+    lever = np.concatenate(
+        [
+            1.0 / np.cos(np.minimum(np.abs(np.asarray(t.slip_angle, float)), settings.steepest_lever))
+            if log.table.slip_definition == "wheel_frame"
+            else np.ones(len(np.atleast_1d(np.asarray(t.slip_angle))))
+            for log, t in zip(logs, tests, strict=True)
+        ]
+    )
     load = np.asarray(stacked.normal_load)
     imposed = Imposed(stacked, slip, lever, np.full(first, load.mean()))
     speed = np.concatenate([_speed(log, t) for log, t in zip(logs, tests, strict=True)])
-    features = np.column_stack([
-        slip / settings.slip_length, np.degrees(stacked.slip_angle) / settings.angle_length,
-        np.log(load) / settings.load_length, np.log(speed) / settings.speed_length,
-    ])  # fmt: skip
+    features = np.column_stack(
+        [
+            slip / settings.slip_length,
+            np.degrees(stacked.slip_angle) / settings.angle_length,
+            np.log(load) / settings.load_length,
+            np.log(speed) / settings.speed_length,
+        ]
+    )
     # Slip and slip angle are what the catalogue's effects are about; none of them follows the rate.
     following = {
         name: _modes(features[:, [k]], settings)
@@ -296,8 +303,7 @@ class WheelForm(Form):
             std.append(sizes[name])
             of.append(_instrument(name))
         names = dict.fromkeys(of)
-        return (np.column_stack(columns), np.array(std),
-                {n: np.flatnonzero([o == n for o in of]) for n in names})  # fmt: skip
+        return (np.column_stack(columns), np.array(std), {n: np.flatnonzero([o == n for o in of]) for n in names})
 
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
         """See `Form`; Gauss-Newton with a trust region under the covariance of noise, calibration and discrepancy."""
@@ -356,15 +362,25 @@ class WheelForm(Form):
                 white = np.where(np.isfinite(white), white, 1e6)
                 solved = linalg.solve_triangular(factor, white, lower=True, check_finite=False)
                 kept.clear()
-                kept[key] = (np.concatenate([solved[:, 0], (x - centre) / std]),
-                             np.vstack([solved[:, 1:], np.diag(1.0 / std)]))  # fmt: skip
+                kept[key] = (
+                    np.concatenate([solved[:, 0], (x - centre) / std]),
+                    np.vstack([solved[:, 1:], np.diag(1.0 / std)]),
+                )
             return kept[key]
 
         x = np.clip(u[free], bounds[:, 0] + 1e-9, bounds[:, 1] - 1e-9)
         answer = optimize.least_squares(
-            lambda x: at(x)[0], x, lambda x: at(x)[1], (bounds[:, 0], bounds[:, 1]), method="trf", x_scale="jac",
-            ftol=self.settings.fit_tolerance, xtol=1e-8, gtol=1e-8, max_nfev=self.settings.most_evaluations,
-        )  # fmt: skip
+            lambda x: at(x)[0],
+            x,
+            lambda x: at(x)[1],
+            (bounds[:, 0], bounds[:, 1]),
+            method="trf",
+            x_scale="jac",
+            ftol=self.settings.fit_tolerance,
+            xtol=1e-8,
+            gtol=1e-8,
+            max_nfev=self.settings.most_evaluations,
+        )
         out = u.copy()
         out[free] = answer.x
         return out, "" if answer.status >= 0 else str(answer.message)

@@ -24,9 +24,15 @@ CHUNK = 32
 """Points of one call: enough that a call's overhead hardly shows, few enough that little is spent on filling up."""
 
 ABSCISSAE = (
-    "slip zero", "slip scale", "slip angle zero", "slip angle scale", "load zero", "load scale", "wheel radius",
+    "slip zero",
+    "slip scale",
+    "slip angle zero",
+    "slip angle scale",
+    "load zero",
+    "load scale",
+    "wheel radius",
     "wheel width",
-)  # fmt: skip
+)
 """What may be wrong about the imposed quantities: slip in its unit, slip angle in rad, all else as a share."""
 
 

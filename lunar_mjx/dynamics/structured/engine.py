@@ -246,8 +246,9 @@ class StructuredEngine:
         dtype = forces.joint_torque.dtype
         armature = _reflected_inertia(params, self._joints, dtype)
         unpowered = dataclasses.replace(forces, joint_torque=jnp.zeros_like(forces.joint_torque))
-        blocks = [leg_block(n, leg, up, unpowered, base.frame, armature, dt)
-                  for n, leg in zip(numbers, legs, strict=True)]  # fmt: skip
+        blocks = [
+            leg_block(n, leg, up, unpowered, base.frame, armature, dt) for n, leg in zip(numbers, legs, strict=True)
+        ]
         drives = [n.links[0].actuated for n in numbers]
         places: list[np.ndarray] = [at for at in drives if at is not None]
         rates = [

@@ -165,9 +165,11 @@ def _couplings(
 ) -> tuple[Coupling, ...]:
     """The joint equalities that `_ties` has not taken: differentials, and joints that mimic others."""
     place = {
-        link.joint: (g, k, i) for g, legs in enumerate(members) for i, leg in enumerate(legs)
+        link.joint: (g, k, i)
+        for g, legs in enumerate(members)
+        for i, leg in enumerate(legs)
         for k, link in enumerate(leg.links)
-    }  # fmt: skip
+    }
 
     def end(joint: int, equality: str) -> End:
         g, k, i = place[joint]

@@ -379,8 +379,12 @@ def search(
         if not paired:
             used = noise(settled)
             # the same explanations once more where the noise as it is moves them
-            settled = [settle(problems(_form(s.suspects)), base, s.suspects, used, split,
-                              s.values(problems(_form(s.suspects)))) for s in settled]  # fmt: skip
+            settled = [
+                settle(
+                    problems(_form(s.suspects)), base, s.suspects, used, split, s.values(problems(_form(s.suspects)))
+                )
+                for s in settled
+            ]
         known = {f.suspects for f in found}
         for s in settled:
             if s.suspects in known:

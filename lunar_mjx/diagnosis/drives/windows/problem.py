@@ -150,11 +150,17 @@ class WindowProblem:
             x, y, z = (np.asarray(a)[window] for a in (imposed.up_x, imposed.up_y, imposed.up_z))
             p, r = pitch[row][:, None], roll[row][:, None]
             given = Windows(
-                *(np.asarray(a, np.float32) for a in (
-                    np.asarray(imposed.speed)[window], x - p * z, y + r * z, z + p * x - r * y,
-                    np.asarray(imposed.yaw_rate)[window],
-                ))
-            )  # fmt: skip
+                *(
+                    np.asarray(a, np.float32)
+                    for a in (
+                        np.asarray(imposed.speed)[window],
+                        x - p * z,
+                        y + r * z,
+                        z + p * x - r * y,
+                        np.asarray(imposed.yaw_rate)[window],
+                    )
+                )
+            )
             found = self.drive.run(jax.tree.map(lambda a, row=row: a[row], params), given)
             wanted = min(size, len(jobs) - at)
             out.append(jax.tree.map(lambda a, wanted=wanted: a[:wanted], found))

@@ -217,8 +217,13 @@ def _comparison(
         for c, channel in enumerate(CHANNELS):
             keep = problem.present[c] & (bench.cut.log == k)
             if keep.any():
-                row = {"manoeuvre": bench.names[k], "split": bench.splits[keep][0], "channel": channel,
-                       "samples": int(keep.sum() * bench.cut.samples), "unit": channel.rpartition("_")[2]}  # fmt: skip
+                row = {
+                    "manoeuvre": bench.names[k],
+                    "split": bench.splits[keep][0],
+                    "channel": channel,
+                    "samples": int(keep.sum() * bench.cut.samples),
+                    "unit": channel.rpartition("_")[2],
+                }
                 for label, r in residual.items():
                     rms = float(np.sqrt(np.mean(r[c][keep] ** 2)))
                     row[label], row[f"{label}_si"] = rms / noise[c].std, rms
@@ -234,13 +239,18 @@ def _comparison(
         "parameters": parameter_table(bench.model, base),
         "not_told": untold,
         "between_logs": base.differ,
-        "certificate": {"chi2": None, "gradient": None, "starts": [], "at_bound": at_edge(bench, base),
-                        "problems": problems},
+        "certificate": {
+            "chi2": None,
+            "gradient": None,
+            "starts": [],
+            "at_bound": at_edge(bench, base),
+            "problems": problems,
+        },
         "observations": int(problem.present.sum() * bench.cut.samples),
         "windows": {"used": len(bench.cut), "of": bench.cut.available, "seconds": WINDOW_S},
         "seconds": seconds,
         "logs": bench.names,
-    }  # fmt: skip
+    }
 
 
 def at_edge(bench: Bench, found: Fitted) -> list[str]:
@@ -488,9 +498,18 @@ def _evidence_of(
     if edge := [k for k in at_edge(bench, found) if k in keys]:
         reason += f"; implausible: {', '.join(edge)} ends at its bound"
     return EffectEvidence(
-        found.name, moved, 1.0, 2.0 * gain, moved, 1.0 - chance, *(held or (math.nan, math.nan)), values, std,
-        status=status, reason=reason,
-    )  # fmt: skip
+        found.name,
+        moved,
+        1.0,
+        2.0 * gain,
+        moved,
+        1.0 - chance,
+        *(held or (math.nan, math.nan)),
+        values,
+        std,
+        status=status,
+        reason=reason,
+    )
 
 
 def add(run: Run, logs: Sequence[Log], name: str, out: Path, progress: Progress) -> Run:
@@ -546,8 +565,9 @@ def _save_series(bench: Bench, noise: Sequence[Noise], given: np.ndarray, fits: 
     """Measured and predicted windows for the report, as `series.npz`."""
     problem, found = bench.problem(None), bench.cut
     rows = np.stack([given, *(f.predicted for f in fits.values())])
-    columns: dict[str, list[Any]] = {k: [] for k in ("measured", "sigma", "time", "unit", "series_start",
-                                                     "series_channel", "series_log")}  # fmt: skip
+    columns: dict[str, list[Any]] = {
+        k: [] for k in ("measured", "sigma", "time", "unit", "series_start", "series_channel", "series_log")
+    }
     predicted, residual = [], []
     at = 0
     logs = [int(k) for k in np.unique(found.log)]
