@@ -69,7 +69,7 @@ def conclude(found: ModelSearch, sure: float) -> Conclusion:
     if members and len(effects) <= LARGEST_CLASS:
         other = len(effects) < len(members)
         tail = f", or something unlisted at {place}," if other else ""
-        said = f"One of {_list(effects)}{tail} is missing" if len(effects) > 1 else f"{effects[0]}{tail} is missing"
+        said = f"{'One of ' if len(effects) > 1 else ''}{_list(effects)}{tail} is missing"
         where = (port, place) if other else (None, None)
         return Conclusion(Verdict.KNOWN_CLASS, effects, other, where[0], p, _with(said, p), where[1])
     said = f"These data do not settle whether anything is missing (nothing: {_percent(nothing)})"

@@ -369,10 +369,11 @@ class WheelForm(Form):
             return kept[key]
 
         x = np.clip(u[free], bounds[:, 0] + 1e-9, bounds[:, 1] - 1e-9)
+        slopes: Any = lambda x: at(x)[1]  # noqa: E731
         answer = optimize.least_squares(
             lambda x: at(x)[0],
             x,
-            lambda x: at(x)[1],
+            slopes,
             (bounds[:, 0], bounds[:, 1]),
             method="trf",
             x_scale="jac",

@@ -80,7 +80,7 @@ def cut(logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, se
     magnitude = frozenset(
         c for c in CHANNELS if any(c in log.magnitudes or _matches(c, log.magnitudes) for log in logs)
     )
-    imposed = Windows(speed[chosen], *(up[chosen, :, i] for i in range(3)), yaw[chosen])
+    imposed = Windows(speed[chosen], up[chosen, :, 0], up[chosen, :, 1], up[chosen, :, 2], yaw[chosen])
     return Cut(log[chosen], start[chosen], interval, imposed, measured, magnitude, len(log))
 
 

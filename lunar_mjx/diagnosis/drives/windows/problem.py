@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -225,6 +226,7 @@ class WindowProblem:
             given = self.predict((coefficient,), np.array([[0.0], [1.0]]))
             self._resistance = (given[1] - given[0]) / coefficient.std
             self._size = np.abs(given[0])
+        assert self._resistance is not None
         return self._resistance
 
     def current_size(self) -> np.ndarray:
@@ -241,7 +243,7 @@ class WindowProblem:
     @property
     def present(self) -> np.ndarray:
         """(channel, window) where a channel was measured throughout."""
-        return np.isfinite(self.measured).all(axis=2)
+        return np.asarray(np.isfinite(self.measured).all(axis=2))
 
 
 _PROGRAMS: dict[Any, KinematicDrive] = {}

@@ -591,9 +591,10 @@ def _save_series(bench: Bench, noise: Sequence[Noise], given: np.ndarray, fits: 
             predicted.append(rows[:, c, keep].reshape(len(rows), -1))
             residual.append((columns["measured"][-1] - predicted[-1]) / noise[c].std)
             at += times.size
+    joined: dict[str, Any] = {k: np.concatenate(columns[k]) for k in ("measured", "sigma", "time", "unit")}
     np.savez_compressed(
         bench.run.folder / SERIES_FILE,
-        **{k: np.concatenate(columns[k]) for k in ("measured", "sigma", "time", "unit")},
+        **joined,
         place=np.zeros((0, 3)),
         unit_names=np.array(
             [bench.names[k] + (" (end)" if s == "test" and (k, "fit") in units else "") for k, s in units]
