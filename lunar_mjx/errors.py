@@ -84,3 +84,8 @@ def require_file(path: str | Path, what: str) -> Path:
     if not path.is_file():
         raise UserError(f"{path}: {what} is not there; check the path or its spelling.")
     return path
+
+
+def one_line(error: object) -> str:
+    """Text of an error of another library on one line, to stand within a sentence."""
+    return " ".join(str(error).split())

@@ -16,7 +16,7 @@ import pandas as pd
 from lunar_mjx.dynamics import System, Telemetry, build
 from lunar_mjx.dynamics.signals import joint_channels, measure
 from lunar_mjx.effects.joint.motor import MODES
-from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file, require_finite
 from lunar_mjx.model import Model, check_effects
 
 COMMAND_UNITS: dict[str, str] = dict(zip(MODES, ("angle_rad", "speed_rad_s", "torque_Nm", "current_A"), strict=True))
@@ -93,7 +93,9 @@ def read_commands(path: str | Path, model: Model) -> Commands:
             warnings.simplefilter("error", pd.errors.ParserWarning)  # rows longer than the header
             table = pd.read_csv(path, index_col=False)
     except (pd.errors.ParserError, pd.errors.ParserWarning, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: is not a CSV table ({error}); write time_s and one column per joint.") from None
+        raise UserError(
+            f"{path}: is not a CSV table ({one_line(error)}); write time_s and one column per joint."
+        ) from None
     names = ["time_s", *command_channels(model)]
     for name in names:
         if name not in table.columns:

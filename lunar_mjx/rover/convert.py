@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 import tomli_w
 from scipy.spatial import ConvexHull, QhullError
 
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, one_line
 from lunar_mjx.files import replacing
 from lunar_mjx.rover.couplings import place_couplings
 from lunar_mjx.rover.description import GROUPS, Description, read_description
@@ -62,12 +63,19 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
         spec = build_spec(name, roles, loops, told, height, driven, couplings)
     except ValueError as error:
         raise _uncompilable(source, error) from None
-    model = _compile(source, spec)
-    level_springs(spec, model, roles, told)
-    model = _compile(source, spec)
-    xml = to_xml(spec)
-    _assert_nothing_lost(source, roles, loops, ties(driven) + len(couplings), mujoco.MjModel.from_xml_string(xml))
-    record = _record(source, name, roles, loops, told, model, height, height_notes, driven)
+    try:
+        with warnings.catch_warnings():
+            # MuJoCo warns of inertia that is next to singular; numbers computed from it would be noise
+            warnings.simplefilter("error")
+            model = _compile(source, spec)
+            level_springs(spec, model, roles, told)
+            model = _compile(source, spec)
+            xml = to_xml(spec)
+            again = mujoco.MjModel.from_xml_string(xml)
+            _assert_nothing_lost(source, roles, loops, ties(driven) + len(couplings), again)
+            record = _record(source, name, roles, loops, told, model, height, height_notes, driven)
+    except Warning as error:
+        raise _uncompilable(source, error) from None
     out = Path(out)
     title = f"# Written by `lunar-mjx convert` from {source.path.name}; edit that and convert again.\n"
     try:
@@ -112,8 +120,8 @@ def _compile(urdf: Urdf, spec: mujoco.MjSpec) -> mujoco.MjModel:
         raise _uncompilable(urdf, error) from None
 
 
-def _uncompilable(urdf: Urdf, error: ValueError) -> UserError:
-    reason = " ".join(str(error).split())
+def _uncompilable(urdf: Urdf, error: Exception) -> UserError:
+    reason = one_line(error)
     return UserError(f"{urdf.path}: MuJoCo cannot compile the converted model ({reason}); mend the URDF.")
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file
 from lunar_mjx.resources import find, shipped
 from lunar_mjx.rover import description as toml
 from lunar_mjx.rover.description import GROUPS, MODES, WINDINGS
@@ -77,7 +77,7 @@ def load_rover(name_or_path: str | Path) -> Rover:
             warnings.simplefilter("error")  # such as of inertia matrices that are next to singular
             model = mujoco.MjSpec.from_file(str(mjcf)).compile()
     except (ValueError, Warning) as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise UserError(f"{mjcf}: MuJoCo cannot compile it ({reason}); {_CONVERT_AGAIN}.") from None
     refuse_unused_fields(mjcf, model)
     mass = toml.at_least(path, "mass", data["mass"], 0.0, strict=True)

@@ -18,7 +18,7 @@ import pandas as pd
 from lunar_mjx.cameras.chase import wheel_places, wheel_tracks
 from lunar_mjx.cameras.texture import Track
 from lunar_mjx.dynamics.signals import joint_channels
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, one_line
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model
 from lunar_mjx.terrain import Terrain, gradient, inside
@@ -164,7 +164,7 @@ def read_drive(folder: str | Path) -> RecordedDrive:
     try:
         table = pd.read_csv(folder / TABLE)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise UserError(f"{folder / TABLE}: is not a CSV table ({error}); write it anew.") from None
+        raise UserError(f"{folder / TABLE}: is not a CSV table ({one_line(error)}); write it anew.") from None
     drive = RecordedDrive(folder, load_model(folder / MODEL), table)
     numbers = drive.columns(["time_s", *(f"position_{a}_m" for a in "xyz")])
     if len(table) < 2 or not np.isfinite(numbers).all() or (np.diff(numbers[:, 0]) <= 0).any():

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file, require_finite
 from lunar_mjx.wheel_bed.bed import SLIP_DEFINITIONS, SPEED, WheelTest, wheel_test
 
 QUANTITIES: Mapping[str, tuple[str, str, str]] = {
@@ -121,7 +121,9 @@ def read_table(
     try:
         frame = pd.read_csv(file)
     except (ValueError, UnicodeDecodeError) as error:
-        raise UserError(f"{file}: is not a CSV table ({error}); give comma-separated values with a header.") from error
+        raise UserError(
+            f"{file}: is not a CSV table ({one_line(error)}); give comma-separated values with a header."
+        ) from error
     _check_columns(file, frame)
     numbers = _numbers(file, frame)
     _check_values(file, numbers, slip_definition)

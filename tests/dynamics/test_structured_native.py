@@ -193,7 +193,7 @@ def test_refuses_joints_it_cannot_honour(joint, message, tmp_path):
         ('integrator="Euler"', 'integrator="implicitfast"', "integrator"),
         ('integrator="Euler"', 'integrator="Euler" density="1.2"', "fluid"),
         ('<body name="mast"', '<body name="mast" gravcomp="1"', "gravcomp"),
-        ("</worldbody>", '</worldbody><equality><weld body1="mast" body2="l0_wheel"/></equality>', "no connect"),
+        ("</worldbody>", '</worldbody><equality><weld body1="mast" body2="l0_wheel"/></equality>', "neither connect"),
         ("</worldbody>", '</worldbody><actuator><position joint="l0_drive"/></actuator>', "biastype"),
         ("</worldbody>", '</worldbody><tendon><fixed><joint joint="l0_drive" coef="1"/></fixed></tendon>', "tendons"),
         (

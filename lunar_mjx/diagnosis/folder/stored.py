@@ -55,7 +55,7 @@ class _Comparison(_Stored):
     as_given: dict[str, Number | None]
     refitted: dict[str, Number | None]
     by_channel: list[_Channel]
-    certificate: _Certificate
+    certificate: _Certificate | None = None
 
 
 class _Verdict(_Stored):

@@ -530,9 +530,8 @@ def _save_signatures(run: Run, refit: Refit, form: WheelForm) -> None:
     for name, places in form.candidates.items() if len(columns) else ():
         names.append(name)
         signatures.append(columns[fit][:, places] @ refit.linear.amplitudes.std[places])
-    np.savez_compressed(
-        run.folder / SIGNATURES_FILE, names=np.array(names, str), signatures=np.array(signatures, np.float32)
-    )
+    with replacing(run.folder / SIGNATURES_FILE) as part:
+        np.savez_compressed(part, names=np.array(names, str), signatures=np.array(signatures, np.float32))
 
 
 def _fits(problem: Tables, found: ModelSearch) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file
 from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import LogTable
 from lunar_mjx.logs.schema import limits, parse_column
@@ -37,7 +37,9 @@ def read_frame(path: Path, what: str) -> pd.DataFrame:
             warnings.simplefilter("ignore", pd.errors.DtypeWarning)  # a text deep in a column of numbers is found below
             frame = pd.read_csv(path, index_col=False, comment=None)
     except (ValueError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: is not a CSV table ({error}); write time_s and one column per channel.") from None
+        raise UserError(
+            f"{path}: is not a CSV table ({one_line(error)}); write time_s and one column per channel."
+        ) from None
     # Two columns of one name reach us as "name" and "name.1".
     for column in map(str, frame.columns):
         stem = re.fullmatch(r"(.+)\.\d+", column)

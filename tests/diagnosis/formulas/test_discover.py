@@ -82,11 +82,14 @@ def test_a_second_suggestion_leaves_the_first_and_the_users_files_alone(tmp_path
     assert mine.read_text() == "# of my own"
 
 
+VERDICT = {"verdict": "NOISE_ONLY", "sentence": "", "effects": []}
+
+
 def test_a_search_needs_a_port(tmp_path):
     run = Run(tmp_path, (), make_model("luvmi_x", terrain="flat"))
     with pytest.raises(UserError, match="lunar-mjx why first, or give --port"):
         discover(run)
-    run.save(VERDICT_FILE, {"details": {"localise": {"port": None}}})
+    run.save(VERDICT_FILE, {**VERDICT, "details": {"localise": {"port": None}}})
     with pytest.raises(UserError, match="lunar-mjx why first"):
         discover(run)
     with pytest.raises(UserError, match="does not exist"):

@@ -38,6 +38,7 @@ from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, cor
 from lunar_mjx.diagnosis.runs import COMPARISON_FILE, SERIES_FILE, VERDICT_FILE, Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, EffectEvidence, Verdict
 from lunar_mjx.errors import UserError
+from lunar_mjx.files import replacing
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.logs import Log
@@ -591,20 +592,23 @@ def _save_series(bench: Bench, noise: Sequence[Noise], given: np.ndarray, fits: 
             predicted.append(rows[:, c, keep].reshape(len(rows), -1))
             residual.append((columns["measured"][-1] - predicted[-1]) / noise[c].std)
             at += times.size
-    joined: dict[str, Any] = {k: np.concatenate(columns[k]) for k in ("measured", "sigma", "time", "unit")}
-    np.savez_compressed(
-        bench.run.folder / SERIES_FILE,
-        **joined,
-        place=np.zeros((0, 3)),
-        unit_names=np.array(
-            [bench.names[k] + (" (end)" if s == "test" and (k, "fit") in units else "") for k, s in units]
-        ),
-        split=np.array([s for _, s in units]),
-        series_start=np.array(columns["series_start"]),
-        series_channel=np.array(columns["series_channel"]),
-        series_log=np.array(columns["series_log"]),
-        logs=np.array(bench.names),
-        labels=np.array(["as given", *fits]),
-        predicted=np.concatenate(predicted, axis=1),
-        residual=np.concatenate(residual, axis=1),
-    )
+    with replacing(bench.run.folder / SERIES_FILE) as part:
+        np.savez_compressed(
+            part,
+            measured=np.concatenate(columns["measured"]),
+            sigma=np.concatenate(columns["sigma"]),
+            time=np.concatenate(columns["time"]),
+            unit=np.concatenate(columns["unit"]),
+            place=np.zeros((0, 3)),
+            unit_names=np.array(
+                [bench.names[k] + (" (end)" if s == "test" and (k, "fit") in units else "") for k, s in units]
+            ),
+            split=np.array([s for _, s in units]),
+            series_start=np.array(columns["series_start"]),
+            series_channel=np.array(columns["series_channel"]),
+            series_log=np.array(columns["series_log"]),
+            logs=np.array(bench.names),
+            labels=np.array(["as given", *fits]),
+            predicted=np.concatenate(predicted, axis=1),
+            residual=np.concatenate(residual, axis=1),
+        )
