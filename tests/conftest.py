@@ -10,6 +10,8 @@ import pytest
 from hypothesis import settings
 
 from lunar_mjx import cli
+from lunar_mjx.cameras.gl import BACKENDS, context_class
+from lunar_mjx.errors import UserError
 from tests.cli_harness import Result, Run
 
 FAST_COMPILE = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0").lower() in ("1", "true", "yes", "on")
@@ -43,3 +45,13 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
         return Result(status, out, err)
 
     return call
+
+
+@pytest.fixture
+def opengl(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets cameras use OpenGL, which the tests' settings turn off."""
+    try:
+        context_class(BACKENDS)
+    except UserError as missing:
+        pytest.skip(str(missing))
+    monkeypatch.delenv("MUJOCO_GL", raising=False)

@@ -101,6 +101,8 @@ def print_preset(model: Model, console: Console) -> None:
     for flaw in FLAWS:
         told = (("paper", flaw.paper), ("consistent", flaw.consistent), ("effect", flaw.mended_by))
         _print_difference(f"{flaw.number} {flaw.where}", told, console)
+    if model.preset == "paper":  # how the paper differs from `field` follows from the two lists
+        return
     console.print("\nwhat consistent leaves out, and field has")
     for change in FIELD_CHANGES:
         told = (("consistent", change.consistent), ("field", change.field), ("effect", change.mended_by))

@@ -147,18 +147,18 @@ class MapInset:
 
     def __init__(self, drive: RecordedDrive, size: int) -> None:
         self._drive = drive
-        self._map = GroundMap(drive.terrain, *bounds(drive.position[:, :2], 0.25), size)
-        self._path = [self._map.pixel(p) for p in drive.position[:, :2]]
-        draw = ImageDraw.Draw(self._map.base)
+        self.ground = GroundMap(drive.terrain, *bounds(drive.position[:, :2], 0.25), size)
+        self._path = [self.ground.pixel(p) for p in drive.position[:, :2]]
+        draw = ImageDraw.Draw(self.ground.base)
         draw.line(self._path, fill=(235, 235, 235), width=1)
-        draw.rectangle([0, 0, self._map.width - 1, self._map.height - 1], outline=(200, 200, 200))
+        draw.rectangle([0, 0, self.ground.width - 1, self.ground.height - 1], outline=(200, 200, 200))
 
     def draw(self, row: int) -> Image.Image:
         """The map at a row of the drive."""
-        image = self._map.base.copy()
+        image = self.ground.base.copy()
         draw = ImageDraw.Draw(image)
         if row:
             draw.line(self._path[: row + 1], fill=PATH, width=3)
         yaw = np.radians(self._drive.table["yaw_deg"].to_numpy(float)[row])
-        self._map.arrow(draw, self._drive.position[row], float(yaw), max(5.0, 0.035 * self._map.width))
+        self.ground.arrow(draw, self._drive.position[row], float(yaw), max(5.0, 0.035 * self.ground.width))
         return image.convert("RGBA")

@@ -51,9 +51,10 @@ def test_batch_and_chunks_agree_with_one(march):
     whole = depth_images(terrain, position, rotation, small)
     parts = depth_images(terrain, position, rotation, small, at_once=2)
     assert whole.shape == (5, 12, 16)
-    np.testing.assert_allclose(whole, parts, rtol=1e-5)
+    # Programs of other batch sizes round differently; grazing rays make 6e-5 m of it, within what a depth is good to.
+    np.testing.assert_allclose(whole, parts, rtol=1e-4)
     one = depth_image(terrain, position[3], rotation[3], small)
-    np.testing.assert_allclose(whole[3], one, rtol=1e-5)
+    np.testing.assert_allclose(whole[3], one, rtol=1e-4)
 
 
 def test_height_scan_looks_ahead_and_to_the_left():

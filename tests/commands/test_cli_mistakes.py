@@ -109,7 +109,7 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {},
         ["gone.tif", "not there"],
     ),
-    "rover unknown": ([*LUVMI, "--rover", "moonbuggy"], {}, ["moonbuggy", "luvmi_x, viper"]),
+    "rover unknown": ([*LUVMI, "--rover", "moonbuggy"], {}, ["moonbuggy", "luvmi_x, rocker_bogie, viper"]),
     "simulated terrain unknown": ([*LUVMI, "--terrain", "sea"], {}, ["sea", "lunar_plain"]),
     "simulated slope too steep": ([*LUVMI, "--terrain", "slope:95deg"], {}, ["slope:95deg", "below 90"]),
     "simulated preset unknown": ([*LUVMI, "--preset", "best"], {}, ["'best'", "consistent, field, paper"]),

@@ -174,7 +174,7 @@ REFUSED: dict[str, tuple[Change, list[str]]] = {
     ),
     "one gain": (lambda m: m.replace(gains={"drive": (1.0,)}), ["control.drive", "two gains"]),
     "unknown preset": (lambda m: make_model(m.rover, m.terrain, "best"), ["'best'", "consistent, field, paper"]),
-    "unknown rover": (lambda m: make_model("moonbuggy", m.terrain), ["moonbuggy", "luvmi_x, viper"]),
+    "unknown rover": (lambda m: make_model("moonbuggy", m.terrain), ["moonbuggy", "luvmi_x, rocker_bogie, viper"]),
     "unknown terrain": (lambda m: make_model(m.rover, "sea"), ["sea", "lunar_plain"]),
     "gains of no group": (lambda m: make_model(m.rover, m.terrain, gains={"arm": (1, 1)}), ["control.arm"]),
     "unknown attribute": (lambda m: m.replace(weight=1.0), ["Model.replace", "weight", "unknown", "gravity"]),

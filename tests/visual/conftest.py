@@ -9,8 +9,6 @@ import pytest
 
 from lunar_mjx.backends.base import telemetry
 from lunar_mjx.backends.native import NativeBackend
-from lunar_mjx.cameras.gl import BACKENDS, context_class
-from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 from lunar_mjx.model.file import save_model
 from lunar_mjx.simulate import constant_commands
@@ -45,13 +43,3 @@ def viper(tmp_path_factory: pytest.TempPathFactory):
 def luvmi(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("drives") / "luvmi"
     return folder, write_drive(folder, "luvmi_x", 1.5)
-
-
-@pytest.fixture
-def opengl(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets cameras use OpenGL, which the tests' settings turn off."""
-    try:
-        context_class(BACKENDS)
-    except UserError as missing:
-        pytest.skip(str(missing))
-    monkeypatch.delenv("MUJOCO_GL", raising=False)

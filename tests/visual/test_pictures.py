@@ -104,9 +104,9 @@ def test_map_has_north_up(luvmi):
     gold = np.argwhere((image[..., 0] > 230) & (image[..., 2] < 100) & (image[..., 1] > 150))
     start, end = drive.position[0, :2], drive.position[-1, :2]
     middle = gold.mean(axis=0)
-    u, v = inset._pixel(end)
+    u, v = inset.ground.pixel(end)
     assert middle == pytest.approx([v, u], abs=4)
-    assert inset._pixel(start)[0] < u and (inset._pixel(start)[1] > v) == (end[1] > start[1])
+    assert inset.ground.pixel(start)[0] < u and (inset.ground.pixel(start)[1] > v) == (end[1] > start[1])
 
 
 @pytest.mark.parametrize(
