@@ -3,6 +3,7 @@
     python -m benchmarks.foreign make --set tune --tables 60 --drives 12 -o build/foreign/tune
     python -m benchmarks.foreign run   build/foreign/tune
     python -m benchmarks.foreign score build/foreign/tune
+    python -m benchmarks.foreign sweep --set report --tables 640 -o build/foreign/report   # all of it, on all cores
 
 `run` goes on where it was stopped. The report set's seed is drawn from the commit under test, so that nobody can have
 seen its tables before.
@@ -14,8 +15,10 @@ import argparse
 import datetime
 import hashlib
 import json
+import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from . import bed, cases, told
 from .work import ROOT, ask, commit
@@ -30,7 +33,7 @@ def make(args: argparse.Namespace) -> None:
     """Writes logs and sealed truths; goes on where it was stopped."""
     folder: Path = args.out
     folder.mkdir(parents=True, exist_ok=True)
-    about = _campaign(folder, args.set, args.seed)
+    about = campaign(folder, args.set, args.seed)
     seed = int(about["seed"])
     _make_tables(args, folder, seed)
     if args.drives:
@@ -80,7 +83,8 @@ def _make_drives(args: argparse.Namespace, folder: Path, seed: int) -> None:
         print(f"{name}  {job[0]:<8} {case.rover.name:<8} {case.world.law:<9} {said or 'nothing hidden'}", flush=True)
 
 
-def _campaign(folder: Path, which: str, seed: int | None) -> dict[str, object]:
+def campaign(folder: Path, which: str, seed: int | None) -> dict[str, Any]:
+    """What a folder's set is: its seed, and the commit that it was drawn from; written where it is new."""
     path = folder / "campaign.json"
     if path.is_file():
         about = json.loads(path.read_text(encoding="utf-8"))
@@ -106,7 +110,7 @@ def run(args: argparse.Namespace) -> None:
     # Twins with other stated noise come last: a part of the set is then a small copy of its cases.
     found = [p.name for p in (args.folder / "logs").iterdir() if p.is_dir()]
     names = sorted(found, key=lambda n: (n.endswith(tuple(TWINS)), n))
-    names = [n for n in names if args.only in n][: args.first]
+    names = [n for n in names if any(part in n for part in args.only.split(","))][: args.first]
     first, _, of = args.share.partition("/")
     mine = names[int(first) :: int(of)]
     number = ask(args.folder, mine, args.limit, args.minutes)
@@ -122,6 +126,13 @@ def score(args: argparse.Namespace) -> None:
     out.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     print(text(found))
     print(f"written to {out}")
+
+
+def sweep(args: argparse.Namespace) -> None:
+    """Makes, asks and scores tables on all cores."""
+    from .sweep import sweep as run_sweep
+
+    run_sweep(args)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -141,10 +152,23 @@ def parser() -> argparse.ArgumentParser:
     asked.add_argument("folder", type=Path)
     asked.add_argument("--limit", type=float, default=900.0, help="seconds for one case")
     asked.add_argument("--minutes", type=float, default=1e6, help="after which no case is begun")
-    asked.add_argument("--only", default="", help="cases whose name has this in it")
+    asked.add_argument("--only", default="", help="cases whose name has this, or one of these (A,B), in it")
     asked.add_argument("--first", type=int, help="so many cases only")
     asked.add_argument("--share", default="0/1", help="K/N: every Nth case from the Kth, for several processes")
     asked.set_defaults(do=run)
+    swept = verbs.add_parser("sweep", help="make, ask and score tables on all cores until the time is up")
+    swept.add_argument("--set", choices=("tune", "report"), required=True)
+    swept.add_argument("--tables", type=int, default=640)
+    swept.add_argument(
+        "--twins", type=int, default=4, help="every so many tables twice more with other stated noise; 0: none"
+    )
+    swept.add_argument("--seed", type=int, help="as for make")
+    swept.add_argument("--processes", type=int, default=len(os.sched_getaffinity(0)))
+    swept.add_argument("--minutes", type=float, default=9.0)
+    swept.add_argument("--setting", action="append", default=[], help="NAME=VALUE for `compare`, to ablate a rule")
+    swept.add_argument("--cold", action="store_true", help="compile nothing beforehand")
+    swept.add_argument("-o", "--out", type=Path, required=True)
+    swept.set_defaults(do=sweep)
     scored = verbs.add_parser("score", help="score the answers")
     scored.add_argument("folder", type=Path)
     scored.add_argument("-o", "--out", type=Path)

@@ -73,6 +73,7 @@ def said(answer: Mapping[str, Any], verdict: Mapping[str, Any]) -> Row:
         "effects": effects,
         "unlisted": unlisted,
         "ports": ports,
+        "further": [str(e) for e in verdict.get("further") or ()],
         "probabilities": _numbers(verdict.get("probabilities")),
         "inclusion": _numbers(verdict.get("inclusion")),
     }
@@ -137,13 +138,21 @@ def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
     else:
         wrong, strict = confident and bool(bad), confident and len(good) < len(effects)
     number = len([e for e in effects if not neutral(e, truth)])
+    # Beside what is named, a verdict may say that one of a class acts, too.
+    further = list(answer.get("further", ()))
+    nearby = [e for e in further if right(e, truth)]
+    if further and not nearby and not answer["unlisted"]:
+        wrong = wrong or not any(neutral(e, truth) for e in further)
+        strict = True
     if label == "KNOWN_CLASS":
         found = bool(good) and number <= CLASS
     else:
-        found = confident and bool(good) and not bad and hidden <= {right(e, truth) for e in good}
+        small = len([e for e in further if not neutral(e, truth)]) <= CLASS
+        told = {right(e, truth) for e in [*good, *(nearby if small else [])]}
+        found = confident and bool(told) and not bad and hidden <= told
     right_port = bool(set(answer["ports"]) & set(truth["ports"]))
     by_port = label == "UNKNOWN" and right_port
-    by_more = label in ("KNOWN", "MULTIPLE") and answer["unlisted"] and right_port and not bad
+    by_more = label in ("KNOWN", "MULTIPLE") and answer["unlisted"] and right_port and not bad and not wrong
     # What UNKNOWN lists beside its port helps only; it is no name.
     at_port = right_port and (label == "UNKNOWN" or (answer["unlisted"] and not bad))
     by_class = label == "KNOWN_CLASS" and answer["unlisted"] and (right_port or bool(good))
@@ -266,7 +275,7 @@ def report(folder: Path) -> Row:
         "cases_made": len(list((folder / "truth").glob("*.json"))),
         "cases_answered": sum(r["twin_of"] is None for r in everything),
     }
-    return about | _figures(tables) | ({"drives": _figures(drives)} if drives else {})
+    return about | figures(tables) | ({"drives": figures(drives)} if drives else {})
 
 
 def _sigma(row: Row, key: str = "sigma") -> float:
@@ -288,7 +297,7 @@ def _by_kind(rows: Sequence[Row]) -> Row:
     return found
 
 
-def _figures(everything: Sequence[Row]) -> Row:
+def figures(everything: Sequence[Row]) -> Row:
     """The figures of tables or of drives."""
     rows = [r for r in everything if r["twin_of"] is None]
     groups: dict[str, list[Row]] = defaultdict(list)

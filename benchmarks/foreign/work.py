@@ -141,10 +141,29 @@ def _verb(main: Any, *words: str) -> int:
     return 0
 
 
-def _answer(main: Any, logs: str, out: Path) -> dict[str, Any]:
+def one(logs: Path, out: Path, extra: Sequence[str] = ()) -> dict[str, Any]:
+    """`log check`, `compare` (with more words) and `why` in this process; what the verbs print is dropped."""
+    from lunar_mjx.cli import main
+
+    with (
+        open(os.devnull, "w", encoding="utf-8") as nothing,
+        contextlib.redirect_stdout(nothing),
+        contextlib.redirect_stderr(nothing),
+    ):
+        try:
+            return _answer(main, str(logs), out, extra)
+        except Exception:
+            return {"verdict": "CRASH", "effects": [], "seconds": {}, "error": traceback.format_exc(limit=-6)}
+
+
+def _answer(main: Any, logs: str, out: Path, extra: Sequence[str] = ()) -> dict[str, Any]:
     """`log check`, `compare` and `why`, as a user calls them."""
     run, status, seconds = out / "run", {}, {}
-    verbs = {"check": ["log", "check", logs], "compare": ["compare", logs, "-o", str(run)], "why": ["why", str(run)]}
+    verbs = {
+        "check": ["log", "check", logs],
+        "compare": ["compare", logs, "-o", str(run), *extra],
+        "why": ["why", str(run)],
+    }
     verdict = ""
     for name, words in verbs.items():
         begun = time.monotonic()

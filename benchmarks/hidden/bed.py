@@ -177,7 +177,8 @@ def _closed(v: Values) -> None:
     area = 0.5 * (t1 - t2)
     r_s = r + v["lug"]
     chord = np.sin(t1) - np.sin(tm)
-    j_x = r_s * ((t1 - tm) - (1.0 - v["slip"]) * chord)
+    # Slip is that of the rim, and tips of grousers turn faster than it.
+    j_x = r_s * (t1 - tm) - r * (1.0 - v["slip"]) * chord
     j_y = r * (t1 - tm) * v["lateral"]
     strength = (v["cohesion"] + sigma * v["tan_phi"]) * v["grip"]
     tau_x, tau_y = _shear(v, strength, j_x, j_y)
@@ -203,7 +204,7 @@ def _integral(v: Values) -> None:
     sigma = (v["k_c"] / b + v["k_phi"])[..., None] * depth ** v["n"][..., None] * v["pressure"][..., None]
     r_s = r + v["lug"]
     chord = np.sin(t1) - np.sin(angle)
-    j_x = r_s[..., None] * ((t1 - angle) - (1.0 - v["slip"][..., None]) * chord)
+    j_x = r_s[..., None] * (t1 - angle) - r[..., None] * (1.0 - v["slip"][..., None]) * chord
     j_y = r[..., None] * (t1 - angle) * v["lateral"][..., None]
     strength = (v["cohesion"][..., None] + sigma * v["tan_phi"][..., None]) * v["grip"][..., None]
     tau_x, tau_y = _shear(v, strength, j_x, j_y)

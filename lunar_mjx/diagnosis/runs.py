@@ -38,6 +38,7 @@ class Run:
       candidates: effects from the user's own files, as file.py:name. splits: chosen by the user, by log or group.
       added: effects added since the first run. parent: folder of the run that this one grew from.
       seed: of all random starts. discrepancy: known unexplained error by quantity, added to the noise.
+      settings: sizes, priors and effort of a diagnosis of tables, by name, where they are not the usual ones.
     """
 
     folder: Path
@@ -49,6 +50,7 @@ class Run:
     parent: str | None = None
     seed: int = 0
     discrepancy: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def campaign(self) -> list[Log] | list[SteadyLog]:
         """The logs, all of one kind.
@@ -91,6 +93,7 @@ class Run:
                 "parent": self.parent,
                 "seed": self.seed,
                 "discrepancy": dict(self.discrepancy),
+                "settings": dict(self.settings),
                 "test_opened": opened,
             },
         )
@@ -149,6 +152,7 @@ def load_run(folder: str | Path) -> Run:
         data.get("parent"),
         data.get("seed", 0),
         data.get("discrepancy", {}),
+        data.get("settings", {}),
     )
 
 

@@ -15,6 +15,7 @@ from lunar_mjx.diagnosis.build_problem import build_problem, require_splits
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.windows import verbs as windows
 from lunar_mjx.diagnosis.fitted_model import fitted_model
+from lunar_mjx.diagnosis.folder.refits import write_refits
 from lunar_mjx.diagnosis.refit import Settings
 from lunar_mjx.diagnosis.runs import (
     COMPARISON_FILE,
@@ -27,8 +28,9 @@ from lunar_mjx.diagnosis.runs import (
     log_folders,
 )
 from lunar_mjx.diagnosis.search import Search, fit_baseline
-from lunar_mjx.diagnosis.tables.loop import better_law, compare_tables, diagnose_tables, grown_model
+from lunar_mjx.diagnosis.tables.loop import better_law, build_tables, grown_model
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
+from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.errors import UserError
 from lunar_mjx.files import replacing
 from lunar_mjx.inference.coordinates import Coordinate
@@ -60,6 +62,7 @@ def compare(
     seed: int = 0,
     discrepancy: Mapping[str, float] | None = None,
     progress: Progress = silent,
+    settings: Mapping[str, Any] | None = None,
 ) -> Run:
     """Holds a model against logs: as it stands, and refitted; writes the run folder with `comparison.json`.
 
@@ -72,6 +75,7 @@ def compare(
       seed: of all random starts.
       discrepancy: known unexplained error by quantity of a table, SI units, added to the noise.
       progress: told what is being done.
+      settings: of a diagnosis of tables, by name, where they are not the usual ones (`diagnosis.tables.settings`).
 
     Returns:
       The run.
@@ -87,6 +91,7 @@ def compare(
         dict(splits or {}),
         seed=seed,
         discrepancy=dict(discrepancy or {}),
+        settings=dict(settings or {}),
     )
     return _compare(run, progress)
 
@@ -98,10 +103,10 @@ def _compare(run: Run, progress: Progress) -> Run:
         return windows.compare(run, campaign, progress)
     run.write()
     if isinstance(campaign[0], SteadyLog):
-        tables, refit = compare_tables(run, campaign, progress)
-        own = tables.own
-        rows = {"as given": np.zeros(len(own.coordinates)), "refitted": refit.u}
-        _record_opening(run, "compare", own.data.observations, own.coordinates, own.baseline, rows)
+        tables = build_tables(run, campaign, rivals=False)
+        own, refit = tables.own, answer.compare(run, tables, progress)
+        rows = {"as given": own.origin(), "refitted": refit.u}
+        _record_opening(run, "compare", own.observations, own.coordinates, own.baseline, rows)
         return run
     # All candidates are in the problem from the start: `why` then shares the program that is compiled here.
     problem = build_problem(run, campaign, progress=progress)
@@ -310,7 +315,7 @@ def why(
     if seconds is not None:
         raise UserError("why: --seconds is for logs with imposed wheel speeds; drop it.")
     if isinstance(campaign[0], SteadyLog):
-        diagnosis = diagnose_tables(run, campaign, only, progress)
+        diagnosis, _ = answer.diagnose(run, build_tables(run, campaign, only), progress)
         run.save(VERDICT_FILE, diagnosis.to_dict())
         return diagnosis
     problem = build_problem(run, campaign, only, progress)
@@ -350,6 +355,7 @@ def why(
             fits["with " + ", ".join(found.chosen.effects)] = found.chosen.fit
         start = whitened_residuals(problem, problem.origin()[None])[0]
         _save_series(run, problem, start, fits)
+        write_refits(run.folder, {c.effects: (c.fit.residual, None) for c in found.tried if c.effects})
         run.save(COMPARISON_FILE, comparison(problem, start, found.base.fit))
         _save_signatures(run, found)
         _record_test(run, "why", problem, fits)
@@ -450,11 +456,12 @@ def improve(
     keep_going: bool = False,
     discrepancy: Mapping[str, float] | None = None,
     progress: Progress = silent,
+    settings: Mapping[str, Any] | None = None,
 ) -> tuple[Diagnosis, list[Run]]:
     """The whole loop unattended: compare, why, add, until the verdict is neither KNOWN nor MULTIPLE.
 
     Args:
-      logs, model, effects, splits, seed, discrepancy, progress: as for `compare`.
+      logs, model, effects, splits, seed, discrepancy, progress, settings: as for `compare`.
       out: folder of the runs run1, run2, ...
       most: effects added at most.
       keep_going: go on also through UNKNOWN while some catalogue effect earns its place on held-out manoeuvres.
@@ -464,7 +471,7 @@ def improve(
     """
     out = Path(out)
     try:
-        run = compare(logs, model, out / "run1", effects, splits, seed, discrepancy, progress)
+        run = compare(logs, model, out / "run1", effects, splits, seed, discrepancy, progress, settings)
     except BadData as bad:
         return bad.diagnosis, []
     runs = [run]

@@ -87,6 +87,7 @@ class Diagnosis:
       probability: of the verdict as a statement. probabilities: by hypothesis, together 1. inclusion: by effect, that
         it is missing whatever else is. forms: by form of the model, such as its contact law.
       unlisted: whether something unlisted at `port` belongs to the statement.
+      further: beside `effects`, one of these (or something unlisted, where `unlisted`) acts, too.
       discrepancy: what remains, by port: `size` (share of the force or stress there), its 68 % range `low` to `high`,
         and `text` in the user's terms.
       details: certificate of the fit, seeds, splits and whatever else a report shows.
@@ -107,6 +108,7 @@ class Diagnosis:
     inclusion: Mapping[str, float] = dataclasses.field(default_factory=dict)
     forms: Mapping[str, float] = dataclasses.field(default_factory=dict)
     unlisted: bool = False
+    further: tuple[str, ...] = ()
     discrepancy: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     details: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -116,5 +118,6 @@ class Diagnosis:
         plain["verdict"] = self.verdict.label
         plain["exit_status"] = self.verdict.exit_status
         plain["effects"] = list(self.effects)
+        plain["further"] = list(self.further)
         plain["evidence"] = [dataclasses.asdict(e) for e in self.evidence]
         return plain

@@ -146,3 +146,11 @@ def test_a_folder_is_scored_with_whatever_is_missing(tmp_path: Path) -> None:
     assert found["reliability_of_inclusion"]["number"] == 4
     json.dumps(found, allow_nan=False)
     assert "3 of 4 cases" in score.text(found)
+
+
+def test_what_acts_beside_a_neutral_name_counts_as_a_class() -> None:
+    assert ask(TRUTH, "KNOWN", ["exit_angle"], further=["grousers", "bulldozing"])["found"]
+    assert not ask(TRUTH, "KNOWN", ["exit_angle"], further=["side_wall", "bulldozing"])["found"]
+    assert ask(TRUTH, "KNOWN", ["exit_angle"], further=["side_wall", "bulldozing"])["wrong_name"]
+    assert not ask(TRUTH, "KNOWN", ["exit_angle"], further=["side_wall"], unlisted=True)["wrong_name"]
+    assert not ask(TRUTH, "KNOWN", ["bulldozing"], further=["grousers"])["found"]

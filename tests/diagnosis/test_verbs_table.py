@@ -79,7 +79,16 @@ def work(tmp_path_factory):
     return tmp_path_factory.mktemp("runs")
 
 
+def _asked(run, log, folder):
+    """A run folder in which `why` has answered; made by whichever test needs it first."""
+    if not (folder / "verdict.json").is_file():
+        assert run("compare", log, "-o", folder).status == 0
+        run("why", folder)
+    return folder
+
+
 def test_the_loop_names_the_hidden_effect_and_the_error_falls(run, logs, work):
+    shutil.rmtree(work / "run1", ignore_errors=True)
     found = run("compare", logs / "hidden", "-o", work / "run1")
     assert found.status == 0, found.err
     before = json.loads((work / "run1" / "comparison.json").read_text())
@@ -126,23 +135,23 @@ def test_the_loop_names_the_hidden_effect_and_the_error_falls(run, logs, work):
 
 
 def test_nothing_hidden_is_noise(run, logs, work):
+    shutil.rmtree(work / "null", ignore_errors=True)
     assert run("compare", logs / "null", "-o", work / "null").status == 0
     assert run("why", work / "null").status == 0
 
 
 def test_why_can_be_asked_about_one_effect(run, logs, work):
-    if not (work / "null" / "run.json").is_file():
-        pytest.skip("needs the run of the test before")
-    about = run("why", work / "null", "--explain", "friction_circle", "--json")
+    null = _asked(run, logs / "null", work / "null")
+    about = run("why", null, "--explain", "friction_circle", "--json")
     assert "friction_circle" in json.loads(about.out)["sentence"]
-    wrong = run("why", work / "null", "--explain", "phlogiston")
+    wrong = run("why", null, "--explain", "phlogiston")
     assert wrong.status == 2
     assert "phlogiston" in wrong.err
 
 
 def test_an_interrupt_leaves_a_usable_folder(run, logs, work, monkeypatch):
     folder = work / "stopped"
-    shutil.copytree(work / "null", folder)
+    shutil.copytree(_asked(run, logs / "null", work / "null"), folder)
 
     def stop(*_args, **_kwargs):
         raise KeyboardInterrupt
@@ -158,8 +167,10 @@ def test_a_solver_that_fails_is_bad_fit(run, logs, work, monkeypatch):
     def fail(*_args, **_kwargs):
         raise EvidenceError("on purpose")
 
+    folder = work / "failing"
+    shutil.copytree(_asked(run, logs / "null", work / "null"), folder)
     monkeypatch.setattr(WheelForm, "refit", fail)
-    found = verbs.why(work / "null")
+    found = verbs.why(folder)
     assert found.verdict is Verdict.BAD_FIT
     assert "on purpose" in found.sentence
 
@@ -212,9 +223,8 @@ def test_bad_data_is_a_verdict_of_its_own(run, logs, work):
 
 
 def test_next_names_the_sweep_that_tells_two_effects_apart(run, logs, work):
-    if not (work / "run1" / "verdict.json").is_file():
-        pytest.skip("needs the run of the first test")
-    found = run("next", work / "run1", "--between", FEW[0], "--between", FEW[1], "--json")
+    folder = _asked(run, logs / "hidden", work / "run1")
+    found = run("next", folder, "--between", FEW[0], "--between", FEW[1], "--json")
     assert found.status == 0, found.err
     answer = json.loads(found.out)
     separations = [p["separation"] for p in answer["plans"]]
@@ -223,12 +233,11 @@ def test_next_names_the_sweep_that_tells_two_effects_apart(run, logs, work):
     assert separations[0] > 2.0 * separations[-1], "no plan would matter"
     assert set(answer["plans"][0]["pair"]) == set(FEW)
     assert answer["plans"][0]["name"] in answer["sentence"]
-    assert json.loads((work / "run1" / "next.json").read_text()) == answer
+    assert json.loads((folder / "next.json").read_text()) == answer
 
 
-def test_an_audit_counts_and_goes_on_where_it_was(logs, work):
-    if not (work / "null" / "fits.json").is_file():
-        pytest.skip("needs the run of a test before")
+def test_an_audit_counts_and_goes_on_where_it_was(run, logs, work):
+    _asked(run, logs / "null", work / "null")
     first = audit(work / "null", 1e-3)
     assert [c["truth"] == "nothing" for c in first.cases] == [True, False]
     assert first.cases[0]["outcome"] == "silent, rightly"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lunar_mjx.diagnosis.tables.conclusion import conclude, probabilities
 from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.weighing.hypotheses import shifted
 from lunar_mjx.inference.weighing.search import search

@@ -172,7 +172,7 @@ def discover(
     settings = settings or Settings(seed=run.seed)
     verdict = run.load(VERDICT_FILE) or {}
     place = (verdict.get("details") or {}).get("localise") or {}
-    asked, port = port, port or place.get("port")
+    asked, port = port, port or verdict.get("port") or place.get("port")
     if port is None:
         raise UserError(f"{run.folder}: no port shows anything unknown; run lunar-mjx why first, or give --port.")
     if port not in PORTS:

@@ -74,9 +74,17 @@ def _seal(ctx: Any, a: Any, wheel: Any) -> Any:
     return dataclasses.replace(wheel, moment=wheel.moment._replace(y=wheel.moment.y - added))
 
 
+def _radius(ctx: Any, a: Any, geometry: Any) -> Any:
+    return dataclasses.replace(geometry, radius=geometry.radius * (1.0 + a))
+
+
 ADDED = 0.25
 """Size of a force that is missing, over the load, per size of the gain on the forces that are there: where a shear
 stress is good to 4 %, a drag of 1 % of the load may have been left out."""
+
+DRAWN = 0.1
+"""Size of the wheel's deformation over its radius, per size of the gain on a force: where a stress is good to 5 %, the
+radius of a wheel under its load is to 0.5 %."""
 
 GAINS: tuple[Gain, ...] = (
     Gain("soil: stiffness", "soil", _stiffness, 1.0),
@@ -88,6 +96,7 @@ GAINS: tuple[Gain, ...] = (
     Gain("wheel_shear: lateral force", "wheel_shear", _push_aside, ADDED),
     Gain("wheel_shear: driving moment", "wheel_shear", _moment, 1.0),
     Gain("wheel_shear: driving moment", "wheel_shear", _seal, ADDED),
+    Gain("geometry: radius", "geometry", _radius, DRAWN),
 )
 """Gains of all fields; a wheel bed takes one amount of each, which may differ between points."""
 
@@ -98,8 +107,12 @@ FIELDS: Mapping[str, str] = {
     "wheel_shear: longitudinal force": "shear stress along the wheel",
     "wheel_shear: lateral force": "side force",
     "wheel_shear: driving moment": "driving torque",
+    "geometry: radius": "radius of the wheel under its load",
 }
 """Fields of discrepancy, and what is "good to so many per cent" in the user's words."""
+
+SHARE: Mapping[str, float] = {f: max(g.share for g in GAINS if g.field == f) for f in FIELDS}
+"""What a field's size is "good to", over that size."""
 
 EFFECT = "port_gains"
 

@@ -244,13 +244,17 @@ def _coordinates(
             else:
                 scale = relative * (at or 0.1 * min(high, 1e4))
                 found.append(Coordinate(effect.name, name, at, scale, low, high, False, prior, True, p.unit))
-        # Effects added earlier are refitted with the rest.
-        if effect.name not in baseline and all(p.null is not None for p in effect.parameters.values()):
+        # Effects added earlier are refitted with the rest, their shapes within a third, as those of candidates are.
+        amplitudes = [p for p in effect.parameters.values() if p.null is not None]
+        if effect.name not in baseline and amplitudes and not _unfit(effect.name, effect):
             for name, p in effect.parameters.items():
                 at = float(bed.parameters[effect.name][name])
-                scale = abs(at) or abs(p.nominal) or 1.0
-                physical = p.null in p.bounds
-                found.append(Coordinate(effect.name, name, at, 0.3 * scale, *p.bounds, False, WIDE, physical, p.unit))
+                if p.null is not None:
+                    scale = 0.3 * (abs(at) or abs(p.nominal) or 1.0)
+                    physical = p.null in p.bounds
+                    found.append(Coordinate(effect.name, name, at, scale, *p.bounds, False, WIDE, physical, p.unit))
+                elif at > 0.0 and p.bounds[0] >= 0.0:
+                    found.append(Coordinate(effect.name, name, at, 0.3, *p.bounds, True, 1.0, unit=p.unit))
     count, places = len(found), {}
     for name, effect in effects.items():
         mine = of_candidate(effect, values.get(name))

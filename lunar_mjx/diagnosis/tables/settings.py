@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
+from typing import Any
+
+from lunar_mjx.diagnosis.weighed.form import SearchSettings
+from lunar_mjx.errors import bad_input
 
 
 @dataclasses.dataclass(frozen=True)
-class TableSettings:
+class TableSettings(SearchSettings):
     """Sizes, priors and effort of a diagnosis of tables; written to `run.json`."""
 
     # --- what is usual -----------------------------------------------------------------------------------------------
-    usual_discrepancy: float = 0.05
-    """1; scale of the half-normal prior of each port's discrepancy: no contact law is exact (terramechanics models
-    predict drawbar pull and sinkage to some 5 to 10 per cent, Wong 2008)."""
-    unlisted_discrepancy: float = 0.3
-    """1; the same where something unlisted acts at a port."""
     following_discrepancy: float = 0.2
     """1; standard deviation of something unlisted that follows one quantity alone."""
     sensor_scale: float = 0.02
@@ -24,7 +24,7 @@ class TableSettings:
     """1; usual error of a sensor's zero, over its largest reading."""
     cross_talk: float = 0.01
     """1; usual cross-talk between the axes of a force sensor."""
-    slip_zero: float = 0.01
+    slip_zero: float = 0.015
     """1; usual error of the imposed slip ratio."""
     angle_zero: float = math.radians(0.5)
     """rad; usual error of the imposed slip angle."""
@@ -40,20 +40,18 @@ class TableSettings:
     """1; standard deviation of the logarithm of the noise's size where it is only stated."""
     replicate_spread: float = 0.15
     """1; the same beside what the number of replicates allows: between points noise is not quite that between runs."""
-    effect_size: float = 1.0
-    """1; prior standard deviation of an effect's amplitude, over its nominal size."""
+
+    length_size: float = 0.06
+    """1; prior standard deviation of an amplitude in metres (height of grousers, error of the radius) over the wheel's
+    radius: VIPER's grousers have 4 to 10 per cent of it."""
+    laws: tuple[str, ...] = ("closed form", "stress_integral", "granular_resistance")
+    """contact laws that are rivals of the model's own."""
 
     # --- how rare things are -----------------------------------------------------------------------------------------
-    effect_odds: float = 0.01
-    """1; prior odds of each effect of the catalogue: of some fifteen, one is missing in every seventh table."""
-    unlisted_odds: float = 0.005
-    """1; prior odds of something unlisted in each of the six fields of discrepancy."""
-    following_odds: float = 0.0015
+    following_odds: float = 0.002
     """1; prior odds of something unlisted that follows load or speed alone, for each field and quantity."""
     calibration_odds: float = 0.005
     """1; prior odds of each instrument to be out of order."""
-    sure: float = 0.95
-    """1; probability of a statement that is a verdict."""
 
     # --- smooth functions of a table's points ------------------------------------------------------------------------
     slip_length: float = 0.4
@@ -86,22 +84,23 @@ class TableSettings:
     """1; relative fall of the refit's cost below which it ends: less than 0.1 of chi-square at the noise."""
     most_evaluations: int = 12
     """1; evaluations of one round of a refit."""
-    most_refits: int = 14
-    """1; refits of a search."""
-    most_terms: int = 7
-    """1; terms of one hypothesis at most, as the real wheel needs."""
-    window: float = 4.0
-    """nat; hypotheses further below the best are not refitted: 2 per cent of its probability."""
 
-    @property
-    def effect_log_odds(self) -> float:
-        """Log of `effect_odds`."""
-        return math.log(self.effect_odds)
+    @classmethod
+    def of(cls, changed: Mapping[str, Any]) -> TableSettings:
+        """The usual settings but for some, given by name as numbers, lists or text.
 
-    @property
-    def unlisted_log_odds(self) -> float:
-        """Log of `unlisted_odds`."""
-        return math.log(self.unlisted_odds)
+        Raises:
+          UserError: no such setting, or a value of another kind.
+        """
+        usual, values = dataclasses.asdict(cls()), {}
+        for name, value in changed.items():
+            if name not in usual:
+                raise bad_input("settings", name, value, "is not known", f"use one of {', '.join(usual)}")
+            try:
+                values[name] = _like(usual[name], value)
+            except (TypeError, ValueError):
+                raise bad_input("settings", name, value, "has another kind", f"give it like {usual[name]}") from None
+        return cls(**values)
 
     @property
     def following_log_odds(self) -> float:
@@ -125,3 +124,14 @@ class TableSettings:
             "wheel radius": self.wheel_radius,
             "wheel width": self.load_scale,
         }
+
+
+def _like(usual: Any, value: Any) -> Any:
+    """A value in the kind of the usual one; lists may be text with commas."""
+    if isinstance(usual, tuple):
+        items = [v.strip() for v in value.split(",")] if isinstance(value, str) else list(value)
+        return tuple(type(usual[0])(v) for v in items if v != "")
+    found = float(value)
+    if not math.isfinite(found) or (isinstance(usual, int) and found != int(found)):
+        raise ValueError(value)
+    return type(usual)(found)

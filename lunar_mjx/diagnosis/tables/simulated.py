@@ -15,9 +15,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lunar_mjx.diagnosis.runs import Run
-from lunar_mjx.diagnosis.tables.conclusion import Conclusion, conclude
 from lunar_mjx.diagnosis.tables.loop import build_tables
 from lunar_mjx.diagnosis.tables.wheel_form import WheelForm
+from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude
 from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, search
 from lunar_mjx.logs import SteadyLog
 
@@ -38,6 +38,9 @@ class SimulatedTables:
         self._u = refit.u
         linear, self._columns, _ = own.linearise(refit.u)
         self._amplitudes, self._fields, self._noises = linear.amplitudes, linear.fields, linear.noises
+        self._usual = np.setdiff1d(
+            linear.always, np.arange(len(own.coordinates))
+        )  # calibration and fields, none unlisted
         self._sizes = {
             name: min(max(1.0, _VISIBLE / length), self._room(own, name))
             for name, length in linear.shows().items()
@@ -68,8 +71,8 @@ class SimulatedTables:
         sigma = observations.sigma()
         size = np.abs(rng.normal(size=len(self._fields))) * [f.usual for f in self._fields]
         scale = self._amplitudes.std * np.append(size, 1.0)[self._amplitudes.field]
-        scale[: len(own.coordinates)] = 0.0
-        misfit = self._columns @ (scale * rng.normal(size=len(scale)))
+        usual = self._usual
+        misfit = self._columns[:, usual] @ (scale[usual] * rng.normal(size=len(usual)))
         noise = np.exp([rng.normal(0.0, n.log_std) for n in self._noises])[own.noise_group()]
         value = own.predict(u)[0] + sigma * (misfit + noise * rng.normal(size=len(sigma)))
         drawn = dataclasses.replace(own.data, observations=dataclasses.replace(observations, value=value))

@@ -11,16 +11,18 @@ import numpy as np
 from scipy import linalg, optimize
 
 from lunar_mjx.diagnosis.tables.noise import scatter
-from lunar_mjx.diagnosis.tables.port_gains import FIELDS, GAINS
+from lunar_mjx.diagnosis.tables.port_gains import FIELDS, GAINS, SHARE
 from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE, Imposed, WheelProgram
+from lunar_mjx.diagnosis.weighed.form import MeasuredForm
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
 from lunar_mjx.inference.observations import Observations
-from lunar_mjx.inference.weighing.hypotheses import CALIBRATION, EFFECT, UNLISTED, Form, Linear, Refit, Term
+from lunar_mjx.inference.weighing.hypotheses import CALIBRATION, EFFECT, UNLISTED, Linear, Refit, Term
+from lunar_mjx.inference.weighing.search import Hypothesis
 from lunar_mjx.logs import SteadyLog
-from lunar_mjx.wheel_bed.bed import WheelBed, WheelTest
-from lunar_mjx.wheel_bed.table import QUANTITIES
+from lunar_mjx.wheel_bed.bed import EARTH_GRAVITY, WheelBed, WheelTest
+from lunar_mjx.wheel_bed.table import QUANTITIES, average
 
 _QUANTITY_OF = {column: i for i, (column, _, _) in enumerate(QUANTITIES.values())}
 _NAMES = tuple(QUANTITIES)
@@ -83,8 +85,12 @@ def table_data(
         ]
     )
     load = np.asarray(stacked.normal_load)
-    imposed = Imposed(stacked, slip, lever, np.full(first, load.mean()))
-    speed = np.concatenate([_speed(log, t) for log, t in zip(logs, tests, strict=True)])
+    gravity = [
+        np.full(len(np.atleast_1d(t.slip_angle)), log.gravity_m_s2 or EARTH_GRAVITY)
+        for log, t in zip(logs, tests, strict=True)
+    ]
+    imposed = Imposed(stacked, slip, lever, np.full(first, load.mean()), np.concatenate(gravity))
+    speed = np.concatenate([_speed(log) for log in logs])
     features = np.column_stack(
         [
             slip / settings.slip_length,
@@ -93,7 +99,9 @@ def table_data(
             np.log(speed) / settings.speed_length,
         ]
     )
-    # Slip and slip angle are what the catalogue's effects are about; none of them follows the rate.
+    # A contact law is inexact in what it is a law of: slip, slip angle and load. It knows no speed, so that whatever
+    # follows the speed is a phenomenon that it lacks, and no usual discrepancy.
+    usual = features[:, :3]
     following = {
         name: _modes(features[:, [k]], settings)
         for name, k in (("load", 2), ("speed", 3))
@@ -106,18 +114,15 @@ def table_data(
             i = _NAMES.index(name)
             std[i] = max(std.get(i, 0.0), float(told))
     return TableData(
-        observations, imposed, point, quantity, _modes(features, settings), following, dict(sorted(std.items()))
+        observations, imposed, point, quantity, _modes(usual, settings), following, dict(sorted(std.items()))
     )
 
 
-def _speed(log: SteadyLog, test: WheelTest) -> np.ndarray:
-    """(points,) larger of rim and travel speed where the table gives any, else 1; m/s."""
-    del test
-    from lunar_mjx.wheel_bed.table import average
-
+def _speed(log: SteadyLog) -> np.ndarray:
+    """(points,) speed at which the bed runs, m/s: of rim and travel the one that differs less; slip sets the other."""
     columns = average(log.table).test
-    given = [columns[c] for c in ("rim_speed_m_s", "travel_speed_m_s") if c in columns]
-    return np.maximum(np.max(given, axis=0), 1e-6) if given else np.ones(len(columns["slip_ratio"]))
+    given = [np.maximum(columns[c], 1e-6) for c in ("rim_speed_m_s", "travel_speed_m_s") if c in columns]
+    return min(given, key=lambda v: float(np.ptp(np.log(v)))) if given else np.ones(len(columns["slip_ratio"]))
 
 
 def _modes(features: np.ndarray, settings: TableSettings) -> np.ndarray:
@@ -134,7 +139,7 @@ def _modes(features: np.ndarray, settings: TableSettings) -> np.ndarray:
     return (vectors[:, keep] * np.sqrt(values[keep]))[inverse.reshape(-1)]
 
 
-class WheelForm(Form):
+class WheelForm(MeasuredForm):
     """One contact law against tables."""
 
     def __init__(
@@ -159,6 +164,7 @@ class WheelForm(Form):
         self.name, self.data, self.settings, self.log_prior = name, data, settings, log_prior
         self.coordinates, self.baseline, self.candidates = tuple(coordinates), baseline, dict(candidates)
         self.program = WheelProgram(bed, coordinates)
+        self.observations, self.words, self.shares = data.observations, FIELDS, SHARE
         self._fit = data.observations.in_split("fit")
         names = _instruments(data)
         self.instruments = names
@@ -176,9 +182,21 @@ class WheelForm(Form):
         at = (self.data.quantity, self.data.point)
         return values[at], slopes[at]
 
-    def residual(self, u: np.ndarray) -> np.ndarray:
-        """(n,) whitened residuals, measured less predicted."""
-        return self.data.observations.whiten(self.data.observations.value - self.predict(u)[0])
+    def predicted(self, u: np.ndarray) -> np.ndarray:
+        """See `MeasuredForm`."""
+        return self.predict(u)[0]
+
+    def corrected(self, best: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+        """See `MeasuredForm`."""
+        _, columns, residual = self.linearise(best.refit.u)
+        learnt = columns[:, best.places] @ best.evidence.mean
+        return self.predicted(best.refit.u) + self.observations.sigma() * learnt, residual - learnt
+
+    def signatures(self, refit: Refit) -> dict[str, np.ndarray]:
+        """See `MeasuredForm`."""
+        _, columns, _ = self.linearise(refit.u)
+        std, fit = refit.linear.amplitudes.std, self._fit
+        return {name: columns[fit][:, places] @ std[places] for name, places in self.candidates.items()}
 
     def linearise(self, u: np.ndarray) -> tuple[Linear, np.ndarray, np.ndarray]:
         """Everything that hypotheses need around a place; whitened columns (n, k) and residuals (n,) beside it."""
@@ -200,7 +218,7 @@ class WheelForm(Form):
         std = np.concatenate([[c.prior for c in self.coordinates], error_std, np.ones(len(rest)), sizes])
         for places in self.candidates.values():
             amplitude = [i for i in places if self.coordinates[i].amplitude]
-            std[amplitude] = settings.effect_size
+            std[amplitude] = [self._effect_size(self.coordinates[i]) for i in amplitude]
         field = np.concatenate([np.full(count + errors.shape[1], -1), field_of, np.full(unlisted.shape[1], -1)])
         mean = np.zeros(len(std))
         centre = np.array([c.centre for c in self.coordinates])
@@ -241,6 +259,12 @@ class WheelForm(Form):
             far=settings.bad_calibration,
         )
         return linear, columns, residual
+
+    def _effect_size(self, c: Coordinate) -> float:
+        """Prior standard deviation of an effect's amplitude, in scales: lengths are measured by the wheel's radius."""
+        if c.unit != "m":
+            return self.settings.effect_size
+        return self.settings.length_size * float(np.mean(self.data.imposed.test.radius)) / c.scale
 
     def noise_group(self) -> np.ndarray:
         """(n,) noise group of every observation."""

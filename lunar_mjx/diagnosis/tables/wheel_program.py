@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.diagnosis.tables.port_gains import EFFECT, GAINS, gains_effect
+from lunar_mjx.effects import catalogue
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.wheel_bed.bed import WheelBed, WheelTest
 from lunar_mjx.wheel_bed.table import QUANTITIES
@@ -45,29 +46,41 @@ class Imposed(NamedTuple):
       lever: change of the travel speed per rim speed and change of a driving wheel's slip (1, or 1/cos of the slip
         angle where slip is that of the wheel's frame).
       mean_load: N, of the whole table.
+      gravity: of the table that a point belongs to, m/s2.
     """
 
     test: WheelTest
     slip: Any
     lever: Any
     mean_load: Any
+    gravity: Any
 
 
 class WheelProgram:
     """Predictions of drawbar pull, side force, driving torque and sinkage, and derivatives by everything unknown."""
 
     def __init__(self, bed: WheelBed, coordinates: Sequence[Coordinate]):
-        """Makes the program; compiled programs are shared by beds of the same effects and coordinates.
+        """Makes the program; compiled programs are shared by beds of the same effects and parameters.
+
+        Effects and parameters take the catalogue's order: a model that an effect was added to shares the program in
+        which it was a candidate.
 
         Args:
           bed: with all effects that may be missing, at their null.
           coordinates: what a fit may move.
         """
-        self.bed = bed.with_effect(gains_effect()) if EFFECT not in bed.parameters else bed
-        self._layout = tuple((c.effect, c.name, c.log) for c in coordinates)
-        self._scales = np.array([[c.start, c.scale] for c in coordinates], float).reshape(-1, 2)
-        effects = tuple(e if e.name != EFFECT else EFFECT for e in self.bed.effects)
-        self._run = _compiled((tuple(map(_identity, effects)), self._layout), self.bed, self._layout)
+        rank = {name: i for i, name in enumerate(catalogue.CATALOGUE)}
+        effects = sorted(
+            (e for e in bed.effects if e.name != EFFECT), key=lambda e: (rank.get(e.name, len(rank)), e.name)
+        )
+        self.bed = WheelBed([*effects, gains_effect()], bed.parameters, bed.gravity)
+        self._order = np.array(sorted(range(len(coordinates)), key=lambda i: coordinates[i].key), int)
+        ordered = [coordinates[i] for i in self._order]
+        self._layout = tuple((c.effect, c.name) for c in ordered)
+        # Numbers on the device, of the points that were asked last: handing them over takes as long as the program.
+        self._held: tuple[Imposed, tuple[Any, Any], list[Any]] | None = None
+        self._scales = np.array([[c.start, c.scale, c.log] for c in ordered], float).reshape(-1, 3)
+        self._run = _compiled((tuple(map(id, effects)), self._layout), self.bed, self._layout)
 
     @property
     def width(self) -> int:
@@ -85,30 +98,43 @@ class WheelProgram:
           (4, points) by `QUANTITIES`, SI units; (4, points, width).
         """
         points = len(np.asarray(imposed.slip))
-        fill = -points % CHUNK
+        values = np.empty((len(QUANTITIES), points))
+        slopes = np.empty((*values.shape, self.width))
         with jax.enable_x64(True):
-            z = jnp.asarray(np.concatenate([u, np.zeros(self.width - len(u))]))
-            scales, parameters = jnp.asarray(self._scales), self.bed.parameters
-            gravity = jnp.asarray(float(self.bed.gravity))
-            parameters = {e: {k: jnp.asarray(v, float) for k, v in p.items()} for e, p in parameters.items()}
-            padded = jax.tree.map(lambda a: np.pad(np.asarray(a, float), (0, fill), mode="edge"), imposed)
-            parts = []
-            for at in range(0, points + fill, CHUNK):
-                chunk = jax.tree.map(lambda a, at=at: jnp.asarray(a[at : at + CHUNK]), padded)
-                parts.append(self._run(z, scales, parameters, gravity, chunk))
-            slopes, values = zip(*jax.device_get(parts), strict=True)
-        return np.concatenate(values, axis=1)[:, :points], np.concatenate(slopes, axis=1)[:, :points]
+            if self._held is None or self._held[0] is not imposed:
+                self._held = imposed, self._constants(), self._chunks(imposed)
+            _, constants, chunks = self._held
+            z = jnp.asarray(np.concatenate([u[self._order], np.zeros(self.width - len(u))]))
+            parts = [(rows, self._run(z, *constants, *chunk)) for rows, chunk in chunks]
+            for rows, (slope, value) in parts:
+                values[:, rows], slopes[:, rows] = np.asarray(value)[:, : len(rows)], np.asarray(slope)[:, : len(rows)]
+        slopes[..., self._order] = slopes[..., : len(u)].copy()
+        return values, slopes
+
+    def _constants(self) -> tuple[Any, Any]:
+        parameters = {e: {k: jnp.asarray(v, float) for k, v in p.items()} for e, p in self.bed.parameters.items()}
+        return jnp.asarray(self._scales), parameters
+
+    def _chunks(self, imposed: Imposed) -> list[tuple[np.ndarray, tuple[Any, Any]]]:
+        """Places of the points of each chunk, and its gravity and what is imposed there."""
+        gravities = np.asarray(imposed.gravity, float)
+        whole = jax.tree.map(lambda a: np.asarray(a, float), imposed)
+        found = []
+        for gravity in np.unique(gravities):
+            mine = np.flatnonzero(gravities == gravity)
+            for at in range(0, len(mine), CHUNK):
+                rows = mine[at : at + CHUNK]
+                filled = np.pad(rows, (0, CHUNK - len(rows)), mode="edge")
+                chunk = jax.tree.map(lambda a, filled=filled: jnp.asarray(a[filled]), whole)
+                found.append((rows, (jnp.asarray(gravity), chunk)))
+        return found
 
 
 _PROGRAMS: dict[Any, tuple[WheelBed, Any]] = {}
 _MOST_PROGRAMS = 24
 
 
-def _identity(effect: Any) -> Any:
-    return effect if isinstance(effect, str) else id(effect)
-
-
-def _compiled(key: Any, bed: WheelBed, layout: Sequence[tuple[str, str, bool]]) -> Any:
+def _compiled(key: Any, bed: WheelBed, layout: Sequence[tuple[str, str]]) -> Any:
     if key not in _PROGRAMS:
 
         def values(z: Any, scales: Any, parameters: Any, gravity: Any, imposed: Imposed) -> tuple[Any, Any]:
@@ -116,10 +142,13 @@ def _compiled(key: Any, bed: WheelBed, layout: Sequence[tuple[str, str, bool]]) 
             here = copy.copy(bed)
             here.gravity = gravity
             own = {e: dict(v) for e, v in parameters.items()}
-            for i, (effect, name, log) in enumerate(layout):
-                start, scale = scales[i, 0], scales[i, 1]
-                own[effect][name] = start * jnp.exp(scale * z[i]) if log else start + scale * z[i]
             count = len(layout)
+            start, change = scales[:, 0], scales[:, 1] * z[:count]
+            log = scales[:, 2] > 0.0
+            # The exponent is zero where it is not taken, so that none overflows.
+            moved = jnp.where(log, start * jnp.exp(jnp.where(log, change, 0.0)), start + change)
+            for i, (effect, name) in enumerate(layout):
+                own[effect][name] = moved[i]
             for i in range(len(GAINS)):
                 own[EFFECT][f"gain_{i}"] = z[count + i]
             result = here(own, _off(imposed, z[count + len(GAINS) :]))

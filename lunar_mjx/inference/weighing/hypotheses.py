@@ -139,7 +139,7 @@ def shifted(gram: Gram, amounts: np.ndarray) -> Gram:
     """Statistics after the model's amplitudes have been moved by (k,) amounts: residual less columns times amounts."""
     change = np.eye(gram.width + 1)
     change[:-1, -1] = -amounts
-    return Gram(gram.count, np.einsum("ji,gjk,kl->gil", change, gram.matrix, change))
+    return Gram(gram.count, change.T @ gram.matrix @ change)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

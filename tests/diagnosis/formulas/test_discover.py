@@ -94,6 +94,9 @@ def test_a_search_needs_a_port(tmp_path):
         discover(run)
     with pytest.raises(UserError, match="does not exist"):
         discover(run, "nowhere")
+    run.save(VERDICT_FILE, {**VERDICT, "verdict": "UNKNOWN", "port": "elsewhere"})
+    with pytest.raises(UserError, match=r"elsewhere.*does not exist"):
+        discover(run)  # the port of a verdict that weighs hypotheses is taken
 
 
 def test_amounts_are_numbers_of_clear_size():

@@ -10,12 +10,14 @@ import pytest
 
 from lunar_mjx.diagnosis import build_problem
 from lunar_mjx.diagnosis.runs import Run
-from lunar_mjx.diagnosis.tables.conclusion import conclude
 from lunar_mjx.diagnosis.tables.loop import build_tables, contact_laws, with_law
 from lunar_mjx.diagnosis.tables.port_gains import FIELDS, GAINS
+from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE
 from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.effects import catalogue
+from lunar_mjx.errors import UserError
 from lunar_mjx.inference.weighing.search import search
 from lunar_mjx.logs import Noise, read_campaign, write_steady_log
 from lunar_mjx.model import make_model
@@ -123,6 +125,7 @@ def test_chunks_of_points_make_no_difference(folder):
         slip=form.data.imposed.slip[:5],
         lever=form.data.imposed.lever[:5],
         mean_load=form.data.imposed.mean_load[:5],
+        gravity=form.data.imposed.gravity[:5],
     )
     np.testing.assert_allclose(form.program(u, part)[0], whole[:, :5], rtol=1e-12)
 
@@ -167,8 +170,47 @@ def test_an_effect_is_named_and_what_remains_is_told_by_port(folder):
 
 def test_rival_laws_take_the_place_of_the_models_own():
     model = make_model("luvmi_x", terrain="flat", preset="consistent")
-    laws = contact_laws(model, rivals=True)
-    assert list(laws) == ["closed form", "stress_integral"]
+    laws = contact_laws(model, TableSettings().laws)
+    assert list(laws) == ["closed form", "stress_integral", "granular_resistance"]
     assert "stress_integral" in laws["stress_integral"].effect_names
     assert not {"pressure_sinkage", "closed_form_shear"} & set(laws["stress_integral"].effect_names)
-    assert list(contact_laws(with_law(model, "stress_integral"), rivals=False)) == ["stress_integral"]
+    assert list(contact_laws(with_law(model, "stress_integral"), ())) == ["stress_integral"]
+
+
+def test_tables_of_several_gravities_share_a_run(folder):
+    write(folder / "earth", seed=4)
+    write(folder / "moon", seed=4)
+    path = folder / "moon" / "log.toml"
+    path.write_text("gravity_m_s2 = 1.62\n" + path.read_text().replace("gravity_m_s2 = 9.80665\n", ""))
+    run = Run(folder / "run", (folder / "earth", folder / "moon"), make_model("luvmi_x", terrain="flat"))
+    form = build_tables(run, run.campaign(), rivals=False).own  # type: ignore[arg-type]
+    value, _ = form.predict(np.zeros(len(form.coordinates)))
+    half = len(form.data.imposed.slip) // 2
+    assert set(form.data.imposed.gravity[:half]) != set(form.data.imposed.gravity[half:])
+    first, second = value[form.data.point < half], value[form.data.point >= half]
+    assert np.isfinite(value).all() and len(first) == len(second)
+
+
+def test_settings_are_given_by_name():
+    changed = TableSettings.of({"effect_odds": "0.5", "laws": "stress_integral", "most_terms": 3})
+    assert (changed.effect_odds, changed.laws, changed.most_terms) == (0.5, ("stress_integral",), 3)
+    for name, value in (("odds", "1"), ("most_terms", "2.5"), ("effect_odds", "many")):
+        with pytest.raises(UserError, match=name):
+            TableSettings.of({name: value})
+
+
+def test_a_model_that_an_effect_was_added_to_shares_its_program(folder):
+    path = folder / "plain"
+    if not path.exists():
+        write(path)
+    model = make_model("luvmi_x", terrain="flat", preset="consistent")
+    grown = model.add("rolling_resistance", "add", coefficient=0.05)
+    first, second = (
+        build_tables(Run(folder / "run", (path,), m), Run(folder / "run", (path,), m).campaign(), rivals=False).own  # type: ignore[arg-type]
+        for m in (model, grown)
+    )
+    assert first.program._run is second.program._run
+    u, v = np.zeros(len(first.coordinates)), np.zeros(len(second.coordinates))
+    place = next(i for i, c in enumerate(first.coordinates) if c.key == "rolling_resistance.coefficient")
+    u[place] = 0.05 / first.coordinates[place].scale
+    np.testing.assert_allclose(first.predict(u)[0], second.predict(v)[0], rtol=1e-9, atol=1e-12)

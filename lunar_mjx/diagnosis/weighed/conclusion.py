@@ -24,6 +24,7 @@ class Conclusion:
       unlisted: whether "or something unlisted" belongs to it. port: where, most probably. place: the same with what is
         wrong there, for a reader.
       probability: of the statement. sentence: it in words.
+      further: beside `effects`, one of these is missing as well; together with something unlisted where `unlisted`.
     """
 
     verdict: Verdict
@@ -33,13 +34,15 @@ class Conclusion:
     probability: float
     sentence: str
     place: str | None = None
+    further: tuple[str, ...] = ()
 
 
 def conclude(found: ModelSearch, sure: float) -> Conclusion:
     """The strongest statement that has the probability `sure`.
 
-    In this order: effects that are each sure (KNOWN, MULTIPLE); something unlisted (UNKNOWN); the smallest class that
-    holds what is missing (KNOWN_CLASS); nothing beyond usual discrepancy (NOISE_ONLY); none of these (UNDECIDABLE).
+    In this order: effects that are each sure (KNOWN, MULTIPLE), and beside them the smallest class that holds what is
+    missing as well; something unlisted (UNKNOWN); nothing beyond usual discrepancy (NOISE_ONLY); the smallest class
+    that holds what is missing (KNOWN_CLASS); none of these (UNDECIDABLE).
     """
     inclusion = found.inclusion()
     named = [t for t, p in inclusion.items() if p >= sure and t.kind in (EFFECT, CALIBRATION)]
@@ -48,6 +51,8 @@ def conclude(found: ModelSearch, sure: float) -> Conclusion:
     if named:
         p = found.probability_of(lambda h: set(named) <= h.terms)
         names = tuple(map(label, named))
+        rest = [t for t in inclusion if t not in named and not (t.kind == UNLISTED and unlisted >= sure)]
+        further, _ = _smallest(found, rest, sure, named)
         many = len(names) > 1
         said = f"{_list(names)} {'are' if many else 'is'} missing"
         if all(t.kind == CALIBRATION for t in named):
@@ -55,8 +60,13 @@ def conclude(found: ModelSearch, sure: float) -> Conclusion:
         if unlisted >= sure:
             said += f", and something unlisted acts at {place}"
         verdict = Verdict.MULTIPLE if many else Verdict.KNOWN
-        where = (port, place) if unlisted >= sure else (None, None)
-        return Conclusion(verdict, names, unlisted >= sure, where[0], p, _with(said, p), where[1])
+        other = unlisted >= sure or _UNLISTED in further
+        where = (port, place) if other else (None, None)
+        more = tuple(m for m in further if m != _UNLISTED)
+        sentence = _with(said, p)
+        if further:
+            sentence += f" Beside {'them' if many else 'it'}, {_one_of(further, place)} acts, too."
+        return Conclusion(verdict, names, other, where[0], p, sentence, where[1], more)
     if unlisted >= sure:
         said = f"Something that no listed effect explains acts at {place}"
         return Conclusion(Verdict.UNKNOWN, _helpful(found), True, port, unlisted, _with(said, unlisted), place)
@@ -64,12 +74,11 @@ def conclude(found: ModelSearch, sure: float) -> Conclusion:
     if nothing >= sure:
         said = "Nothing is missing beyond usual errors of model, sensors and noise"
         return Conclusion(Verdict.NOISE_ONLY, (), False, None, nothing, _with(said, nothing))
-    members, p = _smallest(found, [t for t in inclusion if t.kind == EFFECT], sure)
+    members, p = _smallest(found, list(inclusion), sure)
     effects = tuple(m for m in members if m != _UNLISTED)
-    if members and len(effects) <= LARGEST_CLASS:
-        other = len(effects) < len(members)
-        tail = f", or something unlisted at {place}," if other else ""
-        said = f"{'One of ' if len(effects) > 1 else ''}{_list(effects)}{tail} is missing"
+    if members:
+        other = _UNLISTED in members
+        said = f"{_one_of(members, place)} acts".capitalize() if other else f"One of {_list(effects)} is missing"
         where = (port, place) if other else (None, None)
         return Conclusion(Verdict.KNOWN_CLASS, effects, other, where[0], p, _with(said, p), where[1])
     said = f"These data do not settle whether anything is missing (nothing: {_percent(nothing)})"
@@ -128,28 +137,40 @@ _UNLISTED = ""
 """Member of a class that stands for something unlisted, wherever it acts."""
 
 
-def _smallest(found: ModelSearch, terms: Sequence[Term], sure: float) -> tuple[list[str], float]:
-    """Fewest effects, one by one the most useful, of which the truth holds at least one with probability `sure`.
+def _smallest(
+    found: ModelSearch, terms: Sequence[Term], sure: float, named: Sequence[Term] = ()
+) -> tuple[list[str], float]:
+    """Fewest terms, one by one the most useful, of which the truth holds at least one with probability `sure`.
 
-    Something unlisted counts as one of them.
+    Something unlisted counts as one of them, wherever it acts. Hypotheses that lack what is `named` hold no statement
+    about what acts beside it. Empty where the class would hold more than `LARGEST_CLASS` names.
     """
+    by_label = {_UNLISTED if t.kind == UNLISTED else label(t): t for t in terms}
     members: list[str] = []
-    choice = [t.name for t in terms] + [_UNLISTED]
 
     def holds(more: Sequence[str]) -> Callable[[Hypothesis], bool]:
-        wanted = set(more)
-        return lambda h: bool(wanted & h.effects) or (_UNLISTED in wanted and any(t.kind == UNLISTED for t in h.terms))
+        wanted = {by_label[m] for m in more if m != _UNLISTED}
+        return lambda h: (
+            set(named) <= h.terms
+            and (bool(wanted & h.terms) or (_UNLISTED in more and any(t.kind == UNLISTED for t in h.terms)))
+        )
 
     p = 0.0
-    while p < sure and len(members) < len(choice):
-        rest = [t for t in choice if t not in members]
-        gains = {t: found.probability_of(holds([*members, t])) for t in rest}
-        best = max(rest, key=lambda t: gains[t])
-        if gains[best] <= p:
-            return [], p
+    while p < sure and len([m for m in members if m != _UNLISTED]) < LARGEST_CLASS:
+        gains = {t: found.probability_of(holds([*members, t])) for t in by_label if t not in members}
+        best = max(gains, key=lambda t: gains[t], default=None)
+        if best is None or gains[best] <= p:
+            break
         members.append(best)
         p = gains[best]
     return (members, p) if p >= sure else ([], p)
+
+
+def _one_of(members: Sequence[str], place: str | None) -> str:
+    names = [m for m in members if m != _UNLISTED] + (
+        [f"something unlisted at {place}"] if _UNLISTED in members else []
+    )
+    return names[0] if len(names) == 1 else f"one of {_list(names)}"
 
 
 def _list(names: Sequence[str]) -> str:

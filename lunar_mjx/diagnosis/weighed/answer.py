@@ -1,0 +1,388 @@
+"""The verbs on any problem of weighed hypotheses: compare a model with measurements, and say what is missing."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from lunar_mjx.diagnosis.runs import COMPARISON_FILE, HYPOTHESES_FILE, RUN_FILE, SERIES_FILE, SIGNATURES_FILE, Run
+from lunar_mjx.diagnosis.verdict import Diagnosis, EffectEvidence, Verdict
+from lunar_mjx.diagnosis.weighed.conclusion import conclude, label, probabilities, title
+from lunar_mjx.diagnosis.weighed.form import MeasuredForm, Problem
+from lunar_mjx.files import replacing
+from lunar_mjx.inference.evidence import EvidenceError
+from lunar_mjx.inference.fitting import Progress
+from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Refit
+from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, Hypothesis, ModelSearch, search
+
+_SPLITS = {
+    "fit": ("fit",),
+    "select": ("select",),
+    "test": ("test",),
+    "held_out": ("select", "test"),
+    "apart": ("apart",),
+}
+
+
+def compare(run: Run, problem: Problem, progress: Progress) -> Refit:
+    """The model as given and refitted; writes `comparison.json` and the series."""
+    run.save(RUN_FILE, {**run.load(RUN_FILE), "settings": dataclasses.asdict(problem.settings)})
+    own = problem.own
+    progress("refitting the model", 0.0)
+    with threadpool_limits(1, "blas"):
+        refit = own.refit(frozenset(), None, None)
+    start = own.residual(own.origin())
+    run.save(COMPARISON_FILE, comparison(problem, start, refit))
+    save_series(run, own, start, {"refitted": (own, refit.u)})
+    return refit
+
+
+def diagnose(run: Run, problem: Problem, progress: Progress) -> tuple[Diagnosis, ModelSearch | None]:
+    """Weighs all hypotheses; writes comparison, series, signatures, refits. A search that failed is not returned."""
+    settings = problem.settings
+    try:
+        # Matrices of some hundred rows are factored faster by one thread than by several that wait for each other.
+        with threadpool_limits(1, "blas"):
+            found = search(problem.forms, settings.most_refits, settings.most_terms, settings.window, progress)
+    except EvidenceError as error:
+        return Diagnosis(Verdict.BAD_FIT, (), f"The solver failed ({error}), so nothing is said about physics."), None
+    own = problem.own
+    if not any(h.form == own.name for h in found.hypotheses):
+        return Diagnosis(Verdict.BAD_FIT, (), f"The solver failed ({'; '.join(found.failed)})."), None
+    base = found.base(own.name).refit
+    best = next(h for h in found.hypotheses if h.refitted)
+    diagnosis = _diagnosis(problem, found, best)
+    start = own.residual(own.origin())
+    after = problem.form(best.form)
+    run.save(COMPARISON_FILE, comparison(problem, start, base))
+    fits = {"refitted": (own, base.u)}
+    if best.effects or best.form != own.name:
+        words = [*([best.form] if best.form != own.name else []), *sorted(best.effects)]
+        fits["with " + ", ".join(words)] = (after, best.refit.u)
+    save_series(run, own, start, fits, after.corrected(best))
+    _save_signatures(run, found.base(best.form).refit, own)
+    run.save(HYPOTHESES_FILE, _fits(problem, found))
+    diagnosis = dataclasses.replace(
+        diagnosis,
+        error_before=errors(own, own.residual(base.u)),
+        error_after=errors(after, after.residual(best.refit.u)),
+    )
+    return diagnosis, found
+
+
+def comparison(problem: Problem, start: np.ndarray, refit: Refit) -> dict[str, Any]:
+    """Errors in sigma of the model as given and refitted, by group and channel, and the refitted parameters."""
+    form = problem.own
+    observations = form.observations
+    residual = form.residual(refit.u)
+    rows = []
+    for s in observations.series:
+        part = slice(s.start, s.stop)
+        for unit in np.unique(observations.unit[part]):
+            keep = np.arange(s.start, s.stop)[observations.unit[part] == unit]
+            rows.append(
+                {
+                    "manoeuvre": observations.unit_names[unit],
+                    "split": observations.unit_split[unit],
+                    "channel": s.channel,
+                    "samples": len(keep),
+                    "as_given": _rms(start[keep]),
+                    "refitted": _rms(residual[keep]),
+                }
+            )
+    value, found, places = refit.linear.evidence(form.listed(refit.effects))
+    del value
+    return {
+        "unit": "sigma of the measurement noise",
+        "as_given": errors(form, start),
+        "refitted": errors(form, residual),
+        "by_channel": rows,
+        "parameters": parameter_table(form, refit, found.mean, found.covariance, places),
+        "discrepancy": _discrepancy(form, found.tau, found.tau_log_std, refit.linear.felt()),
+        "noise": {n.name: float(s) for n, s in zip(refit.linear.noises, found.noise, strict=True)},
+        "solver": refit.failed or "ended",
+        "observations": len(observations),
+        "logs": list(observations.logs),
+    }
+
+
+def errors(form: MeasuredForm, residual: np.ndarray) -> dict[str, float]:
+    """Root mean square of whitened residuals by split."""
+    observations = form.observations
+    return {k: _rms(residual[keep]) for k, v in _SPLITS.items() if (keep := observations.in_split(*v)).any()}
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def parameter_table(
+    form: MeasuredForm, refit: Refit, mean: np.ndarray, covariance: np.ndarray, places: np.ndarray
+) -> dict[str, Any]:
+    """Fitted values and standard deviations by effect and name, with units and the values that the model came with."""
+    table: dict[str, Any] = {}
+    for k, i in enumerate(places):
+        if i >= len(form.coordinates):
+            continue
+        c = form.coordinates[i]
+        entry = table.setdefault(c.effect, {"value": {}, "std": {}, "given": {}, "unit": {}})
+        entry["value"][c.name] = float(c.value(refit.u[i]))
+        entry["std"][c.name] = c.std(refit.u[i], math.sqrt(max(float(covariance[k, k]), 0.0)))
+        entry["given"][c.name], entry["unit"][c.name] = c.start, c.unit
+    return table
+
+
+def _discrepancy(
+    form: MeasuredForm, tau: np.ndarray, log_std: np.ndarray, felt: Mapping[str, float]
+) -> dict[str, dict[str, Any]]:
+    """Size of every field of which the data can tell something."""
+    found = {}
+    for (field, said), size, spread in zip(form.words.items(), tau, log_std, strict=True):
+        if felt[field] < LEAST_SIGNAL:
+            continue
+        size = size * form.shares.get(field, 1.0)
+        low, high = size * math.exp(-spread), size * math.exp(spread)
+        found[field] = {
+            "size": float(size),
+            "low": float(low),
+            "high": float(high),
+            "text": f"{said} good to {_percent(size)}",
+        }
+    return found
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2g} %"
+
+
+def save_series(
+    run: Run,
+    own: MeasuredForm,
+    start: np.ndarray,
+    fits: Mapping[str, tuple[MeasuredForm, np.ndarray]],
+    corrected: tuple[np.ndarray, np.ndarray] | None = None,
+) -> None:
+    """Measured and predicted series for the report, as `series.npz` (arrays only, no pickle).
+
+    Args:
+      run: to write to. own: the model as given. start: its whitened residuals.
+      fits: form and coordinates by label.
+      corrected: predictions and whitened residuals of the last fit with what the fitted points taught of discrepancy.
+    """
+    observations = own.observations
+    predicted = [own.predicted(own.origin()), *(f.predicted(u) for f, u in fits.values())]
+    residual = [start, *(f.residual(u) for f, u in fits.values())]
+    time = np.concatenate(
+        [np.full(s.stop - s.start, np.nan) if s.time is None else s.time for s in observations.series]
+    )
+    place = observations.place if observations.place is not None else np.zeros((0, 3))
+    with replacing(run.folder / SERIES_FILE) as part:
+        np.savez_compressed(
+            part,
+            measured=observations.value,
+            sigma=observations.sigma(),
+            time=time,
+            place=place,
+            unit=observations.unit,
+            unit_names=np.array(observations.unit_names),
+            split=np.array(observations.unit_split),
+            series_start=np.array([s.start for s in observations.series]),
+            series_channel=np.array([s.channel for s in observations.series]),
+            series_log=np.array([s.log for s in observations.series]),
+            logs=np.array(observations.logs),
+            labels=np.array(["as given", *fits]),
+            predicted=np.vstack(predicted),
+            residual=np.vstack(residual),
+            **({} if corrected is None else dict(zip(("corrected", "corrected_residual"), corrected, strict=True))),
+        )
+
+
+def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagnosis:
+    settings = problem.settings
+    said = conclude(found, settings.sure)
+    forms = found.forms()
+    own = problem.own.name
+    remains = _averaged(problem.own, found)
+    sentence = said.sentence
+    better = max(forms, key=lambda n: forms[n])
+    if forms[better] >= settings.sure and better != own:
+        sentence += f" The contact law {better} explains these data better than {own}: add it."
+    if remains:
+        sizes = {k: d["size"] / problem.own.shares.get(k, 1.0) for k, d in remains.items()}
+        worst = max(sizes, key=lambda k: sizes[k])
+        usual = sizes[worst] <= 2.0 * settings.usual_discrepancy
+        tail = f"usual: {remains[worst]['text']}, the rest better" if usual else f"large: {remains[worst]['text']}"
+        sentence += f" What remains is {tail}."
+    gain, se, units = _held_out(found, best, own)
+    inclusion = found.inclusion()
+    evidence, undecidable = _evidence(problem, found, said.effects)
+    return Diagnosis(
+        verdict=said.verdict,
+        effects=said.effects,
+        sentence=sentence,
+        evidence=evidence,
+        port=said.port,
+        ports={t.name: p for t, p in inclusion.items() if t.kind == UNLISTED and p >= 1e-4},
+        isolability=_cosines(found.base(best.form).refit),
+        undecidable=undecidable,
+        probability=said.probability,
+        probabilities=probabilities(found),
+        inclusion={label(t): p for t, p in inclusion.items()},
+        forms=forms,
+        unlisted=said.unlisted,
+        further=said.further,
+        discrepancy=remains,
+        details={
+            "best": {"form": best.form, "hypothesis": title(best), "log_posterior": best.log_posterior},
+            "place": said.place,
+            "held_out": {"gain": gain, "se": se, "manoeuvres": units},
+            "noise": {n.name: float(s) for n, s in zip(best.refit.linear.noises, best.evidence.noise, strict=True)},
+            "search": {
+                "refits": found.refits,
+                "complete": found.complete,
+                "failed": list(found.failed),
+                "hypotheses": len(found.hypotheses),
+            },
+            "parameters": parameter_table(
+                problem.form(best.form), best.refit, best.evidence.mean, best.evidence.covariance, best.places
+            ),
+            "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
+        },
+    )
+
+
+def _averaged(form: MeasuredForm, found: ModelSearch) -> dict[str, dict[str, Any]]:
+    """Size of each field, averaged over hypotheses by their probability."""
+    tau = np.sqrt(sum(p * h.evidence.tau**2 for h, p in zip(found.hypotheses, found.probability, strict=True)))
+    spread = sum(p * h.evidence.tau_log_std for h, p in zip(found.hypotheses, found.probability, strict=True))
+    return _discrepancy(form, np.asarray(tau), np.asarray(spread), found.best.refit.linear.felt())
+
+
+def _held_out(found: ModelSearch, best: Hypothesis, own: str) -> tuple[float, float, int]:
+    """Gain of log predictive density on manoeuvres that chose nothing: the best hypothesis over the model as it is."""
+    base = found.base(own)
+    names = list(best.refit.linear.held_out)
+    if not names:
+        return float("nan"), float("nan"), 0
+
+    def score(h: Hypothesis, name: str) -> float:
+        return h.evidence.log_score(h.refit.linear.held_out[name].select(h.places))
+
+    gains = np.array([score(best, n) - score(base, n) for n in names])
+    se = float(np.sqrt(len(gains) * np.var(gains, ddof=1))) if len(gains) > 1 else float("nan")
+    return float(gains.sum()), se, len(names)
+
+
+def _evidence(
+    problem: Problem, found: ModelSearch, named: Sequence[str]
+) -> tuple[tuple[EffectEvidence, ...], tuple[str, ...]]:
+    inclusion = {t.name: p for t, p in found.inclusion().items() if t.kind == EFFECT}
+    best_form = found.best.form
+    shows = found.base(best_form).refit.linear.shows()
+    cosines = _cosines(found.base(best_form).refit)
+    rows = []
+    for name, length in shows.items():
+        p = inclusion.get(name, 0.0)
+        holding = next((h for h in found.hypotheses if name in h.effects), None)
+        without = next(h for h in found.hypotheses if name not in h.effects)
+        values, std, log_ratio = {}, {}, float("-inf")
+        if holding is not None:
+            log_ratio = holding.log_posterior - without.log_posterior
+            form = problem.form(holding.form)
+            moved = holding.evidence.mean
+            for k, i in enumerate(holding.places):
+                if i < len(form.coordinates) and form.coordinates[i].effect == name:
+                    c = form.coordinates[i]
+                    values[c.name] = float(c.value(holding.refit.u[i] + (0.0 if holding.refitted else moved[k])))
+                    std[c.name] = c.std(
+                        holding.refit.u[i], math.sqrt(max(float(holding.evidence.covariance[k, k]), 0.0))
+                    )
+        others = {e: v for e, v in cosines.get(name, {}).items() if e != name}
+        nearest = max(others.items(), key=lambda item: item[1]) if others else ("", 0.0)
+        if length < LEAST_SIGNAL:
+            status, reason = "not tested", f"would show with {length:.2g} sigma after a refit"
+        elif name in named:
+            status, reason = "accepted", f"probability {p:.3f}"
+        elif p > 0.5 * (1.0 - problem.settings.sure):
+            status, reason = "confounded", f"probability {p:.3f}"
+        else:
+            status, reason = "rejected", f"probability {p:.2g}"
+        rows.append(
+            EffectEvidence(
+                effect=name,
+                separable_sigma=length,
+                separable_share=float("nan"),
+                chi2=float("nan"),
+                z=math.copysign(math.sqrt(2.0 * abs(log_ratio)), log_ratio) if math.isfinite(log_ratio) else -99.0,
+                p=1.0 - p,
+                values=values,
+                std=std,
+                nearest=nearest,
+                probability=p,
+                status=status,
+                reason=reason,
+            )
+        )
+    order = {name: i for i, name in enumerate(named)}
+    rows.sort(key=lambda e: (order.get(e.effect, len(order)), -e.probability, -e.z))
+    return tuple(rows), tuple(e.effect for e in rows if e.status == "not tested")
+
+
+def _cosines(refit: Refit) -> dict[str, dict[str, float]]:
+    """|cos| between the signatures of effects at their prior sizes that the form's own parameters cannot absorb."""
+    linear = refit.linear
+    whole = linear.gram.matrix.sum(axis=0)[:-1, :-1]
+    calibrated = np.concatenate([*linear.calibration.values(), np.zeros(0)]).astype(int)
+    own = np.setdiff1d(linear.always[linear.amplitudes.field[linear.always] < 0], calibrated)
+    scale = linear.amplitudes.std
+    inner = np.eye(len(own)) + scale[own, None] * whole[np.ix_(own, own)] * scale[own]
+    every = np.concatenate([*linear.effects.values(), np.zeros(0)]).astype(int)
+    across = scale[own, None] * whole[np.ix_(own, every)] * scale[every]
+    left = scale[every, None] * whole[np.ix_(every, every)] * scale[every] - across.T @ np.linalg.solve(inner, across)
+    index = {i: k for k, i in enumerate(every)}
+    shows = linear.shows()
+    names = [n for n in linear.effects if shows[n] >= LEAST_SIGNAL]
+    found: dict[str, dict[str, float]] = {}
+    for a in names:
+        pa = [index[i] for i in linear.effects[a]]
+        for b in names:
+            pb = [index[i] for i in linear.effects[b]]
+            # the largest canonical cosine of the two signatures' spans
+            wa, wb = (_root(left[np.ix_(p, p)]) for p in (pa, pb))
+            value = np.linalg.svd(wa @ left[np.ix_(pa, pb)] @ wb, compute_uv=False)
+            found.setdefault(a, {})[b] = float(min(value.max(initial=0.0), 1.0))
+    return found
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """Inverse square root of what is felt of a symmetric matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    keep = values > 1e-6 * max(values.max(initial=0.0), 1e-300)
+    return (vectors[:, keep] / np.sqrt(values[keep])) @ vectors[:, keep].T
+
+
+def _save_signatures(run: Run, refit: Refit, form: MeasuredForm) -> None:
+    """Each effect's signature over the fitted observations at its prior size, in sigma."""
+    found = form.signatures(refit) if refit.form == form.name else {}
+    with replacing(run.folder / SIGNATURES_FILE) as part:
+        np.savez_compressed(
+            part, names=np.array(list(found), str), signatures=np.array(list(found.values()), np.float32)
+        )
+
+
+def _fits(problem: Problem, found: ModelSearch) -> dict[str, Any]:
+    """Coordinates of every refit, by form and effects, for `add` and for whoever reads along."""
+    out: dict[str, Any] = {}
+    for h in found.hypotheses:
+        if h.refitted:
+            key = " + ".join([h.form, *sorted(h.effects)])
+            keys = [c.key for c in problem.form(h.form).coordinates]
+            out.setdefault(
+                key, {"u": dict(zip(keys, map(float, h.refit.u), strict=True)), "log_posterior": h.log_posterior}
+            )
+    return out

@@ -1,0 +1,125 @@
+"""What the verbs need of a model that is held against measurements, whatever these are."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+import numpy as np
+
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.inference.coordinates import Coordinate
+from lunar_mjx.inference.observations import Observations
+from lunar_mjx.inference.problem import NotTested
+from lunar_mjx.inference.weighing.hypotheses import EFFECT, Form, Refit, Term
+from lunar_mjx.inference.weighing.search import Hypothesis
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchSettings:
+    """How rare things are, what a verdict needs, and how much a search may do."""
+
+    usual_discrepancy: float = 0.05
+    """1; scale of the half-normal prior of each port's discrepancy: no contact law is exact (terramechanics models
+    predict drawbar pull and sinkage to some 5 to 10 per cent, Wong 2008)."""
+    unlisted_discrepancy: float = 0.3
+    """1; the same where something unlisted acts at a port."""
+    effect_size: float = 1.0
+    """1; prior standard deviation of an effect's amplitude, over its nominal size."""
+    effect_odds: float = 0.01
+    """1; prior odds of each effect of the catalogue: of some fifteen, one is missing in every seventh table."""
+    unlisted_odds: float = 0.005
+    """1; prior odds of something unlisted in each field of discrepancy."""
+    sure: float = 0.95
+    """1; probability of a statement that is a verdict."""
+    most_refits: int = 14
+    """1; refits of a search."""
+    most_terms: int = 7
+    """1; terms of one hypothesis at most, as the real wheel needs."""
+    window: float = 4.0
+    """nat; hypotheses further below the best are not refitted: 2 per cent of its probability."""
+
+    @property
+    def effect_log_odds(self) -> float:
+        """Log of `effect_odds`."""
+        return math.log(self.effect_odds)
+
+    @property
+    def unlisted_log_odds(self) -> float:
+        """Log of `unlisted_odds`."""
+        return math.log(self.unlisted_odds)
+
+
+class MeasuredForm(Form):
+    """A form of a model beside its measurements.
+
+    Attributes:
+      observations: what was measured.
+      coordinates: everything that a refit may move. baseline: places of those of the model as it is.
+      candidates: places by effect that may be missing.
+      words: fields of discrepancy, and what is "good to so many per cent" in the user's words.
+      shares: what a field's size is "good to", over that size, where not 1.
+    """
+
+    observations: Observations
+    coordinates: tuple[Coordinate, ...]
+    baseline: np.ndarray
+    candidates: Mapping[str, np.ndarray]
+    words: Mapping[str, str]
+    shares: Mapping[str, float] = MappingProxyType({})
+
+    @abc.abstractmethod
+    def predicted(self, u: np.ndarray) -> np.ndarray:
+        """(n,) predictions in SI units at (coordinates,)."""
+
+    def corrected(self, best: Hypothesis) -> tuple[np.ndarray, np.ndarray] | None:
+        """Predictions (n,) and whitened residuals (n,) with what is learnt of discrepancy, where a form can tell."""
+        del best
+        return None
+
+    def signatures(self, refit: Refit) -> dict[str, np.ndarray]:
+        """(fitted,) whitened signature of each effect at its prior size, where told."""
+        del refit
+        return {}
+
+    def origin(self) -> np.ndarray:
+        """(coordinates,) the model as given."""
+        return np.zeros(len(self.coordinates))
+
+    def residual(self, u: np.ndarray) -> np.ndarray:
+        """(n,) whitened residuals, measured less predicted."""
+        return self.observations.whiten(self.observations.value - self.predicted(u))
+
+    def listed(self, effects: frozenset[str]) -> frozenset[Term]:
+        """The terms of some effects."""
+        return frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """Measurements of a run and everything that they are held against.
+
+    Attributes:
+      forms: rival forms of the model, its own first. effects: candidates by name.
+      not_tested: candidates that these measurements cannot show.
+      settings: how rare things are, what a verdict needs, effort.
+      unused: what the logs hold and nothing reads, as one sentence; empty if all is read.
+    """
+
+    forms: Sequence[MeasuredForm]
+    effects: Mapping[str, Effect]
+    not_tested: tuple[NotTested, ...]
+    settings: SearchSettings
+    unused: str = ""
+
+    @property
+    def own(self) -> MeasuredForm:
+        """The form of the model as given."""
+        return self.forms[0]
+
+    def form(self, name: str) -> MeasuredForm:
+        """The form of a name."""
+        return next(f for f in self.forms if f.name == name)
