@@ -28,6 +28,9 @@ def test_the_demonstration_writes_its_page_and_its_numbers(tmp_path):
     assert names == ["paper", "consistent", "paper, refitted", "consistent, refitted"]
     scores = {case["name"]: case["comparison"]["overall"] for case in numbers["wheel"]}
     assert scores["consistent"] < scores["paper"]
+    husky = numbers["husky"]
+    assert husky["error_after"]["fit"] < husky["error_before"]["fit"]
+    assert "BorealTC" in html or "LaRocque" in html
     assert numbers["wheel"][0]["fit"] is None and numbers["wheel"][3]["fit"]["values"]["soil"]["n"] > 0
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-NAMES = ("drive_a_rover", "own_terrain", "own_rover", "find_missing_effect", "train_td3")
+NAMES = ("drive_a_rover", "own_terrain", "own_rover", "find_missing_effect", "your_rovers_log", "train_td3")
 
 
 def cells(name: str) -> list[tuple[str, str]]:

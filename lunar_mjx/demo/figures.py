@@ -14,6 +14,7 @@ from plotly.subplots import make_subplots
 from lunar_mjx.cameras.relief import relief, rocks_within
 from lunar_mjx.criticism import SteadyStateTable, replicate_scatter
 from lunar_mjx.demo.drive import Drive
+from lunar_mjx.demo.husky import HuskyCase
 from lunar_mjx.demo.wheel import Case, dense_curves
 from lunar_mjx.report.style import BLUE, INK, MEASURED, SERIES, VERMILION, Series, faded, finish
 from lunar_mjx.terrain import Terrain
@@ -164,6 +165,35 @@ def headline_figure(cases: Sequence[Case]) -> go.Figure:
         tickvals=[1, 2, 5, 10, 20, 50],
     )
     figure.update_yaxes(type="category", autorange="reversed", automargin=True, showgrid=False)
+    return figure
+
+
+def husky_figure(case: HuskyCase) -> go.Figure:
+    """The current of a real Husky's left motor on sandy loam, measured and by the model before and after."""
+    figure = go.Figure()
+    for name, values, look in (
+        ("as fitted on the floor", case.before, SERIES[1]),
+        ("with soft ground", case.after, SERIES[2]),
+    ):
+        figure.add_scatter(
+            x=case.time.round(2),
+            y=values.round(2),
+            mode="lines",
+            name=name,
+            line={"color": look.colour, "dash": look.dash, "width": 2},
+            hovertemplate=f"{name}: %{{y:.1f}} A<extra></extra>",
+        )
+    figure.add_scatter(
+        x=case.time.round(2),
+        y=case.measured.round(2),
+        mode="markers",
+        name="measured",
+        marker={"color": MEASURED.colour, "size": 5, "symbol": MEASURED.symbol},
+        hovertemplate="measured: %{y:.1f} A<extra></extra>",
+    )
+    finish(figure, 360, margin={"l": 60, "r": 24, "t": 48, "b": 52})
+    figure.update_xaxes(title_text="time, s")
+    figure.update_yaxes(title_text="current of the left motor, A", rangemode="tozero")
     return figure
 
 

@@ -13,10 +13,12 @@ import numpy as np
 
 from lunar_mjx.demo.drive import Drive, drive
 from lunar_mjx.demo.figures import ROVERS
+from lunar_mjx.demo.husky import HuskyCase, husky_case
 from lunar_mjx.demo.sections import (
     LEAD,
     driving_section,
     headline_section,
+    husky_section,
     provenance_section,
     verdict,
     versions,
@@ -70,9 +72,11 @@ def run_demo(
             tell = _part(report, what, done + 0.85 * share, 0.15 * share)
             drives.append(drive(name, rovers, seconds, seed, terrain, tell, shift=0.5 * i))
             done += share
-        cases = wheel_cases(starts, seed, _part(report, "wheel against test bed", done, 0.95 - done))
+        share = 0.5 * (0.95 - done)
+        cases = wheel_cases(starts, seed, _part(report, "wheel against test bed", done, share))
+        husky = husky_case(seed, _part(report, "a real Husky's drive", done + share, share))
         report("writing the page", 0.95)
-        page = _write(out, drives, cases, terrain, seed, begun)
+        page = _write(out, drives, cases, husky, terrain, seed, begun)
         report("done", 1.0)
     return page
 
@@ -81,8 +85,11 @@ def _part(report: Reporter, what: str, start: float, share: float) -> Any:
     return lambda done: report(what, start + share * done)
 
 
-def _write(out: Path, drives: Sequence[Drive], cases: Sequence[Case], terrain: Any, seed: int, begun: float) -> Path:
+def _write(
+    out: Path, drives: Sequence[Drive], cases: Sequence[Case], husky: HuskyCase, terrain: Any, seed: int, begun: float
+) -> Path:
     sections = [
+        husky_section(husky),
         driving_section(drives, terrain),
         wheel_section(cases),
         provenance_section(cases[0].comparison.table, terrain.name, seed),
@@ -92,6 +99,7 @@ def _write(out: Path, drives: Sequence[Drive], cases: Sequence[Case], terrain: A
         "verdict": verdict(drives, cases),
         "drives": [summary(d) for d in drives],
         "wheel": [case.to_dict() for case in cases],
+        "husky": husky.to_dict(),
         "terrain": terrain.name,
         "seed": seed,
         "versions": versions(),

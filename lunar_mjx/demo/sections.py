@@ -12,7 +12,16 @@ import numpy as np
 from lunar_mjx._version import __version__
 from lunar_mjx.criticism import SteadyStateTable
 from lunar_mjx.demo.drive import Drive
-from lunar_mjx.demo.figures import CASE_LABELS, ROVERS, headline_figure, history_figure, paths_figure, wheel_figure
+from lunar_mjx.demo.figures import (
+    CASE_LABELS,
+    ROVERS,
+    headline_figure,
+    history_figure,
+    husky_figure,
+    paths_figure,
+    wheel_figure,
+)
+from lunar_mjx.demo.husky import HuskyCase
 from lunar_mjx.demo.wheel import Case
 from lunar_mjx.report.page import Facts, Figure, Lead, Pair, Section, Table, Text
 from lunar_mjx.terrain import Terrain
@@ -66,6 +75,27 @@ def headline_section(cases: Sequence[Case]) -> Section:
         "well a repeated run agrees. Refitting the soil helps and does not suffice: lunar-mjx why says what is missing."
     )
     return Section("How far the wheel models are from the measurements", [Figure(headline_figure(cases), caption)])
+
+
+def husky_section(case: HuskyCase) -> Section:
+    """A real drive: measured against the model before and after an effect was added."""
+    caption = (
+        "The current of a Husky's left motor on sandy loam. The wheels turn as measured; the model was fitted on a "
+        "hard floor, and then soft ground took the floor's place. Gaps lie between windows of two seconds."
+    )
+    told = {"fit": "fitted windows", "held_out": "held-out windows"}
+    steps = (case.error_before, case.error_refitted, case.error_after)
+    rows = [[told[k], *(f"{s[k]:.2f}" for s in steps)] for k in told if k in case.error_before]
+    header = ["", "as fitted on the floor", "refitted", "with soft ground"]
+    table = Table("Error in standard deviations of the noise, all channels", header, rows)
+    credit = "; ".join(case.source[k] for k in ("who", "citation", "licence") if k in case.source)
+    words = (
+        f"Measurements: {credit}. Your own rover's log takes the same way: lunar-mjx log import, compare, why, add "
+        "(docs/tutorials/your_rovers_log.md)."
+    )
+    return Section(
+        "A real rover's drive, before and after", [Figure(husky_figure(case), caption), table, Text([words])]
+    )
 
 
 def _drove(d: Drive) -> str:

@@ -93,6 +93,20 @@ def on_a_plane(model: Model) -> Model:
     return model.replace(terrain=flat(8.0))
 
 
+def require_drives_alone(model: Model) -> None:
+    """Refuses rovers whose wheels are steered or sprung by actuators.
+
+    Raises:
+      UserError: the rover has joints beside its drives, which imposed wheel speeds do not move.
+    """
+    if any(g.name != "drive" for g in model.rover.groups):
+        joints = ", ".join(j for g in model.rover.groups if g.name != "drive" for j in g.joints)
+        raise UserError(
+            f"{model.rover.name}: imposed wheel speeds need a rover whose drives are its only joints, and it has "
+            f"{joints}; leave `imposed` out of log.toml, so that its commands are simulated."
+        )
+
+
 class KinematicDrive:
     """A model whose wheels move as they were measured.
 
@@ -113,12 +127,7 @@ class KinematicDrive:
         Raises:
           UserError: the rover has other joints, which imposed wheel speeds do not move.
         """
-        if any(g.name != "drive" for g in model.rover.groups):
-            joints = ", ".join(j for g in model.rover.groups if g.name != "drive" for j in g.joints)
-            raise UserError(
-                f"{model.rover.name}: imposed wheel speeds need a rover whose drives are its only joints, and it has "
-                f"{joints}; simulate its commands instead."
-            )
+        require_drives_alone(model)
         self.steps = max(1, int(np.ceil(bin_s / longest_step_s - 1e-9)))
         self.bin_s = bin_s
         self.model = on_a_plane(model).replace(timestep=bin_s / self.steps)

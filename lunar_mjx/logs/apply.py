@@ -25,9 +25,9 @@ def log_modes(log: Log, model: Model) -> dict[str, str]:
     """
     modes: dict[str, str] = {}
     names = set(log.channel_names)
-    channels = dict(zip(model.rover.joints, joint_channels(model.rover), strict=True))
+    channels = _channels_by_joint(model)
     for group in model.rover.groups:
-        found = [m for m in MODES if any(_command(channels[j], m) in names for j in group.joints)]
+        found = [m for m in MODES if any(_command(c, m) in names for j in group.joints for c in channels[j])]
         if len(found) > 1:
             shown = ", ".join(f"command_*_{_KIND[group.name]}_{COMMAND_UNITS[m]}" for m in found)
             raise bad_input(
@@ -42,6 +42,18 @@ def log_modes(log: Log, model: Model) -> dict[str, str]:
     return modes
 
 
+def _channels_by_joint(model: Model) -> dict[str, tuple[str, ...]]:
+    """Names under which a log may command each joint, its own first, such as (`lf_drive`, `left_drive`).
+
+    Wheels that share a motor (`DriveGroup`) share its command, which rovers log once, for the motor.
+    """
+    rover = model.rover
+    return {
+        joint: (own, *(f"{g.name}_{_KIND['drive']}" for g in rover.drive_groups if joint in g.joints))
+        for joint, own in zip(rover.joints, joint_channels(rover), strict=True)
+    }
+
+
 def _command(channel: str, mode: str) -> str:
     return f"command_{channel}_{COMMAND_UNITS[mode]}"
 
@@ -49,8 +61,9 @@ def _command(channel: str, mode: str) -> str:
 def commands(log: Log, model: Model) -> tuple[Commands, float]:
     """The log's commands as the simulator takes them: zero-order hold on whole time steps.
 
-    A joint without a command channel is commanded 0 in its group's mode. A gap holds the command before it; before
-    the first command, the first one holds.
+    Wheels of one motor may be commanded by its channel, such as `command_left_drive_speed_rad_s`. A joint without a
+    command channel is commanded 0 in its group's mode. A gap holds the command before it; before the first command,
+    the first one holds.
 
     Args:
       log: a drive log.
@@ -81,7 +94,7 @@ def commands(log: Log, model: Model) -> tuple[Commands, float]:
                 "make the model with log_model(log, model)",
             )
     start, end = log.span_s
-    names = _command_names(model)
+    names = _command_names(log, model)
     interval = _interval([log.table_of(n) for n in names if log.table_of(n) is not None], model.timestep)
     grid = start + interval * np.arange(max(1, int(np.floor((end - start) / interval + 1e-6)) + 1))
     values = np.zeros((len(grid), len(names)))
@@ -92,9 +105,16 @@ def commands(log: Log, model: Model) -> tuple[Commands, float]:
     return Commands(values, interval), start
 
 
-def _command_names(model: Model) -> list[str]:
-    modes = [model.modes[group.name] for group in model.rover.groups for _ in group.joints]
-    return [_command(c, m) for c, m in zip(joint_channels(model.rover), modes, strict=True)]
+def _command_names(log: Log, model: Model) -> list[str]:
+    """Command channel of each joint in the order of the controls: the first of its names that the log has."""
+    channels = _channels_by_joint(model)
+    logged = set(log.channel_names)
+    names = []
+    for group in model.rover.groups:
+        for joint in group.joints:
+            own = [_command(c, model.modes[group.name]) for c in channels[joint]]
+            names.append(next((n for n in own if n in logged), own[0]))
+    return names
 
 
 def hold(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:

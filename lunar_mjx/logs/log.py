@@ -98,7 +98,7 @@ class Log:
       problems: what reading found wrong; `check` passes them on.
       imposed: "wheel_speed" where the measured wheel speeds are taken as what the wheels did; None where the commands
         are what drove the rover.
-      magnitudes: channels that hold a size without its sign.
+      magnitudes: channels that hold a size without its sign, with what each reads where there is nothing, in its unit.
       ground: what was driven on, in the user's words; nothing is computed from it.
       geodetic_origin: latitude_deg, longitude_deg and projection of the point from which positions count, if stated.
     """
@@ -120,7 +120,7 @@ class Log:
     terrain_origin_m: tuple[float, float] = (0.0, 0.0)
     problems: tuple[Finding, ...] = ()
     imposed: str | None = None
-    magnitudes: frozenset[str] = frozenset()
+    magnitudes: Mapping[str, float] = dataclasses.field(default_factory=dict)
     ground: str = ""
     geodetic_origin: Mapping[str, float | str] = dataclasses.field(default_factory=dict)
 

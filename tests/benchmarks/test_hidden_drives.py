@@ -1,4 +1,4 @@
-"""A fixed part of the hidden-effect benchmark: short drives, asked about three effects; one of them in every test."""
+"""A fixed part of the hidden-effect benchmark: short drives, asked about three effects."""
 
 from __future__ import annotations
 
@@ -15,13 +15,10 @@ SHORT = drives.MANOEUVRES[:3]
 ASKED = ("coulomb_friction", "iron_loss", "rolling_resistance")
 
 
-@pytest.mark.optimised
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("group", "number", "verdict", "named"),
-    [
-        pytest.param("nulls", 0, Verdict.NOISE_ONLY, (), marks=pytest.mark.slow),
-        ("singles", 2, Verdict.KNOWN, ("iron_loss",)),
-    ],
+    [("nulls", 0, Verdict.NOISE_ONLY, ()), ("singles", 2, Verdict.KNOWN, ("iron_loss",))],
 )
 def test_short_drives_are_answered(
     tmp_path: Path, group: str, number: int, verdict: Verdict, named: tuple[str, ...]

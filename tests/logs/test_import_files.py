@@ -331,7 +331,7 @@ def test_the_example_is_imported_and_passes_the_gate(run: Run, tmp_path: Path) -
     assert run("log", "check", tmp_path / "log").status == 0
     floor, sand = drive(tmp_path / "log" / "floor"), drive(tmp_path / "log" / "sand")
     assert floor.imposed == "wheel_speed" and floor.ground == "x"
-    assert floor.magnitudes == {"motor_left_drive_current_A", "motor_right_drive_current_A"}
+    assert floor.magnitudes == {"motor_left_drive_current_A": 0.6, "motor_right_drive_current_A": 0.6}
     assert set(floor.tables) == {"drive", "imu"} and sand.tables["imu"].rate_hz == pytest.approx(100.0)
 
     def vertical(log: Log) -> float:

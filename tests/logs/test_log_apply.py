@@ -131,3 +131,15 @@ def test_refused(base: Model, tmp_path: Path) -> None:
         commands(torque, base)
     with pytest.raises(UserError, match="is not the model's rover"):
         log_model(make_log(tmp_path / "d"), make_model("viper", "flat"))
+
+
+def test_wheels_of_one_motor_follow_its_command(tmp_path: Path) -> None:
+    husky = make_model("husky", "flat")
+    sides = {"command_left_drive_speed_rad_s": [1.0, 1.0], "command_right_drive_speed_rad_s": [-2.0, -2.0]}
+    frame = pd.DataFrame({"time_s": [0.0, 0.05], **sides})
+    write_log(tmp_path / "a", {"drive": frame}, rover="husky")
+    log = read_log(tmp_path / "a")
+    assert isinstance(log, Log)
+    driven, _ = commands(log, log_model(log, husky))
+    corners = [w.corner for w in husky.rover.wheels]
+    assert driven.values[0].tolist() == [1.0 if c.startswith("l") else -2.0 for c in corners]

@@ -152,6 +152,18 @@ def test_replicates_contradict_the_stated_noise(scale: float, tmp_path: Path) ->
     assert ratio * scale == pytest.approx(1.0, rel=0.4)
 
 
+def test_noise_that_grows_with_its_quantity_is_rarely_a_wrong_statement(tmp_path: Path) -> None:
+    refused = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        frame = points(seed)
+        size = np.geomspace(0.02, 10.0, 14)[frame.groupby(["slip_angle_deg", "slip_ratio"]).ngroup()]
+        frame["drawbar_pull_N"] += STD["drawbar_pull_N"] * size * rng.standard_normal(len(frame))
+        refused += is_bad(check(make(tmp_path / str(seed), frame)))
+    # Fourteen points tell their median scatter to a fifth: one table in fifty is refused by chance (20,000 draws).
+    assert refused <= 2
+
+
 def test_a_gap_in_what_was_measured_is_left_out(tmp_path: Path) -> None:
     log = make(tmp_path / "a", cell("sinkage_m", 7, float("nan"))(points()))
     assert len(log.table) == 41 and 7 not in log.rows

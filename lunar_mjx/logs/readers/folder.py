@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -170,24 +171,29 @@ def _imposed(top: Fields, channels: Sequence[str]) -> str | None:
     return imposed
 
 
-def _magnitudes(top: Fields, channels: Sequence[str]) -> frozenset[str]:
-    """Channels without sign; a pattern with `*` means all that it matches."""
+def _magnitudes(top: Fields, channels: Sequence[str]) -> dict[str, float]:
+    """Channels without sign, with what each reads where there is nothing; a pattern with `*` means all it matches."""
     stated = top.values.get("magnitudes", [])
-    if not isinstance(stated, list) or not all(isinstance(v, str) for v in stated):
+    floors = (
+        dict.fromkeys(stated, 0.0) if isinstance(stated, list) and all(isinstance(v, str) for v in stated) else stated
+    )
+    if not isinstance(floors, dict) or not all(
+        isinstance(v, int | float) and not isinstance(v, bool) and 0.0 <= v < math.inf for v in floors.values()
+    ):
         raise bad_input(
             top.path,
             "magnitudes",
             stated,
-            "is not a list of channels",
-            'write magnitudes = ["motor_left_drive_current_A"]',
+            "is neither a list of channels nor a table of what they read at zero",
+            'write magnitudes = ["motor_left_drive_current_A"], or { "motor_left_drive_current_A" = 0.6 }',
         )
-    found = []
-    for name in stated:
+    found = {}
+    for name, floor in floors.items():
         matches = [c for c in channels if fnmatchcase(c, name)]
         if not matches and find_channel(name) is None:
             raise bad_input(top.path, "magnitudes", name, "is no channel", "correct its name or leave it out")
-        found += matches
-    return frozenset(found)
+        found |= dict.fromkeys(matches, float(floor))
+    return found
 
 
 def _geodetic_origin(fields: Fields) -> dict[str, float | str]:

@@ -144,7 +144,9 @@ def _settings(drive: RecordedDrive, mapping: ImportMap, changes: Mapping[str, An
     settings = _merged(settings, {k: v for k, v in (changes or {}).items() if k != "rover"})
     channels = {c for frame in drive.tables.values() for c in frame.columns}
     if "magnitudes" in settings:
-        settings["magnitudes"] = [m for m in settings["magnitudes"] if _names(m, channels)]
+        stated = settings["magnitudes"]
+        kept = [m for m in stated if _names(m, channels)]
+        settings["magnitudes"] = {m: stated[m] for m in kept} if isinstance(stated, Mapping) else kept
     if not any(c.startswith("joint_") and c.endswith("_drive_speed_rad_s") for c in channels):
         settings.pop("imposed", None)
     return {**settings, "source": {**settings.get("source", {}), **drive.source}}

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lunar_mjx.dynamics.imposed import Windows
 from lunar_mjx.errors import UserError
@@ -15,12 +16,24 @@ WINDOW_S = 2.0
 """Length of a window: short beside a drive, long beside the 0.1 s in which loads and yaw rate settle."""
 SHORTEST_BIN_S = 0.1
 """Faster samples are averaged: currents at 100 Hz show the ripple of gears, which nobody models."""
+SLOW_S, SLOW_BINS = 0.4, 10
+"""Interval of wheel speeds from which they are known only about each reading: windows then lie about the readings, and
+have so many samples of what is measured faster."""
 LEVELLING_S = 1.0
 """Span over which an accelerometer is averaged to tell the slope: longer than a wheel takes over a stone, shorter than
 the rover takes into another slope."""
 STRATA = (0.05, 0.3)
 """Bounds between standing, slow and fast, m/s, of the mean and of half the difference of the sides' rim speeds."""
-CHANNELS = ("motor_left_drive_current_A", "motor_right_drive_current_A", "gyro_z_rad_s")
+CURRENTS = ("motor_left_drive_current_A", "motor_right_drive_current_A")
+GYRO, AHEAD = "gyro_z_rad_s", "body_velocity_x_m_s"
+CHANNELS = (*CURRENTS, GYRO, AHEAD)
+"""What windows are judged by, as far as a log tells it: currents of the sides (or of their wheels), yaw rate (or
+heading), and speed over ground along the chassis (or positions with a heading)."""
+SPEED_SPAN_S, MOST_SPAN = 0.5, 5.0
+"""Time between two positions that tell a speed, and the most over it: poses by lidar come up to 0.1 s early or late, so
+that neighbours would tell 6 m/s of a rover that drives 1 m/s (DRIVE)."""
+UNKNOWN_HEADING_DEG = 20.0
+"""Standard deviation of an IMU's mounting about the vertical from which its heading has no known zero."""
 SIDES = ("left", "right")
 
 
@@ -32,8 +45,12 @@ class Cut:
       log: (window,) number of the log. start_s: (window,) time of its first sample on the log's clock.
       interval_s: between samples. imposed: speeds and slopes at the edges of half intervals.
       measured: by channel (window, sample), NaN where nothing was measured.
-      magnitude: channels that hold sizes without sign.
+      magnitude: channels that hold sizes without sign, with what they read where there is nothing.
       available: number of windows from which these were drawn.
+      recording: (window,) number of the recording that the log was cut from; None: every log is one.
+      clocks: offset of the IMU's clock and its standard deviation by number of the log, s, where the log's own were
+        not known well; the windows are cut with it.
+      unlevelled: numbers of logs that measure neither acceleration nor attitude: their ground is taken as level.
     """
 
     log: np.ndarray
@@ -41,8 +58,11 @@ class Cut:
     interval_s: float
     imposed: Windows
     measured: dict[str, np.ndarray]
-    magnitude: frozenset[str]
+    magnitude: Mapping[str, float]
     available: int
+    recording: np.ndarray | None = None
+    clocks: Mapping[int, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    unlevelled: frozenset[int] = frozenset()
 
     def __len__(self) -> int:
         return len(self.log)
@@ -51,6 +71,21 @@ class Cut:
     def samples(self) -> int:
         """Samples of a window."""
         return next(iter(self.measured.values())).shape[1]
+
+    @property
+    def seconds(self) -> float:
+        """Length of a window, s."""
+        return self.samples * self.interval_s
+
+    @property
+    def recordings(self) -> np.ndarray:
+        """(window,) number of the recording that a window belongs to: one ground, one day, one warmth of the drives."""
+        return self.log if self.recording is None else self.recording
+
+    @property
+    def channels(self) -> frozenset[str]:
+        """Channels that are measured in some window."""
+        return frozenset(c for c, v in self.measured.items() if np.isfinite(v).any())
 
 
 def cut(logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, seed: int = 0) -> Cut:
@@ -64,85 +99,266 @@ def cut(logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, se
       seed: of the draw.
 
     Raises:
-      UserError: no log is long enough, or they are sampled too differently.
+      UserError: no log is long enough, or tells anything that the windows could be judged by.
     """
-    intervals = [float(np.median(np.diff(_speeds(log, "left")[0]))) for log in logs]
+    speeds = [[_speed(log, j) for j in joints] for log in logs]
+    intervals = [float(np.median(np.diff(s[0][0]))) for s in speeds]
     interval = max(SHORTEST_BIN_S, float(np.median(intervals)))
-    parts = [_windows(n, log, joints, radius, interval) for n, log in enumerate(logs)]
+    slow = interval > SLOW_S
+    interval = WINDOW_S / SLOW_BINS if slow else interval
+    clocks = {}
+    for n, log in enumerate(logs):
+        found = imu_clock(log, *_sides(speeds[n], joints))
+        if found is not None:
+            clocks[n] = found
+    parts = [
+        _windows(n, log, joints, speeds[n], radius, interval, slow, clocks.get(n, (0.0, 0.0))[0])
+        for n, log in enumerate(logs)
+    ]
     whole = [np.concatenate(column) for column in zip(*parts, strict=True)]
     log, start, speed, up, yaw, values = whole
     if not len(log):
         raise UserError(
             f"{logs[0].folder}: no window of {WINDOW_S:g} s has wheel speeds without a gap; give longer logs."
         )
-    chosen = _stratified(speed, radius, log, most, np.random.default_rng(seed))
+    if not np.isfinite(values).any():
+        raise UserError(
+            f"{logs[0].folder}: measures nothing that imposed wheel speeds could be judged by; give motor currents, "
+            f"gyro_z_rad_s or yaw_deg, or {AHEAD}."
+        )
+    moving = np.abs(radius * speed).mean(axis=(1, 2)) > STANDING_M_S
+    if not moving.any():
+        raise UserError(f"{logs[0].folder}: the wheels turn in no window of {WINDOW_S:g} s; give logs of driving.")
+    left = np.array([j.startswith("l") for j in joints])
+    rim_left, rim_right = (radius * speed[..., mine].mean(axis=(1, 2)) for mine in (left, ~left))
+    chosen = _stratified(rim_left, rim_right, moving, log, most, np.random.default_rng(seed))
     measured = {c: values[chosen, k] for k, c in enumerate(CHANNELS)}
-    magnitude = frozenset(
-        c for c in CHANNELS if any(c in log.magnitudes or _matches(c, log.magnitudes) for log in logs)
-    )
     imposed = Windows(speed[chosen], up[chosen, :, 0], up[chosen, :, 1], up[chosen, :, 2], yaw[chosen])
-    return Cut(log[chosen], start[chosen], interval, imposed, measured, magnitude, len(log))
+    return Cut(
+        log[chosen],
+        start[chosen],
+        interval,
+        imposed,
+        measured,
+        _magnitudes(logs),
+        len(log),
+        _recordings(logs)[log[chosen]],
+        clocks,
+        frozenset(n for n, g in enumerate(logs) if not _leans(g)),
+    )
 
 
-def _matches(channel: str, patterns: frozenset[str]) -> bool:
-    from fnmatch import fnmatchcase
-
-    return any(fnmatchcase(channel, p) for p in patterns)
+STANDING_M_S = 0.02
+"""Mean size of the rims' speeds below which a rover stands."""
 
 
-def _speeds(log: Log, side: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times s and speeds rad/s of a side, or of the first wheel of it."""
-    for corner in (side, side[0] + "f", side[0] + "m", side[0] + "r"):
-        found = log.channel(f"joint_{corner}_drive_speed_rad_s")
+def _recordings(logs: Sequence[Log]) -> np.ndarray:
+    """(log,) number of the recording of every log: logs that were cut from the same files share one."""
+    keys = [(log.folder.resolve().parent, log.source.get("files", log.name)) for log in logs]
+    return np.array([keys.index(k) for k in keys])
+
+
+def _magnitudes(logs: Sequence[Log]) -> dict[str, float]:
+    """Channels without sign, with what they read where there is nothing; a side's from those of its wheels."""
+    found: dict[str, float] = {}
+    for log in logs:
+        for channel in CHANNELS:
+            mine = [channel] if channel in log.magnitudes else _of_wheels(log, channel)
+            floors = [log.magnitudes[c] for c in mine if c in log.magnitudes]
+            if floors:
+                found[channel] = float(sum(floors))
+    return found
+
+
+def _speed(log: Log, joint: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times s and speeds rad/s of a wheel: its own, its side's, or those of another wheel of its side."""
+    side = "left" if joint.startswith("l") else "right"
+    for name in (joint, f"{side}_drive", *(f"{side[0]}{row}_drive" for row in "fmr")):
+        found = log.channel(f"joint_{name}_speed_rad_s")
         if found is not None and len(found[0]) > 2:
             return found
     raise UserError(f"{log.folder}: has no wheel speeds of the {side} side, which imposed motion needs.")
 
 
-def _windows(number: int, log: Log, joints: Sequence[str], radius: float, interval: float) -> tuple[np.ndarray, ...]:
+def _sides(
+    speeds: Sequence[tuple[np.ndarray, np.ndarray]], joints: Sequence[str]
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Times and speeds of the first wheel of either side."""
+    left, right = (next(s for s, j in zip(speeds, joints, strict=True) if j.startswith(c)) for c in "lr")
+    return left, right
+
+
+LAG_STEP_S, INDEPENDENT_S = 0.02, 0.5
+"""Steps in which clocks are laid against each other; time after which what a gyroscope shows beyond the wheels'
+turning is another matter, so that so many seconds count as one measurement."""
+
+
+def imu_clock(
+    log: Log, left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray, np.ndarray]
+) -> tuple[float, float] | None:
+    """What has to be added to the times of the IMU's table, s, and its standard deviation.
+
+    The yaw rate follows the difference of the sides, so that both clocks can be laid over each other wherever the rover
+    turns. The log's own uncertainty is the prior, three standard deviations the furthest.
+
+    Args:
+      log: a drive. left, right: times s and speeds rad/s of the sides.
+
+    Returns:
+      None where the yaw rate is in the table of the wheel speeds, or the log states its clock as exact.
+    """
+    table = log.table_of(GYRO)
+    stated = table.clock_offset_std_s if table is not None else 0.0
+    yaw = log.channel(GYRO)
+    if yaw is None or stated <= 0.0 or len(yaw[0]) < 10:
+        return None
+    width = max(SHORTEST_BIN_S, float(np.median(np.diff(left[0]))))
+    reach = 3.0 * stated
+    grid = np.arange(max(left[0][0], right[0][0]) + reach, min(left[0][-1], right[0][-1]) - reach, LAG_STEP_S)
+    if len(grid) * LAG_STEP_S < 10.0 * INDEPENDENT_S:
+        return 0.0, stated
+    turn = np.interp(grid, *right) - np.interp(grid, *left)
+    lags = np.arange(-reach, reach + 0.5 * LAG_STEP_S, LAG_STEP_S)
+    left_over = np.zeros(len(lags))
+    for k, lag in enumerate(lags):
+        seen = _means(yaw[0] + lag, yaw[1], grid, width)
+        ok = np.isfinite(seen)
+        if ok.mean() < 0.5:
+            left_over[k] = np.inf
+            continue
+        columns = np.column_stack([turn[ok], np.ones(ok.sum())])
+        fitted = columns @ np.linalg.lstsq(columns, seen[ok], rcond=None)[0]
+        left_over[k] = np.mean((seen[ok] - fitted) ** 2)
+    count = len(grid) * LAG_STEP_S / INDEPENDENT_S
+    score = -0.5 * count * np.log(np.maximum(left_over, 1e-12)) - 0.5 * (lags / stated) ** 2
+    weight = np.exp(score - score.max())
+    weight /= weight.sum()
+    mean = float(weight @ lags)
+    return mean, float(max(np.sqrt(weight @ (lags - mean) ** 2), 0.5 * LAG_STEP_S))
+
+
+def _windows(
+    number: int,
+    log: Log,
+    joints: Sequence[str],
+    speeds: Sequence[tuple[np.ndarray, np.ndarray]],
+    radius: float,
+    interval: float,
+    slow: bool,
+    clock_s: float,
+) -> tuple[np.ndarray, ...]:
     """All windows of a log: number, start, speeds at edges, up at edges, yaw rate, and measurements."""
-    left, right = _speeds(log, "left"), _speeds(log, "right")
+    left, right = _sides(speeds, joints)
     count = max(3, round(WINDOW_S / interval))
-    starts: list[float] = []
-    for first, last in _stretches(left[0], interval):
-        for at in np.arange(first, last - (count - 1.01) * interval, count * interval):
-            if _covered(right[0], at + interval * np.arange(count), interval):
-                starts.append(float(at))
-    start = np.array(starts)
+    start = np.array(_about_readings(left[0], right[0]) if slow else _in_stretches(left[0], right[0], interval, count))
+    if slow:
+        start = start + 0.5 * interval
     half = 0.5 * interval
     edges = start[:, None] - half + half * np.arange(2 * count + 1)
-    sides = {side: np.interp(edges, *s) for side, s in zip(SIDES, (left, right), strict=True)}
-    speed = np.stack([sides["left" if j.startswith("l") else "right"] for j in joints], axis=-1)
-    up = _up(log, edges, (left, right), radius)
+    speed = np.stack([np.interp(edges, *s) for s in speeds], axis=-1)
+    up = _up(log, edges, (left, right), radius, clock_s)
     times = start[:, None] + interval * np.arange(count)
-    own = {"motor_left_drive_current_A": ("l",), "motor_right_drive_current_A": ("r",)}
+    imu = log.table_of(GYRO)
     values = []
     for channel in CHANNELS:
         found = log.channel(channel)
-        if found is None and channel in own:
-            found = _sum_of_wheels(log, own[channel][0])
-        if found is None and channel == "gyro_z_rad_s":
+        if found is not None and imu is not None and channel in imu.channels:
+            found = found[0] + clock_s, found[1]
+        if channel == GYRO and found is not None:
+            found = _upright(log, found)
+        if found is None and channel in CURRENTS:
+            found = _sum_of_wheels(log, channel)
+        if found is None and channel == GYRO:
             found = _turning(log)
+        if found is None and channel == AHEAD:
+            found = _over_ground(log)
         values.append(np.full(times.shape, np.nan) if found is None else _means(*found, times, interval))
     values = np.stack(values, axis=1) if len(start) else np.zeros((0, len(CHANNELS), count))
-    begun = values[:, 2, 0] if len(start) else np.zeros(0)
+    begun = values[:, CHANNELS.index(GYRO), 0] if len(start) else np.zeros(0)
     base = np.where(np.isfinite(begun), begun, 0.0)
     return np.full(len(start), number), start, speed, up, base, values
 
 
-def _sum_of_wheels(log: Log, side: str) -> tuple[np.ndarray, np.ndarray] | None:
-    found = [log.channel(f"motor_{side}{row}_drive_current_A") for row in "fmr"]
-    found = [f for f in found if f is not None]
-    return (found[0][0], sum(np.interp(found[0][0], *f) for f in found)) if found else None  # type: ignore[return-value]
+def _in_stretches(left: np.ndarray, right: np.ndarray, interval: float, count: int) -> list[float]:
+    """Starts of windows that lie one after another wherever both sides' speeds have no gap."""
+    starts: list[float] = []
+    for first, last in _stretches(left, interval):
+        for at in np.arange(first, last - (count - 1.01) * interval, count * interval):
+            if _covered(right, at + interval * np.arange(count), interval):
+                starts.append(float(at))
+    return starts
+
+
+def _about_readings(left: np.ndarray, right: np.ndarray) -> list[float]:
+    """Starts of windows about readings of speeds that come slowly: each between its neighbours, none over another."""
+    usual = float(np.median(np.diff(left)))
+    starts: list[float] = []
+    for before, at, after in zip(left[:-2], left[1:-1], left[2:], strict=True):
+        near = after - before < 2.0 * 1.6 * usual and np.abs(right - at).min() < 0.5 * usual
+        if near and (not starts or at - 0.5 * WINDOW_S >= starts[-1] + WINDOW_S):
+            starts.append(float(at - 0.5 * WINDOW_S))
+    return starts
+
+
+def _of_wheels(log: Log, channel: str) -> list[str]:
+    """The channels of a side's wheels in the place of the side's own."""
+    if channel not in CURRENTS:
+        return []
+    side = "l" if channel == CURRENTS[0] else "r"
+    known = log.channel_names
+    return [c for c in (f"motor_{side}{row}_drive_current_A" for row in "fmr") if c in known]
+
+
+def _sum_of_wheels(log: Log, channel: str) -> tuple[np.ndarray, np.ndarray] | None:
+    parts = [log.channel(c) for c in _of_wheels(log, channel)]
+    found = [f for f in parts if f is not None and len(f[0]) > 1]
+    if not found:
+        return None
+    return found[0][0], np.sum([np.interp(found[0][0], *f) for f in found], axis=0)
+
+
+def _upright(log: Log, found: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The yaw rate about the chassis's z axis, where the IMU is mounted askew and all of its axes were recorded."""
+    turn = _mounting(log)
+    others = [log.channel(f"gyro_{a}_rad_s") for a in "xy"]
+    if turn is None or any(o is None or len(o[0]) != len(found[0]) for o in others):
+        return found
+    axes = [o[1] for o in others if o is not None]
+    return found[0], turn.apply(np.column_stack([*axes, found[1]]))[:, 2]
+
+
+def _mounting(log: Log) -> Rotation | None:
+    """The rotation from the IMU's frame to the chassis's; None where they are one."""
+    turn = Rotation.from_quat(log.imu.quaternion, scalar_first=True)
+    return None if turn.magnitude() < 1e-6 else turn
 
 
 def _turning(log: Log) -> tuple[np.ndarray, np.ndarray] | None:
     """The yaw rate as the slope of a measured heading."""
     found = log.channel("yaw_deg")
-    if found is None:
+    if found is None or len(found[0]) < 3:
         return None
     time, yaw = found
     return time, np.gradient(np.unwrap(np.radians(yaw)), time)
+
+
+def _over_ground(log: Log) -> tuple[np.ndarray, np.ndarray] | None:
+    """The speed along the chassis from positions and heading, at the middle of two positions half a second apart."""
+    x, y, yaw = (log.channel(c) for c in ("position_x_m", "position_y_m", "yaw_deg"))
+    lost = log.imu.attitude and log.imu.mounting_std_deg[2] > UNKNOWN_HEADING_DEG
+    if x is None or y is None or yaw is None or lost or len(x[0]) < 3 or len(x[0]) != len(y[0]):
+        return None
+    later = np.searchsorted(x[0], x[0] + SPEED_SPAN_S - 1e-6)
+    first = np.flatnonzero(later < len(x[0]))
+    last = later[first]
+    first, last = (k[x[0][last] - x[0][first] < MOST_SPAN * SPEED_SPAN_S] for k in (first, last))
+    if len(first) < 2:
+        return None
+    step = x[0][last] - x[0][first]
+    middle = x[0][first] + 0.5 * step
+    heading = np.interp(middle, yaw[0], np.unwrap(np.radians(yaw[1])))
+    ahead, aside = x[1][last] - x[1][first], y[1][last] - y[1][first]
+    return middle, (np.cos(heading) * ahead + np.sin(heading) * aside) / step
 
 
 def _stretches(time: np.ndarray, interval: float) -> list[tuple[float, float]]:
@@ -167,43 +383,59 @@ def _means(time: np.ndarray, value: np.ndarray, wanted: np.ndarray, width: float
     return np.where(many > 0, (total[high] - total[low]) / np.maximum(many, 1), np.nan)
 
 
-def _up(log: Log, edges: np.ndarray, sides: Sequence[tuple[np.ndarray, np.ndarray]], radius: float) -> np.ndarray:
+LEANS_BY = (tuple(f"accelerometer_{a}_m_s2" for a in "xyz"), ("roll_deg", "pitch_deg"))
+"""Channels that tell the slope, the first that a log has."""
+
+
+def _leans(log: Log) -> bool:
+    """Whether a log tells how the ground leans."""
+    return any(all(log.channel(c) is not None for c in channels) for channels in LEANS_BY)
+
+
+def _up(
+    log: Log, edges: np.ndarray, sides: Sequence[tuple[np.ndarray, np.ndarray]], radius: float, clock_s: float
+) -> np.ndarray:
     """(window, edge, 3) specific force of gravity in the chassis frame.
 
     From the accelerometer over a second, less what the wheels' speed-up explains of it; else from measured attitude;
     else level ground.
     """
     g = log.gravity_m_s2
-    force = [log.channel(f"accelerometer_{a}_m_s2") for a in "xyz"]
+    force = [log.channel(c) for c in LEANS_BY[0]]
     if all(f is not None for f in force):
-        up = np.stack([_means(*f, edges, LEVELLING_S) for f in force], axis=-1)  # type: ignore[misc]
+        up = np.stack([_means(f[0] + clock_s, f[1], edges, LEVELLING_S) for f in force if f is not None], axis=-1)
+        turn = _mounting(log)
+        if turn is not None:
+            up = turn.apply(up.reshape(-1, 3)).reshape(up.shape)
         ahead = [np.interp(edges + 0.5 * s * LEVELLING_S, *side) for side in sides for s in (1, -1)]
         up[..., 0] -= radius * 0.5 * (ahead[0] - ahead[1] + ahead[2] - ahead[3]) / LEVELLING_S
         level = np.array([0.0, 0.0, g])
-        up = np.where(np.isfinite(up), up, level)
+        up = np.where(np.isfinite(up).all(axis=-1, keepdims=True), up, level)
         size = np.linalg.norm(up, axis=-1, keepdims=True)
         return up * g / size
-    roll, pitch = (log.channel(c) for c in ("roll_deg", "pitch_deg"))
+    roll, pitch = (log.channel(c) for c in LEANS_BY[1])
     if roll is not None and pitch is not None:
         r, p = (np.radians(np.interp(edges, *f)) for f in (roll, pitch))
         return g * np.stack([-np.sin(p), np.sin(r) * np.cos(p), np.cos(r) * np.cos(p)], axis=-1)
     return np.broadcast_to(np.array([0.0, 0.0, g]), (*edges.shape, 3)).copy()
 
 
-def _stratified(speed: np.ndarray, radius: float, log: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+def _stratified(
+    left: np.ndarray, right: np.ndarray, moving: np.ndarray, log: np.ndarray, most: int, rng: np.random.Generator
+) -> np.ndarray:
     """Numbers of the windows to use, in order: as many of every stratum of speed and turn and of every log."""
-    left, right = radius * speed[..., 0].mean(axis=1), radius * speed[..., 1].mean(axis=1)
     ahead, turn = 0.5 * (left + right), 0.5 * (right - left)
     stratum = np.sign(ahead) * np.digitize(np.abs(ahead), STRATA) + 10 * np.sign(turn) * np.digitize(
         np.abs(turn), (0.02, 0.1)
     )
-    moving = np.abs(radius * speed).mean(axis=(1, 2)) > 0.02
     order: list[int] = []
     queues = [
         list(rng.permutation(np.flatnonzero(moving & (log == n) & (stratum == s))))
         for n in np.unique(log)
         for s in np.unique(stratum)
     ]
+    # by lot, so that of more queues than windows not the first logs alone are used
+    queues = [queues[k] for k in rng.permutation(len(queues))]
     while any(queues) and len(order) < most:
         for queue in queues:
             if queue and len(order) < most:

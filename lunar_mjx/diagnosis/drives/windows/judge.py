@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, Suspect, Unknown, with_prior
-from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS
+from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem
 from lunar_mjx.inference.evidence import Amplitudes, Evidence, EvidenceError, Gram, NoiseSize, infer
 
@@ -42,12 +42,13 @@ FIELDS = {
     "current for a torque": 0.1,
     "left against right current": 0.03,
     "slope by the accelerometer": 1.0,
-    "clock of the IMU": 0.4,
 }
 """Usual differences between drives on one kind of ground with one rover: rolling resistance over load (asphalt 0.01 to
 0.02, gravel 0.02, turf to 0.05: Wong 2008, table 1.1); friction (paint, dust and rubber: 30 %); current for the same
-torque (oil and magnets by temperature: 10 %); the left side's against the right one's; the tilt that an accelerometer
-shows over a second on rough ground, deg; and the clocks of two recordings (BorealTC: -1.2 to 1.1 s), s."""
+torque (oil and magnets by temperature: 10 %); the left side's against the right one's; and the tilt that an
+accelerometer shows over a second on rough ground, deg. What an IMU's clock may be off by, the logs say themselves."""
+UNKNOWN_SLOPE_DEG = 3.0
+"""Slope of ground that a log says nothing of, along the drive: 5 % is the steepest of most paths and yards."""
 NAMED = 0.95
 """Probability of a statement."""
 MOST_NAMED = 3
@@ -145,25 +146,20 @@ def settle(
         np.where(kept, np.minimum(high, mean + DRIFTED), high),
     )
     u = np.clip(np.array([_u_of(problem, q, start) for q in unknowns]), low, high)
-    used = problem.present & split.fit
-    groups = [np.flatnonzero(used[c]) for c in range(len(CHANNELS))]
+    used = problem.there & split.fit[:, None]
 
     def rows(values: np.ndarray) -> np.ndarray:
-        white = problem.whitened(values, noise)
-        return np.concatenate([white[c][g].reshape(-1, white.shape[-1]) for c, g in enumerate(groups)])
-
-    def left(predicted: np.ndarray) -> np.ndarray:
-        return np.where(problem.present[..., None], np.nan_to_num(problem.measured) - predicted, 0.0)
+        return problem.whitened(values, noise)[used]
 
     def cost(u: np.ndarray, predicted: np.ndarray) -> float:
-        return float(np.sum(rows(left(predicted)[..., None]) ** 2) + np.sum((u - mean) ** 2))
+        return float(np.sum(rows(problem.residual(predicted)[..., None]) ** 2) + np.sum((u - mean) ** 2))
 
     best = math.inf
     calm = False
     for _ in range(STEPS):
         predicted, slopes = problem.linearise(unknowns, u)
         best = cost(u, predicted)
-        j, r = rows(slopes), rows(left(predicted)[..., None])[:, 0]
+        j, r = rows(slopes), rows(problem.residual(predicted)[..., None])[:, 0]
         step = np.linalg.solve(j.T @ j + np.eye(len(u)), j.T @ r - (u - mean))
         step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
         for share in (1.0, 0.4, 0.15):
@@ -204,7 +200,7 @@ def judged(problem: WindowProblem, found: Settled, noise: Sequence[Noise], split
     wide_low, wide_high = np.full(evidence.gram.width, -np.inf), np.full(evidence.gram.width, np.inf)
     wide_low[:count], wide_high[:count] = low - u, high - u
     bounded = evidence.log_evidence + evidence.log_inside(wide_low, wide_high)
-    columns, names = fields(problem, found.unknowns, slopes)
+    columns, names, _ = fields(problem, found.unknowns, slopes)
     amounts = evidence.mean[count:]
     differ = {
         k: float(np.sqrt(np.mean([a**2 for a, n in zip(amounts, names, strict=True) if n == k])))
@@ -242,39 +238,46 @@ def _bounds(problem: WindowProblem, unknowns: Sequence[Unknown]) -> tuple[np.nda
 
 def fields(
     problem: WindowProblem, unknowns: Sequence[Unknown], slopes: np.ndarray
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """What differs from log to log: columns (channel, window, sample, field column), and the field of each.
+) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
+    """What differs from recording to recording: columns (channel, window, sample, k), the kind of each, and its size.
 
     Resistance of the ground acts on both sides with the sense of rolling; grip as friction does; currents by a scale,
     and by one between the sides.
     """
-    logs = np.unique(problem.cut.log)
+    recordings = problem.cut.recordings
     keys = [q.key for q in unknowns]
-    out, names = [], []
-    predicted = problem.resistance_slope()
-    grip = None
-    if "hard_ground.mu" in keys:
-        i = keys.index("hard_ground.mu")
-        grip = slopes[..., i] / unknowns[i].std  # per logarithm of the friction
-    for n in logs:
+    out, names, sizes = [], [], []
+
+    def also(column: np.ndarray, kind: str, size: float | None = None) -> None:
+        out.append(column)
+        names.append(kind)
+        sizes.append(FIELDS[kind] if size is None else size)
+
+    def slope_of(key: str) -> np.ndarray | None:
+        at = keys.index(key) if key in keys else None
+        return None if at is None else slopes[..., at] / unknowns[at].std
+
+    resistance, size = problem.resistance_slope(), problem.current_size().copy()
+    size[len(CURRENTS) :] = 0.0
+    apart = size.copy()
+    apart[: len(CURRENTS)] *= np.array([0.5, -0.5])[:, None, None]
+    grip, pitch = slope_of("hard_ground.mu"), slope_of(f"{CALIBRATION}.pitch")
+    for n in np.unique(recordings):
+        own = (recordings == n)[None, :, None]
+        also(resistance * own, "resistance of the ground")
+        if grip is not None:  # per logarithm of the friction
+            also(grip * own, "grip of the ground")
+        also(size * own, "current for a torque")
+        also(apart * own, "left against right current")
+        if pitch is not None:
+            unknown = problem.cut.unlevelled & set(problem.cut.log[recordings == n].tolist())
+            also(pitch * own, "slope by the accelerometer", UNKNOWN_SLOPE_DEG if unknown else None)
+    clock = slope_of(f"{CALIBRATION}.imu_clock")
+    for n, (_, std) in problem.cut.clocks.items():
         own = (problem.cut.log == n)[None, :, None]
-        out.append(predicted * own)
-        names.append("resistance of the ground")
-        if grip is not None:
-            out.append(grip * own)
-            names.append("grip of the ground")
-        size = problem.current_size().copy()
-        size[2] = 0.0
-        out.append(size * own)
-        names.append("current for a torque")
-        out.append(size * np.array([0.5, -0.5, 0.0])[:, None, None] * own)
-        names.append("left against right current")
-        for key, kind in (("pitch", "slope by the accelerometer"), ("imu_clock", "clock of the IMU")):
-            if (key := f"{CALIBRATION}.{key}") in keys:
-                i = keys.index(key)
-                out.append(slopes[..., i] / unknowns[i].std * own)
-                names.append(kind)
-    return np.stack(out, axis=-1), tuple(names)
+        if clock is not None and own.any():
+            also(clock * own, "clock of the IMU", std)
+    return np.stack(out, axis=-1), tuple(names), np.array(sizes)
 
 
 def _infer(
@@ -286,12 +289,11 @@ def _infer(
     noise: Sequence[Noise],
     split: Split,
 ) -> Evidence:
-    extra, names = fields(problem, unknowns, slopes)
+    extra, names, usual = fields(problem, unknowns, slopes)
     columns = np.concatenate([slopes, extra], axis=-1)
-    residual = np.where(problem.present[..., None], np.nan_to_num(problem.measured) - predicted, 0.0)
+    residual = problem.residual(predicted)
     gram = gram_of(problem, columns, residual, noise, split.fit)
     # Of fixed size: a size that could grow would swallow whatever one log lacks for the price of its logarithm.
-    usual = np.array([FIELDS[n] for n in names])
     mean = np.concatenate([np.array([q.mean for q in unknowns]) - u, np.zeros(len(names))])
     amplitudes = Amplitudes.of(np.concatenate([np.ones(len(u)), usual]), None, mean)
     return infer(gram, amplitudes, (), tuple(NoiseSize(c, NOISE_LOG_STD) for c in CHANNELS))
@@ -304,8 +306,7 @@ def gram_of(
     white = problem.whitened(np.concatenate([columns, residual[..., None]], axis=-1), noise)
     total = None
     for c in range(len(CHANNELS)):
-        keep = problem.present[c] & windows
-        rows = white[c][keep].reshape(-1, white.shape[-1])
+        rows = white[c][problem.there[c] & windows[:, None]]
         part = Gram.of(rows[:, :-1], rows[:, -1], np.full(len(rows), c), len(CHANNELS))
         total = part if total is None else total + part
     assert total is not None
@@ -315,15 +316,14 @@ def gram_of(
 def probabilities(found: Sequence[Fitted]) -> dict[str, float]:
     """Posterior probability of every hypothesis; nothing missing is as probable beforehand as anything missing.
 
-    Explanations with k suspects share a half of 2^-k, each alike.
+    Explanations with k suspects share a half of 2^-k, each alike. All sets of k count, tried or not: those that were
+    not tried beside the best are taken to explain nothing.
     """
+    many = sum(len(f.suspects) == 1 for f in found)
     scores = {}
-    many: dict[int, int] = {}
-    for f in found:
-        many[len(f.suspects)] = many.get(len(f.suspects), 0) + 1
     for f in found:
         order = len(f.suspects)
-        scores[f.name] = f.log_evidence - math.log(2.0 ** (order + 1) * many[order])
+        scores[f.name] = f.log_evidence - math.log(2.0 ** (order + 1) * max(math.comb(many, order), 1))
     top = max(scores.values())
     weight = {k: math.exp(v - top) for k, v in scores.items()}
     return {k: w / sum(weight.values()) for k, w in weight.items()}

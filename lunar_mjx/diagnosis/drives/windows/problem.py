@@ -11,23 +11,24 @@ import numpy as np
 from scipy import linalg
 
 from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, Unknown, start_of
-from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, Cut
-from lunar_mjx.dynamics.imposed import KinematicDrive, Seen, Windows, on_a_plane
+from lunar_mjx.diagnosis.drives.windows.cut import AHEAD, CHANNELS, CURRENTS, Cut
+from lunar_mjx.dynamics.imposed import KinematicDrive, Seen, Windows, on_a_plane, require_drives_alone
 from lunar_mjx.dynamics.system import default_params
 from lunar_mjx.effects import catalogue
 from lunar_mjx.inference.fitting import Progress, silent
+from lunar_mjx.logs.schema import KINDS
 from lunar_mjx.model import Model
 
 SIZES = (64, 1024)
 """Windows simulated at once, few and many: a program is compiled for each; the state of 1,024 stays in the cache."""
+FEW = 4
+"""Batches of few that take less time than one of many: 0.07 s against 0.5 s on one core."""
 LONGEST_STEP_S = 0.008
 """Time step: currents of a Husky on its tyres differ from those at 2.5 ms by less than 0.01 A."""
 STEP = 0.25
 """Step of difference quotients in units of the prior's standard deviation, and at most `STEP` of it."""
 FREEDOM = 4.0
 """Degrees of freedom of Student's noise: heavy tails with a finite variance."""
-FLOOR_A = 0.6
-"""What an ammeter of magnitudes shows at rest: half of the 1.2 A that both sides of a standing Husky read."""
 AT_NULL = ("rolling_resistance", "viscous_friction", "payload", "wheel_radius_error", "com_offset")
 """Candidates that stand in one program at their null, so that it is compiled once."""
 
@@ -44,10 +45,11 @@ class Noise:
     share: float
     time_s: float
 
-    def factor(self, samples: int, interval_s: float) -> np.ndarray:
-        """Lower Cholesky factor (sample, sample) of the covariance of a window."""
-        lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples))) * interval_s
-        whole = (1.0 - self.share) * np.eye(samples) + self.share * np.exp(-lag / self.time_s)
+    def factor(self, there: np.ndarray, interval_s: float) -> np.ndarray:
+        """Lower Cholesky factor (k, k) of the covariance of the k samples of a window that are `there`, (sample,)."""
+        at = np.flatnonzero(there)
+        lag = np.abs(np.subtract.outer(at, at)) * interval_s
+        whole = (1.0 - self.share) * np.eye(len(at)) + self.share * np.exp(-lag / self.time_s)
         return self.std * np.linalg.cholesky(whole)
 
 
@@ -86,11 +88,11 @@ class WindowProblem:
           unknowns: the coordinates. rows: (k, unknown) values in units of their priors.
 
         Returns:
-          (k, channel, window, sample) currents of the sides, A, and yaw rate, rad/s.
+          (k, channel, window, sample) currents of the sides, A, yaw rate, rad/s, and speed ahead, m/s.
         """
         seen = self._simulate(unknowns, rows)
         current = np.einsum("kwbj,sj->kswb", seen.current, self._side)
-        return self._measured(unknowns, rows, current, seen.yaw_rate)
+        return self._measured(unknowns, rows, current, seen)
 
     def _value(self, unknowns: Sequence[Unknown], rows: np.ndarray, name: str) -> np.ndarray:
         """(k,) a calibration's value; the model's own, or zero, where it is not among the unknowns."""
@@ -143,8 +145,9 @@ class WindowProblem:
         imposed = self.cut.imposed
         out: list[Seen] = []
         jobs = np.stack(np.meshgrid(np.arange(count), np.arange(windows), indexing="ij"), -1).reshape(-1, 2)
-        size = next((s for s in SIZES if s >= len(jobs)), SIZES[-1])
-        for at in range(0, len(jobs), size):
+        at = 0
+        while at < len(jobs):
+            size = SIZES[1] if len(jobs) - at > FEW * SIZES[0] else SIZES[0]
             part = jobs[at : at + size]
             part = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
             row, window = part[:, 0], part[:, 1]
@@ -165,15 +168,14 @@ class WindowProblem:
             found = self.drive.run(jax.tree.map(lambda a, row=row: a[row], params), given)
             wanted = min(size, len(jobs) - at)
             out.append(jax.tree.map(lambda a, wanted=wanted: a[:wanted], found))
-            self.progress("simulating windows", min(1.0, (at + size) / len(jobs)))
+            at += size
+            self.progress("simulating windows", min(1.0, at / len(jobs)))
         whole = jax.tree.map(lambda *a: np.concatenate(a).reshape(count, windows, *a[0].shape[1:]), *out)
         for k, key in enumerate(keys):
             self._kept[key] = jax.tree.map(lambda a, k=k: a[k], whole)
 
-    def _measured(
-        self, unknowns: Sequence[Unknown], rows: np.ndarray, current: np.ndarray, yaw: np.ndarray
-    ) -> np.ndarray:
-        """What the instruments make of currents (k, side, window, bin) and yaw rates (k, window, bin)."""
+    def _measured(self, unknowns: Sequence[Unknown], rows: np.ndarray, current: np.ndarray, seen: Seen) -> np.ndarray:
+        """What instruments show of currents (k, side, window, bin) and of motion (k, window, bin)."""
 
         def of(name: str) -> np.ndarray:
             return self._value(unknowns, rows, name)[:, None, None]
@@ -182,18 +184,23 @@ class WindowProblem:
             rate = np.gradient(series, 0.5 * self.cut.interval_s, axis=-1)
             return series - delay * rate
 
+        def whole(series: np.ndarray) -> np.ndarray:
+            return 0.5 * (series[..., 0::2] + series[..., 1::2])
+
+        floor = self.cut.magnitude
         out = []
         both = of("current_scale")
         half = 0.5 * of("current_difference")
         scale = [1.0 + both + half + of("current_left"), 1.0 + both - half + of("current_right")]
-        for side in range(2):
-            series = scale[side] * late(current[:, side], of("current_clock"))
-            series = 0.5 * (series[..., 0::2] + series[..., 1::2])
-            if CHANNELS[side] in self.cut.magnitude:
-                series = np.sqrt(series**2 + np.maximum(FLOOR_A + of("current_floor"), 0.0) ** 2)
+        for side, channel in enumerate(CURRENTS):
+            series = whole(scale[side] * late(current[:, side], of("current_clock")))
+            if channel in floor:
+                series = np.hypot(series, floor[channel] * np.maximum(1.0 + of("current_floor"), 0.0))
             out.append(series)
-        turn = (1.0 + of("gyro_scale")) * late(yaw, of("imu_clock")) + of("gyro_bias")
-        out.append(0.5 * (turn[..., 0::2] + turn[..., 1::2]))
+        yaw = np.asarray(seen.yaw_rate)
+        out.append(whole((1.0 + of("gyro_scale")) * late(yaw, of("imu_clock")) + of("gyro_bias")))
+        ahead = whole(np.asarray(seen.speed_x) - of("position_aside") * yaw)
+        out.append(np.hypot(ahead, whole(np.asarray(seen.speed_y))) if AHEAD in floor else ahead)
         return np.stack(out, axis=1)
 
     def linearise(self, unknowns: Sequence[Unknown], u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,20 +211,20 @@ class WindowProblem:
         return values[0], slopes
 
     def whitened(self, values: np.ndarray, noise: Sequence[Noise]) -> np.ndarray:
-        """Residuals or derivatives (channel, window, sample, ...) in units of the noise; zero where unmeasured.
-
-        A window that lacks samples of a channel is left out for that channel.
-        """
+        """Residuals or derivatives (channel, window, sample, ...) in units of the noise; zero where unmeasured."""
         out = np.zeros_like(values)
-        for c, name in enumerate(CHANNELS):
-            whole = np.isfinite(self.cut.measured[name]).all(axis=1)
-            factor = noise[c].factor(self.cut.samples, self.cut.interval_s)
-            block = np.moveaxis(values[c][whole], 1, 0)
-            shape = block.shape
-            solved = linalg.solve_triangular(factor, block.reshape(shape[0], -1), lower=True)
-            scale = np.sqrt(self.weight[c][whole]).reshape(-1, *[1] * (len(shape) - 1))
-            out[c][whole] = np.moveaxis(solved.reshape(shape), 0, 1) * scale
+        for c in range(len(CHANNELS)):
+            for there, windows in patterns(self.there[c]):
+                factor = noise[c].factor(there, self.cut.interval_s)
+                block = np.moveaxis(values[c][windows][:, there], 1, 0)
+                solved = linalg.solve_triangular(factor, block.reshape(len(block), -1), lower=True)
+                scale = np.sqrt(self.weight[c][windows]).reshape(-1, *[1] * (values.ndim - 2))
+                out[c][np.ix_(windows, there)] = np.moveaxis(solved.reshape(block.shape), 0, 1) * scale
         return out
+
+    def residual(self, predicted: np.ndarray) -> np.ndarray:
+        """(channel, window, sample) measured less predicted; zero where nothing was measured."""
+        return np.where(self.there, np.nan_to_num(self.measured) - predicted, 0.0)
 
     def resistance_slope(self) -> np.ndarray:
         """(channel, window, sample) change of the predictions per coefficient of rolling resistance, at the model."""
@@ -241,9 +248,24 @@ class WindowProblem:
         return np.stack([self.cut.measured[c] for c in CHANNELS])
 
     @property
+    def there(self) -> np.ndarray:
+        """(channel, window, sample) where something was measured."""
+        return np.asarray(np.isfinite(self.measured))
+
+    @property
     def present(self) -> np.ndarray:
-        """(channel, window) where a channel was measured throughout."""
-        return np.asarray(np.isfinite(self.measured).all(axis=2))
+        """(channel, window) where a channel was measured at all."""
+        return np.asarray(self.there.any(axis=2))
+
+
+def patterns(there: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Windows that lack the same samples: (sample,) which there are, and numbers of the windows; none without any.
+
+    Args:
+      there: (window, sample) where something was measured.
+    """
+    kinds, number = np.unique(there, axis=0, return_inverse=True)
+    return [(kind, np.flatnonzero(number.ravel() == k)) for k, kind in enumerate(kinds) if kind.any()]
 
 
 _PROGRAMS: dict[Any, KinematicDrive] = {}
@@ -266,49 +288,62 @@ def _null(name: str) -> dict[str, float]:
 
 
 def corners(model: Model) -> list[str]:
-    """Corner and kind of every joint, as in channels."""
-    from lunar_mjx.logs.schema import KINDS
+    """Corner and kind of every joint, as in channels.
 
+    Raises:
+      UserError: the rover has joints beside its drives, which imposed wheel speeds do not move.
+    """
+    require_drives_alone(model)
     names = {w.drive: f"{w.corner}_{KINDS[0]}" for w in model.rover.wheels}
     return [names[j] for j in model.rover.joints]
 
 
-def learn_noise(residual: np.ndarray, present: np.ndarray, interval_s: float) -> list[Noise]:
+def learn_noise(residual: np.ndarray, there: np.ndarray, interval_s: float) -> list[Noise]:
     """Noise of every channel by maximum likelihood from residuals (channel, window, sample), robustly.
 
     Slow parts of it are what a window differs from another by and no model explains: stones, patches, slopes. A colour
     is tried on a grid; windows with the largest tenth of squares are left out (a kerb, a collision).
+
+    Args:
+      residual: (channel, window, sample), finite. there: where something was measured. interval_s: between samples.
     """
     found = []
     for c in range(len(residual)):
-        block = residual[c][present[c]]
-        if len(block) < 3:
+        count = there[c].sum(axis=1)
+        if (count > 0).sum() < 3:
             found.append(Noise(1.0, 0.0, 1.0))
             continue
-        size = np.mean(block**2, axis=1)
-        block = block[size <= np.quantile(size, 0.9)]
+        size = np.sum(np.where(there[c], residual[c] ** 2, 0.0), axis=1) / np.maximum(count, 1)
+        usual = size <= np.quantile(size[count > 0], 0.9)
+        groups = [(kind, rows[usual[rows]]) for kind, rows in patterns(there[c])]
+        samples = sum(int(kind.sum()) * len(rows) for kind, rows in groups)
         best = (-np.inf, Noise(1.0, 0.0, 1.0))
         for share in (0.0, 0.3, 0.5, 0.7, 0.9, 0.97):
-            for time_s in (0.2, 0.5, 1.0, 3.0, 20.0):
-                factor = Noise(1.0, share, time_s).factor(block.shape[1], interval_s)
-                white = linalg.solve_triangular(factor, block.T, lower=True)
-                std = float(np.sqrt(np.mean(white**2)))
-                score = -block.size * np.log(std) - len(block) * float(np.sum(np.log(np.diag(factor))))
+            for time_s in (0.2, 0.5, 1.0, 3.0, 20.0) if share else (1.0,):
+                square = logs = 0.0
+                for kind, rows in groups:
+                    factor = Noise(1.0, share, time_s).factor(kind, interval_s)
+                    block = residual[c][rows][:, kind]
+                    square += float(np.sum(linalg.solve_triangular(factor, block.T, lower=True) ** 2))
+                    logs += len(rows) * float(np.sum(np.log(np.diag(factor))))
+                std = float(np.sqrt(max(square / samples, 1e-300)))
+                score = -samples * np.log(std) - logs
                 if score > best[0]:
-                    best = score, Noise(std, share, time_s)
+                    best = score, Noise(max(std, 1e-9), share, time_s)
         found.append(best[1])
     return found
 
 
-def student_weights(residual: np.ndarray, present: np.ndarray, noise: Sequence[Noise], interval_s: float) -> np.ndarray:
+def student_weights(residual: np.ndarray, there: np.ndarray, noise: Sequence[Noise], interval_s: float) -> np.ndarray:
     """(channel, window) weights (nu + n)/(nu + chi^2) of Student's noise, for residuals (channel, window, sample).
 
     A window as a whole is an outlier or none: a wheel against a kerb, or a clock that is off by a second.
     """
-    weight = np.ones(present.shape)
-    samples = residual.shape[2]
+    weight = np.ones(there.shape[:2])
     for c in range(len(residual)):
-        white = linalg.solve_triangular(noise[c].factor(samples, interval_s), residual[c].T, lower=True)
-        square = np.sum(white**2, axis=0)
-        weight[c] = np.where(present[c], np.minimum((FREEDOM + samples) / (FREEDOM + square), 1.0), 1.0)
+        for kind, rows in patterns(there[c]):
+            factor = noise[c].factor(kind, interval_s)
+            white = linalg.solve_triangular(factor, residual[c][rows][:, kind].T, lower=True)
+            share = (FREEDOM + kind.sum()) / (FREEDOM + np.sum(white**2, axis=0))
+            weight[c, rows] = np.minimum(share, 1.0)
     return weight

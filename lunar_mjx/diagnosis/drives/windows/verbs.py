@@ -14,14 +14,15 @@ import numpy as np
 from lunar_mjx.diagnosis.drives.windows.coordinates import (
     CALIBRATION,
     DRIFT,
-    SUSPECTS,
     Suspect,
     Unknown,
     baseline,
+    catalogue_of,
+    data_sheet,
     start_of,
     suspects_of,
 )
-from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, WINDOW_S, Cut, cut
+from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, Cut, cut
 from lunar_mjx.diagnosis.drives.windows.judge import (
     MOST_NAMED,
     NAMED,
@@ -42,6 +43,7 @@ from lunar_mjx.files import replacing
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.logs import Log
+from lunar_mjx.logs.schema import find_channel
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import save_model
 
@@ -82,7 +84,7 @@ class Bench:
         self.names = [log.name if len({g.name for g in logs}) == len(logs) else _long_name(log) for log in logs]
         self.splits = _splits(run, self.logs, self.names, self.cut)
         self.split = Split(self.splits == "fit", np.isin(self.splits, ("select", "test")))
-        self.base = baseline(self.model)
+        self.base = baseline(self.model, self.cut.channels, self.logs)
         self.weight = np.ones((len(CHANNELS), len(self.cut)))
         self._made: dict[str | None, WindowProblem] = {}
 
@@ -94,8 +96,8 @@ class Bench:
         return self._made[form]
 
     def residual(self, predicted: np.ndarray) -> np.ndarray:
-        problem = self.problem(None)
-        return np.where(problem.present[..., None], np.nan_to_num(problem.measured) - predicted, 0.0)
+        """(channel, window, sample) measured less predicted; zero where nothing was measured."""
+        return self.problem(None).residual(predicted)
 
     def noise(self) -> list[Noise]:
         """The noise that a run has kept, or what the windows show beyond the model refitted."""
@@ -111,11 +113,16 @@ class Bench:
         """Noise by what fluctuates within windows, whatever the model: a first guess."""
         problem = self.problem(None)
         residual = self.residual(problem.predict(self.base, np.zeros((1, len(self.base))))[0])
-        inside = residual - residual.mean(axis=-1, keepdims=True)
-        return [
-            Noise(float(np.sqrt(np.mean(r[p] ** 2))) if p.any() else 1.0, 0.5, 0.5)
-            for r, p in zip(inside, problem.present, strict=True)
-        ]
+        there = problem.there
+        count = np.maximum(there.sum(axis=-1, keepdims=True), 1)
+        inside = np.where(there, residual - residual.sum(axis=-1, keepdims=True) / count, 0.0)
+        many = there.sum(axis=-1) > 1
+        out = []
+        for r, t, m in zip(inside, there, many, strict=True):
+            # a channel with one sample a window shows no ripple: what differs from window to window takes its place
+            values = r[m][t[m]] if m.any() else residual[len(out)][t]
+            out.append(Noise(max(float(np.sqrt(np.mean(values**2))), 1e-6) if values.size else 1.0, 0.5, 0.5))
+        return out
 
     def learn(self, settled: Sequence[Settled]) -> list[Noise]:
         """The noise that the best of some hypotheses leaves of the fitted windows, and the weights of all windows."""
@@ -123,8 +130,8 @@ class Bench:
         problem = self.problem("soft_ground" if any(s.name == "soft_ground" for s in best.suspects) else None)
         left = self.residual(problem.predict(best.unknowns, best.u[None])[0])
         mine = self.split.fit
-        found = learn_noise(left[:, mine], problem.present[:, mine], self.cut.interval_s)
-        self.use_weight(student_weights(left, problem.present, found, self.cut.interval_s))
+        found = learn_noise(left[:, mine], problem.there[:, mine], self.cut.interval_s)
+        self.use_weight(student_weights(left, problem.there, found, self.cut.interval_s))
         return found
 
     def use_weight(self, weight: np.ndarray) -> None:
@@ -179,7 +186,7 @@ def _save(
     run.save(
         WINDOWS_FILE,
         {
-            "window_s": WINDOW_S,
+            "window_s": found.seconds,
             "interval_s": found.interval_s,
             "available": found.available,
             "used": [
@@ -202,7 +209,7 @@ def errors(bench: Bench, noise: Sequence[Noise], predicted: np.ndarray) -> dict[
     white = bench.residual(predicted) / np.array([n.std for n in noise])[:, None, None]
     out = {}
     for name, windows in (("fit", bench.split.fit), ("held_out", bench.split.held_out)):
-        keep = problem.present & windows
+        keep = problem.there & windows[:, None]
         if keep.any():
             out[name] = float(np.sqrt(np.mean(white[keep] ** 2)))
     return out
@@ -214,16 +221,16 @@ def _comparison(
     problem = bench.problem(None)
     residual = {"as_given": bench.residual(given), "refitted": bench.residual(base.predicted)}
     table = []
-    for k in np.unique(bench.cut.log):
+    for k, split in sorted({(int(k), str(s)) for k, s in zip(bench.cut.log, bench.splits, strict=True)}):
         for c, channel in enumerate(CHANNELS):
-            keep = problem.present[c] & (bench.cut.log == k)
+            keep = problem.there[c] & ((bench.cut.log == k) & (bench.splits == split))[:, None]
             if keep.any():
                 row = {
                     "manoeuvre": bench.names[k],
-                    "split": bench.splits[keep][0],
+                    "split": split,
                     "channel": channel,
-                    "samples": int(keep.sum() * bench.cut.samples),
-                    "unit": channel.rpartition("_")[2],
+                    "samples": int(keep.sum()),
+                    "unit": _unit(channel),
                 }
                 for label, r in residual.items():
                     rms = float(np.sqrt(np.mean(r[c][keep] ** 2)))
@@ -247,11 +254,16 @@ def _comparison(
             "at_bound": at_edge(bench, base),
             "problems": problems,
         },
-        "observations": int(problem.present.sum() * bench.cut.samples),
-        "windows": {"used": len(bench.cut), "of": bench.cut.available, "seconds": WINDOW_S},
+        "observations": int(problem.there.sum()),
+        "windows": {"used": len(bench.cut), "of": bench.cut.available, "seconds": bench.cut.seconds},
         "seconds": seconds,
         "logs": bench.names,
     }
+
+
+def _unit(channel: str) -> str:
+    found = find_channel(channel)
+    return found[0].unit if found is not None else ""
 
 
 def at_edge(bench: Bench, found: Fitted) -> list[str]:
@@ -297,7 +309,7 @@ def fitted_model(model: Model, found: Fitted) -> Model:
         if s.kind == "effect" and s.name not in model.effect_names:
             model = model.add(s.name)
     priors = dict(model.priors)
-    full = {q.key: q for q in (*(q for s in SUSPECTS for q in s.unknowns), *_defaults())}
+    full = {q.key: q for q in (*(q for s in catalogue_of(model) for q in s.unknowns), *data_sheet(model))}
     for q, u, s in zip(found.unknowns, found.u, found.std, strict=True):
         start = _start(model, q)
         value = float(q.value(start, u))
@@ -311,18 +323,12 @@ def fitted_model(model: Model, found: Fitted) -> Model:
     return dataclasses.replace(model, priors=priors)
 
 
-def _defaults() -> tuple[Unknown, ...]:
-    from lunar_mjx.diagnosis.drives.windows.coordinates import ROVER, SENSORS
-
-    return (*ROVER, *SENSORS)
-
-
 def why(run: Run, logs: Sequence[Log], only: Sequence[str] | None, seconds: float, progress: Progress) -> Diagnosis:
     """Weighs every explanation of what a model leaves of some logs; writes `verdict.json`, provisionally as it goes."""
     begin = time.monotonic()
     bench = Bench(run, logs, progress)
     noise = bench.noise()
-    suspects = suspects_of(bench.model)
+    suspects = suspects_of(bench.model, bench.cut.channels)
     if only is not None:
         names = [s.name for s in suspects]
         for name in only:
@@ -362,10 +368,13 @@ def _diagnosis(bench: Bench, noise: Sequence[Noise], found: Sequence[Fitted], le
     names = tuple(dict.fromkeys(s.name for n in named for s in by_name[n].suspects))
     families = sorted({by_name[n].suspects[0].family for n in named if by_name[n].suspects})
     held = {n: _held_out_gain(bench, noise, by_name[n], base) for n in order[:8]}
-    unseen = [held.get(n, (math.nan, math.nan)) for n in named]
-    if named and verdict is not Verdict.UNKNOWN and all(gain <= se for gain, se in unseen):
+    if named and verdict is not Verdict.UNKNOWN:
+        gain, error = held.get(named[0], (math.nan, math.nan))
         # A name that does not help what it never saw is none; where nothing was held out, nothing is refused.
-        verdict = Verdict.UNKNOWN
+        if gain <= error:
+            verdict = Verdict.UNKNOWN
+    if verdict is Verdict.UNKNOWN:
+        names = ()
     evidence = [
         _evidence_of(bench, f, base, chance[f.name], held.get(f.name), f.name in named)
         for f in sorted(found[1:], key=lambda f: -chance[f.name])
@@ -408,7 +417,7 @@ def _named(
     """The verdict, and the hypotheses that together are as good as certain."""
     null = by_name_null(by_name)
     if chance[null] >= 1.0 - NAMED and order[0] == null:
-        return Verdict.NOISE_ONLY if chance[null] >= 0.5 else Verdict.UNDECIDABLE, ()
+        return Verdict.NOISE_ONLY if chance[null] >= NAMED else Verdict.UNDECIDABLE, ()
     named: list[str] = []
     total = 0.0
     for name in order:
@@ -448,12 +457,34 @@ def _sentence(
         return f"One of {shown}; these logs do not tell them apart further."
     if verdict is Verdict.MULTIPLE:
         return f"Several at once: {shown}; {_values(bench.model, top)}."
-    if verdict is Verdict.UNKNOWN and len(named) <= MOST_NAMED:
-        return f"Something is missing, but {shown} fits these windows without helping those that were held out."
     if verdict is Verdict.UNKNOWN:
-        return f"Something is missing, and more than {MOST_NAMED} explanations remain: {shown}."
+        return _unknown_sentence(named, shown, bench, top, base)
+    quiet = f"Nothing need be missing ({100.0 * chance[base.name]:.0f} %)" if top is base else "No explanation has 95 %"
+    rivals = ", ".join(
+        f"{n} ({100.0 * p:.0f} %)" for n, p in sorted(chance.items(), key=lambda c: -c[1])[:4] if n != base.name
+    )
+    return f"{quiet}, and these logs do not exclude {rivals}; drive slopes, turns and speeds beside these."
+
+
+def _unknown_sentence(named: Sequence[str], shown: str, bench: Bench, top: Fitted, base: Fitted) -> str:
+    """Where something acts that cannot be named, how much it is, and what would tell more."""
+    problem = bench.problem(None)
+    sizes = []
+    for c, channel in enumerate(CHANNELS):
+        there = problem.there[c]
+        if there.any():
+            moved = float(np.sqrt(np.mean((top.predicted[c] - base.predicted[c])[there] ** 2)))
+            left = float(np.sqrt(np.mean(problem.residual(base.predicted)[c][there] ** 2)))
+            sizes.append(f"{moved:.2g} of {left:.2g} {_unit(channel)} of {channel}")
+    families = ", ".join(dict.fromkeys(s.family for s in top.suspects)) or "model"
+    why_not = (
+        "fits these windows without helping those that were held out"
+        if len(named) <= MOST_NAMED
+        else f"are more than {MOST_NAMED} explanations"
+    )
     return (
-        "No explanation reaches 95 %, nor does it that nothing is missing; drive slopes, turns and speeds beside these."
+        f"Something acts on the {families} that the list does not explain: {shown} {why_not}. It would change "
+        f"{'; '.join(sizes)}. Measure the same ground again, with straight drives, turns and slopes at two speeds."
     )
 
 
@@ -520,7 +551,7 @@ def add(run: Run, logs: Sequence[Log], name: str, out: Path, progress: Progress)
       UserError: no such effect, parameter or calibration, or the model has it.
     """
     bench = Bench(run, logs, progress)
-    by_name = {s.name: s for s in suspects_of(bench.model)}
+    by_name = {s.name: s for s in suspects_of(bench.model, bench.cut.channels)}
     if name not in by_name:
         raise UserError(f"add: {name} cannot be added to this model; use one of {', '.join(by_name)}.")
     suspect: Suspect = by_name[name]
@@ -580,16 +611,17 @@ def _save_series(bench: Bench, noise: Sequence[Noise], given: np.ndarray, fits: 
             if not len(keep):
                 continue
             keep = keep[np.argsort(found.start_s[keep])]
-            times = found.start_s[keep][:, None] + found.interval_s * np.arange(found.samples)
+            there = problem.there[c][keep]
+            times = (found.start_s[keep][:, None] + found.interval_s * np.arange(found.samples))[there]
             columns["series_start"].append(at)
             columns["series_channel"].append(channel)
             columns["series_log"].append(k)
-            columns["measured"].append(problem.measured[c][keep].ravel())
+            columns["measured"].append(problem.measured[c][keep][there])
             columns["sigma"].append(np.full(times.size, noise[c].std))
-            columns["time"].append(times.ravel())
-            number = [units.index((k, bench.splits[w])) for w in keep]
-            columns["unit"].append(np.repeat(number, found.samples))
-            predicted.append(rows[:, c, keep].reshape(len(rows), -1))
+            columns["time"].append(times)
+            number = np.array([units.index((k, bench.splits[w])) for w in keep])
+            columns["unit"].append(np.broadcast_to(number[:, None], there.shape)[there])
+            predicted.append(rows[:, c, keep][:, there])
             residual.append((columns["measured"][-1] - predicted[-1]) / noise[c].std)
             at += times.size
     with replacing(bench.run.folder / SERIES_FILE) as part:
