@@ -88,21 +88,29 @@ def loop_parity(model: Model, states: int = 20) -> float:
     return gap
 
 
-MEETING: list[str] = []
-"""Folder and number of the processes that wait for each other before they time a row, if any."""
+READY = "ready"
+"""What a process of `side_by_side` prints when its row is compiled; it times the row once it gets a line of input."""
+MEETING: list[bool] = []
+"""Not empty where this process waits for such a line."""
 
 
 def meet() -> None:
-    """Waits until every process has arrived."""
-    for place in MEETING:
-        folder, _, count = place.rpartition(":")
-        (Path(folder) / f"here.{os.getpid()}").touch()
-        while len(list(Path(folder).glob("here.*"))) < int(count):
-            time.sleep(0.01)
+    """Waits until all processes of `side_by_side` have compiled, or ends with the one that started them."""
+    if MEETING:
+        print(READY, flush=True)
+        if not sys.stdin.readline():
+            raise SystemExit("speed.py: another process ended before it was ready.")
 
 
-def timed(function: Any, state: Any, steps: int, batch: int, repeats: int = 3) -> dict[str, Any]:
-    """Compiles, warms up, and times `function(state) -> state` of `steps` steps."""
+def timed(
+    function: Any,
+    state: Any,
+    steps: int,
+    batch: int,
+    repeats: int = 3,
+    inspect: Callable[[Any], dict[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Compiles, warms up, and times `function(state) -> state` of `steps` steps; `inspect` sees the first result."""
     begin = time.perf_counter()
     lowered = jax.jit(function).lower(state)
     traced = time.perf_counter() - begin
@@ -112,12 +120,13 @@ def timed(function: Any, state: Any, steps: int, batch: int, repeats: int = 3) -
     best = cpu = float("inf")
     with alone():
         new = jax.block_until_ready(compiled(state))
+        found = inspect(new) if inspect is not None else {}
         meet()
         for _ in range(repeats):
             wall, process = time.perf_counter(), time.process_time()
             new = jax.block_until_ready(compiled(new))
             best, cpu = min(best, time.perf_counter() - wall), min(cpu, time.process_time() - process)
-    return {
+    return found | {
         "steps_per_s": batch * steps / best,
         "us_per_batch_step": best / steps * 1e6,
         "process_cpu_ns_per_step": cpu / steps / batch * 1e9,
@@ -180,27 +189,29 @@ def side_by_side(rover: str, batch: int, options: argparse.Namespace) -> dict[st
     """The sum of several processes that run the same batch at the same time, one on each core."""
     cores = sorted(os.sched_getaffinity(0))
     with tempfile.TemporaryDirectory() as folder:
-        meeting, command = Path(folder), [sys.executable, __file__, "--rovers", rover, "--batches", str(batch)]
+        outs = [Path(folder) / f"{i}.json" for i in range(options.processes)]
+        command = [sys.executable, __file__, "--rovers", rover, "--batches", str(batch), "--meet", "--only-full"]
         # long enough to overlap
-        command += ["--only-full", "--skip-mjx", "--pool", "1", "--steps", str(20 * options.steps)]
+        command += ["--skip-mjx", "--pool", "1", "--steps", str(20 * options.steps)]
         children = [
             subprocess.Popen(
-                [
-                    *command,
-                    "--meet",
-                    f"{meeting}:{options.processes}",
-                    "--out",
-                    str(meeting / f"{i}.json"),
-                    "--core",
-                    str(cores[i % len(cores)]),
-                ],
-                stdout=subprocess.DEVNULL,
+                [*command, "--out", str(out), "--core", str(cores[i % len(cores)])],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
             )
-            for i in range(options.processes)
+            for i, out in enumerate(outs)
         ]
-        if any(child.wait() for child in children):
+        if all(any(line.strip() == READY for line in child.stdout or ()) for child in children):
+            for child in children:
+                assert child.stdin is not None
+                print("go", file=child.stdin, flush=True)
+        # closes the input of all: where one has ended, the others do so, too
+        for child in children:
+            child.communicate()
+        if any(child.returncode for child in children):
             raise SystemExit("speed.py: one of the processes ended with an error; run it with --processes 0.")
-        rows = [json.loads((meeting / f"{i}.json").read_text())["rows"][0] for i in range(options.processes)]
+        rows = [json.loads(out.read_text())["rows"][0] for out in outs]
     own = [row["process_cpu_ns_per_step"] for row in rows]
     return {
         "steps_per_s": sum(row["steps_per_s"] for row in rows),
@@ -329,7 +340,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=0, help="processes side by side, besides the one; 0: none")
     parser.add_argument("--pool", type=int, default=0, help="threads of XLA on a CPU (NPROC); 0: one per core")
     parser.add_argument("--core", type=int, default=-1, help="core to run on; -1: any")
-    parser.add_argument("--meet", help="folder:count, for processes that wait for each other")
+    parser.add_argument("--meet", action="store_true", help="wait for a line of input before a row is timed")
     parser.add_argument("--skip-mjx", action="store_true")
     parser.add_argument("--only-full", action="store_true", help="leave out stress integral and no effects")
     parser.add_argument("--out", type=Path)
@@ -338,7 +349,7 @@ def main() -> None:
         os.environ["NPROC"] = str(options.pool)  # read when JAX makes its CPU client, at the first use of a device
     if options.core >= 0:
         os.sched_setaffinity(0, {options.core})
-    MEETING[:] = [options.meet] if options.meet else []
+    MEETING[:] = [True] if options.meet else []
     rows: list[dict[str, Any]] = []
     LOCK[:] = [options.lock] if options.lock else []
     about = {

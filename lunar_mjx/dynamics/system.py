@@ -97,6 +97,8 @@ class System:
             effects=effects,
         )
 
+    # GPUs multiply float32 matrices in TF32 unless told otherwise: a height of 5 m would be wrong by millimetres.
+    @jax.default_matmul_precision("highest")
     def _stand(self, params: Params, x: Any, y: Any, yaw: Any) -> tuple[Any, Any]:
         """Pose on the plane fitted to the terrain under the wheels, none of which lies below the surface."""
         feet = self.engine.wheel_feet

@@ -14,6 +14,7 @@ from lunar_mjx.effects import context as c
 from lunar_mjx.effects.base import Effect, Parameter, StateVariable
 from lunar_mjx.effects.joint.motor import MODE_UNITS
 from lunar_mjx.effects.sensor.channels import SensorContext, Signals
+from lunar_mjx.effects.soil.ruts import Relief
 from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import SoilMap, Terrain
 from lunar_mjx.terrain.heightfield import HeightField
@@ -44,7 +45,10 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "payload_position": "m",
         "com_offset": "m",
         "gravity": "m/s2",
+        "rim_share": "1",
+        "relief": _OWN,
     },
+    Relief: {"moved": "m", "pressed": "m", "tile": _PLAIN, "cell": "m"},
     c.Contact: {
         "sinkage": "m",
         "sinkage_rate": "m/s",
@@ -53,6 +57,7 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "v_x": "m/s",
         "v_y": "m/s",
         "rim_speed": "m/s",
+        "soil_slip": "1",
         "forward": "1",
         "left": "1",
         "normal": "1",

@@ -15,14 +15,16 @@ from lunar_mjx.effects.joint import driveline, electrical, friction
 from lunar_mjx.effects.joint import motor as motor_module
 from lunar_mjx.effects.sensor import channel_errors as sensors
 from lunar_mjx.effects.soil import ground as soil
-from lunar_mjx.effects.soil import multipass, slip_sinkage
+from lunar_mjx.effects.soil import multipass, ruts, slip_sinkage
 from lunar_mjx.effects.soil import variation as soil_variation
 from lunar_mjx.effects.wheel import (
     bulldozing,
     contact_angles,
     friction_circle,
+    granular,
     grousers,
     paper,
+    rim_contact,
     rock,
     sliding_contact,
     stress_integral,
@@ -50,6 +52,7 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         wheel.shear_state,
         wheel.closed_form_shear,
         stress_integral.stress_integral,
+        granular.granular_resistance,
         rock.hard_ground,
         rock.boulders,
         rock.static_boulders,
@@ -58,6 +61,7 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         paper.penalty_contact,
         paper.printed_shear,
         paper.engine_friction,
+        rim_contact.rim_contact,
         chassis.payload,
         chassis.com_offset,
         chassis.wheel_radius_error,
@@ -78,6 +82,7 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         soil_variation.slope_stiffness,
         soil_variation.soil_patches,
         multipass.multipass,
+        ruts.ruts,
         contact_angles.exit_angle,
         contact_angles.dynamic_sinkage,
         friction_circle.friction_circle,

@@ -39,6 +39,8 @@ class Geometry:
       payload_position: its place in the chassis frame, m.
       com_offset: shift of the chassis' centre of mass, in the chassis frame, m.
       gravity: true gravity, m/s2; None where it is as stated.
+      rim_share: share of the plane that is fitted along the rim; None for the tangent below the axle alone.
+      relief: soil that wheels moved, whose `at(x, y)` gives its height first; None where none is remembered.
     """
 
     radius: Float[Array, "wheel"]
@@ -48,6 +50,8 @@ class Geometry:
     payload_position: Vec3
     com_offset: Vec3
     gravity: Any = None
+    rim_share: Any = None
+    relief: Any = None
 
 
 @pytree

@@ -22,6 +22,7 @@ from lunar_mjx.effects.context import (
     WheelForce,
 )
 from lunar_mjx.effects.wheel.closed_form import lateral_slip_speed
+from lunar_mjx.effects.wheel.rim_contact import fitted_plane
 from lunar_mjx.pytree import pytree
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import inside, sample
@@ -101,12 +102,13 @@ def nominal_geometry(rover: RoverInfo) -> Geometry:
 def wheel_contact(ctx: Context) -> Contact:
     """How the wheels meet the ground: sinkage, slip (eq. 8), slip angle (eq. 9) and the wheel frames.
 
-    The ground under a wheel is the plane that touches the bilinear surface below the wheel's centre. Slip and slip
-    angle are taken in the direction of travel, so that both keep their meaning when backing up.
+    The ground under a wheel is the plane that touches the bilinear surface below the wheel's centre, or the one fitted
+    along its rim where an effect says so. Slip and slip angle are taken in the direction of travel, so that both keep
+    their meaning when backing up.
     """
     geometry: Geometry = ctx.geometry  # type: ignore[assignment]
     place = ctx.wheel_position
-    height, slope_x, slope_y = sample(ctx.terrain.field, place.x, place.y)
+    height, slope_x, slope_y = _ground_below(ctx, geometry)
     normal = Vec3(-slope_x, -slope_y, jnp.ones_like(slope_x)).unit()
     tilt = ctx.wheel_axle.dot(normal)
     lowest = geometry.radius * jnp.sqrt(jnp.maximum(1.0 - tilt * tilt, 1e-6))
@@ -135,6 +137,22 @@ def wheel_contact(ctx: Context) -> Contact:
         inside=inside(ctx.terrain.field, place.x, place.y),
         soil_slip=jnp.clip(slip, -1.0, 1.0),
     )
+
+
+def _ground_below(ctx: Context, geometry: Geometry) -> tuple[Any, Any, Any]:
+    """Height of the plane that each wheel meets, below its centre, m, and the plane's slopes by x and y."""
+    place = ctx.wheel_position
+    tangent = sample(ctx.terrain.field, place.x, place.y)
+    if geometry.rim_share is None:
+        return tangent
+
+    def height_at(x: Any, y: Any) -> Any:
+        ground = sample(ctx.terrain.field, x, y)[0]
+        return ground if geometry.relief is None else ground + geometry.relief.at(x, y)[0]
+
+    fitted = fitted_plane(height_at, place, ctx.wheel_axle, geometry.radius, geometry.width)
+    height, slope_x, slope_y = (t + geometry.rim_share * (f - t) for t, f in zip(tangent, fitted, strict=True))
+    return height, slope_x, slope_y
 
 
 def initial_soil(like: Any) -> Soil:

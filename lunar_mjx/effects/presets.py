@@ -33,6 +33,7 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
         "thermal_cutoff",
         "motor",
         "directional_gear_efficiency",
+        "rim_contact",
         "soil",
         "surface_type",
         "slip_sinkage",
@@ -71,6 +72,12 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
 }
 """Effects of each preset: `consistent`, the paper's equations mended, `field`, what a drive outdoors needs beyond them,
 and `paper`, the equations as printed."""
+
+DEFAULT_PRESET = "field"
+"""Preset of drives for which none is named: `simulate`, `view` and the environments.
+
+Diagnosis starts from `consistent` all the same: it adds what the measurements ask for and takes nothing away, so that
+its baseline must not hold coefficients (of slip-sinkage, ruts, rolling) which were chosen and not measured."""
 
 _PAPER_WINDING = WINDINGS[12]
 
@@ -250,11 +257,16 @@ FIELD_CHANGES: tuple[Change, ...] = (
     ),
     Change("ambient temperature", "25 degC for ever", "lunar day and night near the pole", "the model's ambient"),
     Change("chassis on ground and boulders", "friction creeps", "friction creeps", "nothing yet"),
-    Change("wheel contact", "one plane under the axle: load steps at facet edges", "as `consistent`", "nothing yet"),
+    Change(
+        "wheel contact",
+        "the facet under the axle: load steps at facet edges",
+        "a plane fitted along and beside the rim",
+        "rim_contact",
+    ),
     Change(
         "dug soil",
         "no rut stays in the terrain",
-        "remembered by the wheels alone (multipass, 64 places each)",
+        "remembered by the wheels alone (multipass, 20 places); the opt-in effect `ruts` digs them",
         "nothing yet",
     ),
 )

@@ -5,19 +5,44 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from matplotlib.colors import LightSource
+from matplotlib.colors import LightSource, ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from matplotlib.ticker import MaxNLocator
 
-from lunar_mjx.cameras import LABELS, Pinhole, RoverCamera, Sun, orbit
+from lunar_mjx.cameras import (
+    LABELS,
+    Light,
+    Pictures,
+    Pinhole,
+    Pose,
+    RoverCamera,
+    Sun,
+    front_mount,
+    mounted,
+    orbit,
+    painted,
+    picture,
+    placed,
+    rover_shapes,
+)
+from lunar_mjx.cameras.chase import wheel_tracks
+from lunar_mjx.cameras.texture import ALBEDO, TrackPainter, regolith
 from lunar_mjx.dynamics import build
-from lunar_mjx.model import make_model
+from lunar_mjx.model import Model, make_model
 from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, VERMILION
-from lunar_mjx.terrain import load_terrain
+from lunar_mjx.rover import Rover
+from lunar_mjx.terrain import HeightField, load_terrain
 
 RIM = "de_gerlache_rim"
+_PLACE = (5.0, 0.0, -0.2)
+"""Where the rover of the first figure stands: x, y in m and yaw in rad."""
+_LOW_SUN = (250.0, 7.0)
+"""Azimuth and elevation of its Sun, deg."""
+_LABEL_COLOURS = ("#000000", "#8c8c8c", "#56B4E9", "#E69F00")
+"""Sky, ground, rock, rover: told apart without colour vision, and by their brightness."""
 _BOXES: dict[str, tuple[float, float, str, str, str]] = {
     "urdf": (0.0, 2.0, "URDF + description", "loops, motors, gains", BLUE),
     "dem": (0.0, 1.0, "DEM or procedure", "GeoTIFF, PDS, craters, rocks", BLUE),
@@ -40,40 +65,74 @@ _ARROWS = (
 
 
 def figure_1() -> tuple[Figure, dict[str, Any]]:
-    """The display: a rover on its terrain, and the three pictures of its front camera with the matrices' camera."""
+    """The display: a rover under a low Sun, and colour, depth and labels of its front camera, by the cameras in JAX."""
     model = make_model("viper", "lunar_plain")
+    rover = model.rover
     system = build(model)
-    qpos = np.asarray(system.reset(system.params, 5.0, 0.0, -0.2).qpos, float)
-    with RoverCamera(model.rover, model.terrain, qpos[None, :2], sun=Sun(200.0, 14.0)) as camera:
-        camera.place(qpos)
-        wide = camera.picture(orbit(qpos[:3] + np.array([0.6, 0.0, 0.2]), 6.0, 215.0, 16.0), Pinhole(1200, 760, 42.0))
-        images = camera.front()
-        optics, pose = camera.camera, camera.front_pose
+    qpos = np.asarray(system.reset(system.params, *_PLACE).qpos, float)
+    light = Light(Sun(*_LOW_SUN))
+    paint = _trodden(rover, qpos)
+    pose = orbit(qpos[:3] + np.array([0.7, 0.2, 0.25]), 6.6, 222.0, 8.0)
+    wide = _taken(model, qpos, pose, Pinhole(960, 572, 38.0), light, paint, detail=True)
+    optics = Pinhole(320, 240)
+    place, turn = mounted(front_mount(rover), jnp.asarray(qpos, jnp.float32))
+    front = Pose(np.asarray(place, float), np.asarray(turn, float))
+    seen = _taken(model, qpos, front, optics, light, paint, detail=False)
     figure = Figure(figsize=(13.0, 6.6))
-    grid = figure.add_gridspec(3, 2, width_ratios=(3.0, 1.0))
-    _picture(figure.add_subplot(grid[:, 0]), wide, "VIPER on lunar_plain, Sun in the south-south-west, 14° high")
-    near = np.where(np.isfinite(images.depth), images.depth, np.nan)
-    _picture(figure.add_subplot(grid[0, 1]), images.rgba, "front camera, RGBA")
+    grid = figure.add_gridspec(3, 2, width_ratios=(3.0, 1.0), left=0.01, right=0.94, top=0.95, bottom=0.01, wspace=0.02)
+    title = f"VIPER on lunar_plain, Sun in the west-south-west, {_LOW_SUN[1]:g}° high"
+    _picture(figure.add_subplot(grid[:, 0]), np.asarray(wide.rgb), title)
+    depth = np.asarray(seen.depth)
+    near = np.where(np.isfinite(depth), depth, np.nan)
+    _picture(figure.add_subplot(grid[0, 1]), np.asarray(seen.rgb), "its front camera: colour")
     axes = figure.add_subplot(grid[1, 1])
-    shown = axes.imshow(near, cmap="cividis_r", vmin=0.0, vmax=float(np.nanpercentile(near, 97)))
-    _bare(axes, "depth, m")
-    figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)))
-    labels = figure.add_subplot(grid[2, 1])
-    shown = labels.imshow(images.segmentation, cmap="gray", vmin=0, vmax=len(LABELS) - 1)
-    _bare(labels, "segmentation")
-    bar = figure.colorbar(shown, cax=labels.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=range(len(LABELS)))
+    shown = axes.imshow(near, cmap="cividis_r", norm=LogNorm(float(np.nanmin(near)), float(np.nanmax(near))))
+    _bare(axes, "distance, m (logarithmic)")
+    bar = figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=(2, 5, 10, 20, 50))
+    bar.ax.set_yticklabels(("2", "5", "10", "20", "50"))
+    bar.ax.minorticks_off()
+    labels, axes = np.asarray(seen.label), figure.add_subplot(grid[2, 1])
+    shown = axes.imshow(labels, cmap=ListedColormap(_LABEL_COLOURS), vmin=-0.5, vmax=len(LABELS) - 0.5)
+    _bare(axes, "what each pixel shows")
+    bar = figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=range(len(LABELS)))
     bar.ax.set_yticklabels(LABELS)
-    shares = {name: float((images.segmentation == i).mean()) for i, name in enumerate(LABELS)}
     return figure, {
         "size": [optics.width, optics.height],
         "fovy_deg": optics.fovy_deg,
-        "camera_position_m": pose.position.tolist(),
-        "view_matrix": images.view.tolist(),
-        "projection_matrix": images.projection.tolist(),
-        "share_of_pixels": shares,
+        "camera_position_m": front.position.tolist(),
+        "view_matrix": front.view_matrix().tolist(),
+        "projection_matrix": optics.projection_matrix().tolist(),
+        "share_of_pixels": {name: float((labels == i).mean()) for i, name in enumerate(LABELS)},
         "nearest_m": float(np.nanmin(near)),
         "median_m": float(np.nanmedian(near)),
     }
+
+
+def _taken(
+    model: Model, qpos: np.ndarray, pose: Pose, camera: Pinhole, light: Light, paint: HeightField, detail: bool
+) -> Pictures:
+    """A picture of a rover, its own tracks and its shadow."""
+    shapes = rover_shapes(model.rover, detail)
+
+    def look(terrain: Any, q: Any, place: Any, turn: Any) -> Pictures:
+        seen = placed(shapes, model.rover, q)
+        return picture(terrain, place, turn, camera, light, seen, paint=paint, far=90.0, steps=128, shadow_steps=128)
+
+    given = (jnp.asarray(v, jnp.float32) for v in (qpos, pose.position, pose.rotation))
+    return jax.device_get(jax.jit(look)(model.terrain, *given))
+
+
+def _trodden(rover: Rover, qpos: np.ndarray) -> HeightField:
+    """Mottled ground with the tracks of a rover that came straight to where it stands."""
+    w, x, y, z = qpos[3:7]
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    way = np.tile(qpos, (300, 1))
+    way[:, :2] -= np.linspace(12.0, 0.0, 300)[:, None] * np.array([np.cos(yaw), np.sin(yaw)])
+    side = 40.0
+    low = qpos[:2] - 0.5 * side
+    ground = regolith(4096, side)
+    trodden = TrackPainter(ground, low.tolist(), [side, side], wheel_tracks(rover, way)).paint(len(way))
+    return painted(np.asarray(trodden, np.float32).mean(axis=-1) / (255.0 * float(ALBEDO.mean())), low, side)
 
 
 def figure_2() -> tuple[Figure, dict[str, Any]]:

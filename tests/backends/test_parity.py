@@ -93,6 +93,7 @@ def test_a_drive_stays_within_tolerance_and_noise(luvmi):
     }
 
 
+@pytest.mark.slow
 def test_every_effect_of_field_agrees_with_native():
     """Ruts, slip-sinkage, skidding, bulldozing, boulders that hold, voltage and gear: JAX against NumPy, to rounding.
 

@@ -92,7 +92,7 @@ class Bench:
 
 
 @functools.cache
-def bench(rover: str, preset: str = "consistent", dt: float = 0.002) -> Bench:
+def bench(rover: str, preset: str = "field", dt: float = 0.002) -> Bench:
     """The bench for a rover, with a parking brake; cached, since each costs a compilation."""
     model = make_model(rover, "flat", preset, timestep=dt).add("parking_brake", engaged=0.0)
     return Bench(build(model))

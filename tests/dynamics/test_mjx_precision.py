@@ -1,4 +1,4 @@
-"""The MJX engine keeps every bit of float32, on a GPU too, and adds what MJX leaves out of a loop."""
+"""Engines and cameras keep every bit of float32, on a GPU too; MJX gets what it leaves out of a loop."""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +6,9 @@ import mujoco
 import numpy as np
 
 from lunar_mjx._quiet import mjx
+from lunar_mjx.cameras import Pinhole, front_mount
+from lunar_mjx.cameras.raymarch import depth_image, mounted
+from lunar_mjx.cameras.shapes import body_poses
 from lunar_mjx.dynamics import build
 from lunar_mjx.dynamics.mjx import MjxEngine, _cast
 from lunar_mjx.model import make_model
@@ -20,6 +23,22 @@ def test_products_keep_all_bits():
     text = str(jax.make_jaxpr(lambda p, s: system.step(p, s, control)[0])(system.params, state))
     assert text.count("dot_general[") > 50 and text.count("Precision.HIGHEST") >= text.count("dot_general[")
     assert "precision=None" not in text
+
+
+def test_a_rover_is_set_down_and_seen_with_all_bits():
+    system = build(make_model("luvmi_x", "lunar_plain", preset="field"))
+    control = jnp.zeros(len(system.joint_names))
+    camera = Pinhole(width=4, height=3)
+
+    def drive_and_look(params):
+        state, _ = system.step(params, system.reset(params), control)
+        places, turns = body_poses(system.model.rover, state.qpos)
+        picture = depth_image(params.terrain, places[1], turns[1], camera)
+        return picture, mounted(front_mount(system.model.rover), state.qpos)
+
+    text = str(jax.make_jaxpr(drive_and_look)(system.params))
+    products = text.count("dot_general[")
+    assert products >= 4 and text.count("Precision.HIGHEST") == 2 * products, "one for each factor"
 
 
 def test_loops_accelerate_at_given_speeds_as_in_native_mujoco():

@@ -217,9 +217,10 @@ def test_all_that_vanishes_vanishes_together() -> None:
     assert_alike(run((*without, *VANISHING), nulls, s, compiled=True), run(without, {}, s, compiled=True))
 
 
-UNSEEN = {"gravity_error", "multipass", "wheel_wear", "side_exit"}
-"""Effects that act on the bodies or by what went before, not on the forces of one step (test_history.py has them), or
-on contact behind the axle, which this list does not have (test_sliding_contact.py)."""
+UNSEEN = {"gravity_error", "multipass", "wheel_wear", "side_exit", "rim_contact", "ruts"}
+"""Effects that act on the bodies or by what went before, not on the forces of one step (test_history.py has them), on
+contact behind the axle, which this list does not have (test_sliding_contact.py), or on ground that is no plane
+(test_rim_contact.py, test_ruts.py)."""
 
 
 @pytest.mark.parametrize("name", VANISHING)

@@ -101,7 +101,7 @@ def closed_form(state: WheelState, shear_radius: float = 1.0, coefficient: float
     sigma = stress(s, np.cos(theta_m), np.cos(theta_1))
     strength = s.cohesion + sigma * s.tan_phi
     arc, chord = theta_1 - theta_m, np.sin(theta_1) - np.sin(theta_m)
-    tau_x = strength * mobilised(r_s * (d * (arc - chord) + s.slip_x * chord), s.shear_modulus_x)
+    tau_x = strength * mobilised(d * (r_s * arc - r * chord) + r * s.slip_x * chord, s.shear_modulus_x)
     tau_y = strength * mobilised(r * theta_m * s.slip_y, s.shear_modulus_y)
     load = r * b * sigma * a
     push = normal_force(load, damping(s, coefficient, theta_1))
@@ -141,7 +141,7 @@ def stress_integral(
                 sigma = stress(s, np.cos(front), np.cos(theta_1))
                 strength = s.cohesion + sigma * s.tan_phi
                 arc, chord = theta_1 - theta, np.sin(theta_1) - np.sin(theta)
-                tau_x = strength * mobilised(r_s * (d * (arc - chord) + s.slip_x * chord), s.shear_modulus_x)
+                tau_x = strength * mobilised(d * (r_s * arc - r * chord) + r * s.slip_x * chord, s.shear_modulus_x)
                 tau_y = strength * mobilised(r * arc * s.slip_y, s.shear_modulus_y)
                 step = theta_m * REAL(w) / (2 * pieces)
                 cos, sin = np.cos(theta), np.sin(theta)

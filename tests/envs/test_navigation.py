@@ -141,7 +141,11 @@ def test_straight_line_and_shipped_policy_reach_goals_on_flat_ground_in_every_so
 def test_shipped_policies_fit_their_task_and_hold_what_they_scored(rover):
     path = shipped_policy(rover)
     policy = load_policy(path)
-    assert path.stat().st_size < 2_000_000 and policy.environment["options"] == {"task": "large", "rover": rover}
+    assert path.stat().st_size < 2_000_000 and policy.environment["options"] == {
+        "task": "large",
+        "rover": rover,
+        "preset": "consistent",
+    }
     env = make_navigation("large", rover, terrain="flat", places=64, goal_distance=(4.0, 5.0))
     assert policy.network["obs"] == env.observation_size and policy.network["actions"] == env.action_size
     assert policy.notes["train_score"]["success"] > 0.95

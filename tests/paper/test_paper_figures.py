@@ -108,7 +108,8 @@ def test_workflow(tmp_path):
     assert "step on MJX" in numbers.read_text()
 
 
-def test_display_shows_what_the_front_camera_sees(opengl):
+@pytest.mark.slow
+def test_display_shows_what_the_front_camera_sees():
     figure, numbers = FIGURES["1"]()
     assert numbers["size"] == [320, 240]
     assert sum(numbers["share_of_pixels"].values()) == pytest.approx(1.0)

@@ -264,6 +264,7 @@ def test_folder_layout(rover: Rover, models: Path) -> None:
         "README.md",
         "LICENSE",
         "CHANGELOG.md",
+        "look.toml",
         "policy.npz",
         "POLICY.md",
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lunar_mjx.backends.physics.context import Context, Values
+from lunar_mjx.backends.physics.ground import Grid
 from lunar_mjx.backends.physics.vectors import clamp, cross, dot
 
 SLOW = 2e-3
@@ -56,6 +57,42 @@ def wheel_contact(
         "normal": normal,
         "inside": inside,
     }
+
+
+ALONG = np.linspace(-0.9, 0.9, 11)
+"""Places of the samples along the wheel, in radii."""
+MARGIN = 0.02
+"""Clearance, in radii, within which ground counts as near the rim."""
+AIRBORNE = 1e-6
+"""Weight of the three middle samples whatever the rim's clearance."""
+
+
+def rim_plane(c: Context, field: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Height below each wheel's centre and slopes by x and y of the plane fitted along and beside its rim.
+
+    Weighted least squares along the heading with weights (p/r + m)^2 of the depth p within the rim, and the difference
+    of the two sides across.
+    """
+    r, axle, center = c.geometry["radius"], c.wheel_axle, c.wheel_position
+    level = np.sqrt(axle[..., 0] ** 2 + axle[..., 1] ** 2 + 1e-12)
+    heading = np.stack([axle[..., 1], -axle[..., 0]], axis=-1) / level[..., None]
+    beside = np.stack([-heading[..., 1], heading[..., 0]], axis=-1)
+    u = r[..., None] * ALONG
+    points = center[..., None, :2] + u[..., None] * heading[..., None, :]
+    along = field.value(points[..., 0], points[..., 1])[0]
+    offset = 0.5 * c.geometry["width"][..., None] * beside
+    left, right = (field.value(*np.moveaxis(center[..., :2] + s * offset, -1, 0))[0] for s in (1.0, -1.0))
+    foot = along[..., len(ALONG) // 2].copy()
+    along -= foot[..., None]
+    clear = center[..., 2, None] - foot[..., None] - along
+    depth = 1.0 + MARGIN - np.sqrt(u * u + clear * clear) / r[..., None]
+    weight = np.maximum(depth, 0.0) ** 2 + AIRBORNE * (np.abs(ALONG) < 0.3)
+    weight /= weight.sum(-1, keepdims=True)
+    mean_u, mean_h = (weight * u).sum(-1), (weight * along).sum(-1)
+    off = u - mean_u[..., None]
+    slope = (weight * off * along).sum(-1) / (weight * off * off).sum(-1)
+    steep = slope[..., None] * heading + ((left - right) / c.geometry["width"])[..., None] * beside
+    return foot + mean_h - slope * mean_u, steep[..., 0], steep[..., 1]
 
 
 def faster(rim: np.ndarray, travel: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from lunar_mjx.backends.hooks import Hooks
 from lunar_mjx.backends.physics import hard, motor, outdoors, printed, soil
-from lunar_mjx.backends.physics.contact import momentary_slip, wheel_contact
+from lunar_mjx.backends.physics.contact import momentary_slip, rim_plane, wheel_contact
 from lunar_mjx.backends.physics.context import Context, Values
 from lunar_mjx.backends.physics.ground import Ground
 from lunar_mjx.backends.physics.parameters import Numbers
@@ -168,7 +168,12 @@ class ForceModel:
             c.chassis_point = points
         height, slope_x, slope_y, inside = self.ground.field.value(place[..., 0], place[..., 1])
         c.chassis_ground = height[:, wheels:], slope_x[:, wheels:], slope_y[:, wheels:]
-        c.contact = wheel_contact(c, height[:, :wheels], slope_x[:, :wheels], slope_y[:, :wheels], inside[:, :wheels])
+        flat, along_x, along_y = height[:, :wheels], slope_x[:, :wheels], slope_y[:, :wheels]
+        if "rim_contact" in self.numbers:
+            share, fitted = self.numbers.effects["rim_contact"].share, rim_plane(c, self.ground.field)
+            flat = flat + share * (fitted[0] - flat)
+            along_x, along_y = along_x + share * (fitted[1] - along_x), along_y + share * (fitted[2] - along_y)
+        c.contact = wheel_contact(c, flat, along_x, along_y, inside[:, :wheels])
         if "contact" in hooks:
             c.contact = hooks.call("contact", c, c.contact)
 

@@ -150,7 +150,7 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
 
 
 def closed_form_shear(c: Context, p: SimpleNamespace) -> None:
-    """tau at theta_m from j = r_s[(theta_1 - theta_m) - (1 - s)(sin theta_1 - sin theta_m)], applied over the arc.
+    """tau at theta_m from j = r_s (theta_1 - theta_m) - r (1 - s)(sin theta_1 - sin theta_m), applied over the arc.
 
     F_x = r_s b tau A - r b sigma_m B; F_y = -r b tau_y theta_m; F_z = load + damping + r_s b tau B; M_x = r F_y;
     M_y = -r_s^2 b tau theta_m; M_z = r sin(theta_m) F_y, with the arc leaning in the direction of rolling.
@@ -163,7 +163,7 @@ def closed_form_shear(c: Context, p: SimpleNamespace) -> None:
     sin_m = np.sin(theta_m)
     chord = np.sin(theta_1) - sin_m
     strength = (soil["cohesion"] + normal["sigma_m"] * soil["tan_phi"]) * (c.contact["sinkage"] > 0.0)
-    j = r_s * (way * (theta_1 - theta_m - chord) + slip["slip_x"] * chord)
+    j = way * (r_s * (theta_1 - theta_m) - r * chord) + r * slip["slip_x"] * chord
     tau, tau_y = shear_stress(
         c, strength, j / soil["shear_modulus_x"], r * theta_m * slip["slip_y"] / soil["shear_modulus_y"]
     )
@@ -216,7 +216,8 @@ def integral_shear(c: Context, p: SimpleNamespace) -> None:
     chord = np.sin(theta_1) - np.sin(theta)
     touching = (c.contact["sinkage"] > 0.0)[..., None]
     strength = weight * (soil["cohesion"][..., None] + sigma * soil["tan_phi"][..., None]) * touching
-    j = r_s[..., None] * (way[..., None] * (theta_1 - theta - chord) + slip["slip_x"][..., None] * chord)
+    j = way[..., None] * (r_s[..., None] * (theta_1 - theta) - r[..., None] * chord)
+    j = j + (r * slip["slip_x"])[..., None] * chord
     across = (r * slip["slip_y"])[..., None] * (theta_1 - theta)
     tau, tau_y = shear_stress(
         c, strength, j / soil["shear_modulus_x"][..., None], across / soil["shear_modulus_y"][..., None]

@@ -241,7 +241,8 @@ def shearing_radius(p, geometry, wheel):
 def closed_form_shear(ctx, p, x, wheel):
     """Eqs. 10-14 mended: j with the radius in both terms (flaw 3), Ding's place of r_s (flaw 5), signs for both ways.
 
-    j = r_s[(theta_1 - theta_m) - (1 - s)(sin theta_1 - sin theta_m)]; tau = (c + sigma_m tan phi)(1 - exp(-j/K_s));
+    j = r_s (theta_1 - theta_m) - r (1 - s)(sin theta_1 - sin theta_m), as the slip s is that of the rim;
+    tau = (c + sigma_m tan phi)(1 - exp(-j/K_s));
     F_x = r_s b tau A - r b sigma_m B; F_z = r b sigma_m A + r_s b tau B; F_y = -r b tau_y theta_m with its own
     displacement r (1-s) theta_m tan(beta), so that a wheel that does not slip along still holds across; M_y = -r_s^2 b
     tau theta_m. Lateral force acts at theta_m below the axle: M_x = r F_y (eq. 13), M_z = r sin(theta_m) F_y (eq. 14,
@@ -256,7 +257,7 @@ def closed_form_shear(ctx, p, x, wheel):
         a_factor, b_factor, whole, front = normal.arc.cos, normal.arc.sin, normal.arc.one, theta_1 - theta_m
     arc = sin_difference(theta_1, theta_m)
     strength = grounded(ctx.contact, soil.cohesion + normal.sigma_m * soil.tan_phi)
-    j_x = r_s * (wheel.direction * ((theta_1 - theta_m) - arc) + wheel.slip_x * arc)
+    j_x = wheel.direction * (r_s * (theta_1 - theta_m) - r * arc) + r * wheel.slip_x * arc
     tau, tau_y = shear_stress(wheel, soil, strength, j_x, r * front * wheel.slip_y)
     side = -r * b * whole * tau_y
     force = Vec3(

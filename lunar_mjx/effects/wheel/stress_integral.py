@@ -81,7 +81,7 @@ def _shear(ctx, p, x, wheel):
     )
     arc = sin_difference(theta_1, theta)
     strength = grounded(ctx.contact, soil.cohesion + sigma * soil.tan_phi)
-    j_x = r_s * (wheel.direction * ((theta_1 - theta) - arc) + wheel.slip_x * arc)
+    j_x = wheel.direction * (r_s * (theta_1 - theta) - r * arc) + r * wheel.slip_x * arc
     tau, tau_y = shear_stress(wheel, soil, weight * strength, j_x, r * (theta_1 - theta) * wheel.slip_y)
     cos, sin = jnp.cos(theta), jnp.sin(theta)
     along, lift, turn = jnp.sum(tau * cos, axis=0), jnp.sum(tau * sin, axis=0), jnp.sum(tau, axis=0)
@@ -108,6 +108,6 @@ stress_integral = Effect(
 
     sigma(theta) = (k_c/b + k_phi)[r(cos theta - cos theta_1)]^n in front of theta_m = theta_1/2, mirrored in proportion
     behind it down to theta_2 = 0 (Wong & Reece 1967); tau(theta) = (c + sigma tan phi)(1 - exp(-j(theta)/K)) with
-    j(theta) = r_s[(theta_1 - theta) - (1 - s)(sin theta_1 - sin theta)] (Janosi & Hanamoto 1961) and across
+    j(theta) = r_s (theta_1 - theta) - r (1 - s)(sin theta_1 - sin theta) (Janosi & Hanamoto 1961) and across
     r (1 - s)(theta_1 - theta) tan(beta) (Ishigami et al. 2007).""",
 )

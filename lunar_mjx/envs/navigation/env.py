@@ -14,6 +14,7 @@ import numpy as np
 from lunar_mjx.cameras.batch import Light, pictures
 from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics import State as Physics
+from lunar_mjx.effects.presets import DEFAULT_PRESET
 from lunar_mjx.envs.core import State, side_by_side, where
 from lunar_mjx.envs.navigation import kalman, randomise, rewards
 from lunar_mjx.envs.navigation.actions import action_map
@@ -437,7 +438,7 @@ def make_navigation(
     task: str | NavigationConfig = "consistent",
     rover: str = "luvmi_x",
     terrain: Any = None,
-    preset: str = "consistent",
+    preset: str = DEFAULT_PRESET,
     model: Model | str | Path | None = None,
     engine: str = "auto",
     **settings: Any,

@@ -1,0 +1,61 @@
+"""A wheeled rover on hard, level ground, from what its folder says: where criticism of drives on Earth begins."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from lunar_mjx.effects import catalogue
+from lunar_mjx.model.model import Model, make_model
+from lunar_mjx.rover import Rover
+
+EFFECTS = (
+    "joint_control",
+    "motor",
+    "directional_gear_efficiency",
+    "coulomb_friction",
+    "com_offset",
+    "soil",
+    "hard_surface",
+    "pressure_sinkage",
+    "shear_state",
+    "closed_form_shear",
+    "hard_ground",
+)
+"""Motors with friction in their gears, and tyres with friction that hardly sink."""
+TYRE_SINKAGE = 0.018
+"""Depth by which a tyre under its share of the rover yields, over its radius: 3 mm of a Husky's 0.165 m."""
+TYRE_DAMPING = 0.23
+"""Damping of the rover on its tyres over the critical one."""
+GEAR_FRICTION = 0.02
+"""Coulomb friction of a drive over the torque that lifts the whole weight at the rim; 2 N m of a Husky's 97."""
+FRICTION, SLIP_SCALE, SIDE = 0.6, 0.05, 0.75
+"""Rubber on floors and asphalt: friction; slip at which it is reached to 1/e; friction across a tyre over along it."""
+
+
+def hard_floor(rover: str | Path | Rover, gravity: float | None = None) -> Model:
+    """The model of a rover on hard, level ground, with tyres and gear friction in proportion to its weight.
+
+    Values are starting points for `compare`, which fits them to drives.
+
+    Args:
+      rover: name or folder of a rover, or a rover.
+      gravity: m/s2; the rover's own where None.
+    """
+    model = make_model(rover, terrain="flat", preset="consistent", **({} if gravity is None else {"gravity": gravity}))
+    effects = tuple(catalogue.CATALOGUE[name] for name in EFFECTS)
+    model = dataclasses.replace(
+        model,
+        effects=effects,
+        parameters={e.name: model.parameters.get(e.name, e.nominal()) for e in effects},
+        effect_files={e.name: e.name for e in effects},
+    )
+    wheels = model.rover.wheels
+    radius = sum(w.radius for w in wheels) / len(wheels)
+    load = model.rover.mass * model.gravity / len(wheels)
+    stiffness = load / (TYRE_SINKAGE * radius)
+    damping = 2.0 * TYRE_DAMPING * (stiffness * model.rover.mass / len(wheels)) ** 0.5
+    model = model.set(
+        "hard_ground", "hard floor", stiffness=stiffness, damping=damping, mu=FRICTION, slip_scale=SLIP_SCALE, side=SIDE
+    )
+    return model.set("coulomb_friction", "hard floor", torque=GEAR_FRICTION * load * len(wheels) * radius)
