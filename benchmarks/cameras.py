@@ -1,18 +1,20 @@
 """Images per second: pictures, depth and height images in JAX by batch and size, and MuJoCo's renderer beside them.
 
-    python benchmarks/cameras.py --batches 256,1024,4096 --out benchmarks/cameras_h200.json
-    python benchmarks/cameras.py --batches 4,16 --sizes 64x48 --repeats 2 --out benchmarks/cameras_2cores.json
+    python benchmarks/cameras.py --batches 4,16 --sizes 64x48,320x240 --repeats 2 --out benchmarks/cameras_2cores.json
+    python benchmarks/cameras.py --only pictures --batches 2048 --sizes 64x48,320x240 --out benchmarks/cameras_h100.json
 
 Pictures are colour, depth and labels with shadows. A row of the JAX cameras counts only where `median_error` is there:
-the depth of one picture of the same size against MuJoCo's renderer in the same process; `labels` is the share of pixels
-whose label agrees. Without OpenGL these are null, and there is no row of the renderer. `mebibytes` is what the compiled
-program needs beyond arguments and results.
+the depth of one picture of the same size against MuJoCo's renderer; `labels` is the share of pixels whose label agrees.
+Where there is OpenGL, what the renderer drew is kept in `cameras_drawn.npz`; where there is none, as on most machines
+with a large GPU, pictures are held against that file, and there is no row of the renderer. `mebibytes` is what the
+compiled program needs beyond arguments and results. A checkout without git says its commit as CAMERAS_COMMIT.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import time
 from functools import partial
@@ -58,10 +60,10 @@ def seconds(function: Any, repeats: int) -> tuple[float, float]:
 
 
 def spread(model: Model, count: int) -> jax.Array:
-    """Coordinates of rovers on a spiral over the middle of the terrain."""
+    """Coordinates of rovers on a spiral over the middle of the terrain; the first one is always at the same place."""
     system = build(model)
     turn = jnp.arange(count) * 2.4
-    reach = 15.0 * jnp.sqrt((jnp.arange(count) + 0.5) / count)
+    reach = 15.0 * jnp.sqrt(jnp.arange(count) / count)
     reset = jax.jit(jax.vmap(lambda x, y, yaw: system.reset(system.params, x, y, yaw).qpos))
     return reset(reach * jnp.cos(turn), reach * jnp.sin(turn), turn)
 
@@ -90,6 +92,27 @@ def renderer_rows(model: Model, sizes: list[Pinhole], qpos: np.ndarray, repeats:
     return rows
 
 
+DRAWN = Path(__file__).with_name("cameras_drawn.npz")
+THINNED = 4
+"""Of pictures wider than 100 pixels, every fourth row and column is kept and compared."""
+
+
+def thinned(picture: np.ndarray) -> np.ndarray:
+    """The pixels of a picture that are compared."""
+    return picture[::THINNED, ::THINNED] if picture.shape[1] > 100 else picture
+
+
+def keep_or_recall(rows: list[dict], about: str, sizes: list[Pinhole]) -> list[dict]:
+    """What the renderer drew, thinned: kept in `DRAWN` where it drew, read from there where it could not."""
+    kept = dict(np.load(DRAWN)) if DRAWN.is_file() else {}
+    keys = [f"{about} {c.width}x{c.height}" for c in sizes]
+    for row, key in zip(rows, keys, strict=False):
+        kept |= {f"{key} depth": thinned(row["depth"]).astype(np.float32), f"{key} labels": thinned(row["labels"])}
+    if rows:
+        np.savez_compressed(DRAWN, **kept)
+    return [{k: kept[f"{key} {k}"] for k in ("depth", "labels")} for key in keys if f"{key} depth" in kept]
+
+
 def picture_rows(
     model: Model, camera: Pinhole, qpos: jax.Array, batches: list[int], given: argparse.Namespace, drawn: dict | None
 ) -> list[dict]:
@@ -105,7 +128,7 @@ def picture_rows(
         compiling = time.perf_counter() - started
         if drawn is not None and median is None:
             seen = compiled(terrain, qpos[:batch])
-            depth, label = np.asarray(seen.depth[0]), np.asarray(seen.label[0])
+            depth, label = thinned(np.asarray(seen.depth[0])), thinned(np.asarray(seen.label[0]))
             both = np.isfinite(depth) & np.isfinite(drawn["depth"]) & (label == drawn["labels"])
             median = float(np.median(np.abs(depth[both] / drawn["depth"][both] - 1.0)))
             share = float((label == drawn["labels"]).mean())
@@ -138,6 +161,7 @@ def main() -> None:
     parser.add_argument("--scan", default="32x32", help="rows and columns of the height images")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--pixels", type=int, default=80_000_000, help="largest number of pixels at once")
+    parser.add_argument("--only", choices=("all", "pictures"), default="all", help="leave out depth and height images")
     parser.add_argument("--out", type=Path, default=Path("cameras.json"))
     given = parser.parse_args()
     model = make_model(given.rover, given.terrain)
@@ -148,10 +172,13 @@ def main() -> None:
     position, rotation = jax.jit(partial(mounted, front_mount(model.rover)))(qpos)
     terrain = jax.device_put(model.terrain)
     rows: list[dict] = [{k: v for k, v in row.items() if k not in ("depth", "labels")} for row in drawn]
-    for k, camera in enumerate(sizes):
+    drawn = keep_or_recall(drawn, f"{given.rover} {given.terrain}", sizes)
+    drawn = drawn if len(drawn) == len(sizes) else []
+    others = sizes if given.only == "all" else []
+    for k, camera in enumerate(others):
         error = None
         if drawn:
-            one = np.asarray(jax.jit(partial(depth_image, camera=camera))(terrain, position[0], rotation[0]))
+            one = thinned(np.asarray(jax.jit(partial(depth_image, camera=camera))(terrain, position[0], rotation[0])))
             both = np.isfinite(one) & np.isfinite(drawn[k]["depth"])
             error = float(np.median(np.abs(one[both] / drawn[k]["depth"][both] - 1.0)))
             if error > TOLERANCE:
@@ -172,9 +199,10 @@ def main() -> None:
             )
     for k, camera in enumerate(sizes):
         rows += picture_rows(model, camera, qpos, batches, given, drawn[k] if drawn else None)
+        write(given, rows)
     rows_, columns = (int(n) for n in given.scan.split("x"))
     shape = (rows_, columns)
-    for batch in batches:
+    for batch in batches if given.only == "all" else []:
         scan = jax.jit(partial(height_scan, shape=shape))
         yaw = jnp.zeros(batch)
         first, each = seconds(partial(scan, terrain, qpos[:batch, :3], yaw), given.repeats)
@@ -187,21 +215,25 @@ def main() -> None:
                 "first_call_s": first,
             }
         )
-    device = jax.devices()[0]
-    about = {
-        "rover": given.rover,
-        "terrain": given.terrain,
-        "device": device.device_kind,
-        "commit": commit(),
-        "jax": jax.__version__,
-        "processor": platform.processor() or platform.machine(),
-        "repeats": given.repeats,
-    }
     for row in rows:
         print(
             f"{row['kind']:36} {row['size'][0]:4} x {row['size'][1]:<4} batch {row['batch']:6}: "
             f"{row['images_per_s']:12,.1f} images/s"
         )
+    write(given, rows)
+
+
+def write(given: argparse.Namespace, rows: list[dict]) -> None:
+    """Writes the rows so far, with what they were measured on."""
+    about = {
+        "rover": given.rover,
+        "terrain": given.terrain,
+        "device": jax.devices()[0].device_kind,
+        "commit": os.environ.get("CAMERAS_COMMIT") or commit(),
+        "jax": jax.__version__,
+        "processor": platform.processor() or platform.machine(),
+        "repeats": given.repeats,
+    }
     given.out.write_text(json.dumps({"about": about, "rows": rows}, indent=1) + "\n", encoding="utf-8")
 
 

@@ -139,6 +139,7 @@ def pictures(
     light: Light | None = None,
     others: Float[Array, "rover other nq"] | None = None,
     at_once: int | None = None,
+    detail: bool = False,
     **more: Any,
 ) -> Pictures:
     """What the front cameras of many rovers see of ground, rocks, themselves and each other.
@@ -149,9 +150,10 @@ def pictures(
       camera: optics. mount: the camera's pose in the chassis frame; `front_mount` if None. light: see `Light`.
       others: coordinates of other rovers of the kind that each camera may see.
       at_once: how many pictures are in memory at once (all if None).
+      detail: whether parts too small for small pictures are drawn, such as grousers.
       more: `far`, `steps`, `shadow_steps`, `paint` of `picture`.
     """
-    shapes, optics = rover_shapes(rover), camera or Pinhole(64, 48)
+    shapes, optics = rover_shapes(rover, detail), camera or Pinhole(64, 48)
     where = mount or front_mount(rover)
 
     def one(given: tuple) -> Pictures:

@@ -21,6 +21,7 @@ from lunar_mjx.cameras.pinhole import Pose
 from lunar_mjx.cameras.texture import ALBEDO, Track, TrackPainter, regolith
 from lunar_mjx.errors import bad_input
 from lunar_mjx.rover import Rover
+from lunar_mjx.rover.look import seen_spec
 from lunar_mjx.rover.mjcf import quaternion
 from lunar_mjx.terrain import Terrain
 
@@ -108,7 +109,7 @@ def build_scene(
       The compiled `MjModel`, with untrodden ground, and what paints the tracks into its texture.
     """
     terrain = jax.device_get(terrain)
-    spec = rover.spec()
+    spec = seen_spec(rover)
     spec.stat.extent = 1.0
     spec.stat.center = [0.0, 0.0, 0.0]
     visual = spec.visual

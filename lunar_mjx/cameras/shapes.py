@@ -8,12 +8,14 @@ from __future__ import annotations
 import functools
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
 from lunar_mjx.rover import Rover
+from lunar_mjx.rover.look import DETAIL, HIDDEN, seen_spec
 
 BOX, CYLINDER, CAPSULE, ELLIPSOID = range(4)
 _KINDS = {
@@ -24,8 +26,6 @@ _KINDS = {
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: ELLIPSOID,
     mujoco.mjtGeom.mjGEOM_MESH: BOX,
 }
-_HIDDEN_GROUP = 3
-"""MuJoCo's convention: geoms of this group and above are for collisions, not for the eye."""
 _FAR = 1e9
 
 
@@ -57,16 +57,16 @@ class Placed(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def _compiled(rover: Rover) -> Any:
-    return rover.compile()
+    return seen_spec(rover).compile()
 
 
-def rover_shapes(rover: Rover) -> Shapes:
-    """The shapes of a rover that the eye sees."""
+def rover_shapes(rover: Rover, detail: bool = False) -> Shapes:
+    """The shapes of a rover that the eye sees; with `detail` grousers, seams and lenses, too, which take time."""
     m = _compiled(rover)
     seen = [
         i
         for i in range(m.ngeom)
-        if m.geom_group[i] < _HIDDEN_GROUP and m.geom_rgba[i, 3] > 0 and int(m.geom_type[i]) in _KINDS
+        if m.geom_group[i] < (HIDDEN if detail else DETAIL) and m.geom_rgba[i, 3] > 0 and int(m.geom_type[i]) in _KINDS
     ]
     size = m.geom_size[seen].copy()
     place, turn = m.geom_pos[seen].copy(), np.stack([_matrix(q) for q in m.geom_quat[seen]])
@@ -93,6 +93,7 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
     return out.reshape(3, 3)
 
 
+@jax.default_matmul_precision("highest")  # not TF32, the default of GPUs
 def body_poses(rover: Rover, qpos: Float[Array, "nq"]) -> tuple[Any, Any]:
     """Positions (body, 3) m and rotations (body, 3, 3) of a rover's bodies; the same as `mj_kinematics` gives.
 

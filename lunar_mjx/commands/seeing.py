@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from lunar_mjx.commands.compiled import keep_compiled
-from lunar_mjx.commands.options import MOST_SEED
+from lunar_mjx.commands.options import MOST_SEED, PresetOption
 from lunar_mjx.errors import bad_input
 
 ModelOption = Annotated[Path | None, typer.Option(help="model.toml; overrides --rover, --terrain and --preset.")]
@@ -83,7 +83,7 @@ def view(
     terrain: Annotated[
         str, typer.Option(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")
     ] = "lunar_plain",
-    preset: Annotated[str, typer.Option(help="consistent, field or paper.")] = "consistent",
+    preset: PresetOption = None,
     model: ModelOption = None,
     effects: Annotated[
         list[str] | None, typer.Option(help="Effect to add: catalogue name, my_effects.py or my_effects.py:name.")
@@ -105,6 +105,7 @@ def view(
     check_finite(speed=speed, x=x, y=y, yaw_deg=yaw_deg)
     azimuth, elevation = _numbers("--sun", sun, ",", float)
     from lunar_mjx.cameras import Sun
+    from lunar_mjx.effects.presets import DEFAULT_PRESET
     from lunar_mjx.model import make_model
     from lunar_mjx.model.file import load_model
     from lunar_mjx.viewer.drive import LiveDrive
@@ -114,7 +115,7 @@ def view(
     light = Sun(azimuth, elevation)
     check_port(port)
     keep_compiled()
-    built = load_model(model) if model else make_model(rover, terrain, preset)
+    built = load_model(model) if model else make_model(rover, terrain, preset or DEFAULT_PRESET)
     for effect in effects or []:
         built = built.add(effect, "--effects")
     drive = LiveDrive(built, engine, speed, x, y, math.radians(yaw_deg))

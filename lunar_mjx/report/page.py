@@ -107,10 +107,11 @@ _CONFIG = {
 
 def _script() -> str:
     """plotly.js, compressed: the page stays far below 5 MB, and the browser unpacks it without any request."""
-    return _packed(plotly.offline.get_plotlyjs())
+    return packed(plotly.offline.get_plotlyjs())
 
 
-def _packed(text: str) -> str:
+def packed(text: str) -> str:
+    """Text as gzip in base64, which a page unpacks without any request."""
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode("ascii")
 
 
@@ -165,7 +166,7 @@ def _block(block: Block, figures: list[str]) -> dict[str, Any]:
             "caption": block.caption,
             "map": _placed(block.figure, figures),
             "detail": _placed(block.detail, figures),
-            "panels": _packed(json.dumps(block.panels, allow_nan=False)),
+            "panels": packed(json.dumps(block.panels, allow_nan=False)),
             "choices": [(key, panel["label"]) for key, panel in block.panels.items()],
         }
     return {"kind": kind, **block._asdict()}

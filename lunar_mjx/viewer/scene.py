@@ -13,6 +13,7 @@ import numpy as np
 
 from lunar_mjx.cameras.scene import FAR_NODES, Patch, Sun, cut
 from lunar_mjx.model import Model
+from lunar_mjx.rover.look import HIDDEN, seen_spec
 from lunar_mjx.terrain import Terrain
 
 NEAR, NODES = 20.0, 420
@@ -26,17 +27,13 @@ _SHAPES = {
     mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
-_HIDDEN_GROUP = 3
-"""MuJoCo's convention: geoms of this group and above are for collisions, not for the eye."""
 
 
 def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
     """The rover's shapes, wheels, and the light, as plain data for JSON."""
     rover = model.rover
-    mj = rover.compile()
-    shapes = [
-        _shape(mj, i) for i in range(mj.ngeom) if mj.geom_group[i] < _HIDDEN_GROUP and int(mj.geom_type[i]) in _SHAPES
-    ]
+    mj = seen_spec(rover).compile()
+    shapes = [_shape(mj, i) for i in range(mj.ngeom) if mj.geom_group[i] < HIDDEN and int(mj.geom_type[i]) in _SHAPES]
     return {
         "rover": rover.name,
         "terrain": model.terrain.name,

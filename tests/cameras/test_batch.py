@@ -187,6 +187,7 @@ def test_a_rover_throws_a_shadow() -> None:
     assert west.min() > -0.1 and west.max() == pytest.approx(1.0 / np.tan(np.radians(30.0)), abs=0.25)
 
 
+@pytest.mark.slow
 def test_batches_agree_with_one_and_see_each_other() -> None:
     rover, terrain, eye = load_rover("luvmi_x"), bumpy(), Pinhole(24, 18)
     qpos = np.tile(rover.compile().qpos0, (3, 1))

@@ -13,11 +13,15 @@ import pytest
 from lunar_mjx.cameras import placed, rover_shapes, together
 from lunar_mjx.cameras.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, Placed, body_poses, hit, normal
 from lunar_mjx.rover import load_rover
+from lunar_mjx.rover.look import seen_spec
+
+SHOWN = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+"""Groups of geoms that the eye sees."""
 
 
 def some_pose(rover, seed: int):
     """Any coordinates, joints within 0.5 rad, and MuJoCo's data there."""
-    model = rover.compile()
+    model = seen_spec(rover).compile()
     rng = np.random.default_rng(seed)
     qpos = model.qpos0 + rng.uniform(-0.5, 0.5, model.nq)
     qpos[3:7] = rng.standard_normal(4)
@@ -45,12 +49,12 @@ def test_rays_meet_a_rover_where_mujocos_do(name: str) -> None:
     origin = data.xpos[1] + np.array([2.5, -1.5, 1.0])
     aim = data.xpos[1] + rng.uniform(-0.6, 0.6, (600, 3))
     direction = aim - origin
-    shapes = rover_shapes(rover)
+    shapes = rover_shapes(rover, detail=True)
     found, which = jax.jit(lambda q, d: hit(placed(shapes, rover, q), jnp.asarray(origin, jnp.float32), d))(
         jnp.asarray(qpos, jnp.float32), jnp.asarray(direction, jnp.float32)
     )
     geom = np.zeros(1, np.int32)
-    true = np.array([mujoco.mj_ray(model, data, origin, d, None, 1, -1, geom, None) for d in direction])
+    true = np.array([mujoco.mj_ray(model, data, origin, d, SHOWN, 1, -1, geom, None) for d in direction])
     met = true >= 0
     assert 100 < met.sum() < 600
     assert (np.isfinite(found) == met).mean() > 0.995  # but for rays that graze an edge

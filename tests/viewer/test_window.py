@@ -12,7 +12,10 @@ import pytest
 
 from tests.cli_harness import MAIN
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no Xvfb is installed")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no Xvfb is installed: apt install xvfb"),
+]
 
 
 @pytest.fixture

@@ -37,12 +37,12 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     All models must have been held against the same measurements.
     """
     o = steps[0].observations
-    cells = {(c, u): at for c, u, at in _cells(o) if any(np.isfinite(s.residual[at]).any() for s in steps)}
-    if not cells:
+    places = {(c, u): at for c, u, at in cells(o) if any(np.isfinite(s.residual[at]).any() for s in steps)}
+    if not places:
         return []
-    channels, units = list(dict.fromkeys(c for c, _ in cells)), sorted({u for _, u in cells})
+    channels, units = list(dict.fromkeys(c for c, _ in places)), sorted({u for _, u in places})
     shown_steps = [*steps[: _MAPS - 1], steps[-1]] if len(steps) > _MAPS else list(steps)
-    rms = [{key: _rms(s.residual[at]) for key, at in cells.items()} for s in shown_steps]
+    rms = [{key: _rms(s.residual[at]) for key, at in places.items()} for s in shown_steps]
     most = max(v for row in rms for v in row.values() if v is not None)
     titles = [f"{_number(steps, s)}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for s in shown_steps]
     height = 24 * len(channels)
@@ -71,9 +71,9 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     figure.update_xaxes(tickangle=0 if len(units) <= 8 else -45, showgrid=False, type="category", automargin=True)
     figure.update_annotations(x=0.0, xanchor="left")
     thin = max(1, int(np.ceil(len(o) * 5 / _MOST_VALUES)))
-    worst = sorted(cells, key=lambda key: -(rms[0][key] or 0.0))
+    worst = sorted(places, key=lambda key: -(rms[0][key] or 0.0))
     models = _compared(steps)
-    found = {_key(*key): _panel(models, *key, cells[key][::thin]) for key in worst}
+    found = {_key(*key): _panel(models, *key, places[key][::thin]) for key in worst}
     left = f" {len(steps) - _MAPS} models in between are left out." if len(steps) > _MAPS else ""
     caption = (
         "Root mean square residual in sigma, 1 is the noise: one map for each model of the chain, in one scale of "
@@ -224,7 +224,7 @@ def _baseline(traces: Traces) -> int:
     return traces.labels.index("refitted") if "refitted" in traces.labels else len(traces.labels) - 1
 
 
-def _cells(o: Observations) -> Iterator[tuple[str, int, np.ndarray]]:
+def cells(o: Observations) -> Iterator[tuple[str, int, np.ndarray]]:
     """Channel, manoeuvre, and places of its observations."""
     found: dict[tuple[str, int], list[np.ndarray]] = {}
     for s in o.series:
@@ -335,11 +335,11 @@ def _covariates(traces: Traces) -> Mapping[str, np.ndarray]:
     }
     out = {"time, s": traces.time}
     for name, (begin, end) in wanted.items():
-        out[name] = _along(o, begin, end)
+        out[name] = covariate_along(o, begin, end)
     return out
 
 
-def _along(o: Observations, begin: str, end: str) -> np.ndarray:
+def covariate_along(o: Observations, begin: str, end: str) -> np.ndarray:
     """Mean of the measured channels of a kind, at the times of all observations of the same log."""
     out = np.full(len(o), np.nan)
     for log in range(len(o.logs)):
@@ -370,6 +370,6 @@ def _binned(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float], lis
 
 def _largest(o: Observations, shape: np.ndarray) -> tuple[str, int, np.ndarray] | None:
     """Channel, manoeuvre and observations where a shape has most of its length."""
-    cells = [(c, u, at) for c, u, at in _cells(o) if len(at) >= _FEW]
-    best = max(cells, key=lambda cell: float(np.sum(shape[cell[2]] ** 2)), default=None)
+    seen = [(c, u, at) for c, u, at in cells(o) if len(at) >= _FEW]
+    best = max(seen, key=lambda cell: float(np.sum(shape[cell[2]] ** 2)), default=None)
     return best if best is not None and np.any(shape[best[2]]) else None

@@ -11,10 +11,16 @@ from pathlib import Path
 from typing import Any
 
 CHROMIUM = next((p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None)
+ABSENT = "no Chromium on the path; get it by: apt-get install chromium (Debian), brew install --cask chromium (macOS)"
+"""Why a test of a page is skipped, and what to do about it."""
 
 
 class Browser:
-    """One page of a headless Chromium with software WebGL."""
+    """One page of a headless Chromium with software WebGL.
+
+    Attributes:
+      problems: errors of the page and entries of its log. requests: addresses that it asked for.
+    """
 
     def __init__(self, folder: Path, size: tuple[int, int] = (1280, 760)):
         assert CHROMIUM is not None
@@ -43,6 +49,7 @@ class Browser:
         os.close(to_read)
         os.close(to_write)
         self._count, self._rest, self.problems = 0, b"", []
+        self.requests: list[str] = []
         self._session: str | None = None
         targets = self.call("Target.getTargets")["targetInfos"]
         page = next(t["targetId"] for t in targets if t["type"] == "page")
@@ -50,6 +57,7 @@ class Browser:
         self.call("Page.enable")
         self.call("Runtime.enable")
         self.call("Log.enable")
+        self.call("Network.enable")
         self.call(
             "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
         )
@@ -65,6 +73,8 @@ class Browser:
             answer = self._next()
             if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
                 self.problems.append(answer["params"])
+            if answer.get("method") == "Network.requestWillBeSent":
+                self.requests.append(answer["params"]["request"]["url"])
             if answer.get("id") == self._count:
                 assert "error" not in answer, answer["error"]
                 return answer["result"]
@@ -94,6 +104,21 @@ class Browser:
     def key(self, kind: str, code: str, key: str) -> None:
         """`kind` is keyDown or keyUp."""
         self.call("Input.dispatchKeyEvent", type=kind, code=code, key=key)
+
+    def press(self, key: str) -> None:
+        """Presses and releases a key that moves the focus or the choice, such as Tab, Enter or ArrowDown."""
+        number = {"Tab": 9, "Enter": 13, "End": 35, "Home": 36}
+        number |= {f"Arrow{way}": 37 + i for i, way in enumerate(("Left", "Up", "Right", "Down"))}
+        text = {"text": "\r"} if key == "Enter" else {}
+        for kind in ("keyDown", "keyUp"):
+            more = text if kind == "keyDown" else {}
+            self.call("Input.dispatchKeyEvent", type=kind, code=key, key=key, windowsVirtualKeyCode=number[key], **more)
+
+    def resize(self, width: int, height: int) -> None:
+        """Gives the page another size, of a phone below 600 pixels."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
+        )
 
     def picture(self, path: Path) -> Path:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))

@@ -1,0 +1,133 @@
+"""The error falling, as a short animation: what was measured, and each model of a run in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from lunar_mjx.diagnosis.report.explore import cells
+from lunar_mjx.diagnosis.report.read import read_result
+from lunar_mjx.diagnosis.report.steps import Step, chain, error, judged
+from lunar_mjx.diagnosis.report.words import channel_label, shown
+from lunar_mjx.errors import UserError
+from lunar_mjx.report.style import BLUE, DARK, INK, MUTED, ORANGE, PAPER, RULE
+from lunar_mjx.visual.encode import writer
+
+_FPS = 12
+_HOLD, _MOVE = 14, 12
+"""Pictures for which a model stands still, and in which it passes into the next."""
+_SIZE = (9.6, 3.9)
+"""Inches, at 100 pixels each."""
+_MOST_PANELS = 3
+
+
+def write_falling(run: str | Path, out: str | Path, dark: bool = False) -> Path:
+    """Writes an animation of a run's models: as given, refitted, with the effects that the diagnosis names.
+
+    Between two models the curves pass through means of both predictions; these pictures are no model's.
+
+    Args:
+      run: the run folder. out: a .gif, .webp or .mp4 file. dark: for a dark page.
+
+    Returns:
+      The file's path.
+
+    Raises:
+      UserError: the folder is no run, holds no series yet, or the file is of no known kind.
+    """
+    result = read_result(Path(run))
+    if result.traces is None:
+        raise UserError(f"{run}: holds no series.npz yet; make it with lunar-mjx compare, then lunar-mjx why.")
+    steps = chain([result])
+    splits, measure = judged(steps)
+    errors = [e.value for s in steps if (e := error(s, splits)) is not None]
+    panels = _worst(steps)
+    path = Path(out)
+    if path.suffix.lower() not in (".gif", ".webp", ".mp4"):
+        raise UserError(f"{path}: is of no known kind; end it in .gif, .webp or .mp4.")
+    course = _course(len(steps))
+    drawn = {place: _picture(steps, errors, panels, place, measure, dark) for place in sorted(set(course))}
+    with writer(path, _FPS) as put:
+        for place in course:
+            put(drawn[place])
+    return path
+
+
+def _course(models: int) -> list[float]:
+    """Where the animation is at each picture: 0 is the first model, 1 the second."""
+    ease = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, _MOVE + 1) / (_MOVE + 1))
+    course: list[float] = []
+    for i in range(models):
+        course += [float(i)] * (_HOLD if i < models - 1 else 2 * _HOLD)
+        if i < models - 1:
+            course += [i + float(e) for e in ease]
+    return course
+
+
+def _worst(steps: Sequence[Step]) -> list[tuple[str, str, np.ndarray]]:
+    """Channel, manoeuvre and observations where the first model is worst, one of each channel."""
+    o, residual = steps[0].observations, steps[0].residual
+    ranked = sorted(cells(o), key=lambda c: -float(np.sqrt(np.nanmean(residual[c[2]] ** 2))))
+    found: dict[str, tuple[str, str, np.ndarray]] = {}
+    for channel, unit, at in ranked:
+        found.setdefault(channel, (channel, o.unit_names[unit], at))
+    return list(found.values())[:_MOST_PANELS]
+
+
+def _picture(
+    steps: Sequence[Step],
+    errors: Sequence[float],
+    panels: Sequence[tuple[str, str, np.ndarray]],
+    place: float,
+    measure: str,
+    dark: bool,
+) -> np.ndarray:
+    """One picture, (height, width, 3) uint8."""
+    ink, muted, rule, paper = (DARK[c] if dark else c for c in (INK, MUTED, RULE, PAPER))
+    low = min(int(place), len(steps) - 1)
+    high, share = min(low + 1, len(steps) - 1), place - low
+    figure = Figure(_SIZE, dpi=100, facecolor=paper)
+    grid = figure.add_gridspec(
+        2, len(panels), height_ratios=(3, 1), left=0.075, right=0.985, top=0.86, bottom=0.13, hspace=0.62, wspace=0.3
+    )
+    traces = steps[0].result.traces
+    assert traces is not None
+    for k, (channel, manoeuvre, at) in enumerate(panels):
+        axes = figure.add_subplot(grid[0, k])
+        x = traces.observations.place[at, 0] if traces.observations.place is not None else traces.time[at]
+        order = np.argsort(x, kind="stable")
+        x, at = x[order], at[order]
+        measured = traces.observations.value[at]
+        predicted = (1.0 - share) * steps[low].predicted[at] + share * steps[high].predicted[at]
+        every = np.concatenate([measured, *(s.predicted[at] for s in steps)])
+        margin = 0.06 * max(float(np.nanmax(every) - np.nanmin(every)), 1e-12)
+        axes.set_ylim(float(np.nanmin(every)) - margin, float(np.nanmax(every)) + margin)
+        axes.plot(x, predicted, color=BLUE if not dark else "#56B4E9", marker="s", markersize=5, linewidth=2)
+        axes.plot(x, measured, color=ink, marker="o", markersize=4.5, linestyle="none")
+        axes.set_title(
+            f"{channel_label(channel)}\n{manoeuvre.replace('_', ' ')[:34]}", fontsize=9, color=ink, loc="left"
+        )
+        axes.set_xlabel("slip ratio" if traces.is_table else "time, s", fontsize=8, color=ink)
+        axes.set_facecolor(paper)
+        axes.tick_params(colors=muted, labelsize=8)
+        axes.grid(color=rule, linewidth=0.6)
+        for spine in axes.spines.values():
+            spine.set_color(rule)
+    bar = figure.add_subplot(grid[1, :])
+    now = (1.0 - share) * errors[low] + share * errors[high]
+    bar.barh([0], [now], color=ORANGE, height=0.6)
+    bar.axvline(1.0, color=ink, linestyle="--", linewidth=1.5)
+    bar.set(xlim=(0.0, 1.25 * max(errors)), ylim=(-0.5, 0.5), yticks=[], facecolor=paper)
+    bar.text(now + 0.012 * max(errors), 0, f"{shown(now)} sigma", va="center", fontsize=12, weight="bold", color=ink)
+    name = steps[low if share < 0.5 else high].label
+    bar.set_title(f"{name}: error on {measure} points (dashed: the noise)", fontsize=10, color=ink, loc="left")
+    bar.tick_params(colors=muted, labelsize=8)
+    for spine in bar.spines.values():
+        spine.set_visible(False)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -1,0 +1,96 @@
+"""Why it is this effect, and why it is not that one, in plain sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from lunar_mjx.diagnosis.report.words import and_list, shown
+
+ALIKE = 0.9
+"""|cos| between two traces from which a reader is told that they look alike; the report's isolability says the same."""
+_SURE = 0.95
+"""Probability that a statement needs."""
+
+
+def reason(
+    evidence: Mapping[str, Any], named: list[str], errors: Mapping[str, float], before: float | None, measure: str
+) -> str:
+    """What the measurements say for or against one effect.
+
+    Args:
+      evidence: its entry of `verdict.json`.
+      named: effects that the verdict names.
+      errors: error in sigma that is left with an effect or with all the named ones ("" for these), where known.
+      before: error of the model as it is. measure: on which manoeuvres these errors are, such as "held-out".
+    """
+    name, status = str(evidence.get("effect")), str(evidence.get("status"))
+    shows = _number(evidence.get("separable_sigma"))
+    if status == "not tested":
+        seen = "leaves no trace" if not shows else f"stands out by {shown(shows, 2)} sigma only"
+        return f"These measurements cannot tell: at its usual size it {seen} once the model has been refitted."
+    said = []
+    probability = _number(evidence.get("probability"))
+    if name in named:
+        said.append("This is what the measurements ask for.")
+        own = errors.get("" if len(named) > 1 else name, errors.get(name))
+        if own is not None and before is not None:
+            together = f" together with {and_list([_plain(n) for n in named if n != name])}" if len(named) > 1 else ""
+            said.append(f"With it{together} the {measure} error falls from {shown(before)} to {shown(own)} sigma.")
+        return " ".join([*said, *_probable(probability)])
+    if shows:
+        said.append(f"At its usual size it would stand out by {shown(shows, 2)} sigma.")
+    if name in errors and before is not None:
+        left = errors[name]
+        falls = left < 0.98 * before
+        tail = f"leaves {shown(left)} of {shown(before)} sigma" if falls else "does not make the error smaller"
+        best = errors.get("") if "" in errors else errors.get(named[0]) if named else None
+        if best is not None and best < left:
+            tail += f", where {and_list([_plain(n) for n in named])} leaves {shown(best)}"
+        said.append(f"Adding it alone {tail} ({measure} error).")
+    near, cosine = _nearest(evidence)
+    if near and cosine >= ALIKE:
+        more = (
+            "which is named"
+            if near in named
+            else "which is not named either"
+            if named
+            else "so either may stand for both"
+        )
+        said.append(f"Its trace looks like that of {_plain(near)} (alike to {cosine:.2f} of 1), {more}.")
+    note = str(evidence.get("reason") or "")
+    if probability is None and note:
+        said.append(f"The diagnosis notes: {note[:200]}.")
+    return " ".join([*said, *_probable(probability)])
+
+
+def _probable(probability: float | None) -> list[str]:
+    if probability is None:
+        return []
+    if probability >= _SURE:
+        return [f"Its probability is {_percent(probability)}."]
+    words = "more than the 5 % that would rule it out" if probability > 1.0 - _SURE else "so it is ruled out"
+    return [f"Its probability is {_percent(probability)}, {words}."]
+
+
+def _percent(p: float) -> str:
+    if p > 0.999:
+        return "more than 99.9 %"
+    return "less than 0.1 %" if p < 0.001 else f"{100.0 * p:.2g} %"
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _number(value: Any) -> float | None:
+    """A finite number, or None for whatever else a file may hold."""
+    known = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < float("inf")
+    return float(value) if known else None
+
+
+def _nearest(evidence: Mapping[str, Any]) -> tuple[str, float]:
+    pair = evidence.get("nearest")
+    if isinstance(pair, list | tuple) and len(pair) == 2 and (cosine := _number(pair[1])) is not None:
+        return str(pair[0]), cosine
+    return "", 0.0

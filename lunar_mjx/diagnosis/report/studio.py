@@ -1,0 +1,323 @@
+"""The studio: one offline page on a run, to choose effects, see the error fall, and see where the model fails."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import plotly.offline
+
+from lunar_mjx.diagnosis.folder.refits import read_refits
+from lunar_mjx.diagnosis.report.explore import cells, covariate_along
+from lunar_mjx.diagnosis.report.lead import lead
+from lunar_mjx.diagnosis.report.read import Result, Traces, read_result
+from lunar_mjx.diagnosis.report.reasons import reason
+from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, and_list, channel_label, plot_text
+from lunar_mjx.effects.catalogue import CATALOGUE
+from lunar_mjx.errors import UserError
+from lunar_mjx.files import write_text
+from lunar_mjx.report.page import packed
+from lunar_mjx.report.style import BLUE, DARK, FONT, INK, MUTED, ORANGE, PAPER, RULE
+
+_MOST_VALUES = 400_000
+"""Numbers in all traces of a page; longer series are thinned."""
+_MOST_MODELS = 14
+"""Models to choose from: as many buttons as a reader looks through."""
+_MOST_MAP = 2_000
+"""Points of the map."""
+_STYLE = {
+    "font": FONT,
+    "ink": INK,
+    "muted": MUTED,
+    "rule": RULE,
+    "paper": PAPER,
+    "blue": BLUE,
+    "orange": ORANGE,
+    "dark": DARK,
+}
+"""What the figures of the page look like."""
+_REST = "others"
+"""Name of the hypotheses that are not listed one by one."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Model:
+    """A model that the reader may choose.
+
+    Attributes:
+      label: for the reader. effects: added to the refitted model. kind: "given", "refit" or "estimate".
+      residual: (n,) in sigma, NaN where not known. predicted: (n,), None where not known.
+    """
+
+    label: str
+    effects: tuple[str, ...]
+    kind: str
+    residual: np.ndarray
+    predicted: np.ndarray | None
+
+
+def write_studio(run: str | Path, out: str | Path) -> Path:
+    """Writes the studio of a run as one HTML file that asks no network for anything.
+
+    Errors with an effect are those of refits that the run folder holds. Where it holds none, they are estimates to
+    first order on fitted manoeuvres: what the best amount of the effect's stored signature leaves.
+
+    Args:
+      run: the run folder. Nothing in it is run as code, and all text from it is shown as text.
+      out: the HTML file.
+
+    Returns:
+      Its path.
+
+    Raises:
+      UserError: the folder is no run, holds no comparison yet, or one of its files is damaged.
+    """
+    result = read_result(Path(run))
+    if result.traces is None:
+        raise UserError(f"{run}: holds no series.npz yet; make it with lunar-mjx compare, then lunar-mjx why.")
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("lunar_mjx.report", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    program = environment.get_template("studio.js").render()
+    plotly = plotly_text()
+    html = environment.get_template("studio.html.j2").render(
+        title=f"Studio: {result.name}",
+        lead=lead([result], result),
+        program=program,
+        allowed=" ".join(f"'sha256-{_digest(text)}'" for text in (program, plotly)),
+        data=packed(json.dumps(_page_data(result, result.traces), allow_nan=False)),
+        plotly=packed(plotly),
+    )
+    path = Path(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return write_text(path, html)
+
+
+def plotly_text() -> str:
+    """plotly.js as it is put into pages."""
+    return plotly.offline.get_plotlyjs()
+
+
+def _digest(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+
+
+def _page_data(result: Result, traces: Traces) -> dict[str, Any]:
+    o = traces.observations
+    models = _models(result, traces)
+    found = {(c, u): at for c, u, at in cells(o) if np.isfinite(models[0].residual[at]).any()}
+    channels = list(dict.fromkeys(c for c, _ in found))
+    units = sorted({u for _, u in found})
+    thin = max(1, int(np.ceil(len(o) * (2 + 2 * len(models)) / _MOST_VALUES)))
+    held = o.in_split("select", "test")
+    fitted = o.in_split("fit")
+    verdict = result.verdict or {}
+    base = next((i for i, m in enumerate(models) if m.kind == "refit"), 0)
+    grid = [[found.get((c, u)) for u in units] for c in channels]
+    remains = [(k, d) for k, d in (verdict.get("discrepancy") or {}).items() if isinstance(d, Mapping)]
+    return {
+        "table": traces.is_table,
+        "style": _STYLE,
+        "channels": [channel_label(c)[:60] for c in channels],
+        "units": [_unit(o.unit_names[u], o.unit_split[u]) for u in units],
+        "base": base,
+        "models": [
+            {
+                "label": m.label[:160],
+                "kind": m.kind,
+                "fit": _rms(m.residual[fitted]),
+                "held": _rms(m.residual[held]),
+                "cells": [[None if at is None else _rms(m.residual[at]) for at in line] for line in grid],
+            }
+            for m in models
+        ],
+        "panels": [
+            [None if at is None else _panel(traces, models, at, thin, c) for at in line]
+            for c, line in zip(channels, grid, strict=True)
+        ],
+        "map": _map(traces, models),
+        "hypotheses": _hypotheses(verdict),
+        "effects": _effects(verdict, models, base, fitted, held),
+        "next": _next(result),
+        "remains": [[str(port)[:60], str(d.get("text", ""))[:120]] for port, d in remains],
+    }
+
+
+def _unit(name: str, split: str) -> dict[str, str]:
+    return {"name": name.replace("_", " ")[:60], "split": SPLIT_NAMES.get(split, split)[:60]}
+
+
+def _models(result: Result, traces: Traces) -> list[_Model]:
+    """As given, refitted, and with every effect of which the folder tells something, best first within each kind."""
+    o = traces.observations
+    found = []
+    for row, label in enumerate(traces.labels):
+        effects = () if label in ("as given", "refitted") else tuple(re.split(r", | \+ ", label.removeprefix("with ")))
+        words = {"as given": "the model as given", "refitted": "the model, refitted"}.get(label, "+ " + _words(effects))
+        kind = "given" if label == "as given" else "refit"
+        found.append(_Model(words, effects, kind, traces.residual[row], traces.predicted[row]))
+    base = next((m for m in found if m.kind == "refit"), found[-1])
+    known = {frozenset(m.effects) for m in found}
+    refits = read_refits(result.folder, len(o)) if result.folder is not None else {}
+    more = [
+        _Model("+ " + _words(names), names, "refit", left.residual, left.predicted)
+        for names, left in refits.items()
+        if frozenset(names) not in known
+    ]
+    known |= {frozenset(m.effects) for m in more}
+    fitted = np.flatnonzero(o.in_split("fit"))
+    for name, signature in result.signatures.items():
+        if frozenset((name,)) not in known and (left := _estimate(base.residual[fitted], signature)) is not None:
+            residual = np.full(len(o), np.nan)
+            residual[fitted] = left
+            more.append(_Model("+ " + _words((name,)), (name,), "estimate", residual, None))
+    more.sort(key=lambda m: (m.kind != "refit", _rms(m.residual[fitted]) or np.inf))
+    return [*found, *more][:_MOST_MODELS]
+
+
+def _estimate(residual: np.ndarray, signature: np.ndarray) -> np.ndarray | None:
+    """Residual less the best amount of a signature's columns; None for one of other observations or without length."""
+    columns = np.asarray(signature, float)
+    if columns.ndim != 1 or len(columns) != len(residual):
+        return None
+    keep = np.isfinite(residual) & np.isfinite(columns)
+    length = float(np.sum(columns[keep] ** 2))
+    if length <= 0.0:
+        return None
+    amount = max(float(np.sum(columns[keep] * residual[keep])) / length, 0.0)
+    return residual - amount * columns
+
+
+def _words(effects: Sequence[str]) -> str:
+    return and_list([e.replace("_", " ") for e in effects])
+
+
+def _rms(residual: np.ndarray) -> float | None:
+    known = residual[np.isfinite(residual)]
+    return _short(float(np.sqrt(np.mean(known**2)))) if known.size else None
+
+
+def _short(value: float) -> float | None:
+    return float(f"{value:.5g}") if np.isfinite(value) else None
+
+
+def _list(values: np.ndarray) -> list[float | None]:
+    return [_short(v) for v in values.tolist()]
+
+
+def _panel(traces: Traces, models: Sequence[_Model], at: np.ndarray, thin: int, channel: str) -> dict[str, Any]:
+    """Abscissa, measurements, and predictions and residuals by model, of one channel of one manoeuvre."""
+    o = traces.observations
+    x = o.place[at, 0] if o.place is not None else traces.time[at]
+    order = np.argsort(x, kind="stable")[::thin]
+    at, x = at[order], x[order]
+    return {
+        "x": _list(x),
+        "x_title": "slip ratio" if traces.is_table else "time, s",
+        "y_title": plot_text(channel_label(channel)),
+        "measured": _list(o.value[at]),
+        "predicted": [None if m.predicted is None else _list(m.predicted[at]) for m in models],
+        "residual": [_list(m.residual[at]) for m in models],
+    }
+
+
+def _map(traces: Traces, models: Sequence[_Model]) -> dict[str, Any] | None:
+    """Where the error happens: place of every observation, and the error there over all channels, by model.
+
+    Places of drives are the measured ones; those of tables are slip ratio and slip angle.
+    """
+    o = traces.observations
+    if o.place is not None:
+        where, titles = np.column_stack([o.place[:, 0], o.place[:, 1]]), ("slip ratio", "slip angle, deg")
+    else:
+        parts = [covariate_along(o, f"position_{axis}_m", "") for axis in "xy"]
+        where, titles = np.column_stack(parts), ("east x, m", "north y, m")
+    known = np.isfinite(where).all(axis=1)
+    if not known.any():
+        return None
+    cell = 0.02 * max(float(np.ptp(where[known], axis=0).max()), 1e-9)
+    grid = np.round(where[known] / (cell if o.place is None else 1e-9)).astype(np.int64)
+    _, first, number = np.unique(np.column_stack([grid, o.unit[known]]), axis=0, return_index=True, return_inverse=True)
+    number = np.ravel(number)
+    units = sorted(set(o.unit.tolist()))
+    keep = np.arange(len(first))[:: max(1, int(np.ceil(len(first) / _MOST_MAP)))]
+    here = where[known][first][keep]
+
+    def errors(residual: np.ndarray) -> list[float | None]:
+        fine = np.isfinite(residual)
+        squares = np.bincount(number[fine], residual[fine] ** 2, len(first))
+        count = np.bincount(number[fine], minlength=len(first))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return _list(np.sqrt(squares / count)[keep])
+
+    return {
+        "x": _list(here[:, 0]),
+        "y": _list(here[:, 1]),
+        "unit": [units.index(int(u)) for u in o.unit[known][first][keep]],
+        "x_title": titles[0],
+        "y_title": titles[1],
+        "equal": o.place is None,
+        "error": [errors(m.residual[known]) for m in models],
+    }
+
+
+def _hypotheses(verdict: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Probabilities of hypotheses, most probable first."""
+    listed = verdict.get("probabilities")
+    if not isinstance(listed, Mapping):
+        return []
+    rows = [(str(n)[:120], float(p)) for n, p in listed.items() if isinstance(p, int | float) and 0.0 <= p <= 1.0]
+    rows.sort(key=lambda row: (row[0] == _REST, -row[1]))
+    return [{"name": n.replace("_", " "), "p": _short(p)} for n, p in rows]
+
+
+def _effects(
+    verdict: Mapping[str, Any], models: Sequence[_Model], base: int, fitted: np.ndarray, held: np.ndarray
+) -> list[dict[str, Any]]:
+    """Every effect with its probability, what it is, why or why not, and the model that has it."""
+    evidence = [e for e in verdict.get("evidence") or [] if isinstance(e, Mapping) and isinstance(e.get("effect"), str)]
+    named = [str(n) for n in verdict.get("effects") or []]
+    index = {m.effects: i for i, m in enumerate(models) if m.effects}
+    sets = {frozenset(k): i for k, i in index.items()}
+    whole = sets.get(frozenset(named), -1) if named else -1
+    on_held = bool(held.any()) and all(_rms(models[i].residual[held]) is not None for i in [base, *index.values()])
+    part, measure = (held, "held-out") if on_held else (fitted, "fitted")
+    errors: dict[str, float] = {}
+    for names, i in index.items():
+        value = _rms(models[i].residual[part])
+        if value is not None and len(names) == 1:
+            errors[names[0]] = value
+        if value is not None and i == whole and len(named) > 1:
+            errors[""] = value
+    before = _rms(models[base].residual[part])
+    rows = []
+    for e in evidence:
+        name = e["effect"]
+        p = e.get("probability")
+        rows.append(
+            {
+                "name": name.replace("_", " ")[:120],
+                "p": _short(p) if isinstance(p, int | float) and not isinstance(p, bool) else None,
+                "status": "named" if name in named else str(e.get("status", ""))[:40],
+                "what": CATALOGUE[name].doc.strip().splitlines()[0] if name in CATALOGUE else "",
+                "why": reason(e, named, errors, before, measure),
+                "model": sets.get(frozenset((name,)), whole if name in named and whole >= 0 else None),
+            }
+        )
+    rows.sort(key=lambda row: (row["status"] != "named", row["status"] == "not tested", -(row["p"] or 0.0)))
+    return rows
+
+
+def _next(result: Result) -> list[str]:
+    """What to measure next: what `next` found, else what to do now."""
+    planned = (result.next or {}).get("sentence")
+    steps = [str(line) for line in lead([result], result).next]
+    return [str(planned)[:600], *steps] if planned else steps

@@ -1,0 +1,215 @@
+"""The studio: what a run folder holds, chosen by hand, as text alone, in a real browser."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import ABSENT, CHROMIUM, Browser
+from PIL import Image
+
+from lunar_mjx.diagnosis.folder.refits import read_refits, write_refits
+from lunar_mjx.diagnosis.report import falling, studio
+from lunar_mjx.diagnosis.report.read import read_result
+from lunar_mjx.diagnosis.report.reasons import reason
+from lunar_mjx.errors import UserError
+
+HOSTILE = "</script><img src=x onerror='document.title=1'><b>"
+POINTS = 24
+
+
+def write_run(folder: Path, table: bool, hostile: str = "") -> Path:
+    """A run of two channels and two manoeuvres, the second held out: an effect `drag` is refitted, `toe` is not."""
+    folder.mkdir()
+    n = 4 * POINTS
+    rng = np.random.default_rng(0)
+    unit = np.repeat([0, 1, 0, 1], POINTS)
+    signal = 6.0 * np.sin(np.linspace(0, 9, n))
+    residual = rng.standard_normal((3, n)) + np.array([[2.0], [1.0], [0.0]]) * signal
+    time = np.tile(np.arange(POINTS) * 0.5, 4)
+    channels = ["drawbar_pull_N", "sinkage_m"] if table else ["position_x_m", "position_y_m"]
+    np.savez_compressed(
+        folder / "series.npz",
+        measured=np.zeros(n),
+        sigma=np.full(n, 0.1),
+        time=np.full(n, np.nan) if table else time,
+        place=np.column_stack([np.tile(np.linspace(0, 0.6, POINTS), 4), 15.0 * unit, np.full(n, 50.0)])
+        if table
+        else np.zeros((0, 3)),
+        unit=unit,
+        unit_names=np.array(["flat", "climb" + hostile]),
+        split=np.array(["fit", "select"]),
+        series_start=np.array([0, 2 * POINTS]),
+        series_channel=np.array([channels[0], channels[1] + hostile]),
+        series_log=np.array([0, 0]),
+        logs=np.array(["a"]),
+        labels=np.array(["as given", "refitted", "with drag"]),
+        predicted=-0.1 * residual,
+        residual=residual,
+    )
+    fitted = unit == 0
+    np.savez_compressed(
+        folder / "signatures.npz", names=np.array(["drag", "toe"]), signatures=np.array([signal[fitted], time[fitted]])
+    )
+    write_refits(folder, {("slip_sinkage",): (residual[1] - 0.5 * signal, None)})
+    run = {"format": "lunar-mjx-run/1", "logs": ["gone" + hostile], "hashes": {}, "added": []}
+    evidence = [
+        {"effect": "drag", "status": "accepted", "separable_sigma": 40.0, "probability": 0.97},
+        {
+            "effect": "slip_sinkage",
+            "status": "rejected",
+            "separable_sigma": 30.0,
+            "probability": 0.01,
+            "nearest": ["drag", 0.95],
+        },
+        {"effect": "toe", "status": "confounded", "separable_sigma": 8.0, "probability": 0.02},
+        {"effect": "faint" + hostile, "status": "not tested", "separable_sigma": 0.4, "probability": 0.0},
+    ]
+    verdict = {
+        "verdict": "KNOWN",
+        "sentence": "drag is missing" + hostile,
+        "effects": ["drag"],
+        "evidence": evidence,
+        "probabilities": {"drag": 0.96, "drag + toe" + hostile: 0.02, "others": 0.02},
+        "discrepancy": {"soil": {"size": 0.04, "low": 0.02, "high": 0.08, "text": "good to 4 %" + hostile}},
+    }
+    (folder / "run.json").write_text(json.dumps(run), encoding="utf-8")
+    (folder / "verdict.json").write_text(json.dumps(verdict), encoding="utf-8")
+    (folder / "next.json").write_text(json.dumps({"sentence": "Drive a slope" + hostile}), encoding="utf-8")
+    return folder
+
+
+def page_data(folder: Path) -> dict:
+    result = read_result(folder)
+    assert result.traces is not None
+    return json.loads(json.dumps(studio._page_data(result, result.traces), allow_nan=False))
+
+
+def test_refits_and_estimates_are_told_apart_and_each_has_its_error(tmp_path):
+    data = page_data(write_run(tmp_path / "run", table=True))
+    kinds = {m["label"]: m["kind"] for m in data["models"]}
+    assert kinds == {
+        "the model as given": "given",
+        "the model, refitted": "refit",
+        "+ drag": "refit",
+        "+ slip sinkage": "refit",
+        "+ toe": "estimate",
+    }
+    given, refitted, drag, half, toe = data["models"]
+    assert given["held"] > refitted["held"] > half["held"] > drag["held"]
+    assert toe["held"] is None and toe["fit"] <= refitted["fit"]
+    with np.load(tmp_path / "run" / "series.npz") as series:
+        rows = series["residual"][1][POINTS : 2 * POINTS]
+        held = series["residual"][2][series["unit"] == 1]
+    assert drag["held"] == pytest.approx(np.sqrt(np.mean(held**2)), rel=1e-4)
+    assert refitted["cells"][0][1] == pytest.approx(np.sqrt(np.mean(rows**2)), rel=1e-4)
+    assert [e["name"] for e in data["effects"]] == ["drag", "toe", "slip sinkage", "faint"]
+    assert [e["model"] for e in data["effects"]] == [2, 4, 3, None]
+    assert data["map"]["x_title"] == "slip ratio" and len(data["map"]["x"]) == 2 * POINTS
+
+
+def test_the_map_of_a_drive_is_where_it_was_measured(tmp_path):
+    data = page_data(write_run(tmp_path / "run", table=False))
+    assert data["map"]["equal"] and data["map"]["x_title"] == "east x, m"
+    assert data["panels"][0][0]["x_title"] == "time, s"
+
+
+def test_refits_of_other_observations_are_left_alone_and_damaged_ones_refused(tmp_path):
+    folder = write_run(tmp_path / "run", table=True)
+    assert set(read_refits(folder, 4 * POINTS)) == {("slip_sinkage",)}
+    assert read_refits(folder, 7) == {}
+    np.savez_compressed(folder / "refits.npz", names=np.array(["x"]), residual=np.array(["y"]), predicted=np.zeros(3))
+    with pytest.raises(UserError, match=r"refits\.npz"):
+        read_refits(folder, 4 * POINTS)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "words"),
+    [
+        ({"effect": "toe", "status": "not tested", "separable_sigma": 0.4}, "cannot tell"),
+        ({"effect": "drag", "status": "accepted", "probability": 0.97}, "falls from 8 to 1 sigma"),
+        ({"effect": "toe", "status": "rejected", "probability": 0.001}, "leaves 6 of 8 sigma, where drag leaves 1"),
+        ({"effect": "toe", "status": "rejected", "probability": 0.2}, "more than the 5 % that would rule it out"),
+        ({"effect": "toe", "status": "rejected", "nearest": ["drag", 0.97]}, "looks like that of drag"),
+        ({"effect": "toe", "status": "rejected", "probability": "x", "nearest": 3, "separable_sigma": []}, "leaves 6"),
+    ],
+)
+def test_reasons_are_told_in_words(evidence, words):
+    assert words in reason(evidence, ["drag"], {"drag": 1.0, "toe": 6.0}, 8.0, "held-out")
+
+
+def test_no_text_of_a_run_becomes_markup(tmp_path):
+    page = studio.write_studio(write_run(tmp_path / "run", True, HOSTILE), tmp_path / "studio.html").read_text("utf-8")
+    assert "<img src=x" not in page and page.count("</script>") == 3
+    assert "http://" not in page and "https://" not in page
+
+
+def test_the_error_falls_in_an_animation(tmp_path):
+    folder = write_run(tmp_path / "run", table=True)
+    course = falling._course(3)
+    assert course[0] == 0.0 and course[-1] == 2.0 and (np.diff(course) >= 0.0).all()
+    path = falling.write_falling(folder, tmp_path / "falling.gif")
+    with Image.open(path) as film:
+        assert film.n_frames > 2
+        film.seek(0)
+        first = np.asarray(film.convert("RGB"), int)
+        film.seek(film.n_frames - 1)
+        last = np.asarray(film.convert("RGB"), int)
+    orange = [((p[..., 0] > 200) & (p[..., 2] < 80)).sum() for p in (first, last)]
+    assert orange[0] > 1.5 * orange[1] > 0  # the bar of the error
+    with pytest.raises(UserError, match="no known kind"):
+        falling.write_falling(folder, tmp_path / "falling.txt")
+
+
+def test_a_run_without_series_says_what_to_do(tmp_path):
+    folder = write_run(tmp_path / "run", table=True)
+    (folder / "series.npz").unlink()
+    with pytest.raises(UserError, match="lunar-mjx compare"):
+        studio.write_studio(folder, tmp_path / "studio.html")
+
+
+@pytest.fixture
+def browser(tmp_path):
+    opened = Browser(tmp_path / "profile")
+    yield opened
+    opened.close()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=ABSENT)
+@pytest.mark.parametrize("table", [True, False], ids=["table", "drive"])
+def test_by_hand_in_a_browser(tmp_path, browser, table):
+    """Mouse, keyboard, phone width, hostile names, and not one request but for the page itself."""
+    page = studio.write_studio(write_run(tmp_path / "run", table, HOSTILE), tmp_path / "studio.html")
+    browser.open(page.as_uri())
+    browser.wait("document.body?.dataset.ready")
+    text = "document.getElementById('why').textContent"
+    assert browser.value("document.querySelectorAll('#heat tbody button').length") == 4
+    # the first field is the worst; another one is chosen by mouse, and by arrow keys from there
+    browser.value('document.querySelector(\'#heat [data-row="0"][data-column="0"]\').click()')
+    assert browser.value("document.body.dataset.cell") == "0,0"
+    browser.value('document.querySelector(\'#heat [data-row="0"][data-column="0"]\').focus()')
+    browser.press("ArrowRight")
+    browser.press("ArrowDown")
+    assert browser.value("document.body.dataset.cell") == "1,1"
+    assert HOSTILE[:9] in browser.value("document.getElementById('traces').getAttribute('aria-label')")
+    # an effect by Enter: its model, its error, its reason
+    before = float(browser.value('document.querySelector(\'#heat [data-row="0"][data-column="1"]\').textContent'))
+    browser.value("document.querySelector('#effects button').focus()")
+    browser.press("End")
+    assert "cannot tell" in browser.value(text)
+    browser.press("Home")
+    browser.press("ArrowDown")
+    browser.press("ArrowDown")
+    assert "slip sinkage" in browser.value(text) and browser.value("document.body.dataset.model") == "3"
+    after = float(browser.value('document.querySelector(\'#heat [data-row="0"][data-column="1"]\').textContent'))
+    assert after != before
+    assert browser.value("document.querySelectorAll('#traces .trace').length") > 0
+    assert browser.value("document.querySelectorAll('#place .points path').length") > 0
+    browser.resize(360, 740)
+    assert browser.value("document.documentElement.scrollWidth") <= 360
+    assert browser.value("document.title") == "Studio: run" and browser.value("document.images.length") == 0
+    assert browser.requests == [page.as_uri()]
+    assert not browser.problems
