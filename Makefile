@@ -1,5 +1,6 @@
 # make demo: run the main job. make test: lint, type-check and test; make test-all: the slow tests, too. make docs: the pages.
-# make proofs: slow tests in turn, 40 minutes of them; make all-proofs: all of them, with the table of when each last passed.
+# make proofs: slow tests in turn, 40 minutes of them, those with a record first; make all-proofs: all of them,
+# with the table of when each last passed.
 # Each installs all that it needs into .venv.
 
 PYTHON ?= python3
@@ -18,7 +19,7 @@ export PIP_NO_COMPILE ?= 1
 FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$(XLA_FLAGS) --xla_cpu_use_fusion_emitters=false"
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test fast-tests test-all proofs all-proofs lint docs foreign-tune foreign-report clean
+.PHONY: demo test fast-tests test-all proofs all-proofs lint docs foreign-tune foreign-report hashes clean
 
 demo: $(VENV)/run.stamp
 	$(BIN)/lunar-mjx demo -o runs/demo
@@ -64,6 +65,12 @@ foreign-report: $(VENV)/run.stamp
 	$(BIN)/python -m benchmarks.foreign make --set report --tables $(FOREIGN_REPORT_TABLES) --drives $(FOREIGN_REPORT_DRIVES) -o $(FOREIGN)
 	$(BIN)/python -m benchmarks.foreign run $(FOREIGN)
 	$(BIN)/python -m benchmarks.foreign score $(FOREIGN)
+
+# Hashes of all files of every pinned version, for pip install --require-hashes; needed after a change of requirements*.txt.
+hashes: $(VENV)/run.stamp
+	$(PIP) install --quiet uv
+	$(BIN)/uv pip compile --quiet --no-deps --generate-hashes --universal --python-version 3.11 --no-annotate \
+		--custom-compile-command "make hashes" -o requirements-hashed.txt requirements-dev.txt requirements-docs.txt
 
 clean:
 	rm -rf $(VENV) build runs

@@ -17,7 +17,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(floor.split())
     for floor in (
         "errors",
-        "files pytree spatial trust _quiet _version",
+        "files pytree spatial together trust _quiet _version",
         "report resources units toml_fields inference",
         "rover terrain",
         "effects cameras",
@@ -44,7 +44,12 @@ THIRD_PARTY: dict[str, frozenset[str]] = {
 }
 """What rooms that others stand on may take from outside the standard library."""
 
-ONLY_IN = {"typer": frozenset({"commands"}), "mujoco.mjx": frozenset({"_quiet"})}
+ONLY_IN = {
+    "typer": frozenset({"commands"}),
+    "mujoco.mjx": frozenset({"_quiet"}),
+    "newton": frozenset({"wheel_bed"}),
+    "warp": frozenset({"wheel_bed"}),
+}
 """Libraries that belong to one room."""
 
 LATE_CIRCLES: dict[frozenset[str], str] = {}

@@ -70,12 +70,6 @@ def percent(score: Mapping[str, Any]) -> str:
     return f"{100 * score['success']:.1f} % ({100 * score['low']:.1f} to {100 * score['high']:.1f})"
 
 
-def wait(args: argparse.Namespace, clock: Clock) -> None:
-    """Until the file of --wait-for is there, or time is up."""
-    while args.wait_for is not None and not args.wait_for.exists() and clock.left > 0.0:
-        time.sleep(0.5)
-
-
 def in_threads(*calls: Callable[[], Any]) -> list[float]:
     """Calls side by side, since XLA lets go of the interpreter while it compiles; s after which each was done."""
     begin = time.monotonic()

@@ -62,7 +62,6 @@ def options() -> argparse.Namespace:
     add("--variants", nargs="*", default=list(DEFAULT), choices=list(VARIANTS), help="of part paper")
     add("--together", type=int, default=1, help="seeds in one program of part paper-child")
     add("--core", type=int, help="CPU core of part paper-child")
-    add("--wait-for", type=Path, help="parts rates and scaling measure once this file is there")
     args = parser.parse_args()
     if args.tiny:
         args.seeds, args.steps, args.eval_every = min(args.seeds, 2), min(args.steps, 4000), 1.0

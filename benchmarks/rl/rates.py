@@ -8,7 +8,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from harness import SMALL_TASK, Clock, in_threads, save, say, training_of, wait
+from harness import SMALL_TASK, Clock, in_threads, save, say, training_of
 
 PLAN = (
     ("17 numbers", 5, (65536, 1024, 2048, 4096, 8192, 16384, 32768, 262144)),
@@ -20,7 +20,7 @@ PLAN = (
 
 
 def rates(args: argparse.Namespace, clock: Clock) -> None:
-    """Compiles every row in threads, waits for quiet if told to, and measures."""
+    """Compiles every row in threads, and measures."""
     from lunar_mjx.envs import make_navigation
     from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION
 
@@ -41,7 +41,6 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
         steps = {every: 4 if args.tiny else max(20, 1000 // every) for _, every, _ in plan}
         ready = list(pool.map(lambda row: Rate(made[row[:2]], row[2], steps[row[1]]), plan))
     say(f"rates: {len(ready)} rows compiled after {clock.spent:.0f} s")
-    wait(args, clock)
     rows: list[dict[str, Any]] = []
     for (seen, every, size), rate in zip(plan, ready, strict=True):
         if clock.left < 2.0:
@@ -144,7 +143,6 @@ def scaling(args: argparse.Namespace, clock: Clock) -> None:
         learners[count] = Learner(env, config, Mesh(np.array(jax.devices()[:count]), (AXIS,)))
     in_threads(*(learner.compile for learner in learners.values()))
     say(f"scaling: compiled after {clock.spent:.0f} s")
-    wait(args, clock)
     rows: list[dict[str, Any]] = []
     for count, learner in learners.items():
         config, state, best = learner.config, learner.init(0), float("inf")

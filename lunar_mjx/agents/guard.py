@@ -68,8 +68,8 @@ def broken(tree: Any) -> Any:
     return ~jnp.all(jnp.stack([jnp.isfinite(a).all() for a in leaves]))
 
 
-def dump(guard: Guard, path: Path, envs_per_device: int) -> tuple[int, int]:
-    """Writes the remembered state of the first device that tripped.
+def dump(guard: Guard, path: Path | None, envs_per_device: int) -> tuple[int, int]:
+    """Writes the remembered state of the first device that tripped; nothing if `path` is None.
 
     Returns:
       The environment's number in the whole batch, and the iteration.
@@ -77,10 +77,11 @@ def dump(guard: Guard, path: Path, envs_per_device: int) -> tuple[int, int]:
     device = int(np.argmax(np.asarray(guard.tripped)))
     one = jax.tree.map(lambda a: np.asarray(a)[device : device + 1], guard)
     number = device * envs_per_device + int(one.env[0])
-    leaves = {jax.tree_util.keystr(p): a for p, a in jax.tree_util.tree_leaves_with_path(one.state)}
-    note = json.dumps({"environment": number, "iteration": int(one.iteration[0])})
-    with replacing(path) as part:
-        np.savez_compressed(part, note=np.array(note), action=one.action, **leaves)
+    if path is not None:
+        leaves = {jax.tree_util.keystr(p): a for p, a in jax.tree_util.tree_leaves_with_path(one.state)}
+        note = json.dumps({"environment": number, "iteration": int(one.iteration[0])})
+        with replacing(path) as part:
+            np.savez_compressed(part, note=np.array(note), action=one.action, **leaves)
     return number, int(one.iteration[0])
 
 

@@ -66,6 +66,9 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
         )
     policy = load_policy(path)
     made_in = policy.environment
+    if not made_in:
+        remedy = "take its actions in Python by load_policy, or train it in an environment that has a name"
+        raise bad_input(path, "environment.name", None, "says of no environment how it is made", remedy)
     arguments = {k: tuple(v) if isinstance(v, list) else v for k, v in made_in["options"].items()}
     require_trust(path, "environment.name", made_in["name"])
     env = make(made_in["name"], **{**arguments, **options})

@@ -18,6 +18,8 @@ from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.files import replacing
 
 FORMAT = "lunar-mjx-policy/1"
+FORMER_PRESET = "consistent"
+"""Preset of policies that do not tell theirs: the environments' default until `field` became it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,7 +29,7 @@ class Policy:
     Attributes:
       params: of the actor. mean, deviation: of the observations; None if they are not normalised.
       network: `obs`, `actions`, `layers`, `activation`, `layer_norm` of the actor.
-      environment: name and options that make the environment that it was trained in.
+      environment: name and options that make the environment that it was trained in; empty if it has no name.
       notes: what trained it, with what result.
     """
 
@@ -76,13 +78,19 @@ class _Environment(BaseModel):
     unseen: dict[str, Any] = {}
 
 
+class _Nameless(BaseModel):
+    """Of a policy that was trained in Python, in an environment without a name."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
 class _Record(BaseModel):
     """What `policy.npz` says of itself."""
 
     model_config = ConfigDict(strict=True)
     format: str
     network: _Network
-    environment: _Environment
+    environment: _Environment | _Nameless
     notes: dict[str, Any]
 
 
@@ -115,6 +123,9 @@ def load_policy(path: str | Path) -> Policy:
     except Exception as error:  # archives, their compression and NumPy's headers raise a dozen kinds
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise UserError(f"{path}: is no policy ({reason}); give an .npz that `lunar-mjx train` wrote.") from None
+    environment = record["environment"]
+    if environment.get("name") == "navigation" and not {"model", "preset"} & environment["options"].keys():
+        environment["options"]["preset"] = FORMER_PRESET
     if record.get("format") != FORMAT:
         raise bad_input(path, "format", record.get("format"), "is not known", f"give a file of format {FORMAT}")
     network = record["network"]

@@ -17,9 +17,11 @@ from lunar_mjx.agents.evaluate import Evaluator, Score
 from lunar_mjx.agents.learner import Learner, TrainState, normalised
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.train import Result, RunConfig, plain, train
+from lunar_mjx.effects.presets import DEFAULT_PRESET
 from lunar_mjx.envs import NavigationEnv, make
 from lunar_mjx.envs.navigation.config import UNSEEN_SOIL
 from lunar_mjx.files import write_text
+from lunar_mjx.together import leads
 
 
 def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
@@ -86,7 +88,8 @@ class Scorer:
         self._next = self.every
 
     def __call__(self, learner: Learner, state: TrainState, row: dict[str, Any]) -> dict[str, Any] | None:
-        if row["elapsed_s"] < self._next:
+        # the others wait for the first one's word, so that only one of them scores
+        if row["elapsed_s"] < self._next or not leads():
             return None
         score = self.score(learner, state)
         self._next = row["elapsed_s"] + self.every
@@ -104,6 +107,14 @@ class Scorer:
             self._evaluator = Evaluator(self._env, learner_agent(learner), self._episodes)
         params = jax.device_put(jax.device_get(learner.policy(state)))
         return self._evaluator(self.params, params, seed)
+
+
+def _told(training: Training) -> dict[str, Any]:
+    """The options of a training's environment, its preset among them: defaults change, policies stay."""
+    options = dict(training.options)
+    if training.environment == "navigation" and "model" not in options:
+        options.setdefault("preset", DEFAULT_PRESET)
+    return options
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -128,7 +139,8 @@ def run_training(
     eval_episodes: int = 512,
     target: float | None = None,
 ) -> Report:
-    """Trains, scores on unseen ground, and writes policy, curve and scores into a folder.
+    """Trains, scores on unseen ground, and writes policy, curve and scores into a folder; of several processes the
+    first one writes.
 
     Files: `progress.csv`, `events/` (TensorBoard), `checkpoints/`, `policy.npz`, `best_policy.npz` (best on unseen
     ground during training), `curve.json`, `curve.png`.
@@ -141,11 +153,7 @@ def run_training(
     """
     begin = time.monotonic()
     env = make(training.environment, **training.options)
-    environment = {
-        "name": training.environment,
-        "options": plain(dict(training.options)),
-        "unseen": dict(training.unseen),
-    }
+    environment = {"name": training.environment, "options": plain(_told(training)), "unseen": dict(training.unseen)}
     learner = Learner(env, training.train)
     scorer = Scorer(env, training.unseen, eval_episodes, eval_every, target, folder, environment)
     result = train(learner, run, folder, environment, scorer)
@@ -163,6 +171,8 @@ def run_training(
         "unseen": plain(scorer.scores),
         "final": plain(score.record()),
     }
+    if not leads():
+        return Report(result, score, record)
     write_text(folder / "curve.json", json.dumps(record))
     plot_progress([record], folder / "curve.png", name)
     if result.episodes["step"]:

@@ -17,6 +17,7 @@ from lunar_mjx.agents.learner import EPISODE, Learner, TrainState
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.record import Progress, Record
 from lunar_mjx.errors import UserError
+from lunar_mjx.together import agreed, everywhere, leads, of_the_first
 
 if TYPE_CHECKING:
     from lunar_mjx.agents.checkpoint import Checkpoints
@@ -111,9 +112,9 @@ class _Loop:
     ):
         self.learner, self.config, self.folder, self.environment = learner, run, folder, environment
         self.per_epoch = learner.config.envs * learner.config.epoch_steps
-        self.lead = jax.process_index() == 0
+        self.lead = leads()
         self.clock = clock
-        self.lock = only_writer(folder) if folder and self.lead else None
+        self.lock: IO[str] | None = None
         self.checkpoints: Checkpoints | None = None
         self.record: Record | None = None
         try:
@@ -124,6 +125,8 @@ class _Loop:
 
     def _begin(self) -> None:
         learner, run, folder = self.learner, self.config, self.folder
+        with agreed("opening its folder"):
+            self.lock = only_writer(folder) if folder and self.lead else None
         settings = plain(
             {"train": dataclasses.asdict(learner.config), "seed": run.seed, "environment": self.environment}
         )
@@ -141,7 +144,8 @@ class _Loop:
             self.episodes = notes["episodes"]
         else:
             self.state = learner.init(run.seed)
-        self.record = Record(folder, rows) if folder and self.lead else None
+        with agreed("beginning its records"):
+            self.record = Record(folder, rows) if folder and self.lead else None
         self.rows: list[dict[str, Any]] = self.record.rows if self.record else list(rows)
         self.progress = Progress(run.steps, run.time_limit, run.quiet or not self.lead)
 
@@ -155,20 +159,20 @@ class _Loop:
             tock = self.clock()
             # a process that is a moment behind must neither stop nor save alone: the others would wait for it for ever
             self.elapsed, rate = (
-                float(v)
-                for v in _of_the_first(before + tock - begin - outside, self.per_epoch / max(tock - tick, 1e-9))
+                float(v) for v in of_the_first(before + tock - begin - outside, self.per_epoch / max(tock - tick, 1e-9))
             )
             row |= {"elapsed_s": self.elapsed, "steps_per_s": rate}
-            extra = dict(callback(self.learner, self.state, row) or {}) if callback else {}
-            outside += self.clock() - tock
-            asked = bool(extra.pop("stop", False))
-            row |= extra
-            self._keep(row)
-            self.progress.show(row, final=self.epochs >= total)
+            with agreed(f"looking at epoch {self.epochs}"):
+                extra = dict(callback(self.learner, self.state, row) or {}) if callback else {}
+                outside += self.clock() - tock
+                asked = bool(extra.pop("stop", False))
+                row |= extra
+                self._keep(row)
+                self.progress.show(row, final=self.epochs >= total)
             now = self.clock()
             late = c.time_limit is not None and now - begin >= c.time_limit
             due = now - saved >= c.checkpoint_every
-            stop, late, due = (bool(v) for v in _of_the_first(asked, late, due))
+            stop, late, due = (bool(v) for v in of_the_first(asked, late, due))
             last = self.epochs >= total or late or stop
             if self.checkpoints and math.isfinite(c.checkpoint_every) and (last or due):
                 self._save()
@@ -211,7 +215,7 @@ class _Loop:
 
     def _diverged(self) -> None:
         envs = self.learner.config.envs // self.learner.devices
-        seen = jax.device_get(self.state.guard)
+        seen = everywhere(self.state.guard)
         if not np.any(seen.tripped):
             raise guard.DivergenceError(
                 "train: the agent's parameters are not finite although all environments are; "
@@ -223,7 +227,7 @@ class _Loop:
                 f"train: environment {number} gave a value that is not finite; train into a folder to keep its state."
             )
         path = self.folder / "not_finite.npz"
-        number, when = guard.dump(seen, path, envs)
+        number, when = guard.dump(seen, path if self.lead else None, envs)
         raise guard.DivergenceError(
             f"train: environment {number} gave a value that is not finite in step {when}; its state before that step "
             f"is in {path}: take the step again with lunar_mjx.agents.guard.replay, and mend the model or time step."
@@ -249,15 +253,6 @@ class _Loop:
             self.checkpoints.close()
         if self.lock:
             self.lock.close()
-
-
-def _of_the_first(*values: float) -> np.ndarray:
-    """Values of the first process, in all processes."""
-    if jax.process_count() == 1:
-        return np.asarray(values)
-    from jax.experimental import multihost_utils
-
-    return np.asarray(multihost_utils.broadcast_one_to_all(np.asarray(values, np.float32)))
 
 
 def only_writer(folder: Path) -> IO[str]:

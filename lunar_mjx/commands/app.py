@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from lunar_mjx._version import __version__
+from lunar_mjx.commands import bed as bed_commands
 from lunar_mjx.commands import diagnosis as criticism_commands
 from lunar_mjx.commands import effect_test, usage
 from lunar_mjx.commands import log as log_commands
@@ -125,7 +126,7 @@ def simulate(
     model: Annotated[Path | None, typer.Option(help="model.toml; overrides --rover, --terrain and --preset.")] = None,
     rover: RoverOption = "viper",
     terrain: TerrainOption = "lunar_plain",
-    preset: PresetOption = "consistent",
+    preset: PresetOption = None,
     effects: Annotated[
         list[str] | None, typer.Option(help="Effect to add: catalogue name, my_effects.py or my_effects.py:name.")
     ] = None,
@@ -139,19 +140,25 @@ def simulate(
     x: Annotated[float, typer.Option(help="start, m")] = 0.0,
     y: Annotated[float, typer.Option(help="start, m")] = 0.0,
     yaw_deg: Annotated[float, typer.Option(help="start heading, deg")] = 0.0,
+    gravity: Annotated[float | None, typer.Option(help="m/s2; the model's own if left out.")] = None,
     device: DeviceOption = "auto",
 ) -> None:
     """Drive one rover and write its telemetry as a table of log channels."""
     check_folder(out)
     check_finite(drive=drive, steer=steer, duration=duration, x=x, y=y, yaw_deg=yaw_deg)
     select_device(device)
+    from lunar_mjx.effects.presets import DEFAULT_PRESET
     from lunar_mjx.manoeuvres.cmd_vel import cmd_vel_commands
     from lunar_mjx.model import make_model
     from lunar_mjx.model.file import load_model, save_model
     from lunar_mjx.simulate import channels, constant_commands, front_steering, read_commands
     from lunar_mjx.simulate import simulate as run
 
-    built = load_model(model) if model else make_model(rover, terrain, preset)
+    built = load_model(model) if model else make_model(rover, terrain, preset or DEFAULT_PRESET)
+    if gravity is not None:
+        if not 0.0 < gravity < 30.0:
+            raise bad_input("simulate", "--gravity", gravity, "is no gravity that a rover meets", "give 0 to 30 m/s2")
+        built = built.replace(gravity=gravity)
     for effect in effects or []:
         built = built.add(effect, "--effects")
     if commands and cmd_vel:
@@ -261,6 +268,7 @@ train_commands.register(app)
 parity_commands.register(app)
 seeing_commands.register(app, terrain_app)
 log_commands.register(app)
+bed_commands.register(app)
 criticism_commands.register(app)
 effect_test.register(effect_app)
 

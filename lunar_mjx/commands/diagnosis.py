@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -14,13 +15,20 @@ from lunar_mjx.commands.options import MOST_SEED
 from lunar_mjx.errors import UserError, bad_input
 
 if TYPE_CHECKING:
+    from lunar_mjx.diagnosis.runs import Run
     from lunar_mjx.diagnosis.verdict import Diagnosis
     from lunar_mjx.model import Model
 
 RunArgument = Annotated[Path, typer.Argument(help="Run folder that `compare` or `add` wrote.")]
 LogsArgument = Annotated[list[Path], typer.Argument(help="Logs, or folders of logs; all drives or all wheel tables.")]
 ModelOption = Annotated[Path | None, typer.Option(help="model.toml; by default the preset on the logs' rover.")]
-PresetOption = Annotated[str, typer.Option(help="consistent, field or paper, where no --model is given.")]
+PresetOption = Annotated[
+    str | None,
+    typer.Option(
+        help="consistent, field or paper, where no --model is given; by default consistent, or a hard floor where the "
+        "logs' wheel speeds are imposed."
+    ),
+]
 EffectsOption = Annotated[
     list[str] | None, typer.Option("--effects", help="Your own effects to consider too, as my_effects.py:name.")
 ]
@@ -30,11 +38,27 @@ SplitOption = Annotated[
 SeedOption = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of all random starts.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+PriorOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--prior",
+        help="What is known of a parameter or an instrument, as hard_ground.mu=0.6+-0.05 in its own unit; for logs "
+        "with imposed wheel speeds.",
+    ),
+]
+FixOption = Annotated[
+    list[str] | None,
+    typer.Option("--fix", help="Exact value of a parameter, as motor.gear_efficiency=0.7; it is not fitted."),
+]
 DiscrepancyOption = Annotated[
     list[str] | None,
     typer.Option(
         "--discrepancy", help="Known unexplained error of the model, as drawbar_pull=2.5 (SI), added to the noise."
     ),
+]
+SettingOption = Annotated[
+    list[str] | None,
+    typer.Option("--setting", help="Size, prior or effort for tables, as effect_odds=0.01; run.json lists all."),
 ]
 
 
@@ -47,6 +71,7 @@ def register(app: typer.Typer) -> None:
         ("add", add),
         ("unknown", unknown),
         ("report", report),
+        ("studio", studio),
         ("improve", improve),
     ):
         app.command(name)(function)
@@ -56,10 +81,13 @@ def compare(
     logs: LogsArgument,
     out: OutOption = Path("run1"),
     model: ModelOption = None,
-    preset: PresetOption = "consistent",
+    preset: PresetOption = None,
     effects: EffectsOption = None,
     split: SplitOption = None,
     discrepancy: DiscrepancyOption = None,
+    setting: SettingOption = None,
+    prior: PriorOption = None,
+    fix: FixOption = None,
     seed: SeedOption = 0,
 ) -> None:
     """Hold a model against logs: where it fails, and by how many sigma."""
@@ -71,13 +99,14 @@ def compare(
         with console_progress() as progress:
             run = verbs.compare(
                 logs,
-                _model(model, preset, logs),
+                _with_priors(_model(model, preset, logs), prior, fix),
                 out,
                 effects or (),
                 _pairs("--split", split),
                 seed,
                 _numbers("--discrepancy", discrepancy),
                 progress,
+                _pairs("--setting", setting),
             )
     except verbs.BadData as bad:
         _finish(bad.diagnosis, False)
@@ -177,14 +206,40 @@ def report(
     print(out)
 
 
+def studio(
+    run: RunArgument,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="HTML file; RUN/studio.html if left out.")] = None,
+    refit: Annotated[
+        bool, typer.Option(help="Refit wheel tables with each effect, if the run does not hold these refits yet.")
+    ] = True,
+    animation: Annotated[Path | None, typer.Option(help="Also write the falling error as .gif, .webp or .mp4.")] = None,
+    dark: Annotated[bool, typer.Option(help="The animation for a dark page.")] = False,
+) -> None:
+    """Write an offline page to choose effects, see the error fall, and where the model fails."""
+    from lunar_mjx.diagnosis.studio import studio as make
+    from lunar_mjx.report.progress import console_progress
+
+    keep_compiled()
+    with console_progress() as progress:
+        path, left_out = make(run, out, refit, progress)
+    if left_out:
+        print(left_out, file=sys.stderr)
+    print(path)
+    if animation is not None:
+        from lunar_mjx.diagnosis.report.falling import write_falling
+
+        print(write_falling(run, animation, dark))
+
+
 def improve(
     logs: LogsArgument,
     out: OutOption = Path("runs"),
     model: ModelOption = None,
-    preset: PresetOption = "consistent",
+    preset: PresetOption = None,
     effects: EffectsOption = None,
     split: SplitOption = None,
     discrepancy: DiscrepancyOption = None,
+    setting: SettingOption = None,
     keep_going: Annotated[
         bool, typer.Option(help="Go on through UNKNOWN while an effect earns its place on held-out manoeuvres.")
     ] = False,
@@ -207,24 +262,55 @@ def improve(
             keep_going=keep_going,
             discrepancy=_numbers("--discrepancy", discrepancy),
             progress=progress,
+            settings=_pairs("--setting", setting),
         )
     if runs:
         _write_report([r.folder for r in runs], out / "report.html")
+        if not as_json:
+            _print_steps(runs)
     _finish(diagnosis, as_json)
 
 
-def _model(path: Path | None, preset: str, logs: Sequence[Path]) -> Model:
-    """The model to compare: a file's, or the preset on the rover that the first log names."""
+def _model(path: Path | None, preset: str | None, logs: Sequence[Path]) -> Model:
+    """The model to compare: a file's, or the preset on the rover that the first log names.
+
+    Logs with imposed wheel speeds are of rovers that drove on Earth: they begin with a hard, level floor.
+    """
     from lunar_mjx.logs import Log, read_campaign
     from lunar_mjx.model import make_model
     from lunar_mjx.model.file import load_model
+    from lunar_mjx.model.hard_floor import hard_floor
 
     if path is not None:
         return load_model(path)
     first = read_campaign(logs)[0]
-    if isinstance(first, Log):
-        return make_model(first.rover, terrain="flat", preset=preset)
-    return make_model("luvmi_x", terrain="flat", preset=preset)
+    if isinstance(first, Log) and first.imposed is not None and preset is None:
+        return hard_floor(first.rover, first.gravity_m_s2)
+    rover = first.rover if isinstance(first, Log) else "luvmi_x"
+    return make_model(rover, terrain="flat", preset=preset or "consistent")
+
+
+def _with_priors(model: Model, prior: Sequence[str] | None, fix: Sequence[str] | None) -> Model:
+    """The model with what `--prior` and `--fix` say of its parameters and instruments, in physical units."""
+    from lunar_mjx.diagnosis.drives.windows.coordinates import with_knowledge
+
+    known = {}
+    for name, text in _pairs("--prior", prior).items():
+        value, mark, std = text.partition("+-")
+        known[name] = (
+            _number("--prior", f"{name}={text}", value),
+            _number("--prior", f"{name}={text}", std if mark else ""),
+        )
+    for name, value in _numbers("--fix", fix).items():
+        known[name] = (value, 0.0)
+    return with_knowledge(model, known)
+
+
+def _number(option: str, given: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise bad_input("lunar-mjx", option, given, "is not NAME=VALUE+-STD", "give two numbers") from None
 
 
 def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
@@ -281,6 +367,23 @@ def _print_comparison(run: Any) -> None:
     if remains := found.get("discrepancy"):
         console.print("The model as refitted: " + "; ".join(d["text"] for d in remains.values()), highlight=False)
     console.print(f"{run.folder}", highlight=False)
+
+
+def _print_steps(runs: Sequence[Run]) -> None:
+    """What every round added, the error that it left, and what was said then."""
+    from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE
+    from lunar_mjx.model.describe import make_console
+
+    console, before = make_console(), 0
+    for run in runs:
+        error = (run.load(COMPARISON_FILE) or {}).get("refitted", {})
+        said = run.load(VERDICT_FILE) or {}
+        left = ", ".join(f"{split} {_shown(value)}" for split, value in error.items())
+        added = ", ".join(run.added[before:]) or "the model as given"
+        before = len(run.added)
+        console.print(f"{run.folder.name}: {added}; sigma after a refit: {left}", style="bold", highlight=False)
+        if said:
+            console.print(f"  {said.get('verdict')}: {said.get('sentence')}", highlight=False)
 
 
 def _shown(value: float | None) -> str:

@@ -14,7 +14,7 @@ MOST_SEED = 2**32 - 1
 """Seeds are 32 bits wide: what JAX takes on every platform."""
 RoverOption = Annotated[str, typer.Option(help="Name of a shipped rover, or folder that `convert` wrote.")]
 TerrainOption = Annotated[str, typer.Option(help="Shipped terrain, flat, slope:10deg, DEM file or terrain.toml.")]
-PresetOption = Annotated[str, typer.Option(help="consistent, field or paper.")]
+PresetOption = Annotated[str | None, typer.Option(help="field (by default), consistent or paper.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 

@@ -64,6 +64,11 @@ def train(
     quiet: Annotated[bool, typer.Option(help="No progress.")] = False,
     list_: Annotated[bool, typer.Option("--list", help="List the trainings and stop.")] = False,
     device: DeviceOption = "auto",
+    coordinator: Annotated[
+        str | None, typer.Option(help="HOST:PORT of the first process, where several hosts train together.")
+    ] = None,
+    processes: Annotated[int, typer.Option(help="How many processes train together.")] = 1,
+    process: Annotated[int, typer.Option(help="Which of them this is, from 0; the first writes the files.")] = 0,
 ) -> None:
     """Train a policy; resumes from the folder's newest checkpoint."""
     from lunar_mjx.commands.options import check_folder, make_folder, select_device
@@ -91,11 +96,16 @@ def train(
         chosen = dataclasses.replace(chosen, environment=environment, options=options, unseen={})
     elif options:
         chosen = dataclasses.replace(chosen, options={**chosen.options, **options})
+    from lunar_mjx.together import join, leads
+
+    join(coordinator, processes, process)
     from lunar_mjx.agents.run import run_training
     from lunar_mjx.agents.train import RunConfig
 
     run = RunConfig(steps or chosen.steps, seed, time_limit, checkpoint_every, not restart, quiet)
     report = run_training(training, chosen, run, make_folder(out), eval_every, eval_episodes, target)
+    if not leads():
+        return
     score = report.score
     print(
         f"success on unseen ground {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of "

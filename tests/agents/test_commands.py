@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
+
+from lunar_mjx.agents.networks import make_actor
+from lunar_mjx.agents.policy import Policy, load_policy, save_policy
 
 SHORT = [
     f"--env={text}"
@@ -64,6 +68,10 @@ def test_plays_an_agent_as_video_picture_and_table(run, tmp_path):
         (("train", "point", "--set", "speed=1"), "is no setting"),
         (("train", "point", "--set", "envs"), "is not name=value"),
         (("train", "point", "--environment", "nowhere"), "navigation, point"),
+        (("train", "point", "--processes", 2), "--coordinator"),
+        (("train", "point", "--coordinator", "here"), "is not HOST:PORT"),
+        (("train", "point", "--coordinator", "h:1"), "--processes = 1 is below 2"),
+        (("train", "point", "--coordinator", "h:1", "--processes", 2, "--process", 2), "is not one of 0 to 1"),
         (("evaluate", "clever"), "is no rover with a trained policy"),
         (("evaluate", "missing.npz"), "missing.npz"),
         (("play", "zero", "--task", "easy"), "paper, consistent, large"),
@@ -73,6 +81,15 @@ def test_mistakes_are_one_sentence(run, tmp_path, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
     found = run(*arguments)
     assert found.status == 2 and said in found.err and "Traceback" not in found.err
+
+
+def test_a_policy_of_an_environment_without_a_name_is_read_and_not_played(run, tmp_path):
+    layers = {"obs": 2, "actions": 1, "layers": [3], "activation": "relu", "layer_norm": False}
+    params = make_actor(**layers).init(jax.random.PRNGKey(0))
+    path = save_policy(Policy(params, None, None, layers, {}, {}), tmp_path / "policy.npz")
+    assert load_policy(path).act(np.zeros((4, 2), np.float32)).shape == (4, 1)
+    found = run("evaluate", path)
+    assert found.status == 2 and "says of no environment how it is made" in found.err
 
 
 def test_lists_the_trainings(run):

@@ -1,18 +1,13 @@
-"""Whole trainings: they solve the task without physics, survive SIGKILL bit for bit, spread out, and stop at nan."""
+"""Whole trainings: they solve the task without physics, survive SIGKILL bit for bit, and stop at nan."""
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import signal
-import socket
 import subprocess
-import sys
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 
 from lunar_mjx.agents import guard
@@ -25,20 +20,7 @@ from lunar_mjx.agents.td3 import TD3Config
 from lunar_mjx.agents.train import RunConfig, train
 from lunar_mjx.envs import PointEnv, make_agent
 from lunar_mjx.errors import UserError
-
-SCRIPT = Path(__file__).with_name("point_run.py")
-
-
-def command(*arguments: object, devices: int = 1) -> tuple[list[str], dict[str, str]]:
-    flags = f"--xla_force_host_platform_device_count={devices} --xla_cpu_multi_thread_eigen=false"
-    return [sys.executable, str(SCRIPT), *map(str, arguments)], {**os.environ, "XLA_FLAGS": flags}
-
-
-def run(*arguments: object, devices: int = 1) -> dict:
-    line, env = command(*arguments, devices=devices)
-    done = subprocess.run(line, env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return json.loads(done.stdout.splitlines()[-1])
+from tests.agents.point_process import command, run
 
 
 def settings(algorithm) -> TrainConfig:
@@ -103,67 +85,6 @@ def test_killed_and_resumed_it_ends_bit_for_bit_alike(tmp_path, whole):
     assert resumed["curve"] == whole["curve"]
     rows = (folder / "progress.csv").read_text().splitlines()
     assert len(rows) == 1 + len(whole["curve"])
-
-
-@pytest.fixture(scope="module")
-def spread() -> dict:
-    """The same training over two virtual devices of one process."""
-    return run("-", devices=2)
-
-
-@pytest.mark.slow
-def test_two_devices_learn_like_one(whole, spread):
-    one = whole[1]
-    assert (one["devices"], spread["devices"]) == (1, 2)
-    assert spread["digest"] != one["digest"], "other random numbers, so only alike"
-    for curve in (one["curve"], spread["curve"]):
-        assert np.mean([row[2] for row in curve[-6:]]) > 0.85
-        assert np.mean([row[1] for row in curve[-6:]]) > 5.0 + np.mean([row[1] for row in curve[1:3]])
-    late = [np.mean([row[1] for row in r["curve"][-8:]]) for r in (one, spread)]
-    assert max(late) - min(late) < 0.15 * max(late), "the same learning curve within noise"
-
-
-def _two_processes(*arguments: object) -> list[dict]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    lines = [
-        command(*arguments, "--coordinator", f"127.0.0.1:{port}", "--processes", 2, "--process", i) for i in (0, 1)
-    ]
-    running = [
-        subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for line, env in lines
-    ]
-    try:
-        outputs = [p.communicate() for p in running]
-    finally:
-        for process in running:
-            process.kill()
-            process.communicate()
-    assert all(p.returncode == 0 for p in running), outputs[0][1][-2000:]
-    return [json.loads(out.splitlines()[-1]) for out, _ in outputs]
-
-
-@pytest.mark.slow
-def test_two_processes_whose_clocks_differ_stop_and_save_together(tmp_path):
-    """One that is slower would else go on to the next step, and wait there for the other for ever."""
-    first, second = _two_processes(tmp_path, "--skew")
-    assert first["digest"] == second["digest"] and first["curve"] == second["curve"]
-    assert 2 < len(first["curve"]) < 20, "stopped by the limit of the first process's clock"
-    assert _checkpoints(tmp_path) == len(first["curve"])
-
-
-def _checkpoints(folder: Path) -> int:
-    return max(int(p.name) for p in (folder / "checkpoints").glob("*") if p.name.isdigit())
-
-
-@pytest.mark.slow
-def test_two_processes_on_loopback_are_two_devices(spread):
-    outputs = _two_processes("-", "--steps", 1600)
-    two, other = outputs
-    assert two["devices"] == 2
-    assert two["digest"] == other["digest"], "both processes hold the same parameters"
-    np.testing.assert_allclose(two["curve"], spread["curve"][:2], rtol=0.02)
 
 
 def test_stops_at_a_value_that_is_not_finite_and_keeps_the_state_for_replay(tmp_path):
