@@ -19,6 +19,7 @@ FOUNDATION = (
     "files",
     "pytree",
     "spatial",
+    "together",
     "trust",
     "units",
     "resources",

@@ -1,7 +1,8 @@
 """Criticism: compare a model with measurements, see where it fails, learn which effect is missing, add it.
 
 Every verb of the loop is a function: `check`, `compare`, `why` (and `explain`), `next_experiment`, `add`, `unknown`,
-`report`, `improve`, `audit`, and `simulate_log` makes measurements to try them on. Their results are plain data.
+`report`, `studio`, `improve`, `audit`, and `simulate_log` makes measurements to try them on. Their results are plain
+data.
 """
 
 from lunar_mjx.diagnosis.audit import Audit as Audit
@@ -13,6 +14,7 @@ from lunar_mjx.diagnosis.next_experiment import next_experiment as next_experime
 from lunar_mjx.diagnosis.report import write_report as report  # noqa: F401
 from lunar_mjx.diagnosis.runs import Run as Run
 from lunar_mjx.diagnosis.runs import load_run as load_run
+from lunar_mjx.diagnosis.studio import studio as studio
 from lunar_mjx.diagnosis.verbs import BadData as BadData
 from lunar_mjx.diagnosis.verbs import add as add
 from lunar_mjx.diagnosis.verbs import compare as compare
