@@ -19,7 +19,8 @@ from lunar_mjx.inference.coordinates import WIDE, Coordinate
 from lunar_mjx.inference.observations import Chain, Observations, Series
 from lunar_mjx.inference.problem import Problem
 from lunar_mjx.wheel_bed.bed import PORTS, WheelBed, WheelTest
-from lunar_mjx.wheel_bed.table import QUANTITIES, SteadyStateTable, average
+from lunar_mjx.wheel_bed.scatter import point_scatter
+from lunar_mjx.wheel_bed.table import QUANTITIES, SteadyStateTable, average, replicate_groups
 
 if TYPE_CHECKING:
     from lunar_mjx.logs import SteadyLog
@@ -46,25 +47,33 @@ width only through k_c/b + k_phi and is held."""
 def points(log: SteadyLog) -> tuple[SteadyStateTable, dict[str, np.ndarray]]:
     """A table with replicates averaged, and the standard deviation of each averaged point by quantity.
 
-    The noise is the scatter of the replicates where there are any, else what the log states.
+    The noise is the scatter of the replicates where there are any, growing with the reading as far as they show it;
+    else what each row states; else what the log states.
 
     Raises:
-      UserError: neither is there.
+      UserError: nothing of these is there.
     """
     table = average(log.table)
+    group = replicate_groups(log.table)
+    count = np.bincount(group)
     noise = {}
-    for quantity in table.measured:
+    for quantity, values in log.table.measured.items():
         column = QUANTITIES[quantity][0]
-        sigma = table.sigma.get(quantity, 0.0)
-        if not sigma > 0.0:
+        mean = table.measured[quantity]
+        squares = np.bincount(group, weights=(values - mean[group]) ** 2)
+        if squares.any():
+            noise[quantity] = point_scatter(squares, count - 1, mean) / np.sqrt(count)
+            continue
+        rows = log.row_std.get(column)
+        if rows is None or not (rows > 0.0).all():
             stated = log.noise.get(column)
             if stated is None:
                 raise UserError(
                     f"{log.folder}: nothing tells the noise of {column}; give replicates, or state "
                     f"[noise.{column}] std in log.toml."
                 )
-            sigma = stated.std
-        noise[quantity] = sigma / np.sqrt(table.replicates)
+            rows = np.full(len(values), stated.std)
+        noise[quantity] = np.sqrt(np.bincount(group, weights=rows**2 / log.table.replicates)) / count
     return table, noise
 
 

@@ -10,6 +10,7 @@ from lunar_mjx.logs.checks.values import CHANCE
 from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import SteadyLog
 from lunar_mjx.logs.schema import STEADY_CHANNELS
+from lunar_mjx.wheel_bed.scatter import grows
 from lunar_mjx.wheel_bed.table import QUANTITIES, average, replicate_groups
 
 
@@ -224,10 +225,13 @@ def _replicates(log: SteadyLog) -> list[Finding]:
         statistic = float(residual @ residual)
         ratio = float(np.sqrt(statistic / freedom))
         high, low = stats.chi2.sf(statistic, freedom) < CHANCE, stats.chi2.cdf(statistic, freedom) < CHANCE
-        # Noise that grows with its quantity scatters more than stated at a few points and less at others. A wrong
-        # statement is wrong at most points: the median point tells the two apart.
+        # A wrong statement is wrong at most points: where noise differs between points the median point tells.
         usual = _scatter_of_median_point(residual, group, count)
-        if (min(ratio, usual) > FACTOR and high) or (max(ratio, usual) < 1.0 / FACTOR and low):
+        several = count > 1
+        squares = np.bincount(group, weights=(values - mean[group]) ** 2)[several]
+        level = np.sqrt(np.bincount(group, weights=stated**2) / count)[several]
+        honest = grows(squares, count[several] - 1, mean[several], level)
+        if (min(ratio, usual) > FACTOR and high and not honest) or (max(ratio, usual) < 1.0 / FACTOR and low):
             worst = int(np.argmax(np.abs(residual))) if ratio > 1.0 else None
             found.append(
                 _finding(
