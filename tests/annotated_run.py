@@ -28,7 +28,7 @@ from lunar_mjx.criticism import WheelBed, load_figures
 from lunar_mjx.dynamics import build
 from lunar_mjx.dynamics.state import Temperature
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.model import make_model
+from lunar_mjx.model import Model, make_model
 from lunar_mjx.model.file import load_model, save_model
 from lunar_mjx.paper import hot_motor
 from lunar_mjx.rover import convert
@@ -74,7 +74,7 @@ def vectors() -> None:
 def steps() -> None:
     """Traces one step and a rollout of LUVMI-X, by both engines and presets."""
     ground = load_terrain(DETAILED)
-    for preset in ("consistent", "paper"):
+    for preset in ("field", "consistent", "paper"):
         for engine in ("mjx", "structured"):
             system = build(make_model("luvmi_x", ground, preset), engine)
             state = system.reset(system.params, 1.0, -1.0, 0.3)
@@ -84,12 +84,14 @@ def steps() -> None:
 
 
 def every_effect() -> None:
-    """Traces a step with each effect that the preset leaves out and that fits beside the others or in their place."""
+    """Traces a step with each effect that the preset leaves out, and with what it reads, beside the others or in their
+    place."""
     model = make_model("luvmi_x", "flat")
     for name in CATALOGUE:
         if name in model.effect_names or any(name in e.replaces for e in model.effects):
             continue
-        system = build(model.add(name))
+        needed = [n for n in CATALOGUE[name].requires if n not in model.effect_names]
+        system = build(functools.reduce(Model.add, [*needed, name], model))
         jax.make_jaxpr(system.step)(system.params, system.reset(system.params), jnp.zeros(len(system.joint_names)))
 
 

@@ -336,8 +336,10 @@ class _World:
         position, turn, velocity, spin = self._base()
         states = p.getJointStates(self._body, self._moving, **self._id)
         links = p.getLinkStates(self._body, wheels, computeLinkVelocity=1, computeForwardKinematics=1, **self._id)
-        turned = np.stack([_matrix(link[5]) for link in links])
-        center, place = np.array([link[0] for link in links]), np.array([link[4] for link in links])
+        # from the centres of mass: Bullet reckons link frames in the world in float32 (6e-8 m at 1 m from the origin)
+        center = np.array([link[0] for link in links])
+        turned = np.stack([_matrix(link[1]) @ _matrix(link[3]).T for link in links])
+        place = center - np.einsum("wij,wj->wi", turned, np.array([link[2] for link in links]))
         wheel_spin = np.array([link[7] for link in links])
         return {
             "position": position,

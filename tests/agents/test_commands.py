@@ -19,12 +19,12 @@ SHORT = [
         "goal_distance=[1.0, 1.5]",
         "places=64",
         "decimation=25",
-        "episode_time=3.0",
+        "episode_time=15.0",
         "action=velocity",
         "start_yaw=0.3",
     )
 ]
-"""A goal a few seconds away: the straight line reaches it."""
+"""A goal at most 1 m away, which the motors' 0.28 m/s (48 V) and soft soil leave some seconds for."""
 
 
 @pytest.mark.slow

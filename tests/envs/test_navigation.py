@@ -18,7 +18,7 @@ from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.envs import make_agent, make_navigation, split_keys
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
 from lunar_mjx.envs.navigation import rewards
-from lunar_mjx.envs.navigation.actions import action_map
+from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
 from lunar_mjx.envs.navigation.places import draw_places
 from lunar_mjx.envs.navigation.randomise import Range, check_ranges
@@ -129,12 +129,25 @@ def test_pictures_show_rover_and_goal(env):
 
 @pytest.mark.slow
 def test_straight_line_and_shipped_policy_reach_goals_on_flat_ground_in_every_soil():
-    env = make_navigation("large", terrain="flat", goal_distance=(4.0, 5.0), episode_time=25.0, places=64)
+    # 25 s at 1 m/s, which 48 V do not allow: three and a half times as long
+    env = make_navigation("large", terrain="flat", goal_distance=(4.0, 5.0), episode_time=90.0, places=64)
     straight, policy = make_agent("scripted", env), load_policy(shipped_policy("luvmi_x"))
     evaluator = Evaluator(env, lambda trained, s, key: jnp.where(trained, policy.act(s.obs), straight(s, key)), 16)
     for params in (env.params, unseen_params(env, {"ranges": "unseen"})):
         for trained in (False, True):
             assert evaluator(params, jnp.array(trained), 0).success >= 0.8, trained
+
+
+def test_episodes_are_long_enough_for_what_the_bus_voltage_allows():
+    """A shipped task's time is for 1 m/s; 48 V allow LUVMI-X 48/(71.6e-3 * 243) rad/s at 0.1 m. A given time stays."""
+    speed = 48.0 / (71.6e-3 * 243.0) * 0.1
+    for preset, longer in (("field", 1.0 / speed), ("consistent", 1.0)):
+        near = {"terrain": "flat", "preset": preset, "places": 16, "goal_distance": (4.0, 5.0)}
+        assert make_navigation("large", **near).config.episode_time == pytest.approx(120.0 * longer, rel=1e-6)
+        assert make_navigation("large", **near, episode_time=25.0).config.episode_time == 25.0
+    assert reachable_speed(make_model("luvmi_x", "flat")) == np.inf
+    slow = make_model("luvmi_x", "flat", "field").set("voltage_saturation", limit=256.0)
+    assert reachable_speed(slow) == pytest.approx(0.5 * speed, rel=1e-6), "24 V"
 
 
 @pytest.mark.parametrize("rover", ["luvmi_x", "viper"])

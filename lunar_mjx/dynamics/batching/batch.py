@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ Axes = Any
 """None, 0, or a prefix of `Params` whose leaves are None (shared by all rovers) or 0 (leading axis: per rover)."""
 
 
+@runtime_checkable
 class Steps(Protocol):
     """What a batch needs of a system: its step for one rover, and its engine.
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from lunar_mjx.effects.joint.electrical import voltage_of
 from lunar_mjx.effects.joint.motor import CURRENT, POSITION, TORQUE, VELOCITY
 from lunar_mjx.errors import bad_input
 from lunar_mjx.model import Model
@@ -105,6 +106,23 @@ def _six(rover: Rover, mode: str, groups: list[str], limits: np.ndarray, all_ste
         scale.append(value)
         code.append(kind)
     return ActionMap(names, np.array(source), np.array(scale), np.array(code))
+
+
+def reachable_speed(model: Model) -> float:
+    """Rim speed that the bus voltage allows a wheel without load, m/s, of the slowest wheel; infinite without a limit.
+
+    omega = V_bus/(K N), from |R I + K N omega| <= V_bus at I = 0.
+    """
+    supply = model.parameters.get("voltage_saturation")
+    if supply is None:
+        return np.inf
+    rover, motor = model.rover, model.parameters["motor"]
+    ratio, constant, voltage = (
+        np.broadcast_to(values, len(rover.joints))
+        for values in (motor["gear_ratio"], motor["torque_constant"], np.vectorize(voltage_of)(supply["limit"]))
+    )
+    driven = [(w.radius, rover.joints.index(w.drive)) for w in rover.wheels if w.drive]
+    return min((float(radius * voltage[i] / (constant[i] * ratio[i])) for radius, i in driven), default=np.inf)
 
 
 def _limits(model: Model, mode: str, top_speed: float, load_share: float) -> np.ndarray:

@@ -228,7 +228,10 @@ UNSAID: dict[str, tuple[str, str]] = {
     "goal distance": ("4 to 6 m", "some body lengths of the rover: reached in 400 episodes of one rover"),
     "start": ("within 2 m of the origin, heading within 90 deg of the goal", "the paper shows one place only"),
     "goal radius": ("0.5 m", "about half the body's length"),
-    "episode length": ("30 s, then truncated, not terminated", "several times what the drive takes"),
+    "episode length": (
+        "30 s, longer where the bus voltage keeps the wheels below 1 m/s; then truncated, not terminated",
+        "several times what the drive takes",
+    ),
     "time step": ("2 ms physics, 0.1 s control", "the physics' own; 10 Hz is what rover electronics do"),
     "torque at action 1": (
         "drive: 0.6 of a wheel's load times its radius; steering: turns the motor's inertia to its limit in 0.5 s; "

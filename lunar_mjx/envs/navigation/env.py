@@ -17,7 +17,7 @@ from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.effects.presets import DEFAULT_PRESET
 from lunar_mjx.envs.core import State, side_by_side, where
 from lunar_mjx.envs.navigation import kalman, randomise, rewards
-from lunar_mjx.envs.navigation.actions import action_map
+from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
 from lunar_mjx.envs.navigation.observations import CAMERA, Scene, observe
 from lunar_mjx.envs.navigation.places import draw_places
@@ -453,7 +453,9 @@ def make_navigation(
       preset: of the physics.
       model: a model or `model.toml` instead of rover, terrain and preset; a terrain given beside it takes its place.
       engine: of the physics.
-      **settings: that differ from the task's, see `NavigationConfig`.
+      **settings: that differ from the task's, see `NavigationConfig`. Unless `episode_time` is among them, a shipped
+        task's time is longer by the factor by which the motors stay below its top speed (`actions.reachable_speed`):
+        with the preset `field` LUVMI-X drives 0.28 m/s at most, not 1 m/s.
 
     Raises:
       UserError: unknown names, or settings that do not fit.
@@ -476,4 +478,8 @@ def make_navigation(
         model = make_model(rover, terrain or "lunar_plain", preset)
     elif terrain is not None:
         model = model.replace(terrain=terrain)
+    if isinstance(task, str) and "episode_time" not in settings:
+        # a task's time is for its top speed, which the bus voltage may not allow
+        slower = max(1.0, config.top_speed / reachable_speed(model))
+        config = config.replace(episode_time=config.episode_time * slower)
     return NavigationEnv(model, config, engine)
