@@ -20,7 +20,6 @@ from lunar_mjx.backends.hooks import Hook
 from lunar_mjx.backends.jax_backend import JaxBackend
 from lunar_mjx.backends.native import NativeBackend
 from lunar_mjx.backends.parity.cases import (
-    ABSOLUTE,
     DRIVE_EXCEPTIONS,
     EXCEPTIONS,
     QUANTITIES,
@@ -297,12 +296,10 @@ def tolerances(kind: str, drive: bool = False) -> dict[str, Tolerance]:
     out = {}
     for quantity, (_, size) in QUANTITIES.items():
         relative = grown * DRIVE_EXCEPTIONS.get(kind, {}).get(quantity, 0.0) if drive else 0.0
-        absolute = 0.0
         for k in kind.split(", "):
             usual = RELATIVE[k] if drive or k != SOFT_LOOP else SOFT_STEP.get(quantity, 0.0)
             relative = max(relative, grown * EXCEPTIONS.get(k, {}).get(quantity, usual))
-            absolute = max(absolute, grown * ABSOLUTE.get(k, {}).get(quantity, 0.0))
-        out[quantity] = Tolerance(max(relative * size, absolute), relative)
+        out[quantity] = Tolerance(relative * size, relative)
     return out
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 
-from lunar_mjx.backends.parity.cases import ABSOLUTE, DRIVE_EXCEPTIONS, EXCEPTIONS, QUANTITIES, RELATIVE, SOFT_STEP
+from lunar_mjx.backends.parity.cases import DRIVE_EXCEPTIONS, EXCEPTIONS, QUANTITIES, RELATIVE, SOFT_STEP
 from lunar_mjx.backends.parity.compare import first_failure, traces
 from lunar_mjx.backends.parity.record import COMPLIANCE, RUNS_DOUBLE, RUNS_SINGLE, SPREAD
 from lunar_mjx.backends.parity.study import Pair, Study
@@ -88,9 +88,6 @@ def _method(study: Study) -> list[str]:
     kinds = ", ".join(f"{k} {v:g}" for k, v in RELATIVE.items())
     but = "; ".join(f"{k}: {', '.join(f'{q} {v:g}' for q, v in own.items())}" for k, own in EXCEPTIONS.items())
     apart = "; ".join(f"{k}: {', '.join(f'{q} {v:g}' for q, v in own.items())}" for k, own in DRIVE_EXCEPTIONS.items())
-    least = "; ".join(
-        f"{k}: {', '.join(f'{q} {v:g} {QUANTITIES[q][0]}' for q, v in own.items())}" for k, own in ABSOLUTE.items()
-    )
     loops = ", ".join(f"{q} {v:g}" for q, v in SOFT_STEP.items())
     shares = ", ".join(f"{c:g}" for c in COMPLIANCE)
     return [
@@ -99,20 +96,20 @@ def _method(study: Study) -> list[str]:
         "drive; level 3 lets every engine drive for itself.",
         "An error is |a - b|/(atol + rtol |a|); above 1 the engines disagree. rtol by what separates the engines: "
         f"{kinds} (with exceptions, {but}), ten times that for drives (there {apart}); atol is rtol times the "
-        f"quantity's typical size (at least, {least}).",
+        "quantity's typical size.",
         "Drives may also depart by ten times the noise floor. That is the farthest of the reference's own drives, once "
         f"with coordinates rounded to float32 at the start, and {RUNS_DOUBLE} times with coordinates and speeds moved "
         f"by chance within {SPREAD:g} units in the last place of float64 after every step; where an engine holds "
-        f"coordinates or frames in float32, also {RUNS_SINGLE} times in its last place, which makes the sinkage err "
-        "as it was measured to err in float32, by 4e-8 m. A slip of 2 and one of -2 are the same.",
+        f"coordinates in float32, or is PyBullet, also {RUNS_SINGLE} times in float32's last place, which makes the "
+        "sinkage err as it was measured to err in float32, by 4e-8 m. A slip of 2 and one of -2 are the same.",
         "MuJoCo's loops give way by a micrometre. Engines that close them exactly are compared with it from states "
         "whose loops are closed: there every stage before the acceleration must agree as if there were no loop, and "
         f"then with rtol {loops}. Their drives' noise floor also has the reference with {shares} times its loops' "
         "compliance, and damped within the loops, as the other engines damp.",
         "Errors of every step matter where the rover stands and its law of friction has no rest: with the preset paper "
         "the wheels chatter by some mm/s, and every rounding grows until the drive begins.",
-        "PyBullet keeps the frames of a URDF in float32: its wheels lie up to 6e-8 m off, which is 0.01 N on rock of "
-        "2e5 N/m.",
+        "PyBullet's poses and forces of one state agree to rounding; it integrates about the chassis' centre of mass, "
+        "which moves the chassis' frame by up to 6e-10 m a step.",
         f"Grounds: {grounds}.",
     ]
 

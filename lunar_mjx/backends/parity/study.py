@@ -183,7 +183,11 @@ def kind_of(names: tuple[str, str], model: Model) -> str:
 
 
 def floor_of(names: tuple[str, str], kind: str, noise: Noise) -> Telemetry:
-    """The reference and its drives perturbed as the engines are: PyBullet keeps frames in float32, and errs so."""
+    """The reference and its drives perturbed as the engines are: by float64's errors, and by float32's.
+
+    Those of float32 count for PyBullet as well: it integrates about the chassis' centre of mass, not its frame, which
+    differs by up to 6e-10 m a step, far beyond float64.
+    """
     single = any(name.endswith("float32") or name.startswith("pybullet") for name in names)
     return noise.floor(single, SOFT_LOOP in kind)
 
