@@ -38,6 +38,8 @@ SplitOption = Annotated[
 SeedOption = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of all random starts.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+AnimationOption = Annotated[Path | None, typer.Option(help="Also write the falling error as .gif, .webp or .mp4.")]
+DarkOption = Annotated[bool, typer.Option(help="The animation for a dark page.")]
 PriorOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -200,10 +202,13 @@ def unknown(
 def report(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, in the order in which effects were added.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
+    animation: AnimationOption = None,
+    dark: DarkOption = False,
 ) -> None:
     """Write one offline page: the error falls."""
     _write_report(runs, out)
     print(out)
+    _write_animation(runs, animation, dark)
 
 
 def studio(
@@ -212,8 +217,8 @@ def studio(
     refit: Annotated[
         bool, typer.Option(help="Refit wheel tables with each effect, if the run does not hold these refits yet.")
     ] = True,
-    animation: Annotated[Path | None, typer.Option(help="Also write the falling error as .gif, .webp or .mp4.")] = None,
-    dark: Annotated[bool, typer.Option(help="The animation for a dark page.")] = False,
+    animation: AnimationOption = None,
+    dark: DarkOption = False,
 ) -> None:
     """Write an offline page to choose effects, see the error fall, and where the model fails."""
     from lunar_mjx.diagnosis.studio import studio as make
@@ -225,10 +230,7 @@ def studio(
     if left_out:
         print(left_out, file=sys.stderr)
     print(path)
-    if animation is not None:
-        from lunar_mjx.diagnosis.report.falling import write_falling
-
-        print(write_falling(run, animation, dark))
+    _write_animation([run], animation, dark)
 
 
 def improve(
@@ -269,6 +271,13 @@ def improve(
         if not as_json:
             _print_steps(runs)
     _finish(diagnosis, as_json)
+
+
+def _write_animation(runs: Sequence[Path], animation: Path | None, dark: bool) -> None:
+    if animation is not None:
+        from lunar_mjx.diagnosis.report.falling import write_falling
+
+        print(write_falling(runs, animation, dark))
 
 
 def _model(path: Path | None, preset: str | None, logs: Sequence[Path]) -> Model:

@@ -190,7 +190,7 @@ _FILES = {
     "6": "fig6_training",
     "slope": "slope_stall",
 }
-NEED_OPENGL = ("1", "4")
+NEED_OPENGL = ("4",)
 """Figures that MuJoCo's renderer draws."""
 NEED_TRAININGS = ("6",)
 """Figures of trainings, which must have been made: nothing is trained or invented here."""
@@ -208,6 +208,6 @@ def available_figures(trainings: Sequence[Path] = ()) -> list[str]:
     try:
         context_class()
     except UserError as missing:
-        print(f"Figs. {' and '.join(NEED_OPENGL)} are left out: {missing}", file=sys.stderr)
+        print(f"Fig. {' and '.join(NEED_OPENGL)} is left out: {missing}", file=sys.stderr)
         names = [name for name in names if name not in NEED_OPENGL]
     return names

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -14,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lunar_mjx.cameras import (
     LABELS,
+    Film,
     Light,
     Pictures,
     Pinhole,
@@ -27,20 +31,34 @@ from lunar_mjx.cameras import (
     picture,
     placed,
     rover_shapes,
+    together,
 )
 from lunar_mjx.cameras.chase import wheel_tracks
 from lunar_mjx.cameras.texture import ALBEDO, TrackPainter, regolith
 from lunar_mjx.dynamics import build
 from lunar_mjx.model import Model, make_model
 from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, VERMILION
+from lunar_mjx.resources import find
 from lunar_mjx.rover import Rover
-from lunar_mjx.terrain import HeightField, load_terrain
+from lunar_mjx.terrain import HeightField, Terrain, load_terrain
+from lunar_mjx.terrain.config import read_config
+from lunar_mjx.terrain.load import CONFIG, build_terrain
 
 RIM = "de_gerlache_rim"
-_PLACE = (5.0, 0.0, -0.2)
-"""Where the rover of the first figure stands: x, y in m and yaw in rad."""
-_LOW_SUN = (250.0, 7.0)
-"""Azimuth and elevation of its Sun, deg."""
+_ABUNDANCE = 0.04
+"""Share of the ground that rocks cover in the first figure: as on fresh ejecta, four times that of `lunar_plain`."""
+_PLACE = (-10.0, -10.0, math.radians(290.0))
+"""Where the rover of the first figure stands: x, y in m and yaw in rad. Its front camera sees rocks and a rover."""
+_MATE = (4.1, -28.0, 75.0)
+"""Where the other rover stands: distance in m and direction from the heading, and yaw from the heading, deg."""
+_ONLOOKER = (7.0, 280.0, 9.0)
+"""Where the first figure is seen from: distance in m, compass azimuth and elevation in deg."""
+_LOW_SUN = (308.0, 7.0)
+"""Azimuth and elevation of the Sun in the first figure, deg."""
+_FILM = Film(mid=0.12)
+"""A little darker than the cameras' own exposure, so that white parts are not burnt out."""
+_ROWS = 300
+"""Places of a rover on its way here, from which its tracks are painted."""
 _LABEL_COLOURS = ("#000000", "#8c8c8c", "#56B4E9", "#E69F00")
 """Sky, ground, rock, rover: told apart without colour vision, and by their brightness."""
 _BOXES: dict[str, tuple[float, float, str, str, str]] = {
@@ -66,21 +84,23 @@ _ARROWS = (
 
 def figure_1() -> tuple[Figure, dict[str, Any]]:
     """The display: a rover under a low Sun, and colour, depth and labels of its front camera, by the cameras in JAX."""
-    model = make_model("viper", "lunar_plain")
-    rover = model.rover
-    system = build(model)
-    qpos = np.asarray(system.reset(system.params, *_PLACE).qpos, float)
-    light = Light(Sun(*_LOW_SUN))
-    paint = _trodden(rover, qpos)
-    pose = orbit(qpos[:3] + np.array([0.7, 0.2, 0.25]), 6.6, 222.0, 8.0)
-    wide = _taken(model, qpos, pose, Pinhole(960, 572, 38.0), light, paint, detail=True)
+    terrain = _rocky_plain()
+    model = make_model("viper", terrain)
+    qpos, mate_qpos = _standing(model, _PLACE), _beside(_PLACE, _MATE)
+    mate = make_model("luvmi_x", terrain)
+    both = ((model.rover, qpos), (mate.rover, _standing(mate, mate_qpos)))
+    light = Light(Sun(*_LOW_SUN), film=_FILM)
+    paint = _trodden(both)
+    ahead = np.array([math.cos(_PLACE[2]), math.sin(_PLACE[2]), 0.0])
+    pose = orbit(qpos[:3] + 1.9 * ahead + np.array([0.0, 0.0, 0.2]), *_ONLOOKER)
+    wide = _taken(terrain, both, pose, Pinhole(960, 572, 38.0), light, paint, detail=True)
     optics = Pinhole(320, 240)
-    place, turn = mounted(front_mount(rover), jnp.asarray(qpos, jnp.float32))
+    place, turn = mounted(front_mount(model.rover), jnp.asarray(qpos, jnp.float32))
     front = Pose(np.asarray(place, float), np.asarray(turn, float))
-    seen = _taken(model, qpos, front, optics, light, paint, detail=False)
+    seen = _taken(terrain, both, front, optics, light, paint, detail=False)
     figure = Figure(figsize=(13.0, 6.6))
     grid = figure.add_gridspec(3, 2, width_ratios=(3.0, 1.0), left=0.01, right=0.94, top=0.95, bottom=0.01, wspace=0.02)
-    title = f"VIPER on lunar_plain, Sun in the west-south-west, {_LOW_SUN[1]:g}° high"
+    title = f"VIPER and LUVMI-X on a rocky lunar plain, Sun {_LOW_SUN[1]:g}° high"
     _picture(figure.add_subplot(grid[:, 0]), np.asarray(wide.rgb), title)
     depth = np.asarray(seen.depth)
     near = np.where(np.isfinite(depth), depth, np.nan)
@@ -108,30 +128,62 @@ def figure_1() -> tuple[Figure, dict[str, Any]]:
     }
 
 
+def _rocky_plain() -> Terrain:
+    """`lunar_plain` with more rocks."""
+    file = find("terrain", "lunar_plain", CONFIG) / CONFIG
+    config = read_config(file)
+    assert config.rocks is not None
+    rocks = dataclasses.replace(config.rocks, abundance=_ABUNDANCE)
+    return build_terrain(dataclasses.replace(config, rocks=rocks), "lunar_plain", file.parent)
+
+
+def _standing(model: Model, place: tuple[float, float, float]) -> np.ndarray:
+    """Coordinates (nq,) of a rover that stands at x, y in m and yaw in rad."""
+    system = build(model)
+    return np.asarray(system.reset(system.params, *place).qpos, float)
+
+
+def _beside(place: tuple[float, float, float], way: tuple[float, float, float]) -> tuple[float, float, float]:
+    """The place at a distance (m) and direction (deg) from a rover's heading, turned by deg."""
+    x, y, yaw = place
+    towards = yaw + math.radians(way[1])
+    return x + way[0] * math.cos(towards), y + way[0] * math.sin(towards), yaw + math.radians(way[2])
+
+
 def _taken(
-    model: Model, qpos: np.ndarray, pose: Pose, camera: Pinhole, light: Light, paint: HeightField, detail: bool
+    terrain: Terrain,
+    rovers: Sequence[tuple[Rover, np.ndarray]],
+    pose: Pose,
+    camera: Pinhole,
+    light: Light,
+    paint: HeightField,
+    detail: bool,
 ) -> Pictures:
-    """A picture of a rover, its own tracks and its shadow."""
-    shapes = rover_shapes(model.rover, detail)
+    """A picture of rovers at their coordinates, their tracks and their shadows."""
+    shapes = [rover_shapes(rover, detail) for rover, _ in rovers]
 
-    def look(terrain: Any, q: Any, place: Any, turn: Any) -> Pictures:
-        seen = placed(shapes, model.rover, q)
-        return picture(terrain, place, turn, camera, light, seen, paint=paint, far=90.0, steps=128, shadow_steps=128)
+    def look(terrain: Any, coordinates: Any, place: Any, turn: Any) -> Pictures:
+        stand = [placed(s, r, q) for s, (r, _), q in zip(shapes, rovers, coordinates, strict=True)]
+        return picture(
+            terrain, place, turn, camera, light, together(*stand), paint=paint, far=90.0, steps=512, shadow_steps=256
+        )
 
-    given = (jnp.asarray(v, jnp.float32) for v in (qpos, pose.position, pose.rotation))
-    return jax.device_get(jax.jit(look)(model.terrain, *given))
+    coordinates = [jnp.asarray(qpos, jnp.float32) for _, qpos in rovers]
+    given = (jnp.asarray(v, jnp.float32) for v in (pose.position, pose.rotation))
+    return jax.device_get(jax.jit(look)(terrain, coordinates, *given))
 
 
-def _trodden(rover: Rover, qpos: np.ndarray) -> HeightField:
-    """Mottled ground with the tracks of a rover that came straight to where it stands."""
-    w, x, y, z = qpos[3:7]
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    way = np.tile(qpos, (300, 1))
-    way[:, :2] -= np.linspace(12.0, 0.0, 300)[:, None] * np.array([np.cos(yaw), np.sin(yaw)])
-    side = 40.0
-    low = qpos[:2] - 0.5 * side
-    ground = regolith(4096, side)
-    trodden = TrackPainter(ground, low.tolist(), [side, side], wheel_tracks(rover, way)).paint(len(way))
+def _trodden(rovers: Sequence[tuple[Rover, np.ndarray]]) -> HeightField:
+    """Mottled ground with the tracks of rovers that came straight to where they stand; the first is in the middle."""
+    side, tracks = 40.0, []
+    for rover, qpos in rovers:
+        w, x, y, z = qpos[3:7]
+        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        way = np.tile(qpos, (_ROWS, 1))
+        way[:, :2] -= np.linspace(12.0, 0.0, _ROWS)[:, None] * np.array([np.cos(yaw), np.sin(yaw)])
+        tracks += wheel_tracks(rover, way)
+    low = rovers[0][1][:2] - 0.5 * side
+    trodden = TrackPainter(regolith(4096, side), low.tolist(), [side, side], tracks).paint(_ROWS)
     return painted(np.asarray(trodden, np.float32).mean(axis=-1) / (255.0 * float(ALBEDO.mean())), low, side)
 
 

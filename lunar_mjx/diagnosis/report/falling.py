@@ -1,7 +1,8 @@
-"""The error falling, as a short animation: what was measured, and each model of a run in turn."""
+"""The error falling, as a short animation: what was measured, and each model of a chain of runs in turn."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,41 +12,55 @@ from matplotlib.figure import Figure
 
 from lunar_mjx.diagnosis.report.explore import cells
 from lunar_mjx.diagnosis.report.read import read_result
-from lunar_mjx.diagnosis.report.steps import Step, chain, error, judged
+from lunar_mjx.diagnosis.report.steps import Step, chain, comparable, error, judged
 from lunar_mjx.diagnosis.report.words import channel_label, shown
 from lunar_mjx.errors import UserError
-from lunar_mjx.report.style import BLUE, DARK, INK, MUTED, ORANGE, PAPER, RULE
+from lunar_mjx.report.style import BLUE, DARK, INK, MUTED, ORANGE, PAPER, RULE, SKY
 from lunar_mjx.visual.encode import writer
 
 _FPS = 12
 _HOLD, _MOVE = 14, 12
 """Pictures for which a model stands still, and in which it passes into the next."""
-_SIZE = (9.6, 3.9)
+_SIZE = (9.6, 4.1)
 """Inches, at 100 pixels each."""
 _MOST_PANELS = 3
+_LEAST_POINTS = 5
+"""Fewer observations show no course."""
+_MANY_POINTS = 60
+"""From so many on, points are drawn small and models without marks."""
+_GAP = 5.0
+"""Lines break where two observations are so many times further apart than is usual."""
+_TITLE_WIDTH = 104
+"""Characters of a line above the bar."""
 
 
-def write_falling(run: str | Path, out: str | Path, dark: bool = False) -> Path:
-    """Writes an animation of a run's models: as given, refitted, with the effects that the diagnosis names.
+def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark: bool = False) -> Path:
+    """Writes an animation of a chain of models: as given, refitted, with effects added, and as the last run proposes.
 
     Between two models the curves pass through means of both predictions; these pictures are no model's.
 
     Args:
-      run: the run folder. out: a .gif, .webp or .mp4 file. dark: for a dark page.
+      runs: a run folder, or several in the order in which effects were added. out: a .gif, .webp or .mp4 file.
+      dark: for a dark page.
 
     Returns:
       The file's path.
 
     Raises:
-      UserError: the folder is no run, holds no series yet, or the file is of no known kind.
+      UserError: a folder is no run, holds no series yet, the runs are of other logs, or the file is of no known kind.
     """
-    result = read_result(Path(run))
-    if result.traces is None:
-        raise UserError(f"{run}: holds no series.npz yet; make it with lunar-mjx compare, then lunar-mjx why.")
-    steps = chain([result])
+    results = [read_result(Path(r)) for r in ([runs] if isinstance(runs, str | Path) else runs)]
+    for result in results:
+        if result.traces is None:
+            raise UserError(
+                f"{result.folder or result.name}: holds no series.npz yet; make it with lunar-mjx compare, then why."
+            )
+    steps = chain(results)
+    if not comparable(steps):
+        raise UserError("--animation: these runs are of other measurements; give runs of the same logs.")
     splits, measure = judged(steps)
     errors = [e.value for s in steps if (e := error(s, splits)) is not None]
-    panels = _worst(steps)
+    panels = _worst(steps, splits)
     path = Path(out)
     if path.suffix.lower() not in (".gif", ".webp", ".mp4"):
         raise UserError(f"{path}: is of no known kind; end it in .gif, .webp or .mp4.")
@@ -68,14 +83,25 @@ def _course(models: int) -> list[float]:
     return course
 
 
-def _worst(steps: Sequence[Step]) -> list[tuple[str, str, np.ndarray]]:
-    """Channel, manoeuvre and observations where the first model is worst, one of each channel."""
+def _worst(steps: Sequence[Step], splits: Sequence[str]) -> list[tuple[str, str, np.ndarray]]:
+    """Channel, manoeuvre and observations where the first model is worst, one of each channel, of the judged splits."""
     o, residual = steps[0].observations, steps[0].residual
-    ranked = sorted(cells(o), key=lambda c: -float(np.sqrt(np.nanmean(residual[c[2]] ** 2))))
-    found: dict[str, tuple[str, str, np.ndarray]] = {}
+    judges = o.in_split(*splits)
+    found = [(channel, unit, at[judges[at] & np.isfinite(residual[at])]) for channel, unit, at in cells(o)]
+    ranked = sorted(
+        (c for c in found if len(c[2]) >= _LEAST_POINTS), key=lambda c: -float(np.sqrt(np.mean(residual[c[2]] ** 2)))
+    )
+    worst: dict[str, tuple[str, str, np.ndarray]] = {}
     for channel, unit, at in ranked:
-        found.setdefault(channel, (channel, o.unit_names[unit], at))
-    return list(found.values())[:_MOST_PANELS]
+        worst.setdefault(channel, (channel, o.unit_names[unit], at))
+    return list(worst.values())[:_MOST_PANELS]
+
+
+def _broken(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places and values of a line that breaks where measurements pause."""
+    steps = np.diff(x)
+    pauses = np.flatnonzero(steps > _GAP * max(float(np.median(steps)), 1e-12)) + 1 if len(x) > 2 else []
+    return np.insert(x.astype(float), pauses, np.nan), np.insert(y.astype(float), pauses, np.nan)
 
 
 def _picture(
@@ -92,7 +118,7 @@ def _picture(
     high, share = min(low + 1, len(steps) - 1), place - low
     figure = Figure(_SIZE, dpi=100, facecolor=paper)
     grid = figure.add_gridspec(
-        2, len(panels), height_ratios=(3, 1), left=0.075, right=0.985, top=0.86, bottom=0.13, hspace=0.62, wspace=0.3
+        2, len(panels), height_ratios=(3, 1), left=0.075, right=0.985, top=0.83, bottom=0.07, hspace=0.72, wspace=0.3
     )
     traces = steps[0].result.traces
     assert traces is not None
@@ -106,8 +132,16 @@ def _picture(
         every = np.concatenate([measured, *(s.predicted[at] for s in steps)])
         margin = 0.06 * max(float(np.nanmax(every) - np.nanmin(every)), 1e-12)
         axes.set_ylim(float(np.nanmin(every)) - margin, float(np.nanmax(every)) + margin)
-        axes.plot(x, predicted, color=BLUE if not dark else "#56B4E9", marker="s", markersize=5, linewidth=2)
-        axes.plot(x, measured, color=ink, marker="o", markersize=4.5, linestyle="none")
+        many = len(x) > _MANY_POINTS
+        axes.plot(
+            *_broken(x, predicted),
+            color=SKY if dark else BLUE,
+            marker="" if many else "s",
+            markersize=5,
+            linewidth=2,
+            label="model",
+        )
+        axes.plot(x, measured, color=ink, marker="o", markersize=2 if many else 4.5, linestyle="none", label="measured")
         axes.set_title(
             f"{channel_label(channel)}\n{manoeuvre.replace('_', ' ')[:34]}", fontsize=9, color=ink, loc="left"
         )
@@ -117,6 +151,10 @@ def _picture(
         axes.grid(color=rule, linewidth=0.6)
         for spine in axes.spines.values():
             spine.set_color(rule)
+    marks, words = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        marks, words, loc="upper right", ncols=2, fontsize=9, frameon=False, labelcolor=ink, bbox_to_anchor=(0.99, 1.01)
+    )
     bar = figure.add_subplot(grid[1, :])
     now = (1.0 - share) * errors[low] + share * errors[high]
     bar.barh([0], [now], color=ORANGE, height=0.6)
@@ -124,7 +162,8 @@ def _picture(
     bar.set(xlim=(0.0, 1.25 * max(errors)), ylim=(-0.5, 0.5), yticks=[], facecolor=paper)
     bar.text(now + 0.012 * max(errors), 0, f"{shown(now)} sigma", va="center", fontsize=12, weight="bold", color=ink)
     name = steps[low if share < 0.5 else high].label
-    bar.set_title(f"{name}: error on {measure} points (dashed: the noise)", fontsize=10, color=ink, loc="left")
+    title = f"{name}: error on {measure} points (dashed: the noise)"
+    bar.set_title(textwrap.fill(title, _TITLE_WIDTH), fontsize=10, color=ink, loc="left")
     bar.tick_params(colors=muted, labelsize=8)
     for spine in bar.spines.values():
         spine.set_visible(False)

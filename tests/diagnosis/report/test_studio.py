@@ -14,6 +14,7 @@ from lunar_mjx.diagnosis.folder.refits import read_refits, write_refits
 from lunar_mjx.diagnosis.report import falling, studio
 from lunar_mjx.diagnosis.report.read import read_result
 from lunar_mjx.diagnosis.report.reasons import reason
+from lunar_mjx.diagnosis.report.steps import chain, judged
 from lunar_mjx.errors import UserError
 
 HOSTILE = "</script><img src=x onerror='document.title=1'><b>"
@@ -159,6 +160,10 @@ def test_the_error_falls_in_an_animation(tmp_path):
         last = np.asarray(film.convert("RGB"), int)
     orange = [((p[..., 0] > 200) & (p[..., 2] < 80)).sum() for p in (first, last)]
     assert orange[0] > 1.5 * orange[1] > 0  # the bar of the error
+    steps = chain([read_result(folder)])
+    splits, _ = judged(steps)
+    for _, _, at in falling._worst(steps, splits):  # only what the bar judges
+        assert steps[0].observations.in_split(*splits)[at].all()
     with pytest.raises(UserError, match="no known kind"):
         falling.write_falling(folder, tmp_path / "falling.txt")
 
