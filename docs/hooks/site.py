@@ -11,8 +11,8 @@ from lunar_mjx.effects.base import PORTS, Effect
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.joint.motor import WINDINGS
 from lunar_mjx.effects.presets import FIELD_CHANGES, FLAWS, PRESETS, UNSAID
-from lunar_mjx.effects.soil.ground import SOILS
 from lunar_mjx.effects.wheel.paper import REGULARISATIONS
+from lunar_mjx.terrain.soil.named import SOILS
 
 
 def on_config(config: Any) -> Any:

@@ -16,7 +16,7 @@ from lunar_mjx.effects.joint.motor import MODE_UNITS
 from lunar_mjx.effects.sensor.channels import SensorContext, Signals
 from lunar_mjx.effects.soil.ruts import Relief
 from lunar_mjx.spatial import Frame, Vec3
-from lunar_mjx.terrain import SoilMap, Terrain
+from lunar_mjx.terrain import SoilGrids, SoilMap, Terrain
 from lunar_mjx.terrain.heightfield import HeightField
 from lunar_mjx.terrain.rocks import Rocks
 from lunar_mjx.units import si_dimensions
@@ -143,10 +143,20 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "normal": _OWN,
         "wheel": _OWN,
     },
-    Terrain: {"field": _OWN, "rocks": _OWN, "soil": _OWN, "origin": "m", "name": _PLAIN},
+    Terrain: {"field": _OWN, "rocks": _OWN, "soil": _OWN, "origin": "m", "name": _PLAIN, "grids": _OWN},
     HeightField: {"heights": "m", **_GRID},
     Rocks: {"centers": "m", "radii": "m", "index": _PLAIN, **_GRID},
     SoilMap: {"rock": "1", **_GRID},
+    SoilGrids: {
+        **_GRID,
+        "k_c": "N/m^(n+1)",
+        "k_phi": "N/m^(n+2)",
+        "n": "1",
+        "cohesion": "Pa",
+        "tan_phi": "1",
+        "shear_modulus_x": "m",
+        "shear_modulus_y": "m",
+    },
     Signals: {"time": "s", "channels": "channels"},
     SensorContext: {
         "time": "s",
@@ -238,7 +248,7 @@ class Rescaling:
         units = UNITS[type(value)]
         if isinstance(value, c.Context | SensorContext):
             mode = value.rover.mode
-        n = value.n if isinstance(value, c.Soil) else 1.0
+        n = value.n if isinstance(value, c.Soil | SoilGrids) and value.n is not None else 1.0
         changed = {
             f.name: self.value(getattr(value, f.name), units[f.name], n, mode) for f in dataclasses.fields(value)
         }

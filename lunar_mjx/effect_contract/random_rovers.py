@@ -14,7 +14,7 @@ from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.context import Context, RoverInfo
 from lunar_mjx.effects.ports import Pipeline, apply_effects, heat_flow
 from lunar_mjx.spatial import Frame, Vec3
-from lunar_mjx.terrain import SoilMap, Terrain, build_rocks, inclined
+from lunar_mjx.terrain import SoilGrids, SoilMap, Terrain, build_rocks, inclined
 
 SLOPE = 0.1
 """Inclination of the probe's ground, rad."""
@@ -27,7 +27,7 @@ Memory = dict[str, dict[str, Any]]
 
 
 def terrain() -> Terrain:
-    """A slope with hard rock in the east, under some of the wheels, and boulders beside two of them."""
+    """A slope with rock and ever firmer soil in the east, under some of the wheels, and boulders beside two of them."""
     dtype = jnp.result_type(float)
     plane = inclined(SLOPE, 20.0, dtype=dtype)
     bounds = (-10.0, -10.0, 10.0, 10.0)
@@ -37,7 +37,10 @@ def terrain() -> Terrain:
     columns = np.arange(201) * cell - 10.0
     rock = jnp.asarray(np.tile(columns > 0.55, (201, 1)), float)
     ground = SoilMap(rock, *(jnp.asarray(v, float) for v in (-10.0, -10.0, cell)))
-    return dataclasses.replace(plane, rocks=rocks, soil=ground)
+    east = jnp.asarray(np.tile(np.linspace(0.5, 1.5, 5), (5, 1)), float)
+    at = (jnp.asarray(v, float) for v in (-10.0, -10.0, 5.0))
+    firmer = SoilGrids(*at, k_phi=8e5 * east, n=0.0 * east + 1.1, cohesion=170.0 * east, tan_phi=0.7 * east)
+    return dataclasses.replace(plane, rocks=rocks, soil=ground, grids=firmer)
 
 
 def rover(wheels: int) -> RoverInfo:

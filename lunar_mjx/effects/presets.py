@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from lunar_mjx.effects.joint.motor import WINDINGS
-from lunar_mjx.effects.soil.ground import SOILS
+from lunar_mjx.terrain.soil.named import SOILS
 
 PRESETS: Mapping[str, tuple[str, ...]] = {
     "consistent": (

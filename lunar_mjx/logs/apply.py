@@ -186,7 +186,7 @@ def moved(terrain: Terrain, x: float, y: float) -> Terrain:
     """
     import dataclasses
 
-    if terrain.rocks is not None or terrain.soil is not None:
+    if not (terrain.rocks is None and terrain.soil is None and terrain.grids is None):
         raise bad_input(
             "log_model",
             "terrain_origin_m",

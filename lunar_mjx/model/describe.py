@@ -177,4 +177,7 @@ def print_terrain(terrain: Terrain, console: Console) -> None:
     rocks = 0 if terrain.rocks is None else int((np.asarray(terrain.rocks.radii) > 0).sum())
     table.add_row("rocks", str(rocks))
     table.add_row("soil map", "none: soft everywhere" if terrain.soil is None else "rock and soft soil by place")
+    for key, values in ({} if terrain.grids is None else terrain.grids.layers).items():
+        low, high = float(np.min(values)), float(np.max(values))
+        table.add_row(f"soil {key}", f"{low:.4g} .. {high:.4g} by place, SI")
     console.print(table)

@@ -215,10 +215,10 @@ def _check_flat(effect: Effect, key: str, value: Any, source: str) -> None:
 
 
 def check_effects(model: Model, source: str | Path) -> None:
-    """Refuses a list of effects that cannot run.
+    """Refuses a list of effects that cannot run, alone or on the model's terrain.
 
     Raises:
-      UserError: an effect needs another one that is not in the list.
+      UserError: an effect needs another one that is not in the list, or the soil's moduli pull wheels down somewhere.
     """
     present = set(model.effect_names)
     for missing in dict.fromkeys(name for e in model.effects for name in e.requires if name not in present):
@@ -229,6 +229,25 @@ def check_effects(model: Model, source: str | Path) -> None:
             ", ".join(model.effect_names),
             f"lacks {missing}, which {needy[0]} reads",
             f"add {missing} or take out {', '.join(needy)}",
+        )
+    _check_moduli(model, source)
+
+
+def _check_moduli(model: Model, source: str | Path) -> None:
+    """Refuses soil grids in which k_c/b + k_phi is not positive under the narrowest wheel."""
+    layers = {} if model.terrain.grids is None else model.terrain.grids.layers
+    if "soil" not in model.effect_names or not {"k_c", "k_phi"} & set(layers):
+        return
+    k_c, k_phi = (np.asarray(layers.get(k, model.parameters["soil"][k]), float) for k in ("k_c", "k_phi"))
+    width = min(wheel.width for wheel in model.rover.wheels)
+    least = float((k_c / width + k_phi).min())
+    if least <= 0.0:
+        raise bad_input(
+            source,
+            f"soil grids of {model.terrain.name}: k_c/b + k_phi",
+            f"{least:g} N/m^(n+2)",
+            f"is not positive under a wheel b = {width:g} m wide",
+            "give a larger k_c or k_phi there",
         )
 
 

@@ -21,8 +21,10 @@ from lunar_mjx.terrain.rocks import Rocks as Rocks
 from lunar_mjx.terrain.rocks import build_rocks as build_rocks
 from lunar_mjx.terrain.rocks import nearest_rock as nearest_rock
 from lunar_mjx.terrain.roughness import Roughness as Roughness
-from lunar_mjx.terrain.soil_map import SoilMap as SoilMap
-from lunar_mjx.terrain.soil_map import rock_fraction as rock_fraction
+from lunar_mjx.terrain.soil.maps import SoilGrids as SoilGrids
+from lunar_mjx.terrain.soil.maps import SoilMap as SoilMap
+from lunar_mjx.terrain.soil.maps import rock_fraction as rock_fraction
+from lunar_mjx.terrain.soil.maps import soil_parameters as soil_parameters
 from lunar_mjx.terrain.surface import surface as surface
 from lunar_mjx.terrain.terrain import Terrain as Terrain
 from lunar_mjx.terrain.terrain import flat as flat

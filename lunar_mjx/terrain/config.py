@@ -64,11 +64,35 @@ class PlaneTable:
 
 
 @dataclasses.dataclass(frozen=True)
-class SoilTable:
-    """`[soil]`: patches of hard rock; see `make_soil_patches`."""
+class GridsTable:
+    """`[soil.grids]`: the soil's parameters as grids; see `read_grids`."""
 
-    rock_fraction: float
+    file: str
+    layers: list | None = None
+    cell: float | None = None
+    x: float | None = None
+    y: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ClassesTable:
+    """`[soil.classes]`: which soil lies where, as whole numbers; see `read_classes`."""
+
+    file: str
+    soils: dict
+    cell: float | None = None
+    x: float | None = None
+    y: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class SoilTable:
+    """`[soil]`: patches of hard rock (see `make_soil_patches`), and the soil's parameters by place."""
+
+    rock_fraction: float | None = None
     patch: float = 5.0
+    grids: GridsTable | None = None
+    classes: ClassesTable | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,6 +126,10 @@ def parse_config(table: dict[str, Any], source: str) -> TerrainConfig:
         for other in ("dem", "surface", "crop", "detail", "rocks", "soil"):
             if getattr(config, other) is not None:
                 raise bad_input(source, other, "given", "does not go with [plane]", "remove one of the two")
+    elif config.soil is not None and (config.soil.rock_fraction, config.soil.grids, config.soil.classes) == (None,) * 3:
+        raise bad_input(source, "soil", "empty", "says nothing", "give rock_fraction, [soil.grids] or [soil.classes]")
+    elif config.soil is not None and None not in (config.soil.grids, config.soil.classes):
+        raise bad_input(source, "soil.classes", "given", "does not go with [soil.grids]", "remove one of the two")
     elif config.dem is None and config.surface is None:
         raise UserError(f"{source}: tables = none of [plane], [dem], [surface]; give one of them to make the ground.")
     return config
@@ -134,7 +162,14 @@ def _convert(hint: Any, value: Any, source: str, where: str) -> Any:
         return _build(hint, value, source, where)  # pyright: ignore[reportArgumentType]
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = require_finite(source, where, value)
-    kinds = {float: "a number", int: "a whole number", str: "a text in quotes", bool: "true or false"}
+    kinds = {
+        float: "a number",
+        int: "a whole number",
+        str: "a text in quotes",
+        bool: "true or false",
+        list: "a list",
+        dict: "a table",
+    }
     if type(value) is not hint:
         raise bad_input(source, where, value, f"is not {kinds[hint]}", f"give {kinds[hint]}")
     if hint is float and not math.isfinite(value):

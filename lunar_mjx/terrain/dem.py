@@ -21,6 +21,8 @@ NODATA_GAP = 100.0
 """A mark of nodata that is as near as this to real heights, in the file's numbers, may be one itself."""
 HIGHEST = 1e7
 """m; radii of the Moon (1.7e6 m) pass for heights, marks of nodata such as -3.4e38 do not."""
+LARGEST = 1e12
+"""Numbers other than heights that are larger count as marks of nodata; the stiffest soil has 1e9."""
 MOST_CELLS = 50_000_000
 """A grid of more nodes than this is refused before memory runs out."""
 
@@ -37,6 +39,7 @@ class Dem:
       source: file or generator that the heights came from.
       reference: what a height of zero means.
       notes: what was done to the data, one sentence each.
+      highest: magnitude beyond which a number counts as a mark of nodata, m.
     """
 
     heights: np.ndarray
@@ -46,6 +49,7 @@ class Dem:
     source: str = "array"
     reference: str = "as in the source"
     notes: tuple[str, ...] = ()
+    highest: float = HIGHEST
 
     def __post_init__(self) -> None:
         heights = np.asarray(self.heights, np.float64)
@@ -55,7 +59,7 @@ class Dem:
             raise bad_input(
                 self.source, "heights", f"shape {heights.shape}", "is not a grid of at least 2 x 2", "give more heights"
             )
-        if (np.abs(heights) > HIGHEST).any():
+        if (np.abs(heights) > self.highest).any():
             worst = heights.flat[np.nanargmax(np.abs(heights))]
             raise bad_input(
                 self.source,

@@ -14,11 +14,13 @@ from scipy import ndimage
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.resources import find
-from lunar_mjx.terrain.config import TerrainConfig, parse_config, read_config
+from lunar_mjx.terrain.config import ClassesTable, GridsTable, SoilTable, TerrainConfig, parse_config, read_config
 from lunar_mjx.terrain.dem import Dem
 from lunar_mjx.terrain.procedural import add_detail, make_soil_patches, make_surface, rock_stream
 from lunar_mjx.terrain.readers.dispatch import SUFFIXES, read_dem
 from lunar_mjx.terrain.rock_field import place_rocks
+from lunar_mjx.terrain.soil.maps import SoilGrids, SoilMap
+from lunar_mjx.terrain.soil.read import Place, read_classes, read_grids
 from lunar_mjx.terrain.terrain import Terrain, inclined
 
 CONFIG = "terrain.toml"
@@ -146,12 +148,37 @@ def build_terrain(
             return ndimage.map_coordinates(ground.heights - origin[2], at, order=1, mode="nearest")
 
         rocks = place_rocks(config.rocks, bounds, height, rock_stream(seed), dtype)
-    soil = None
-    if config.soil is not None:
-        soil = make_soil_patches(ground, config.soil.rock_fraction, config.soil.patch, seed, dtype)
+    soil, grids = _soil(config.soil, ground, origin, folder, seed, dtype)
     # Reports show the name: a stand-in shall not pass for the site.
     stand_in = config.dem is not None and _dem_file(config, name, folder, dem) is None
-    return Terrain(field, rocks, soil, jnp.asarray(origin, dtype), f"{name} (stand-in)" if stand_in else name)
+    return Terrain(field, rocks, soil, jnp.asarray(origin, dtype), f"{name} (stand-in)" if stand_in else name, grids)
+
+
+def _soil(
+    table: SoilTable | None, ground: Dem, origin: np.ndarray, folder: Path, seed: int, dtype: np.dtype | type
+) -> tuple[SoilMap | None, SoilGrids | None]:
+    """Where hard rock is, and the soil's parameters by place."""
+    if table is None:
+        return None, None
+    patches = None
+    if table.rock_fraction is not None:
+        patches = make_soil_patches(ground, table.rock_fraction, table.patch, seed, dtype)
+    if table.grids is not None:
+        read = read_grids(folder / table.grids.file, table.grids.layers or (), _place(table.grids), ground)
+    elif table.classes is not None:
+        read = read_classes(folder / table.classes.file, table.classes.soils, _place(table.classes), ground)
+    else:
+        return patches, None
+    mapped, grids = read.on_ground(origin, dtype)
+    if mapped is not None and patches is not None:
+        raise bad_input(
+            read.source, "rock", "given", "does not go with soil.rock_fraction", "say in one of the two where rock is"
+        )
+    return patches if mapped is None else mapped, grids
+
+
+def _place(table: GridsTable | ClassesTable) -> Place:
+    return Place(table.cell, table.x, table.y)
 
 
 def terrain_from_dem(dem: Dem, name: str = "dem", dtype: np.dtype | type = np.float32) -> Terrain:

@@ -13,7 +13,7 @@ from lunar_mjx.terrain import craters as cratering
 from lunar_mjx.terrain.craters import Craters
 from lunar_mjx.terrain.dem import Dem, require_cell, require_size, spline
 from lunar_mjx.terrain.roughness import Roughness, fractal
-from lunar_mjx.terrain.soil_map import SoilMap
+from lunar_mjx.terrain.soil.maps import SoilMap
 
 TOLERANCE = 1e-3
 """Most that `add_detail` changes the mean height of a DEM cell, m."""

@@ -14,7 +14,7 @@ from lunar_mjx.errors import UserError, bad_input, require_finite
 from lunar_mjx.pytree import pytree, static
 from lunar_mjx.terrain.heightfield import HeightField
 from lunar_mjx.terrain.rocks import Rocks
-from lunar_mjx.terrain.soil_map import SoilMap
+from lunar_mjx.terrain.soil.maps import LAYERS, SoilGrids, SoilMap
 
 
 @pytree
@@ -28,6 +28,7 @@ class Terrain:
       origin: easting, northing and altitude of the local (0, 0, 0), m; whole numbers, so that float32 holds them
         exactly. Arrays, not static: a terrain from another seed must not compile the step again.
       name: for messages and reports.
+      grids: the soil's parameters by place, or None where they are the same everywhere.
     """
 
     field: HeightField
@@ -35,18 +36,20 @@ class Terrain:
     soil: SoilMap | None
     origin: Float[Array, "*batch 3"]
     name: str = static(default="terrain")
+    grids: SoilGrids | None = None
 
 
 def stack(terrains: Sequence[Terrain]) -> Terrain:
     """Joins terrains into a batch with a leading axis on every array; use it with `vmap`.
 
-    Rocks and soil that only some of the terrains have become empty ones in the others.
+    Rocks and patches of rock that only some of the terrains have become empty ones in the others; grids of the soil's
+    parameters have all of them or none.
 
     Args:
       terrains: at least one; their grids must agree in shape.
 
     Raises:
-      UserError: no terrain, or grids that differ in shape.
+      UserError: no terrain, or grids that differ in shape or in what they hold.
     """
     if not terrains:
         raise UserError("stack: terrains = [] is empty; give at least one terrain.")
@@ -60,9 +63,22 @@ def stack(terrains: Sequence[Terrain]) -> Terrain:
                 f"does not agree with the {first} of {terrains[0].name}",
                 "crop or resample the terrains to one shape before stacking",
             )
+    _require_same_grids(terrains)
     names = sorted({t.name for t in terrains})
     alike = [dataclasses.replace(t, name="+".join(names)) for t in _with_soil(_with_rocks(terrains))]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)
+
+
+def _require_same_grids(terrains: Sequence[Terrain]) -> None:
+    held = {None if t.grids is None else tuple((k, v.shape) for k, v in t.grids.layers.items()) for t in terrains}
+    if len(held) > 1:
+        raise bad_input(
+            "stack",
+            "soil grids",
+            ", ".join(sorted("none" if h is None else " ".join(f"{k} {s}" for k, s in h) for h in held)),
+            "differ",
+            f"give all terrains the same of {', '.join(LAYERS)} on grids of one shape",
+        )
 
 
 def _with_rocks(terrains: Sequence[Terrain]) -> Sequence[Terrain]:

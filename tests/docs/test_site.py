@@ -16,7 +16,7 @@ import typer.main
 from lunar_mjx.cli import app
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.presets import FLAWS, PRESETS
-from lunar_mjx.effects.soil.ground import SOILS
+from lunar_mjx.terrain.soil.named import SOILS
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from lunar_mjx.dynamics import build
-from lunar_mjx.effects.soil.ground import SOILS
 from lunar_mjx.model import make_model
+from lunar_mjx.terrain.soil.named import SOILS
 from tests.dynamics.conftest import bench, plane
 
 

@@ -16,8 +16,8 @@ from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.context import Contact, Context, Normal, RoverInfo, Soil, WheelForce
 from lunar_mjx.effects.ports import Pipeline, initial_normal, nominal_geometry
-from lunar_mjx.effects.soil.ground import SOILS
 from lunar_mjx.spatial import Vec3
+from lunar_mjx.terrain.soil.named import SOILS
 from tests.effects.effects_reference import WheelState
 
 Array = Any

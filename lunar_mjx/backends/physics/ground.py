@@ -1,4 +1,4 @@
-"""The terrain in NumPy: bilinear heights, boulders, rock fraction."""
+"""The terrain in NumPy: bilinear heights, boulders, rock fraction, soil parameters."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ class Ground:
     """Heights, boulders and hard rock of a terrain.
 
     Attributes:
-      field: heights, m. hard: fraction of hard rock, or None. has_rocks: whether there is any boulder.
+      field: heights, m. hard: fraction of hard rock, or None. layers: the soil's parameters by place, in SI units.
+      has_rocks: whether there is any boulder.
     """
 
     def __init__(self, terrain: Terrain) -> None:
@@ -48,6 +49,9 @@ class Ground:
         self.field = Grid(field.heights, field.x0, field.y0, field.cell)
         soil = terrain.soil
         self.hard = None if soil is None else Grid(soil.rock, soil.x0, soil.y0, soil.cell)
+        grids = terrain.grids
+        given = {} if grids is None else grids.layers
+        self.layers = {k: Grid(v, grids.x0, grids.y0, grids.cell) for k, v in given.items()}  # type: ignore[union-attr]
         rocks = terrain.rocks
         self.has_rocks = rocks is not None and bool((np.asarray(rocks.radii) > 0).any())
         if rocks is not None:

@@ -42,8 +42,12 @@ def local_soil(c: Context, uniform: Values, names: tuple[str, ...]) -> Values:
     soil, place = dict(uniform), c.wheel_position
     for name in names:
         p = c.numbers.effects[name]
-        if name == "surface_type" and c.ground.hard is not None:
-            soil["rock"] = (c.ground.hard.value(place[..., 0], place[..., 1])[0] > 0.5).astype(float)
+        if name == "surface_type":
+            if c.ground.layers:
+                foot = place - c.geometry["radius"][..., None] * c.contact["normal"]
+                soil |= {k: grid.value(foot[..., 0], foot[..., 1])[0] for k, grid in c.ground.layers.items()}
+            if c.ground.hard is not None:
+                soil["rock"] = (c.ground.hard.value(place[..., 0], place[..., 1])[0] > 0.5).astype(float)
         elif name == "hard_surface" and p.fraction > 0.5:
             soil["rock"] = np.ones_like(soil["rock"])
         elif name == "soil_gradient":

@@ -9,59 +9,10 @@ from typing import Any
 import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Parameter, Refusal, effect
-from lunar_mjx.terrain import rock_fraction
+from lunar_mjx.terrain import rock_fraction, soil_parameters
+from lunar_mjx.terrain.soil.named import BOUNDS
 
 _SOURCEBOOK = "Heiken et al. 1991, Lunar Sourcebook, ch. 9"
-
-SOILS: dict[str, dict[str, float]] = {
-    "lunar_nominal": {
-        "k_c": 1.4e3,
-        "k_phi": 8.2e5,
-        "n": 1.0,
-        "cohesion": 170.0,
-        "friction_angle": 0.6108652381980153,
-        "shear_modulus_x": 0.0178,
-        "shear_modulus_y": 0.0178,
-    },
-    "paper": {
-        "k_c": 1e5,
-        "k_phi": 1e3,
-        "n": 1.1,
-        "cohesion": 462.3,
-        "friction_angle": 0.3889,
-        "shear_modulus_x": 0.015,
-        "shear_modulus_y": 0.015,
-    },
-    "ding_2011": {
-        "k_c": 15.6e3,
-        "k_phi": 2.4074e6,
-        "n": 1.10,
-        "cohesion": 250.0,
-        "friction_angle": 0.5567600313861338,
-        "shear_modulus_x": 0.0114,
-        "shear_modulus_y": 0.0114,
-    },
-    "marssim": {
-        "k_c": 13600.0,
-        "k_phi": 2259100.0,
-        "n": 0.92,
-        "cohesion": 462.3,
-        "friction_angle": 0.6108652381980153,
-        "shear_modulus_x": 0.015,
-        "shear_modulus_y": 0.015,
-    },
-    "lete_sand": {
-        "k_c": 102e3,
-        "k_phi": 5.301e6,
-        "n": 0.793,
-        "cohesion": 1300.0,
-        "friction_angle": 0.5427973973702366,
-        "shear_modulus_x": 0.012,
-        "shear_modulus_y": 0.012,
-    },
-}
-"""Soils by name, in SI units (angles in rad): Lunar Sourcebook; the seed paper's release (k_c and k_phi look swapped
-there); Ding et al. 2011 (shear moduli 0.0097-0.0131 m, middle taken); MarsSim's parameter file; Wong (LETE sand)."""
 
 
 def _positive_stiffness(values: Mapping[str, Any], wheel_widths: Sequence[float]) -> Refusal | None:
@@ -82,16 +33,28 @@ def _positive_stiffness(values: Mapping[str, Any], wheel_widths: Sequence[float]
     "soil",
     order=-100,
     validate=_positive_stiffness,
-    k_c=Parameter(1.4e3, None, (-1e7, 1e7), "N/m^(n+1)", "cohesive modulus of sinkage", _SOURCEBOOK),
-    k_phi=Parameter(8.2e5, None, (0.0, 1e9), "N/m^(n+2)", "frictional modulus of sinkage", _SOURCEBOOK),
-    n=Parameter(1.0, None, (0.1, 3.0), "1", "sinkage exponent", _SOURCEBOOK),
-    cohesion=Parameter(170.0, None, (0.0, 1e6), "Pa", "cohesion", _SOURCEBOOK),
+    k_c=Parameter(1.4e3, None, BOUNDS["k_c"], "N/m^(n+1)", "cohesive modulus of sinkage", _SOURCEBOOK),
+    k_phi=Parameter(8.2e5, None, BOUNDS["k_phi"], "N/m^(n+2)", "frictional modulus of sinkage", _SOURCEBOOK),
+    n=Parameter(1.0, None, BOUNDS["n"], "1", "sinkage exponent", _SOURCEBOOK),
+    cohesion=Parameter(170.0, None, BOUNDS["cohesion"], "Pa", "cohesion", _SOURCEBOOK),
     friction_angle=Parameter(
-        0.6108652381980153, None, (0.0, 1.2), "rad", "angle of internal friction", _SOURCEBOOK + " (35 deg)"
+        0.6108652381980153,
+        None,
+        BOUNDS["friction_angle"],
+        "rad",
+        "angle of internal friction",
+        _SOURCEBOOK + " (35 deg)",
     ),
-    shear_modulus_x=Parameter(0.0178, None, (1e-5, 1.0), "m", "shear deformation modulus K_s", _SOURCEBOOK),
+    shear_modulus_x=Parameter(
+        0.0178, None, BOUNDS["shear_modulus_x"], "m", "shear deformation modulus K_s", _SOURCEBOOK
+    ),
     shear_modulus_y=Parameter(
-        0.0178, None, (1e-5, 1.0), "m", "lateral shear deformation modulus K_y", _SOURCEBOOK + "; K_y = K_s"
+        0.0178,
+        None,
+        BOUNDS["shear_modulus_y"],
+        "m",
+        "lateral shear deformation modulus K_y",
+        _SOURCEBOOK + "; K_y = K_s",
     ),
 )
 def soil(ctx, p, x, ground):
@@ -111,10 +74,18 @@ def soil(ctx, p, x, ground):
 
 @effect("soil", order=-90)
 def surface_type(ctx, p, x, ground):
-    """Soft soil or hard rock at each wheel, read from the terrain's map; all soft where the terrain has none."""
-    if ctx.terrain.soil is None:
+    """What the terrain's maps say at each wheel: soft soil or hard rock, and parameters of the soil.
+
+    A parameter that no map holds stays as the effect `soil` has it; without maps all is soft and the same everywhere.
+    The wheel's foot counts, one radius below its centre along the normal of the ground (for rock, its centre).
+    """
+    terrain, here = ctx.terrain, ctx.wheel_position
+    if terrain.grids is not None:
+        foot = here - ctx.contact.normal * ctx.geometry.radius
+        ground = dataclasses.replace(ground, **soil_parameters(terrain.grids, foot.x, foot.y))
+    if terrain.soil is None:
         return ground
-    fraction = rock_fraction(ctx.terrain.soil, ctx.wheel_position.x, ctx.wheel_position.y)
+    fraction = rock_fraction(terrain.soil, here.x, here.y)
     return dataclasses.replace(ground, rock=jnp.where(fraction > 0.5, 1.0, 0.0) * jnp.ones_like(ground.rock))
 
 

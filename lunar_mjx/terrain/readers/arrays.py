@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input, require_finite
-from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size, undeclared_nodata
+from lunar_mjx.terrain.dem import HIGHEST, LARGEST, Dem, fill_holes, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions
 
 
@@ -29,13 +29,21 @@ def read_npy(path: Path, options: ReadOptions) -> Dem:
         raise bad_input(path, "dtype", data.dtype, "is not a real number", "save heights in m")
     require_size(str(path), *data.shape)
     heights, undeclared = undeclared_nodata(data.astype(np.float64), str(path))
-    heights, notes = fill_holes(heights, str(path))
-    return Dem(heights[::-1], cell, 0.0, 0.0, str(path), notes=undeclared + notes)
+    return grid(heights, cell, 0.0, 0.0, str(path), undeclared, options)
+
+
+def grid(
+    heights: np.ndarray, cell: float, x0: float, y0: float, source: str, notes: tuple[str, ...], options: ReadOptions
+) -> Dem:
+    """The grid of numbers whose first row is the north and which are NaN in holes; (x0, y0) is its south-west."""
+    if options.fill:
+        heights, filled = fill_holes(heights, source)
+        notes = notes + filled
+    return Dem(heights[::-1], cell, x0, y0, source, notes=notes, highest=HIGHEST if options.heights else LARGEST)
 
 
 def read_asc(path: Path, options: ReadOptions) -> Dem:
     """Reads an ESRI ASCII grid; see `read_dem`."""
-    del options
     try:
         lines = path.read_text(encoding="ascii").splitlines()
     except UnicodeDecodeError:
@@ -54,12 +62,10 @@ def read_asc(path: Path, options: ReadOptions) -> Dem:
     heights = numbers.reshape(rows, cols)
     heights[heights == header.get("nodata_value", -9999.0)] = np.nan
     heights, undeclared = undeclared_nodata(heights, str(path))
-    heights, notes = fill_holes(heights, str(path))
-    notes = undeclared + notes
     cell = _asc_cell(path, header)
     x0 = header.get("xllcenter", header.get("xllcorner", 0.0) + cell / 2)
     y0 = header.get("yllcenter", header.get("yllcorner", 0.0) + cell / 2)
-    return Dem(heights[::-1], cell, x0, y0, str(path), notes=notes)
+    return grid(heights, cell, x0, y0, str(path), undeclared, options)
 
 
 def _header(path: Path, lines: list[str]) -> tuple[dict[str, float], list[str]]:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from lunar_mjx.errors import UserError, require_file
+from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.terrain.dem import Dem
 from lunar_mjx.terrain.readers.arrays import read_asc, read_npy
 from lunar_mjx.terrain.readers.geotiff import read_geotiff
@@ -25,6 +25,8 @@ _READERS: dict[str, Callable[[Path, ReadOptions], Dem]] = {
     ".asc": read_asc,
 }
 SUFFIXES = tuple(_READERS)
+GRIDS = (".tif", ".tiff", ".npy", ".asc")
+"""Suffixes of files that may hold other numbers than heights."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -68,3 +70,24 @@ def read_dem(
     for note in dem.notes:
         _LOG.info("%s: %s", path, note)
     return dem
+
+
+def read_plain(path: Path, *, cell: float | None = None, band: int = 1, fill: bool = True) -> Dem:
+    """Reads a grid of numbers that are no heights, of any unit.
+
+    Args:
+      path: GeoTIFF, npy or ESRI ASCII.
+      cell: spacing of the grid in m, for formats that do not say it.
+      band: of a GeoTIFF, from 1.
+      fill: whether holes are filled by interpolation; else they are refused.
+
+    Returns:
+      The grid; its `heights` are the numbers.
+
+    Raises:
+      UserError: the file is missing, broken or of another kind, or its numbers are not usable.
+    """
+    if path.suffix.lower() not in GRIDS:
+        raise bad_input(path, "suffix", path.suffix, "is no grid that is known", f"use one of {', '.join(GRIDS)}")
+    require_file(path, "the grid")
+    return _READERS[path.suffix.lower()](path, ReadOptions(cell, band=band, heights=False, fill=fill))

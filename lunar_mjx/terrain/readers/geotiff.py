@@ -11,7 +11,8 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as PixelWindow
 
 from lunar_mjx.errors import UserError, bad_input
-from lunar_mjx.terrain.dem import Dem, fill_holes, require_cell, require_size, undeclared_nodata
+from lunar_mjx.terrain.dem import Dem, require_cell, require_size, undeclared_nodata
+from lunar_mjx.terrain.readers.arrays import grid
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions, Window
 
 _SQUARE = 1e-4  # relative difference of pixel width and height that counts as square
@@ -43,19 +44,13 @@ def _read(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> D
         raise bad_input(path, "data type", data.dtype, "is not a real number", "give a raster of heights")
     heights, undeclared = undeclared_nodata(np.ma.filled(data.astype(np.float64), np.nan), str(path))
     heights = heights * raster.scales[band - 1] + raster.offsets[band - 1]
-    unit = _unit(path, raster.units[band - 1])
-    heights, notes = fill_holes(heights * unit, str(path))
-    notes = undeclared + notes
+    if options.heights:
+        heights = heights * _unit(path, raster.units[band - 1])
     if raster.count > 1:
-        notes = (*notes, f"band {band} of {raster.count} used")
-    return Dem(
-        heights=heights[::-1],  # row 0 of a raster is the north
-        cell=cell,
-        x0=west + (window.col_off + 0.5) * cell,
-        y0=north - (window.row_off + window.height - 0.5) * cell,
-        source=str(path),
-        notes=notes,
-    )
+        undeclared = (*undeclared, f"band {band} of {raster.count} used")
+    x0 = west + (window.col_off + 0.5) * cell
+    y0 = north - (window.row_off + window.height - 0.5) * cell
+    return grid(heights, cell, x0, y0, str(path), undeclared, options)
 
 
 def _grid(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> tuple[float, float, float]:

@@ -28,6 +28,8 @@ class ReadOptions:
       dequantise: removes the steps of an image's few grey levels.
       band: which band of a GeoTIFF, from 1.
       crop: reads only this part.
+      heights: whether the numbers are heights in m; else they are plain numbers of any unit and size.
+      fill: whether holes are filled by interpolation; else they are refused.
     """
 
     cell: float | None = None
@@ -35,3 +37,5 @@ class ReadOptions:
     dequantise: bool = True
     band: int = 1
     crop: Window | None = None
+    heights: bool = True
+    fill: bool = True
