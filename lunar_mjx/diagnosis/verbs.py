@@ -31,6 +31,7 @@ from lunar_mjx.diagnosis.search import Search, fit_baseline
 from lunar_mjx.diagnosis.tables.loop import better_law, build_tables, grown_model
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
+from lunar_mjx.diagnosis.weighed.form import SearchSettings
 from lunar_mjx.errors import UserError
 from lunar_mjx.files import replacing
 from lunar_mjx.inference.coordinates import Coordinate
@@ -508,9 +509,14 @@ def _add_to_tables(
 
 
 def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> list[str]:
-    """What `improve` adds next: another form of the model first, where it is surely better, then all that is named."""
+    """What `improve` adds next: another form of the model first, where it is surely better, then all that is named.
+
+    Beside something unlisted that is what is sure in itself, or with `keep_going` all that helps.
+    """
     law = better_law(diagnosis.forms, run.model)
-    go_on = diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE)
-    go_on = go_on or (keep_going and diagnosis.verdict is Verdict.UNKNOWN)
     names = [n for n in diagnosis.effects if not n.startswith("calibration: ")]
+    sure = float(run.settings.get("sure", SearchSettings().sure))
+    if diagnosis.verdict is Verdict.UNKNOWN and not keep_going:
+        names = [n for n in names if diagnosis.inclusion.get(n, 0.0) >= sure]
+    go_on = diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE, Verdict.UNKNOWN)
     return [*([law] if law else []), *(names if go_on else [])]

@@ -88,13 +88,9 @@ def build_tables(
     laws = contact_laws(run.model, settings.laws if rivals else ())
     for number, (name, model) in enumerate(laws.items()):
         bed = WheelBed(model.effects, {n: _single(v) for n, v in model.parameters.items()}, gravity)
-        mine = {
-            n: e
-            for n, e in candidates.items()
-            if only is not None or n not in build_problem.FINER_FORMS or _integrates(bed)
-        }
         grains = "granular_resistance" in bed.parameters
-        mine = {n: e for n, e in mine.items() if not e.replaces and not (grains and n in _OF_REECE)}
+        foreign = _OF_REECE | build_problem.FINER_FORMS if grains else frozenset()
+        mine = {n: e for n, e in candidates.items() if not e.replaces and n not in foreign}
         effects, left = usable(bed.effects, mine, tables._unfit)
         refused = left if number == 0 else refused
         union = bed
@@ -143,10 +139,6 @@ def better_law(forms: Mapping[str, float], model: Model, sure: float = TableSett
     best = max(forms, key=lambda name: forms[name])
     own = next(iter(contact_laws(model, ())))
     return LAWS[best][0] if best != own and best in LAWS and forms[best] >= sure else None
-
-
-def _integrates(bed: WheelBed) -> bool:
-    return "stress_integral" in bed.parameters
 
 
 def _single(values: Mapping[str, Any]) -> dict[str, float]:

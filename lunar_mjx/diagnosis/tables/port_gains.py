@@ -1,8 +1,9 @@
 """What a contact law may get wrong at a wheel's ports: gains on its stresses, forces and moment, per point of a table.
 
 A field of discrepancy is one smooth function w of slip, slip angle, load and speed. It multiplies a stress or force of
-the law by 1 + w, so that drawbar pull, side force, torque and sinkage of a point move together as physics has it. Where
-a law may also lack a force altogether, a second smooth function adds it, as a share of the load.
+the law by 1 + w, so that drawbar pull, side force, torque and sinkage of a point move together as physics has it. A law
+is usually inexact in what it has; a force that it lacks altogether is something unlisted, and a second smooth function
+adds it there, as a share of the load.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ _LAST = 10_000
 """Order at a port: after every effect."""
 
 
+SCALED, ADDED, DRAWN = "scaled", "added", "drawn"
+
+
 @dataclasses.dataclass(frozen=True)
 class Gain:
     """A gain at a port.
@@ -25,13 +29,14 @@ class Gain:
       field: the discrepancy that it belongs to.
       port: of the effects' pipeline.
       act: function(ctx, amount, value) that applies it.
-      share: its size over that of the field: 1 for the gain on a force, less for a force that is added.
+      kind: SCALED for a gain on a stress or force that is there, ADDED for a force that is missing, as a share of the
+        load, DRAWN for a change of the wheel's shape.
     """
 
     field: str
     port: str
     act: Callable[[Any, Any, Any], Any]
-    share: float
+    kind: str
 
 
 def _stiffness(ctx: Any, a: Any, soil: Any) -> Any:
@@ -78,23 +83,15 @@ def _radius(ctx: Any, a: Any, geometry: Any) -> Any:
     return dataclasses.replace(geometry, radius=geometry.radius * (1.0 + a))
 
 
-ADDED = 0.25
-"""Size of a force that is missing, over the load, per size of the gain on the forces that are there: where a shear
-stress is good to 4 %, a drag of 1 % of the load may have been left out."""
-
-DRAWN = 0.1
-"""Size of the wheel's deformation over its radius, per size of the gain on a force: where a stress is good to 5 %, the
-radius of a wheel under its load is to 0.5 %."""
-
 GAINS: tuple[Gain, ...] = (
-    Gain("soil: stiffness", "soil", _stiffness, 1.0),
-    Gain("soil: shear strength", "soil", _strength, 1.0),
-    Gain("wheel_normal: resistance", "wheel_shear", _resistance, 1.0),
+    Gain("soil: stiffness", "soil", _stiffness, SCALED),
+    Gain("soil: shear strength", "soil", _strength, SCALED),
+    Gain("wheel_normal: resistance", "wheel_shear", _resistance, SCALED),
     Gain("wheel_normal: resistance", "wheel_shear", _drag, ADDED),
-    Gain("wheel_shear: longitudinal force", "wheel_shear", _thrust, 1.0),
-    Gain("wheel_shear: lateral force", "wheel_shear", _side, 1.0),
+    Gain("wheel_shear: longitudinal force", "wheel_shear", _thrust, SCALED),
+    Gain("wheel_shear: lateral force", "wheel_shear", _side, SCALED),
     Gain("wheel_shear: lateral force", "wheel_shear", _push_aside, ADDED),
-    Gain("wheel_shear: driving moment", "wheel_shear", _moment, 1.0),
+    Gain("wheel_shear: driving moment", "wheel_shear", _moment, SCALED),
     Gain("wheel_shear: driving moment", "wheel_shear", _seal, ADDED),
     Gain("geometry: radius", "geometry", _radius, DRAWN),
 )
@@ -110,9 +107,6 @@ FIELDS: Mapping[str, str] = {
     "geometry: radius": "radius of the wheel under its load",
 }
 """Fields of discrepancy, and what is "good to so many per cent" in the user's words."""
-
-SHARE: Mapping[str, float] = {f: max(g.share for g in GAINS if g.field == f) for f in FIELDS}
-"""What a field's size is "good to", over that size."""
 
 EFFECT = "port_gains"
 

@@ -18,6 +18,14 @@ class TableSettings(SearchSettings):
     # --- what is usual -----------------------------------------------------------------------------------------------
     following_discrepancy: float = 0.2
     """1; standard deviation of something unlisted that follows one quantity alone."""
+    added_force: float = 0.25
+    """1; size of a force that is missing, over the load, per size of the gain on the forces that are there."""
+    added_usually: float = 0.0
+    """1; share of that which belongs to a usual discrepancy: a law is inexact in what it has, what it lacks is
+    something unlisted."""
+    drawn_radius: float = 0.1
+    """1; size of the wheel's deformation over its radius, per size of the gain on a force: where a stress is good to
+    5 per cent, the radius of a wheel under its load is to 0.5 per cent."""
     sensor_scale: float = 0.02
     """1; usual error of a sensor's scale."""
     sensor_zero: float = 0.01

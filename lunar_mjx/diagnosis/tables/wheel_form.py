@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg, optimize
 
 from lunar_mjx.diagnosis.tables.noise import scatter
-from lunar_mjx.diagnosis.tables.port_gains import FIELDS, GAINS, SHARE
+from lunar_mjx.diagnosis.tables.port_gains import ADDED, DRAWN, FIELDS, GAINS, Gain
 from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE, Imposed, WheelProgram
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
@@ -164,7 +164,8 @@ class WheelForm(MeasuredForm):
         self.name, self.data, self.settings, self.log_prior = name, data, settings, log_prior
         self.coordinates, self.baseline, self.candidates = tuple(coordinates), baseline, dict(candidates)
         self.program = WheelProgram(bed, coordinates)
-        self.observations, self.words, self.shares = data.observations, FIELDS, SHARE
+        self.observations, self.words = data.observations, FIELDS
+        self.shares = {f: max(self._share(g) for g in GAINS if g.field == f) for f in FIELDS}
         self._fit = data.observations.in_split("fit")
         names = _instruments(data)
         self.instruments = names
@@ -208,18 +209,22 @@ class WheelForm(MeasuredForm):
         residual = whiten(data.observations.value - value)
         own = whiten(slope[:, :count])
         errors, error_std, instruments = self._calibration(value, slope[:, count + len(GAINS) :])
-        fields, field_of = self._fields(slope[:, count : count + len(GAINS)])
-        unlisted, followed = self._following(slope[:, count : count + len(GAINS)])
-        columns = np.column_stack([own, whiten(errors), fields, unlisted])
+        gains = slope[:, count : count + len(GAINS)]
+        fields, field_of = self._fields(gains, False)
+        added, added_to = self._fields(gains, True)
+        unlisted, followed = self._following(gains)
+        columns = np.column_stack([own, whiten(errors), fields, added, unlisted])
         calibrated = count + np.arange(errors.shape[1])
         rest = count + errors.shape[1] + np.arange(fields.shape[1])
         last = columns.shape[1] - unlisted.shape[1]
+        more = last - added.shape[1]
         sizes = np.full(unlisted.shape[1], settings.following_discrepancy)
-        std = np.concatenate([[c.prior for c in self.coordinates], error_std, np.ones(len(rest)), sizes])
+        std = np.concatenate([[c.prior for c in self.coordinates], error_std, np.ones(last - more + len(rest)), sizes])
         for places in self.candidates.values():
             amplitude = [i for i in places if self.coordinates[i].amplitude]
             std[amplitude] = [self._effect_size(self.coordinates[i]) for i in amplitude]
-        field = np.concatenate([np.full(count + errors.shape[1], -1), field_of, np.full(unlisted.shape[1], -1)])
+        none = np.full(count + errors.shape[1], -1)
+        field = np.concatenate([none, field_of, added_to, np.full(unlisted.shape[1], -1)])
         mean = np.zeros(len(std))
         centre = np.array([c.centre for c in self.coordinates])
         mean[:count] = centre - u
@@ -253,6 +258,7 @@ class WheelForm(MeasuredForm):
             at=at,
             calibration={name: calibrated[places] for name, places in instruments.items()},
             following={name: last + places for name, places in followed.items()},
+            added={f: more + np.flatnonzero(added_to == k) for k, f in enumerate(FIELDS) if np.any(added_to == k)},
             fields=tuple(Field(f, settings.usual_discrepancy) for f in FIELDS),
             noises=tuple(NoiseSize(_NAMES[q], s) for q, s in data.noise_std.items()),
             wide=settings.unlisted_discrepancy,
@@ -270,13 +276,28 @@ class WheelForm(MeasuredForm):
         """(n,) noise group of every observation."""
         return np.searchsorted(np.array(self.data.measured), self.data.quantity)
 
-    def _fields(self, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened columns (n, m) of all fields, rotated so that few are left, and the field (m,) of each."""
-        columns, number = [], []
+    def _share(self, gain: Gain) -> float:
+        """Size of a gain over that of its field."""
+        return {ADDED: self.settings.added_force, DRAWN: self.settings.drawn_radius}.get(gain.kind, 1.0)
+
+    def _fields(self, slope: np.ndarray, added: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened columns (n, m) of all fields, rotated so that few are left, and the field (m,) of each.
+
+        Args:
+          slope: (n, gains). added: forces that are missing, in place of what a discrepancy usually is.
+        """
+        columns, number = [np.zeros((len(slope), 0))], [np.zeros(0, int)]
         modes = self.data.modes[self.data.point]
+        usually = self.settings.added_usually
         for f, field in enumerate(FIELDS):
-            mine = [slope[:, [i]] * gain.share * modes for i, gain in enumerate(GAINS) if gain.field == field]
-            white = self.data.observations.whiten(np.column_stack(mine))
+            parts = [
+                (i, (1.0 if added or gain.kind != ADDED else usually) * self._share(gain))
+                for i, gain in enumerate(GAINS)
+                if gain.field == field and (gain.kind == ADDED if added else gain.kind != ADDED or usually > 0.0)
+            ]
+            if not parts or (added and usually > 0.0):
+                continue
+            white = self.data.observations.whiten(np.column_stack([slope[:, [i]] * x * modes for i, x in parts]))
             left, size, _ = np.linalg.svd(white, full_matrices=False)
             keep = size * self.settings.unlisted_discrepancy > self.settings.least_length
             columns.append(left[:, keep] * size[keep])
@@ -289,7 +310,7 @@ class WheelForm(MeasuredForm):
         for field in FIELDS:
             for quantity, modes in self.data.following.items():
                 mine = [
-                    slope[:, [i]] * gain.share * modes[self.data.point]
+                    slope[:, [i]] * self._share(gain) * modes[self.data.point]
                     for i, gain in enumerate(GAINS)
                     if gain.field == field
                 ]

@@ -40,36 +40,40 @@ class Conclusion:
 def conclude(found: ModelSearch, sure: float) -> Conclusion:
     """The strongest statement that has the probability `sure`.
 
-    In this order: effects that are each sure (KNOWN, MULTIPLE), and beside them the smallest class that holds what is
-    missing as well; something unlisted (UNKNOWN); nothing beyond usual discrepancy (NOISE_ONLY); the smallest class
-    that holds what is missing (KNOWN_CLASS); none of these (UNDECIDABLE).
+    In this order: something unlisted (UNKNOWN), and beside it the effects that are as sure or help; effects that are
+    each sure (KNOWN, MULTIPLE), and beside them the smallest class that holds what is missing as well; nothing beyond
+    usual discrepancy (NOISE_ONLY); the smallest class that holds what is missing (KNOWN_CLASS); none of these
+    (UNDECIDABLE). Something unlisted comes first: beside what no hypothesis describes, the shares of the described ones
+    are not known.
     """
     inclusion = found.inclusion()
     named = [t for t, p in inclusion.items() if p >= sure and t.kind in (EFFECT, CALIBRATION)]
     unlisted = found.probability_of(lambda h: any(t.kind == UNLISTED for t in h.terms))
     port, place = _where(found)
+    if unlisted >= sure:
+        names = tuple(map(label, named))
+        said = _with(f"Something that no listed effect explains acts at {place}", unlisted)
+        if names:
+            said += f" Beside it {_list(names)} {'help' if len(names) > 1 else 'helps'}."
+        effects = tuple(dict.fromkeys([*names, *_helpful(found)]))
+        return Conclusion(Verdict.UNKNOWN, effects, True, port, unlisted, said, place)
     if named:
         p = found.probability_of(lambda h: set(named) <= h.terms)
         names = tuple(map(label, named))
-        rest = [t for t in inclusion if t not in named and not (t.kind == UNLISTED and unlisted >= sure)]
+        rest = [t for t in inclusion if t not in named]
         further, _ = _smallest(found, rest, sure, named)
         many = len(names) > 1
         said = f"{_list(names)} {'are' if many else 'is'} missing"
         if all(t.kind == CALIBRATION for t in named):
             said = f"{_list(names)}: out of order beyond what is usual"
-        if unlisted >= sure:
-            said += f", and something unlisted acts at {place}"
         verdict = Verdict.MULTIPLE if many else Verdict.KNOWN
-        other = unlisted >= sure or _UNLISTED in further
+        other = _UNLISTED in further
         where = (port, place) if other else (None, None)
         more = tuple(m for m in further if m != _UNLISTED)
         sentence = _with(said, p)
         if further:
             sentence += f" Beside {'them' if many else 'it'}, {_one_of(further, place)} acts, too."
         return Conclusion(verdict, names, other, where[0], p, sentence, where[1], more)
-    if unlisted >= sure:
-        said = f"Something that no listed effect explains acts at {place}"
-        return Conclusion(Verdict.UNKNOWN, _helpful(found), True, port, unlisted, _with(said, unlisted), place)
     nothing = found.probability_of(lambda h: not any(t.kind in (EFFECT, UNLISTED) for t in h.terms))
     if nothing >= sure:
         said = "Nothing is missing beyond usual errors of model, sensors and noise"

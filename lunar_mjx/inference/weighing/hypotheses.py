@@ -47,6 +47,7 @@ class Linear:
       at: (k,) where the refit stands, relative to an effect's null; zero for other columns.
       calibration: columns by instrument, among `always`.
       following: columns of something unlisted that follows one quantity alone, by the name of its term.
+      added: columns of a field of discrepancy that count only where something unlisted acts in it, by field.
       fields: discrepancies. noises: of the noise groups.
       wide: scale of tau's prior where something unlisted acts at a port. far: factor on the prior of an instrument that
         errs more than usual.
@@ -66,6 +67,7 @@ class Linear:
     noises: tuple[NoiseSize, ...]
     wide: float
     far: float
+    added: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     def evidence(
         self, terms: frozenset[Term], start: tuple[np.ndarray, np.ndarray] | None = None
@@ -84,7 +86,7 @@ class Linear:
         named = {t.name for t in terms if t.kind == EFFECT}
         own = [self.effects[name] for name in self.effects if name in named]
         unlisted = {t.name for t in terms if t.kind == UNLISTED}
-        own += [self.following[name] for name in self.following if name in unlisted]
+        own += [part[name] for part in (self.added, self.following) for name in part if name in unlisted]
         places = np.concatenate([self.always, *own]).astype(int)
         # An effect of the refit that is no term of this hypothesis goes back to its null.
         gone = [p for name, p in self.effects.items() if name not in named and np.any(self.at[p] != 0.0)]

@@ -45,6 +45,8 @@ def found(*pairs):
             False,
         ),
         ([((SOIL,), 0.96), ((), 0.04)], Verdict.UNKNOWN, (), (), True),
+        # beside what no hypothesis describes an effect helps; it is not known
+        ([((EXIT, SOIL), 0.96), ((EXIT,), 0.04)], Verdict.UNKNOWN, ("exit_angle",), (), True),
         ([((), 0.96), ((CELL,), 0.04)], Verdict.NOISE_ONLY, (), (), False),
         ([((), 0.5), ((LUGS,), 0.5)], Verdict.UNDECIDABLE, (), (), False),
     ],

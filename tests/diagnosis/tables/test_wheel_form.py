@@ -11,13 +11,14 @@ import pytest
 from lunar_mjx.diagnosis import build_problem
 from lunar_mjx.diagnosis.runs import Run
 from lunar_mjx.diagnosis.tables.loop import build_tables, contact_laws, with_law
-from lunar_mjx.diagnosis.tables.port_gains import FIELDS, GAINS
+from lunar_mjx.diagnosis.tables.port_gains import ADDED, FIELDS, GAINS
 from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.effects import catalogue
 from lunar_mjx.errors import UserError
+from lunar_mjx.inference.weighing.hypotheses import UNLISTED
 from lunar_mjx.inference.weighing.search import search
 from lunar_mjx.logs import Noise, read_campaign, write_steady_log
 from lunar_mjx.model import make_model
@@ -109,6 +110,30 @@ def test_a_gain_on_the_side_force_moves_the_side_force_alone(folder):
     aside = form.data.quantity == 1
     np.testing.assert_allclose(column[aside], value[aside], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(column[~aside], 0.0, atol=1e-12)
+
+
+def test_a_force_that_a_law_lacks_is_unlisted_and_no_usual_discrepancy(folder):
+    form = tables(folder, "plain").own
+    linear, _, _ = form.linearise(np.zeros(len(form.coordinates)))
+    assert set(linear.added) == {g.field for g in GAINS if g.kind == ADDED}
+    added = np.concatenate(list(linear.added.values()))
+    assert not set(added) & set(linear.always)
+    field = "wheel_shear: driving moment"
+    unlisted = frozenset(t for t in form.terms if t.kind == UNLISTED and t.name == field)
+    _, _, places = linear.evidence(unlisted)
+    assert set(linear.added[field]) <= set(places)
+    assert not set(added) & set(linear.evidence(frozenset())[2])
+
+
+def test_forms_of_one_law_have_the_same_candidates(folder, monkeypatch):
+    more = {n: catalogue.get(n) for n in ("side_wall", "skid_shear", "shear_softening", "slip_sinkage")}
+    monkeypatch.setattr(build_problem, "candidate_effects", lambda run: more)
+    tables(folder, "plain")
+    path = folder / "plain"
+    run = Run(folder / "run", (path,), make_model("luvmi_x", terrain="flat", preset="consistent"))
+    problem = build_tables(run, read_campaign([path]))
+    closed, integral = (set(problem.form(n).candidates) for n in ("closed form", "stress_integral"))
+    assert closed == integral == set(more)
 
 
 def test_chunks_of_points_make_no_difference(folder):
