@@ -17,7 +17,7 @@ PROOFS = {
     "parked": "braked on 10° of soft soil, facing four ways: way from 10 s to 70 s",
     "energy": "dropped from 0.3 m: largest gain of energy with springs and soil, over the fall",
     "halving": "20 s with steering on a slope: the end moves, when the time step is halved, by this share of the way",
-    "drives": "20 s in a hard and a soft crater: largest error against native MuJoCo, in tolerances",
+    "drives": "20 s in a hard and a soft crater, {engines}: largest error against native MuJoCo, in tolerances",
     "parity": "states ({states:,}) and 5 s drives on all grounds, structured engine and MJX: likewise",
 }
 """What each proof of `benchmarks/acceptance.py` measures."""
@@ -25,14 +25,14 @@ PROOFS = {
 
 def acceptance(record: Mapping[str, Any]) -> str:
     """The table of the acceptance proofs."""
-    about = record["about"]
-    lines = [f"| `{about['preset']}` at {about['commit']} | rover | measured | limit |", "|---|---|---|---|"]
+    lines = [f"| `{record['about']['preset']}` | rover | measured | limit | at |", "|---|---|---|---|---|"]
     for row in record["rows"]:
         unit = {"1": "", "tolerances": ""}.get(row["unit"], f" {row['unit']}")
         value = "none found" if row["value"] is None else f"{row['value']:.3g}{unit}"
         limit = "-" if row["limit"] is None else f"{row['limit']:g}{unit}"
         missed = " (missed)" if row["passed"] is False else ""
-        lines.append(f"| {PROOFS[row['proof']].format(**row)} | {row['rover']} | {value}{missed} | {limit} |")
+        text = PROOFS[row["proof"]].format(**row | {"engines": " and ".join(row.get("engines", ()))})
+        lines.append(f"| {text} | {row['rover']} | {value}{missed} | {limit} | {row['commit']} |")
     return "\n".join(lines)
 
 

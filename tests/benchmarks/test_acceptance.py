@@ -34,7 +34,8 @@ def test_a_missed_limit_and_a_lacking_gate_are_told() -> None:
     """Rows that fail or have no reference say so."""
     about = {"preset": "field", "commit": "abc", "device": "a GPU"}
     row = {"proof": "parked", "rover": "viper", "value": 2e-3, "limit": 1e-3, "unit": "m", "passed": False}
-    assert "0.002 m (missed) | 0.001 m" in checked.acceptance({"about": about, "rows": [row]})
+    row["commit"] = "abc"
+    assert "0.002 m (missed) | 0.001 m | abc |" in checked.acceptance({"about": about, "rows": [row]})
     base = {"rover": "viper", "batch": 8, "steps_per_s": 2e6}
     rows = [
         {**base, "program": str(p), "parity": p, "parity_gap": None if p is None else 0.1} for p in (True, False, None)
