@@ -10,7 +10,7 @@ from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.weighing.hypotheses import shifted
 from lunar_mjx.inference.weighing.search import search
-from tests.inference.toy_form import ToyForm, X, measured
+from tests.inference.toy_form import EFFECTS, ToyForm, X, measured
 
 
 def look(value, **more):
@@ -46,8 +46,12 @@ def test_two_effects_are_both_named():
 
 def test_something_unlisted_is_unknown_at_its_port():
     value = measured(3) + 0.5 * np.where(X > 0.2, X - 0.2, 0.0) * np.cos(6.0 * X)
-    said = conclude(look(value), 0.95)
+    found = look(value)
+    said = conclude(found, 0.95)
     assert said.verdict is Verdict.UNKNOWN
+    assert found.complete
+    tried = set().union(*(h.effects for h in found.hypotheses if h.refitted))
+    assert tried == set(EFFECTS), "something unlisted was believed before every effect was refitted"
     assert said.port == "level"
 
 

@@ -69,7 +69,7 @@ def rank_sweeps(
         for k, name in enumerate(names):
             progress(f"refitting with {name}", k / len(names))
             effects = frozenset(sure if name == nothing else sure | {name})
-            refit = base if effects == base.effects else form.refit(effects, base, _tried(form, base.u, name))
+            refit = base if effects == base.effects else form.refit(effects, base, form.trial(base.u, name))
             linear, columns, residual = form.linearise(refit.u)
             terms = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in effects)
             _, found, places = linear.evidence(terms)
@@ -88,18 +88,6 @@ def rank_sweeps(
         worst = min(pairs, key=lambda p: pairs[p])
         ranked.append(Sweep(name, text, pairs[worst], worst))
     return sorted(ranked, key=lambda s: -s.separation)
-
-
-def _tried(form: Any, u: np.ndarray, name: str) -> np.ndarray:
-    """A place to begin at: the effect at half its prior size, since many have no slope at their null."""
-    out = u.copy()
-    for i in form.candidates[name]:
-        c = form.coordinates[i]
-        low, high = c.bounds()
-        if c.amplitude and out[i] == 0.0:
-            out[i] = 0.5 * form.settings.effect_size * (1.0 if high > 0.0 else -1.0)
-            out[i] = min(max(out[i], low), high)
-    return out
 
 
 def _separation(true: _Expected, judge: _Expected, rows: np.ndarray) -> float:

@@ -222,7 +222,7 @@ class WheelForm(MeasuredForm):
         std = np.concatenate([[c.prior for c in self.coordinates], error_std, np.ones(last - more + len(rest)), sizes])
         for places in self.candidates.values():
             amplitude = [i for i in places if self.coordinates[i].amplitude]
-            std[amplitude] = [self._effect_size(self.coordinates[i]) for i in amplitude]
+            std[amplitude] = [self.effect_size(self.coordinates[i]) for i in amplitude]
         none = np.full(count + errors.shape[1], -1)
         field = np.concatenate([none, field_of, added_to, np.full(unlisted.shape[1], -1)])
         mean = np.zeros(len(std))
@@ -266,7 +266,7 @@ class WheelForm(MeasuredForm):
         )
         return linear, columns, residual
 
-    def _effect_size(self, c: Coordinate) -> float:
+    def effect_size(self, c: Coordinate) -> float:
         """Prior standard deviation of an effect's amplitude, in scales: lengths are measured by the wheel's radius."""
         if c.unit != "m":
             return self.settings.effect_size

@@ -85,6 +85,21 @@ class MeasuredForm(Form):
         del refit
         return {}
 
+    def trial(self, u: np.ndarray, effect: str) -> np.ndarray:
+        """See `Form`: amplitudes that a place has near their null at half their prior size."""
+        out = u.copy()
+        for i in self.candidates[effect]:
+            c = self.coordinates[i]
+            low, high = c.bounds()
+            if c.amplitude and abs(out[i]) < 0.5 * (size := self.effect_size(c)):
+                out[i] = min(max(0.5 * size * (1.0 if high > 0.0 else -1.0), low), high)
+        return out
+
+    def effect_size(self, c: Coordinate) -> float:
+        """Prior standard deviation of an effect's amplitude, in scales."""
+        del c
+        return 1.0
+
     def origin(self) -> np.ndarray:
         """(coordinates,) the model as given."""
         return np.zeros(len(self.coordinates))

@@ -181,3 +181,8 @@ class Form(abc.ABC):
           near: refit of a similar set to begin at; the model as given if None.
           start: (coordinates,) to begin at, in place of that of `near`.
         """
+
+    def trial(self, u: np.ndarray, effect: str) -> np.ndarray:
+        """(coordinates,) a place at which an effect acts with a usual size, for one whose slope at its null says little."""
+        del effect
+        return u

@@ -2,14 +2,16 @@
 
 Best first: around each refit all neighbours (one term more, one less) are scored in linear approximation; the most
 probable set that has not been refitted is refitted next, until no other comes near the best. So every accepted effect
-is challenged by leaving it out again, and a greedy step that led into a trap is undone.
+is challenged by leaving it out again, and a greedy step that led into a trap is undone. Before something unlisted is
+believed, every effect that could be seen is refitted from a place where it acts: where a signature saturates, the linear
+estimate at its null is much too low.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -120,10 +122,12 @@ def search(
     reasons: list[str] = []
     by_name = {form.name: form for form in forms}
 
-    def refit(form: Form, effects: frozenset[str], near: Hypothesis | None) -> None:
+    def refit(form: Form, effects: frozenset[str], near: Hypothesis | None, trial: str = "") -> None:
         label = form.name + "".join(f" + {e}" for e in sorted(effects))
         progress(f"refitting {label}", len(done) / most_refits)
         start = None if near is None else _start(near, form)
+        if trial and start is not None:
+            start = form.trial(start, trial)
         try:
             made = form.refit(effects, near.refit if near else None, start)
         except (EvidenceError, ValueError, np.linalg.LinAlgError) as error:
@@ -156,15 +160,44 @@ def search(
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all.
         others = [f for f in forms if best.refitted and (f.name, best.effects) not in done]
         others = [f for f in others if best.effects <= {t.name for t in f.terms}]
-        if not others:
+        if others:
+            refit(others[0], best.effects, None)
+            continue
+        untried = _untried(known.values(), best, by_name[best.form], done)
+        if not untried:
             complete = True
             break
-        refit(others[0], best.effects, None)
+        refit(by_name[best.form], best.effects | {untried[0]}, best, untried[0])
     # A set whose refit failed is no hypothesis.
     alive = [h for h in known.values() if done.get((h.form, h.effects), h.refit) is not None]
     ranked = sorted(alive, key=lambda h: -h.log_posterior)
     weight = np.exp([h.log_posterior - ranked[0].log_posterior for h in ranked])
     return ModelSearch(tuple(ranked), weight / weight.sum(), len(done), tuple(reasons), complete)
+
+
+def _untried(
+    known: Iterable[Hypothesis], best: Hypothesis, form: Form, done: Mapping[tuple[str, frozenset[str]], Refit | None]
+) -> list[str]:
+    """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.
+
+    Empty where something unlisted is less probable than not: then what is listed explains the measurements.
+    """
+    scored = list(known)
+    top = max(h.log_posterior for h in scored)
+    weights = [(math.exp(h.log_posterior - top), any(t.kind == UNLISTED for t in h.terms)) for h in scored]
+    if sum(w for w, other in weights if other) < 0.5 * sum(w for w, _ in weights):
+        return []
+    linear = {next(iter(h.effects - best.effects)): h.log_posterior for h in scored if _one_more(h, best)}
+    shows = best.refit.linear.shows()
+    names = [n for n in shows if n not in best.effects and shows[n] >= LEAST_SIGNAL]
+    names = [n for n in names if (form.name, best.effects | {n}) not in done]
+    return sorted(names, key=lambda n: -linear.get(n, -math.inf))
+
+
+def _one_more(h: Hypothesis, best: Hypothesis) -> bool:
+    """Whether a hypothesis is another with one effect more, and nothing else."""
+    more = h.terms - best.terms
+    return h.form == best.form and best.terms <= h.terms and len(more) == 1 and len(h.effects) > len(best.effects)
 
 
 def _start(near: Hypothesis, form: Form) -> np.ndarray:
