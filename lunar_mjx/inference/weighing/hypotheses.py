@@ -183,6 +183,6 @@ class Form(abc.ABC):
         """
 
     def trial(self, u: np.ndarray, effect: str) -> np.ndarray:
-        """(coordinates,) a place at which an effect acts with a usual size, for one whose slope at its null says little."""
+        """(coordinates,) a place at which an effect acts, for one whose slope at its null says little."""
         del effect
         return u

@@ -3,8 +3,8 @@
 Best first: around each refit all neighbours (one term more, one less) are scored in linear approximation; the most
 probable set that has not been refitted is refitted next, until no other comes near the best. So every accepted effect
 is challenged by leaving it out again, and a greedy step that led into a trap is undone. Before something unlisted is
-believed, every effect that could be seen is refitted from a place where it acts: where a signature saturates, the linear
-estimate at its null is much too low.
+believed, every effect that could be seen is refitted from a place where it acts: where a signature saturates, the
+linear estimate at its null is much too low.
 """
 
 from __future__ import annotations
