@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,6 +13,7 @@ from lunar_mjx.commands.options import MOST_SEED, PresetOption
 from lunar_mjx.errors import bad_input
 
 ModelOption = Annotated[Path | None, typer.Option(help="model.toml; overrides --rover, --terrain and --preset.")]
+SUN = "azimuth,elevation of the Sun, deg; the model's own, or 135,15, if left out"
 RunArgument = Annotated[Path, typer.Argument(help="Folder that `simulate` wrote.")]
 
 
@@ -56,7 +57,7 @@ def render(
     size: Annotated[str, typer.Option(help="width x height, pixels")] = "960x540",
     fps: Annotated[int, typer.Option(min=1, max=60, help="pictures per second of the video")] = 20,
     speed: Annotated[float, typer.Option(help="times real time; 0: as fast as keeps the video within 20 s")] = 0.0,
-    sun: Annotated[str, typer.Option(help="azimuth,elevation of the Sun, deg")] = "135,15",
+    sun: Annotated[str | None, typer.Option(help=SUN)] = None,
 ) -> None:
     """Make a video of a drive, with path, slip and temperature."""
     from lunar_mjx.commands.options import check_finite
@@ -67,15 +68,16 @@ def render(
     if speed < 0:
         raise bad_input("lunar-mjx render", "--speed", speed, "is negative", "give 0 or more")
     width, height = _numbers("--size", size, "x", int)
-    azimuth, elevation = _numbers("--sun", sun, ",", float)
-    from lunar_mjx.cameras import Sun
+    from lunar_mjx.model.sun import camera_sun
     from lunar_mjx.report import console_progress
     from lunar_mjx.visual.recorded import read_drive
     from lunar_mjx.visual.video import render_video
 
-    light = Sun(azimuth, elevation)
+    given = None if sun is None else _sun(sun)
+    drive = read_drive(run)
+    light = given or camera_sun(drive.model.sun, float(drive.time[0]))
     with console_progress() as report:
-        print(render_video(read_drive(run), path, view, (width, height), fps, speed, light, report))
+        print(render_video(drive, path, view, (width, height), fps, speed, light, report))
 
 
 def view(
@@ -94,7 +96,7 @@ def view(
     yaw_deg: Annotated[float, typer.Option(help="start heading, deg")] = 0.0,
     web: Annotated[bool, typer.Option("--web", help="A web page on this machine although there is a screen.")] = False,
     port: Annotated[int, typer.Option(help="Of the web page; 0 for any that is free.")] = 8600,
-    sun: Annotated[str, typer.Option(help="azimuth,elevation of the Sun, deg")] = "135,15",
+    sun: Annotated[str | None, typer.Option(help=SUN)] = None,
     engine: Annotated[
         str, typer.Option(help="native (starts at once), structured, mjx; auto: native where it has every effect.")
     ] = "auto",
@@ -103,21 +105,21 @@ def view(
     from lunar_mjx.commands.options import check_finite
 
     check_finite(speed=speed, x=x, y=y, yaw_deg=yaw_deg)
-    azimuth, elevation = _numbers("--sun", sun, ",", float)
-    from lunar_mjx.cameras import Sun
     from lunar_mjx.effects.presets import DEFAULT_PRESET
     from lunar_mjx.model import make_model
     from lunar_mjx.model.file import load_model
+    from lunar_mjx.model.sun import camera_sun
     from lunar_mjx.viewer.drive import LiveDrive
     from lunar_mjx.viewer.server import Viewer, check_port
     from lunar_mjx.viewer.window import has_screen, show_window
 
-    light = Sun(azimuth, elevation)
+    given = None if sun is None else _sun(sun)
     check_port(port)
     keep_compiled()
     built = load_model(model) if model else make_model(rover, terrain, preset or DEFAULT_PRESET)
     for effect in effects or []:
         built = built.add(effect, "--effects")
+    light = given or camera_sun(built.sun)
     drive = LiveDrive(built, engine, speed, x, y, math.radians(yaw_deg))
     if has_screen() and not web:
         show_window(drive, light)
@@ -129,6 +131,13 @@ def view(
         except KeyboardInterrupt:  # before or after it could be caught there
             server.close()
     print(f"{built.rover.name} drove {drive.path:.1f} m in {drive.time:.1f} s")
+
+
+def _sun(text: str) -> Any:
+    from lunar_mjx.cameras import Sun
+
+    azimuth, elevation = _numbers("--sun", text, ",", float)
+    return Sun(azimuth, elevation)
 
 
 def _numbers(option: str, text: str, between: str, kind: type) -> list:

@@ -31,6 +31,11 @@ NO_CANDIDATE = frozenset(
         "joint_limits",
         "chassis_contact",
         "encoder_quantisation",
+        "motor_power",
+        "electronics",
+        "solar_panels",
+        "battery",
+        "chassis_node",
     }
 )
 """Effects that are an arrangement of the test which its user knows, an engine's substitute for physics, or without a

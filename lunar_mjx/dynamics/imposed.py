@@ -212,7 +212,7 @@ class KinematicDrive:
         system = self.system
         params = dataclasses.replace(params, terrain=system.params.terrain)
         kinematics, finish = self._engine.forward_imposed(params, q, v, system.dt)
-        cold = params.ambient.at(0.0) - REFERENCE_TEMPERATURE + jnp.zeros_like(speed)
+        cold = params.ambient_temperature(0.0) - REFERENCE_TEMPERATURE + jnp.zeros_like(speed)
         temperature = Temperature(cold, jnp.zeros_like(cold), cold, jnp.zeros_like(cold))
         pieces: tuple[Any, Any] = (q, v)  # as the engine carries them within a loop
         state = State(jnp.zeros((), jnp.int32), pieces[0], pieces[1], temperature, effects)

@@ -170,7 +170,7 @@ def sensor_context(system: System, signals: Signals, params: Params | None = Non
     return SensorContext(
         time=signals.time,
         gravity=used.gravity,
-        ambient_temperature=used.ambient.at(signals.time),
+        ambient_temperature=used.ambient_temperature(signals.time),
         rover=system.info,
         parameters={name: SimpleNamespace(**values) for name, values in used.effects.items()},
         joints=tuple(joint_channels(system.model.rover)),

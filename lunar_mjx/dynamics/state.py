@@ -11,6 +11,7 @@ from lunar_mjx.model.ambient import Ambient
 from lunar_mjx.pytree import AnyArray, pytree
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import Terrain
+from lunar_mjx.terrain.sky import Sun
 
 
 @pytree
@@ -69,12 +70,20 @@ class Params:
       ambient: ambient temperature.
       effects: parameters by effect and name, each a number or one per wheel or joint.
       terrain: the ground.
+      sun: over it; None where no effect reads it but the ambient temperature, which then has a day of its own.
     """
 
     gravity: Any
     ambient: Ambient
     effects: dict[str, dict[str, Any]]
     terrain: Terrain
+    sun: Sun | None = None
+
+    def ambient_temperature(self, time: Any) -> Any:
+        """K at `time`, s: by the height of the Sun where there is one, else by the ambient's own day."""
+        if self.sun is None:
+            return self.ambient.at(time)
+        return self.ambient.under(self.sun.towards(time).z / self.sun.highest)
 
 
 @pytree

@@ -19,6 +19,7 @@ from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperat
 from lunar_mjx.effects.context import Context, Heat, RoverInfo
 from lunar_mjx.effects.joint.motor import MODES, REFERENCE_TEMPERATURE, constant_at, winding_resistance
 from lunar_mjx.effects.ports import Pipeline, apply_effects
+from lunar_mjx.model.sun import make_sun
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import sample
@@ -79,7 +80,7 @@ class System:
         )
         qpos = jnp.concatenate([position, quaternion, qpos[7:]])
         joint = jnp.zeros(len(self.joint_names), dtype)
-        ambient = params.ambient.at(jnp.zeros((), dtype))
+        ambient = params.ambient_temperature(jnp.zeros((), dtype))
         warm = ambient if winding_temperature is None else winding_temperature
         offset = joint + (jnp.asarray(warm, dtype) - REFERENCE_TEMPERATURE)
         wheel = jnp.zeros(len(self.model.rover.wheels), dtype)
@@ -216,7 +217,7 @@ class System:
             time=time,
             dt=jnp.asarray(self.dt, dtype),
             gravity=params.gravity,
-            ambient_temperature=params.ambient.at(time),
+            ambient_temperature=params.ambient_temperature(time),
             position=k.position,
             frame=k.frame,
             velocity=k.velocity,
@@ -233,6 +234,7 @@ class System:
             terrain=params.terrain,
             rover=jax.tree.map(lambda a: jnp.asarray(a, dtype) if a.dtype.kind == "f" else jnp.asarray(a), self.info),
             parameters={name: SimpleNamespace(**values) for name, values in params.effects.items()},
+            sunlight=None if params.sun is None else params.sun.light(time, k.position.x, k.position.y),
         )
 
 
@@ -277,13 +279,13 @@ def rover_info(model: Model) -> RoverInfo:
 def default_params(model: Model) -> Params:
     """The model's parameters as arrays of the default float type."""
     dtype = jnp.result_type(float)
-    terrain = jax.tree.map(
+    terrain, sun = jax.tree.map(
         lambda a: jnp.asarray(a, dtype) if jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating) else jnp.asarray(a),
-        model.terrain,
+        (model.terrain, make_sun(model.sun, model.terrain)),
     )
     ambient = Ambient(*(jnp.asarray(v, dtype) for v in model.ambient))
     effects = {e.name: {k: jnp.asarray(v, dtype) for k, v in model.parameters[e.name].items()} for e in model.effects}
-    return Params(jnp.asarray(model.gravity, dtype), ambient, effects, terrain)
+    return Params(jnp.asarray(model.gravity, dtype), ambient, effects, terrain, sun)
 
 
 def _telemetry(ctx: Context, k: Kinematics, heat: Heat) -> Telemetry:

@@ -19,6 +19,7 @@ from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import SoilGrids, SoilMap, Terrain
 from lunar_mjx.terrain.heightfield import HeightField
 from lunar_mjx.terrain.rocks import Rocks
+from lunar_mjx.terrain.sky import Sunlight
 from lunar_mjx.units import si_dimensions
 
 BASES = {
@@ -98,6 +99,8 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "grip": "1",
     },
     c.BodyWrench: {"force": "N", "moment": "N m", "joint_torque": "N m"},
+    c.Power: {"load": "W", "solar": "W", "loss": "W", "current": "A", "voltage": "V"},
+    Sunlight: {"direction": "1", "irradiance": "W/m2"},
     c.Heat: {"winding": "W", "housing": "W", "winding_capacity": "J/K", "housing_capacity": "J/K"},
     c.RoverInfo: {
         "wheel_radius": "m",
@@ -142,6 +145,8 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "soil": _OWN,
         "normal": _OWN,
         "wheel": _OWN,
+        "power": _OWN,
+        "sunlight": _OWN,
     },
     Terrain: {"field": _OWN, "rocks": _OWN, "soil": _OWN, "origin": "m", "name": _PLAIN, "grids": _OWN},
     HeightField: {"heights": "m", **_GRID},

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.effects.base import Effect
-from lunar_mjx.effects.context import Context, RoverInfo
+from lunar_mjx.effects.context import Context, Power, RoverInfo
 from lunar_mjx.effects.ports import Pipeline, apply_effects, heat_flow
 from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import SoilGrids, SoilMap, Terrain, build_rocks, inclined
+from lunar_mjx.terrain.sky import Sunlight
 
 SLOPE = 0.1
 """Inclination of the probe's ground, rad."""
@@ -140,6 +141,7 @@ def context(effects: Sequence[Effect], values: Values, world: Terrain, s: Mappin
         terrain=world,
         rover=rover(wheels),
         parameters={e.name: SimpleNamespace(**{**e.nominal(), **values.get(e.name, {})}) for e in effects},
+        sunlight=Sunlight(Vec3(0.6 * one, -0.48 * one, 0.64 * one), 1000.0 * one),
     )
 
 
@@ -158,7 +160,8 @@ def step(
     ctx = context(pipeline.effects, values, world, s, moment)
     forces, ctx, memory = apply_effects(pipeline, ctx, s["target"][moment], memory)
     heat, memory = heat_flow(pipeline, ctx, memory)
-    geometry = forces.geometry
+    geometry, nil = forces.geometry, jnp.zeros(())
+    power = Power(nil, nil, nil) if ctx.power is None else ctx.power
     return {
         "joint_torque": forces.joint_torque,
         "wheel_force": forces.wheel_force.stack(),
@@ -171,6 +174,7 @@ def step(
         "gravity": ctx.gravity,
         "winding_heat": heat.winding,
         "housing_heat": heat.housing,
+        "electric_power": jnp.stack([power.load, power.solar, power.loss]),
     }, memory
 
 

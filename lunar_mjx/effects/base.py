@@ -31,7 +31,18 @@ import jax.numpy as jnp
 
 from lunar_mjx.errors import UserError, bad_input, require_finite
 
-PORTS = ("command", "motor_torque", "geometry", "soil", "wheel_normal", "wheel_shear", "body_wrench", "heat", "sensor")
+PORTS = (
+    "command",
+    "motor_torque",
+    "geometry",
+    "soil",
+    "wheel_normal",
+    "wheel_shear",
+    "body_wrench",
+    "power",
+    "heat",
+    "sensor",
+)
 """The ports, in the order in which a step calls them (`sensor` acts on the finished trajectory)."""
 
 AXES = ("rover", "wheel", "joint")

@@ -13,6 +13,8 @@ from lunar_mjx.effects.heat import paths as thermal
 from lunar_mjx.effects.heat import sources as heat_sources
 from lunar_mjx.effects.joint import driveline, electrical, friction
 from lunar_mjx.effects.joint import motor as motor_module
+from lunar_mjx.effects.power import chassis as chassis_heat
+from lunar_mjx.effects.power import supply
 from lunar_mjx.effects.sensor import channel_errors as sensors
 from lunar_mjx.effects.soil import ground as soil
 from lunar_mjx.effects.soil import multipass, ruts, slip_sinkage
@@ -92,6 +94,11 @@ CATALOGUE: Mapping[str, Effect] = _by_name(
         bulldozing.rolling_resistance,
         suspension.suspension_friction,
         suspension.dust_charging,
+        supply.motor_power,
+        supply.electronics,
+        supply.solar_panels,
+        supply.battery,
+        chassis_heat.chassis_node,
         thermal.winding_conduction,
         thermal.rotor_stator_path,
         thermal.housing_convection,

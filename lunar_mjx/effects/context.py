@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from lunar_mjx.pytree import AnyArray, pytree, static
 from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import Terrain
+from lunar_mjx.terrain.sky import Sunlight
 
 
 @pytree
@@ -196,6 +197,24 @@ class BodyWrench:
 
 
 @pytree
+class Power:
+    """Value of the port `power`: electric power of the rover's bus.
+
+    Attributes:
+      load: what is drawn, W, with what amplifiers lose.
+      solar: what panels give, W.
+      loss: what of it heats the chassis, W.
+      current, voltage: of the battery, A (positive when it gives) and V; None without one.
+    """
+
+    load: Any
+    solar: Any
+    loss: Any
+    current: Any = None
+    voltage: Any = None
+
+
+@pytree
 class Heat:
     """Value of the port `heat`: heat flow into the two nodes of every motor, W, and their heat capacities, J/K."""
 
@@ -249,7 +268,8 @@ class Context:
       terrain: the ground.
       rover: the rover as drawn.
       parameters: every effect's parameters, by effect and name.
-      command, torque, geometry, contact, soil, normal, wheel: what the ports before have settled.
+      command, torque, geometry, contact, soil, normal, wheel, power: what the ports before have settled.
+      sunlight: where the rover is; None for a model without a Sun.
     """
 
     time: Any
@@ -279,3 +299,5 @@ class Context:
     soil: Soil | None = None
     normal: Normal | None = None
     wheel: WheelForce | None = None
+    power: Power | None = None
+    sunlight: Sunlight | None = None

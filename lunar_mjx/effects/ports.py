@@ -17,6 +17,7 @@ from lunar_mjx.effects.context import (
     Geometry,
     Heat,
     Normal,
+    Power,
     RoverInfo,
     Soil,
     WheelForce,
@@ -209,6 +210,9 @@ def apply_effects(
     zero = jnp.zeros_like(ctx.position.x)
     none = Vec3(zero, zero, zero)
     wrench, state = pipeline.run("body_wrench", ctx, state, BodyWrench(none, none, jnp.zeros_like(ctx.joint_angle)))
+    if "power" in pipeline:
+        power, state = pipeline.run("power", ctx, state, Power(zero, zero, zero))
+        ctx = dataclasses.replace(ctx, power=power)
     contact, wheel = ctx.contact, ctx.wheel
 
     def to_world(v: Vec3) -> Vec3:

@@ -29,6 +29,10 @@ class Ambient:
     period: Any
 
     def at(self, time: Any) -> Any:
-        sun = jnp.cos(2.0 * jnp.pi * (time - self.noon_time) / self.period)
+        """Temperature at `time`, s, K."""
+        return self.under(jnp.cos(2.0 * jnp.pi * (time - self.noon_time) / self.period))
+
+    def under(self, sun: Any) -> Any:
+        """Temperature, K, where the sine of the Sun's elevation is `sun` times its highest."""
         up = jnp.where(sun > 0.0, jnp.where(sun > 0.0, sun, 1.0) ** 0.25, 0.0)
         return self.night + (self.noon - self.night) * up

@@ -25,6 +25,7 @@ from lunar_mjx.model.model import (
     settled,
     with_position_gains,
 )
+from lunar_mjx.model.sun import SunSettings, read_sun
 from lunar_mjx.resources import shipped
 from lunar_mjx.rover import load_rover
 from lunar_mjx.terrain import load_terrain
@@ -47,6 +48,7 @@ _TOP = (
     "control",
     "effects",
     "priors",
+    "sun",
 )
 _AMBIENT = ("temperature_degC", "noon_temperature_degC", "night_temperature_degC", "noon_time_s", "period_s")
 _CONTROL = ("mode", *GAINS)
@@ -88,6 +90,7 @@ def load_model(path: str | Path) -> Model:
         timestep=_number(path, "timestep_s", data.get("timestep_s", model.timestep)),
         thermal_integrator=_text(path, "thermal_integrator", data.get("thermal_integrator", model.thermal_integrator)),
         ambient=ambient,
+        sun=read_sun(path, _table(path, "sun", data["sun"])) if "sun" in data else None,
         modes={**model.modes, **modes},
         gains={**model.gains, **gains},
     )
@@ -162,8 +165,14 @@ def _record(model: Model, path: Path) -> dict[str, Any]:
             for e in model.effects
             if e.parameters
         },
+        **({"sun": _sun(model.sun, folder)} if model.sun is not None else {}),
         **({"priors": {k: {"value": v, "std": s} for k, (v, s) in model.priors.items()}} if model.priors else {}),
     }
+
+
+def _sun(sun: SunSettings, folder: Path) -> dict[str, Any]:
+    table = {k: v for k, v in dataclasses.asdict(sun).items() if v is not None}
+    return table | ({"horizon_dem": _spelled(sun.horizon_dem, folder)} if sun.horizon_dem is not None else {})
 
 
 def _spelled(spec: str, folder: Path) -> str:

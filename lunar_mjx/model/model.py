@@ -14,6 +14,7 @@ from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.joint.motor import MODES, WINDINGS
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.model.ambient import SYNODIC_DAY
+from lunar_mjx.model.sun import SunSettings
 from lunar_mjx.resources import shipped
 from lunar_mjx.rover import Rover, load_rover
 from lunar_mjx.terrain import Terrain, load_terrain
@@ -47,6 +48,7 @@ class Model:
       effect_files: catalogue name or /absolute/file.py:name of every effect.
       priors: value and standard deviation of what is known of a parameter (`effect.parameter`) or of an instrument
         (`calibration.pitch`) before a fit; a standard deviation of zero fixes it.
+      sun: where the Sun stands or how it moves, for power, heat and cameras; None where each has its own default.
     """
 
     rover: Rover
@@ -63,6 +65,7 @@ class Model:
     gains: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     effect_files: Mapping[str, str] = dataclasses.field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    sun: SunSettings | None = None
 
     @property
     def effect_names(self) -> tuple[str, ...]:

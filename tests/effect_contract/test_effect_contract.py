@@ -14,7 +14,7 @@ import pytest
 
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
-from lunar_mjx.effects.context import RoverInfo
+from lunar_mjx.effects.context import Power, RoverInfo
 from lunar_mjx.effects.ports import Pipeline, apply_effects, heat_flow
 from lunar_mjx.effects.presets import PRESETS
 from lunar_mjx.errors import UserError
@@ -166,6 +166,7 @@ def act(names: tuple[str, ...], world: Terrain, values: Mapping[str, Any], s: Ma
         memory["shear_state"] = dict(zip(("slip_x", "slip_y", "direction"), s["slip"], strict=True))
     forces, ctx, memory = apply_effects(pipeline, ctx, s["target"], memory)
     heat, memory = heat_flow(pipeline, ctx, memory)
+    power = Power(zero, zero, zero) if ctx.power is None else ctx.power
     return {
         "joint_torque": forces.joint_torque,
         "wheel_force": forces.wheel_force.stack(),
@@ -177,6 +178,7 @@ def act(names: tuple[str, ...], world: Terrain, values: Mapping[str, Any], s: Ma
         "com_offset": forces.geometry.com_offset.stack(),
         "winding_heat": heat.winding,
         "housing_heat": heat.housing,
+        "electric_power": jnp.stack([power.load, power.solar, power.loss]),
     }
 
 

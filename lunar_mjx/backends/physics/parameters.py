@@ -135,6 +135,11 @@ def read_numbers(model: Model, backend: str = "backend") -> Numbers:
       UserError: an effect that the NumPy physics does not implement.
     """
     check_supported(model, backend)
+    if model.sun is not None:
+        raise UserError(
+            f"{backend}: sun = {model.sun.date or 'at rest'} is followed by the structured and MJX engines alone; run "
+            "the model on one of these, or remove [sun]."
+        )
     rover = model.rover
     groups = [g for g in rover.groups for _ in g.joints]
     kinds = ("drive", "steer", "suspension")

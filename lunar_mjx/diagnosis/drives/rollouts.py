@@ -19,6 +19,7 @@ from lunar_mjx.effects.sensor.channels import EULER
 from lunar_mjx.inference.fitting import Progress
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.model import Model
+from lunar_mjx.model.sun import make_sun
 
 if TYPE_CHECKING:
     from lunar_mjx.logs import Log
@@ -235,9 +236,9 @@ def _params(model: Model) -> Params:
     """
     effects = {e.name: {k: np.asarray(v, float) for k, v in model.parameters[e.name].items()} for e in model.effects}
     terrain = jax.tree.map(_array, dataclasses.replace(model.terrain, name=""))
-    return Params(
-        np.asarray(model.gravity, float), Ambient(*(np.asarray(v, float) for v in model.ambient)), effects, terrain
-    )
+    ambient = Ambient(*(np.asarray(v, float) for v in model.ambient))
+    sun = jax.tree.map(_array, make_sun(model.sun, model.terrain))
+    return Params(np.asarray(model.gravity, float), ambient, effects, terrain, sun)
 
 
 def _array(leaf: Any) -> np.ndarray:

@@ -118,13 +118,21 @@ def gear_friction_heat(ctx, p, x, heat):
 def solar_flux(ctx, p, x, heat):
     """P_S += alpha A q_sun max(0, cos theta), theta from the housing's normal, which turns with the rover, to the Sun.
 
-    No sunlight below the horizon; shadows of the terrain and of the rover itself are not cast.
+    Where the model has a Sun of its own, direction and irradiance are its, behind the terrain's horizon, and the
+    parameters sun_azimuth, sun_elevation and flux count for nothing; else there is no sunlight below a level horizon.
+    The rover casts no shadow.
     """
+    if ctx.sunlight is not None:
+        return _warmed(ctx, p, heat, ctx.sunlight.direction, ctx.sunlight.irradiance)
     level = jnp.cos(p.sun_elevation)
     sun = Vec3(level * jnp.sin(p.sun_azimuth), level * jnp.cos(p.sun_azimuth), jnp.sin(p.sun_elevation))
+    return _warmed(ctx, p, heat, sun, jnp.where(p.sun_elevation > 0.0, p.flux, 0.0))
+
+
+def _warmed(ctx, p, heat, sun, lit):
+    """The heat with what the housings absorb of sunlight of irradiance `lit`, W/m2, from the direction `sun`."""
     ahead, left = sun.dot(ctx.frame.forward), sun.dot(ctx.frame.left)
     cosine = jnp.maximum(ahead * jnp.cos(p.facing) + left * jnp.sin(p.facing), 0.0)
-    lit = jnp.where(p.sun_elevation > 0.0, p.flux, 0.0)
     return dataclasses.replace(heat, housing=heat.housing + p.absorptivity * p.area * lit * cosine)
 
 

@@ -1,0 +1,1 @@
+"""Effects of electric power (port `power`), and the chassis that its losses warm."""
