@@ -24,7 +24,7 @@ import jax
 from benchmarks.hidden.drives import MANOEUVRES, Manoeuvre, generate
 from lunar_mjx.criticism import compare, read_campaign, why
 from lunar_mjx.diagnosis.drives.problem import SIMULATED
-from lunar_mjx.diagnosis.drives.program import cores
+from lunar_mjx.diagnosis.drives.simulation.program import cores
 from lunar_mjx.model import make_model
 
 EFFECTS = (

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.diagnosis import verbs
-from lunar_mjx.diagnosis.refit import Settings
 from lunar_mjx.diagnosis.runs import SERIES_FILE, Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
@@ -139,7 +138,6 @@ def drive_row(group: str, number: int, seed: int, folder: str, keep: str | None 
             "named": list(found.effects) if found else [],
             "sentence": found.sentence if found else refused,
             "seconds": round(seconds, 2),
-            "half_step_chi2": _half_steps(found),
         }
         if found is not None and found.verdict not in (Verdict.BAD_DATA, Verdict.BAD_FIT):
             kinds = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
@@ -156,12 +154,6 @@ def drive_row(group: str, number: int, seed: int, folder: str, keep: str | None 
     finally:
         if not keep:
             shutil.rmtree(place, ignore_errors=True)
-
-
-def _half_steps(found: Diagnosis | None) -> list[float | None]:
-    """Changes of chi-square by halving the time step, of the baseline and of the model that is named."""
-    details = found.details if found else {}
-    return [details.get(c, {}).get("half_step_chi2") for c in ("certificate", "certificate_after")]
 
 
 def _twins(truth: bed_logs.Truth, name: str) -> float:
@@ -240,7 +232,7 @@ def _suggestions(run: Path) -> list[dict[str, Any]]:
 
     loaded: Run = load_run(run)
     try:
-        found = discover(loaded, settings=Settings(seed=loaded.seed))
+        found = discover(loaded)
     except UserError as error:
         return [{"refused": str(error)}]
     return [

@@ -6,7 +6,6 @@ rates are those of the method where the rest of the model is true: a lower bound
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import hashlib
 import time
@@ -16,25 +15,23 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx._version import __version__
-from lunar_mjx.diagnosis.attribute import diagnose
-from lunar_mjx.diagnosis.build_problem import build_problem
-from lunar_mjx.diagnosis.refit import Settings
-from lunar_mjx.diagnosis.runs import FITS_FILE, MODEL_FILE, Run, folder_hash, load_run
-from lunar_mjx.diagnosis.search import fit_baseline
+from lunar_mjx.diagnosis.drives.form import DriveForm
+from lunar_mjx.diagnosis.drives.loop import build_drives
+from lunar_mjx.diagnosis.runs import MODEL_FILE, Run, folder_hash, load_run
 from lunar_mjx.diagnosis.tables.simulated import SimulatedTables
 from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.errors import bad_input
-from lunar_mjx.inference.fit_store import Memory
-from lunar_mjx.inference.fitting import Fit, Progress, silent
+from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.observations import Observations
-from lunar_mjx.inference.problem import Problem
-from lunar_mjx.inference.score import SEPARABLE, score, signatures
+from lunar_mjx.inference.weighing.hypotheses import Refit
+from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, search
 from lunar_mjx.logs import SteadyLog
 
 AUDIT_FILE = "audit.json"
 NULL = "nothing"
-_MARGIN = 3.0
-"""Separable signals are tested at this multiple of the least one that counts, where the nominal size gives less."""
+_VISIBLE = 15.0
+"""Length in sigma, at least, of the signature of a simulated effect that is to be found."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,16 +53,14 @@ class Audit:
         return dataclasses.asdict(self)
 
 
-def audit(
-    folder: str | Path | Run, seconds: float, progress: Progress = silent, settings: Settings | None = None
-) -> Audit:
+def audit(folder: str | Path | Run, seconds: float, progress: Progress = silent) -> Audit:
     """Diagnoses simulated logs like those of a run until the time is spent; writes `audit.json`.
 
     Nulls and single effects take turns. Earlier cases of the same model and logs are kept and added to.
 
     Args:
       folder: of the run. seconds: to spend; the case in progress is finished, and two are diagnosed at least.
-      progress: told what is being done. settings: thresholds and effort of the diagnoses.
+      progress: told what is being done.
 
     Raises:
       UserError: a time that is not positive.
@@ -73,8 +68,7 @@ def audit(
     if not seconds > 0.0:
         raise bad_input("why", "--audit", seconds, "is not a time", "give minutes above 0")
     run = folder if isinstance(folder, Run) else load_run(folder)
-    settings = settings or Settings(seed=run.seed)
-    key = _key(run, settings)
+    key = _key(run)
     stored = run.load(AUDIT_FILE) or {}
     cases: list[dict[str, Any]] = list(stored.get("cases", [])) if stored.get("key") == key else []
     end = time.monotonic() + seconds
@@ -92,12 +86,14 @@ def audit(
                 "outcome": _outcome(truth or NULL, said.verdict, said.effects),
             }
     else:
-        problem = build_problem(run, logs)
-        base = fit_baseline(problem, settings, Memory(run.load(FITS_FILE)), progress)
-        sizes = _sizes(problem, base, settings)
+        problem = build_drives(run, logs, None, progress)  # type: ignore[arg-type]
+        form = problem.own
+        assert isinstance(form, DriveForm)
+        base = form.refit(frozenset(), None, None)
+        sizes = _sizes(form, base)
 
         def one(number: int) -> dict[str, Any]:
-            return _case(problem, base, sizes, number, settings)
+            return _case(form, base, sizes, number, run.seed)
 
     begun = time.monotonic()
     done = 0
@@ -110,53 +106,50 @@ def audit(
     return _summary(cases)
 
 
-def _key(run: Run, settings: Settings) -> str:
+def _key(run: Run) -> str:
     """Of the model and the campaign that an audit belongs to, and of the tool that was audited."""
     digest = hashlib.sha256((run.folder / MODEL_FILE).read_bytes())
     for log in run.logs:
         digest.update(folder_hash(log).encode())
     digest.update(repr((run.candidates, sorted(run.splits.items()), sorted(run.discrepancy.items()))).encode())
-    digest.update(repr((__version__, dataclasses.astuple(settings))).encode())
+    digest.update(repr((__version__, run.seed, sorted(run.settings.items()))).encode())
     return digest.hexdigest()
 
 
-def _sizes(problem: Problem, base: Fit, settings: Settings) -> dict[str, float]:
-    """Amount, in nominal sizes, of every effect that these logs can show: the nominal one, or what is just visible."""
-    found = score(problem, base, signatures(problem, base, list(problem.candidates)), 2, settings.seed)
+def _sizes(form: DriveForm, base: Refit) -> dict[str, float]:
+    """Amount, in nominal sizes, of every effect that these logs can show: the nominal one, or what is well visible."""
     sizes = {}
-    for s in found:
-        if s.length < SEPARABLE:
-            continue
-        low, high = problem.bounds(problem.candidates[s.effect])
-        wanted = max(1.0, _MARGIN * SEPARABLE / s.length)
-        sizes[s.effect] = float(np.clip(wanted, 0.0, np.min(np.maximum(high, -low))))
+    for name, length in base.linear.shows().items():
+        if length >= LEAST_SIGNAL:
+            low, high = form.drives.bounds(form.candidates[name])
+            sizes[name] = float(np.clip(max(1.0, _VISIBLE / length), 0.0, np.min(np.maximum(high, -low))))
     return sizes
 
 
-def _case(problem: Problem, base: Fit, sizes: dict[str, float], number: int, settings: Settings) -> dict[str, Any]:
-    rng = np.random.default_rng([settings.seed, number])
+def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng([seed, number])
     truth, u, amount = NULL, base.u.copy(), 0.0
     if number % 2 and sizes:
         names = sorted(sizes)
         truth = names[int(rng.integers(len(names)))]
         amount = sizes[truth]
-        places = [i for i in problem.candidates[truth] if problem.coordinates[i].amplitude]
-        low, high = problem.bounds(np.array(places))
+        places = [i for i in form.candidates[truth] if form.coordinates[i].amplitude]
+        low, high = form.drives.bounds(np.array(places))
         sign = rng.choice([-1.0, 1.0], size=len(places))
         u[places] = np.clip(np.where((sign > 0.0) & (high > 0.0) | (low >= 0.0), amount, -amount), low, high)
-    clean = problem.predict(u[None])[0]
+    clean = form.predicted(u)
     case: dict[str, Any] = {"truth": truth, "amount": amount}
     if not np.isfinite(clean).all():
         return {**case, "verdict": "", "effects": [], "outcome": "diverged"}
-    simulated = copy.copy(problem)
-    measured = clean + draw_noise(problem.observations, rng)
-    simulated.observations = dataclasses.replace(problem.observations, value=measured)
-    diagnosis, _ = diagnose(simulated, settings)
+    drawn = form.measuring(clean + draw_noise(form.drives.observations, rng), base.u)
+    settings = form.settings
+    found = search([drawn], settings.most_refits, settings.most_terms, settings.window)
+    said = conclude(found, settings.sure)
     return {
         **case,
-        "verdict": diagnosis.verdict.label,
-        "effects": list(diagnosis.effects),
-        "outcome": _outcome(truth, diagnosis.verdict, diagnosis.effects),
+        "verdict": said.verdict.label,
+        "effects": list(said.effects),
+        "outcome": _outcome(truth, said.verdict, said.effects),
     }
 
 

@@ -1,18 +1,15 @@
-"""Makes the problem of a run: its logs, its model, and every effect that might be missing."""
+"""What the problem of a run is made of: every effect that might be missing, splits, and a bed for its tables."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.runs import Run
 from lunar_mjx.diagnosis.tables.problem import TableProblem, default_units, points
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import UserError, bad_input
-from lunar_mjx.inference.fitting import Progress, silent
-from lunar_mjx.inference.problem import Problem
 from lunar_mjx.logs import Log, SteadyLog
 from lunar_mjx.wheel_bed.bed import EARTH_GRAVITY, WheelBed
 
@@ -69,40 +66,19 @@ def require_splits(splits: Mapping[str, str], logs: Sequence[Any]) -> None:
             )
 
 
-def build_problem(
-    run: Run, logs: Sequence[Any] | None = None, only: Sequence[str] | None = None, progress: Progress = silent
-) -> Problem:
-    """The problem of a run.
-
-    Args:
-      run: logs and model.
-      logs: the run's logs, if they are read already.
-      only: candidates to include; all if None.
-      progress: told of simulations.
+def candidates_of(run: Run, only: Sequence[str] | None = None) -> dict[str, Effect]:
+    """Candidates of a run's drives by name: those asked for, else all that drives could show.
 
     Raises:
-      UserError: a candidate that does not exist, or logs that do not fit the model.
+      UserError: a candidate that does not exist.
     """
-    logs = run.campaign() if logs is None else logs
-    candidates = candidate_effects(run)
-    if only is not None:
-        for name in only:
-            if name not in candidates:
-                raise UserError(f"effect {name!r} is no candidate here; use one of {', '.join(candidates)}.")
-        candidates = {n: candidates[n] for n in only}
-    finer = isinstance(logs[0], SteadyLog) and "stress_integral" in run.model.effect_names
-    if only is None and not finer:
-        candidates = {n: e for n, e in candidates.items() if n not in FINER_FORMS}
-    if isinstance(logs[0], SteadyLog):
-        return table_problem(run, logs, candidates)
-    return DriveProblem(
-        logs,  # type: ignore[arg-type]
-        run.model,
-        candidates,
-        run.splits,
-        progress=progress,
-        discrepancy=run.discrepancy,
-    )
+    known = candidate_effects(run)
+    if only is None:
+        return {n: e for n, e in known.items() if n not in FINER_FORMS}
+    for name in only:
+        if name not in known:
+            raise UserError(f"effect {name!r} is no candidate here; use one of {', '.join(known)}.")
+    return {n: known[n] for n in only}
 
 
 def table_problem(run: Run, logs: Sequence[SteadyLog], candidates: Mapping[str, Effect]) -> TableProblem:

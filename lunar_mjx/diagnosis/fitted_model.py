@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
+import numpy as np
+
+from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.model import Model
 
-if TYPE_CHECKING:
-    from lunar_mjx.inference.fitting import Fit
-    from lunar_mjx.inference.problem import Problem
 
+def fitted_model(
+    coordinates: Sequence[Coordinate],
+    u: np.ndarray,
+    moved: Iterable[int],
+    model: Model,
+    held: Mapping[str, float] | None = None,
+) -> Model:
+    """A model with the fitted values of everything that moved.
 
-def fitted_model(problem: Problem, fitted: Fit, model: Model, held: Mapping[str, float] | None = None) -> Model:
-    """A model with the fitted values of everything that moved."""
-    for i in fitted.free:
-        c = problem.coordinates[i]
+    Args:
+      coordinates: of the fit. u: (coordinates,) where it stands. moved: places of those that moved.
+      model: with all effects. held: parameters that stay as they are in the model.
+    """
+    for i in moved:
+        c = coordinates[i]
         if c.nuisance or c.effect not in model.effect_names or c.name in (held or {}):
             continue
-        value = float(c.value(fitted.u[i]))
+        value = float(c.value(u[i]))
         old = model.parameters[c.effect][c.name]
         if c.factor:
             new: Any = tuple(v * value for v in old) if isinstance(old, tuple) else float(old) * value

@@ -14,18 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis.build_problem import build_problem, candidate_effects
+from lunar_mjx.diagnosis.build_problem import candidate_effects
+from lunar_mjx.diagnosis.drives.form import DriveForm
+from lunar_mjx.diagnosis.drives.loop import build_drives
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.planned import planned_drives
-from lunar_mjx.diagnosis.refit import Settings
-from lunar_mjx.diagnosis.runs import FITS_FILE, VERDICT_FILE, Run, load_run
-from lunar_mjx.diagnosis.search import fit_baseline
+from lunar_mjx.diagnosis.runs import HYPOTHESES_FILE, VERDICT_FILE, Run, load_run
 from lunar_mjx.diagnosis.tables.sweeps import rank_sweeps
+from lunar_mjx.diagnosis.weighed.answer import kept_start
 from lunar_mjx.errors import UserError
-from lunar_mjx.inference.fit_store import Memory
 from lunar_mjx.inference.fitting import Progress, silent
-from lunar_mjx.inference.problem import Problem
-from lunar_mjx.inference.score import SEPARABLE
 from lunar_mjx.logs import SteadyLog
 
 NEXT_FILE = "next.json"
@@ -34,6 +32,8 @@ SECONDS = 30.0
 """Longest planned drive by default, s."""
 _MOST = 4
 """Hypotheses at most."""
+SEPARABLE = 5.0
+"""sigma; difference of two hypotheses from which a measurement tells them apart."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,15 +101,17 @@ def next_experiment(
         found = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
         run.save(NEXT_FILE, found.to_dict())
         return found
-    problem = build_problem(run, logs, effects, progress)
-    usable = [n for n in names if n == NOTHING or n in problem.candidates]
+    form = build_drives(run, logs, effects, progress).own  # type: ignore[arg-type]
+    assert isinstance(form, DriveForm)
+    usable = [n for n in names if n == NOTHING or n in form.candidates]
     if len(usable) < 2:
         raise UserError(f"{run.folder}: no two hypotheses are left to tell apart; name effects with --between.")
-    problem.progress = silent  # type: ignore[attr-defined]
+    form.drives.progress = silent
     progress("what the logs say so far", 0.0)
-    known = _Knowledge(problem, run, usable)
+    known = _Knowledge(form, run, usable)
     plans = planned_drives(logs, run.model, seconds)  # type: ignore[arg-type]
-    new = DriveProblem([p[2] for p in plans], run.model, problem.effects, progress=progress)  # type: ignore[arg-type]
+    effects_by_name = {n: form.drives.effects[n] for n in usable if n != NOTHING}
+    new = DriveProblem([p[2] for p in plans], run.model, effects_by_name, progress=progress)  # type: ignore[arg-type]
     ranked = _rank(new, known, usable, [(name, text) for name, text, _ in plans])
     found = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
     run.save(NEXT_FILE, found.to_dict())
@@ -144,35 +146,37 @@ class _Knowledge:
       place: coordinate by key, for each hypothesis. precision: inverse covariance of the shared coordinates `keys`.
     """
 
-    def __init__(self, problem: Problem, run: Run, names: Sequence[str]):
-        memory = Memory(run.load(FITS_FILE))
-        base = fit_baseline(problem, Settings(seed=run.seed), memory)
+    def __init__(self, form: DriveForm, run: Run, names: Sequence[str]):
+        base = kept_start(run, form, frozenset())
+        base = form.refit(frozenset(), None, None).u if base is None else base
+        kept = run.load(HYPOTHESES_FILE) or {}
         self.place: dict[str, dict[str, float]] = {}
         for name in names:
-            entry = memory.entries.get("" if name == NOTHING else name)
-            u = base.u.copy()
+            entry = kept.get(form.name if name == NOTHING else f"{form.name} + {name}")
+            u = base.copy()
             if entry is not None:
-                for i, c in enumerate(problem.coordinates):
+                for i, c in enumerate(form.coordinates):
                     u[i] = entry["u"].get(c.key, u[i])
             elif name != NOTHING:
-                places = problem.candidates[name]
-                low, high = problem.bounds(places)
-                amplitude = np.array([problem.coordinates[i].amplitude for i in places])
+                places = form.candidates[name]
+                low, high = form.drives.bounds(places)
+                amplitude = np.array([form.coordinates[i].amplitude for i in places])
                 u[places] = np.where(amplitude, np.where(high >= 1.0, 1.0, np.maximum(low, -1.0)), u[places])
-            self.place[name] = {c.key: float(v) for c, v in zip(problem.coordinates, u, strict=True)}
-        free = problem.free([n for n in names if n != NOTHING])
-        jacobian = problem.observations.whiten(problem.jacobian(base.u, free))
-        jacobian = np.where(np.isfinite(jacobian), jacobian, 0.0)[problem.observations.in_split("fit", "select")]
-        _, scale = problem.prior_rows(base.u, free)
+            self.place[name] = {c.key: float(v) for c, v in zip(form.coordinates, u, strict=True)}
+        free = form.drives.free([n for n in names if n != NOTHING])
+        jacobian = form.observations.whiten(form.jacobian(base, free)[1])[form.observations.in_split("fit", "select")]
+        scale = np.array([1.0 / form.coordinates[i].prior for i in free])
         hessian = jacobian.T @ jacobian + np.diag(scale**2)
-        own = np.array([problem.coordinates[i].nuisance for i in free])
-        self.keys = [problem.coordinates[i].key for i, mine in zip(free, own, strict=True) if not mine]
+        own = np.array([form.coordinates[i].nuisance for i in free])
+        self.keys = [form.coordinates[i].key for i, mine in zip(free, own, strict=True) if not mine]
         across = hessian[np.ix_(~own, own)]
         inner = np.linalg.pinv(hessian[np.ix_(own, own)], hermitian=True)
         self.precision = hessian[np.ix_(~own, ~own)] - across @ inner @ across.T
 
 
-def _rank(problem: Problem, known: _Knowledge, names: Sequence[str], plans: Sequence[tuple[str, str]]) -> list[Plan]:
+def _rank(
+    problem: DriveProblem, known: _Knowledge, names: Sequence[str], plans: Sequence[tuple[str, str]]
+) -> list[Plan]:
     keys = {c.key: i for i, c in enumerate(problem.coordinates)}
     rows = np.repeat(problem.origin()[None], len(names), axis=0)
     for row, name in zip(rows, names, strict=True):
@@ -184,7 +188,7 @@ def _rank(problem: Problem, known: _Knowledge, names: Sequence[str], plans: Sequ
     free = problem.free(effects)
     base = problem.origin()
     base[problem.baseline] = np.mean(rows[:, problem.baseline], axis=0)
-    jacobian = problem.observations.whiten(problem.jacobian(base, free))
+    jacobian = problem.observations.whiten(problem.jacobian(base, free)[1])
     found = []
     for number, (name, text) in enumerate(plans):
         keep = problem.observations.unit == -1
@@ -204,7 +208,7 @@ def _rank(problem: Problem, known: _Knowledge, names: Sequence[str], plans: Sequ
 
 
 def _left(
-    problem: Problem,
+    problem: DriveProblem,
     known: _Knowledge,
     difference: np.ndarray,
     jacobian: np.ndarray,

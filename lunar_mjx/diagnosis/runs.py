@@ -24,7 +24,7 @@ from lunar_mjx.model.file import load_model, save_model
 from lunar_mjx.trust import require_trust
 
 FORMAT = "lunar-mjx-run/1"
-RUN_FILE, MODEL_FILE, FITS_FILE = "run.json", "model.toml", "fits.json"
+RUN_FILE, MODEL_FILE = "run.json", "model.toml"
 COMPARISON_FILE, VERDICT_FILE, SERIES_FILE = "comparison.json", "verdict.json", "series.npz"
 SIGNATURES_FILE, HYPOTHESES_FILE = "signatures.npz", "hypotheses.json"
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lunar_mjx.inference.fitting import Fit, fit
+from lunar_mjx.inference.fitting import Fit
 from lunar_mjx.inference.problem import Problem
 from lunar_mjx.inference.score import blocks
 
@@ -100,22 +100,6 @@ def predictive_gain(
     per = np.bincount(block[inside], weights=(change * new)[inside])
     noise = max(float(np.sum(per**2)), float(np.sum(change**2)))
     return float(difference.sum()), float(np.sqrt(noise))
-
-
-def gain_in_turn(problem: Problem, before: Fit, after: Fit) -> tuple[float, float]:
-    """As `gain`, with both models fitted to the selecting manoeuvres, too, and each manoeuvre left out in turn.
-
-    More manoeuvres judge, and each of them a model that has seen all others: a small effect that the few `select` ones
-    show too weakly earns its place here or not at all. Two more fits, so only where fits are cheap.
-
-    Returns:
-      Gain and standard error; minus infinity where there are too few manoeuvres for it.
-    """
-    kept = problem.observations.in_split("fit", "select")
-    if len(np.unique(problem.observations.unit[kept])) <= ENOUGH:
-        return -np.inf, np.inf
-    old, new = (fit(problem, f.free, f.u, starts=1, splits=("fit", "select"), certify=False) for f in (before, after))
-    return gain(problem, old, new)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,41 +5,27 @@ Source of the bent steps: geodesic acceleration (Transtrum & Sethna 2012).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from lunar_mjx.inference.problem import Problem
 
 _PROBE = 0.1
-_NEAR = np.array([0.003, 0.01, 0.03])
 _ROOM = 1e-12
 """Width that the solver needs between bounds."""
-
-
-def whitened_residuals(problem: Problem, u: np.ndarray) -> np.ndarray:
-    """(k, n) measured less predicted, whitened, at (k, coordinates); not finite where a prediction is not."""
-    difference = problem.observations.value[None] - problem.predict(u)
-    return problem.observations.whiten(difference.T).T
 
 
 class Objective:
     """Chi-square of the fitted observations with the priors, and its quadratic model, over the free coordinates."""
 
-    def __init__(self, problem: Problem, free: np.ndarray, fitted: np.ndarray, eager: bool = False):
+    def __init__(self, problem: Problem, free: np.ndarray, fitted: np.ndarray):
         self.problem, self.free, self.fitted = problem, free, fitted
-        self._eager = eager
         self.low, self.high = problem.bounds(free)
-
-    @property
-    def eager(self) -> bool:
-        """Whether Jacobians are taken with the residuals; a problem may come to afford that meanwhile."""
-        return self._eager or self.problem.eager
 
     def residuals(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whitened residuals (k, n), and chi-square (k,), infinite where a prediction is not finite."""
-        r = whitened_residuals(self.problem, u)
+        observations = self.problem.observations
+        r = observations.whiten((observations.value[None] - self.problem.predict(u)).T).T
         return r, self.chi2(u, r)
 
     def chi2(self, u: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -50,20 +36,8 @@ class Objective:
         return np.where(np.isfinite(chi2), chi2, np.inf)
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
-        return self._whitened(self.problem.jacobian(u, self.free))
-
-    def wide_jacobian(self, u: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """The same for intervals, over steps of about the standard errors (free,); not finite where a step fails."""
-        return self.problem.observations.whiten(self.problem.wide_jacobian(u, self.free, std))
-
-    def without_jumps(self, *jacobians: np.ndarray) -> np.ndarray:
-        """(n, free) of Jacobians over different steps, of every finite column the one that tells least.
-
-        A jump within a step adds to a derivative what looks like knowledge, and seldom takes any away.
-        """
-        told = np.array([np.sum(j[self.fitted] ** 2, axis=0) for j in jacobians])
-        least = np.argmin(np.where(np.isfinite(told), told, np.inf), axis=0)
-        j = np.take_along_axis(np.stack(jacobians), least[None, None], axis=0)[0]
+        """(n, free) whitened derivatives of the predictions; zero where they are not finite."""
+        j = self.problem.observations.whiten(self.problem.jacobian(u, self.free))
         return np.where(np.isfinite(j), j, 0.0)
 
     def covariance(self, u: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -71,25 +45,6 @@ class Objective:
         j = j[self.fitted]
         _, scale = self.problem.prior_rows(u, self.free)
         return np.linalg.pinv(j.T @ j + np.diag(scale**2), hermitian=True)
-
-    def standard_errors(self, u: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """(free,) square roots of its diagonal."""
-        return np.sqrt(np.maximum(np.diag(self.covariance(u, j)), 0.0))
-
-    def _whitened(self, jacobian: np.ndarray) -> np.ndarray:
-        j = self.problem.observations.whiten(jacobian)
-        return np.where(np.isfinite(j), j, 0.0)
-
-    def linearise(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, Callable[[int], np.ndarray]]:
-        """Whitened residuals (k, n), chi-square (k,), and Jacobians (n, free) by number, simulated in one batch."""
-        observations = self.problem.observations
-        predicted, jacobian = self.problem.linearise(u, self.free)
-        r = observations.whiten((observations.value[None] - predicted).T).T
-
-        def whitened(k: int) -> np.ndarray:
-            return self._whitened(jacobian(k))
-
-        return r, self.chi2(u, r), whitened
 
     def quadratic(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half the downhill gradient and the Gauss-Newton Hessian."""
@@ -138,27 +93,6 @@ class Objective:
         out = np.repeat(u[None], len(trials), axis=0)
         out[:, self.free] += _PROBE * (trials - u)[:, self.free]
         return out
-
-    def roughness(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> float:
-        """Scatter of chi-square about its quadratic model over the first hundredths of a Gauss-Newton step.
-
-        A smooth function agrees with its model there, however its valley bends further on. A simulation with contacts
-        that open and close jumps; below these jumps there is nothing to be found.
-        """
-        downhill, hessian = self.quadratic(u, r, j)
-        rows, step = self._near(u, downhill, hessian)
-        _, chi2 = self.residuals(rows)
-        along = step[self.free]
-        model = -2.0 * _NEAR * float(downhill @ along) + _NEAR**2 * float(along @ hessian @ along)
-        return float(np.max(np.abs(chi2[1:] - chi2[0] - model)))
-
-    def foresee_roughness(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> None:
-        """`roughness` will be asked for."""
-        self.problem.foresee(self._near(u, *self.quadratic(u, r, j))[0])
-
-    def _near(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        step = self.steps(u, downhill, hessian, np.array([1e-8]))[0] - u
-        return u + np.concatenate([[0.0], _NEAR])[:, None] * step, step
 
     def promise(self, u: np.ndarray, downhill: np.ndarray, hessian: np.ndarray) -> float:
         """Drop of chi-square that a full Gauss-Newton step within the bounds promises."""

@@ -131,6 +131,26 @@ class Observations:
             _innovations(group, flat, out)
         return out.reshape(columns.shape)
 
+    def log_widths(self) -> np.ndarray:
+        """(n,) log of what `whiten` divides every innovation by, in the channels' units.
+
+        Their sum is half the log determinant of the noise's covariance.
+        """
+        out = np.empty(len(self))
+        for s in self.series:
+            white = np.broadcast_to(np.square(s.white), s.stop - s.start)
+            if s.time is None or s.coloured <= 0.0 or s.correlation_time <= 0.0:
+                out[s.start : s.stop] = 0.5 * np.log(white + s.coloured**2)
+                continue
+            keep = np.exp(-np.diff(np.asarray(s.time)) / s.correlation_time) ** 2
+            variance = s.coloured**2
+            for i, own in enumerate(white):
+                if i:
+                    variance = keep[i - 1] * variance + s.coloured**2 * (1.0 - keep[i - 1])
+                out[s.start + i] = 0.5 * np.log(variance + own)
+                variance *= own / (variance + own)
+        return out
+
 
 def _innovations(group: Sequence[Series], flat: np.ndarray, out: np.ndarray) -> None:
     """Kalman filter of a white noise plus an Ornstein-Uhlenbeck process, for series that share their times."""

@@ -1,4 +1,4 @@
-"""Run folders that were damaged: one sentence, and fits are dropped rather than in the way."""
+"""Run folders that were damaged: one sentence."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ def test_a_torn_archive_is_refused(tmp_path):
         _traces(path)
 
 
-def test_damaged_fits_are_dropped_and_told(tmp_path, capfd):
-    path = tmp_path / "fits.json"
-    for text in ("{", "[]", '{"soil": {"u": {"soil.n": "x"}}}', '{"at a": {"soil.n": null}}', '{"soil": 3}', "\x00"):
+def test_damaged_refits_are_refused(tmp_path):
+    path = tmp_path / "hypotheses.json"
+    for text in ("{", "[]", '{"the model": {"u": {"soil.n": "x"}}}', '{"the model": 3}', "\x00"):
         path.write_text(text)
-        assert read_stored(path) is None
-        assert "fits.json: is damaged" in capfd.readouterr().err
+        with pytest.raises(UserError, match=r"hypotheses\.json: is damaged"):
+            read_stored(path)

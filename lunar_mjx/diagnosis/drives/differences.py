@@ -13,25 +13,17 @@ from lunar_mjx.inference.observations import Observations
 STEP = 1e-7
 """Difference quotient's step in scales. Predictions jump by hundredths of a sigma where a wheel at rest changes the
 sign of its slip; a step this short rarely meets a jump, and rounding spoils only the faintest derivatives."""
-WIDE = 1e-2, 1e-1
-"""Least and most of the same for intervals, where it is the standard error itself. A descent slides to the very edge
-of a jump, where derivatives over one step are steep and over another are not, and coordinates that nearly stand for
-each other are told apart by small differences of them. A delay of 63.2 ms (61 hidden) was +- 0.25 ms by steps of 0.001
-where it ended, elsewhere +- 0.71; by steps of 0.01, 0.03, and 0.1 +- 0.93 to 0.96, as chi-square near it says, too. A
-slip-sinkage of 1.207 (1.165 hidden) is +- 0.018 by the short step and +- 0.010, 0.008, 0.004 by these."""
 
 
 class Differences:
     """Which rows a Jacobian takes: nuisances of different logs are perturbed together, since a log feels only its own.
 
     Args:
-      coordinates: of the problem. which: (m,) places of those that the Jacobian is of. step: of the quotients, scales,
-        one for all or (m,).
+      coordinates: of the problem. which: (m,) places of those that the Jacobian is of.
     """
 
-    def __init__(self, coordinates: Sequence[Coordinate], which: np.ndarray, step: float | np.ndarray = STEP):
+    def __init__(self, coordinates: Sequence[Coordinate], which: np.ndarray):
         self._coordinates, self._which = coordinates, which
-        self._size = {int(i): float(s) for i, s in zip(which, np.broadcast_to(step, len(which)), strict=True)}
         self._own = [int(i) for i in which if coordinates[i].log_index >= 0 and not is_linear(coordinates[i])]
         self._shared = [int(i) for i in which if coordinates[i].log_index < 0 and not is_linear(coordinates[i])]
         self._kinds = sorted({coordinates[i].name for i in self._own})
@@ -47,7 +39,7 @@ class Differences:
         return rows
 
     def _step(self, u: np.ndarray, i: int) -> float:
-        return self._size[i] if u[i] + self._size[i] <= self._coordinates[i].bounds()[1] else -self._size[i]
+        return STEP if u[i] + STEP <= self._coordinates[i].bounds()[1] else -STEP
 
     def jacobian(
         self,

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.instruments import is_instrument
-from lunar_mjx.diagnosis.drives.log_run import SETTLE, STOOD
+from lunar_mjx.diagnosis.drives.simulation.log_run import SETTLE, STOOD
 from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
 from lunar_mjx.inference.observations import Observations, Series
 
 if TYPE_CHECKING:
-    from lunar_mjx.diagnosis.drives.rollouts import LogRun
+    from lunar_mjx.diagnosis.drives.simulation.rollouts import LogRun
 
 STEP_ERROR = "step_error"
 """Name of the nuisance by which logs differ from what steps of finite length predict."""
@@ -121,14 +121,6 @@ def direction(c: Coordinate, observations: Observations, step_error: np.ndarray)
             elif c.name == s.channel:
                 out[part] = 1.0
     return out
-
-
-def unabsorbed(change: np.ndarray, step_error: np.ndarray, observations: Observations) -> np.ndarray:
-    """(n,) what of a change of the predictions some amount of the step's error does not take up, by the fitted logs."""
-    keep = observations.in_split("fit")
-    step, moved = (observations.whiten(v)[keep] for v in (step_error, change))
-    size = float(step @ step)
-    return change - (float(step @ moved) / size if size > 0.0 else 0.0) * step_error
 
 
 def from_first(predicted: np.ndarray, observations: Observations) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.noise import Noises
-from lunar_mjx.diagnosis.drives.rollouts import Bench
+from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench
 from lunar_mjx.diagnosis.drives.slip_samples import defined
 from lunar_mjx.errors import bad_input
 from lunar_mjx.inference.observations import Observations, Series

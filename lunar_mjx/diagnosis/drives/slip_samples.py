@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
-from lunar_mjx.diagnosis.drives.rollouts import LogRun
+from lunar_mjx.diagnosis.drives.simulation.rollouts import LogRun
 
 if TYPE_CHECKING:
     from lunar_mjx.logs import Log

@@ -6,7 +6,6 @@ Fits are a cache: they are dropped where they are damaged, saying so, and made a
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -66,29 +65,21 @@ class _Verdict(_Stored):
     details: dict[str, Any] = {}
 
 
-class _Fit(_Stored):
+class _Refit(_Stored):
     u: dict[str, Number]
-    chi2: Number | None
-    gradient: Number | None
-    starts: list[Any]
-    at_bound: list[str]
-    extra: dict[str, Any]
-    problems: list[str]
-    wide: dict[str, Number] | None = None
 
 
 _SCHEMAS: dict[str, TypeAdapter[Any]] = {
     "run.json": TypeAdapter(_Run),
     "comparison.json": TypeAdapter(_Comparison),
     "verdict.json": TypeAdapter(_Verdict),
+    "hypotheses.json": TypeAdapter(dict[str, _Refit]),
 }
 _ANY: TypeAdapter[Any] = TypeAdapter(dict[str, Any])
-_FIT, _PLACE = TypeAdapter(_Fit), TypeAdapter(dict[str, Number])
-FITS = "fits.json"
 
 
 def read_stored(path: Path) -> dict[str, Any] | None:
-    """Contents of a JSON file of a run folder; None if it is not there, or is a store of fits that cannot be used.
+    """Contents of a JSON file of a run folder; None if it is not there.
 
     Raises:
       UserError: it is no JSON, or a field is missing or of another kind.
@@ -97,22 +88,15 @@ def read_stored(path: Path) -> dict[str, Any] | None:
         return None
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        if path.name == FITS:
-            for name, entry in _ANY.validate_python(content).items():
-                (_PLACE if name.startswith("at ") else _FIT).validate_python(entry)
-        else:
-            _SCHEMAS.get(path.name, _ANY).validate_python(content)
+        _SCHEMAS.get(path.name, _ANY).validate_python(content)
     except (ValueError, RecursionError) as error:  # ValidationError, JSONDecodeError and UnicodeDecodeError are such
-        if path.name == FITS:
-            print(f"{path}: is damaged ({_told(error)}); its fits are made anew", file=sys.stderr)
-            return None
         raise UserError(
             f"{path}: is damaged ({_told(error)}); make it anew with lunar-mjx {_MAKERS.get(path.name, 'compare')}."
         ) from None
     return content
 
 
-_MAKERS = {"verdict.json": "why", "audit.json": "why --audit", "next.json": "next"}
+_MAKERS = {"verdict.json": "why", "hypotheses.json": "compare", "audit.json": "why --audit", "next.json": "next"}
 
 
 def _told(error: Exception) -> str:

@@ -5,30 +5,29 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis.build_problem import build_problem
-from lunar_mjx.diagnosis.drives.problem import DriveProblem
-from lunar_mjx.diagnosis.formulas.search import PENALTY, Trial, search_formulas
+from lunar_mjx.diagnosis.build_problem import table_problem
+from lunar_mjx.diagnosis.drives.loop import build_drives
+from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.diagnosis.formulas.search import PENALTY, Settings, Trial, search_formulas
 from lunar_mjx.diagnosis.formulas.slots import WHEEL_PORTS, Slots
 from lunar_mjx.diagnosis.formulas.targets import CONSTANTS
 from lunar_mjx.diagnosis.formulas.terms import SUGGESTED, Term, effect_of, terms, with_amount
-from lunar_mjx.diagnosis.refit import Settings, refit_with
 from lunar_mjx.diagnosis.runs import VERDICT_FILE, Run, load_run
-from lunar_mjx.diagnosis.search import fit_baseline
-from lunar_mjx.diagnosis.tables.problem import TableProblem
+from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.effects.base import PORTS
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.files import write_text
-from lunar_mjx.inference.fit_store import Memory
-from lunar_mjx.inference.fitting import Fit, Progress, silent
-from lunar_mjx.inference.held_out import errors, gain, noise_test
-from lunar_mjx.inference.problem import Problem
-from lunar_mjx.inference.score import score, signatures
+from lunar_mjx.inference.evidence import EvidenceError
+from lunar_mjx.inference.fitting import Fit, Progress, fit, silent
+from lunar_mjx.inference.held_out import errors
+from lunar_mjx.logs import Log, SteadyLog
 
 UNKNOWN_FILE = "unknown.json"
 REFITS = 5
@@ -111,7 +110,6 @@ class Discovery:
     Attributes:
       port: where the most evidence is, or that was asked for. suggestions: refitted ones.
       scored: formulas with their score's chi-square, highest first (tables: the first hundred).
-      ceiling: chi-square that any smooth input at the port explains; None where `why` has not been asked.
       files: effect files of the best suggestion, one for each of its parts; none where nothing pays on manoeuvres left
         out. error_before: root mean square residual in sigma by split. number: formulas scored.
     """
@@ -119,7 +117,6 @@ class Discovery:
     port: str
     suggestions: tuple[Suggestion, ...]
     scored: tuple[tuple[str, float], ...]
-    ceiling: float | None
     files: tuple[str, ...]
     error_before: dict[str, float]
     number: int = 0
@@ -137,8 +134,6 @@ class Discovery:
                 f"     chi2 -{s.chi2:.0f}, held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
                 + (", at the noise" if s.at_noise else "")
             )
-        if self.ceiling is not None:
-            lines.append(f"  any smooth input at this port explains chi2 of at most about {self.ceiling:.0f}")
         if self.files:
             runs = ["RUN", *(f"run{k + 2}" for k in range(len(self.files)))]
             then = ", then ".join(
@@ -151,11 +146,7 @@ class Discovery:
 
 
 def discover(
-    folder: str | Path | Run,
-    port: str | None = None,
-    out: str | Path | None = None,
-    settings: Settings | None = None,
-    progress: Progress = silent,
+    folder: str | Path | Run, port: str | None = None, out: str | Path | None = None, progress: Progress = silent
 ) -> Discovery:
     """Suggests formulas for what is missing at a port, and writes the best as an effect file.
 
@@ -163,42 +154,37 @@ def discover(
       folder: of the run. port: where to look; if None, where `why` found the most evidence, and for tables at every
         port of the wheel, because one signal may enter a bed at several.
       out: effect file to write; `suggested_<port>.py` in the run's folder if None.
-      settings: thresholds. progress: told what is being done.
+      progress: told what is being done.
 
     Raises:
       UserError: no such port, or `why` has not been asked and no port is given.
     """
     run = folder if isinstance(folder, Run) else load_run(folder)
-    settings = settings or Settings(seed=run.seed)
     verdict = run.load(VERDICT_FILE) or {}
-    place = (verdict.get("details") or {}).get("localise") or {}
-    asked, port = port, port or verdict.get("port") or place.get("port")
+    asked, port = port, port or verdict.get("port")
     if port is None:
         raise UserError(f"{run.folder}: no port shows anything unknown; run lunar-mjx why first, or give --port.")
     if port not in PORTS:
         raise bad_input("unknown", "port", port, "does not exist", f"use one of {', '.join(PORTS)}")
     if out is not None and Path(out).exists() and not Path(out).read_text(encoding="utf-8").startswith(SUGGESTED):
         raise bad_input("unknown", "--out", str(out), "exists, and is none of these suggestions", "name another file")
-    plain = build_problem(run, run.campaign(), [], progress)
-    if isinstance(plain, TableProblem) and (asked is None or asked in WHEEL_PORTS):
-        problem, base, found, scored, number = _in_tables(plain, [asked] if asked else WHEEL_PORTS, settings, progress)
+    logs = run.campaign()
+    if isinstance(logs[0], SteadyLog):
+        if asked is not None and asked not in WHEEL_PORTS:
+            raise bad_input("unknown", "port", asked, "is none of a wheel bed", f"use one of {', '.join(WHEEL_PORTS)}")
+        before, found, scored, number = _in_tables(run, logs, [asked] if asked else WHEEL_PORTS, progress)
     else:
-        problem, library = with_terms(plain, terms(port, sensor_kinds(plain)), progress)
-        base = fit_baseline(problem, settings, Memory(), progress)
-        found, scored = suggest(problem, base, library, settings, progress)
+        before, found, scored = _in_drives(run, logs, port, progress)
         number = len(scored)
     files: list[str] = []
-    best = next((row for row in found if row[0].pays(settings.chi2)), None)
+    best = next((row for row in found if row[0].pays(Settings().chi2)), None)
     if best is not None:
         provenance = f"lunar-mjx unknown on {', '.join(p.name for p in run.logs)}"
         for k, (part, term) in enumerate(zip(best[0].parts, best[1], strict=True)):
             values = {c: v for c, (v, _) in part.constants.items()}
             text = functools.partial(with_amount, term, part.amount, provenance=provenance, constants=values)
             files.append(str(_write(run, Path(out) if out else None, part.port, k, text)))
-    ceiling = max((v for k, v in place.get("ceiling", {}).items() if k.partition(":")[0] == port), default=None)
-    result = Discovery(
-        port, tuple(s for s, _ in found), tuple(scored[:LISTED]), ceiling, tuple(files), errors(problem, base), number
-    )
+    result = Discovery(port, tuple(s for s, _ in found), tuple(scored[:LISTED]), tuple(files), before, number)
     run.save(UNKNOWN_FILE, result.to_dict())
     return result
 
@@ -221,15 +207,62 @@ Row = tuple[Suggestion, tuple[Term, ...]]
 
 
 def _in_tables(
-    plain: TableProblem, ports: Sequence[str], settings: Settings, progress: Progress
-) -> tuple[Problem, Fit, list[Row], list[tuple[str, float]], int]:
-    """Problem, its fit, suggestions, the best scores, and how many formulas of a wheel were scored."""
-    empty = Slots(plain)
-    base = fit_baseline(empty.problem, settings, Memory(), progress)
+    run: Run, logs: Sequence[Any], ports: Sequence[str], progress: Progress
+) -> tuple[dict[str, float], list[Row], list[tuple[str, float]], int]:
+    """Errors of the model as it is, suggestions, the best scores, and how many formulas of a wheel were scored."""
+    empty = Slots(table_problem(run, logs, {}))
+    settings = Settings(seed=run.seed)
+    base = fit(empty.problem, empty.problem.free(), starts=settings.starts, seed=settings.seed, progress=progress)
     found = search_formulas(empty, base, ports, settings, progress)
     rows = [_of_trial(t, base) for t in found.trials[:REFITS]]
     scored = [(f"{c.term.target}: {c.term.formula}", chi2) for c, chi2 in found.scored[:LISTED]]
-    return empty.problem, base, rows, scored, len(found.scored)
+    return errors(empty.problem, base), rows, scored, len(found.scored)
+
+
+def _in_drives(
+    run: Run, logs: Sequence[Any], port: str, progress: Progress
+) -> tuple[dict[str, float], list[Row], list[tuple[str, float]]]:
+    """Errors of the model as it is, suggestions, and all formulas at a port with what they take off chi-square.
+
+    Each formula is an effect with one amount: all are scored by their evidence in linear approximation where the model
+    as it is has been refitted, beside usual discrepancy, and the best are refitted.
+    """
+    library = {t.name: t for t in terms(port, sensor_kinds(run, logs))}
+    form = build_drives(run, logs, None, progress, {name: effect_of(t) for name, t in library.items()}).own
+    base = form.refit(frozenset(), None, None)
+    before, nothing, places = base.linear.evidence(frozenset())
+    gains = {
+        name: base.linear.evidence(form.listed(frozenset([name])), (nothing.tau, nothing.noise))[0] - before
+        for name in form.candidates
+    }
+    order = sorted(gains, key=lambda n: -(2.0 * gains[n] - PENALTY * library[n].length))
+    scored = [(f"{library[n].target}: {library[n].formula}", max(2.0 * gains[n], 0.0)) for n in order]
+    found: list[Row] = []
+    for i, name in enumerate(order[:REFITS]):
+        progress("refitting formulas", i / REFITS)
+        try:
+            refit = form.refit(frozenset([name]), base, None)
+        except EvidenceError:
+            continue  # a formula with which the rover cannot drive
+        after, posterior, own = refit.linear.evidence(form.listed(frozenset([name])))
+        t = library[name]
+        at = next(i for i in form.candidates[name] if form.coordinates[i].amplitude)
+        c, k = form.coordinates[at], list(own).index(at)
+        std = c.std(refit.u[at], math.sqrt(float(posterior.covariance[k, k])))
+        part = Part(t.port, t.target, t.formula, t.latex, float(c.value(refit.u[at])), std, t.unit)
+        held = [
+            posterior.log_score(gram.select(own)) - nothing.log_score(base.linear.held_out[n].select(places))
+            for n, gram in refit.linear.held_out.items()
+        ]
+        se = math.sqrt(len(held)) * float(np.std(held, ddof=1)) if len(held) > 1 else 0.0
+        # without manoeuvres left out the evidence itself judges: it is what each measurement predicts of the next
+        gained = (sum(held), se) if held else (after - before, 0.0)
+        residual = form.residual(refit.u)
+        quiet = bool(np.max(posterior.noise) < 1.0 + DriveSettings().stated_spread)
+        suggestion = _suggestion([part], 2.0 * (after - before), gained, answer.errors(form, residual), quiet, t.length)
+        found.append((suggestion, (t,)))
+    found.sort(key=lambda row: -(row[0].chi2 - PENALTY * row[0].length))
+    return answer.errors(form, form.residual(base.u)), found, scored
 
 
 def _of_trial(trial: Trial, base: Fit) -> Row:
@@ -266,51 +299,8 @@ def _of_trial(trial: Trial, base: Fit) -> Row:
     return suggestion, tuple(c.term for _, (c, _) in sorted(trial.slots.held.items()))
 
 
-def suggest(
-    problem: Problem, base: Fit, library: dict[str, Term], settings: Settings, progress: Progress = silent
-) -> tuple[list[Row], list[tuple[str, float]]]:
-    """Scores a library of formulas that are simulated one by one, and refits the best.
-
-    Returns:
-      Suggestions with their terms, best first; and all formulas with the chi-square of their score.
-    """
-    scores = score(problem, base, signatures(problem, base, list(library)), settings.draws, settings.seed)
-    scored = [(f"{library[s.effect].target}: {library[s.effect].formula}", s.chi2) for s in scores]
-    found: list[Row] = []
-    for i, s in enumerate(scores[:REFITS]):
-        progress("refitting formulas", i / REFITS)
-        fitted = refit_with(problem, base, s.effect, settings, Memory())
-        place = next(i for i in problem.candidates[s.effect] if problem.coordinates[i].amplitude)
-        c, k = problem.coordinates[place], list(fitted.free).index(place)
-        std = c.std(fitted.u[place], float(fitted.covariance(problem)[k, k]) ** 0.5)
-        t = library[s.effect]
-        part = Part(t.port, t.target, t.formula, t.latex, float(c.value(fitted.u[place])), std, t.unit)
-        suggestion = _suggestion(
-            [part],
-            base.chi2 - fitted.chi2,
-            gain(problem, base, fitted),
-            errors(problem, fitted),
-            noise_test(problem, fitted).passes,
-            t.length,
-        )
-        found.append((suggestion, (t,)))
-    found.sort(key=lambda row: -(2.0 * row[0].held_out_gain - PENALTY * row[0].length))
-    return found, scored
-
-
-def with_terms(plain: Problem, library: Sequence[Term], progress: Progress) -> tuple[Problem, dict[str, Term]]:
-    """The problem with formulas as candidates, and the formulas by the names of their effects."""
-    effects = {t.name: effect_of(t) for t in library}
-    if isinstance(plain, TableProblem):
-        problem: Problem = TableProblem(plain.logs, plain.bed, effects, plain.splits, extra_sigma=plain.extra_sigma)
-    else:
-        assert isinstance(plain, DriveProblem)
-        problem = plain.with_effects(effects, progress)
-    return problem, {t.name: t for t in library if t.name in problem.candidates}
-
-
-def sensor_kinds(problem: Problem) -> list[str]:
+def sensor_kinds(run: Run, logs: Sequence[Log]) -> list[str]:
     """Kinds of measured channels: their names without corners."""
     corners = ("lf", "rf", "lm", "rm", "lr", "rr")
-    kinds = ["_".join(w for w in s.channel.split("_") if w not in corners) for s in problem.observations.series]
-    return list(dict.fromkeys(kinds))
+    names = [c for log in logs for c in log.channel_names if not c.startswith("command_")]
+    return list(dict.fromkeys("_".join(w for w in c.split("_") if w not in corners) for c in names))

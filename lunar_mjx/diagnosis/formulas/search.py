@@ -14,7 +14,6 @@ import numpy as np
 from lunar_mjx.diagnosis.formulas import expression as f
 from lunar_mjx.diagnosis.formulas.slots import Choice, Slots, features, library, targets
 from lunar_mjx.diagnosis.formulas.targets import known
-from lunar_mjx.diagnosis.refit import Settings
 from lunar_mjx.inference.descent import descend
 from lunar_mjx.inference.fitting import Fit, Progress, fit, silent
 from lunar_mjx.inference.held_out import ENOUGH, noise_test, predictive_gain, predictive_residual
@@ -35,6 +34,20 @@ _SAME = 1.0
 """Squared difference of two fits' predictions, in sigma, below which they are one."""
 _FAR = 30.0
 """Amounts beyond so many visible ones are no linear estimate."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How formulas are sought.
+
+    Attributes:
+      chi2: least drop of chi-square of a formula that is refitted. starts: of the fit of the model as it is. seed: of
+        these starts.
+    """
+
+    chi2: float = 25.0
+    starts: int = 4
+    seed: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -250,7 +263,7 @@ class _Search:
         down = descend(goal, start, iterations=_STEPS)
         if not np.isfinite(down.chi2):
             return None
-        found = Fit(down.u, slots.free, down.chi2, down.residual, down.jacobian, self.base.fitted, down.promise)
+        found = Fit(down.u, slots.free, down.chi2, down.residual, down.jacobian, self.base.fitted)
         return self._judged(choices, slots, found)
 
     def _judged(self, choices: tuple[Choice, ...], slots: Slots, found: Fit) -> Trial:
@@ -281,7 +294,7 @@ class _Search:
         ordered = sorted(trials, key=lambda t: -t.merit)
         done = []
         for t in ordered[:_FINISHED]:
-            found = fit(t.slots.problem, t.slots.free, t.fit.u, starts=1, certify=False)
+            found = fit(t.slots.problem, t.slots.free, t.fit.u, starts=1)
             done.append(self._judged(t.choices, t.slots, found) if found.chi2 <= t.fit.chi2 else t)
         return done + ordered[_FINISHED:]
 

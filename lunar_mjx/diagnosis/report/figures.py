@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from lunar_mjx.diagnosis.report.steps import Ceiling, Error, Step
+from lunar_mjx.diagnosis.report.steps import Error, Step
 from lunar_mjx.diagnosis.report.words import plot_text, port_label, shown
 from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, VERMILION, faded, finish
 
@@ -16,7 +16,7 @@ SHADES = ((0.0, "#f7fbff"), (0.25, "#c6dbef"), (0.5, "#6baed6"), (0.75, "#2171b5
 
 
 def waterfall(
-    steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[Error | None], measure: str, top: Ceiling | None
+    steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[Error | None], measure: str
 ) -> go.Figure:
     """The error of each model of the chain, a row each from the first to the last, with its interval."""
     names = [f"{i}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for i, s in enumerate(steps, 1)]
@@ -58,9 +58,11 @@ def waterfall(
             xanchor="left",
             font={"size": 14},
         )
-    _level(figure, names, 1.0, "noise floor, 1 sigma", "solid")
-    if top is not None:
-        _level(figure, names, top.value, plot_text(f"ceiling, {shown(top.value)} sigma: {top.label}"), "dash")
+    floor = {"color": MUTED, "dash": "solid", "width": 2}
+    name = "noise floor, 1 sigma"
+    ends = [names[0], names[-1]]
+    figure.add_scatter(x=[1.0, 1.0], y=ends, mode="lines", name=name, hoverinfo="skip", line=floor)
+    figure.add_vline(x=1.0, line=floor)
     finish(figure, 150 + 42 * len(names), margin={"t": 74, "b": 52, "l": 24, "r": 96})
     figure.update_yaxes(type="category", autorange="reversed", automargin=True, showgrid=False)
     figure.update_xaxes(
@@ -78,19 +80,6 @@ def _interval(errors: Sequence[Error]) -> dict:
     up = [e.high - e.value if np.isfinite(e.high) else 0.0 for e in errors]
     down = [e.value - e.low if np.isfinite(e.low) else 0.0 for e in errors]
     return {"type": "data", "array": up, "arrayminus": down, "color": INK, "thickness": 1.5, "width": 6}
-
-
-def _level(figure: go.Figure, names: Sequence[str], x: float, name: str, dash: str) -> None:
-    """A line across all rows, with an entry in the legend."""
-    figure.add_scatter(
-        x=[x, x],
-        y=[names[0], names[-1]],
-        mode="lines",
-        name=name,
-        hoverinfo="skip",
-        line={"color": MUTED, "dash": dash, "width": 2},
-    )
-    figure.add_vline(x=x, line={"color": MUTED, "dash": dash, "width": 2})
 
 
 def bars(values: Mapping[str, float | None], title: str, named: str = "") -> go.Figure:

@@ -13,7 +13,6 @@ import numpy as np
 from lunar_mjx.diagnosis.folder.stored import read_arrays, read_stored
 from lunar_mjx.diagnosis.runs import (
     COMPARISON_FILE,
-    FITS_FILE,
     FORMAT,
     MODEL_FILE,
     RUN_FILE,
@@ -73,7 +72,7 @@ class Result:
 
     Attributes:
       name: of the folder. run: contents of `run.json`.
-      comparison, verdict, fits, audit, unknown, next: contents of the other files, None where not written.
+      comparison, verdict, audit, unknown, next: contents of the other files, None where not written.
       traces: measurements and predictions, None where not written.
       signatures: whitened signature of each effect that was scored, over the fitted observations, in sigma.
       folder: where it lies; None for one made in memory.
@@ -83,7 +82,6 @@ class Result:
     run: dict[str, Any]
     comparison: dict[str, Any] | None
     verdict: dict[str, Any] | None
-    fits: dict[str, Any] | None
     audit: dict[str, Any] | None
     unknown: dict[str, Any] | None
     next: dict[str, Any] | None
@@ -113,11 +111,11 @@ def read_result(folder: Path) -> Result:
     run = read_stored(path)
     if run is None or run.get("format") != FORMAT:
         raise bad_input(path, "format", (run or {}).get("format"), "is not known", f"give a run of format {FORMAT}")
-    names = (COMPARISON_FILE, VERDICT_FILE, FITS_FILE, AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE)
-    comparison, verdict, fits, audit, unknown, following = (read_stored(folder / name) for name in names)
+    names = (COMPARISON_FILE, VERDICT_FILE, AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE)
+    comparison, verdict, audit, unknown, following = (read_stored(folder / name) for name in names)
     traces, signatures = _traces(folder / SERIES_FILE), _signatures(folder / SIGNATURES_FILE)
     return Result(
-        folder.resolve().name, run, comparison, verdict, fits, audit, unknown, following, traces, signatures, folder
+        folder.resolve().name, run, comparison, verdict, audit, unknown, following, traces, signatures, folder
     )
 
 

@@ -1,4 +1,4 @@
-"""The chain of models that a report tells of, the error of each with its interval, the noise floor and the ceiling."""
+"""The chain of models that a report tells of, the error of each with its interval and the noise floor."""
 
 from __future__ import annotations
 
@@ -123,24 +123,3 @@ def judged(steps: Sequence[Step]) -> tuple[tuple[str, ...], str]:
     """The splits on which the chain is judged, and what they are: those held out, else those fitted."""
     held = all(s.observations.in_split("select", "test").any() for s in steps)
     return (("select", "test"), "held-out") if held else (("fit",), "fitted")
-
-
-@dataclasses.dataclass(frozen=True)
-class Ceiling:
-    """The least error that any smooth input at one port leaves, in sigma, on fitted and selecting manoeuvres."""
-
-    label: str
-    value: float
-
-
-def ceiling(result: Result) -> Ceiling | None:
-    """From the localisation of a run; None where the residual was at the noise or nobody asked."""
-    place = ((result.verdict or {}).get("details") or {}).get("localise") or {}
-    explained = place.get("ceiling") or {}
-    if not explained or result.traces is None:
-        return None
-    label = max(explained, key=lambda k: explained[k] or 0.0)
-    observations, residual = result.traces.observations, result.traces.residual[-1]
-    keep = observations.in_split("fit", "select") & np.isfinite(residual)
-    left = float(np.sum(residual[keep] ** 2)) - float(explained[label] or 0.0)
-    return Ceiling(label, float(np.sqrt(max(left, 0.0) / max(int(keep.sum()), 1))))

@@ -6,7 +6,7 @@ import html
 import math
 from typing import Any
 
-from lunar_mjx.diagnosis.unknown_inputs.probes import PROBES
+from lunar_mjx.diagnosis.unknown_inputs.inputs import PROBES
 from lunar_mjx.logs.schema import CHANNELS, STEADY_CHANNELS
 
 SPLIT_NAMES = {

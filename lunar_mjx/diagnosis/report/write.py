@@ -9,7 +9,7 @@ from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.report import explore, figures, tables
 from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result, read_result
-from lunar_mjx.diagnosis.report.steps import Step, ceiling, chain, comparable, error, judged
+from lunar_mjx.diagnosis.report.steps import Step, chain, comparable, error, judged
 from lunar_mjx.diagnosis.report.words import and_list, shown
 from lunar_mjx.errors import UserError
 from lunar_mjx.report.page import Block, Figure, Section, Text, write_page
@@ -87,17 +87,11 @@ def _error_section(steps: Sequence[Step], results: Sequence[Result]) -> Section:
     if not comparable(steps):
         blocks.append(Text(["The runs were not made on the same measurements, so their errors do not compare."]))
     if len(now) == len(steps):
-        top = ceiling(results[-1])
         caption = (
             f"Root mean square residual over {measure} manoeuvres in sigma of the noise. 1 sigma is the noise floor: a "
             "true model cannot go below it but by chance."
         )
-        if top is not None:
-            caption += (
-                " The ceiling is what the best smooth unknown input at any one port could leave, on fitted and "
-                "selecting manoeuvres together: no formula at a single port gets much below it."
-            )
-        blocks.append(Figure(figures.waterfall(steps, now, fitted, measure, top), caption))
+        blocks.append(Figure(figures.waterfall(steps, now, fitted, measure), caption))
         blocks.append(tables.error_rows(steps, now, fitted, measure))
     return Section("The error, step by step", blocks)
 
@@ -109,19 +103,8 @@ def _where(judge: Result, steps: Sequence[Step]) -> Section:
     ports = verdict.get("ports") or {}
     if ports:
         best = max(ports, key=lambda k: ports[k] or 0.0)
-        weighed = bool(verdict.get("probabilities"))
-        caption = (
-            "Probability that something unlisted acts at a port."
-            if weighed
-            else "Gain of the log evidence when something nobody modelled acts at a port, its course free but smooth; "
-            "below 3 it is no better than noise."
-        )
-        title = "probability" if weighed else "gain of log evidence"
-        blocks.append(Figure(figures.bars(ports, title, best), caption))
-    follows = ((verdict.get("details") or {}).get("localise") or {}).get("dependence") or {}
-    if follows:
-        caption = "Chi-square that a parameter would take off if it followed slip, slip angle or load."
-        blocks.append(Figure(figures.bars(follows, "chi-square taken off"), caption))
+        caption = "Probability that something unlisted acts at a port."
+        blocks.append(Figure(figures.bars(ports, "probability", best), caption))
     return Section("Where it fails", blocks)
 
 

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import Any
 
 from lunar_mjx.diagnosis.weighed.form import SearchSettings
-from lunar_mjx.errors import bad_input
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,23 +90,6 @@ class TableSettings(SearchSettings):
     most_evaluations: int = 12
     """1; evaluations of one round of a refit."""
 
-    @classmethod
-    def of(cls, changed: Mapping[str, Any]) -> TableSettings:
-        """The usual settings but for some, given by name as numbers, lists or text.
-
-        Raises:
-          UserError: no such setting, or a value of another kind.
-        """
-        usual, values = dataclasses.asdict(cls()), {}
-        for name, value in changed.items():
-            if name not in usual:
-                raise bad_input("settings", name, value, "is not known", f"use one of {', '.join(usual)}")
-            try:
-                values[name] = _like(usual[name], value)
-            except (TypeError, ValueError):
-                raise bad_input("settings", name, value, "has another kind", f"give it like {usual[name]}") from None
-        return cls(**values)
-
     @property
     def following_log_odds(self) -> float:
         """Log of `following_odds`."""
@@ -132,14 +112,3 @@ class TableSettings(SearchSettings):
             "wheel radius": self.wheel_radius,
             "wheel width": self.load_scale,
         }
-
-
-def _like(usual: Any, value: Any) -> Any:
-    """A value in the kind of the usual one; lists may be text with commas."""
-    if isinstance(usual, tuple):
-        items = [v.strip() for v in value.split(",")] if isinstance(value, str) else list(value)
-        return tuple(type(usual[0])(v) for v in items if v != "")
-    found = float(value)
-    if not math.isfinite(found) or (isinstance(usual, int) and found != int(found)):
-        raise ValueError(value)
-    return type(usual)(found)

@@ -1,1 +1,1 @@
-"""Unknown inputs at the ports: where a model fails, before anything is named."""
+"""Unknown inputs at the ports: what nobody modelled, and how large it usually is."""

@@ -1,4 +1,4 @@
-"""Unknown inputs of drives: something that nobody modelled acts at a port, over time or with the port's quantities."""
+"""Unknown inputs of drives: something that nobody modelled acts at a port and follows the port's quantities."""
 
 from __future__ import annotations
 
@@ -100,20 +100,39 @@ def _wheel_speed(ctx):
     return ctx.contact.rim_speed / ctx.geometry.radius
 
 
-QUANTITIES: Mapping[str, Callable[[Any, Any], Any]] = {
-    "constant": lambda ctx, value: 1.0,
-    "current": lambda ctx, value: value.current / 1.0,
-    "joint speed": lambda ctx, value: ctx.joint_speed / 2.0,
-    "wheel speed": lambda ctx, value: _wheel_speed(ctx) / 2.0,
-    "slip": lambda ctx, value: ctx.contact.soil_slip / 0.3,
-    "signed slip": lambda ctx, value: value.slip_x / 0.3,
-    "lateral slip": lambda ctx, value: value.slip_y / 0.3,
-    "load": lambda ctx, value: value.load / 100.0,
-    "loss": lambda ctx, value: jnp.abs(ctx.command.current) / 1.0,
-    "travel speed": lambda ctx, value: ctx.velocity.dot(ctx.frame.forward) / 0.2,
+QUANTITY_SIZES: Mapping[str, float] = {
+    "constant": 1.0,
+    "current": 1.0,
+    "joint speed": 2.0,
+    "wheel speed": 2.0,
+    "slip": 0.3,
+    "signed slip": 0.3,
+    "lateral slip": 0.3,
+    "load": 100.0,
+    "loss": 1.0,
+    "travel speed": 0.2,
 }
-"""Quantities that an unknown input may follow, each over a usual size: 1 A, 2 rad/s, 0.3 of slip, 100 N, 0.2 m/s.
-(A loss that follows the square of the current is the winding's resistance, which every refit moves.)"""
+"""Usual sizes of the quantities that an unknown input may follow: A, rad/s, slip, N, m/s."""
+
+_READ: Mapping[str, Callable[[Any, Any], Any]] = {
+    "constant": lambda ctx, value: 1.0,
+    "current": lambda ctx, value: value.current,
+    "joint speed": lambda ctx, value: ctx.joint_speed,
+    "wheel speed": lambda ctx, value: _wheel_speed(ctx),
+    "slip": lambda ctx, value: ctx.contact.soil_slip,
+    "signed slip": lambda ctx, value: value.slip_x,
+    "lateral slip": lambda ctx, value: value.slip_y,
+    "load": lambda ctx, value: value.load,
+    "loss": lambda ctx, value: jnp.abs(ctx.command.current),
+    "travel speed": lambda ctx, value: ctx.velocity.dot(ctx.frame.forward),
+}
+
+
+def _quantity(name: str, ctx: Any, value: Any) -> Any:
+    """A quantity over its usual size. (A loss that follows the square of the current is the winding's resistance, which
+    every refit moves.)"""
+    return _READ[name](ctx, value) / QUANTITY_SIZES[name]
+
 
 FOLLOWS: Mapping[str, tuple[str, ...]] = {
     "command: motor current": ("constant", "current", "joint speed"),
@@ -141,23 +160,6 @@ def present(label: str, ports: frozenset[str]) -> bool:
 
 
 @functools.cache
-def unknown_input(label: str, knots: int, span: float) -> Effect:
-    """An unknown input as an effect whose amplitudes are the knots of a course over time (one knot: constant)."""
-    port, act, size, unit = PROBES[label]
-
-    def function(ctx, p, x, value):
-        if knots == 1:
-            return act(ctx, p.knot_0, value)
-        place = ctx.time / span * (knots - 1)
-        weights = [jnp.maximum(0.0, 1.0 - jnp.abs(place - k)) for k in range(knots)]
-        return act(ctx, sum(w * getattr(p, f"knot_{k}") for k, w in enumerate(weights)), value)
-
-    amplitudes = {f"knot_{k}": _amplitude(size, unit, f"{label} at knot {k}") for k in range(knots)}
-    name = f"probe_{_word(label)}"
-    return Effect(name=name, ports={port: function}, parameters=amplitudes, order=_ORDER, doc=SOURCE)
-
-
-@functools.cache
 def smooth_inputs(ports: frozenset[str]) -> Effect:
     """All inputs that follow quantities of their ports, as one effect; amplitudes are named by `amplitude`.
 
@@ -177,7 +179,7 @@ def smooth_inputs(ports: frozenset[str]) -> Effect:
         def function(ctx, p, x, value):
             given = value
             for label in mine:
-                amount = sum(getattr(p, amplitude(label, q)) * QUANTITIES[q](ctx, given) for q in FOLLOWS[label])
+                amount = sum(getattr(p, amplitude(label, q)) * _quantity(q, ctx, given) for q in FOLLOWS[label])
                 value = PROBES[label][1](ctx, amount, value)
             return value
 

@@ -38,8 +38,19 @@ def compare(run: Run, problem: Problem, progress: Progress) -> Refit:
         refit = own.refit(frozenset(), None, None)
     start = own.residual(own.origin())
     run.save(COMPARISON_FILE, comparison(problem, start, refit))
+    run.save(HYPOTHESES_FILE, {own.name: {"u": _by_key(own, refit.u)}})
     save_series(run, own, start, {"refitted": (own, refit.u)})
     return refit
+
+
+def kept_start(run: Run, form: MeasuredForm, effects: frozenset[str]) -> np.ndarray | None:
+    """(coordinates,) where a run's refit of a form with some effects has ended; None where it keeps none."""
+    kept = (run.load(HYPOTHESES_FILE) or {}).get(" + ".join([form.name, *sorted(effects)]), {}).get("u")
+    return None if kept is None else np.array([float(kept.get(c.key, 0.0)) for c in form.coordinates])
+
+
+def _by_key(form: MeasuredForm, u: np.ndarray) -> dict[str, float]:
+    return dict(zip([c.key for c in form.coordinates], map(float, u), strict=True))
 
 
 def diagnose(run: Run, problem: Problem, progress: Progress) -> tuple[Diagnosis, ModelSearch | None]:
@@ -59,7 +70,7 @@ def diagnose(run: Run, problem: Problem, progress: Progress) -> tuple[Diagnosis,
     diagnosis = _diagnosis(problem, found, best)
     start = own.residual(own.origin())
     after = problem.form(best.form)
-    run.save(COMPARISON_FILE, comparison(problem, start, base))
+    run.save(COMPARISON_FILE, {**(run.load(COMPARISON_FILE) or {}), **comparison(problem, start, base)})
     fits = {"refitted": (own, base.u)}
     if best.effects or best.form != own.name:
         words = [*([best.form] if best.form != own.name else []), *sorted(best.effects)]
@@ -108,6 +119,7 @@ def comparison(problem: Problem, start: np.ndarray, refit: Refit) -> dict[str, A
         "solver": refit.failed or "ended",
         "observations": len(observations),
         "logs": list(observations.logs),
+        "unused": problem.unused,
     }
 
 
@@ -381,8 +393,5 @@ def _fits(problem: Problem, found: ModelSearch) -> dict[str, Any]:
     for h in found.hypotheses:
         if h.refitted:
             key = " + ".join([h.form, *sorted(h.effects)])
-            keys = [c.key for c in problem.form(h.form).coordinates]
-            out.setdefault(
-                key, {"u": dict(zip(keys, map(float, h.refit.u), strict=True)), "log_posterior": h.log_posterior}
-            )
+            out.setdefault(key, {"u": _by_key(problem.form(h.form), h.refit.u), "log_posterior": h.log_posterior})
     return out

@@ -7,10 +7,12 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+from typing import Any, Self
 
 import numpy as np
 
 from lunar_mjx.effects.base import Effect
+from lunar_mjx.errors import bad_input
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import NotTested
@@ -42,6 +44,23 @@ class SearchSettings:
     window: float = 4.0
     """nat; hypotheses further below the best are not refitted: 2 per cent of its probability."""
 
+    @classmethod
+    def of(cls, changed: Mapping[str, Any]) -> Self:
+        """The usual settings but for some, given by name as numbers, lists or text.
+
+        Raises:
+          UserError: no such setting, or a value of another kind.
+        """
+        usual, values = dataclasses.asdict(cls()), {}
+        for name, value in changed.items():
+            if name not in usual:
+                raise bad_input("settings", name, value, "is not known", f"use one of {', '.join(usual)}")
+            try:
+                values[name] = _like(usual[name], value)
+            except (TypeError, ValueError):
+                raise bad_input("settings", name, value, "has another kind", f"give it like {usual[name]}") from None
+        return cls(**values)
+
     @property
     def effect_log_odds(self) -> float:
         """Log of `effect_odds`."""
@@ -51,6 +70,17 @@ class SearchSettings:
     def unlisted_log_odds(self) -> float:
         """Log of `unlisted_odds`."""
         return math.log(self.unlisted_odds)
+
+
+def _like(usual: Any, value: Any) -> Any:
+    """A value in the kind of the usual one; lists may be text with commas."""
+    if isinstance(usual, tuple):
+        items = [v.strip() for v in value.split(",")] if isinstance(value, str) else list(value)
+        return tuple(type(usual[0])(v) for v in items if v != "")
+    found = float(value)
+    if not math.isfinite(found) or (isinstance(usual, int) and found != int(found)):
+        raise ValueError(value)
+    return type(usual)(found)
 
 
 class MeasuredForm(Form):

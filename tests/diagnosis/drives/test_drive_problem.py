@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from lunar_mjx.backends import Hook
-from lunar_mjx.diagnosis.attribute import diagnose
+from lunar_mjx.diagnosis.drives.form import DriveForm
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
-from lunar_mjx.diagnosis.refit import Settings
+from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.effects import catalogue
+from lunar_mjx.inference.weighing.search import search
 from lunar_mjx.logs import check, read_campaign
 from lunar_mjx.logs.findings import is_bad
 from lunar_mjx.model import make_model
@@ -24,7 +26,6 @@ BASELINE = {
     "soil": {"shear_modulus_x": (0.3, 2.0), "friction_angle": (0.1, 2.0)},
 }
 CANDIDATES = ("coulomb_friction", "viscous_friction", "wheel_radius_error")
-SETTINGS = Settings(starts=3, draws=500)
 
 
 def _friction(ctx, state, torque):
@@ -38,6 +39,23 @@ def _problem(folder, engine="auto"):
     return DriveProblem(
         logs, make_model("luvmi_x", terrain="flat", timestep=0.0025), candidates, baseline=BASELINE, engine=engine
     )
+
+
+def _found(problem):
+    settings = DriveSettings()
+    form = DriveForm(problem, settings)
+    found = search([form], settings.most_refits, settings.most_terms, settings.window)
+    return form, found, conclude(found, settings.sure)
+
+
+def _rms(form, hypothesis):
+    fitted = form.observations.in_split("fit")
+    return float(np.sqrt(np.mean(form.residual(hypothesis.refit.u)[fitted] ** 2)))
+
+
+def _torque(form, hypothesis):
+    (place,) = [i for i in form.candidates["coulomb_friction"] if form.coordinates[i].name == "torque"]
+    return float(form.coordinates[place].value(hypothesis.refit.u[place]))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +76,8 @@ def quiet(quiet_logs):
 def test_quotients_agree_with_a_change_of_the_parameter(quiet):
     which = quiet.baseline[:3]
     origin = quiet.origin()
-    jacobian = quiet.jacobian(origin, which)
+    value, jacobian = quiet.jacobian(origin, which)
+    np.testing.assert_array_equal(value, quiet.predict(origin[None])[0])
     rows = np.repeat(origin[None], 2, axis=0)
     rows[0, which[1]] += 0.02
     rows[1, which[1]] -= 0.02
@@ -70,35 +89,25 @@ def test_quotients_agree_with_a_change_of_the_parameter(quiet):
 
 def test_a_program_without_candidates_predicts_what_one_with_them_at_their_null_does(quiet):
     plain = quiet.predict(quiet.origin()[None])
-    assert len(quiet._benches) == 1
+    assert quiet._bench_for(quiet.origin()[None]) is quiet.bench
     moved = np.repeat(quiet.origin()[None], 2, axis=0)
     moved[1, quiet.candidates["coulomb_friction"][0]] = 1.0
     both = quiet.predict(moved)
-    assert len(quiet._benches) == 2
+    assert quiet._bench_for(moved) is not quiet.bench
     np.testing.assert_allclose(both[0], plain[0], rtol=1e-9, atol=1e-9)
     assert np.abs((both[1] - both[0]) / quiet.observations.sigma()).max() > 5.0
 
 
 def test_drives_without_a_hidden_effect_are_noise_only(quiet):
-    diagnosis, found = diagnose(quiet, SETTINGS)
-    assert diagnosis.verdict is Verdict.NOISE_ONLY, diagnosis.sentence
-    assert found.base.fit.rms(found.base.fit.fitted) == pytest.approx(1.0, abs=0.05)
+    form, found, said = _found(quiet)
+    assert said.verdict is Verdict.NOISE_ONLY, said.sentence
+    assert _rms(form, found.base(form.name)) == pytest.approx(1.0, abs=0.05)
 
 
-def test_friction_hidden_in_a_drive_is_named_and_sized(rubbing_logs):
-    problem = _problem(rubbing_logs)
-    diagnosis, found = diagnose(problem, SETTINGS)
-    assert diagnosis.verdict is Verdict.KNOWN, diagnosis.sentence
-    assert diagnosis.effects == ("coulomb_friction",)
-    row = diagnosis.evidence[0]
-    assert row.values["torque"] == pytest.approx(FRICTION, rel=0.1)
-    assert found.chosen.fit.rms(found.chosen.fit.fitted) < 1.05 < 1.2 < found.base.fit.rms(found.base.fit.fitted)
-
-
-def test_the_other_engine_gives_the_same_verdicts(quiet_logs, rubbing_logs):
-    nothing, _ = diagnose(_problem(quiet_logs, "mjx"), SETTINGS)
-    assert nothing.verdict is Verdict.NOISE_ONLY, nothing.sentence
-    friction, _ = diagnose(_problem(rubbing_logs, "mjx"), SETTINGS)
-    assert friction.verdict is Verdict.KNOWN, friction.sentence
-    assert friction.effects == ("coulomb_friction",)
-    assert friction.evidence[0].values["torque"] == pytest.approx(FRICTION, rel=0.1)
+@pytest.mark.parametrize("engine", ["auto", "mjx"])
+def test_friction_hidden_in_a_drive_is_named_and_sized(rubbing_logs, engine):
+    form, found, said = _found(_problem(rubbing_logs, engine))
+    assert said.verdict is Verdict.KNOWN, said.sentence
+    assert said.effects == ("coulomb_friction",)
+    assert _torque(form, found.best) == pytest.approx(FRICTION, rel=0.1)
+    assert _rms(form, found.best) < 1.05 < 1.2 < _rms(form, found.base(form.name))

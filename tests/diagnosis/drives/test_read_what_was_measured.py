@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lunar_mjx.diagnosis.drives.log_run import log_run
 from lunar_mjx.diagnosis.drives.observations import with_discrepancy
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
+from lunar_mjx.diagnosis.drives.simulation.log_run import log_run
 from lunar_mjx.diagnosis.drives.unused import unused_channels
 from lunar_mjx.dynamics import build
 from lunar_mjx.dynamics.signals import observe

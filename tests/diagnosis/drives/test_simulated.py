@@ -11,8 +11,8 @@ import pytest
 from lunar_mjx.diagnosis.drives import problem as drive_problem
 from lunar_mjx.diagnosis.drives.nuisances import STEP_ERROR
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
-from lunar_mjx.diagnosis.drives.rollouts import Bench
-from lunar_mjx.diagnosis.drives.simulated_rows import Simulated
+from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench
+from lunar_mjx.diagnosis.drives.simulation.simulated_rows import Simulated
 from lunar_mjx.effects import catalogue
 from lunar_mjx.logs import read_log, write_log
 from lunar_mjx.logs.log import Noise
@@ -49,7 +49,7 @@ def runs(monkeypatch):
     """What is simulated: (effects, time step, rows) of every call; predictions are a sum over what acts."""
     calls = []
 
-    def run(self, rows, values, observations, progress, windows=False):
+    def run(self, rows, values, observations, progress):
         acting = {**dict.fromkeys(self.model.effect_names, 1.0), "initial": 1.0}
         total = sum(np.asarray(v) * acting.get(k[0], 0.0) for k, v in values.items())
         given = sum(float(np.sum(p.effects["motor"]["resistance"])) for p in self.params)
@@ -57,7 +57,7 @@ def runs(monkeypatch):
         for number in range(len(self.runs)):
             part = observations.of_log[number]
             rising = np.arange(part.stop - part.start)
-            error = self.model.timestep * (1.0 + 7.0 * windows)
+            error = self.model.timestep
             yield number, slice(0, rows), (total + given + error)[:, None] + rising
 
     monkeypatch.setattr(Bench, "run", run)
@@ -96,22 +96,11 @@ def test_another_model_or_bench_or_time_step_is_not_answered_from_what_is_known(
     rubbing = origin.copy()
     rubbing[0, problem.candidates["coulomb_friction"]] = 0.3
     problem.predict(np.concatenate([origin, rubbing]))
-    assert runs[-1][0] == runs[0][0] + 1  # with one effect more
+    assert runs[-1][0] == runs[0][0] + len(CANDIDATES) + 1  # with all candidates and the unknown inputs
     assert runs[-1][2] == 2  # and the origin anew, since differences are taken within one program
     assert problem.step_error == pytest.approx(-model.timestep)
     assert runs[-1][1:] == (0.5 * model.timestep, 1)
     assert len(runs) == 4
-
-
-def test_windows_are_another_simulation_and_the_error_of_the_step_is_that_of_whole_drives(logs, runs):
-    problem, plain = _problem(logs), _problem(logs)
-    origin = problem.origin()[None]
-    first = problem.predict(origin)
-    with problem.in_windows():
-        assert problem.predict(origin) == pytest.approx(first + 7.0 * problem.model.timestep)
-        windowed = problem.step_error
-    assert np.array_equal(problem.predict(origin), first)
-    assert windowed == pytest.approx(plain.step_error) and problem.step_error == pytest.approx(windowed)
 
 
 def test_what_only_adds_to_the_predictions_is_not_simulated(logs, runs):
@@ -138,42 +127,7 @@ def test_all_logs_share_one_amount_of_the_steps_error_and_half_of_it_is_expected
     assert moved[1] - moved[0] == pytest.approx(problem.step_error)
     assert len(problem.observations.of_log) == 2
     assert all(np.any(problem.step_error[part]) for part in problem.observations.of_log.values())
-    priors = [problem.prior_rows(np.full(len(u), v), np.array([place])) for v in (0.0, 0.5, 1.0)]
-    assert [float(p[0][0]) for p in priors] == [-1.0, 0.0, 1.0] and priors[0][1] == 2.0
-
-
-def test_foreseen_rows_are_taken_along_where_rows_cost_nothing(logs, runs):
-    problem = _problem(logs)
-    origin, which = problem.origin(), problem.baseline[:3]
-    problem.foresee(origin[None], which)
-    problem.predict(origin[None])
-    assert [c[2] for c in runs] == [1]  # each row costs on a CPU
-    problem._batched, problem._together = True, 8
-    far = origin.copy()
-    far[problem.baseline[0]] = 0.5
-    problem.foresee(origin[None], which)
-    problem.foresee(np.repeat(far[None], 8, axis=0))  # too many
-    problem.predict(far[None])
-    assert [c[2] for c in runs] == [1, 4]
-    jacobian = problem.jacobian(origin, which)
-    assert len(runs) == 2
-    assert np.array_equal(jacobian, _problem(logs).jacobian(origin, which))
-
-
-def test_the_step_is_not_halved_again_within_a_sigma(logs, runs):
-    problem = _problem(logs)
-    halved = 0.5 * problem.model.timestep
-    origin = problem.origin()
-    place = problem.baseline[0]
-    away = [origin.copy() for _ in range(3)]
-    away[1][place], away[2][place] = 1e-4, 1.0  # a hundredth of a sigma per row of its factor, and a hundred
-    changes = [problem._halving(u) for u in away]
-    assert sum(c[1] == halved for c in runs) == 2
-    assert np.array_equal(changes[0], changes[1])
-    rubbing = origin.copy()
-    rubbing[problem.candidates["coulomb_friction"]] = 1e-9
-    problem._halving(rubbing)
-    assert sum(c[1] == halved for c in runs) == 3  # what acts is another
+    assert (problem.coordinates[place].centre, problem.coordinates[place].prior) == (0.5, 0.5)
 
 
 def test_how_long_a_rover_had_stood_is_asked_once(logs, runs, monkeypatch):

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lunar_mjx.diagnosis.drives.log_run import SETTLE, STOOD
 from lunar_mjx.diagnosis.drives.nuisances import standing_shows
 from lunar_mjx.diagnosis.drives.problem import SIMULATED, DriveProblem
-from lunar_mjx.diagnosis.drives.program import PIECE, Program, _between
-from lunar_mjx.diagnosis.drives.rollouts import Bench
+from lunar_mjx.diagnosis.drives.simulation.log_run import SETTLE, STOOD
+from lunar_mjx.diagnosis.drives.simulation.program import PIECE, Program, _between
+from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench
 from lunar_mjx.logs import read_log, simulate_log, write_log
 from lunar_mjx.logs.log import Noise
 from lunar_mjx.logs.recorder.instruments import Recording
@@ -68,7 +68,7 @@ def test_it_is_a_nuisance_where_the_ground_is_inclined_and_it_shows(tmp_path, mo
     )
     runs = []
 
-    def run(self, rows, values, observations, progress, windows=False):
+    def run(self, rows, values, observations, progress):
         runs.append(values)
         change = (0.0, 10.0 if shows else 0.001)
         yield 0, slice(0, rows), np.outer(change, np.arange(len(observations)))

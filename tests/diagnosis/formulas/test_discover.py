@@ -16,7 +16,7 @@ from lunar_mjx.diagnosis.formulas.discover import _write, discover
 from lunar_mjx.diagnosis.formulas.targets import STIFFNESS
 from lunar_mjx.diagnosis.formulas.terms import effect_of, term, terms, with_amount
 from lunar_mjx.diagnosis.runs import VERDICT_FILE, Run
-from lunar_mjx.diagnosis.unknown_inputs.probes import PROBES, unknown_input
+from lunar_mjx.diagnosis.unknown_inputs.inputs import smooth_inputs
 from lunar_mjx.effect_contract import random_rovers as probe
 from lunar_mjx.effect_contract.promises import base_list
 from lunar_mjx.effects import catalogue
@@ -89,7 +89,7 @@ def test_a_search_needs_a_port(tmp_path):
     run = Run(tmp_path, (), make_model("luvmi_x", terrain="flat"))
     with pytest.raises(UserError, match="lunar-mjx why first, or give --port"):
         discover(run)
-    run.save(VERDICT_FILE, {**VERDICT, "details": {"localise": {"port": None}}})
+    run.save(VERDICT_FILE, VERDICT)
     with pytest.raises(UserError, match="lunar-mjx why first"):
         discover(run)
     with pytest.raises(UserError, match="does not exist"):
@@ -116,7 +116,7 @@ def test_every_formula_acts_on_a_rover(port):
 
 
 def test_every_unknown_input_acts_on_a_rover():
-    assert "chassis_force" in _felt([unknown_input(label, 8, 10.0) for label in PROBES])
+    assert "chassis_force" in _felt([smooth_inputs(frozenset(PORTS))])
 
 
 HIDDEN_LAW, AMOUNT = "log(Max(1 - s, 1/50))", 0.35

@@ -34,7 +34,7 @@ def result():
     traces = Traces(o, ("as given", "refitted", "with drag"), -0.1 * residual, residual, np.tile(TIME, 4))
     evidence = [{"effect": "drag", "status": "accepted"}, {"effect": "faint", "status": "not tested"}]
     return Result(
-        "run", {}, None, {"evidence": evidence}, None, None, None, None, traces, {"drag": shape, "faint": 0.0 * shape}
+        "run", {}, None, {"evidence": evidence}, None, None, None, traces, {"drag": shape, "faint": 0.0 * shape}
     )
 
 

@@ -13,7 +13,7 @@ from lunar_mjx.diagnosis.verdict import Verdict
 
 
 def result(name: str, verdict: dict | None, comparison: dict | None = None, **run) -> Result:
-    return Result(name, run, comparison, verdict, None, None, None, None, None, {})
+    return Result(name, run, comparison, verdict, None, None, None, None, {})
 
 
 @pytest.mark.parametrize("verdict", Verdict)
@@ -48,7 +48,7 @@ class Named:
 def test_labels_of_the_waterfall_stand_in_places_of_their_own():
     steps = [Named("as given"), Named("refitted"), Named("+ slip_sinkage<br>(proposed)")]
     errors = [Error(v, 0.9 * v, 1.2 * v, 10, 5) for v in (12.8, 8.4, 1.2)]
-    figure = figures.waterfall(steps, errors, [None] * 3, "held-out", None)  # type: ignore[arg-type]
+    figure = figures.waterfall(steps, errors, [None] * 3, "held-out")  # type: ignore[arg-type]
     bars = figure.data[0]
     assert list(bars.x) == [12.8, 8.4, 1.2] and len(set(bars.y)) == 3
     notes = [a for a in figure.layout.annotations if "sigma" in a.text]
@@ -70,7 +70,7 @@ def test_a_common_factor_is_shown_in_the_unit_of_what_it_multiplies(tmp_path):
             "unit": {"gear_ratio": "factor"},
         }
     }
-    run = Result("run1", {}, {"parameters": fitted}, None, None, None, None, None, None, {}, tmp_path)
+    run = Result("run1", {}, {"parameters": fitted}, None, None, None, None, None, {}, tmp_path)
     (table,) = tables.parameters(run, run)
     own = np.unique(np.asarray(model.parameters["motor"]["gear_ratio"], float))
     assert len(table.rows) == len(own) > 1

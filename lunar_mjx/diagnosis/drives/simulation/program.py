@@ -8,30 +8,24 @@ import itertools
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.log_run import SETTLE, STOOD, ImuMounting, LogRun
-from lunar_mjx.diagnosis.drives.measured_states import begin_at, measured_states
+from lunar_mjx.diagnosis.drives.simulation.log_run import SETTLE, STOOD, ImuMounting, LogRun
 from lunar_mjx.dynamics import System, build
-from lunar_mjx.dynamics.signals import joint_channels, measure
+from lunar_mjx.dynamics.signals import measure
 from lunar_mjx.dynamics.state import Params
 from lunar_mjx.inference.coordinates import NUISANCE
 from lunar_mjx.model import Model
-
-if TYPE_CHECKING:
-    from lunar_mjx.logs import Log
 
 Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
 """(rows,) values by effect, parameter, log (-1 for all) and whether they are factors."""
 
 PIECE = 0.5
 """Length of the pieces in which logs are simulated, s. A time of standing between two of them is interpolated."""
-WINDOW = 4
-"""Pieces of a window that begins at the measured state: short beside a drive, long beside a wheel's time to settle."""
 _FEWEST = 64
 """Rovers that come back from the device at least; else the next power of two, for few programs."""
 
@@ -53,7 +47,6 @@ class Program:
         self._reset = jax.jit(self._reset_all)
         self._drive = jax.jit(self._drive_all, static_argnames="shared")
         self._measure = jax.jit(self._measure_all, static_argnames="shared")
-        self._begin_anew = jax.jit(self._begin_all_anew, static_argnames="shared")
         self._set_moving = jax.jit(jax.vmap(self._in_motion))
         body = self.system.engine.mj_model
         self._joint_dofs = np.array([body.jnt_dofadr[body.joint(j).id] for j in model.rover.joints])
@@ -98,16 +91,10 @@ class Program:
         moving = moving.at[self._joint_dofs].set(jnp.where(jnp.isnan(spin), moving[self._joint_dofs], spin))
         return dataclasses.replace(state, qvel=jnp.where(motion["moves"], moving, state.qvel))
 
-    def _begin_all_anew(self, params: Params, state: Any, measured: Mapping[str, Any], shared: bool) -> Any:
-        return jax.vmap(begin_at, (self._axes(params, shared), 0, 0))(params, state, measured)
-
-    def __call__(
-        self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int, windows: bool = False
-    ) -> np.ndarray:
+    def __call__(self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int) -> np.ndarray:
         """(rovers, channels, time) of rovers by their log (place in `logs`) and their row of `values`.
 
-        The first `count` are wanted, and few beyond them come back from the device. With `windows` rovers begin anew at
-        the measured state after every few pieces.
+        The first `count` are wanted, and few beyond them come back from the device.
         """
         params, start = logs.rovers(log, row, values)
         commands = logs.commands[log]
@@ -122,9 +109,6 @@ class Program:
                 state = self._set_moving(state, {name: a[log] for name, a in logs.motion.items()})
             seen = []
             for at in range(0, commands.shape[1], self.segment):
-                if windows and at and at % (WINDOW * self.segment) == 0:
-                    edge = {name: a[log, at // self.segment] for name, a in logs.measured.items()}
-                    state = self._begin_anew(full, state, edge, shared=shared)
                 state, telemetry = self._drive(full, state, commands[:, at : at + self.segment], shared=shared)
                 seen.append(telemetry)
             found = self._measure(full, seen, shared=shared)
@@ -172,7 +156,6 @@ class Logs:
       terrain: the ground, with a leading axis of logs unless `shared` by all of them.
       commands: (logs, time, joint), the last ones repeated up to whole pieces.
       motion: (logs, ...) velocities at the start, by name, as in `LogRun`.
-      logs: as recorded. begin: (logs,) when the simulations begin on their clocks, s.
     """
 
     program: Program
@@ -183,17 +166,6 @@ class Logs:
     shared: bool
     commands: np.ndarray
     motion: Mapping[str, np.ndarray]
-    logs: tuple[Log, ...]
-    begin: tuple[float, ...]
-
-    @functools.cached_property
-    def measured(self) -> dict[str, np.ndarray]:
-        """What was measured of the state at the beginning of every piece, (logs, pieces, ...) by name."""
-        program = self.program
-        place = np.arange(0, self.commands.shape[1], program.segment) * program.every * program.system.dt
-        joints = joint_channels(program.model.rover)
-        found = [measured_states(log, joints, begin + place) for log, begin in zip(self.logs, self.begin, strict=True)]
-        return {name: np.stack([f[name] for f in found]) for name in found[0]}
 
     def rovers(self, log: np.ndarray, row: np.ndarray, values: Rows) -> tuple[Params, dict[str, np.ndarray]]:
         """Parameters (but for the ground) and starts of rovers: the logs' conditions with rows of values put in."""
@@ -212,9 +184,7 @@ class Logs:
         return params, start
 
 
-def stack_logs(
-    program: Program, numbers: Sequence[int], logs: Sequence[Log], runs: Sequence[LogRun], params: Sequence[Params]
-) -> Logs:
+def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun], params: Sequence[Params]) -> Logs:
     """Makes logs of one program and one length ready."""
     length = program.length(max(len(r.commands) for r in runs))
     terrains = [p.terrain for p in params]
@@ -233,8 +203,6 @@ def stack_logs(
         shared=shared,
         commands=np.stack([_padded(r.commands, length) for r in runs]),
         motion={name: np.stack([r.motion[name] for r in runs]) for name in runs[0].motion},
-        logs=tuple(logs),
-        begin=tuple(r.begin for r in runs),
     )
 
 

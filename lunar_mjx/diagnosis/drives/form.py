@@ -1,0 +1,388 @@
+"""A rover's model held against drives, with all effects that may be missing and what may be wrong at its ports."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from scipy import linalg
+
+from lunar_mjx.diagnosis.drives.channel_errors import chosen_errors
+from lunar_mjx.diagnosis.drives.problem import DriveProblem
+from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
+from lunar_mjx.diagnosis.unknown_inputs.port_fields import SHARES, WORDS, Usual, rotated
+from lunar_mjx.diagnosis.weighed.form import MeasuredForm
+from lunar_mjx.effects.sensor.channels import family
+from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
+from lunar_mjx.inference.fitting import Progress, silent
+from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Refit, Term
+
+OWN_FORM = "the model"
+_SHARES = (1.0, 0.5, 0.2, 0.05)
+"""Shares of a step that are simulated side by side, as far as they fit into one batch."""
+
+
+class DriveForm(MeasuredForm):
+    """A rover's model against drives.
+
+    Derivatives are difference quotients between rovers of one batch. Those of the model's own parameters and of the
+    effects in a refit are taken where it stands; those of other candidates and of unknown inputs once, where the model
+    as it is has been refitted.
+    """
+
+    name, log_prior = OWN_FORM, 0.0
+
+    def __init__(self, drives: DriveProblem, settings: DriveSettings, progress: Progress = silent):
+        """Makes the form.
+
+        Args:
+          drives: simulation of the logs with all candidates and unknown inputs. settings: sizes and priors.
+          progress: told of refits.
+        """
+        self.drives, self.settings, self.progress = drives, settings, progress
+        labels = list(drives.inputs)
+        self._inputs = np.concatenate([np.zeros(0, int), *(drives.inputs[label] for label in labels)])
+        self._label = np.repeat(np.arange(len(labels)), [len(drives.inputs[label]) for label in labels])
+        count = len(drives.coordinates) - len(self._inputs)
+        self.coordinates = drives.coordinates[:count]
+        self.baseline, self.candidates = drives.baseline, dict(drives.candidates)
+        self.observations = drives.observations
+        self.words = {label: WORDS[label] for label in labels}
+        self.shares = SHARES
+        self.terms = (
+            *(Term(e, EFFECT, settings.effect_log_odds) for e in self.candidates),
+            *(Term(label, UNLISTED, settings.unlisted_log_odds) for label in labels),
+        )
+        # (coordinates,) prior standard deviations: shapes of candidates keep their own
+        self._std = np.array([c.prior for c in self.coordinates])
+        for places in self.candidates.values():
+            self._std[[i for i in places if self.coordinates[i].amplitude]] = settings.effect_size
+        usual = usual_of(drives)
+        self._size = np.array([usual.size(label, q) for label in labels for q in FOLLOWS[label]])
+        families = [family(s.channel) or s.channel for s in self.observations.series]
+        self.noise_names = tuple(dict.fromkeys(families))
+        self._group = np.empty(len(self.observations), int)
+        for s, name in zip(self.observations.series, families, strict=True):
+            self._group[s.start : s.stop] = self.noise_names.index(name)
+        self._fit = self.observations.in_split("fit")
+        self._seen: np.ndarray | None = None  # (n, coordinates + inputs) derivatives at the base, SI
+        self._fields: tuple[np.ndarray, np.ndarray] | None = None
+        self._slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}
+        self._sizes: tuple[np.ndarray, np.ndarray] | None = None
+        self.channel_errors: Mapping[str, float] = {}
+        self.start = self.origin()  # where the first refit begins
+
+    # --- predictions and derivatives ---------------------------------------------------------------------------------
+
+    def _whole(self, u: np.ndarray) -> np.ndarray:
+        return np.concatenate([u, np.zeros((*u.shape[:-1], len(self._inputs)))], axis=-1)
+
+    def predicted(self, u: np.ndarray) -> np.ndarray:
+        """See `MeasuredForm`."""
+        return self.drives.predict(self._whole(u)[None])[0]
+
+    def jacobian(self, u: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predictions (n,) at (coordinates,) and their derivatives (n, free)."""
+        value, slopes = self.drives.jacobian(self._whole(u), free)
+        return value, np.where(np.isfinite(slopes), slopes, 0.0)
+
+    def _see(self, u: np.ndarray) -> None:
+        """Takes the signatures of all candidates and unknown inputs at a refit of the model as it is."""
+        self.progress("signatures of all candidates", 0.0)
+        count = len(self.coordinates)
+        seen = np.zeros((len(self.observations), count + len(self._inputs)))
+        amplitudes = [int(i) for p in self.candidates.values() for i in p if self.coordinates[i].amplitude]
+        rows, steps = [self._whole(u)], []
+        for i in amplitudes:
+            low, high = self.coordinates[i].bounds()
+            step = self.settings.secant if high > 0.0 else -self.settings.secant
+            step = float(np.clip(step, 0.5 * low, 0.5 * high))
+            rows.append(self._whole(u))
+            rows[-1][i] = step
+            steps.append(step)
+        # to first order in inputs of a hundredth of what is usual
+        scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])
+        small = 1e-3 * self._size / scales
+        for i, step in zip(self._inputs, small, strict=True):
+            rows.append(self._whole(u))
+            rows[-1][i] = step
+        values = self.drives.predict(np.array(rows))
+        change = values[1:] - values[:1]
+        change[~np.isfinite(change).all(axis=1)] = 0.0
+        many = len(amplitudes)
+        for i, step, column in zip(amplitudes, steps, change[:many], strict=True):
+            seen[:, i] = column / step
+        seen[:, count:] = change[many:].T / 1e-3  # of a field of size 1
+        self._seen = seen
+
+    def _field_columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened columns (n, m) of all fields at size 1, and the field (m,) of each: in common, and of every log."""
+        assert self._seen is not None
+        settings, observations = self.settings, self.observations
+        white = observations.whiten(self._seen[:, len(self.coordinates) :])
+        common, own = math.sqrt(1.0 - settings.own_share), math.sqrt(settings.own_share)
+        columns, number = [np.zeros((len(observations), 0))], [np.zeros(0, int)]
+        for k in range(len(self.words)):
+            mine = white[:, self._label == k]
+            parts = [common * mine]
+            for part in observations.of_log.values():
+                alone = np.zeros_like(mine)
+                alone[part] = own * mine[part]
+                parts.append(alone)
+            turned = rotated(np.column_stack(parts), settings.least_length / settings.unlisted_discrepancy)
+            columns.append(turned)
+            number.append(np.full(turned.shape[1], k))
+        return np.column_stack(columns), np.concatenate(number)
+
+    def _linear(self, u: np.ndarray, effects: frozenset[str], slopes: np.ndarray) -> Linear:
+        """Everything that hypotheses need around a place (coordinates,) with some effects.
+
+        Args:
+          u: the place. effects: those of the refit. slopes: (n, free) derivatives there.
+        """
+        assert self._seen is not None and self._fields is not None
+        settings, count = self.settings, len(self.coordinates)
+        free, value = self._free(effects), self.predicted(u)
+        whiten = self.observations.whiten
+        columns = whiten(self._seen[:, :count])
+        columns[:, free] = whiten(slopes)
+        fields, field_of = self._fields
+        columns = np.column_stack([columns, fields])
+        residual = whiten(self.observations.value - value)
+        std = np.concatenate([self._std, np.ones(len(field_of))])
+        low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
+        at, mean = np.zeros(len(std)), np.zeros(len(std))
+        mean[:count] = [c.centre for c in self.coordinates]
+        mean[:count] -= u
+        for places in self.candidates.values():
+            at[places] = u[places]
+            for i in places:
+                if self.coordinates[i].amplitude:
+                    low[i], high[i] = np.array(self.coordinates[i].bounds()) - u[i]
+        kinds, fit, observations = len(self.noise_names), self._fit, self.observations
+        held = {}
+        for number, split in enumerate(observations.unit_split):
+            if split in ("select", "test"):
+                rows = observations.unit == number
+                held[observations.unit_names[number]] = Gram.of(columns[rows], residual[rows], self._group[rows], kinds)
+        return Linear(
+            gram=Gram.of(columns[fit], residual[fit], self._group[fit], kinds),
+            held_out=held,
+            amplitudes=Amplitudes(std, np.concatenate([np.full(count, -1), field_of]), mean),
+            low=low,
+            high=high,
+            always=np.concatenate([self.baseline, count + np.arange(len(field_of))]).astype(int),
+            effects=self.candidates,
+            at=at,
+            calibration={},
+            following={},
+            fields=tuple(Field(label, settings.usual_discrepancy) for label in self.words),
+            noises=tuple(NoiseSize(name, settings.stated_spread) for name in self.noise_names),
+            wide=settings.unlisted_discrepancy,
+            far=1.0,
+        )
+
+    def _free(self, effects: frozenset[str]) -> np.ndarray:
+        return self.drives.free([e for e in self.candidates if e in effects])
+
+    def measuring(self, value: np.ndarray, start: np.ndarray) -> DriveForm:
+        """The same form against other measurements (n,), which begins its refits at (coordinates,)."""
+        drives = copy.copy(self.drives)
+        drives.observations = dataclasses.replace(drives.observations, value=value)
+        drives.noise_unlearnt = False
+        other = DriveForm(drives, self.settings)
+        other.start = start
+        return other
+
+    # --- refits ------------------------------------------------------------------------------------------------------
+
+    def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
+        """See `Form`; Gauss-Newton under the covariance of noise and discrepancy, by steps of a shared length."""
+        free = self._free(effects)
+        u = self.origin()
+        given = start if start is not None else None if near is None else near.u
+        if given is not None:
+            u[free] = given[free]
+        low, high = self.drives.bounds(free)
+        u[free] = np.clip(u[free], low + 1e-9, high - 1e-9)
+        if self._seen is None:
+            if effects:
+                raise EvidenceError("the model as it is has not been refitted")
+            u = self._prepare(free)
+        slopes = self._guess(free, near)
+        terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
+        u, slopes = self._descend(u, free, sizes, slopes, guessed=bool(effects))
+        linear = self._linear(u, effects, slopes)
+        value, found, _ = linear.evidence(terms, sizes)
+        for _ in range(self.settings.most_rounds - 1):
+            before = value
+            u, slopes = self._descend(u, free, (found.tau, found.noise), slopes)
+            linear = self._linear(u, effects, slopes)
+            value, found, _ = linear.evidence(terms, (found.tau, found.noise))
+            if abs(value - before) < self.settings.settled:
+                break
+        self._slopes[effects] = free, slopes
+        return Refit(self.name, effects, u, linear)
+
+    def _guess(self, free: np.ndarray, near: Refit | None) -> np.ndarray:
+        """(n, free) derivatives as far as they are known: those of a similar refit, and signatures of what is new."""
+        assert self._seen is not None
+        known = self._seen[:, : len(self.coordinates)].copy()
+        places, slopes = self._slopes[frozenset() if near is None else near.effects]
+        known[:, places] = slopes
+        return known[:, free]
+
+    def _sizes_of(self, near: Refit) -> tuple[np.ndarray, np.ndarray]:
+        found = near.linear.evidence(self.listed(near.effects))[1]
+        return found.tau, found.noise
+
+    def _prepare(self, free: np.ndarray) -> np.ndarray:
+        """Refits the model as it is, takes all signatures there, and chooses the size of the channels' errors.
+
+        Returns:
+          (coordinates,) the refit, with noise alone.
+        """
+        drives = self.drives
+        u, slopes = self._descend(self.start, free)
+        if drives.noise_unlearnt:
+            drives.learn_noise(self._whole(u))
+            self.observations = drives.observations
+        self._see(u)
+        value = self.predicted(u)
+        assert self._seen is not None
+        columns = self._seen.copy()
+        columns[:, free] = slopes
+        held = self.drives.observations
+        unlisted = np.full(len(self._inputs), self.settings.unlisted_discrepancy)
+        self.observations, self.channel_errors = chosen_errors(
+            held,
+            np.column_stack([columns, held.value - value]),
+            np.concatenate([self._std, unlisted]),
+            self._group,
+            len(self.noise_names),
+            self.settings,
+        )
+        self._fields = self._field_columns()
+        self._slopes[frozenset()] = free, slopes
+        self._sizes = np.full(len(self.words), self.settings.usual_discrepancy), np.ones(len(self.noise_names))
+        return u
+
+    def _descend(
+        self,
+        u: np.ndarray,
+        free: np.ndarray,
+        sizes: tuple[np.ndarray, np.ndarray] | None = None,
+        slopes: np.ndarray | None = None,
+        guessed: bool = False,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The most probable coordinates at given sizes of discrepancy and noise, and the derivatives near them.
+
+        Gauss-Newton; derivatives serve for further steps as long as these keep what they promise.
+
+        Args:
+          u: (coordinates,) where from. free: places of what moves. sizes: None for noise alone.
+          slopes: (n, free) derivatives, if known. guessed: whether these are to be taken anew before the end.
+
+        Raises:
+          EvidenceError: the simulation diverged at the start.
+        """
+        fit, settings = self._fit, self.settings
+        noise = np.ones(len(self.noise_names)) if sizes is None else sizes[1]
+        weight = 1.0 / noise[self._group[fit]]
+        misfit = np.zeros((int(fit.sum()), 0))
+        if sizes is not None and self._fields is not None:
+            columns, number = self._fields
+            misfit = columns[fit] * (sizes[0][number] * weight[:, None])
+        factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
+        std = self._std[free]
+        centre = np.array([self.coordinates[i].centre for i in free])
+        low, high = self.drives.bounds(free)
+
+        def white(columns: np.ndarray) -> np.ndarray:
+            found = self.observations.whiten(columns)[fit]
+            return found * (weight if found.ndim == 1 else weight[:, None])
+
+        def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+            """Products of whitened columns under the covariance of noise and discrepancy."""
+            return a.T @ b - (misfit.T @ a).T @ linalg.cho_solve(factor, misfit.T @ b)
+
+        def chi2(residual: np.ndarray, x: np.ndarray) -> float:
+            if not np.isfinite(residual).all():
+                return np.inf
+            return float(inner(residual, residual)) + float(np.sum(((x - centre) / std) ** 2))
+
+        if slopes is None:
+            value, slopes = self.jacobian(u, free)
+        else:
+            value = self.predicted(u)
+        residual = white(self.observations.value - value)
+        if not np.isfinite(residual).all():
+            raise EvidenceError("a rover's simulation diverged")
+        many = min(len(_SHARES), self.drives.together)
+        here = chi2(residual, u[free])
+        for _ in range(settings.most_jacobians):
+            jacobian, first = white(slopes), here
+            normal = inner(jacobian, jacobian) + np.diag(std**-2)
+            while True:
+                downhill = inner(jacobian, residual) - (u[free] - centre) / std**2
+                step = _bounded_step(normal, downhill, u[free], low, high)
+                promised = float(2.0 * step @ downhill - step @ normal @ step)
+                if promised < settings.settled:
+                    break
+                step *= min(1.0, settings.longest_step / float(np.abs(step).max()))
+                rows = np.repeat(u[None], many, axis=0)
+                rows[:, free] = np.clip(u[free] + np.outer(_SHARES[:many], step), low, high)
+                values = self.drives.predict(self._whole(rows))
+                residuals = [white(self.observations.value - v) for v in values]
+                reached = [chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
+                best = int(np.argmin(reached))
+                gained = here - reached[best]
+                if not gained > 0.0:
+                    break
+                u, residual, here = rows[best], residuals[best], reached[best]
+                if gained < 0.3 * promised:
+                    break
+            if not guessed and (promised < settings.settled or first - here < settings.settled):
+                break
+            slopes, guessed = self.jacobian(u, free)[1], False
+        return u, slopes
+
+
+def _bounded_step(
+    normal: np.ndarray, downhill: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """The Gauss-Newton step within bounds: coordinates that it would carry beyond one stay on it."""
+    step, held = np.zeros(len(x)), np.zeros(len(x), bool)
+    for _ in range(len(x)):
+        move = ~held
+        known = downhill[move] - normal[np.ix_(move, held)] @ step[held]
+        step[move] = np.linalg.solve(normal[np.ix_(move, move)], known)
+        outside = move & ((x + step < low - 1e-12) | (x + step > high + 1e-12))
+        if not outside.any():
+            break
+        step[outside] = np.clip(step[outside], (low - x)[outside], (high - x)[outside])
+        held |= outside
+    return step
+
+
+def usual_of(drives: DriveProblem) -> Usual:
+    """What is usual on the rover of drives: its wheels' load, and torque, current and speed of its drives."""
+    model, rover = drives.model, drives.model.rover
+    names = list(rover.joints)
+    driven = [names.index(w.drive) for w in rover.wheels if w.drive in names]
+
+    def own(name: str) -> float:
+        return float(np.mean(np.broadcast_to(model.parameters["motor"][name], len(names))[driven]))
+
+    weight = float(rover.mass) * float(model.gravity)
+    load, radius = weight / len(rover.wheels), float(np.mean([w.radius for w in rover.wheels]))
+    torque = 0.1 * load * radius
+    current = torque / (own("gear_ratio") * own("gear_efficiency") * own("torque_constant"))
+    commands = np.concatenate([r.commands[:, driven].ravel() for r in drives.bench.runs])
+    moving = np.abs(commands[np.abs(commands) > 1e-6])
+    speed = float(np.quantile(moving, 0.9)) if len(moving) else 1.0
+    return Usual(load, radius, speed, torque, current, own("resistance"), weight, 2.0 * radius)

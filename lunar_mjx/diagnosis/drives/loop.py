@@ -1,0 +1,72 @@
+"""Drives through the verbs: the form of a rover's model from a run, and that model with effects added."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+from lunar_mjx.diagnosis.build_problem import candidates_of
+from lunar_mjx.diagnosis.drives.form import DriveForm
+from lunar_mjx.diagnosis.drives.problem import DriveProblem
+from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.diagnosis.fitted_model import fitted_model
+from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.weighed.answer import kept_start
+from lunar_mjx.diagnosis.weighed.form import Problem
+from lunar_mjx.effects import catalogue
+from lunar_mjx.effects.base import Effect
+from lunar_mjx.inference.fitting import Progress, silent
+from lunar_mjx.logs import Log
+from lunar_mjx.model import Model
+
+
+def build_drives(
+    run: Run,
+    logs: Sequence[Log],
+    only: Sequence[str] | None = None,
+    progress: Progress = silent,
+    candidates: Mapping[str, Effect] | None = None,
+) -> Problem:
+    """The problem of a run's drives.
+
+    Args:
+      run: model, candidates, splits, settings. logs: its drives.
+      only: candidates to include; all if None. progress: told of simulations and refits.
+      candidates: effects by name, in place of those of the catalogue.
+
+    Raises:
+      UserError: a candidate or a setting that does not exist.
+    """
+    settings = DriveSettings.of(run.settings)
+    wanted = candidates_of(run, only) if candidates is None else candidates
+    drives = DriveProblem(logs, run.model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
+    form = DriveForm(drives, settings, progress)
+    kept = kept_start(run, form, frozenset())
+    form.start = form.start if kept is None else kept
+    return Problem((form,), drives.effects, drives.not_tested, settings, drives.unused)
+
+
+def grown_drives(
+    run: Run, logs: Sequence[Log], names: Sequence[str], values: Mapping[str, float], progress: Progress
+) -> Model:
+    """The run's model with effects at the values of their refit.
+
+    Args:
+      run: with its model. logs: its drives. names: of effects, or file.py:name.
+      values: parameters to hold at other than their fitted values. progress: told of the refit.
+    """
+    effects = {n: catalogue.get(n) for n in names}
+    model = run.model
+    for name, effect in effects.items():
+        model = model.add(name if ".py" in name else effect, "add", **values)
+    if set(run.model.effect_names) - set(model.effect_names):
+        return model  # another form of what it replaces: its own comparison refits it
+    specs = tuple(n for n in names if ".py" in n and n not in run.candidates)
+    grown = dataclasses.replace(run, candidates=(*run.candidates, *specs))
+    form = build_drives(grown, logs, [e.name for e in effects.values()], progress).own
+    new = frozenset(e.name for e in effects.values()) & set(form.candidates)
+    progress("refitting with " + ", ".join(sorted(new)), 0.0)
+    base = form.refit(frozenset(), None, None)
+    refit = form.refit(new, base, kept_start(run, form, new)) if new else base
+    moved = [*form.baseline, *(i for e in new for i in form.candidates[e])]
+    return fitted_model(form.coordinates, refit.u, moved, model, values)

@@ -1,0 +1,39 @@
+"""Every number that decides about drives, in one tree: name, unit, and what it rests on."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from lunar_mjx.diagnosis.weighed.form import SearchSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveSettings(SearchSettings):
+    """Sizes, priors and effort of a diagnosis of drives."""
+
+    stated_spread: float = 0.3
+    """1; standard deviation of the logarithm of the noise's size: it is only stated, or taken from a second of rest."""
+    own_share: float = 0.5
+    """1; share of a discrepancy's variance that each log has for itself; the rest all logs share."""
+    usual_error: float = 0.02
+    """1; scale of the half-normal prior of the error that a model's channels have beyond its ports, as a share of what
+    a channel does: ground that no map has, play, dynamics that are left out."""
+    errors: tuple[float, ...] = (0.0, 0.003, 0.01, 0.03, 0.1)
+    """1; sizes of that error which are tried."""
+    least_length: float = 0.3
+    """sigma; a direction in which even an unlisted discrepancy is shorter is left out."""
+    secant: float = 0.3
+    """1; amount of a candidate, in nominal sizes, over which its signature is taken: an effect such as a delay does
+    nothing within a time step, and the data ask for amounts of about the nominal one."""
+
+    # --- effort ------------------------------------------------------------------------------------------------------
+    most_refits: int = 8
+    """1; refits of a search, each of which simulates some hundred drives."""
+    most_rounds: int = 2
+    """1; rounds of refit and re-linearisation."""
+    most_jacobians: int = 6
+    """1; Jacobians of one descent."""
+    settled: float = 0.5
+    """chi-square; what a further step must promise."""
+    longest_step: float = 3.0
+    """scale; longest step of a coordinate."""

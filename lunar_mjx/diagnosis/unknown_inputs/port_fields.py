@@ -1,0 +1,92 @@
+"""Fields of discrepancy at a rover's ports: what each is "good to", and how large an unknown input of size 1 is.
+
+A field multiplies what acts at its port by 1 + w, or adds a share of it, where w is a smooth function of the port's own
+quantities (see `inputs`). Sizes are relative, so that 5 per cent means the same on every rover.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from lunar_mjx.diagnosis.unknown_inputs.inputs import QUANTITY_SIZES
+
+WORDS: Mapping[str, str] = {
+    "command: motor current": "motor current",
+    "motor_torque": "torque at the joints",
+    "geometry: wheel radius": "radius of the wheels under their load",
+    "soil: stiffness": "normal stress",
+    "soil: shear strength": "shear strength",
+    "wheel_normal: load": "load of the wheels",
+    "wheel_normal: resistance": "resistance of the normal stress",
+    "wheel_shear: longitudinal force": "shear force along the wheel",
+    "wheel_shear: lateral force": "side force",
+    "wheel_shear: driving moment": "driving torque",
+    "body_wrench: push": "force on the body",
+    "body_wrench: pitching moment": "pitching moment on the body",
+    "heat: winding": "heat of the windings",
+    "heat: housing": "heat of the housings",
+}
+"""Fields of discrepancy, and what is "good to so many per cent" in the user's words."""
+
+ADDED, DRAWN = 0.25, 0.1
+"""Sizes over that of the field: of a force that is added, over the load; of the wheel's deformation, over its radius
+(as for tables)."""
+SHARES: Mapping[str, float] = {
+    "geometry: wheel radius": DRAWN,
+    "wheel_normal: load": ADDED,
+    "wheel_normal: resistance": ADDED,
+    "wheel_shear: longitudinal force": ADDED,
+    "wheel_shear: lateral force": ADDED,
+    "wheel_shear: driving moment": ADDED,
+    "body_wrench: push": ADDED,
+    "body_wrench: pitching moment": ADDED,
+}
+"""Of the fields whose size is not that of a gain; the others are gains."""
+DRAWBAR = 0.1
+"""Torque at the wheels that is usual, over load times radius: a drawbar pull of a tenth of the load."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Usual:
+    """What is usual on a rover, SI units: load of a wheel, its radius, its speed in rad/s, torque and current of its
+    drive, resistance of the winding, weight and half the wheelbase."""
+
+    load: float
+    radius: float
+    speed: float
+    torque: float
+    current: float
+    resistance: float
+    weight: float
+    half_base: float
+
+    def size(self, label: str, quantity: str) -> float:
+        """Amplitude, in the unit of an unknown input, of a field of size 1 that follows a quantity."""
+        heat = self.current**2 * self.resistance
+        amounts = {
+            "command: motor current": self.current,
+            "motor_torque": self.torque,
+            "body_wrench: push": self.weight,
+            "body_wrench: pitching moment": self.weight * self.half_base,
+            "heat: winding": heat,
+            "heat: housing": heat,
+        }
+        usual = {
+            "current": self.current,
+            "loss": self.current,
+            "joint speed": self.speed,
+            "wheel speed": self.speed,
+            "load": self.load,
+            "travel speed": self.speed * self.radius,
+        }
+        follows = QUANTITY_SIZES[quantity] / usual[quantity] if quantity in usual else 1.0
+        return SHARES.get(label, 1.0) * amounts.get(label, 1.0) * follows
+
+
+def rotated(columns: np.ndarray, least: float) -> np.ndarray:
+    """Columns (n, m) turned so that few (n, k) are left: those at least `least` long."""
+    values, vectors = np.linalg.eigh(columns.T @ columns)
+    return columns @ vectors[:, values > least**2]
