@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lunar_mjx.commands.compiled import keep_compiled
 from lunar_mjx.commands.options import MOST_SEED, PresetOption
 from lunar_mjx.errors import bad_input
+
+if TYPE_CHECKING:
+    from lunar_mjx.viewer.policy_drive import PolicyDrive
+    from lunar_mjx.viewer.server import Viewer
 
 ModelOption = Annotated[Path | None, typer.Option(help="model.toml; overrides --rover, --terrain and --preset.")]
 SUN = "azimuth,elevation of the Sun, deg; the model's own, or 135,15, if left out"
@@ -97,11 +102,22 @@ def view(
     web: Annotated[bool, typer.Option("--web", help="A web page on this machine although there is a screen.")] = False,
     port: Annotated[int, typer.Option(help="Of the web page; 0 for any that is free.")] = 8600,
     sun: Annotated[str | None, typer.Option(help=SUN)] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="Look on while a policy drives: a rover that ships one, or a policy.npz.")
+    ] = None,
+    replay: Annotated[
+        Path | None, typer.Option(help="Run folder of a drive: the measured rover beside the model's, as a ghost.")
+    ] = None,
+    log: Annotated[str, typer.Option(help="Which of the run's logs to replay; the first by default.")] = "",
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of a policy's episodes.")] = 0,
     engine: Annotated[
         str, typer.Option(help="native (starts at once), structured, mjx; auto: native where it has every effect.")
     ] = "auto",
 ) -> None:
-    """Drive a rover by keyboard: in a window, or without a screen on a web page that only this machine can open."""
+    """Drive a rover by keyboard: in a window, or without a screen on a web page that only this machine can open.
+
+    On such a page a policy can drive instead, or a measured drive be played back beside a model's prediction.
+    """
     from lunar_mjx.commands.options import check_finite
 
     check_finite(speed=speed, x=x, y=y, yaw_deg=yaw_deg)
@@ -116,6 +132,18 @@ def view(
     given = None if sun is None else _sun(sun)
     check_port(port)
     keep_compiled()
+    if policy is not None and replay is not None:
+        raise bad_input("lunar-mjx view", "--replay", str(replay), "does not go with --policy", "give one of the two")
+    if policy is not None:
+        watched = _policy_drive(policy, seed)
+        _serve(Viewer(watched, port, given or camera_sun(watched.model.sun)))
+        return
+    if replay is not None:
+        from lunar_mjx.diagnosis.report.driven import replayed
+
+        shown = replayed(replay, log)
+        _serve(Viewer(shown, port, given or camera_sun(shown.model.sun)))
+        return
     built = load_model(model) if model else make_model(rover, terrain, preset or DEFAULT_PRESET)
     for effect in effects or []:
         built = built.add(effect, "--effects")
@@ -124,12 +152,7 @@ def view(
     if has_screen() and not web:
         show_window(drive, light)
     else:
-        server = Viewer(drive, port, light)
-        try:
-            print(f"{server.address}  (Ctrl-C ends the drive)", flush=True)
-            server.run()
-        except KeyboardInterrupt:  # before or after it could be caught there
-            server.close()
+        _serve(Viewer(drive, port, light))
     print(f"{built.rover.name} drove {drive.path:.1f} m in {drive.time:.1f} s")
 
 
@@ -138,6 +161,30 @@ def _sun(text: str) -> Any:
 
     azimuth, elevation = _numbers("--sun", text, ",", float)
     return Sun(azimuth, elevation)
+
+
+def _serve(server: Viewer) -> None:
+    """Serves the page until Control-C."""
+    try:
+        print(f"{server.address}  (Ctrl-C ends the drive)", flush=True)
+        server.run()
+    except KeyboardInterrupt:  # before or after it could be caught there
+        server.close()
+
+
+def _policy_drive(name: str, seed: int) -> PolicyDrive:
+    """A policy's drive on the ground that it was not trained on."""
+    from lunar_mjx.agents.play import open_agent
+    from lunar_mjx.agents.run import unseen_params
+    from lunar_mjx.viewer.policy_drive import PolicyDrive
+
+    env, agent, unseen = open_agent(name)
+    print("view: compiling, which can take some minutes the first time", file=sys.stderr)
+    shown = Path(name).stem if name.endswith(".npz") else f"{name}'s policy"
+    drive = PolicyDrive(env, agent, shown, unseen_params(env, unseen), seed)
+    if unseen:
+        drive.scene["terrain"] = "unseen ground"
+    return drive
 
 
 def _numbers(option: str, text: str, between: str, kind: type) -> list:

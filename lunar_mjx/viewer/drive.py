@@ -9,8 +9,8 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
 
 import jax
 import mujoco
@@ -62,6 +62,33 @@ def open_engine(model: Model, engine: str) -> Backend:
     return JaxBackend(model, engine, precision="float32")
 
 
+class Driver(Protocol):
+    """What takes the keys."""
+
+    def hold(self, keys: Iterable[str]) -> None: ...
+
+
+class Drive(Protocol):
+    """What the page can show: a rover that goes on, or a drive that is over.
+
+    Attributes:
+      live: whether it goes on. scene: what the page is told once, beside rover and ground.
+      model: brings both. pilot: takes the keys. rate: times real time.
+    """
+
+    live: bool
+    scene: dict[str, Any]
+    model: Model
+    rate: float
+
+    @property
+    def pilot(self) -> Driver: ...
+    def reset(self) -> None: ...
+    def advance(self, duration: float) -> float: ...
+    def bodies(self) -> np.ndarray: ...
+    def readings(self) -> dict[str, Any]: ...
+
+
 class LiveDrive:
     """A rover that somebody drives.
 
@@ -78,6 +105,8 @@ class LiveDrive:
       UserError: as `open_engine`, or a start off the terrain.
     """
 
+    live = True
+
     def __init__(
         self,
         model: Model,
@@ -91,7 +120,7 @@ class LiveDrive:
         self.model = drivable(model)
         self.pilot = Pilot(self.model, top_speed)
         self.backend = open_engine(self.model, engine)
-        self.note = ""
+        self.note, self.scene = "", {}
         self._start = (x, y, yaw)
         self._steps = max(1, round(HOLD / self.model.timestep))
         self._scene = self.model.rover.compile()
@@ -196,7 +225,7 @@ class Pace:
       lock: held while the drive changes. failure: what ended the thread, if anything did.
     """
 
-    def __init__(self, drive: LiveDrive, show: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, drive: Drive, show: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> None:
         self.drive, self.lock, self.clock, self._show = drive, threading.Lock(), clock, show
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="drive", daemon=True)

@@ -94,6 +94,13 @@ class Pilot:
         return targets
 
 
+class Onlooker:
+    """Takes the keys of somebody who does not drive."""
+
+    def hold(self, keys: Iterable[str]) -> None:
+        """Drops them."""
+
+
 def drivable(model: Model) -> Model:
     """The model with motors that follow a driver: speeds for drives, angles for steering and suspension."""
     modes = {g.name: "velocity" if g.name == "drive" else "position" for g in model.rover.groups}

@@ -24,7 +24,7 @@ import numpy as np
 
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.errors import bad_input
-from lunar_mjx.viewer.drive import LiveDrive, Pace
+from lunar_mjx.viewer.drive import Drive, Pace
 from lunar_mjx.viewer.pilot import KEYS
 from lunar_mjx.viewer.scene import ground_scene, rover_scene
 
@@ -38,7 +38,7 @@ _FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/style.css": ("style.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
-} | {f"/{name}.js": (f"{name}.js", _SCRIPT) for name in ("main", "maths", "panel", "render", "shapes")}
+} | {f"/{name}.js": (f"{name}.js", _SCRIPT) for name in ("main", "maths", "panel", "render", "replay", "shapes")}
 _LONGEST = 4096
 """Bytes of a message from the page."""
 _MOST_CONNECTIONS = 64
@@ -64,7 +64,8 @@ class Viewer(ThreadingHTTPServer):
     """Serves one drive.
 
     Args:
-      drive: what is driven. port: 0 for any that is free. sun: the light. clock: s, monotonic.
+      drive: what is shown: a drive that goes on, or one that is over. port: 0 for any that is free.
+      sun: the light. clock: s, monotonic.
 
     Raises:
       UserError: a port that is no port, or taken.
@@ -77,12 +78,12 @@ class Viewer(ThreadingHTTPServer):
     """Connections that wait to be taken: one that finds no place tries again only after a second."""
 
     def __init__(
-        self, drive: LiveDrive, port: int = PORT, sun: Sun | None = None, clock: Callable[[], float] = time.monotonic
+        self, drive: Drive, port: int = PORT, sun: Sun | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         check_port(port)
         self.drive = drive
         self.terrain = jax.device_get(drive.model.terrain)
-        self.scene = json.dumps(rover_scene(drive.model, sun or Sun()))
+        self.scene = json.dumps(rover_scene(drive.model, sun or Sun()) | drive.scene)
         self.pace = Pace(drive, self._show, clock)
         self._fresh = threading.Condition()
         self._picture, self._count, self._closed = "", 0, False
@@ -109,7 +110,8 @@ class Viewer(ThreadingHTTPServer):
     def run(self) -> None:
         """Drives and serves until Control-C."""
         try:
-            self.pace.start()
+            if self.drive.live:
+                self.pace.start()
             self.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:
             pass

@@ -86,7 +86,7 @@ def show_window(drive: LiveDrive, sun: Sun) -> None:
         _look(window, model, drive)
         pace.start()
         try:
-            _show(window, model, data, pace, sun)
+            _show(window, model, data, drive, pace, sun)
         except KeyboardInterrupt:
             pass
         finally:
@@ -109,12 +109,12 @@ def _look(window: Any, model: mujoco.MjModel, drive: LiveDrive) -> None:
         window.opt.flags[mujoco.mjtVisFlag.mjVIS_CAMERA] = False
 
 
-def _show(window: Any, model: mujoco.MjModel, data: mujoco.MjData, pace: Pace, sun: Sun) -> None:
+def _show(window: Any, model: mujoco.MjModel, data: mujoco.MjData, drive: LiveDrive, pace: Pace, sun: Sun) -> None:
     font, corner = mujoco.mjtFontScale.mjFONTSCALE_100, mujoco.mjtGridPos.mjGRID_TOPLEFT
     while window.is_running() and pace.failure is None:
         begin = time.monotonic()
         with pace.lock:
-            qpos, (names, values) = pace.drive.qpos, captions(pace.drive)
+            qpos, (names, values) = drive.qpos, captions(drive)
         with window.lock():
             data.qpos[:] = qpos
             mujoco.mj_kinematics(model, data)

@@ -2,9 +2,11 @@
 import { add, clamp, lookAt, multiply, perspective, pose, scale } from "./maths.js";
 import { Panel, listen } from "./panel.js";
 import { Renderer } from "./render.js";
-import { ground, shapeOf, sphere } from "./shapes.js";
+import { Replay } from "./replay.js";
+import { cylinder, ground, shapeOf, sphere } from "./shapes.js";
 
 const GROUND = [0.60, 0.585, 0.565], ROCK = [0.5, 0.48, 0.46], STILL = pose([0, 0, 0], [1, 0, 0, 0]);
+const GHOST = [0.34, 0.71, 0.91], GHOSTLY = 0.55, POST = [0.03, 0.7], FLAG = [0.9, 0.62, 0.0];
 const FETCH_AGAIN = 7, BAR = 0.022, MOST_BARS = 80000, VIEWS = ["follow", "fixed", "from above"];
 
 async function json(path) {
@@ -20,6 +22,7 @@ class View {
     this.rover = scene.shapes.filter((s) => s.colour[3] > 0).map((shape) => ({ mesh: this.renderer.upload(shapeOf(shape)),
       body: shape.body, local: pose(shape.place, shape.turn), colour: shape.colour.slice(0, 3),
       kind: shape.kind === "cylinder" && scene.wheels.some((w) => w.body === shape.body) ? 4 : 0 }));
+    this.post = this.renderer.upload(cylinder(POST));
     this.ball = this.renderer.upload(sphere([1, 1, 1]));
     this.soil = [];
     this.camera = { around: 0, above: 0.36, away: 2.1 * scene.size + 1.2, mode: 0, yaw: null, target: null };
@@ -80,10 +83,14 @@ class View {
     this.last = bodies;
   }
 
-  show(bodies) {
+  show(bodies, { ghost = null, goal = null } = {}) {
+    Object.assign(this, { ghost, goal });
     const chassis = bodies[this.scene.chassis], jumped = this.last &&
       Math.hypot(chassis[0] - this.last[this.scene.chassis][0], chassis[1] - this.last[this.scene.chassis][1]) > 0.5;
-    if (jumped) this.restart();
+    if (jumped) {
+      this.restart();
+      Object.assign(this.camera, { target: null });
+    }
     this.tread(bodies);
     this.bodies = bodies;
     this.surround(chassis[0], chassis[1]);
@@ -108,11 +115,20 @@ class View {
     eye[2] = Math.max(eye[2], (this.height?.(eye[0], eye[1]) ?? -Infinity) + 0.25);
     const { clientWidth: width, clientHeight: height } = this.renderer.canvas;
     const clip = multiply(perspective(0.75, width / Math.max(height, 1), 0.05, 600), lookAt(eye, camera.target, [0, 0, 1]));
-    const rover = this.rover.map((part) => {
-      const body = this.bodies[part.body];
-      return { ...part, model: multiply(pose(body.slice(0, 3), body.slice(3)), part.local) };
+    const standing = (bodies, more) => this.rover.map((part) => {
+      const body = bodies[part.body];
+      return { ...part, ...more, model: multiply(pose(body.slice(0, 3), body.slice(3)), part.local) };
     });
-    this.renderer.draw([...rover, ...this.soil], at.slice(0, 3), eye, clip);
+    const ghost = this.ghost ? standing(this.ghost, { colour: GHOST, kind: 0, alpha: GHOSTLY }) : [];
+    this.renderer.draw([...standing(this.bodies), ...this.marks(), ...this.soil], ghost, at.slice(0, 3), eye, clip);
+  }
+
+  // Where the rover wants to go: a post with a ball on it.
+  marks() {
+    if (!this.goal) return [];
+    const [x, y, z] = this.goal, top = new Float32Array([0.12, 0, 0, 0, 0, 0.12, 0, 0, 0, 0, 0.12, 0, x, y, z + 2 * POST[1], 1]);
+    return [{ mesh: this.post, model: pose([x, y, z + POST[1]], [1, 0, 0, 0]), colour: FLAG, kind: 0 },
+      { mesh: this.ball, model: top, colour: FLAG, kind: 0 }];
   }
 
   drag(canvas) {
@@ -138,32 +154,40 @@ async function start() {
   } catch (error) {
     trouble = error.message;   // the readings and the keys still work
   }
+  let last = performance.now(), replay = null;
+  const frame = (now) => {
+    const seconds = Math.min((now - last) / 1000, 0.2);
+    replay?.tick(seconds);
+    view?.draw(seconds);
+    last = now;
+    requestAnimationFrame(frame);
+  };
+  requestAnimationFrame(frame);
   const button = document.getElementById("camera");
   const name = () => { button.textContent = `camera: ${VIEWS[view?.camera.mode ?? 0]}`; };
   name();
-  listen(() => view?.restart(), () => {
+  const turn = () => {
     if (!view) return;
     view.camera.around += view.camera.mode === 0 ? view.camera.yaw : 0;
     view.camera.mode = (view.camera.mode + 1) % VIEWS.length;
     if (view.camera.mode === 0) view.camera.around -= view.camera.yaw;
     name();
-  });
+  };
+  if (scene.replay) {
+    replay = new Replay(scene, view, turn);
+    panel.note(trouble);
+    return;
+  }
+  listen(() => view?.restart(), turn);
   const pictures = new EventSource("/pictures");
   pictures.onmessage = (event) => {
     const now = JSON.parse(event.data);
     now.note ||= trouble;
     panel.show(now);
-    view?.show(now.bodies);
+    view?.show(now.bodies, now);
     document.body.dataset.pictures = 1 + Number(document.body.dataset.pictures ?? 0);
   };
   pictures.onerror = () => panel.note("The drive has ended, or its connection is lost.");
-  let last = performance.now();
-  const frame = (now) => {
-    view?.draw(Math.min((now - last) / 1000, 0.2));
-    last = now;
-    requestAnimationFrame(frame);
-  };
-  requestAnimationFrame(frame);
 }
 
 start().catch((error) => {

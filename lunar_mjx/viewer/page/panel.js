@@ -10,7 +10,10 @@ const WORDS = { lf: "left front", rf: "right front", lm: "left middle", rm: "rig
 
 export class Panel {
   constructor(scene) {
-    byId("title").textContent = `${scene.rover} on ${scene.terrain}`;
+    byId("title").textContent = `${scene.rover} on ${scene.terrain}` + (scene.driver ? `, driven by ${scene.driver}` : "");
+    document.body.classList.toggle("driven", Boolean(scene.driver));
+    if (scene.driver) byId("help").textContent = "R begins another episode, C changes the camera. Drag to look around, " +
+      "scroll to come nearer.";
     document.title = `${scene.rover} – lunar-mjx view`;
     const table = document.createElement("table");
     const head = table.createTHead().insertRow();
@@ -50,6 +53,7 @@ export class Panel {
     byId("heading").textContent = `${number(Math.round(now.heading_deg) % 360, 0)}°`;
     byId("pitch").textContent = `${number(-now.pitch_deg, 1)}°`;
     byId("roll").textContent = `${number(now.roll_deg, 1)}°`;
+    byId("goal").textContent = now.goal ? `${number(now.goal_m, 1)} m away` : "";
     byId("power").textContent = `${number(now.power_W, 0)} W`;
     byId("hottest").textContent = `${now.hottest} ${number(now.hottest_degC, 1)} °C`;
     this.rows.forEach((row, i) => {

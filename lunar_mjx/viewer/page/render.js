@@ -40,7 +40,7 @@ in vec3 at, facing, own;
 in vec4 shade;
 in float edgewise;   // 1 on a wheel's flanks, 0 on its rim
 uniform vec3 eye, sun, colour;
-uniform float exposure, span;
+uniform float exposure, span, alpha;
 uniform vec2 middle;         // of the ground on which tracks are drawn
 uniform int kind;            // 0 rover, 1 near ground, 2 far ground, 3 rock, 4 wheel
 uniform sampler2DShadow shadows;
@@ -119,7 +119,7 @@ void main() {
   vec3 sum = base * (exposure * 1.35 * facingSun * light + fill) + vec3(shine * light * exposure);
   // a filmic shoulder: the brightest parts of the rover keep their shading
   vec3 film = sum * (2.51 * 0.62 * sum + 0.03 * 2.0) / (0.62 * sum * (2.43 * 0.62 * sum + 0.59) + 0.14) * 0.62;
-  pixel = vec4(pow(clamp(film, 0.0, 1.0), vec3(1.0 / 2.0)), 1.0);
+  pixel = vec4(pow(clamp(film, 0.0, 1.0), vec3(1.0 / 2.0)), alpha);
 }`;
 
 const STAR_VERTEX = `#version 300 es
@@ -278,8 +278,8 @@ export class Renderer {
     this.dirty.clear();
   }
 
-  // parts: [{mesh, model, colour, kind}]; centre: of what casts shadows; eye and camera: world to clip.
-  draw(parts, centre, eye, camera) {
+  // parts, ghosts: [{mesh, model, colour, kind}]; ghosts have an alpha too, and cast no shadow; centre: of what casts shadows; eye and camera: world to clip.
+  draw(parts, ghosts, centre, eye, camera) {
     const { gl, canvas } = this;
     this.flushTracks();
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
@@ -328,12 +328,24 @@ export class Renderer {
     gl.bindTexture(gl.TEXTURE_2D, this.shadows);
     gl.uniform1i(at.shadows, 0);
     gl.uniform1i(at.tracks, 1);
-    for (const part of parts) {
-      gl.uniformMatrix4fv(at.model, false, part.model);
-      gl.uniform3fv(at.colour, part.colour);
-      gl.uniform1i(at.kind, part.kind);
-      this.triangles(part.mesh);
-    }
+    const each = (list) => {
+      for (const part of list) {
+        gl.uniformMatrix4fv(at.model, false, part.model);
+        gl.uniform3fv(at.colour, part.colour);
+        gl.uniform1i(at.kind, part.kind);
+        gl.uniform1f(at.alpha, part.alpha ?? 1);
+        this.triangles(part.mesh);
+      }
+    };
+    each(parts);
+    if (!ghosts.length) return;
+    gl.colorMask(false, false, false, false);   // first how deep it is, so that only its nearest faces are blended
+    each(ghosts);
+    gl.colorMask(true, true, true, true);
+    gl.enable(gl.BLEND);
+    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    each(ghosts);
+    gl.disable(gl.BLEND);
   }
 
   triangles(mesh) {

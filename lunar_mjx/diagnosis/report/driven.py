@@ -1,0 +1,120 @@
+"""A run's drive as the viewer plays it back: where the rover was, and where each model says that it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lunar_mjx.diagnosis.report.read import Result, Traces, read_result
+from lunar_mjx.diagnosis.report.words import channel_label
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.inference.observations import Series
+from lunar_mjx.viewer.replay import Course, Replay, Trace
+
+_MOST_TRACES = 4
+"""Channels beside the picture: those that fit on a screen of 768 rows."""
+_LEAST_STEP = 0.02
+"""m between places whose direction tells a heading where none was measured."""
+
+
+def replayed(folder: str | Path, log: str = "") -> Replay:
+    """The drive of a run folder.
+
+    Args:
+      folder: of the run. log: name of one of its logs; the first that measured positions if empty.
+
+    Returns:
+      The measured course, that of each model, and the channels in which the last model is worst.
+
+    Raises:
+      UserError: no run, no such log, a log without positions, or a model that cannot be loaded any more.
+    """
+    folder = Path(folder)
+    result = read_result(folder)
+    traces = result.traces
+    if traces is None:
+        raise UserError(f"{folder}: holds no series.npz yet; make it with lunar-mjx compare.")
+    number = _log(folder, traces, log)
+    model = result.model
+    if model is None:
+        raise UserError(f"{folder}: its model cannot be loaded here, and brings the rover; run lunar-mjx compare anew.")
+    name = traces.observations.logs[number]
+    labels = [_label(result, label) for label in traces.labels]
+    courses = [_course(label, traces, number, row) for row, label in enumerate(labels)]
+    return Replay(model, name, _course("measured", traces, number, None), courses, _worst(traces, number))
+
+
+def _label(result: Result, label: str) -> str:
+    added = ", ".join(result.run.get("added", []))
+    return f"with {added}, refitted" if label == "refitted" and added else label
+
+
+def _log(folder: Path, traces: Traces, wanted: str) -> int:
+    """Number of the log to show."""
+    o = traces.observations
+    placed = [
+        i for i in range(len(o.logs)) if _series(traces, i, "position_x_m") and _series(traces, i, "position_y_m")
+    ]
+    if wanted and wanted not in o.logs:
+        raise bad_input(folder, "--log", wanted, "is none of its logs", f"use one of {', '.join(o.logs)}")
+    chosen = [i for i in placed if not wanted or o.logs[i] == wanted]
+    if not chosen:
+        remedy = f"use one of {', '.join(o.logs[i] for i in placed)}" if placed else "look at it with lunar-mjx studio"
+        raise bad_input(folder, "--replay", wanted or folder.name, "measured no positions to put a rover at", remedy)
+    return chosen[0]
+
+
+def _series(traces: Traces, log: int, channel: str) -> Series | None:
+    return next((s for s in traces.observations.series if s.log == log and s.channel == channel), None)
+
+
+def _values(traces: Traces, series: Series, row: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values of a series, measured (row None) or predicted, without what is missing."""
+    part = slice(series.start, series.stop)
+    value = traces.observations.value[part] if row is None else traces.predicted[row, part]
+    keep = np.isfinite(value) & np.isfinite(traces.time[part])
+    return traces.time[part][keep], value[keep]
+
+
+def _course(label: str, traces: Traces, log: int, row: int | None) -> Course:
+    along, across = (_series(traces, log, f"position_{a}_m") for a in "xy")
+    assert along is not None and across is not None
+    time, x = _values(traces, along, row)
+    y = np.interp(time, *_values(traces, across, row))
+    heading = _series(traces, log, "yaw_deg")
+    if heading is not None:
+        when, degrees = _values(traces, heading, row)
+        yaw = np.interp(time, when, np.unwrap(np.radians(degrees)))
+    else:
+        yaw = _direction(x, y)
+    return Course(label, time, x, y, yaw)
+
+
+def _direction(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Heading of the way, rad: that of the last place that was far enough away, as if it drove forward."""
+    yaw, last, found = np.zeros(len(x)), 0, False
+    for i in range(1, len(x)):
+        yaw[i] = yaw[i - 1]
+        if np.hypot(x[i] - x[last], y[i] - y[last]) >= _LEAST_STEP:
+            yaw[i], last = np.arctan2(y[i] - y[last], x[i] - x[last]), i
+            if not found:
+                yaw[:i], found = yaw[i], True
+    return np.unwrap(yaw)
+
+
+def _worst(traces: Traces, log: int) -> list[Trace]:
+    """Channels in which the last model leaves most, worst first."""
+    mine = [s for s in traces.observations.series if s.log == log and s.stop > s.start]
+    left = {s.channel: float(np.nanmean(traces.residual[-1, s.start : s.stop] ** 2)) for s in mine}
+    ranked = sorted(mine, key=lambda s: -left[s.channel])[:_MOST_TRACES]
+    return [
+        Trace(
+            channel_label(s.channel),
+            traces.time[s.start : s.stop],
+            traces.observations.value[s.start : s.stop],
+            traces.predicted[:, s.start : s.stop],
+            traces.residual[:, s.start : s.stop],
+        )
+        for s in ranked
+    ]

@@ -1,0 +1,158 @@
+"""A measured drive beside a model's: where the rovers stand, what the page gets and does, and what is refused."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import ABSENT, CHROMIUM, Browser
+from PIL import Image
+
+from lunar_mjx.diagnosis.report.driven import replayed
+from lunar_mjx.errors import UserError
+from lunar_mjx.model import make_model
+from lunar_mjx.model.file import save_model
+from lunar_mjx.viewer.server import Viewer
+from tests.viewer.viewer_client import ask
+
+HOSTILE = "<img src=x onerror='document.title=1'>"
+SECONDS, AWAY = 12.0, 0.8
+
+
+def write_run(folder: Path, channels: tuple[str, str] = ("position_x_m", "position_y_m")) -> Path:
+    """A run in which a rover drove a quarter circle of 4 m; the model as given ended `AWAY` m to the side."""
+    folder.mkdir()
+    model = make_model("luvmi_x", "slope:10deg")
+    save_model(model, folder / "model.toml")
+    time = np.linspace(0.0, SECONDS, 61)
+    angle = 0.5 * np.pi * time / SECONDS
+    measured = np.concatenate([4.0 * np.sin(angle), 4.0 - 4.0 * np.cos(angle)])
+    given = measured + np.concatenate([np.zeros(61), -AWAY * time / SECONDS])
+    predicted = np.stack([given, measured + 0.01])
+    n = len(measured)
+    np.savez_compressed(
+        folder / "series.npz",
+        measured=measured,
+        sigma=np.full(n, 0.1),
+        time=np.tile(time, 2),
+        place=np.zeros((0, 3)),
+        unit=np.zeros(n, int),
+        unit_names=np.array(["arc"]),
+        split=np.array(["fit"]),
+        series_start=np.array([0, 61]),
+        series_channel=np.array(channels),
+        series_log=np.array([0, 0]),
+        logs=np.array(["arc" + HOSTILE]),
+        labels=np.array(["as given", "refitted"]),
+        predicted=predicted,
+        residual=(measured - predicted) / 0.1,
+    )
+    run = {"format": "lunar-mjx-run/1", "logs": ["gone"], "hashes": {}, "added": []}
+    (folder / "run.json").write_text(json.dumps(run), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory):
+    return replayed(write_run(tmp_path_factory.mktemp("replay") / "run"))
+
+
+def _bodies(text: str, frames: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), "<f4").reshape(frames, -1, 7)
+
+
+def test_rovers_stand_where_they_were_and_lean_with_the_ground(replay):
+    told = replay.scene["replay"]
+    measured = _bodies(told["measured"], len(told["time"]))
+    given, refitted = (_bodies(m["bodies"], len(told["time"])) for m in told["models"])
+    chassis = replay.model.rover.compile().body(replay.model.rover.chassis).id
+    place = measured[:, chassis, :3]
+    # the body stands upright over its ground, so that its middle is moved downhill by its height times sin(10 deg)
+    offset = replay.model.rover.standing_height * np.sin(np.radians(10.0)) + 0.02
+    np.testing.assert_allclose(place[0, :2], [0.0, 0.0], atol=offset)
+    np.testing.assert_allclose(place[-1, :2], [4.0, 4.0], atol=offset)
+    w, x, y, z = measured[:, chassis, 3:].T
+    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    assert yaw[-1] - yaw[0] == pytest.approx(0.5 * np.pi, abs=0.1)  # its heading is that of its way
+    up = 1 - 2 * (x * x + y * y)
+    np.testing.assert_allclose(up, np.cos(np.radians(10.0)), atol=2e-3)
+    gap = np.hypot(*(given[-1, chassis, :2] - place[-1, :2]))
+    assert gap == pytest.approx(AWAY, rel=0.05)
+    assert np.hypot(*(refitted[-1, chassis, :2] - place[-1, :2])) < 0.05
+    trace = told["traces"][0]
+    assert len(trace["predicted"]) == 2 and len(trace["measured"]) == 61 and trace["residual"][0][-1] is not None
+
+
+def test_what_cannot_be_replayed_is_said(tmp_path):
+    with pytest.raises(UserError, match="measured no positions"):
+        replayed(write_run(tmp_path / "still", ("gyro_x_rad_s", "gyro_z_rad_s")))
+    folder = write_run(tmp_path / "run")
+    with pytest.raises(UserError, match="--log = 'nowhere' is none of its logs"):
+        replayed(folder, "nowhere")
+    (folder / "model.toml").unlink()
+    with pytest.raises(UserError, match="model cannot be loaded"):
+        replayed(folder)
+    (folder / "series.npz").unlink()
+    with pytest.raises(UserError, match=r"no series\.npz"):
+        replayed(folder)
+
+
+@pytest.fixture
+def served(replay):
+    viewer = Viewer(replay, port=0)
+    thread = threading.Thread(target=viewer.run)
+    thread.start()
+    yield viewer
+    viewer.shutdown()
+    thread.join()
+
+
+def test_strangers_get_nothing_and_keys_move_nothing(served):
+    port = served.server_address[1]
+    assert ask(served, "GET", "/scene", Host=f"evil.example:{port}")[0] == 403
+    assert ask(served, "GET", "/replay.js", Origin="http://evil.example")[0] == 403
+    assert ask(served, "GET", "/replay.js")[0] == 200
+    assert ask(served, "POST", "/keys", {"held": ["forward"]})[0] == 200
+    assert ask(served, "POST", "/reset", {})[0] == 200
+    told = json.loads(ask(served, "GET", "/scene")[2])
+    assert len(told["replay"]["models"]) == 2 and told["rover"] == "luvmi_x"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=ABSENT)
+def test_the_page_plays_chooses_and_seeks(served, tmp_path):
+    browser = Browser(tmp_path / "profile")
+    try:
+        browser.open(served.address)
+        browser.wait("Number(document.body?.dataset.time) > 0.5")
+        assert browser.value("document.title") != "1"  # a log's name is text
+        assert HOSTILE in browser.value("document.getElementById('replay-title').textContent")
+        assert browser.value("document.querySelectorAll('#plots figure').length") == 2
+        browser.key("keyDown", "Space", " ")
+        assert browser.value("document.getElementById('play').textContent") == "play"
+        at = float(browser.value("document.body.dataset.time"))
+        browser.key("keyDown", "ArrowRight", "ArrowRight")
+        assert float(browser.value("document.body.dataset.time")) == pytest.approx(at + 2.0, abs=0.01)
+        seek = "const s = document.getElementById('when'); s.value = 12; s.dispatchEvent(new Event('input'));"
+        choose = (
+            "const c = document.getElementById('model'); c.selectedIndex = {}; c.dispatchEvent(new Event('change'));"
+        )
+        browser.value(f"(() => {{ {seek} {choose.format(0)} }})()")
+        gap = "parseFloat(document.getElementById('gap').textContent.match(/[0-9.]+/)[0])"
+        assert browser.value(gap) == pytest.approx(AWAY, abs=0.05)
+        browser.wait("document.readyState === 'complete'")
+        apart = np.asarray(Image.open(browser.picture(tmp_path / "apart.png")).convert("RGB"), int)
+        browser.value(f"(() => {{ {choose.format(1)} }})()")
+        assert browser.value(gap) < 0.05
+        with_fit = np.asarray(Image.open(browser.picture(tmp_path / "fit.png")).convert("RGB"), int)
+        middle = (slice(150, 600), slice(300, 900))
+        assert (np.abs(apart[middle] - with_fit[middle]).max(axis=-1) > 40).mean() > 0.01  # the ghost has moved
+        own = served.address
+        assert all(r.startswith(own) for r in browser.requests if not r.startswith(("data:", "about:")))
+        assert not browser.problems
+    finally:
+        browser.close()
