@@ -114,3 +114,8 @@ def test_replicates_tell_the_correlation_of_neighbours(correlation):
     assert follows.sum() == 3 * 6 * 11
     slip = test["slip_ratio"][order]
     np.testing.assert_allclose(np.diff(slip)[follows[1:]], 0.05)
+
+
+def test_what_whitening_divides_by_is_the_determinant():
+    o, covariance = irregular()
+    assert np.sum(o.log_widths()) == pytest.approx(0.5 * np.linalg.slogdet(covariance)[1])

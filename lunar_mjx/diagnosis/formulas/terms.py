@@ -101,7 +101,7 @@ def terms(port: str, sensors: Sequence[str] = ()) -> list[Term]:
     """Formulas at a port, few enough to be simulated one by one; tables are searched through `slots` for many more.
 
     Args:
-      port: one of the ports but `command` states that need memory.
+      port: one of the ports. What needs memory has no formula at `command`; `power` has none at all.
       sensors: kinds of channels for the port `sensor`, such as `motor_drive_current_A`.
     """
     makers = {
@@ -114,7 +114,7 @@ def terms(port: str, sensors: Sequence[str] = ()) -> list[Term]:
         "body_wrench": _body,
         "geometry": _geometry,
     }
-    return list(_sensor(sensors)) if port == "sensor" else list(makers[port]())
+    return list(_sensor(sensors)) if port == "sensor" else list(makers[port]()) if port in makers else []
 
 
 def term(target: Target, factor: str | Expr, linear: bool = False) -> Term:

@@ -104,6 +104,8 @@ QUANTITY_SIZES: Mapping[str, float] = {
     "constant": 1.0,
     "current": 1.0,
     "joint speed": 2.0,
+    "squared joint speed": 4.0,
+    "direction": 1.0,
     "wheel speed": 2.0,
     "slip": 0.3,
     "signed slip": 0.3,
@@ -112,12 +114,18 @@ QUANTITY_SIZES: Mapping[str, float] = {
     "loss": 1.0,
     "travel speed": 0.2,
 }
-"""Usual sizes of the quantities that an unknown input may follow: A, rad/s, slip, N, m/s."""
+"""Usual sizes of the quantities that an unknown input may follow: A, rad/s, slip, N, m/s; signs
+follow the motion."""
+
+_AT_REST = 0.03
+"""rad/s of a joint below which it has hardly a direction."""
 
 _READ: Mapping[str, Callable[[Any, Any], Any]] = {
     "constant": lambda ctx, value: 1.0,
     "current": lambda ctx, value: value.current,
     "joint speed": lambda ctx, value: ctx.joint_speed,
+    "squared joint speed": lambda ctx, value: ctx.joint_speed * jnp.abs(ctx.joint_speed),
+    "direction": lambda ctx, value: jnp.tanh(ctx.joint_speed / _AT_REST),
     "wheel speed": lambda ctx, value: _wheel_speed(ctx),
     "slip": lambda ctx, value: ctx.contact.soil_slip,
     "signed slip": lambda ctx, value: value.slip_x,
@@ -136,7 +144,7 @@ def _quantity(name: str, ctx: Any, value: Any) -> Any:
 
 FOLLOWS: Mapping[str, tuple[str, ...]] = {
     "command: motor current": ("constant", "current", "joint speed"),
-    "motor_torque": ("constant", "joint speed"),
+    "motor_torque": ("direction", "joint speed", "squared joint speed"),
     "geometry: wheel radius": ("constant",),
     "soil: stiffness": ("slip", "wheel speed"),
     "soil: shear strength": ("slip", "wheel speed"),

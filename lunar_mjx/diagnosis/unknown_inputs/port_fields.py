@@ -78,6 +78,7 @@ class Usual:
             "current": self.current,
             "loss": self.current,
             "joint speed": self.speed,
+            "squared joint speed": self.speed**2,
             "wheel speed": self.speed,
             "load": self.load,
             "travel speed": self.speed * self.radius,

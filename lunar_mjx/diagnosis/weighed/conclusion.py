@@ -115,17 +115,24 @@ def probabilities(found: ModelSearch) -> dict[str, float]:
 
 
 def _where(found: ModelSearch) -> tuple[str | None, str | None]:
-    """The port at which something unlisted most probably acts, and the same in full."""
-    ports: dict[str, float] = {}
-    names: dict[str, float] = {}
-    for t, p in found.inclusion().items():
-        if t.kind == UNLISTED:
-            ports[port_of(t.name)] = ports.get(port_of(t.name), 0.0) + p
-            names[t.name] = p
-    if not ports:
+    """The port at which something unlisted most probably acts, the larger of two that are as sure; the same in full."""
+    names = [t.name for t in found.inclusion() if t.kind == UNLISTED]
+    if not names:
         return None, None
-    port = max(ports, key=lambda n: ports[n])
-    return port, max((n for n in names if port_of(n) == port), key=lambda n: names[n])
+    best = found.best
+    sizes = {f.name: float(tau) for f, tau in zip(best.refit.linear.fields, best.evidence.tau, strict=True)}
+
+    def sure(holds: Callable[[str], bool]) -> float:
+        p = found.probability_of(lambda h: any(t.kind == UNLISTED and holds(t.name) for t in h.terms))
+        return round(p, 2)
+
+    def size(name: str) -> float:
+        return sizes.get(name.partition(" with ")[0], 0.0)
+
+    ports = {port_of(n): max(size(m) for m in names if port_of(m) == port_of(n)) for n in names}
+    port = max(ports, key=lambda p: (sure(lambda name: port_of(name) == p), ports[p]))
+    mine = [n for n in names if port_of(n) == port]
+    return port, max(mine, key=lambda n: (sure(lambda name: name == n), size(n)))
 
 
 def port_of(field: str) -> str:

@@ -256,6 +256,9 @@ def _score_around(
         roots.append(best)
         level = [h for t in others if t not in best.terms and (h := score(best.terms | {t}, _sizes(best)))]
         best = max([best, *level], key=lambda h: h.log_posterior)
+        # What a later term makes needless goes again.
+        fewer = [h for t in best.terms - own if (h := score(best.terms - {t}, _sizes(best)))]
+        best = max([best, *fewer], key=lambda h: h.log_posterior)
     top = max(h.log_posterior for h in known.values())
     for root in roots:
         # A neighbour of what is hopeless may still be the truth where nothing has been found yet.
