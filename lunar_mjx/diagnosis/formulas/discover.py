@@ -18,7 +18,7 @@ from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.formulas.search import PENALTY, Settings, Trial, search_formulas
 from lunar_mjx.diagnosis.formulas.slots import WHEEL_PORTS, Slots
 from lunar_mjx.diagnosis.formulas.targets import CONSTANTS
-from lunar_mjx.diagnosis.formulas.terms import SUGGESTED, Term, effect_of, terms, with_amount
+from lunar_mjx.diagnosis.formulas.terms import FORMULA_PORTS, SUGGESTED, Term, effect_of, terms, with_amount
 from lunar_mjx.diagnosis.runs import VERDICT_FILE, Run, load_run
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.effects.base import PORTS
@@ -164,8 +164,9 @@ def discover(
     asked, port = port, port or verdict.get("port")
     if port is None:
         raise UserError(f"{run.folder}: no port shows anything unknown; run lunar-mjx why first, or give --port.")
-    if port not in PORTS:
-        raise bad_input("unknown", "port", port, "does not exist", f"use one of {', '.join(PORTS)}")
+    if port not in FORMULA_PORTS:
+        what = "has no formulas" if port in PORTS else "does not exist"
+        raise bad_input("unknown", "port", port, what, f"use one of {', '.join(FORMULA_PORTS)}")
     if out is not None and Path(out).exists() and not Path(out).read_text(encoding="utf-8").startswith(SUGGESTED):
         raise bad_input("unknown", "--out", str(out), "exists, and is none of these suggestions", "name another file")
     logs = run.campaign()

@@ -25,7 +25,7 @@ from lunar_mjx.diagnosis.formulas.targets import (
     carried,
     known,
 )
-from lunar_mjx.effects.base import Effect
+from lunar_mjx.effects.base import PORTS, Effect
 
 if TYPE_CHECKING:
     from sympy import Expr
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 _LEAST = "jnp.maximum({}, 0.01)"
 """What a factor 1 + x never falls below."""
 
+
+FORMULA_PORTS = tuple(p for p in PORTS if p != "power")
+"""Ports at which formulas are looked for; what acts at `power` is what is aboard, and no law to be found."""
 
 SUGGESTED = '"""Suggested by `lunar-mjx unknown`'
 """How every effect file begins that is made here."""

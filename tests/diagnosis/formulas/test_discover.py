@@ -14,7 +14,7 @@ from lunar_mjx.criticism import WheelBed, wheel_test
 from lunar_mjx.diagnosis import verbs
 from lunar_mjx.diagnosis.formulas.discover import _write, discover
 from lunar_mjx.diagnosis.formulas.targets import STIFFNESS
-from lunar_mjx.diagnosis.formulas.terms import effect_of, term, terms, with_amount
+from lunar_mjx.diagnosis.formulas.terms import FORMULA_PORTS, effect_of, term, terms, with_amount
 from lunar_mjx.diagnosis.runs import VERDICT_FILE, Run
 from lunar_mjx.diagnosis.unknown_inputs.inputs import smooth_inputs
 from lunar_mjx.effect_contract import random_rovers as probe
@@ -26,7 +26,7 @@ from lunar_mjx.logs import Noise, write_steady_log
 from lunar_mjx.model import make_model
 
 SENSORS = ("motor_drive_current_A", "gyro_rad_s")
-LIBRARIES = {port: terms(port, SENSORS) for port in PORTS if port != "power"}
+LIBRARIES = {port: terms(port, SENSORS) for port in FORMULA_PORTS}
 
 
 @pytest.mark.parametrize("port", LIBRARIES)
@@ -94,6 +94,8 @@ def test_a_search_needs_a_port(tmp_path):
         discover(run)
     with pytest.raises(UserError, match="does not exist"):
         discover(run, "nowhere")
+    with pytest.raises(UserError, match="has no formulas"):
+        discover(run, "power")
     run.save(VERDICT_FILE, {**VERDICT, "verdict": "UNKNOWN", "port": "elsewhere"})
     with pytest.raises(UserError, match=r"elsewhere.*does not exist"):
         discover(run)  # the port of a verdict that weighs hypotheses is taken
