@@ -24,6 +24,8 @@ from lunar_mjx.terrain import height
 from lunar_mjx.trust import require_trust
 
 VIEWS = ("auto", "camera", "top")
+UNSEEN_LADDER = {"ranges": "unseen", "hardness": 1.1}
+"""What agents are scored on: worlds of another seed, harder than the training's by a tenth, and the held-out soil."""
 _MARGIN = 4.0
 """m around path and goal that the map shows."""
 _FRAMES = 300
@@ -54,6 +56,8 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     if name in AGENTS:
         env = make("navigation", **{"task": task, **options})
         unseen = {"terrain": "world:heldout", "ranges": "unseen"} if task == "large" else {}
+        if task.startswith("ladder/"):
+            unseen = UNSEEN_LADDER
         return env, make_agent(name, env), unseen
     path = Path(name) if name.endswith(".npz") else shipped_policy(name)
     if path is None:

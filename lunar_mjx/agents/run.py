@@ -17,9 +17,9 @@ from lunar_mjx.agents.evaluate import Evaluator, Score
 from lunar_mjx.agents.learner import Learner, TrainState, normalised
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.train import Result, RunConfig, plain, train
-from lunar_mjx.effects.presets import DEFAULT_PRESET
 from lunar_mjx.envs import NavigationEnv, make
 from lunar_mjx.envs.navigation.config import UNSEEN_SOIL
+from lunar_mjx.envs.navigation.env import default_preset
 from lunar_mjx.files import write_text
 from lunar_mjx.together import leads
 
@@ -28,7 +28,8 @@ def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
     """The environment's parameters for an evaluation: other terrain, soil and places than in training.
 
     Args:
-      env: of the training. options: `terrain`, and `ranges` = "unseen" for the held-out soil.
+      env: of the training. options: `terrain`, `ranges` = "unseen" for the held-out soil, and on the ladder
+        `hardness` of the worlds.
     """
     if not isinstance(env, NavigationEnv):
         return env.params
@@ -42,7 +43,7 @@ def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
     ranges = None
     if options.get("ranges") == "unseen":
         ranges = tuple(unseen.get(r.parameter, r) for r in env.config.randomise)
-    return env.place(model, ranges, seed=env.config.place_seed + 7919)
+    return env.place(model, ranges, seed=env.config.place_seed + 7919, hardness=options.get("hardness"))
 
 
 def learner_agent(learner: Learner) -> Any:
@@ -113,7 +114,7 @@ def _told(training: Training) -> dict[str, Any]:
     """The options of a training's environment, its preset among them: defaults change, policies stay."""
     options = dict(training.options)
     if training.environment == "navigation" and "model" not in options:
-        options.setdefault("preset", DEFAULT_PRESET)
+        options.setdefault("preset", default_preset(options.get("task", "consistent")))
     return options
 
 

@@ -20,6 +20,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from lunar_mjx.envs.core import Environment, State, split_keys
+from lunar_mjx.envs.ladder.rungs import RUNGS
 from lunar_mjx.envs.picture import Picture
 from lunar_mjx.envs.registry import make
 from lunar_mjx.errors import bad_input
@@ -162,7 +163,8 @@ class NavigationGymEnv(SingleEnv):
     `episode_return` and the ends.
 
     ## Arguments
-    `task` = `paper`, `consistent` (default) or `large`; `rover`, `terrain`, `preset`, `model`, `engine`; every field of
+    `task` = `paper`, `consistent` (default), `large` or `ladder/1` to `ladder/5`, which are also
+    `LunarMJX/Ladder1-v0` and so on; `rover`, `terrain`, `preset`, `model`, `engine`; every field of
     `lunar_mjx.envs.NavigationConfig`, such as `decimation` (physics steps per action), `episode_time` or
     `goal_distance`; `render_mode="rgb_array"`, `view` = `auto`, `camera` or `top`.
 
@@ -263,6 +265,12 @@ def register() -> None:
     for name, single, vector in ((NAVIGATION, NavigationGymEnv, VectorEnv), (POINT, _point, _point_vector)):
         if name not in gym.registry:
             gym.register(name, entry_point=single, vector_entry_point=vector)
+    for rung in RUNGS:
+        name = f"LunarMJX/Ladder{rung}-v0"
+        if name not in gym.registry:
+            gym.register(
+                name, entry_point=NavigationGymEnv, vector_entry_point=VectorEnv, kwargs={"task": f"ladder/{rung}"}
+            )
 
 
 register()

@@ -9,6 +9,7 @@ log-uniformly between `shallowest` and `deepest`, whose defaults have that mean;
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -60,24 +61,25 @@ class Craters:
         return self.density * (diameter**-self.exponent - self.largest**-self.exponent)
 
 
-def profile(r: np.ndarray, depth: float) -> np.ndarray:
+def profile(r: Any, depth: Any, xp: Any = np) -> Any:
     """Height of a crater over the ground around it.
 
     Args:
       r: distance from the centre, in radii.
       depth: from rim to floor, m.
+      xp: `numpy`, or `jax.numpy` for arrays on the device.
 
     Returns:
       Height in m: a parabolic bowl and an r^-3 rim, joined by a smooth minimum, zero beyond `REACH`.
     """
     rim = RIM * depth
     bowl = rim + depth * (r * r - 1)
-    blanket = rim * np.maximum(r, 0.5) ** -3.0
+    blanket = rim * xp.maximum(r, 0.5) ** -3.0
     width = _ROUND * depth
     # Beyond this many widths the smooth minimum is the minimum, and exp() would overflow.
-    lower, gap = np.minimum(bowl, blanket), np.minimum(np.abs(bowl - blanket) / width, 40.0)
-    joined = lower - width * np.log1p(np.exp(-gap))
-    return np.where(r < REACH, joined - rim * REACH**-3.0, 0.0)
+    lower, gap = xp.minimum(bowl, blanket), xp.minimum(xp.abs(bowl - blanket) / width, 40.0)
+    joined = lower - width * xp.log1p(xp.exp(-gap))
+    return xp.where(r < REACH, joined - rim * REACH**-3.0, 0.0)
 
 
 def draw(

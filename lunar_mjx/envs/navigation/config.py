@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.cameras import Pinhole, Sun
+from lunar_mjx.envs.ladder.rungs import COLLISIONS, RUNGS, get_rung
 from lunar_mjx.envs.navigation.actions import ACTION_MODES
 from lunar_mjx.envs.navigation.kalman import KalmanConfig
 from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION, check_blocks
 from lunar_mjx.envs.navigation.randomise import Range
-from lunar_mjx.envs.navigation.rewards import CONSISTENT_WEIGHTS, FAILURE, PAPER_WEIGHTS, SUCCESS, TERMS
+from lunar_mjx.envs.navigation.rewards import CONSISTENT_WEIGHTS, FAILURE, PAPER_WEIGHTS, SUCCESS, TERMS, TOLD_BY_TALLY
 from lunar_mjx.errors import bad_input, require_finite
 
 DIVERGENCE = ("stop", "reset")
@@ -52,6 +53,13 @@ class NavigationConfig:
       divergence: what follows a state that is not finite: "stop" lets it through, so that a trainer's guard stops and
         dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`, and so a rover that is
         faster or farther from the ground than any can be (`env.plausible`).
+      tally: count way, energy, slip and collisions of every episode and tell them as metrics.
+      collisions: what follows when a boulder comes under the rover's outline: nothing ("free"), a price by the reward
+        term `collision` ("cost"), or the end of the episode as failed ("end").
+      arrive_within: the rover must head within this of a drawn direction to have reached the goal; pi for any.
+      rung: of the ladder, whose worlds take the terrain's place; 0 for none.
+      worlds: of the rung, side by side; as many as it says if 0.
+      hardness: by which the rung's slopes, craters, ridges and boulders are multiplied.
     """
 
     decimation: int = 50
@@ -85,6 +93,12 @@ class NavigationConfig:
     sun_azimuth_deg: float = 135.0
     sun_elevation_deg: float = 15.0
     divergence: str = "stop"
+    tally: bool = False
+    collisions: str = "free"
+    arrive_within: float = np.pi
+    rung: int = 0
+    worlds: int = 0
+    hardness: float = 1.0
 
     def __post_init__(self) -> None:
         _check(self)
@@ -127,6 +141,8 @@ def _check(c: NavigationConfig) -> None:
         "stuck_distance",
         "steepest",
         "camera_far",
+        "arrive_within",
+        "hardness",
     ):
         if require_finite("navigation", name, getattr(c, name)) <= 0.0:
             raise bad_input("navigation", name, getattr(c, name), "is not positive", "give a number above zero")
@@ -141,7 +157,7 @@ def _check(c: NavigationConfig) -> None:
             f"is not a range above goal_radius = {c.goal_radius}",
             "give least and greatest distance in m",
         )
-    for name, allowed in (("action", ACTION_MODES), ("divergence", DIVERGENCE)):
+    for name, allowed in (("action", ACTION_MODES), ("divergence", DIVERGENCE), ("collisions", COLLISIONS)):
         if getattr(c, name) not in allowed:
             raise bad_input("navigation", name, getattr(c, name), "does not exist", f"use one of {', '.join(allowed)}")
     # the optics and the light refuse values that make no sense, in words of their own
@@ -154,6 +170,18 @@ def _check(c: NavigationConfig) -> None:
         if name not in TERMS:
             raise bad_input("navigation", "weights", name, "is no reward term", f"use some of {', '.join(TERMS)}")
         require_finite("navigation", f"weights.{name}", weight)
+        if name in TOLD_BY_TALLY and not c.tally:
+            raise bad_input("navigation", "tally", c.tally, f"does not go with the reward term {name}", "give true")
+    if c.collisions != "free" and not c.tally:
+        raise bad_input("navigation", "tally", c.tally, f"does not go with collisions = {c.collisions}", "give true")
+    for name in ("rung", "worlds"):
+        value = getattr(c, name)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise bad_input("navigation", name, value, "is not a whole number of at least 0", "give one")
+    if c.rung:
+        get_rung(c.rung)
+    if "arrival" in c.observations and not c.rung:
+        raise bad_input("navigation", "observations", "arrival", "is only told on the ladder", "leave it out")
 
 
 EGOCENTRIC = (
@@ -216,8 +244,29 @@ TASKS: dict[str, NavigationConfig] = {
         divergence="reset",
     ),
 }
+
+
+def _ladder(number: int) -> NavigationConfig:
+    """The task of a rung: `large` with the rung's worlds, goals, costs and time."""
+    rung, any_heading = RUNGS[number], RUNGS[number].arrival_deg >= 180.0
+    return TASKS["large"].replace(
+        rung=number,
+        tally=True,
+        goal_distance=rung.goal_distance,
+        episode_time=rung.episode_time,
+        collisions=rung.collisions,
+        weights=dict(rung.weights),
+        arrive_within=np.pi if any_heading else float(np.radians(rung.arrival_deg)),
+        observations=EGOCENTRIC if any_heading else (*EGOCENTRIC, "arrival"),
+        # a drive that is given up must stay dearer than any that goes on: a price on time is none
+        stuck_time=15.0,
+    )
+
+
+TASKS |= {f"ladder/{number}": _ladder(number) for number in RUNGS}
 """`paper`: section V with its reward as printed. `consistent`: the same with signed progress. `large`: the task of the
-large-batch trainings, goals 10 to 40 m away over rough ground, drawn soils and motors."""
+large-batch trainings, goals 10 to 40 m away over rough ground, drawn soils and motors. `ladder/1` to `ladder/5`: the
+rungs of the ladder."""
 
 UNSAID: dict[str, tuple[str, str]] = {
     "rover": ("luvmi_x", "the smaller of the two that the paper ships; every setting takes viper as well"),

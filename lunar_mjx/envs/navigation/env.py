@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.effects.presets import DEFAULT_PRESET
 from lunar_mjx.envs.core import State, side_by_side, where
-from lunar_mjx.envs.navigation import kalman, randomise, rewards
+from lunar_mjx.envs.ladder.pool import Pool, make_pool
+from lunar_mjx.envs.ladder.rungs import get_rung
+from lunar_mjx.envs.navigation import kalman, randomise, rewards, tally
 from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
 from lunar_mjx.envs.navigation.observations import CAMERA, Scene, observe
@@ -28,7 +31,11 @@ from lunar_mjx.model import Model, make_model
 from lunar_mjx.pytree import pytree
 
 ENDS = ("reached", "rolled_over", "stuck", "off_terrain", "diverged")
-"""Ways in which an episode terminates; the first is success, the others bring the failure reward."""
+"""Ways in which an episode terminates; the first is success, the others bring the failure reward. Where collisions end
+an episode, `collided` is one more."""
+LADDER_PRESET = "consistent"
+"""Physics of the ladder unless told otherwise. In `field` LUVMI-X slips 0.68 on 5 deg and slides back on 10 deg: the
+upper rungs' slopes could not be driven."""
 _USED = 0.125
 """Share of the rovers that may be without a prepared episode before all are prepared anew."""
 
@@ -42,6 +49,10 @@ class NavigationParams:
       starts, goals: (place, 2) m.
       bounds: (range, 2) low and high of every randomised parameter.
       gains: (n, 3, 2) of the Kalman filter.
+      shortest: (place,) length of the shortest way, m, or as the crow flies; None without a tally.
+      arrivals: (place,) heading to arrive in, rad; None where any will do.
+      ground: lowest and highest ground, m; None to look anew.
+      side: of the worlds that make up the terrain, m: leaving one's own fails; None if it is one.
     """
 
     system: Params
@@ -49,6 +60,10 @@ class NavigationParams:
     goals: Any
     bounds: Any
     gains: Any
+    shortest: Any = None
+    arrivals: Any = None
+    ground: Any = None
+    side: Any = None
 
 
 @pytree
@@ -79,6 +94,7 @@ class Inner:
       last_action: as given.
       anchor: (2,) place that the rover last left by the stuck distance, m. waited: time since then, s.
       steps: control steps of the episode. total: its return.
+      place: number of the pair of start and goal. tally: of the episode. Both None unless the task needs them.
       ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
     """
 
@@ -95,6 +111,8 @@ class Inner:
     waited: Any
     steps: Any
     total: Any
+    place: Any = None
+    tally: tally.Tally | None = None
     ready: Ready | None = None
     used: Any = None
 
@@ -151,6 +169,8 @@ class NavigationEnv:
         self._wheels = len(model.rover.wheels)
         self._ride = model.rover.standing_height
         self._scale = SCAN_SCALE.get(model.rover.name, 1.0)
+        self._outline = tally.Outline(self.system) if config.tally else None
+        self._ends_told = (*ENDS, "collided") if config.collisions == "end" else ENDS
         self.params = self.place(model)
         self.action_size = self.actions.size
         shapes = jax.eval_shape(self.reset, self.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
@@ -158,14 +178,19 @@ class NavigationEnv:
         self.privileged_size = shapes.privileged.shape[1]
 
     def place(
-        self, model: Model | None = None, ranges: Sequence[randomise.Range] | None = None, seed: int | None = None
+        self,
+        model: Model | None = None,
+        ranges: Sequence[randomise.Range] | None = None,
+        seed: int | None = None,
+        hardness: float | None = None,
     ) -> NavigationParams:
         """Parameters for another terrain, other ranges of the same parameters, or other places.
 
         Args:
           model: brings the terrain and physical parameters; this environment's own if None.
           ranges: with the same parameters as the configuration's, in the same order.
-          seed: of the places.
+          seed: of the places; on the ladder of its worlds, too.
+          hardness: of the ladder's worlds; the configuration's if None.
 
         Raises:
           UserError: ranges of other parameters, or a terrain without room.
@@ -184,20 +209,46 @@ class NavigationEnv:
                 "are not those of the task",
                 "give the same parameters and scales in the same order",
             )
+        bounds = np.array([(r.low, r.high) for r in ranges], np.float32).reshape(-1, 2)
+        gains = kalman.gains(c.kalman, c.decimation * model.timestep).astype(np.float32)
+        number = c.place_seed if seed is None else seed
+        if c.rung:
+            return self._on_pool(model, self.pool(number, hardness), bounds, gains)
         starts, goals = draw_places(
             model.terrain,
             c.places,
             c.goal_distance,
-            c.place_seed if seed is None else seed,
+            number,
             clearance=0.5 + 2.0 * self._ride,
             margin=c.edge + 1.0,
             steepest=c.steepest,
             within=c.start_within,
         )
-        bounds = np.array([(r.low, r.high) for r in ranges], np.float32).reshape(-1, 2)
-        gains = kalman.gains(c.kalman, c.decimation * model.timestep).astype(np.float32)
+        arrays = [jnp.asarray(a, jnp.result_type(float)) for a in (starts, goals, bounds, gains)]
+        shortest = jnp.asarray(np.hypot(*(goals - starts).T), arrays[0].dtype) if c.tally else None
+        return NavigationParams(default_params(model), *arrays, shortest=shortest)
+
+    def pool(self, seed: int, hardness: float | None = None) -> Pool:
+        """The ladder's worlds of a seed, for this rover."""
+        c = self.config
+        half_width = (self._outline or tally.Outline(self.system)).half[1] + 0.1
+        rung = get_rung(c.rung).scaled(max(1.0, round(half_width / 0.4)))
+        return make_pool(rung, seed, c.worlds or rung.worlds, half_width, c.hardness if hardness is None else hardness)
+
+    def _on_pool(self, model: Model, pool: Pool, bounds: Any, gains: Any) -> NavigationParams:
+        from lunar_mjx.dynamics.system import default_params
+
+        c, at = self.config, pool.places
+        heights = pool.terrain.field.heights
         return NavigationParams(
-            default_params(model), *(jnp.asarray(a, jnp.result_type(float)) for a in (starts, goals, bounds, gains))
+            default_params(model.replace(terrain=pool.terrain)),
+            at.starts,
+            at.goals,
+            *(jnp.asarray(a, jnp.result_type(float)) for a in (bounds, gains)),
+            shortest=at.shortest if c.tally else None,
+            arrivals=at.arrivals if c.arrive_within < np.pi or "arrival" in c.observations else None,
+            ground=jnp.stack([heights.min(), heights.max()]),
+            side=pool.size,
         )
 
     def reset(self, params: NavigationParams, keys: Any) -> State:
@@ -210,7 +261,8 @@ class NavigationEnv:
         obs, privileged, inner = first.obs, first.privileged, first.inner
         zero, no = jnp.zeros(keys.shape[0], obs.dtype), jnp.zeros(keys.shape[0], bool)
         terms = (f"reward_{n}" for n in self.config.weights)
-        names = ("episode_return", "episode_length", "success", *ENDS[1:], *terms)
+        told = tally.METRICS if self.config.tally else ()
+        names = ("episode_return", "episode_length", "success", *self._ends_told[1:], *told, *terms)
         metrics = dict.fromkeys(names, zero)
         inner = dataclasses.replace(inner, ready=ready, used=no)
         return State(obs, privileged, zero, no, no, obs, privileged, metrics, first.info, inner)
@@ -234,11 +286,12 @@ class NavigationEnv:
             view.filtered.acceleration[:, 2],
             action,
             state.inner.last_action,
+            *self._costs(inner),
         )
         terms = {name: weight * rewards.TERMS[name](transition) for name, weight in c.weights.items()}
         ends = self._ends(params, inner, view, to_goal)
         success = ends["reached"]
-        terminated = success | ends["rolled_over"] | ends["stuck"] | ends["off_terrain"] | ends["diverged"]
+        terminated = functools.reduce(jnp.logical_or, ends.values())
         running = sum(terms.values())
         if c.divergence == "reset":
             running = jnp.where(ends["diverged"], 0.0, bounded(running))
@@ -249,9 +302,11 @@ class NavigationEnv:
             "episode_return": inner.total,
             "episode_length": inner.steps.astype(reward.dtype),
             "success": success.astype(reward.dtype),
-            **{name: ends[name].astype(reward.dtype) for name in ENDS[1:]},
+            **{name: ends[name].astype(reward.dtype) for name in self._ends_told[1:]},
             **{f"reward_{name}": value for name, value in terms.items()},
         }
+        if inner.tally is not None:
+            metrics |= tally.metrics(inner.tally, params.shortest[inner.place], inner.steps)
         final_obs, final_privileged = self._observe(params, inner, view)
         if c.divergence == "reset":
             # the successor of a state that is gone carries no value, but must not poison a batch
@@ -300,29 +355,39 @@ class NavigationEnv:
     def _begin(self, params: NavigationParams, keys: Any) -> Ready:
         """New episodes with their first observations."""
         inner = self._fresh(params, keys)
-        view = self._view(inner)
+        view = self._view(params, inner)
         return Ready(*self._observe(params, inner, view), self._info(view), inner)
 
-    def _drive(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Physics, Any, Any]:
-        """The physics of one action: its state after, and slip and sinkage (env, wheel) of its last step."""
+    def _costs(self, inner: Inner) -> tuple[Any, ...]:
+        """Power, mean slip, hottest winding and collisions of a step, where the task keeps a tally."""
+        if inner.tally is None:
+            return ()
+        hottest = inner.physics.temperature.winding_kelvin.max(-1)
+        return inner.tally.power, jnp.abs(jnp.clip(inner.slip, -1.0, 1.0)).mean(-1), hottest, inner.tally.struck
+
+    def _drive(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Physics, tuple[Any, ...]]:
+        """The physics of one action: its state after, and of its last step slip and sinkage (env, wheel), and the
+        motors' electrical power (env, joint), W, where the task keeps a tally."""
         c = self.config
         system, axes = randomise.apply(params.system, inner.drawn)
         controls = self.actions.controls(action)
-        physics, (slip, sinkage) = self.system.rollout_batch(
+        power = (lambda seen: (seen.current * seen.voltage,)) if c.tally else (lambda seen: ())
+        physics, seen = self.system.rollout_batch(
             system,
             inner.physics,
             controls[:, None],
             c.decimation,
             axes,
-            lambda seen: (seen.slip, seen.sinkage),
+            lambda seen: (seen.slip, seen.sinkage, *power(seen)),
             one_body=True,
             last=True,
         )
-        return physics, slip[:, 0], sinkage[:, 0]
+        return physics, tuple(value[:, 0] for value in seen)
 
     def _advance(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Inner, View]:
         c = self.config
-        physics, slip, sinkage = self._drive(params, inner, action)
+        physics, (slip, sinkage, *power) = self._drive(params, inner, action)
+        moved = rewards.length(physics.qpos[:, :2] - inner.physics.qpos[:, :2])
         position, velocity = physics.qpos[:, :3], physics.qvel[:, :3]
         filtered = kalman.update(params.gains, self.control_interval, inner.filtered, position, velocity)
         away = rewards.length(position[:, :2] - inner.anchor) > c.stuck_distance
@@ -337,29 +402,47 @@ class NavigationEnv:
             anchor=jnp.where(away[:, None], position[:, :2], inner.anchor),
             waited=waited,
         )
-        return inner, self._view(inner)
+        view = self._view(params, inner)
+        if inner.tally is not None and self._outline is not None:
+            touching = self._outline.touches(params.system.terrain, view)
+            counted = tally.update(inner.tally, moved, power[0], slip, touching, self.control_interval)
+            inner = dataclasses.replace(inner, tally=counted)
+        return inner, view
 
     def _ends(self, params: NavigationParams, inner: Inner, view: View, to_goal: Any) -> dict[str, Any]:
         """Which end each episode came to; exclusive, in the order of `ENDS` but divergence first."""
         c, field = self.config, params.system.terrain.field
         rows, cols = field.heights.shape
         physics = inner.physics
+        west, south = field.x0, field.y0
         fine = jnp.isfinite(physics.qpos).all(-1) & jnp.isfinite(physics.qvel).all(-1)
         x, y = view.position[:, 0], view.position[:, 1]
-        east, north = field.x0 + (cols - 1) * field.cell, field.y0 + (rows - 1) * field.cell
+        east, north = west + (cols - 1) * field.cell, south + (rows - 1) * field.cell
+        if params.side is not None:
+            # the world in which the episode began
+            corner = jnp.stack([west, south]) - 0.5 * field.cell
+            west, south = (corner + jnp.floor((inner.origin[:, :2] - corner) / params.side) * params.side).T
+            east, north = west + params.side, south + params.side
         if c.divergence == "reset":
-            ground = jnp.stack([field.heights.min(), field.heights.max()])
+            ground = params.ground
+            if ground is None:
+                ground = jnp.stack([field.heights.min(), field.heights.max()])
             diverged = ~(fine & plausible(physics.qpos, physics.qvel, ground))
         else:
             diverged = jnp.zeros_like(fine)
-        inside = (x > field.x0 + c.edge) & (x < east - c.edge) & (y > field.y0 + c.edge) & (y < north - c.edge)
+        inside = (x > west + c.edge) & (x < east - c.edge) & (y > south + c.edge) & (y < north - c.edge)
+        reached = rewards.reached(to_goal, c.goal_radius)
+        if c.arrive_within < np.pi and view.arrival is not None:
+            reached = reached & (jnp.cos(view.arrival - view.yaw) > np.cos(c.arrive_within))
         found = {
             "diverged": diverged,
-            "reached": rewards.reached(to_goal, c.goal_radius),
+            "reached": reached,
             "rolled_over": rewards.rolled_over(view.up[:, 2], c.most_tilt),
             "stuck": rewards.stuck(inner.waited, c.stuck_time),
             "off_terrain": ~inside & fine,
         }
+        if c.collisions == "end" and inner.tally is not None:
+            found["collided"] = inner.tally.struck > 0.0
         taken = jnp.zeros_like(fine)
         for name, happened in found.items():
             found[name] = happened & ~taken
@@ -396,9 +479,11 @@ class NavigationEnv:
             waited=zero,
             steps=jnp.zeros(count, jnp.int32),
             total=zero,
+            place=pick if params.shortest is not None or params.arrivals is not None else None,
+            tally=tally.start(count, position.dtype) if c.tally else None,
         )
 
-    def _view(self, inner: Inner) -> View:
+    def _view(self, params: NavigationParams, inner: Inner) -> View:
         return read(
             self._reader,
             inner.physics,
@@ -409,6 +494,7 @@ class NavigationEnv:
             filtered=inner.filtered,
             last_action=inner.last_action,
             waited=inner.waited,
+            arrival=None if params.arrivals is None else params.arrivals[inner.place],
         )
 
     def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:
@@ -434,11 +520,17 @@ def _split(keys: Any) -> Any:
     return jax.vmap(lambda k: jax.random.split(k, 4))(keys)
 
 
+def default_preset(task: str | NavigationConfig) -> str:
+    """Preset of the physics in which a task is made unless one is named."""
+    config = TASKS.get(task) if isinstance(task, str) else task
+    return LADDER_PRESET if config is not None and config.rung else DEFAULT_PRESET
+
+
 def make_navigation(
     task: str | NavigationConfig = "consistent",
     rover: str = "luvmi_x",
     terrain: Any = None,
-    preset: str = DEFAULT_PRESET,
+    preset: str | None = None,
     model: Model | str | Path | None = None,
     engine: str = "auto",
     **settings: Any,
@@ -446,11 +538,11 @@ def make_navigation(
     """Makes the navigation environment.
 
     Args:
-      task: name of a shipped task (`paper`, `consistent`, `large`), or a configuration.
+      task: name of a shipped task (`paper`, `consistent`, `large`, `ladder/1` to `ladder/5`), or a configuration.
       rover: name or folder.
       terrain: anything `make_model` takes, or `world:train`, `world:heldout` and others of `worlds.WORLDS`; by default
-        `lunar_plain`, for the task `large` `world:train`.
-      preset: of the physics.
+        `lunar_plain`, for the task `large` `world:train`. The ladder makes its own.
+      preset: of the physics; `default_preset(task)` if None.
       model: a model or `model.toml` instead of rover, terrain and preset; a terrain given beside it takes its place.
       engine: of the physics.
       **settings: that differ from the task's, see `NavigationConfig`. Unless `episode_time` is among them, a shipped
@@ -466,6 +558,11 @@ def make_navigation(
     if rover == "viper" and "goal_radius" not in settings and config.goal_radius == TASKS["large"].goal_radius:
         settings = {"goal_radius": 1.0, **settings}
     config = config.replace(**settings)
+    if config.rung and terrain is not None:
+        raise bad_input("navigation", "terrain", terrain, f"does not go with rung = {config.rung}", "leave it out")
+    if config.rung:
+        # replaced by the worlds of the rung wherever parameters are made
+        terrain = "flat"
     if terrain is None and model is None:
         terrain = PREFIX + "train" if task == "large" else "lunar_plain"
     if isinstance(terrain, str) and terrain.startswith(PREFIX):
@@ -475,7 +572,7 @@ def make_navigation(
 
         model = load_model(model)
     if model is None:
-        model = make_model(rover, terrain or "lunar_plain", preset)
+        model = make_model(rover, terrain or "lunar_plain", preset or default_preset(task))
     elif terrain is not None:
         model = model.replace(terrain=terrain)
     if isinstance(task, str) and "episode_time" not in settings:

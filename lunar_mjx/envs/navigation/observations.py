@@ -145,6 +145,13 @@ def last_action(v: View, s: Scene) -> Any:
     return v.last_action
 
 
+def arrival(v: View, s: Scene) -> Any:
+    """Cosine and sine of the heading to arrive in, from the rover's own."""
+    assert v.arrival is not None, "the configuration refuses this block without a ladder"
+    turn = v.arrival - v.yaw
+    return jnp.stack([jnp.cos(turn), jnp.sin(turn)], axis=-1)
+
+
 def waited(v: View, s: Scene) -> Any:
     """Time since the rover left the place that it may be stuck at, in units of 10 s."""
     return v.waited[:, None] / 10.0
@@ -175,6 +182,7 @@ BLOCKS: dict[str, Block] = {
         sinkage,
         last_action,
         waited,
+        arrival,
         drawn,
     )
 } | {"height_scan": scan, "camera/rgb": camera_rgb, "camera/depth": camera_depth, "camera/labels": camera_labels}

@@ -22,6 +22,8 @@ class Transition:
       roll, pitch, yaw: at the end.
       vertical_acceleration: filtered, m/s2.
       action, last_action: of this step and the one before, in [-1, 1].
+      power: electrical, of all motors, W. slip: mean size over the wheels. hottest: winding, K. struck: 1 where a
+        boulder has come under the rover's outline. All None unless the task keeps a tally.
     """
 
     to_goal_before: Float[Array, "env 2"]
@@ -32,6 +34,10 @@ class Transition:
     vertical_acceleration: Float[Array, "env"]
     action: Float[Array, "env action"]
     last_action: Float[Array, "env action"]
+    power: Any = None
+    slip: Any = None
+    hottest: Any = None
+    struck: Any = None
 
 
 def length(vector: Any) -> Any:
@@ -75,6 +81,26 @@ def jerkiness(t: Transition) -> Any:
     return -jnp.sum((t.action - t.last_action) ** 2, axis=-1)
 
 
+def energy(t: Transition) -> Any:
+    """Minus the electrical power of all motors, W. Not in the paper."""
+    return -t.power
+
+
+def slip(t: Transition) -> Any:
+    """Minus the mean slip of the wheels. Not in the paper."""
+    return -t.slip
+
+
+def heat(t: Transition) -> Any:
+    """Minus what the hottest winding has above 80 degC, in units of 100 K. Not in the paper."""
+    return -jnp.maximum(t.hottest - 353.15, 0.0) / 100.0
+
+
+def collision(t: Transition) -> Any:
+    """-1 when a boulder comes under the rover's outline. Not in the paper."""
+    return -t.struck
+
+
 Term = Callable[[Transition], Any]
 
 TERMS: dict[str, Term] = {
@@ -85,8 +111,15 @@ TERMS: dict[str, Term] = {
     "excite": excite,
     "time": time,
     "jerkiness": jerkiness,
+    "energy": energy,
+    "slip": slip,
+    "heat": heat,
+    "collision": collision,
 }
 """All reward terms by name."""
+
+TOLD_BY_TALLY = ("energy", "slip", "heat", "collision")
+"""Terms of what only a task with a tally knows."""
 
 PAPER_WEIGHTS = {"progress_paper": 20.0, "heading": 0.1, "tilt": 0.05, "excite": 0.1}
 """The paper's sum as printed."""

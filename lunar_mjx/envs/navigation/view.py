@@ -40,6 +40,7 @@ class View:
       last_action: in [-1, 1].
       waited: time since the rover left the place that it is said to be stuck at, s.
       qpos: coordinates of the rover's MJCF.
+      arrival: heading to arrive in, rad; None where any will do.
     """
 
     position: Float[Array, "env 3"]
@@ -63,6 +64,7 @@ class View:
     last_action: Float[Array, "env action"]
     waited: Float[Array, "env"]
     qpos: Float[Array, "env nq"]
+    arrival: Any = None
 
 
 def rotation(quaternion: Float[Array, "env 4"]) -> Float[Array, "env 3 3"]:

@@ -1,0 +1,156 @@
+"""A pool of worlds side by side on one map: made once by a program of its own, so that an episode's reset only picks.
+
+The environment's step sees one terrain and a table of places, as it does for any other task: its program does not
+depend on how worlds are made.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lunar_mjx.envs.ladder.ground import World, make_world
+from lunar_mjx.envs.ladder.rungs import Rung
+from lunar_mjx.envs.ladder.ways import draw_goal, passable
+from lunar_mjx.errors import bad_input
+from lunar_mjx.pytree import pytree
+from lunar_mjx.terrain import HeightField, Rocks, Terrain
+from lunar_mjx.terrain.rocks import CELL
+
+GOALS, STARTS = 4, 16
+"""Goals of a world, and starts of a goal."""
+
+
+@pytree
+class Places:
+    """Pairs of start and goal on a pool; all lead with `place`.
+
+    Attributes:
+      starts, goals: (place, 2) m on the map.
+      arrivals: heading to arrive in, rad. shortest: length of the shortest way, m.
+      way: number of the goal's distances in `Pool.ways`. world: number of the world.
+    """
+
+    starts: Any
+    goals: Any
+    arrivals: Any
+    shortest: Any
+    way: Any
+    world: Any
+
+
+@pytree
+class Pool:
+    """Worlds side by side.
+
+    Attributes:
+      terrain: the map of all.
+      places: where to start and go.
+      ways: (goal, row, column) distance to each goal over the planning grid of its world, m.
+      middles: (world, 2) of the worlds on the map, m.
+      size: side of a world, m.
+    """
+
+    terrain: Terrain
+    places: Places
+    ways: Any
+    middles: Any
+    size: Any
+
+
+def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: float = 1.0) -> Pool:
+    """Makes the worlds of a rung with their places.
+
+    Args:
+      rung: which, for this rover (`Rung.scaled`).
+      seed: of everything in them.
+      worlds: how many. half_width: of the rover with a margin, m. hardness: see `make_world`.
+
+    Raises:
+      UserError: no world has a pair of places as the rung asks.
+    """
+    made = _worlds(rung, worlds, half_width)(jax.random.PRNGKey(seed), jnp.float32(hardness))
+    world, goals = made
+    valid = np.asarray(goals["valid"])
+    if not valid.any():
+        raise bad_input("ladder", "worlds", worlds, "have no such places", "raise it, or lower the hardness")
+    across = math.ceil(math.sqrt(worlds))
+    middles = _middles(worlds, across, rung.size)
+    return Pool(
+        _atlas(rung, world, middles, across),
+        _places(goals, valid, np.asarray(middles), seed),
+        goals["way"].reshape(-1, *goals["way"].shape[2:]),
+        jnp.asarray(middles, jnp.float32),
+        jnp.float32(rung.size),
+    )
+
+
+@functools.cache
+def _worlds(rung: Rung, worlds: int, half_width: float) -> Any:
+    """The compiled maker: key and hardness to worlds and their goals, world by world."""
+
+    def one(key: Any, hardness: Any) -> Any:
+        k_world, k_goals = jax.random.split(key)
+        world = make_world(rung, k_world, hardness)
+        free, roomy = passable(rung, world, half_width)
+        keys = jax.random.split(k_goals, GOALS)
+        return world, jax.vmap(lambda k: draw_goal(rung, free, roomy, k, STARTS))(keys)
+
+    return jax.jit(lambda key, hardness: jax.lax.map(lambda k: one(k, hardness), jax.random.split(key, worlds)))
+
+
+def _middles(worlds: int, across: int, size: float) -> np.ndarray:
+    rows = math.ceil(worlds / across)
+    number = np.arange(worlds)
+    return size * np.column_stack([number % across - 0.5 * (across - 1), number // across - 0.5 * (rows - 1)])
+
+
+def _atlas(rung: Rung, world: World, middles: np.ndarray, across: int) -> Terrain:
+    """The worlds' grids side by side, and their boulders in one list; what is left over of the map is level."""
+    count, each = world.radii.shape
+    rows = math.ceil(count / across)
+
+    def tiled(grids: Any, fill: Any) -> Any:
+        spare = rows * across - count
+        full = jnp.concatenate([grids, jnp.full((spare, *grids.shape[1:]), fill, grids.dtype)])
+        high, wide = grids.shape[1:]
+        return full.reshape(rows, across, high, wide).swapaxes(1, 2).reshape(rows * high, across * wide)
+
+    number = world.index + each * jnp.arange(count)[:, None, None]
+    index = jnp.where(world.index == each, count * each, number)
+    shift = jnp.pad(jnp.asarray(middles, jnp.float32), ((0, 0), (0, 1)))
+    centers = (world.centers + shift[:, None]).reshape(-1, 3)
+    west, south = (-0.5 * n * rung.size for n in (across, rows))
+    cell = rung.cell
+    field = HeightField(
+        tiled(world.heights, 0.0), *(jnp.float32(v) for v in (west + 0.5 * cell, south + 0.5 * cell, cell))
+    )
+    rocks = Rocks(
+        jnp.pad(centers, ((0, 1), (0, 0))),
+        jnp.pad(world.radii.reshape(-1), (0, 1)),
+        tiled(index, count * each),
+        *(jnp.float32(v) for v in (west, south, CELL)),
+    )
+    return Terrain(field, rocks, None, jnp.zeros(3), "ladder")
+
+
+def _places(goals: dict[str, Any], valid: np.ndarray, middles: np.ndarray, seed: int) -> Places:
+    """The pairs of the goals that have starts, repeated until there are as many as with all goals."""
+    starts, shortest = (np.asarray(goals[k]) for k in ("starts", "shortest"))
+    good = np.flatnonzero(valid.reshape(-1))
+    way = np.repeat(np.resize(good, valid.size), starts.shape[2])
+    which = np.tile(np.arange(starts.shape[2]), valid.size)
+    world = way // valid.shape[1]
+    start = starts.reshape(-1, starts.shape[2], 2)[way, which] + middles[world]
+    goal = np.asarray(goals["goal"]).reshape(-1, 2)[way] + middles[world]
+    bearing = np.arctan2(*(goal - start).T[::-1])
+    # from any side but the far one: a rover need not drive around its goal
+    arrival = bearing + np.random.default_rng([seed, 17]).uniform(-0.5 * np.pi, 0.5 * np.pi, len(way))
+    shortest = shortest.reshape(-1, starts.shape[2])[way, which]
+    start, goal, arrival, shortest = (jnp.asarray(a, jnp.float32) for a in (start, goal, arrival, shortest))
+    return Places(start, goal, arrival, shortest, jnp.asarray(way), jnp.asarray(world))

@@ -1,0 +1,91 @@
+"""Ways through a world: where a rover fits, how far every place is from a goal, and pairs of start and goal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from lunar_mjx.envs.ladder.ground import RIM, World, near_boulders, nodes, steepness
+from lunar_mjx.envs.ladder.rungs import Rung
+
+STEEPEST = math.radians(12.0)
+"""Slope up to which ways are planned: LUVMI-X in the preset `consistent` still climbs 12 deg (slip 0.83) and slides
+back on 15 deg."""
+ROOM = 0.9
+"""m around a start or goal that are free of boulders, for a rover as wide as LUVMI-X: enough to turn."""
+_STEPS = tuple((j, i, math.hypot(i, j)) for j in (-1, 0, 1) for i in (-1, 0, 1) if i or j)
+
+
+def slope_grid(rung: Rung, heights: Any) -> Any:
+    """Greatest slope of the ground, averaged over 3 cells, within each node of the planning grid; tangent."""
+    wide = jnp.pad(heights, 1, mode="edge")
+    count = heights.shape[0]
+    smooth = sum(wide[j : j + count, i : i + count] for j in range(3) for i in range(3)) / 9.0
+    per = round(rung.plan_cell / rung.cell)
+    blocks = steepness(smooth, rung.cell).reshape(count // per, per, count // per, per)
+    return blocks.max(axis=(1, 3))
+
+
+def passable(rung: Rung, world: World, half_width: float) -> tuple[Any, Any]:
+    """Nodes of the planning grid that a rover can stand on, and those with room to turn; (row, column) booleans."""
+    at = nodes(rung.size, rung.plan_cell)
+    x, y = jnp.meshgrid(at, at)
+    gap, _ = near_boulders(rung, world.centers, world.radii, x, y)
+    slope = slope_grid(rung, world.heights)
+    inside = jnp.abs(at) < 0.5 * rung.size - RIM
+    inside = inside[:, None] & inside[None, :]
+    room = ROOM * half_width / 0.4
+    free = inside & (gap > half_width) & (slope < math.tan(STEEPEST))
+    return free, free & (gap > room) & (slope < math.tan(0.7 * STEEPEST))
+
+
+def distances(free: Any, row: Any, column: Any, cell: float) -> Any:
+    """Length of the shortest way to a node over free nodes and their eight neighbours, m; infinite where there is none.
+
+    The relaxation of Bellman and Ford for all nodes at once, until nothing changes. Ways bend by 45 deg at a time, so
+    that they are up to 8 % longer than free ones.
+    """
+    blocked = jnp.where(free, 0.0, jnp.inf)
+    start = jnp.full(free.shape, jnp.inf).at[row, column].set(0.0) + blocked
+
+    def relax(carry: Any) -> Any:
+        old, _ = carry
+        wide = jnp.pad(old, 1, constant_values=jnp.inf)
+        best = old
+        for j, i, length in _STEPS:
+            near = jax.lax.dynamic_slice(wide, (1 + j, 1 + i), free.shape)
+            best = jnp.minimum(best, near + length * cell)
+        best = best + blocked
+        return best, jnp.any(best < old)
+
+    return jax.lax.while_loop(lambda carry: carry[1], relax, (start, jnp.array(True)))[0]
+
+
+def draw_goal(rung: Rung, free: Any, roomy: Any, key: Any, starts: int) -> dict[str, Any]:
+    """A goal with its distances, and starts for it.
+
+    Returns:
+      `goal` (2,), `starts` (start, 2), m from the world's middle; `shortest` (start,) length of the shortest way;
+      `way` (row, column) the distances; `valid`: whether the world has such starts.
+    """
+    at = nodes(rung.size, rung.plan_cell)
+    count = at.shape[0]
+    k_goal, k_start = jax.random.split(key)
+    chance = jnp.where(roomy.reshape(-1), 0.0, -jnp.inf)
+    end = jax.random.categorical(k_goal, chance)
+    way = distances(free, end // count, end % count, rung.plan_cell)
+    goal = jnp.stack([at[end % count], at[end // count]])
+    straight = jnp.hypot(at[None, :] - goal[0], at[:, None] - goal[1])
+    low, high = rung.goal_distance
+    fits = roomy & jnp.isfinite(way) & (straight >= low) & (straight <= high) & (way >= rung.detour * straight)
+    begin = jax.random.categorical(k_start, jnp.where(fits.reshape(-1), 0.0, -jnp.inf), shape=(starts,))
+    return {
+        "goal": goal,
+        "starts": jnp.stack([at[begin % count], at[begin // count]], axis=-1),
+        "shortest": way.reshape(-1)[begin],
+        "way": way,
+        "valid": fits.any(),
+    }

@@ -1,0 +1,175 @@
+"""The ladder: worlds are as their rungs say and can be solved, and the task keeps its tally."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lunar_mjx.envs import TASKS, make_navigation, split_keys
+from lunar_mjx.envs.contract import check_environment
+from lunar_mjx.envs.gymnasium_env import NAVIGATION
+from lunar_mjx.envs.ladder.ground import make_world
+from lunar_mjx.envs.ladder.planner import Planner, length
+from lunar_mjx.envs.ladder.pool import make_pool
+from lunar_mjx.envs.ladder.rungs import RUNGS, get_rung
+from lunar_mjx.envs.ladder.ways import STEEPEST, distances
+from lunar_mjx.envs.navigation import rewards
+from lunar_mjx.envs.navigation.tally import METRICS, start, update
+from lunar_mjx.errors import UserError
+from lunar_mjx.terrain import nearest_rock
+
+HALF = 0.4
+SMALL = dataclasses.replace(get_rung(3), size=40.0, goal_distance=(8.0, 20.0), detour=1.1)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return make_pool(SMALL, 0, 5, HALF)
+
+
+def test_rungs_grow_harder():
+    rungs = list(RUNGS.values())
+    for name in ("slope_deg", "coverage", "ridges", "deepest", "episode_time"):
+        values = [getattr(r, name) for r in rungs]
+        assert values == sorted(values), name
+    assert rungs[-1].coverage == 0.12 and rungs[-1].slope_deg == 25.0 and rungs[-1].goal_distance[1] == 500.0
+    assert [r.collisions for r in rungs] == ["free", "cost", "cost", "cost", "end"]
+    with pytest.raises(UserError, match="ladder/5"):
+        get_rung(6)
+
+
+@pytest.mark.parametrize("number", RUNGS)
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_grids_of_a_rung_divide_its_world(number, factor):
+    rung = get_rung(number).scaled(factor)
+    for side in (rung.cell, rung.plan_cell, rung.lattice, rung.block, 0.25):
+        assert rung.size / side == pytest.approx(round(rung.size / side)), side
+    assert rung.plan_cell / rung.cell == pytest.approx(round(rung.plan_cell / rung.cell))
+    assert 0.0 <= rung.presence <= 1.0 and rung.smallest < rung.largest < rung.lattice
+
+
+def test_boulders_cover_what_the_rung_says_and_stay_apart(pool):
+    rocks = pool.terrain.rocks
+    radii, centers = np.asarray(rocks.radii), np.asarray(rocks.centers)
+    real = radii > 0
+    inner = 5 * (SMALL.size - 6.0) ** 2
+    assert np.pi * (radii[real] ** 2).sum() / inner == pytest.approx(SMALL.coverage, rel=0.3)
+    apart = np.hypot(*(centers[real, None, :2] - centers[None, real, :2]).transpose(2, 0, 1))
+    np.fill_diagonal(apart, np.inf)
+    assert (apart - radii[real][:, None] - radii[real][None]).min() > 0.0
+    # the look-up grid finds each boulder at its own centre
+    x, y, _, radius = nearest_rock(rocks, centers[real, 0], centers[real, 1])
+    np.testing.assert_allclose(np.stack([x, y], 1), centers[real, :2], atol=1e-5)
+    np.testing.assert_allclose(radius, radii[real], atol=1e-6)
+
+
+def test_worlds_join_and_the_ground_lies_under_its_boulders(pool):
+    field, rocks = pool.terrain.field, pool.terrain.rocks
+    heights, per = np.asarray(field.heights), round(SMALL.size / SMALL.cell)
+    for k in range(per, heights.shape[0], per):
+        assert np.abs(heights[k] - heights[k - 1]).max() < 0.05
+    real = np.asarray(rocks.radii) > 0
+    x, y, z = np.asarray(rocks.centers)[real].T
+    column, row = (((c - float(c0)) / SMALL.cell + 0.5).astype(int) for c, c0 in ((x, field.x0), (y, field.y0)))
+    np.testing.assert_allclose(z - heights[row, column], 0.2 * np.asarray(rocks.radii)[real], atol=0.05)
+
+
+def test_places_are_as_far_apart_as_asked_and_an_independent_planner_solves_them(pool):
+    at, middles = pool.places, np.asarray(pool.middles)
+    starts, goals, world = (np.asarray(a) for a in (at.starts, at.goals, at.world))
+    straight = np.hypot(*(goals - starts).T)
+    assert straight.min() >= 8.0 - 1e-3 and straight.max() <= 20.0 + 1e-3
+    assert (np.asarray(at.shortest) >= SMALL.detour * straight - 1e-3).all()
+    for points in (starts, goals):
+        assert (np.abs(points - middles[world]) < 0.5 * SMALL.size - 3.0).all()
+    solved = total = 0
+    for number in range(len(middles)):
+        planner = Planner(pool.terrain, middles[number], SMALL.size, 0.9 * HALF, 1.1 * STEEPEST, 0.25, 0.0)
+        for way in np.unique(np.asarray(at.way)[world == number]):
+            mine = np.asarray(at.way) == way
+            found = planner.ways(goals[mine][0], starts[mine])
+            total += len(found)
+            solved += sum(f is not None for f in found)
+            # on a finer grid with a little less room the shortest way is no longer than the told one
+            for path, told, least in zip(found, np.asarray(at.shortest)[mine], straight[mine], strict=True):
+                if path is not None:
+                    assert least - 0.5 < length(path) < 1.05 * told + 0.5
+    assert solved >= 0.98 * total
+
+
+def test_distances_go_around_a_wall():
+    free = np.ones((9, 9), bool)
+    free[4, :8] = False
+    way = np.asarray(distances(jnp.asarray(free), 0, 0, 1.0))
+    assert way[0, 8] == pytest.approx(8.0) and np.isinf(way[4, 0])
+    # along the upper row to the gap, diagonally through it, and back
+    assert way[8, 0] == pytest.approx(4 * np.sqrt(2) + 4 + 4 * np.sqrt(2) + 4, rel=1e-5)
+
+
+def test_hardness_makes_slopes_and_boulders_of_the_same_world():
+    easy, hard = (make_world(SMALL, jax.random.PRNGKey(4), h) for h in (0.3, 1.0))
+    assert np.asarray(easy.heights).std() < 0.5 * np.asarray(hard.heights).std()
+    assert (np.asarray(easy.radii) > 0).sum() < 0.6 * (np.asarray(hard.radii) > 0).sum()
+
+
+def test_a_collision_counts_when_it_begins_and_energy_never_flows_back():
+    seen = start(2, jnp.float32)
+    power, slip = jnp.array([[5.0, -3.0]] * 2), jnp.array([[0.2, -0.4]] * 2)
+    for touching in ([True, False], [True, False], [False, False], [True, False]):
+        seen = update(seen, jnp.ones(2), power, slip, jnp.array(touching), 0.1)
+    np.testing.assert_allclose(seen.collisions, [2.0, 0.0])
+    np.testing.assert_allclose(seen.energy, 4 * 5.0 * 0.1)
+    np.testing.assert_allclose(seen.slip, 4 * 0.3)
+    np.testing.assert_allclose(seen.travelled, 4.0)
+
+
+def test_every_rung_is_a_task_and_a_gymnasium_id():
+    assert NAVIGATION in gym.registry
+    for number, rung in RUNGS.items():
+        c = TASKS[f"ladder/{number}"]
+        assert c.rung == number and c.tally and c.goal_distance == rung.goal_distance
+        assert ("arrival" in c.observations) == (rung.arrival_deg < 180.0) == (c.arrive_within < np.pi)
+        assert gym.spec(f"LunarMJX/Ladder{number}-v0").kwargs == {"task": f"ladder/{number}"}
+        assert c.failure < 0.0 and set(c.weights) <= set(rewards.TERMS)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"task": "ladder/9"}, "ladder/5"),
+        ({"task": "ladder/1", "terrain": "flat"}, "leave it out"),
+        ({"task": "large", "terrain": "flat", "collisions": "end"}, "tally"),
+        ({"task": "large", "terrain": "flat", "weights": {"energy": 1.0}}, "tally"),
+        ({"task": "large", "terrain": "flat", "observations": ("arrival",)}, "ladder"),
+        ({"task": "large", "terrain": "flat", "rung": 7}, "does not exist"),
+    ],
+)
+def test_mistakes_are_told(settings, said):
+    with pytest.raises(UserError, match=said):
+        make_navigation(**settings)
+
+
+@pytest.mark.slow
+def test_a_rung_keeps_the_contract_and_collisions_end_episodes():
+    told = {"observations": ("goal_body", "arrival"), "arrive_within": 0.5, "collisions": "end"}
+    env = make_navigation("ladder/1", worlds=1, decimation=25, **told)
+    state = check_environment(env, envs=4, steps=4)
+    assert set(METRICS) <= set(state.metrics) and "collided" in state.metrics
+    assert np.isfinite([np.asarray(state.metrics[m]) for m in METRICS]).all()
+    # put rovers onto a boulder, onto free ground, and out of their world
+    inner = env.reset(env.params, split_keys(jax.random.PRNGKey(1), 4)).inner
+    rocks = env.params.system.terrain.rocks
+    big = np.asarray(rocks.centers)[np.argmax(np.asarray(rocks.radii))]
+    qpos = inner.physics.qpos.at[0, :3].set(jnp.asarray([big[0] + 0.3, big[1], big[2] + 1.0]))
+    qpos = qpos.at[1, 0].set(39.5)
+    moved = dataclasses.replace(inner, physics=dataclasses.replace(inner.physics, qpos=qpos))
+    view = env._view(env.params, moved)
+    touching = env._outline.touches(env.params.system.terrain, view)
+    assert bool(touching[0]) and not bool(touching[2])
+    ends = env._ends(env.params, moved, view, moved.goal - qpos[:, :2])
+    assert bool(ends["off_terrain"][1]) and not bool(ends["off_terrain"][2])
