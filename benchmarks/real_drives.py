@@ -5,7 +5,8 @@
 DATA holds the folders husky_borealtc (BorealTC, LaRocque et al. 2024, CC0 1.0), husky_drive (DRIVE, Baril et al. 2024,
 BSD-3) and cuadriga_camis (CAMIS_python, University of Malaga, MIT) as their authors publish them. Needs
 `pip install 'lunar-mjx[baselines]'`. On 15 cores about ten minutes; on two cores two hours. What is not begun when
-the minutes are over is listed as not done; called again, the script goes on with what its runs folder lacks.
+the minutes are over is listed as not done; called again, the script goes on with what its runs folder lacks. What the
+JSON holds of earlier runs stays, each row with its commit, until the same job is run again (`--only NAME` for some).
 
 Sequences. A BorealTC sequence's number modulo 3 says what it is for: 1 to fit, 2 to report, 0 is kept for others and
 not read here. Everything below is on sequences that were not fitted:
@@ -48,6 +49,10 @@ HARD, SOFT, ICE = ("ASPHALT", "FLOORING"), ("SANDY_LOAM", "SNOW"), ("ICE",)
 FIT, REPORT = 1, 2
 GROUND = frozenset({"soft_ground", "rolling_resistance"})
 """The family of soft ground."""
+TRUE_OF = {"ice": {"hard_ground.mu"}}
+"""What beside soft ground may be named of a ground."""
+LOOKED_AT = ("ICE-02", "SANDY_LOAM-05", "FLOORING-05", "ASPHALT-05", "FLOORING-02")
+"""Sequences to report that had been looked at while the method was made."""
 LONG_ENOUGH_S = 30.0
 """Driving of a soft ground's sequence that is asked about; hard floors have few sequences, so that all are."""
 MOST_IN_CLASS = 3
@@ -123,17 +128,18 @@ def driving_s(folder: Path) -> float:
 
 def answer_of(answer: Any) -> dict[str, Any]:
     """What a diagnosis says, shortly."""
-    chance = answer.details.get("probability", {})
+    chance = answer.probabilities
+    inclusion = sorted(answer.inclusion.items(), key=lambda item: -item[1])
     return {
         "verdict": answer.verdict.label,
         "named": list(answer.effects),
+        "unlisted": answer.unlisted,
+        "port": answer.port,
         "probability": {k: round(v, 4) for k, v in list(chance.items())[:6]},
+        "inclusion": {k: round(v, 4) for k, v in inclusion[:6]},
         "ground_probability": round(sum(p for n, p in chance.items() if GROUND & set(n.split(" + "))), 4),
-        "held_out_gain": {
-            e.effect: [round(e.held_out_gain, 1), round(e.held_out_se, 1)]
-            for e in answer.evidence[:4]
-            if e.held_out_gain == e.held_out_gain
-        },
+        "held_out": answer.details.get("held_out"),
+        "discrepancy": {k: round(v["size"], 4) for k, v in answer.discrepancy.items()},
         "sentence": answer.sentence,
         "not_tried": len(answer.details.get("not_tried", [])),
     }
@@ -274,15 +280,15 @@ def beside(run: Any) -> dict[str, Any]:
     """The held-out errors of gradient-boosted trees, of a constant and of mujoco.sysid, as `series_errors`."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
+    from lunar_mjx.diagnosis.drives.windows.bench import Bench
     from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, cut
     from lunar_mjx.diagnosis.drives.windows.problem import corners
-    from lunar_mjx.diagnosis.drives.windows.verbs import Bench
 
     logs = run.campaign()
-    bench = Bench(run, logs, lambda *_: None)
-    held = bench.split.held_out
+    bench = Bench(run, logs)
+    held = bench.held_out
     names = np.array(bench.names)
-    seen = sorted(set(bench.cut.log[bench.split.fit].tolist()))
+    seen = sorted(set(bench.cut.log[bench.fitted].tolist()))
     radius = float(np.mean([w.radius for w in run.model.rover.wheels]))
     everything = cut([logs[k] for k in seen], corners(run.model), radius, 10**6, run.seed)
     train, test = features(everything), features(bench.cut)
@@ -324,7 +330,7 @@ def sysid_refit(bench: Any, most: int = 15) -> np.ndarray | None:
     if not hasattr(sysid, "optimize"):
         return None
     problem, noise = bench.problem(None), bench.noise()
-    used = problem.there & bench.split.fit[:, None]
+    used = problem.there & bench.fitted[:, None]
     count = len(bench.base)
 
     def residual_fn(x: np.ndarray, params: Any) -> tuple[list[np.ndarray], None, None]:
@@ -364,6 +370,11 @@ def jobs_of(data: Path) -> list[dict[str, Any]]:
         if fault != "pitch" or (data / "husky_borealtc" / g / f"imu_{n}.csv").exists()
     ]
     return out
+
+
+def job_name(job: Mapping[str, Any]) -> str:
+    """A job's name, such as `ask-SNOW-05` or `ask-FLOORING-02-clock`."""
+    return "-".join(str(job[k]) for k in ("kind", "name", "ground", "number", "fault") if job.get(k))
 
 
 def do(job: Mapping[str, Any], data: Path, runs: Path, seconds: float) -> dict[str, Any]:
@@ -426,10 +437,15 @@ def summary(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for label, grounds in (("soft", SOFT), ("hard", HARD), ("ice", ICE)):
         mine = [r for r in plain if r["ground"] in grounds]
+        out[f"commits, {label}"] = sorted({r.get("commit", "") for r in mine})
         named = [r for r in mine if r["verdict"] in NAMING and GROUND & set(r["named"])]
         likely = [r for r in mine if r["ground_probability"] >= 0.95]
         out[f"ground named, {label}"] = rate(len(named), len(mine))
+        fresh = [r for r in mine if f"{r['ground']}-{r['sequence']}" not in LOOKED_AT]
+        out[f"ground named, {label}, never looked at"] = rate(sum(r in named for r in fresh), len(fresh))
         out[f"ground at 95 %, {label}"] = rate(len(likely), len(mine))
+        wrong = [r for r in mine if r["verdict"] in NAMING and set(r["named"]) - GROUND - TRUE_OF.get(label, set())]
+        out[f"something else named, {label}"] = rate(len(wrong), len(mine))
         verdicts = [r["verdict"] for r in mine]
         out[f"verdicts, {label}"] = {v: verdicts.count(v) for v in sorted(set(verdicts))}
     for fault in FAULTS:
@@ -580,6 +596,7 @@ def run_all(args: argparse.Namespace) -> None:
     """Runs all jobs, each on a core of its own, and writes the JSON after each."""
     begin = time.monotonic()
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    now = args.commit or commit.stdout.strip()
     cores: queue.Queue[list[int]] = queue.Queue()
     available = sorted(os.sched_getaffinity(0))
     count = max(1, min(args.processes, len(available)))
@@ -588,22 +605,26 @@ def run_all(args: argparse.Namespace) -> None:
     for k in range(count - len(spare)) or [0]:
         cores.put([available[(len(spare) + k) % len(available)]])
     done: list[dict[str, Any]] = []
-    wanted = jobs_of(args.data)
+    wanted = [j for j in jobs_of(args.data) if not args.only or job_name(j) in args.only]
+    before = json.loads(args.out.read_text()) if args.out.exists() else {"commit": "", "jobs": []}
+    # what is not run again stays, with the commit that it was measured at
+    earlier = [{"commit": before["commit"], **row} for row in before["jobs"] if row.get("verdict") != "failed"]
 
     def keep() -> None:
-        tried = [{k: r.get(k) for k in ("kind", "name", "ground", "number", "fault")} for r in done]
-        left = [j for j in wanted if {k: j.get(k) for k in ("kind", "name", "ground", "number", "fault")} not in tried]
+        tried = [job_name(r) for r in done]
+        rows = [*done, *(r for r in earlier if job_name(r) not in tried)]
+        known = [job_name(r) for r in rows]
         result = {
-            "commit": args.commit or commit.stdout.strip(),
+            "commit": now,
             "seconds_of_a_search": args.seconds,
-            "summary": summary(done),
-            "not_done": left,
-            "jobs": done,
+            "summary": summary(rows),
+            "not_done": [j for j in jobs_of(args.data) if job_name(j) not in known],
+            "jobs": rows,
         }
         args.out.write_text(json.dumps(result, indent=1) + "\n")
 
     def one(job: dict[str, Any], own: list[int] | None = None) -> None:
-        name = "-".join(str(v) for v in job.values() if v)
+        name = job_name(job)
         file = args.runs / "jobs" / f"{name}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
         if not file.exists():
@@ -629,7 +650,7 @@ def run_all(args: argparse.Namespace) -> None:
                 if own is None:
                     cores.put(mine)
         if file.exists():
-            done.append({**job, **json.loads(file.read_text())})
+            done.append({**job, "commit": now, **json.loads(file.read_text())})
         else:
             lines = (args.runs / "jobs" / f"{name}.txt").read_text().strip().splitlines()
             done.append({**job, "verdict": "failed", "error": lines[-1] if lines else "ran out of time"})
@@ -655,6 +676,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1e4, help="begin no job after these")
     parser.add_argument("--grace", type=float, default=0.5, help="minutes after which jobs under way are ended")
     parser.add_argument("--seconds", type=float, default=120.0, help="time of every search")
+    parser.add_argument("--only", action="append", default=[], help="name of a job, such as ask-SNOW-05, to run alone")
     parser.add_argument("--hour", action="store_true", help="time an hour of log on two cores of its own")
     parser.add_argument("--commit", default="", help="where the checkout has no git")
     parser.add_argument("--job", default="", help="one job as JSON, as this script calls itself")

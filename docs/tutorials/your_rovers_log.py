@@ -92,7 +92,7 @@ listed = ["soft_ground", "coulomb_friction.torque", "payload", "hard_ground.mu",
 diagnosis = why("sand", only=listed, seconds=900.0)
 print(diagnosis.verdict.label, *diagnosis.effects)
 print(diagnosis.sentence)
-for name, chance in list(diagnosis.details["probability"].items())[:6]:
+for name, chance in list(diagnosis.probabilities.items())[:6]:
     print(f"{chance:6.1%}  {name}")
 
 # %% [markdown]

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lunar_mjx.diagnosis.runs import COMPARISON_FILE, HYPOTHESES_FILE, RUN_FILE, SERIES_FILE, SIGNATURES_FILE, Run
+from lunar_mjx.diagnosis.runs import (
+    COMPARISON_FILE,
+    HYPOTHESES_FILE,
+    RUN_FILE,
+    SERIES_FILE,
+    SIGNATURES_FILE,
+    VERDICT_FILE,
+    Run,
+)
 from lunar_mjx.diagnosis.verdict import Diagnosis, EffectEvidence, Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude, label, probabilities, title
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm, Problem
@@ -53,13 +62,34 @@ def _by_key(form: MeasuredForm, u: np.ndarray) -> dict[str, float]:
     return dict(zip([c.key for c in form.coordinates], map(float, u), strict=True))
 
 
-def diagnose(run: Run, problem: Problem, progress: Progress) -> tuple[Diagnosis, ModelSearch | None]:
-    """Weighs all hypotheses; writes comparison, series, signatures, refits. A search that failed is not returned."""
-    settings = problem.settings
+def diagnose(
+    run: Run, problem: Problem, progress: Progress, seconds: float = math.inf
+) -> tuple[Diagnosis, ModelSearch | None]:
+    """Weighs all hypotheses; writes comparison, series, signatures, refits. A search that failed is not returned.
+
+    Args:
+      run: to write to. problem: to be explained. progress: told of every refit.
+      seconds: after which no further refit begins; a verdict is then written after every refit, as provisional.
+    """
+    settings, begin = problem.settings, time.monotonic()
+
+    def provisional(found: ModelSearch) -> None:
+        if math.isfinite(seconds):
+            best = next(h for h in found.hypotheses if h.refitted)
+            run.save(VERDICT_FILE, {**_diagnosis(problem, found, best).to_dict(), "provisional": True})
+
     try:
         # Matrices of some hundred rows are factored faster by one thread than by several that wait for each other.
         with threadpool_limits(1, "blas"):
-            found = search(problem.forms, settings.most_refits, settings.most_terms, settings.window, progress)
+            found = search(
+                problem.forms,
+                settings.most_refits,
+                settings.most_terms,
+                settings.window,
+                progress,
+                lambda: time.monotonic() - begin > seconds,
+                provisional,
+            )
     except EvidenceError as error:
         return Diagnosis(Verdict.BAD_FIT, (), f"The solver failed ({error}), so nothing is said about physics."), None
     own = problem.own

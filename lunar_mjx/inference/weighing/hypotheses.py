@@ -166,11 +166,14 @@ class Form(abc.ABC):
     Attributes:
       name: of the form. log_prior: log of its prior probability among the forms.
       terms: everything that may be the matter beside it.
+      exchanged: effects that take the place of a part of the model and have no small amounts: as no linear estimate
+        holds for them, a search refits each of them alone.
     """
 
     name: str
     log_prior: float
     terms: Sequence[Term]
+    exchanged: Sequence[str] = ()
 
     @abc.abstractmethod
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:

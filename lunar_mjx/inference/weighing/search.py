@@ -104,6 +104,8 @@ def search(
     most_terms: int,
     window: float,
     progress: Callable[[str, float], None] = lambda text, share: None,
+    stop: Callable[[], bool] = lambda: False,
+    provisional: Callable[[ModelSearch], None] = lambda found: None,
 ) -> ModelSearch:
     """Looks for the most probable sets of terms.
 
@@ -111,7 +113,8 @@ def search(
       forms: rival forms of the model, the given one first.
       most_refits: in all. most_terms: of one hypothesis.
       window: log probability below the best from which a hypothesis is not refitted.
-      progress: told of every refit.
+      progress: told of every refit. stop: whether to begin no further refit.
+      provisional: given what is known after every refit but the first.
 
     Raises:
       EvidenceError: no form could be fitted.
@@ -146,7 +149,18 @@ def search(
         refit(form, frozenset(), None)
     if not known:
         raise EvidenceError("; ".join(reasons))
-    while len(done) < most_refits:
+    for form in forms:
+        for effect in form.exchanged:
+            refit(form, frozenset({effect}), known.get((form.name, frozenset())))
+
+    def ranked(complete: bool) -> ModelSearch:
+        # A set whose refit failed is no hypothesis.
+        alive = [h for h in known.values() if done.get((h.form, h.effects), h.refit) is not None]
+        order = sorted(alive, key=lambda h: -h.log_posterior)
+        weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
+        return ModelSearch(tuple(order), weight / weight.sum(), len(done), tuple(reasons), complete)
+
+    while len(done) < most_refits and not stop():
         # Unlisted inputs are linear and need no refit; effects are not, and gain by theirs. What is unlisted closes the
         # door on no effect before that has been refitted.
         listed = [h for h in known.values() if not any(t.kind == UNLISTED for t in h.terms)]
@@ -156,6 +170,7 @@ def search(
         if open_:
             chosen = max(open_, key=lambda h: h.log_posterior)
             refit(by_name[chosen.form], chosen.effects, chosen)
+            provisional(ranked(False))
             continue
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all.
         others = [f for f in forms if best.refitted and (f.name, best.effects) not in done]
@@ -168,11 +183,7 @@ def search(
             complete = True
             break
         refit(by_name[best.form], best.effects | {untried[0]}, best, untried[0])
-    # A set whose refit failed is no hypothesis.
-    alive = [h for h in known.values() if done.get((h.form, h.effects), h.refit) is not None]
-    ranked = sorted(alive, key=lambda h: -h.log_posterior)
-    weight = np.exp([h.log_posterior - ranked[0].log_posterior for h in ranked])
-    return ModelSearch(tuple(ranked), weight / weight.sum(), len(done), tuple(reasons), complete)
+    return ranked(complete)
 
 
 def _untried(

@@ -5,12 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lunar_mjx.diagnosis.drives.windows import coordinates, judge
+from lunar_mjx.diagnosis.drives.windows import coordinates
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, cut, imu_clock
+from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, corners, learn_noise
+from lunar_mjx.diagnosis.drives.windows.settings import WindowSettings
 from lunar_mjx.diagnosis.drives.windows.verbs import fitted_model
+from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.dynamics.imposed import Windows
 from lunar_mjx.errors import UserError
+from lunar_mjx.inference.weighing.search import search
 from lunar_mjx.logs import read_campaign
 from lunar_mjx.model.file import load_model, save_model
 from lunar_mjx.model.hard_floor import hard_floor
@@ -53,19 +57,23 @@ def measured(found, model, changes, rng, magnitude=True):
     return dataclasses.replace(found, measured=values)
 
 
+def form_of(model, found, names=()):
+    """The form of some suspects beside a model, on windows that are all fitted."""
+    problem = WindowProblem(found, model)
+    observations = observe(problem, NOISE, [f"log {k}" for k in range(4)], np.full(len(found), "fit"))
+    suspects = [s for s in coordinates.suspects_of(model) if s.name in names]
+    return WindowForm(lambda _: problem, coordinates.baseline(model), suspects, observations, WindowSettings())
+
+
 def weigh(model, found, names):
-    """Probability of hypotheses of one suspect, against a model whose parameters are known to a tenth."""
+    """What a search finds beside a model whose parameters are known to a tenth, and the form."""
     known = {
         q.key: (coordinates.start_of(model, q), 0.1 * q.std * (coordinates.start_of(model, q) if q.factor else 1.0))
         for q in coordinates.baseline(model)
     }
-    model = dataclasses.replace(model, priors=known)
-    problem = WindowProblem(found, model)
-    split = judge.Split(np.ones(len(found), bool), np.zeros(len(found), bool))
-    base = coordinates.baseline(model)
-    suspects = [s for s in coordinates.suspects_of(model) if s.name in names]
-    hypotheses = [judge.fit(problem, base, s, NOISE, split) for s in [(), *((s,) for s in suspects)]]
-    return judge.probabilities(hypotheses), hypotheses
+    form = form_of(dataclasses.replace(model, priors=known), found, names)
+    s = form.settings
+    return search([form], s.most_refits, s.most_terms, s.window), form
 
 
 SUSPECTS = ("rolling_resistance", "hard_ground.mu", "payload", "calibration.current_left", "calibration.pitch")
@@ -80,20 +88,47 @@ SUSPECTS = ("rolling_resistance", "hard_ground.mu", "payload", "calibration.curr
     ],
 )
 def test_a_planted_change_is_named(model, changes, name):
-    chance, found = weigh(model, measured(drives(), model, changes, np.random.default_rng(1)), SUSPECTS)
-    assert max(chance, key=chance.get) == name
-    assert chance[name] > 0.95
-    best = next(f for f in found if f.name == name)
+    found, form = weigh(model, measured(drives(), model, changes, np.random.default_rng(1)), SUSPECTS)
+    said = conclude(found, 0.95)
+    assert name in said.effects
+    assert len(said.effects) == 1
+    best = next(h for h in found.hypotheses if name in h.effects and h.refitted)
     key, value = next(iter(changes.items()))
-    at = [q.key for q in best.unknowns].index(key)
-    q = best.unknowns[at]
-    start = coordinates.start_of(model, q) if q.effect in model.effect_names else 0.0
-    assert float(q.value(start, best.u[at])) == pytest.approx(value, rel=0.25)
+    at = [i for i, q in enumerate(form.unknowns) if q.key == key]
+    start = form.coordinates[at[0]].start
+    moved = sum(form.unknowns[i].std * best.refit.u[i] for i in at)
+    fitted = start * np.exp(moved) if form.unknowns[at[0]].factor else start + moved
+    assert fitted == pytest.approx(value, rel=0.25)
 
 
 def test_nothing_is_named_where_nothing_is_missing(model):
-    chance, _ = weigh(model, measured(drives(), model, {"hard_ground.mu": 0.6}, np.random.default_rng(2)), SUSPECTS)
-    assert chance["the model"] > 0.7
+    found, _ = weigh(model, measured(drives(), model, {"hard_ground.mu": 0.6}, np.random.default_rng(2)), SUSPECTS)
+    assert conclude(found, 0.95).effects == ()
+    assert found.probability_of(lambda h: not h.effects) > 0.7
+
+
+def test_a_ground_that_differs_as_grounds_do_is_no_effect(model):
+    """Four recordings whose resistance differs by the usual 0.02 want no name."""
+    rng = np.random.default_rng(6)
+    whole = drives()
+    values = {c: np.zeros((len(whole), SAMPLES)) for c in CHANNELS}
+    for number, more in enumerate(rng.normal(0.02, 0.015, 4)):
+        mine = measured(whole, model, {"rolling_resistance.coefficient": abs(more)}, rng)
+        for c in CHANNELS:
+            values[c][whole.log == number] = mine.measured[c][whole.log == number]
+    found, _ = weigh(model, dataclasses.replace(mine, measured=values), SUSPECTS)
+    assert conclude(found, 0.95).effects == ()
+
+
+def test_an_imu_askew_leaves_ground_level_that_nobody_measured(model):
+    """A log without accelerometer or attitude is on level ground, whatever the mounting of an IMU."""
+    found = dataclasses.replace(drives(), unlevelled=frozenset({1}))
+    problem = WindowProblem(found, model)
+    pitch = (coordinates.Unknown("calibration", "pitch", 1.0),)
+    given, turned = problem.predict(pitch, np.array([[0.0], [3.0]]))
+    moved = np.abs(turned - given)[:2].max(axis=(0, 2))
+    assert moved[found.log == 1].max() == 0.0
+    assert moved[found.log != 1].min() > 0.1
 
 
 def test_noise_is_told_from_residuals():
@@ -115,13 +150,12 @@ def test_priors_survive_the_file(model, tmp_path):
 
 
 def test_a_fit_teaches_priors(model):
-    found = measured(drives(), model, {"hard_ground.mu": 0.6}, np.random.default_rng(4))
-    split = judge.Split(np.ones(len(found), bool), np.zeros(len(found), bool))
-    fitted = judge.fit(WindowProblem(found, model), coordinates.baseline(model), (), NOISE, split)
-    taught = fitted_model(model, fitted)
+    form = form_of(model, measured(drives(), model, {"hard_ground.mu": 0.6}, np.random.default_rng(4)))
+    taught = fitted_model(form, form.refit(frozenset(), None, None))
     value, std = taught.priors["hard_ground.mu"]
     assert value == taught.parameters["hard_ground"]["mu"] == pytest.approx(0.6, rel=0.1)
     assert 0.0 < std < 0.35 * value
+    assert 0.0 < taught.priors["between_drives.resistance"][1] < 0.02
 
 
 def test_logs_are_cut_where_speeds_are(tmp_path):

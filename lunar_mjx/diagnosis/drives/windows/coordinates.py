@@ -75,6 +75,7 @@ ROVER = (
     _factor("coulomb_friction", "torque", 0.7, 5e-4, 0.3, "N m", "torque"),
     _factor("viscous_friction", "damping", 1.0, 1e-4, 2.0, "N m s/rad", "damping"),
     _shift("com_offset", "x", 0.08, "m", -0.3, 0.3, "wheelbase"),
+    _shift("com_offset", "y", 0.08, "m", -0.3, 0.3, "wheelbase"),
     _shift("com_offset", "z", 0.10, "m", -0.2, 0.4, "wheelbase"),
     _factor("hard_ground", "mu", 0.35, 0.05, 1.3),
     _factor("hard_ground", "slip_scale", 0.8, 0.003, 0.4),
@@ -90,14 +91,18 @@ SENSORS = (
     _shift(CALIBRATION, "gyro_scale", 0.01, "1", -0.1, 0.1),
     _shift(CALIBRATION, "current_difference", 0.03, "1", -0.3, 0.3),
     _shift(CALIBRATION, "current_floor", 0.33, "1", -1.0, 1.0),
+    _shift(CALIBRATION, "current_clock", 0.05, "s", -0.5, 0.5),
+    _shift(CALIBRATION, "friction_difference", 0.02, "A", -0.1, 0.1, "current"),
     _shift(CALIBRATION, "imu_clock", 0.05, "s", -0.5, 0.5),
     _shift(CALIBRATION, "position_aside", 0.1, "m", -1.0, 1.0),
 )
 """What every instrument may be off by. `current_difference` is the left side's scale over the right one's, less 1;
-`current_floor` what an ammeter of magnitudes shows at rest over what its log states, less 1; `position_aside` how far
-to the left of the chassis frame's origin the speed over ground is measured."""
+`current_floor` what an ammeter of magnitudes shows at rest over what its log states, less 1; `current_clock` how late
+currents come (a third of a sample, and the wind-up of the driveline); `friction_difference` the current that the left
+drives' friction needs, less the right ones' (gears of one series differ by half); `position_aside` how far to the left
+of the chassis frame's origin the speed over ground is measured."""
 
-MEASURED_BY = {"gyro": (GYRO,), "imu_clock": (GYRO,), "current": CURRENTS, "position": (AHEAD,)}
+MEASURED_BY = {"gyro": (GYRO,), "imu_clock": (GYRO,), "current": CURRENTS, "friction": CURRENTS, "position": (AHEAD,)}
 """Channels by which a calibration can be told, by how its name begins."""
 
 
@@ -126,10 +131,10 @@ SUSPECTS = (
         "soft_ground",
         "effect",
         (
-            _factor("soft_ground", "stiffness", 1.2, 2e4, 2e7, "N/m^(n+2)"),
+            _factor("soft_ground", "stiffness", 1.2, 2e4, 5e6, "N/m^(n+2)"),
             _factor("soft_ground", "cohesion", 0.7, 100.0, 2e4, "Pa"),
             _factor("soft_ground", "friction_angle", 0.25, 0.2, 0.85, "rad"),
-            _factor("soft_ground", "shear_modulus", 0.6, 4e-3, 0.12, "m"),
+            _factor("soft_ground", "shear_modulus", 0.6, 0.01, 0.1, "m"),
         ),
         "ground",
     ),
@@ -174,6 +179,9 @@ SUSPECTS = (
 )
 """Everything that may be named, with the usual size of each, in sizes of the rover.
 
+Soft ground is as soft as ground that was measured: moduli of sinkage to 5 MPa/m, and of shear deformation from 1 cm
+(Wong 2008, ch. 2: snow, loams and sands). Stiffer than that it would stand for another law of friction on a hard floor.
+
 A gyroscope's zero is off by 1 deg/s usually and 5 at most (makers' figures of small MEMS gyroscopes), so that a rover
 that hardly turns while its wheels do is not ascribed to it."""
 
@@ -183,20 +191,31 @@ learnt on other logs never gets narrower than this."""
 
 
 def sizes(model: Model) -> dict[str, float]:
-    """Sizes of a rover: mass kg, wheel radius and wheelbase m, torque N m and damping N m s/rad of its weight.
+    """Sizes of a rover: mass kg; wheel radius, wheelbase and track m; torque N m, damping N m s/rad and current A.
 
     The torque is weight times wheel radius, with which all of the weight would be lifted at the rim; the damping makes
-    it at a rim speed of 1 m/s.
+    it at a rim speed of 1 m/s; the current makes it through the motors.
     """
     rover = model.rover
     compiled = rover.compile()
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
-    ahead = [float(data.body(w.body).xpos[0]) for w in rover.wheels]
+    ahead, aside = ([float(data.body(w.body).xpos[k]) for w in rover.wheels] for k in (0, 1))
     radius = float(np.mean([w.radius for w in rover.wheels]))
     torque = rover.mass * model.gravity * radius
     base = max(max(ahead) - min(ahead), radius)
-    return {"mass": rover.mass, "radius": radius, "wheelbase": base, "torque": torque, "damping": torque * radius}
+    motor = model.parameters.get("motor", {})
+    factors = ("torque_constant", "gear_ratio", "gear_efficiency")
+    per_ampere = float(np.prod([np.mean(motor.get(k, 1.0)) for k in factors]))
+    return {
+        "mass": rover.mass,
+        "radius": radius,
+        "wheelbase": base,
+        "track": max(aside) - min(aside),
+        "torque": torque,
+        "damping": torque * radius,
+        "current": torque / per_ampere,
+    }
 
 
 def _of_rover(unknown: Unknown, size: Mapping[str, float]) -> Unknown:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -51,6 +52,7 @@ class Cut:
       clocks: offset of the IMU's clock and its standard deviation by number of the log, s, where the log's own were
         not known well; the windows are cut with it.
       unlevelled: numbers of logs that measure neither acceleration nor attitude: their ground is taken as level.
+      held: number of windows that were left out because the rover was held.
     """
 
     log: np.ndarray
@@ -63,6 +65,7 @@ class Cut:
     recording: np.ndarray | None = None
     clocks: Mapping[int, tuple[float, float]] = dataclasses.field(default_factory=dict)
     unlevelled: frozenset[int] = frozenset()
+    held: int = 0
 
     def __len__(self) -> int:
         return len(self.log)
@@ -88,8 +91,13 @@ class Cut:
         return frozenset(c for c, v in self.measured.items() if np.isfinite(v).any())
 
 
-def cut(logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, seed: int = 0) -> Cut:
+def cut(
+    logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, seed: int = 0, track: float = math.inf
+) -> Cut:
     """Windows of some logs, at most `most`, spread evenly over speeds and turns.
+
+    Windows in which the wheels turn against each other and the rover does not are left out: something beside the
+    ground holds it, such as a kerb, with a force that nobody knows.
 
     Args:
       logs: with imposed wheel speeds.
@@ -97,6 +105,7 @@ def cut(logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, se
       radius: of the wheels, m.
       most: windows at most.
       seed: of the draw.
+      track: distance of the sides, m; infinite where windows of a rover that was held are to be kept.
 
     Raises:
       UserError: no log is long enough, or tells anything that the windows could be judged by.
@@ -131,6 +140,10 @@ def cut(logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, se
         raise UserError(f"{logs[0].folder}: the wheels turn in no window of {WINDOW_S:g} s; give logs of driving.")
     left = np.array([j.startswith("l") for j in joints])
     rim_left, rim_right = (radius * speed[..., mine].mean(axis=(1, 2)) for mine in (left, ~left))
+    held = moving & _held(rim_left, rim_right, values[:, CHANNELS.index(GYRO)], track)
+    moving &= ~held
+    if not moving.any():
+        raise UserError(f"{logs[0].folder}: the rover is held in every window; give logs of free driving.")
     chosen = _stratified(rim_left, rim_right, moving, log, most, np.random.default_rng(seed))
     measured = {c: values[chosen, k] for k, c in enumerate(CHANNELS)}
     imposed = Windows(speed[chosen], up[chosen, :, 0], up[chosen, :, 1], up[chosen, :, 2], yaw[chosen])
@@ -145,7 +158,26 @@ def cut(logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, se
         _recordings(logs)[log[chosen]],
         clocks,
         frozenset(n for n, g in enumerate(logs) if not _leans(g)),
+        int(held.sum()),
     )
+
+
+HELD, TURNING_RAD_S = 0.1, 0.1
+"""Share of the wheels' turning below which a rover that turns on the spot is held, and the least turning of the wheels
+that is asked. A free one on even ground turns by a third of it and more: friction across the wheels acts on shorter
+levers than friction along them."""
+
+
+def _held(left: np.ndarray, right: np.ndarray, yaw_rate: np.ndarray, track: float) -> np.ndarray:
+    """(window,) whether the sides turn against each other and the rover does not.
+
+    Args:
+      left, right: (window,) rim speeds, m/s. yaw_rate: (window, sample), rad/s. track: m.
+    """
+    turn = (right - left) / track
+    seen: np.ndarray = np.asarray(np.isfinite(yaw_rate)).any(axis=1)
+    mean = np.nanmean(np.where(seen[:, None], yaw_rate, 0.0), axis=1)
+    return seen & (left * right < 0.0) & (np.abs(turn) > TURNING_RAD_S) & (np.abs(mean) < HELD * np.abs(turn))
 
 
 STANDING_M_S = 0.02

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg
 
 from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, Unknown, start_of
-from lunar_mjx.diagnosis.drives.windows.cut import AHEAD, CHANNELS, CURRENTS, Cut
+from lunar_mjx.diagnosis.drives.windows.cut import AHEAD, CHANNELS, CURRENTS, STANDING_M_S, Cut
 from lunar_mjx.dynamics.imposed import KinematicDrive, Seen, Windows, on_a_plane, require_drives_alone
 from lunar_mjx.dynamics.system import default_params
 from lunar_mjx.effects import catalogue
@@ -29,6 +29,10 @@ STEP = 0.25
 """Step of difference quotients in units of the prior's standard deviation, and at most `STEP` of it."""
 FREEDOM = 4.0
 """Degrees of freedom of Student's noise: heavy tails with a finite variance."""
+SLOPE = "slope"
+"""Calibration by which all windows lean, whether or not their slope was measured, deg."""
+TILTS = ("pitch", "roll", SLOPE)
+"""Calibrations that turn gravity in the chassis frame."""
 AT_NULL = ("rolling_resistance", "viscous_friction", "payload", "wheel_radius_error", "com_offset")
 """Candidates that stand in one program at their null, so that it is compiled once."""
 
@@ -76,10 +80,17 @@ class WindowProblem:
         )
         self.weight = np.ones((len(CHANNELS), len(cut)))
         self._kept: dict[Any, Seen] = {}
-        self._resistance: np.ndarray | None = None
-        self._size: np.ndarray | None = None
         left = np.array([j.startswith("l") for j in corners(model)])
         self._side = np.stack([left, ~left]).astype(float)
+        self._sense = self._rolling()
+
+    def _rolling(self) -> np.ndarray:
+        """(side, window, bin) sense in which a side's wheels turn, -1 to 1, smooth where they turn round."""
+        edges = np.asarray(self.cut.imposed.speed)
+        middle = 0.5 * (edges[:, :-1] + edges[:, 1:])
+        radius = float(np.mean([w.radius for w in self.model.rover.wheels]))
+        rim = radius * np.einsum("wbj,sj->swb", middle, self._side) / self._side.sum(axis=1)[:, None, None]
+        return np.asarray(np.tanh(rim / STANDING_M_S))
 
     def predict(self, unknowns: Sequence[Unknown], rows: np.ndarray) -> np.ndarray:
         """Predictions.
@@ -103,7 +114,7 @@ class WindowProblem:
 
     def _simulate(self, unknowns: Sequence[Unknown], rows: np.ndarray) -> Seen:
         """Means over half intervals, (k, window, bin, ...); rows that differ in sensors alone are simulated once."""
-        moves = [i for i, u in enumerate(unknowns) if u.effect != CALIBRATION or u.name in ("pitch", "roll")]
+        moves = [i for i, u in enumerate(unknowns) if u.effect != CALIBRATION or u.name in TILTS]
         names = tuple(unknowns[i].key for i in moves)
         values = [unknowns[i].value(self.begin(unknowns[i]), rows[:, i]) for i in moves]
         # What stands at the model's own value is the same simulation whether it is among the unknowns or not.
@@ -141,7 +152,9 @@ class WindowProblem:
             params.effects[u.effect][u.name] = np.asarray(
                 old * (spread / base) if u.factor else np.broadcast_to(spread, old.shape), np.float32
             )
-        pitch, roll = (np.radians(self._value(unknowns, full, n)) for n in ("pitch", "roll"))
+        pitch, roll, slope = (np.radians(self._value(unknowns, full, n)) for n in TILTS)
+        # an IMU that sits askew shows another slope; where none was asked, the ground is level all the same
+        asked = ~np.isin(self.cut.log, list(self.cut.unlevelled))
         imposed = self.cut.imposed
         out: list[Seen] = []
         jobs = np.stack(np.meshgrid(np.arange(count), np.arange(windows), indexing="ij"), -1).reshape(-1, 2)
@@ -152,7 +165,7 @@ class WindowProblem:
             part = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
             row, window = part[:, 0], part[:, 1]
             x, y, z = (np.asarray(a)[window] for a in (imposed.up_x, imposed.up_y, imposed.up_z))
-            p, r = pitch[row][:, None], roll[row][:, None]
+            p, r = (asked[window] * pitch[row] + slope[row])[:, None], (asked[window] * roll[row])[:, None]
             given = Windows(
                 *(
                     np.asarray(a, np.float32)
@@ -192,8 +205,9 @@ class WindowProblem:
         both = of("current_scale")
         half = 0.5 * of("current_difference")
         scale = [1.0 + both + half + of("current_left"), 1.0 + both - half + of("current_right")]
+        friction = [0.5 * of("friction_difference") * self._sense[0], -0.5 * of("friction_difference") * self._sense[1]]
         for side, channel in enumerate(CURRENTS):
-            series = whole(scale[side] * late(current[:, side], of("current_clock")))
+            series = whole(scale[side] * (late(current[:, side], of("current_clock")) + friction[side]))
             if channel in floor:
                 series = np.hypot(series, floor[channel] * np.maximum(1.0 + of("current_floor"), 0.0))
             out.append(series)
@@ -225,22 +239,6 @@ class WindowProblem:
     def residual(self, predicted: np.ndarray) -> np.ndarray:
         """(channel, window, sample) measured less predicted; zero where nothing was measured."""
         return np.where(self.there, np.nan_to_num(self.measured) - predicted, 0.0)
-
-    def resistance_slope(self) -> np.ndarray:
-        """(channel, window, sample) change of the predictions per coefficient of rolling resistance, at the model."""
-        if self._resistance is None:
-            coefficient = Unknown("rolling_resistance", "coefficient", 0.03)
-            given = self.predict((coefficient,), np.array([[0.0], [1.0]]))
-            self._resistance = (given[1] - given[0]) / coefficient.std
-            self._size = np.abs(given[0])
-        assert self._resistance is not None
-        return self._resistance
-
-    def current_size(self) -> np.ndarray:
-        """(channel, window, sample) sizes of the predictions of the model as given."""
-        self.resistance_slope()
-        assert self._size is not None
-        return self._size
 
     @property
     def measured(self) -> np.ndarray:
@@ -296,6 +294,39 @@ def corners(model: Model) -> list[str]:
     require_drives_alone(model)
     names = {w.drive: f"{w.corner}_{KINDS[0]}" for w in model.rover.wheels}
     return [names[j] for j in model.rover.joints]
+
+
+SHARES = (0.0, 0.1, 0.2, 0.4, 0.8)
+"""Noise in proportion to what is measured, over its root mean square, that is tried: patches differ in friction by so
+many per cent, whatever the current."""
+
+
+def proportions(residual: np.ndarray, there: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """(channel, window) standard deviation of a window's noise over that of one where nothing acts.
+
+    By maximum likelihood of noise that has a constant part and one in proportion to a size.
+
+    Args:
+      residual: (channel, window, sample). there: where something was measured.
+      size: (channel, window) root mean square of what is predicted.
+    """
+    out = np.ones(size.shape)
+    for c in range(len(residual)):
+        count = there[c].sum(axis=1)
+        mine = count > 0
+        if mine.sum() < 3:
+            continue
+        power = np.sum(np.where(there[c], residual[c] ** 2, 0.0), axis=1)[mine] / count[mine]
+        usual = power <= np.quantile(power, 0.9)
+        own = size[c][mine] / max(float(np.sqrt(np.mean(size[c][mine] ** 2))), 1e-12)
+        best, scale = np.inf, np.ones(len(own))
+        for share in SHARES:
+            grown = (1.0 - share) ** 2 + (share * own) ** 2
+            score = np.log(np.mean(power[usual] / grown[usual])) + np.mean(np.log(grown[usual]))
+            if score < best - 1e-9:
+                best, scale = score, grown
+        out[c][mine] = np.sqrt(scale)
+    return out
 
 
 def learn_noise(residual: np.ndarray, there: np.ndarray, interval_s: float) -> list[Noise]:

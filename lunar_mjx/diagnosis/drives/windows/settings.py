@@ -1,0 +1,67 @@
+"""How rare things are in drives with imposed wheel speeds, and what usually differs from one drive to the next."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from lunar_mjx.diagnosis.weighed.form import SearchSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowSettings(SearchSettings):
+    """Priors and effort of a diagnosis of windows."""
+
+    most_terms: int = 4
+    """1; terms of one hypothesis at most: a drive tells less than a table."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """What differs from one recording to another on one kind of ground with one rover, at a port of the model.
+
+    Attributes:
+      key: by which a model's file holds its size, `between_drives.KEY`. words: for a reader.
+      size: usual standard deviation between recordings, as a share of what `words` says.
+      unlisted: the same where something unlisted acts.
+    """
+
+    key: str
+    words: str
+    size: float
+    unlisted: float
+
+
+DIFFERENCES: Mapping[str, Difference] = MappingProxyType(
+    {
+        "wheel_normal: resistance": Difference("resistance", "resistance of the ground over the load", 0.01, 0.12),
+        "wheel_shear: friction": Difference("grip", "friction on the ground", 0.3, 0.6),
+        "wheel_shear: side friction": Difference("side_grip", "friction across over along the wheels", 0.1, 0.4),
+        "wheel_shear: slip": Difference("slip", "slip at which the friction is reached", 0.3, 0.8),
+        "motor_torque: current for a torque": Difference("current", "current for a torque", 0.1, 0.25),
+        "motor_torque: left against right": Difference(
+            "sides", "left side's current against the right one's", 0.03, 0.15
+        ),
+    }
+)
+"""Usual differences between drives: rolling resistance over load (hard floors and asphalt have 0.01 to 0.02: Wong 2008,
+table 1.1); friction (paint, dust and rubber: 30 %), across over along it, and how stiffly it comes with slip;
+current for the same torque (oil and magnets by temperature: 10 %); the left side's against the right one's. Several
+recordings teach their own sizes. Unlisted: ground that gives way resists with a tenth of the load and more (Wong 2008),
+friction spans from ice to rubber, and gears, magnets and ammeters that are out of order change a current by a quarter.
+"""
+
+BETWEEN = "between_drives"
+"""First part of the keys by which a model's file holds what was learnt of the sizes of `DIFFERENCES`."""
+
+UNEVEN_DEG, UNKNOWN_SLOPE_DEG = 1.0, 3.0
+"""Tilt that an accelerometer shows over a second on rough ground; slope along the drive of ground that a log says
+nothing of, where 5 % is the steepest of most paths and yards."""
+LATE_S = 0.05
+"""By how much currents come later in one recording than in another: a third of a sample."""
+NOISE_LOG_STD = 0.3
+"""How well the noise's size is known from the residuals that it was learnt from."""
+DRIFTED = 3.0
+"""Standard deviations by which what other logs taught may have drifted: beyond, it is a change, and has to be named as
+one. Without this bound the refit of a hard-floor model on ice takes a friction of 0.15 without a word."""
