@@ -44,6 +44,9 @@ class SoftGround:
 def soft_ground(preset: str, duration: float = 6.0, rover: str = "viper", torque: float = TORQUE) -> list[SoftGround]:
     """Runs the experiment on hard and soft ground, with the soft side on the left and, mirrored, on the right.
 
+    In float64: the preset `paper` carries a wheel on 0.2 mm of penetration, of which float32 loses 1e-4. The load is so
+    uncertain by 0.02 N, as much as the soil's forces, and the paths missed their mirror images by 2.3 % of the drift.
+
     Args:
       preset: "paper" or "consistent".
       duration: s of constant torque, after 3 s in which the rover settles.
@@ -53,6 +56,11 @@ def soft_ground(preset: str, duration: float = 6.0, rover: str = "viper", torque
     Returns:
       Four runs: hard and soft, left and right.
     """
+    with jax.enable_x64(True):
+        return _soft_ground(preset, duration, rover, torque)
+
+
+def _soft_ground(preset: str, duration: float, rover: str, torque: float) -> list[SoftGround]:
     model = make_model(rover, "flat", preset, modes={"drive": "torque"})
     model = model.add("hard_surface").add("soil_gradient")
     system = build(model)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from lunar_mjx.backends.physics.context import Context, Values
 from lunar_mjx.backends.physics.ground import Grid
 from lunar_mjx.backends.physics.vectors import clamp, cross, dot
 
+Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""From x and y, m, to the height of soil that wheels have moved there, m."""
 SLOW = 2e-3
 """m/s; smallest denominator of the slip ratio."""
 
@@ -67,8 +71,10 @@ AIRBORNE = 1e-6
 """Weight of the three middle samples whatever the rim's clearance."""
 
 
-def rim_plane(c: Context, field: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rim_plane(c: Context, field: Grid, moved: Moved | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Height below each wheel's centre and slopes by x and y of the plane fitted along and beside its rim.
+
+    The ground is the field and what `moved` says of soil that wheels have moved there, m, at points (rover, ...).
 
     Weighted least squares along the heading with weights (p/r + m)^2 of the depth p within the rim, and the difference
     of the two sides across.
@@ -77,11 +83,16 @@ def rim_plane(c: Context, field: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarr
     level = np.sqrt(axle[..., 0] ** 2 + axle[..., 1] ** 2 + 1e-12)
     heading = np.stack([axle[..., 1], -axle[..., 0]], axis=-1) / level[..., None]
     beside = np.stack([-heading[..., 1], heading[..., 0]], axis=-1)
+
+    def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        ground = field.value(x, y)[0]
+        return ground if moved is None else ground + moved(x, y)
+
     u = r[..., None] * ALONG
     points = center[..., None, :2] + u[..., None] * heading[..., None, :]
-    along = field.value(points[..., 0], points[..., 1])[0]
+    along = height(points[..., 0], points[..., 1])
     offset = 0.5 * c.geometry["width"][..., None] * beside
-    left, right = (field.value(*np.moveaxis(center[..., :2] + s * offset, -1, 0))[0] for s in (1.0, -1.0))
+    left, right = (height(*np.moveaxis(center[..., :2] + s * offset, -1, 0)) for s in (1.0, -1.0))
     foot = along[..., len(ALONG) // 2].copy()
     along -= foot[..., None]
     clear = center[..., 2, None] - foot[..., None] - along

@@ -13,6 +13,7 @@ from lunar_mjx.backends.physics.contact import momentary_slip, rim_plane, wheel_
 from lunar_mjx.backends.physics.context import Context, Values
 from lunar_mjx.backends.physics.ground import Ground
 from lunar_mjx.backends.physics.parameters import Numbers
+from lunar_mjx.backends.physics.ruts import relief_of, ruts, untouched
 from lunar_mjx.backends.physics.vectors import clamp
 
 EffectState = dict[str, Values]
@@ -90,6 +91,7 @@ class ForceModel:
             "voltage_saturation": {"correction": joint.copy()},
             "multipass": outdoors.no_places(*wheel.shape),
             "static_boulders": outdoors.no_bristles(*wheel.shape),
+            "ruts": untouched(self.rovers),
         }
         return {k: v for k, v in every.items() if k in self.numbers}
 
@@ -111,7 +113,7 @@ class ForceModel:
         """
         new = dict(state)
         self._motor(c, state, new)
-        self._contact(c)
+        self._contact(c, state)
         self._wheels(c, state, new)
         n, hooks = self.rovers, self.hooks
         c.body = {"force": np.zeros((n, 3)), "moment": np.zeros((n, 3)), "joint_torque": np.zeros_like(c.joint_angle)}
@@ -155,7 +157,7 @@ class ForceModel:
         if "torque" in hooks:
             c.torque = hooks.call("torque", c, c.torque)
 
-    def _contact(self, c: Context) -> None:
+    def _contact(self, c: Context, state: EffectState) -> None:
         hooks = self.hooks
         c.geometry = self._nominal
         if "geometry" in hooks:
@@ -170,7 +172,10 @@ class ForceModel:
         c.chassis_ground = height[:, wheels:], slope_x[:, wheels:], slope_y[:, wheels:]
         flat, along_x, along_y = height[:, :wheels], slope_x[:, :wheels], slope_y[:, :wheels]
         if "rim_contact" in self.numbers:
-            share, fitted = self.numbers.effects["rim_contact"].share, rim_plane(c, self.ground.field)
+            effects, moved = self.numbers.effects, None
+            if "ruts" in effects:
+                moved = relief_of(c, effects["ruts"], state["ruts"]).height
+            share, fitted = effects["rim_contact"].share, rim_plane(c, self.ground.field, moved)
             flat = flat + share * (fitted[0] - flat)
             along_x, along_y = along_x + share * (fitted[1] - along_x), along_y + share * (fitted[2] - along_y)
         c.contact = wheel_contact(c, flat, along_x, along_y, inside[:, :wheels])
@@ -187,6 +192,8 @@ class ForceModel:
             outdoors.slip_sinkage(c, effects["slip_sinkage"], c.soil)
         if "multipass" in effects:
             new["multipass"] = outdoors.multipass(c, effects["multipass"], c.soil, state["multipass"])
+        if "ruts" in effects:
+            new["ruts"] = ruts(c, effects["ruts"], c.soil, state["ruts"])
         if "soil" in hooks:
             c.soil = hooks.call("soil", c, {k: v.copy() for k, v in c.soil.items()})
         zero = np.zeros(c.wheel_position.shape[:-1])

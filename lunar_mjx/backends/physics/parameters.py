@@ -39,6 +39,7 @@ SUPPORTED = (
     "directional_gear_efficiency",
     "slip_sinkage",
     "multipass",
+    "ruts",
     "rim_contact",
     "skid_shear",
     "friction_circle",
