@@ -18,7 +18,7 @@ PROOFS = {
     "energy": "dropped from 0.3 m: largest gain of energy with springs and soil, over the fall",
     "halving": "20 s with steering on a slope: the end moves, when the time step is halved, by this share of the way",
     "drives": "20 s in a hard and a soft crater, {engines}: largest error against native MuJoCo, in tolerances",
-    "parity": "states ({states:,}) and 5 s drives on all grounds, structured engine and MJX: likewise",
+    "parity": "states ({states:,}) along drives on all grounds, structured engine and MJX: likewise",
 }
 """What each proof of `benchmarks/acceptance.py` measures."""
 
