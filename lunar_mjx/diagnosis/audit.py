@@ -172,7 +172,7 @@ def draw_noise(observations: Observations, rng: np.random.Generator) -> np.ndarr
 
 def _outcome(truth: str, verdict: Verdict, effects: tuple[str, ...]) -> str:
     if verdict is Verdict.BAD_FIT:
-        return "no certificate"
+        return "no fit"
     if verdict is Verdict.UNDECIDABLE:
         return "missed" if truth != NULL else "undecided"
     if truth == NULL:
@@ -207,7 +207,7 @@ def _summary(cases: list[dict[str, Any]]) -> Audit:
         ("wrongly named", singles, ("wrongly named",)),
         ("missed", singles, ("missed",)),
         ("unknown", singles, ("unknown",)),
-        ("no certificate", used, ("no certificate",)),
+        ("no fit", used, ("no fit",)),
     ):
         count = sum(c["outcome"] in outcomes for c in group)
         low, high = wilson(count, len(group))

@@ -74,10 +74,7 @@ def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
         ],
         "UNKNOWN": [f"lunar-mjx unknown {run}  (suggests a formula, as a ready effect file)"],
         "UNDECIDABLE": [f"lunar-mjx next {run}  (names the manoeuvre that would show it)"],
-        "BAD_FIT": [
-            "Free fewer parameters or add manoeuvres, and compare again; the certificate under Provenance "
-            "says what failed."
-        ],
+        "BAD_FIT": ["The sentence above says what failed: look at the log and the model there, and compare again."],
         "BAD_DATA": ["Mend what the findings below name.", f"lunar-mjx log check {log}"],
     }.get(name, [])
 

@@ -288,21 +288,10 @@ def provenance(results: Sequence[Result]) -> list[Block]:
     for r in results:
         test = (r.comparison or {}).get("certificate") or {}
         chosen = ", ".join(f"{k} = {v}" for k, v in (r.run.get("splits") or {}).items()) or "none"
-        details = (r.verdict or {}).get("details") or {}
         problems = "; ".join(test.get("problems") or []) or ("complete" if test else "-")
         added = ", ".join(r.run.get("added") or []) or "-"
-        rows.append(
-            [
-                r.name,
-                str(r.run.get("version")),
-                str(r.run.get("seed")),
-                added,
-                chosen,
-                problems,
-                shown(details.get("alpha")),
-            ]
-        )
-    header = ["run", "version", "seed", "effects added", "splits by the user", "certificate of the fit", "alpha"]
+        rows.append([r.name, str(r.run.get("version")), str(r.run.get("seed")), added, chosen, problems])
+    header = ["run", "version", "seed", "effects added", "splits by the user", "certificate of the fit"]
     blocks.append(Table("Runs", header, rows, texts=6))
     blocks += [*_splits(results[-1]), *_openings(results)]
     versions = [(name, metadata.version(name)) for name in ("jax", "mujoco", "numpy", "scipy", "plotly")]

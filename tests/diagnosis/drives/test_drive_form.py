@@ -1,0 +1,134 @@
+"""The form of drives on a toy rover without a simulator: refits, signatures, verdicts."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lunar_mjx.diagnosis.drives import form as module
+from lunar_mjx.diagnosis.drives.form import DriveForm, _bounded_step
+from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
+from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotated
+from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.diagnosis.weighed.conclusion import conclude
+from lunar_mjx.inference.weighing.search import search
+from tests.inference.toy_problem import coordinate, manoeuvres
+
+LOGS, SAMPLES, LABEL = 6, 80, "motor_torque"
+USUAL = Usual(40.0, 0.1, 2.0, 0.4, 0.5, 4.0, 240.0, 0.3)
+RNG = np.random.default_rng(0)
+SHAPES = RNG.standard_normal((5 + len(FOLLOWS[LABEL]), LOGS * SAMPLES))
+SHAPES[5:] /= [[USUAL.size(LABEL, q)] for q in FOLLOWS[LABEL]]
+
+
+class Toy:
+    """What `DriveForm` asks of drives: two parameters that bend, two effects of which one saturates, one input."""
+
+    noise_unlearnt, together = False, 4
+
+    def __init__(self, truth: dict[str, float], unlisted: float = 0.0):
+        own = [coordinate("base", "a", prior=2.0), coordinate("base", "b", prior=2.0)]
+        shown = [coordinate(e, "amount", True, low=-1.0, high=30.0) for e in ("drag", "lag", "idle")]
+        self.coordinates = (*own, *shown, *(coordinate("inputs", q, True) for q in FOLLOWS[LABEL]))
+        self.baseline = np.arange(2)
+        self.candidates = {c.effect: np.array([2 + k]) for k, c in enumerate(shown)}
+        self.inputs = {LABEL: np.arange(5, len(self.coordinates))}
+        self.rows = 0
+        u = np.zeros(len(self.coordinates))
+        for c, value in truth.items():
+            u[[x.effect if x.amplitude else x.name for x in self.coordinates].index(c)] = value
+        u[6] = unlisted * USUAL.size(LABEL, FOLLOWS[LABEL][1])
+        noise = np.random.default_rng(1).standard_normal(LOGS * SAMPLES)
+        self.observations = dataclasses.replace(manoeuvres(LOGS, SAMPLES), value=self.predict(u[None])[0] + noise)
+
+    def predict(self, u):
+        u = np.atleast_2d(u).copy()
+        self.rows += len(u)
+        u[:, 0] = 5.0 * np.expm1(0.3 * u[:, 0])
+        u[:, 1] += 0.2 * u[:, 1] ** 2
+        u[:, 2] = 4.0 * (1.0 - np.exp(-0.7 * u[:, 2]))
+        u[:, 4] *= 1e-3
+        u[:, 5:] *= 20.0
+        return u @ SHAPES
+
+    def jacobian(self, u, which):
+        step = 1e-6
+        rows = np.concatenate([u[None], u + step * np.eye(len(u))[which]])
+        values = self.predict(rows)
+        return values[0], ((values[1:] - values[0]) / step).T
+
+    def free(self, effects=()):
+        return np.concatenate([self.baseline, *(self.candidates[e] for e in effects)]).astype(int)
+
+    def bounds(self, which):
+        pairs = np.array([self.coordinates[i].bounds() for i in which], float).reshape(-1, 2)
+        return pairs[:, 0], pairs[:, 1]
+
+
+@pytest.fixture(autouse=True)
+def _no_rover(monkeypatch):
+    monkeypatch.setattr(module, "usual_of", lambda drives: USUAL)
+
+
+def asked(toy: Toy):
+    settings = DriveSettings()
+    form = DriveForm(toy, settings)  # type: ignore[arg-type]
+    found = search([form], settings.most_refits, settings.most_terms, settings.window)
+    return form, found, conclude(found, settings.sure)
+
+
+def test_a_model_that_only_needs_a_refit_lacks_nothing():
+    form, found, said = asked(Toy({"a": 1.5, "b": -0.8}))
+    assert said.verdict is Verdict.NOISE_ONLY, said.sentence
+    assert found.best.refit.u[:2] == pytest.approx([1.5, -0.8], abs=0.3)
+    fitted = form.observations.in_split("fit")
+    assert np.sqrt(np.mean(form.residual(found.best.refit.u)[fitted] ** 2)) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("effect", "amount"), [("drag", 0.9), ("lag", 0.7)])
+def test_an_effect_is_named_and_sized(effect, amount):
+    form, found, said = asked(Toy({"a": 0.5, effect: amount}))
+    assert (said.verdict, said.effects) == (Verdict.KNOWN, (effect,)), said.sentence
+    assert found.best.refit.u[form.candidates[effect][0]] == pytest.approx(amount, abs=0.2)
+    assert set(found.best.refit.linear.held_out) == {"log4", "log5"}
+    assert "idle" not in {t.name for t in found.inclusion()}, "what cannot show is not weighed"
+
+
+def test_what_no_effect_does_is_unlisted_at_its_port():
+    _, found, said = asked(Toy({"b": 0.4}, unlisted=1.2))
+    assert (said.verdict, said.port) == (Verdict.UNKNOWN, LABEL), said.sentence
+    assert 0.2 < found.best.evidence.tau[0] < 2.0
+
+
+def test_a_refit_that_has_arrived_simulates_little():
+    toy = Toy({"a": 0.3, "drag": 0.5})
+    form, found, _ = asked(toy)
+    before = toy.rows
+    form.refit(found.best.effects, found.best.refit, None)
+    assert toy.rows - before < 20
+
+
+def test_a_step_ends_at_a_bound_and_the_others_do_their_best():
+    normal = np.array([[2.0, 0.9], [0.9, 1.0]])
+    downhill = normal @ [3.0, -1.0]
+    low, high = np.array([-1.0, -5.0]), np.array([1.0, 5.0])
+    step = _bounded_step(normal, downhill, np.zeros(2), low, high)
+    assert step == pytest.approx([1.0, (downhill[1] - 0.9) / 1.0])
+    assert _bounded_step(normal, downhill, np.zeros(2), -10.0 * high, 10.0 * high) == pytest.approx([3.0, -1.0])
+
+
+def test_columns_are_turned_so_that_few_are_left():
+    columns = RNG.standard_normal((50, 2)) @ RNG.standard_normal((2, 6))
+    turned = rotated(columns, 1e-6)
+    assert turned.shape == (50, 2)
+    np.testing.assert_allclose(turned @ turned.T, columns @ columns.T, atol=1e-8)
+
+
+def test_fields_are_relative_to_what_is_usual():
+    assert USUAL.size("command: motor current", "current") == pytest.approx(1.0)  # a gain
+    assert USUAL.size("motor_torque", "direction") == pytest.approx(0.4)
+    assert USUAL.size("motor_torque", "squared joint speed") == pytest.approx(0.4 * 4.0 / 2.0**2)
+    assert USUAL.size("soil: stiffness", "slip") == pytest.approx(1.0)
