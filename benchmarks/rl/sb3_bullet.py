@@ -45,8 +45,8 @@ class HostEnv(NavigationEnv):
     """The navigation task around physics that ran elsewhere."""
 
     def _drive(self, params: Any, inner: Any, action: Any) -> Any:
-        physics, slip, sinkage = params.driven
-        return physics, slip, sinkage
+        physics, *seen = params.driven
+        return physics, tuple(seen)
 
 
 class BulletNavigation(gym.Env):
