@@ -139,6 +139,7 @@ def answer_of(answer: Any) -> dict[str, Any]:
         "inclusion": {k: round(v, 4) for k, v in inclusion[:6]},
         "ground_probability": round(sum(p for n, p in chance.items() if GROUND & set(n.split(" + "))), 4),
         "held_out": answer.details.get("held_out"),
+        "held_out_of_usual": answer.details.get("held_out_of_usual"),
         "discrepancy": {k: round(v["size"], 4) for k, v in answer.discrepancy.items()},
         "sentence": answer.sentence,
         "not_tried": len(answer.details.get("not_tried", [])),

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from lunar_mjx.diagnosis.drives.windows import coordinates
-from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, cut, imu_clock
+from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, _held, cut, imu_clock
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
-from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, corners, learn_noise
+from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, corners, learn_noise, proportions
 from lunar_mjx.diagnosis.drives.windows.settings import WindowSettings
-from lunar_mjx.diagnosis.drives.windows.verbs import fitted_model
+from lunar_mjx.diagnosis.drives.windows.verbs import _gains, fitted_model
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.dynamics.imposed import Windows
 from lunar_mjx.errors import UserError
@@ -58,9 +58,10 @@ def measured(found, model, changes, rng, magnitude=True):
 
 
 def form_of(model, found, names=()):
-    """The form of some suspects beside a model, on windows that are all fitted."""
+    """The form of some suspects beside a model, on windows of which the last are held out."""
     problem = WindowProblem(found, model)
-    observations = observe(problem, NOISE, [f"log {k}" for k in range(4)], np.full(len(found), "fit"))
+    splits = np.where(np.arange(len(found)) < 18, "fit", "test")
+    observations = observe(problem, NOISE, [f"log {k}" for k in range(4)], splits)
     suspects = [s for s in coordinates.suspects_of(model) if s.name in names]
     return WindowForm(lambda _: problem, coordinates.baseline(model), suspects, observations, WindowSettings())
 
@@ -92,6 +93,9 @@ def test_a_planted_change_is_named(model, changes, name):
     said = conclude(found, 0.95)
     assert name in said.effects
     assert len(said.effects) == 1
+    gains = _gains(found)
+    assert len(gains) == 6
+    assert gains.sum() > 2.0 * np.sqrt(6.0) * gains.std()
     best = next(h for h in found.hypotheses if name in h.effects and h.refitted)
     key, value = next(iter(changes.items()))
     at = [i for i, q in enumerate(form.unknowns) if q.key == key]
@@ -138,6 +142,24 @@ def test_noise_is_told_from_residuals():
     found = learn_noise(block[None], np.ones((1, 200, 13), bool), 0.15)[0]
     assert found.share >= 0.7
     assert found.std == pytest.approx(0.5, rel=0.2)
+
+
+def test_noise_in_proportion_to_the_current_is_told():
+    """Windows of ten times the current scatter more, by the share that is learnt."""
+    rng = np.random.default_rng(7)
+    size = np.tile([1.0, 10.0], 100)
+    residual = rng.standard_normal((1, 200, 13)) * np.hypot(0.3, 0.2 * size)[None, :, None]
+    scale = proportions(residual, np.ones((1, 200, 13), bool), size[None])[0]
+    assert scale[1] / scale[0] == pytest.approx(np.hypot(0.3, 2.0) / np.hypot(0.3, 0.2), rel=0.3)
+    even = proportions(residual / np.hypot(0.3, 0.2 * size)[None, :, None], np.ones((1, 200, 13), bool), size[None])[0]
+    assert even[1] / even[0] == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_rover_is_held_where_its_wheels_turn_and_it_does_not():
+    left, right = np.array([0.15, 0.15, 0.15, 0.15]), np.array([-0.15, -0.15, 0.16, -0.15])
+    yaw = np.array([[0.001], [-0.2], [0.0], [np.nan]])
+    np.testing.assert_array_equal(_held(left, right, yaw, 0.57), [True, False, False, False])
+    assert not _held(left, right, yaw, np.inf).any()
 
 
 def test_priors_survive_the_file(model, tmp_path):
