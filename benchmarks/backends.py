@@ -41,7 +41,7 @@ from lunar_mjx.backends import NativeBackend
 from lunar_mjx.dynamics import build
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
-from lunar_mjx.report.style import BLUE, GREEN, INK, ORANGE, PURPLE, RULE, SKY, VERMILION
+from lunar_mjx.report.style import BLUE, GREEN, INK, ORANGE, PAPER, PURPLE, RULE, SKY, VERMILION
 
 ENGINES = ("pybullet", "native", "structured", "mjx", "bare", "spheres")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -237,7 +237,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
                 linestyle=":" if hollow else "-",
                 linewidth=1.1,
                 markersize=6,
-                markerfacecolor="white" if hollow else colour,
+                markerfacecolor=PAPER if hollow else colour,
             )
         heights = _spread([own[-1]["steps_per_s"] for own in lines.values()])
         for ((engine, workers), own), height in zip(lines.items(), heights, strict=True):

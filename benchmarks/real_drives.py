@@ -561,6 +561,8 @@ def picture(runs: Sequence[Path], file: Path) -> None:
     """
     from matplotlib.figure import Figure
 
+    from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, styled
+
     stored = []
     for run in runs[:2]:
         with np.load(run / "series.npz") as data:
@@ -569,28 +571,32 @@ def picture(runs: Sequence[Path], file: Path) -> None:
     held = np.isin(first["split"][first["unit"]], ("test", "select"))
     stops = [*first["series_start"][1:], len(first["measured"])]
     channels = [c for c in SHOWN if c in first["series_channel"]]
-    figure = Figure(figsize=(8.0, 2.0 * len(channels)), layout="constrained")
-    for k, (axes, channel) in enumerate(
-        zip(figure.subplots(len(channels), squeeze=False)[:, 0], channels, strict=True)
-    ):
-        parts = [
-            np.arange(a, b)[held[a:b]]
-            for a, b, c in zip(first["series_start"], stops, first["series_channel"], strict=True)
-            if c == channel
-        ]
-        at = np.concatenate(parts)
-        lines = [("as given", first["predicted"][0][at], "#999999"), ("refitted", first["predicted"][1][at], "#E69F00")]
-        if len(stored) > 1:
-            grown = stored[1]
-            lines.append((f"with {runs[1].name}", grown["predicted"][1][at], "#0072B2"))
-        for label, values, colour in lines:
-            axes.plot(values, color=colour, linewidth=1.2, label=label)
-        axes.plot(first["measured"][at], ".", color="black", markersize=2.5, label="measured")
-        axes.set_ylabel(SHOWN[channel], fontsize=8)
-        if k == 0:
-            axes.legend(frameon=False, ncols=4, fontsize=8)
-    figure.supxlabel("samples of held-out windows, one after another", fontsize=9)
-    figure.savefig(file, dpi=110)
+    with styled():
+        figure = Figure(figsize=(8.0, 2.0 * len(channels)), layout="constrained")
+        for k, (axes, channel) in enumerate(
+            zip(figure.subplots(len(channels), squeeze=False)[:, 0], channels, strict=True)
+        ):
+            parts = [
+                np.arange(a, b)[held[a:b]]
+                for a, b, c in zip(first["series_start"], stops, first["series_channel"], strict=True)
+                if c == channel
+            ]
+            at = np.concatenate(parts)
+            lines = [
+                ("as given", first["predicted"][0][at], MUTED, ":"),
+                ("refitted", first["predicted"][1][at], ORANGE, "--"),
+            ]
+            if len(stored) > 1:
+                grown = stored[1]
+                lines.append((f"with {runs[1].name}", grown["predicted"][1][at], BLUE, "-"))
+            for label, values, colour, line in lines:
+                axes.plot(values, color=colour, linestyle=line, linewidth=1.2, label=label)
+            axes.plot(first["measured"][at], ".", color=INK, markersize=2.5, label="measured")
+            axes.set_ylabel(SHOWN[channel], fontsize=8)
+            if k == 0:
+                axes.legend(frameon=False, ncols=4, fontsize=8)
+        figure.supxlabel("samples of held-out windows, one after another", fontsize=9)
+        figure.savefig(file, dpi=110)
 
 
 def run_all(args: argparse.Namespace) -> None:

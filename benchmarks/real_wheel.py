@@ -106,18 +106,22 @@ def draw(rows: list[dict[str, Any]]) -> None:
     matplotlib.use("svg")
     import matplotlib.pyplot as plt
 
+    from lunar_mjx.report.style import MUTED, figure_style
+
+    matplotlib.rcParams.update(figure_style())
+
     fig, ax = plt.subplots(figsize=(9.0, 4.2), layout="constrained")
     for part, mark in (("fitted", "o"), ("inside", "s"), ("extrapolated", "^")):
         angles = ", ".join(str(a) for a in PARTS[part])
         ax.plot([r[part] for r in rows], mark + "-", label=f"{part}: {angles} deg", linewidth=1.2, markersize=5)
     for level, label in ((2.5, "target inside"), (5.0, "target extrapolated"), (1.0, "replicates")):
-        ax.axhline(level, color="0.6", linewidth=0.8, linestyle=":")
-        ax.annotate(label, (0, level), fontsize=7, color="0.4", va="bottom")
+        ax.axhline(level, color=MUTED, linewidth=0.8, linestyle=":")
+        ax.annotate(label, (0, level), fontsize=7, color=MUTED, va="bottom")
     ax.set_yscale("log")
     ax.set_yticks([1, 2, 5, 10, 20, 40], ["1", "2", "5", "10", "20", "40"])
     ax.set_ylabel("error, sigma of single runs")
     ax.set_xticks(range(len(rows)), [r["model"] for r in rows], rotation=35, ha="right", fontsize=8)
-    ax.legend(frameon=False, fontsize=8)
+    ax.legend()
     fig.savefig(FIGURE, metadata={"Date": None})
 
 

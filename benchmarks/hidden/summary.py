@@ -189,19 +189,24 @@ def plot(rows: Sequence[Row], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    from lunar_mjx.report.style import INK, PAPER, SHARES, figure_style
+
+    matplotlib.rcParams.update(figure_style())
+
     truths, answers, counts = confusion(rows)
     part = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     figure, axes = plt.subplots(figsize=(2.5 + 0.55 * len(answers), 2.0 + 0.45 * len(truths)), layout="constrained")
-    axes.imshow(part, cmap="Greys", vmin=0.0, vmax=1.0, aspect="auto")
+    axes.imshow(part, cmap=SHARES, vmin=0.0, vmax=1.0, aspect="auto")
     for i, j in np.argwhere(counts > 0):
-        axes.text(j, i, str(counts[i, j]), ha="center", va="center", color="white" if part[i, j] > 0.5 else "black")
+        axes.text(j, i, str(counts[i, j]), ha="center", va="center", color=PAPER if part[i, j] > 0.5 else INK)
     axes.set_xticks(range(len(answers)), answers, rotation=45, ha="right")
     axes.set_yticks(range(len(truths)), [f"{t} ({n})" for t, n in zip(truths, counts.sum(axis=1), strict=True)])
     axes.set_xlabel("answer")
     axes.set_ylabel("hidden (cases)")
     axes.set_xticks(np.arange(-0.5, len(answers)), minor=True)
     axes.set_yticks(np.arange(-0.5, len(truths)), minor=True)
-    axes.grid(which="minor", color="0.8", linewidth=0.6)
+    axes.grid(False)
+    axes.grid(which="minor")
     axes.tick_params(which="minor", length=0)
     figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -21,6 +21,7 @@ from harness import percent
 
 from lunar_mjx.agents.curves import mean_interval, new_figure
 from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.report.style import MUTED
 
 ROOT = Path(__file__).parents[2]
 KEPT = ROOT / "benchmarks" / "rl"
@@ -89,8 +90,8 @@ def plot_large(record: dict[str, Any], path: Path) -> None:
         rows = [r for r in seed["rows"] if r.get("episode_return") is not None]
         right.plot([r["elapsed_s"] for r in rows], [r["episode_return"] for r in rows], lw=1)
     for style, (name, score) in zip(("--", "-.", ":", (0, (1, 4))), record["agents"].items(), strict=False):
-        left.axhline(100 * score["success"], color="0.5", lw=0.8, ls=style, label=name)
-    left.axhline(100 * record["target"], color="0.7", lw=0.8)
+        left.axhline(100 * score["success"], color=MUTED, lw=0.8, ls=style, label=name)
+    left.axhline(100 * record["target"], color=MUTED, lw=0.8)
     left.set(xlabel="wall time of training, s", ylabel="success on unseen ground, %", ylim=(-3, 103))
     right.set(xlabel="wall time of training, s", ylabel="return of ended episodes in training")
     left.legend(frameon=False, fontsize=7)

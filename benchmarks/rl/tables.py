@@ -10,6 +10,7 @@ import numpy as np
 from harness import percent
 
 from lunar_mjx.agents.curves import mean_interval, moving_mean, new_figure
+from lunar_mjx.report.style import LINES, MUTED
 
 LAST = 50
 """Episodes that a training is judged by at its end."""
@@ -50,8 +51,8 @@ def plot_paper(record: dict[str, Any], path: Path) -> None:
                 mean, low, high = mean_interval(np.stack([c[:count] for c in curves]))
                 x = np.arange(1, count + 1)
                 label = f"{name}, {len(runs)} seed{'s' if len(runs) > 1 else ''}"
-                axes.plot(x, mean, "-" if i == 0 else "--", color=f"C{i}", label=label)
-                axes.fill_between(x, low, high, color=f"C{i}", alpha=0.2, lw=0)
+                axes.plot(x, mean, color=LINES[i][0], linestyle=LINES[i][1], label=label)
+                axes.fill_between(x, low, high, color=LINES[i][0], alpha=0.2, lw=0)
         rows[0][column].set_title(variant, fontsize=9)
         rows[1][column].set(xlabel="episode", ylim=(-3, 103))
         rows[0][column].legend(frameon=False, fontsize=7)
@@ -85,15 +86,15 @@ def plot_rates(record: dict[str, Any], path: Path) -> None:
     )
     figure, (left, right) = new_figure(2)
     at = [r["rovers"] for r in rows]
-    left.loglog(at, [r["bare_steps_per_s"] / 1e6 for r in rows], "s--", ms=4, color="0.5", label="bare physics")
+    left.loglog(at, [r["bare_steps_per_s"] / 1e6 for r in rows], "s--", ms=4, color=MUTED, label="bare physics")
     left.loglog(at, [r["env_steps_per_s"] / 1e6 for r in rows], "o-", ms=4, label="environment")
-    left.axhline(30.0, color="0.8", lw=0.8)
+    left.axhline(30.0, color=MUTED, lw=0.8)
     left.set(xlabel="rovers", ylabel="million steps/s at decimation 5", title=record["rover"])
     left.legend(frameon=False)
     ratios = [[min(r["bare_seconds"]) / s for s in r["seconds"]] for r in rows]
     right.plot(at, [r["ratio"] for r in rows], "o-", ms=4)
     right.vlines(at, [min(q) for q in ratios], [max(q) for q in ratios], lw=1.5)
-    right.axhline(0.7, color="0.8", lw=0.8)
+    right.axhline(0.7, color=MUTED, lw=0.8)
     right.set(xlabel="rovers", xscale="log", ylabel="environment / bare physics", ylim=(0, 1))
     figure.savefig(path, dpi=120)
 
@@ -226,9 +227,11 @@ def table_sb3(record: dict[str, Any]) -> list[str]:
 def plot_learners(large: dict[str, Any] | None, brax: dict[str, Any] | None, path: Path) -> None:
     """Success on unseen ground over time of training: TD3's seeds and brax's learners."""
     figure, (left, right) = new_figure(2)
-    lines = [(f"TD3, {large['about']['device']}", s["unseen"], "C0") for s in large["seeds"]] if large else []
+    lines = [(f"TD3, {large['about']['device']}", s["unseen"], LINES[0][0]) for s in large["seeds"]] if large else []
     for i, (name, run) in enumerate((brax or {"runs": {}})["runs"].items()):
-        lines.append((f"brax {name.upper()}, {(brax or {})['about']['device']}", run.get("unseen", []), f"C{i + 1}"))
+        lines.append(
+            (f"brax {name.upper()}, {(brax or {})['about']['device']}", run.get("unseen", []), LINES[i + 1][0])
+        )
     named = set()
     for label, found, colour in lines:
         for axes, x, unit in ((left, "elapsed_s", 1.0), (right, "steps", 1e6)):

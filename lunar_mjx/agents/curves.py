@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.files import replacing
+from lunar_mjx.report.style import MUTED, styled
 
 EPISODES = 20
 """Episodes in the moving mean of curves by episode."""
@@ -19,9 +20,10 @@ def new_figure(columns: int, width: float = 5.0, height: float = 3.6) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(columns * width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(1, columns, squeeze=False)[0]
+    with styled():
+        figure = Figure(figsize=(columns * width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
 def moving_mean(values: Sequence[float] | np.ndarray, width: int = EPISODES) -> np.ndarray:
@@ -57,7 +59,7 @@ def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str =
     first.set(xlabel="environment steps", ylabel="return of ended episodes", title=title)
     second.set(xlabel="environment steps", ylabel="success in training, %", ylim=(-3, 103))
     third.set(xlabel="wall time of training, s", ylabel="success on unseen ground, %", ylim=(-3, 103))
-    third.axhline(95, color="0.7", lw=0.8, ls="--")
+    third.axhline(95, color=MUTED, lw=0.8, ls="--")
     first.legend(frameon=False, fontsize=8)
     with replacing(path) as part:
         figure.savefig(part, dpi=120)
@@ -73,13 +75,12 @@ def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path,
       most: episodes to show; as many as every seed has if None.
     """
     figure, (axes,) = new_figure(1, 6.0)
-    styles = ["-", "--", "-.", ":"]
-    for i, (name, records) in enumerate(groups.items()):
+    for name, records in groups.items():
         curves = [moving_mean(r["episodes"]["episode_return"]) for r in records]
         count = min(len(c) for c in curves) if most is None else most
         curves = [np.pad(c[:count], (0, max(0, count - len(c))), constant_values=np.nan) for c in curves]
         mean, low, high = mean_interval(np.stack(curves))
-        axes.plot(np.arange(1, count + 1), mean, styles[i % 4], label=name)
+        axes.plot(np.arange(1, count + 1), mean, label=name)
         if len(curves) > 1:
             axes.fill_between(np.arange(1, count + 1), low, high, alpha=0.2)
     axes.set(xlabel="episode", ylabel=f"average return per episode (mean of {EPISODES})")

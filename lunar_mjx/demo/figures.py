@@ -16,7 +16,7 @@ from lunar_mjx.criticism import SteadyStateTable, replicate_scatter
 from lunar_mjx.demo.drive import Drive
 from lunar_mjx.demo.husky import HuskyCase
 from lunar_mjx.demo.wheel import Case, dense_curves
-from lunar_mjx.report.style import BLUE, INK, MEASURED, SERIES, VERMILION, Series, faded, finish
+from lunar_mjx.report.style import BLUE, INK, MEASURED, ROCK, SERIES, VERMILION, Series, faded, finish
 from lunar_mjx.terrain import Terrain
 from lunar_mjx.wheel_bed.soil_fit import APART_ANGLES, FIT_ANGLES
 
@@ -111,13 +111,13 @@ def _add_rocks(figure: go.Figure, terrain: Terrain, box: tuple[float, float, flo
             "y0": y - r,
             "y1": y + r,
             "line": {"width": 0.5},
-            "fillcolor": "#3a3a3a",
+            "fillcolor": ROCK,
         }
         for x, y, r in rocks_within(terrain, np.array([box[0], box[2]]), np.array([box[1], box[3]]))
     ]
     figure.update_layout(shapes=shapes)
     if shapes:
-        figure.add_scatter(x=[None], y=[None], mode="markers", name="rock", marker={"color": "#3a3a3a", "size": 9})
+        figure.add_scatter(x=[None], y=[None], mode="markers", name="rock", marker={"color": ROCK, "size": 9})
 
 
 CASE_LABELS = {

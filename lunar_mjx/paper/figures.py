@@ -16,9 +16,8 @@ from lunar_mjx.effects.presets import UNSAID
 from lunar_mjx.errors import UserError
 from lunar_mjx.files import replacing, write_text
 from lunar_mjx.paper import hot_motor, slope_runs, soft_ground
+from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, VERMILION, styled
 
-# Okabe and Ito's colours, told apart by colour-blind eyes; line styles tell them apart in grey.
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#555555"
 PRESET_NAMES = ("paper", "consistent")
 SLOPES_DEG = (0.0, 5.0, 10.0, 12.5, 15.0, 17.5, 20.0, 22.5, 25.0)
 STALL_SLIP = 0.95
@@ -33,12 +32,13 @@ def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()
     """
     written = []
     for name in names:
-        figure, numbers = FIGURES[name](trainings) if name in NEED_TRAININGS else FIGURES[name]()
-        figure.set_layout_engine("constrained")
-        FigureCanvasAgg(figure)
         image, data = out / f"{_FILES[name]}.png", out / f"{_FILES[name]}.json"
-        with replacing(image) as part:
-            figure.savefig(part, dpi=120)
+        with styled():
+            figure, numbers = FIGURES[name](trainings) if name in NEED_TRAININGS else FIGURES[name]()
+            figure.set_layout_engine("constrained")
+            FigureCanvasAgg(figure)
+            with replacing(image) as part:
+                figure.savefig(part, dpi=120)
         write_text(data, json.dumps(numbers, indent=1))
         written += [image, data]
     return written
@@ -47,10 +47,7 @@ def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()
 def _style(axes: Axes, x: str, y: str, title: str) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.grid(True, color="#dddddd", linewidth=0.6)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.set_title(title)
 
 
 def figure_3() -> tuple[Figure, dict]:
@@ -61,15 +58,15 @@ def figure_3() -> tuple[Figure, dict]:
     for column, preset in enumerate(PRESET_NAMES):
         run = hot_motor(preset)
         above, below = grid[0][column], grid[1][column]
-        above.plot(run.time, run.winding, color=ORANGE, label="winding")
+        above.plot(run.time, run.winding, color=VERMILION, label="winding")
         above.plot(run.time, run.housing, color=BLUE, linestyle="--", label="housing")
-        above.axhline(150.0, color=GREY, linewidth=0.8, linestyle=":")
-        below.plot(run.time, run.torque, color="black", label="actual")
-        below.axhline(run.desired, color=GREY, linestyle="--", label="desired")
+        above.axhline(150.0, color=MUTED, linewidth=0.8, linestyle=":")
+        below.plot(run.time, run.torque, color=INK, label="actual")
+        below.axhline(run.desired, color=MUTED, linestyle="--", label="desired")
         _style(above, "", "temperature, °C", f"preset {preset}")
         _style(below, "time, s", "torque at the wheel, N m", f"cut-off at {run.cutoff_time:.2f} s")
-        above.legend(frameon=False)
-        below.legend(frameon=False)
+        above.legend()
+        below.legend()
         numbers["runs"][preset] = {
             "cutoff_time_s": run.cutoff_time,
             "desired_torque_Nm": run.desired,
@@ -90,14 +87,14 @@ def figure_5() -> tuple[Figure, dict]:
         runs = soft_ground(preset)
         for run in runs:
             hard = run.ground == "hard"
-            colour = GREY if hard else (BLUE if run.side > 0 else ORANGE)
+            colour = MUTED if hard else (BLUE if run.side > 0 else VERMILION)
             label = "hard" if hard else f"soft, softer to the {'left' if run.side > 0 else 'right'}"
             if hard and run.side < 0:
                 continue
             line = "--" if hard else ("-" if run.side > 0 else "-.")
             axes.plot(run.x - run.x[0], run.y - run.y[0], color=colour, linestyle=line, label=label)
         _style(axes, "x, m", "y (left), m", f"preset {preset}")
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend()
         ends = {(r.ground, r.side): r.y[-1] - r.y[0] for r in runs}
         numbers[preset] = {
             "lateral_drift_m": {f"{g}_{'left' if s > 0 else 'right'}": float(v) for (g, s), v in ends.items()},
@@ -115,11 +112,11 @@ def figure_slope() -> tuple[Figure, dict]:
     figure = Figure(figsize=(6.4, 4.2))
     axes = figure.subplots()
     axes.plot(slope, slip, "o-", color=BLUE, label="whole rover")
-    axes.plot(slope, [r.wheel_slip[:2].mean() for r in runs], "^--", color=ORANGE, label="front wheels")
+    axes.plot(slope, [r.wheel_slip[:2].mean() for r in runs], "^--", color=VERMILION, label="front wheels")
     axes.plot(slope, [r.wheel_slip[2:].mean() for r in runs], "v:", color=GREEN, label="rear wheels")
-    axes.plot([15.1], [0.40], "*", color="black", markersize=11, label="drawbar pull of one wheel: 15.1° at 40 %")
+    axes.plot([15.1], [0.40], "*", color=INK, markersize=11, label="drawbar pull of one wheel: 15.1° at 40 %")
     _style(axes, "slope, °", "slip ratio", "VIPER climbing, lunar nominal soil, 0.2 m/s asked")
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend()
     numbers = {
         "slope_at_40_percent_slip_deg": _crossing(slope, slip, 0.40),
         "mean_wheel_slip_40_percent_at_deg": _crossing(slope, np.array([r.wheel_slip.mean() for r in runs]), 0.40),

@@ -37,7 +37,7 @@ from lunar_mjx.cameras.chase import wheel_tracks
 from lunar_mjx.cameras.texture import ALBEDO, TrackPainter, regolith
 from lunar_mjx.dynamics import build
 from lunar_mjx.model import Model, make_model
-from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, VERMILION
+from lunar_mjx.report.style import BLUE, GREEN, HEIGHTS, HEIGHTS_DOWN, INK, MUTED, ORANGE, PAPER, SHADOW, SKY, VERMILION
 from lunar_mjx.resources import find
 from lunar_mjx.rover import Rover
 from lunar_mjx.terrain import HeightField, Terrain, load_terrain
@@ -59,7 +59,7 @@ _FILM = Film(mid=0.12)
 """A little darker than the cameras' own exposure, so that white parts are not burnt out."""
 _ROWS = 300
 """Places of a rover on its way here, from which its tracks are painted."""
-_LABEL_COLOURS = ("#000000", "#8c8c8c", "#56B4E9", "#E69F00")
+_LABEL_COLOURS = (SHADOW, MUTED, SKY, ORANGE)
 """Sky, ground, rock, rover: told apart without colour vision, and by their brightness."""
 _BOXES: dict[str, tuple[float, float, str, str, str]] = {
     "urdf": (0.0, 2.0, "URDF + description", "loops, motors, gains", BLUE),
@@ -106,7 +106,7 @@ def figure_1() -> tuple[Figure, dict[str, Any]]:
     near = np.where(np.isfinite(depth), depth, np.nan)
     _picture(figure.add_subplot(grid[0, 1]), np.asarray(seen.rgb), "its front camera: colour")
     axes = figure.add_subplot(grid[1, 1])
-    shown = axes.imshow(near, cmap="cividis_r", norm=LogNorm(float(np.nanmin(near)), float(np.nanmax(near))))
+    shown = axes.imshow(near, cmap=HEIGHTS_DOWN, norm=LogNorm(float(np.nanmin(near)), float(np.nanmax(near))))
     _bare(axes, "distance, m (logarithmic)")
     bar = figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=(2, 5, 10, 20, 50))
     bar.ax.set_yticklabels(("2", "5", "10", "20", "50"))
@@ -195,7 +195,7 @@ def figure_2() -> tuple[Figure, dict[str, Any]]:
     for x, y, title, text, colour in _BOXES.values():
         axes.add_patch(
             FancyBboxPatch(
-                (1.1 * x, y), wide, high, boxstyle="round,pad=0.04", facecolor="white", edgecolor=colour, linewidth=1.8
+                (1.1 * x, y), wide, high, boxstyle="round,pad=0.04", facecolor=PAPER, edgecolor=colour, linewidth=1.8
             )
         )
         axes.text(1.1 * x + wide / 2, y + 0.36, title, ha="center", va="center", fontsize=10, weight="bold")
@@ -236,8 +236,9 @@ def figure_4() -> tuple[Figure, dict[str, Any]]:
     rows, cols = heights.shape
     extent = (x0, x0 + (cols - 1) * cell, y0, y0 + (rows - 1) * cell)
     axes = figure.add_subplot(2, 2, 3)
-    image = axes.imshow(heights, cmap="cividis", extent=extent, origin="lower")
+    image = axes.imshow(heights, cmap=HEIGHTS, extent=extent, origin="lower")
     axes.set(xlabel="east, m", ylabel="north, m")
+    axes.grid(False)
     axes.set_title(f"(c) elevation map, {terrain.name}", loc="left", fontsize=10)
     figure.colorbar(image, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), label="height, m")
     step = max(1, max(heights.shape) // 160)

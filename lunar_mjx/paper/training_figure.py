@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from lunar_mjx.agents.curves import EPISODES, mean_interval, moving_mean
 from lunar_mjx.errors import UserError, bad_input
-from lunar_mjx.report.style import BLUE, GREEN, ORANGE, PURPLE, RULE, SKY, VERMILION
+from lunar_mjx.report.style import BLUE, GREEN, ORANGE, PAPER, PURPLE, SKY, VERMILION
 
 CURVE = "curve.json"
 _LOOKS = ((BLUE, "-"), (VERMILION, "--"), (GREEN, "-."), (ORANGE, ":"), (PURPLE, (0, (6, 2, 1, 2))), (SKY, (0, (1, 1))))
@@ -102,7 +102,7 @@ def figure_6(paths: Sequence[str | Path]) -> tuple[Figure, dict[str, Any]]:
     _finish(left, x, f"average return per episode{mean}")
     _finish(right, x, f"success, %{mean}" if episodes else "success, %   (dots: on unseen ground)")
     right.set_ylim(-3.0, 103.0)
-    left.legend(frameon=False, fontsize=8)
+    left.legend()
     return figure, {
         "axis": "episode" if episodes else "steps",
         "trainings": {name: [_numbers(r) for r in runs] for name, runs in groups.items()},
@@ -131,7 +131,7 @@ def _by_step(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str,
             "o",
             color=colour,
             markersize=4,
-            markeredgecolor="white",
+            markeredgecolor=PAPER,
             markeredgewidth=0.6,
         )
 
@@ -153,10 +153,7 @@ def _by_episode(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: s
 def _finish(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    axes.grid(True, color=RULE, linewidth=0.6)
     axes.xaxis.set_major_formatter(lambda v, _: f"{v / 1e6:g} M" if v >= 1e6 else f"{v:g}")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
 
 
 def _numbers(record: dict[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import plotly.graph_objects as go
@@ -32,6 +34,76 @@ SERIES: tuple[Series, ...] = (
     Series(PURPLE, "longdash", "x"),
     Series(SKY, "longdashdot", "star"),
 )
+
+
+LINES: tuple[tuple[str, Any], ...] = (
+    (BLUE, "-"),
+    (VERMILION, "--"),
+    (GREEN, "-."),
+    (ORANGE, ":"),
+    (PURPLE, (0, (8, 2))),
+    (SKY, (0, (8, 2, 1, 2, 1, 2))),
+)
+"""Colour and line of the first, second, ... line of a plot that names no styles: in grey the line tells them apart."""
+ROCK, SHADOW, LIT = "#3a3a3a", "#000000", "#ffffff"
+"""What is drawn on pictures of the ground: rocks, outlines on bright ground, and marks on dark ground."""
+HEIGHTS, HEIGHTS_DOWN, RELIEF, SHARES = "cividis", "cividis_r", "gray", "Greys"
+"""Colour maps: of numbers, which rise in lightness alike for all eyes; of shaded ground; of counts."""
+SHADES = ((0.0, "#f7fbff"), (0.25, "#c6dbef"), (0.5, "#6baed6"), (0.75, "#2171b5"), (1.0, "#08306b"))
+"""From none to much, in one hue: how far the darkness goes is what counts."""
+SANS = ("Helvetica", "Arial", "DejaVu Sans")
+"""Fonts of figures that are files; the last one comes with Matplotlib."""
+
+
+def figure_style(dark: bool = False) -> dict[str, Any]:
+    """Matplotlib's settings of every figure.
+
+    Args:
+      dark: for a dark page.
+    """
+    from cycler import cycler
+
+    ink, muted, rule, paper = (DARK[c] if dark else c for c in (INK, MUTED, RULE, PAPER))
+    # blue and purple sink into a dark page
+    colours = [{BLUE: SKY, PURPLE: "#CC79A7", SKY: BLUE}.get(c, c) if dark else c for c, _ in LINES]
+    return {
+        "font.family": "sans-serif",
+        "font.sans-serif": list(SANS),
+        "figure.facecolor": paper,
+        "savefig.facecolor": paper,
+        "axes.facecolor": paper,
+        "axes.edgecolor": muted,
+        "axes.labelcolor": ink,
+        "axes.titlelocation": "left",
+        "axes.titlesize": 10,
+        "axes.labelsize": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "axes.prop_cycle": cycler(color=colours) + cycler(linestyle=[line for _, line in LINES]),
+        "grid.color": rule,
+        "grid.linewidth": 0.6,
+        "text.color": ink,
+        "xtick.color": muted,
+        "ytick.color": muted,
+        "xtick.labelsize": 8,
+        "ytick.labelsize": 8,
+        "legend.frameon": False,
+        "legend.fontsize": 8,
+        "image.cmap": HEIGHTS,
+        "svg.fonttype": "none",
+    }
+
+
+@contextmanager
+def styled(dark: bool = False) -> Iterator[None]:
+    """Draws with Matplotlib in the common style, as `with styled():` or as a decorator `@styled()`."""
+    import matplotlib
+
+    settings: dict[Any, Any] = figure_style(dark)
+    with matplotlib.rc_context(settings):
+        yield
 
 
 def faded(colour: str, alpha: float) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lunar_mjx.cameras.ground_map import PATH, GroundMap
+from lunar_mjx.report.style import MUTED
 from lunar_mjx.visual.plots import WHEEL_STYLES, bounds
 from lunar_mjx.visual.recorded import RecordedDrive
 
@@ -17,7 +18,7 @@ _TEXT, _FAINT, _PATH, _HOT = (240, 240, 240), (150, 155, 160), (120, 190, 255), 
 
 def wheel_colour(corner: str) -> tuple[int, int, int]:
     """RGB of a wheel's line on a dark ground: sides differ in colour as in the plots, rear wheels are dimmer."""
-    colour = WHEEL_STYLES.get(corner, ("#888888",))[0]
+    colour = WHEEL_STYLES.get(corner, (MUTED,))[0]
     bright = 0.62 if corner in ("lr", "rr") else 1.0
     red, green, blue = (round(bright * min(255, int(colour[i : i + 2], 16) + 60)) for i in (1, 3, 5))
     return red, green, blue

@@ -15,7 +15,21 @@ from matplotlib.patches import Circle, Polygon
 from lunar_mjx.cameras.relief import relief, rocks_within
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.files import replacing
-from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, RULE, VERMILION
+from lunar_mjx.report.style import (
+    BLUE,
+    GREEN,
+    HEIGHTS,
+    INK,
+    LIT,
+    MUTED,
+    ORANGE,
+    RELIEF,
+    ROCK,
+    RULE,
+    SHADOW,
+    VERMILION,
+    styled,
+)
 from lunar_mjx.terrain import Terrain, surface
 from lunar_mjx.visual.recorded import RecordedDrive
 
@@ -51,12 +65,9 @@ _LEAST_CONTRAST = 0.08
 
 
 def style(axes: Axes, y: str, x: str = "") -> None:
-    """Axis titles with units, a light grid, no box."""
+    """Axis titles with units."""
     axes.set_ylabel(y)
     axes.set_xlabel(x)
-    axes.grid(True, color=RULE, linewidth=0.6)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -79,14 +90,14 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray,
         "vmin": dark - spare - 0.35 * (bright - dark + 2 * spare),
         "vmax": bright + spare + 0.15 * (bright - dark),
     }
-    axes.imshow(ground.grey, cmap="gray", extent=extent, origin="lower", interpolation="bicubic", **span)
+    axes.imshow(ground.grey, cmap=RELIEF, extent=extent, origin="lower", interpolation="bicubic", **span)
     if contours and np.ptp(ground.heights) > 1e-6:
         rows, cols = ground.heights.shape
         x = np.linspace(ground.west, ground.east, cols)
         y = np.linspace(ground.south, ground.north, rows)
         step = _round_step(float(np.ptp(ground.heights)) / 8.0)
         levels = np.arange(np.floor(ground.heights.min() / step), np.ceil(ground.heights.max() / step) + 1) * step
-        axes.contour(x, y, ground.heights, levels=levels, colors="white", linewidths=0.7, alpha=0.6)
+        axes.contour(x, y, ground.heights, levels=levels, colors=LIT, linewidths=0.7, alpha=0.6)
         text = f"contours every {1e3 * step:g} mm" if step < 0.1 else f"contours every {step:g} m"
     else:
         text = "level ground" if contours else ""
@@ -97,11 +108,12 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray,
             text,
             transform=axes.transAxes,
             fontsize=8,
-            color="white",
+            color=LIT,
             bbox={"facecolor": INK, "alpha": 0.65, "edgecolor": "none", "pad": 2.5},
         )
     stones = [Circle((x, y), r) for x, y, r in rocks_within(terrain, low, high)]
-    axes.add_collection(PatchCollection(stones, facecolor="#3a3a3a", edgecolor="#222222", linewidth=0.4))
+    axes.add_collection(PatchCollection(stones, facecolor=ROCK, edgecolor=SHADOW, linewidth=0.4))
+    axes.grid(False)
     axes.set_aspect("equal")
     axes.set_xlabel("east, m")
     axes.set_ylabel("north, m")
@@ -132,6 +144,7 @@ def bounds(
     return middle - half, middle + half
 
 
+@styled()
 def drive_summary(drive: RecordedDrive) -> Figure:
     """The path on shaded relief, and over time slope, slip, sinkage, temperature and power."""
     figure = Figure(figsize=(13.0, 7.4), layout="constrained")
@@ -196,7 +209,7 @@ def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
     slip = np.nanmean(np.abs(drive.per_wheel("wheel_{}_slip_ratio")), axis=1)
     for n, track in enumerate(drive.tracks()):
         axes.plot(
-            *track.places.T, color="black", linewidth=1.0, alpha=0.55, zorder=2, label="wheels" if n == 0 else None
+            *track.places.T, color=SHADOW, linewidth=1.0, alpha=0.55, zorder=2, label="wheels" if n == 0 else None
         )
     axes.add_patch(
         Polygon(
@@ -209,11 +222,11 @@ def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
             label="rover at the end",
         )
     )
-    axes.plot(*place.T, color="black", linewidth=4.5, solid_capstyle="round")
-    dots = axes.scatter(*place.T, c=np.clip(slip, 0.0, 1.0), cmap="cividis", vmin=0.0, vmax=1.0, s=7, zorder=3)
+    axes.plot(*place.T, color=SHADOW, linewidth=4.5, solid_capstyle="round")
+    dots = axes.scatter(*place.T, c=np.clip(slip, 0.0, 1.0), cmap=HEIGHTS, vmin=0.0, vmax=1.0, s=7, zorder=3)
     figure.colorbar(dots, ax=axes, label="mean |slip ratio| of the wheels", shrink=0.6, pad=0.01)
-    axes.plot(*place[0], "o", color="white", markeredgecolor="black", markersize=8, label="start", zorder=4)
-    axes.plot(*place[-1], "s", color="white", markeredgecolor="black", markersize=8, label="end", zorder=4)
+    axes.plot(*place[0], "o", color=LIT, markeredgecolor=SHADOW, markersize=8, label="start", zorder=4)
+    axes.plot(*place[-1], "s", color=LIT, markeredgecolor=SHADOW, markersize=8, label="end", zorder=4)
     axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
 
 
@@ -276,6 +289,7 @@ def _power(axes: Axes, drive: RecordedDrive) -> None:
     style(axes, "motors' power, W")
 
 
+@styled()
 def terrain_preview(terrain: Terrain) -> Figure:
     """A terrain's heights on shaded relief, and its slopes: map and shares."""
     field = terrain.field
@@ -289,7 +303,8 @@ def terrain_preview(terrain: Terrain) -> Figure:
     step = max(1, round(max(heights.shape) / 600))
     north, east = np.gradient(heights[::step, ::step], cell * step)
     slope = np.degrees(np.arctan(np.hypot(north, east)))
-    image = middle.imshow(slope, cmap="cividis", extent=(low[0], high[0], low[1], high[1]), origin="lower")
+    image = middle.imshow(slope, cmap=HEIGHTS, extent=(low[0], high[0], low[1], high[1]), origin="lower")
+    middle.grid(False)
     middle.set_xlabel("east, m")
     middle.set_title(f"slope over {cell * step:.3g} m", loc="left", fontsize=9)
     figure.colorbar(image, ax=middle, label="slope, °", shrink=0.8)

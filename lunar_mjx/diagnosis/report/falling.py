@@ -15,7 +15,7 @@ from lunar_mjx.diagnosis.report.read import read_result
 from lunar_mjx.diagnosis.report.steps import Step, chain, comparable, error, judged
 from lunar_mjx.diagnosis.report.words import channel_label, shown
 from lunar_mjx.errors import UserError
-from lunar_mjx.report.style import BLUE, DARK, INK, MUTED, ORANGE, PAPER, RULE, SKY
+from lunar_mjx.report.style import BLUE, DARK, INK, ORANGE, SKY, styled
 from lunar_mjx.visual.encode import writer
 
 _FPS = 12
@@ -65,7 +65,8 @@ def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark
     if path.suffix.lower() not in (".gif", ".webp", ".mp4"):
         raise UserError(f"{path}: is of no known kind; end it in .gif, .webp or .mp4.")
     course = _course(len(steps))
-    drawn = {place: _picture(steps, errors, panels, place, measure, dark) for place in sorted(set(course))}
+    with styled(dark):
+        drawn = {place: _picture(steps, errors, panels, place, measure, dark) for place in sorted(set(course))}
     with writer(path, _FPS) as put:
         for place in course:
             put(drawn[place])
@@ -113,10 +114,10 @@ def _picture(
     dark: bool,
 ) -> np.ndarray:
     """One picture, (height, width, 3) uint8."""
-    ink, muted, rule, paper = (DARK[c] if dark else c for c in (INK, MUTED, RULE, PAPER))
+    ink = DARK[INK] if dark else INK
     low = min(int(place), len(steps) - 1)
     high, share = min(low + 1, len(steps) - 1), place - low
-    figure = Figure(_SIZE, dpi=100, facecolor=paper)
+    figure = Figure(_SIZE, dpi=100)
     grid = figure.add_gridspec(
         2, len(panels), height_ratios=(3, 1), left=0.075, right=0.985, top=0.83, bottom=0.07, hspace=0.72, wspace=0.3
     )
@@ -142,29 +143,20 @@ def _picture(
             label="model",
         )
         axes.plot(x, measured, color=ink, marker="o", markersize=2 if many else 4.5, linestyle="none", label="measured")
-        axes.set_title(
-            f"{channel_label(channel)}\n{manoeuvre.replace('_', ' ')[:34]}", fontsize=9, color=ink, loc="left"
-        )
-        axes.set_xlabel("slip ratio" if traces.is_table else "time, s", fontsize=8, color=ink)
-        axes.set_facecolor(paper)
-        axes.tick_params(colors=muted, labelsize=8)
-        axes.grid(color=rule, linewidth=0.6)
-        for spine in axes.spines.values():
-            spine.set_color(rule)
+        axes.set_title(f"{channel_label(channel)}\n{manoeuvre.replace('_', ' ')[:34]}", fontsize=9)
+        axes.set_xlabel("slip ratio" if traces.is_table else "time, s", fontsize=8)
     marks, words = figure.axes[0].get_legend_handles_labels()
-    figure.legend(
-        marks, words, loc="upper right", ncols=2, fontsize=9, frameon=False, labelcolor=ink, bbox_to_anchor=(0.99, 1.01)
-    )
+    figure.legend(marks, words, loc="upper right", ncols=2, fontsize=9, bbox_to_anchor=(0.99, 1.01))
     bar = figure.add_subplot(grid[1, :])
     now = (1.0 - share) * errors[low] + share * errors[high]
     bar.barh([0], [now], color=ORANGE, height=0.6)
     bar.axvline(1.0, color=ink, linestyle="--", linewidth=1.5)
-    bar.set(xlim=(0.0, 1.25 * max(errors)), ylim=(-0.5, 0.5), yticks=[], facecolor=paper)
-    bar.text(now + 0.012 * max(errors), 0, f"{shown(now)} sigma", va="center", fontsize=12, weight="bold", color=ink)
+    bar.set(xlim=(0.0, 1.25 * max(errors)), ylim=(-0.5, 0.5), yticks=[])
+    bar.text(now + 0.012 * max(errors), 0, f"{shown(now)} sigma", va="center", fontsize=12, weight="bold")
     name = steps[low if share < 0.5 else high].label
     title = f"{name}: error on {measure} points (dashed: the noise)"
-    bar.set_title(textwrap.fill(title, _TITLE_WIDTH), fontsize=10, color=ink, loc="left")
-    bar.tick_params(colors=muted, labelsize=8)
+    bar.set_title(textwrap.fill(title, _TITLE_WIDTH))
+    bar.grid(False)
     for spine in bar.spines.values():
         spine.set_visible(False)
     canvas = FigureCanvasAgg(figure)

@@ -9,10 +9,7 @@ import plotly.graph_objects as go
 
 from lunar_mjx.diagnosis.report.steps import Error, Step
 from lunar_mjx.diagnosis.report.words import plot_text, port_label, shown
-from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, VERMILION, faded, finish
-
-SHADES = ((0.0, "#f7fbff"), (0.25, "#c6dbef"), (0.5, "#6baed6"), (0.75, "#2171b5"), (1.0, "#08306b"))
-"""One hue from light to dark: in grey it reads the same."""
+from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, SHADES, VERMILION, faded, finish
 
 
 def waterfall(
