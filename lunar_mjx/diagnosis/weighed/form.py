@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import NotTested
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Form, Refit, Term
 from lunar_mjx.inference.weighing.search import Hypothesis
+
+SettingsKind = TypeVar("SettingsKind", bound="SearchSettings")
+"""The class itself or one that adds to it: annotations are checked method by method, where `Self` has no meaning."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +48,7 @@ class SearchSettings:
     """nat; hypotheses further below the best are not refitted: 2 per cent of its probability."""
 
     @classmethod
-    def of(cls, changed: Mapping[str, Any]) -> Self:
+    def of(cls: type[SettingsKind], changed: Mapping[str, Any]) -> SettingsKind:
         """The usual settings but for some, given by name as numbers, lists or text.
 
         Raises:
