@@ -62,6 +62,8 @@ def uniform(values: Any, unit: float = 1.0) -> Any:
     return float(v[0]) if np.all(np.abs(v - v[0]) <= 4e-16 * np.abs(v[0])) else v
 
 
+# Beside `lunar_mjx.spatial.Vec3`, because a component here may be a Python 0 that takes its products with it: a rover's
+# axles and inertias are mostly zeros. The effects' vectors are all arrays, and would pay a test for each sum.
 class Vector(NamedTuple):
     """A vector in the coordinates of the chassis frame."""
 

@@ -14,9 +14,12 @@ from lunar_mjx.inference.objective import Objective
 SMALL_PROMISE = 0.1
 """Drop of chi-square promised by a Gauss-Newton step below which a descent has arrived."""
 _DAMPINGS = np.array([1e-4, 1e-2, 1e-1, 1.0, 1e2])
+"""Factors on the damping that are tried at once: a batch of rollouts costs little more than one, and a wide spread
+finds in one iteration what a single damping would have to walk to."""
 DAMPING_GROWTH = 1e2
 """Factor on the damping of Levenberg-Marquardt after a step of no damping helped."""
 _ITERATIONS = 60
+"""Most steps: a descent that still moves then creeps along a curved valley, and another start does more."""
 
 
 @dataclasses.dataclass
@@ -43,6 +46,7 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS) -
     u[goal.free] = np.clip(u[goal.free], goal.low, goal.high)
     residuals, chi2s = goal.residuals(u[None])
     if not np.isfinite(chi2s[0]):
+        # a simulation that diverged has no slope to follow: the caller's other starts go on
         return Descent(u, residuals[0], np.zeros((residuals.shape[1], len(goal.free))), float(chi2s[0]))
     here = Descent(u, residuals[0], goal.jacobian(u), float(chi2s[0]))
     damping, curved = 1e-2, False
@@ -60,11 +64,14 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS) -
         residuals, chi2s = goal.residuals(rows)
         k = int(np.argmin(chi2s))
         if chi2s[k] < here.chi2:
+            # a step that keeps less than half of its promise went round a bend: the next one is bent, too, at the
+            # price of one more batch
             curved = not here.chi2 - chi2s[k] > 0.5 * promise
             here = Descent(rows[k], residuals[k], goal.jacobian(rows[k]), float(chi2s[k]))
+            # trials, bent ones and probes lie in blocks of the same dampings
             damping = float(np.clip(dampings[k % len(dampings)], 1e-4, 1e6))
         elif damping > 1e8:
-            break
+            break  # steps this short change nothing but rounding
         else:
             damping, curved = damping * DAMPING_GROWTH, True
     return here

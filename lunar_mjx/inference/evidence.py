@@ -198,6 +198,7 @@ class Evidence:
         The same amplitudes act on both: a discrepancy that the fitted measurements show is predicted as far as its
         columns reach.
         """
+        # p(new | old) = p(new, old) / p(old): the amplitudes are integrated over what the old ones say of them
         joint = _condition(self.gram + held_out, self.amplitudes, self.tau, self.noise)[0]
         return joint - _condition(self.gram, self.amplitudes, self.tau, self.noise)[0]
 
@@ -221,6 +222,7 @@ class Evidence:
 def _log_between(low: float, high: float) -> float:
     """Log of the standard normal probability of an interval."""
     if low > 0.0:
+        # the difference of two numbers near 1 has no digits left; in the other tail it has all of them
         low, high = -high, -low
     upper, lower = special.log_ndtr(high), special.log_ndtr(low)
     return float(upper + math.log(-math.expm1(min(lower - upper, -1e-300)))) if high > low else -math.inf
@@ -244,6 +246,7 @@ def infer(
       EvidenceError: sizes did not settle in 60 Newton steps.
     """
     usual = np.array([f.usual for f in fields])
+    # sizes are positive, and their posterior is nearer to a normal one in the logarithm: Laplace's method is used there
     x = np.log(np.concatenate([usual, np.ones(len(noises))] if start is None else [*start]))
     here = _density(x, gram, amplitudes, usual, noises)
     promised = np.inf
@@ -252,6 +255,7 @@ def infer(
         promised = 0.5 * float(here.gradient @ step)
         if promised < _SETTLED:
             break
+        # in the logarithms a long step leaves the region in which the density is near its quadratic
         step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300))
         for _ in range(30):
             there = _density(x + step, gram, amplitudes, usual, noises)
@@ -311,6 +315,8 @@ def _condition(
     shift = amplitudes.mean
     square = float(whole[k, k] - 2.0 * shift @ across + shift @ inner @ shift)
     downhill = scale * (across - inner @ shift)
+    # standardised by the prior, the matrix is 1 or more in every direction: an amplitude that the data do not see, or a
+    # discrepancy of size zero, cannot make it singular
     factor = linalg.cholesky(np.eye(k) + scale[:, None] * inner * scale, lower=True, check_finite=False)
     covariance = linalg.cho_solve((factor, True), np.eye(k), check_finite=False)
     mean = covariance @ downhill

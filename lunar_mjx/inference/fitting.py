@@ -86,8 +86,10 @@ def _other_starts(
 ) -> np.ndarray:
     if number <= 0:
         return np.zeros((0, len(origin)))
+    # Sobol points are balanced in blocks of a power of two only
     size = 1 << max(0, (number - 1).bit_length())
     cube = qmc.Sobol(len(free), rng=np.random.default_rng(seed)).random(size)[:number]
+    # a box wider than the prior would begin where nobody believes the parameter to be
     width = np.array([spread * min(1.0, problem.coordinates[i].prior) for i in free])
     out = np.repeat(origin[None], number, axis=0)
     out[:, free] = np.clip(origin[free] + (2.0 * cube - 1.0) * width, goal.low, goal.high)

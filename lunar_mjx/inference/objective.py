@@ -60,6 +60,7 @@ class Objective:
         at = u[self.free]
         out = np.repeat(u[None], len(dampings), axis=0)
         for i, damping in enumerate(dampings):
+            # Marquardt's scaling: damping is a share of each coordinate's own stiffness, whatever its unit
             damped = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
             step = _within(damped, downhill, self.low - at, self.high - at)
             out[i, self.free] = np.clip(at + step, self.low, self.high)
@@ -102,12 +103,15 @@ class Objective:
 
 def _within(hessian: np.ndarray, downhill: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """(n,) step that minimises a quadratic model between bounds about zero."""
+    # least squares in place of a solve: coordinates that the data do not tell apart leave the matrix singular
     step = np.linalg.lstsq(hessian, downhill, rcond=None)[0]
     if np.all((step >= low) & (step <= high)):
         return step
+    # one unit for all coordinates, or the bounded solver's tolerance would hold for the stiffest alone
     size = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     values, axes = np.linalg.eigh(hessian * np.outer(size, size))
     root = np.sqrt(np.maximum(values, 1e-14 * max(float(values[-1]), 1e-30)))
+    # a square root of the matrix as rows: the quadratic model becomes a least-squares problem, which takes bounds
     rows = root[:, None] * axes.T
     found = lsq_linear(rows, (axes.T @ (size * downhill)) / root, (low / size - _ROOM, high / size + _ROOM), "bvls")
     return found.x * size

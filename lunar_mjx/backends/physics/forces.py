@@ -165,6 +165,7 @@ class ForceModel:
         place = c.wheel_position
         wheels = place.shape[1]
         if "chassis_contact" in self.numbers:
+            # wheels and chassis look the ground up together: a look-up costs by the call, hardly by the point
             points = np.matmul(self.numbers.chassis_points, c.rotation.swapaxes(-1, -2)) + c.position[:, None]
             place = np.concatenate([place, points], axis=1)
             c.chassis_point = points

@@ -54,6 +54,8 @@ def voltage_limit(c: Context, p: SimpleNamespace, state: Values) -> Values:
     constant = c.torque_constant * motor.gear_ratio
     voltage = c.resistance * c.current + constant * c.joint_speed
     within = voltage * (1.0 + p.limit * np.abs(voltage / 48.0) ** 8) ** -0.125
+    # limited voltage acts like a damper; where it is stiffer than the inertia takes in a step, the correction is
+    # filtered, or an explicit step would turn the joint around
     per_ampere = motor.gear_ratio * motor.gear_efficiency * motor.torque_constant
     stiffness = per_ampere * constant / c.resistance / largest_damping(c)
     wanted = (within - voltage) / c.resistance

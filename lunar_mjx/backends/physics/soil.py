@@ -51,6 +51,7 @@ def local_soil(c: Context, uniform: Values, names: tuple[str, ...]) -> Values:
         elif name == "hard_surface" and p.fraction > 0.5:
             soil["rock"] = np.ones_like(soil["rock"])
         elif name == "soil_gradient":
+            # far from the origin an exponential leaves every range that soil can have
             growth = np.exp(np.clip(p.east * place[..., 0] + p.north * place[..., 1], -5.0, 5.0))
             soil["k_c"], soil["k_phi"] = soil["k_c"] * growth, soil["k_phi"] * growth
     return soil
@@ -64,6 +65,7 @@ def below_surface(c: Context) -> np.ndarray:
 
 def entrance(sinkage: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """theta_1, at which the rim enters the soil: cos theta_1 = 1 - z/r; rad."""
+    # by the half angle: arccos(1 - z/r) loses half of the digits where z is small
     ratio = np.minimum(np.maximum(sinkage / radius, SHALLOW), DEEP)
     return 2.0 * np.arctan2(np.sqrt(ratio), np.sqrt(2.0 - ratio))
 
@@ -76,6 +78,7 @@ def peak_stress(soil: Values, width: np.ndarray, radius: np.ndarray, cos_m: np.n
 
 def arc_factors(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A = 2 cos(t)(1 - cos t)/t and B = 2 sin(t)(1 - cos t)/t of eq. 10."""
+    # 1 - cos(t) = 2 sin^2(t/2), which keeps its digits for shallow wheels
     half = np.sin(0.5 * theta)
     common = 4.0 * half * half / theta
     return np.cos(theta) * common, np.sin(theta) * common
@@ -99,6 +102,7 @@ def shear_stress(c: Context, strength: np.ndarray, q_x: np.ndarray, q_y: np.ndar
 
 def area_damping(c: Context, coefficient: float, theta_1: np.ndarray, load: np.ndarray) -> np.ndarray:
     """c' b r sin(theta_1) zdot, never pulling below zero the sum with the load; N."""
+    # beyond a quarter turn the sine would fall again, and the area in the soil does not
     area = c.geometry["width"] * c.geometry["radius"] * np.sin(np.minimum(theta_1, 0.5 * np.pi))
     return np.maximum(coefficient * area * c.contact["sinkage_rate"], -load)
 
@@ -132,11 +136,13 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     contact, r = c.contact, c.geometry["radius"]
     theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
     length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), SHORTEST * r)
+    # rock has no arc in the ground over which shear could build up: bristles take the place of soil
     length = np.where(c.soil["rock"] > 0.5, p.rock_length, length)
     roll = faster(contact["rim_speed"], contact["v_x"])
     speed = np.abs(roll)
     share = speed / length
     touching = contact["sinkage"] > 0.0
+    # the equation is linear while slip is held, so that its solution over a step holds at any ratio of speed and length
     turned = np.maximum(share * c.dt, 1e-200)
     gain = -np.expm1(-turned) / turned / length
     damped = p.damping_time * np.exp(-share * p.damping_time)

@@ -45,6 +45,7 @@ def compare(run: Run, problem: Problem, progress: Progress) -> Refit:
     progress("refitting the model", 0.0)
     with threadpool_limits(1, "blas"):
         refit = own.refit(frozenset(), None, None)
+    # the model as given, by its own numbers: what a refit gains is told beside it
     start = own.residual(own.origin())
     run.save(COMPARISON_FILE, comparison(problem, start, refit))
     run.save(HYPOTHESES_FILE, {own.name: {"u": _by_key(own, refit.u)}})
@@ -74,6 +75,7 @@ def diagnose(
     settings, begin = problem.settings, time.monotonic()
 
     def provisional(found: ModelSearch) -> None:
+        # with a limit the next refit may never come, and what is known by then is the answer
         if math.isfinite(seconds):
             best = next(h for h in found.hypotheses if h.refitted)
             run.save(VERDICT_FILE, {**_diagnosis(problem, found, best).to_dict(), "provisional": True})
@@ -186,7 +188,7 @@ def _discrepancy(
     found = {}
     for (field, said), size, spread in zip(form.words.items(), tau, log_std, strict=True):
         if felt[field] < LEAST_SIGNAL:
-            continue
+            continue  # its size would be the prior's, told as if it had been measured
         size = size * form.shares.get(field, 1.0)
         low, high = size * math.exp(-spread), size * math.exp(spread)
         found[field] = {
@@ -300,6 +302,7 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
 
 def _averaged(form: MeasuredForm, found: ModelSearch) -> dict[str, dict[str, Any]]:
     """Size of each field, averaged over hypotheses by their probability."""
+    # squares, for sizes are standard deviations
     tau = np.sqrt(sum(p * h.evidence.tau**2 for h, p in zip(found.hypotheses, found.probability, strict=True)))
     spread = sum(p * h.evidence.tau_log_std for h, p in zip(found.hypotheses, found.probability, strict=True))
     return _discrepancy(form, np.asarray(tau), np.asarray(spread), found.best.refit.linear.felt())

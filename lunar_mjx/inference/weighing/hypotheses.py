@@ -100,6 +100,7 @@ class Linear:
         for t in terms:
             if t.kind == CALIBRATION:
                 std[self.calibration[t.name]] *= self.far
+        # an instrument that errs more than usual has the columns of every hypothesis, with a wider prior
         prior = Amplitudes(std, self.amplitudes.field, self.amplitudes.mean).select(places)
         fields = tuple(Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields)
         found = infer(gram.select(places), prior, fields, self.noises, start)

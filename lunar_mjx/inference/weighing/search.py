@@ -157,6 +157,7 @@ def search(
         # A set whose refit failed is no hypothesis.
         alive = [h for h in known.values() if done.get((h.form, h.effects), h.refit) is not None]
         order = sorted(alive, key=lambda h: -h.log_posterior)
+        # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
         return ModelSearch(tuple(order), weight / weight.sum(), len(done), tuple(reasons), complete)
 
