@@ -181,16 +181,17 @@ VECTORS = (
 
 def telemetry(rows: list[Observation]) -> Telemetry:
     """Observations of several times as `Telemetry` with leading axes (rover, time)."""
-    names = [f.name for f in dataclasses.fields(Telemetry)]
+    names = [f.name for f in dataclasses.fields(Telemetry) if f.name in rows[0]]
     stacked = {name: np.stack([row[name] for row in rows], axis=1) for name in names}
     fields: dict[str, Any] = {k: Vec3(*np.moveaxis(v, -1, 0)) if k in VECTORS else v for k, v in stacked.items()}
     return Telemetry(**fields)
 
 
 def observation(seen: Telemetry) -> Observation:
-    """A batch of telemetry as plain arrays."""
+    """A batch of telemetry as plain arrays; without `supply`, of which reference backends know nothing."""
     return {
         f.name: np.stack([np.asarray(a) for a in value], -1) if isinstance(value, Vec3) else np.asarray(value)
         for f in dataclasses.fields(seen)
         for value in (getattr(seen, f.name),)
+        if f.name != "supply"
     }

@@ -133,5 +133,5 @@ def observe(c: Context) -> Observation:
         "wheel_moment": c.wheel["moment"],
         "on_terrain": c.contact["inside"],
     }
-    names = (name for name in Telemetry.__dataclass_fields__ if name not in seen)
+    names = (name for name in Telemetry.__dataclass_fields__ if name not in seen and name != "supply")
     return {k: np.array(v) for k, v in ({name: getattr(c, name) for name in names} | seen).items()}

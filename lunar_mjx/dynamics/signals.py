@@ -123,6 +123,16 @@ def observe(
         **{f"wheel_{{}}_moment_{a}_Nm": getattr(seen.wheel_moment, a) for a in "xyz"},
     }
     _entries(out, per_wheel, corners)
+    if seen.supply is not None:
+        supply = seen.supply
+        kelvin = supply.chassis_temperature
+        rest = {
+            "bus_load_W": supply.load,
+            "bus_solar_W": supply.solar,
+            "battery_charge_ratio": supply.charge,
+            "chassis_temperature_degC": None if kelvin is None else kelvin - _ZERO_CELSIUS,
+        }
+        out |= {name: value for name, value in rest.items() if value is not None}
     return Signals(jnp.asarray(seen.time), {k: jnp.asarray(v) for k, v in out.items()})
 
 

@@ -87,6 +87,21 @@ class Params:
 
 
 @pytree
+class Supply:
+    """Electric power and the chassis' temperature; None where no effect of the model tells.
+
+    Attributes:
+      load: drawn from the bus, W. solar: from the panels, W. charge: of the battery, 0 to 1.
+      chassis_temperature: K.
+    """
+
+    load: Float[AnyArray, "*batch"] | None = None
+    solar: Float[AnyArray, "*batch"] | None = None
+    charge: Float[AnyArray, "*batch"] | None = None
+    chassis_temperature: Float[AnyArray, "*batch"] | None = None
+
+
+@pytree
 class Telemetry:
     """What a step reports, at the beginning of that step (the seed paper's III-E, with temperatures, slip, sinkage).
 
@@ -100,6 +115,7 @@ class Telemetry:
       wheel_position, wheel_velocity: world, m, m/s. sinkage: m. slip: eq. 8. slip_angle: rad.
       wheel_force, wheel_moment: of the ground on the wheel, wheel frame (forward, left, normal), N, N m.
       on_terrain: whether each wheel is over the terrain's grid.
+      supply: electric power, of JAX engines with effects at the port `power` or a chassis node; else None.
     """
 
     time: Any
@@ -126,3 +142,4 @@ class Telemetry:
     wheel_force: Vec3
     wheel_moment: Vec3
     on_terrain: AnyArray
+    supply: Supply | None = None

@@ -15,10 +15,12 @@ from lunar_mjx.dynamics.engines import make_engine
 from lunar_mjx.dynamics.heat import step_heat
 from lunar_mjx.dynamics.indexing import select
 from lunar_mjx.dynamics.kinematics import Kinematics, chassis_boxes
-from lunar_mjx.dynamics.state import Ambient, Params, State, Telemetry, Temperature
+from lunar_mjx.dynamics.state import Ambient, Params, State, Supply, Telemetry, Temperature
 from lunar_mjx.effects.context import Context, Heat, RoverInfo
 from lunar_mjx.effects.joint.motor import MODES, REFERENCE_TEMPERATURE, constant_at, winding_resistance
-from lunar_mjx.effects.ports import Pipeline, apply_effects
+from lunar_mjx.effects.ports import EffectState, Pipeline, apply_effects
+from lunar_mjx.effects.power.chassis import chassis_temperature
+from lunar_mjx.effects.power.supply import charge_of
 from lunar_mjx.model.sun import make_sun
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Vec3
@@ -135,7 +137,7 @@ class System:
             self.pipeline, self.model.thermal_integrator, ctx, state.temperature, effects
         )
         qpos, qvel = finish(forces)
-        telemetry = _telemetry(ctx, kinematics, heat)
+        telemetry = _telemetry(ctx, kinematics, heat, state.effects)
         return State(state.step + 1, qpos, qvel, temperature, effects), telemetry
 
     def rollout(self, params: Params, state: State, controls: Any, every: int = 1) -> tuple[State, Telemetry]:
@@ -288,7 +290,7 @@ def default_params(model: Model) -> Params:
     return Params(jnp.asarray(model.gravity, dtype), ambient, effects, terrain, sun)
 
 
-def _telemetry(ctx: Context, k: Kinematics, heat: Heat) -> Telemetry:
+def _telemetry(ctx: Context, k: Kinematics, heat: Heat, effects: EffectState) -> Telemetry:
     contact, wheel = ctx.contact, ctx.wheel
     assert contact is not None and wheel is not None and ctx.command is not None
     motor = ctx.parameters.get("motor")
@@ -324,7 +326,20 @@ def _telemetry(ctx: Context, k: Kinematics, heat: Heat) -> Telemetry:
         wheel_force=wheel.force,
         wheel_moment=wheel.moment,
         on_terrain=contact.inside,
+        supply=_supply(ctx, effects),
     )
+
+
+def _supply(ctx: Context, effects: EffectState) -> Supply | None:
+    """Power of the step, and charge and temperature at its beginning; None for a model that has none of them."""
+    power, parameters = ctx.power, ctx.parameters
+    told: dict[str, Any] = {} if power is None else {"load": power.load, "solar": power.solar}
+    if "battery" in effects:
+        told["charge"] = charge_of(parameters["battery"], effects["battery"]["used"])
+    if "chassis_node" in effects:
+        node = SimpleNamespace(**effects["chassis_node"])
+        told["chassis_temperature"] = chassis_temperature(parameters["chassis_node"], node)
+    return Supply(**told) if told else None
 
 
 def _quaternion(roll: Any, pitch: Any, yaw: Any) -> Any:

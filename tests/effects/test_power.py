@@ -16,6 +16,7 @@ from scipy import integrate
 from lunar_mjx.backends.physics import read_numbers
 from lunar_mjx.dynamics import build
 from lunar_mjx.dynamics.heat import step_heat
+from lunar_mjx.dynamics.signals import observe
 from lunar_mjx.dynamics.state import Temperature
 from lunar_mjx.dynamics.system import default_params
 from lunar_mjx.effects.context import Command, Heat, Power
@@ -23,6 +24,7 @@ from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
 from lunar_mjx.effects.ports import Pipeline
 from lunar_mjx.effects.power.supply import charge_of, open_voltage
 from lunar_mjx.errors import UserError
+from lunar_mjx.logs.schema import find_channel
 from lunar_mjx.model import make_model
 from lunar_mjx.model.file import load_model, save_model
 from lunar_mjx.model.sun import SunSettings
@@ -195,5 +197,13 @@ def test_a_rover_steps_with_all_of_it():
     system = build(model.replace(sun=SunSettings(horizon=False)))
     state = system.reset(system.params)
     assert float(state.temperature.winding_kelvin[0]) == pytest.approx(230.0)
-    after, _ = jax.eval_shape(system.step, system.params, state, jnp.zeros(len(system.joint_names)))
+    after, seen = jax.eval_shape(system.step, system.params, state, jnp.zeros(len(system.joint_names)))
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
+    drive = jax.tree.map(lambda a: jnp.ones((3, *a.shape)), seen)
+    channels = observe(system, dataclasses.replace(drive, time=jnp.arange(3.0))).channels
+    wanted = {"bus_load_W", "bus_solar_W", "battery_charge_ratio", "chassis_temperature_degC"}
+    assert wanted <= set(channels) and all(find_channel(name) for name in wanted)
+    assert float(channels["chassis_temperature_degC"][0]) == pytest.approx(1.0 - 273.15)
+    bare = build(make_model("luvmi_x", "flat", "field"))
+    state = bare.reset(bare.params)
+    assert jax.eval_shape(bare.step, bare.params, state, jnp.zeros(len(bare.joint_names)))[1].supply is None

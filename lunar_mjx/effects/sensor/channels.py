@@ -31,8 +31,10 @@ _FAMILY_OF = {
     "joint": "joint",
     "motor": "electrical",
     "bus": "electrical",
+    "battery": "electrical",
     "winding": "temperature",
     "housing": "temperature",
+    "chassis": "temperature",
     "wheel": "wheel",
     "drawbar": "wheel",
 }
