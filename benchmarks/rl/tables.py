@@ -10,7 +10,7 @@ import numpy as np
 from harness import percent
 
 from lunar_mjx.agents.curves import mean_interval, moving_mean, new_figure
-from lunar_mjx.report.style import LINES, MUTED
+from lunar_mjx.report.style import LINES, MUTED, styled
 
 LAST = 50
 """Episodes that a training is judged by at its end."""
@@ -41,7 +41,8 @@ def plot_paper(record: dict[str, Any], path: Path) -> None:
     figure, above = new_figure(len(groups), 2.7, 5.0)
     for axes in above:
         axes.remove()
-    rows = figure.subplots(2, len(groups), sharex="col", squeeze=False)
+    with styled():
+        rows = figure.subplots(2, len(groups), sharex="col", squeeze=False)
     for column, (variant, algorithms) in enumerate(groups.items()):
         for name, runs in algorithms.items():
             i = int(name == "DDPG")
