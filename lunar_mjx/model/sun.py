@@ -94,7 +94,7 @@ def read_sun(path: Path, table: Mapping[str, Any]) -> SunSettings:
 
 
 def make_sun(settings: SunSettings | None, terrain: Terrain) -> Sun | None:
-    """The Sun over a terrain in float64; None without settings.
+    """The Sun over a terrain, in the default float type; None without settings.
 
     Raises:
       UserError: astropy is missing for a Sun with a date, or a file cannot be read.
@@ -103,9 +103,13 @@ def make_sun(settings: SunSettings | None, terrain: Terrain) -> Sun | None:
         return None
     horizon = _horizon(terrain, settings.horizon_dem) if settings.horizon else None
     if settings.date is None:
-        return fixed_sun(settings.azimuth_deg, settings.elevation_deg, settings.irradiance_W_m2, horizon, np.float64)
+        return fixed_sun(settings.azimuth_deg, settings.elevation_deg, settings.irradiance_W_m2, horizon, _float())
     towards, irradiance, highest = _track(settings)
     return Sun(jnp.asarray(towards), jnp.asarray(irradiance), jnp.asarray(INTERVAL), jnp.asarray(highest), horizon)
+
+
+def _float() -> np.dtype:
+    return jnp.result_type(float)
 
 
 @functools.cache
@@ -138,7 +142,7 @@ def _horizon(terrain: Terrain, around: str | None) -> Horizon:
                 dataclasses.replace(dem, heights=dem.heights - origin[2], x0=dem.x0 - origin[0], y0=dem.y0 - origin[1])
             ]
         _known.clear()
-        _known[key] = (terrain, compute_horizon(own, outer, dtype=np.float64))
+        _known[key] = (terrain, compute_horizon(own, outer, dtype=_float()))
     return _known[key][1]
 
 

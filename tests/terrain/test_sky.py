@@ -89,6 +89,13 @@ def test_the_sun_of_a_model_is_that_of_cameras_and_ambient():
     assert float(ambient.under(-0.1)) == 90.0
 
 
+def test_a_sun_in_single_precision_warns_of_nothing():
+    with jax.enable_x64(False):
+        sun = make_sun(SunSettings(), flat(20.0))
+        assert sun is not None and sun.horizon is not None and sun.direction.dtype == np.float32
+        assert float(sun.light(0.0, 1.0, 1.0).irradiance) == pytest.approx(1361.0, rel=1e-6)
+
+
 def test_the_sun_at_a_date():
     """Meeus, Astronomical Algorithms, example 53.a: at 1992 April 12.0 it is overhead at 67.90 E, 1.46 N."""
     pytest.importorskip("astropy")
