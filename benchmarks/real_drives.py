@@ -51,7 +51,7 @@ GROUND = frozenset({"soft_ground", "rolling_resistance"})
 """The family of soft ground."""
 TRUE_OF = {"ice": {"hard_ground.mu"}}
 """What beside soft ground may be named of a ground."""
-LOOKED_AT = ("ICE-02", "SANDY_LOAM-05", "FLOORING-05", "ASPHALT-05", "FLOORING-02")
+LOOKED_AT = ("ICE-02", "SANDY_LOAM-05", "SNOW-14", "FLOORING-05", "ASPHALT-05", "FLOORING-02")
 """Sequences to report that had been looked at while the method was made."""
 LONG_ENOUGH_S = 30.0
 """Driving of a soft ground's sequence that is asked about; hard floors have few sequences, so that all are."""
@@ -489,8 +489,11 @@ BEGIN, END = "<!-- real drives: benchmarks/real_drives.py -->", "<!-- end real d
 def page_table(result: Mapping[str, Any]) -> str:
     """The measured figures as Markdown."""
     found = result["summary"]
+    kinds = {"ask": "names and faults", "loop": "errors", "hour": "the hour"}
+    of = {k: sorted({r.get("commit", result["commit"]) for r in result["jobs"] if r.get("kind") == k}) for k in kinds}
+    measured = "; ".join(f"{kinds[k]} at {', '.join(commits)}" for k, commits in of.items() if commits)
     lines = [
-        f"Commit {result['commit']}; sequences that were not fitted; 95 % intervals.",
+        f"Commits: {measured}. Sequences that were not fitted; 95 % intervals.",
         "",
         "| what | measured | interval | of |",
         "|---|---|---|---|",
@@ -505,8 +508,14 @@ def page_table(result: Mapping[str, Any]) -> str:
             )
 
     share("soft ground named, SNOW and SANDY_LOAM", "ground named, soft")
-    share("soft ground named, hard floors", "ground named, hard")
+    share("... hard floors", "ground named, hard")
+    share("names other than soft ground, SNOW and SANDY_LOAM", "something else named, soft")
+    share("... hard floors", "something else named, hard")
     share("soft ground named, ICE", "ground named, ice")
+    for label, where in (("soft", "SNOW and SANDY_LOAM"), ("hard", "hard floors"), ("ice", "ICE")):
+        verdicts = ", ".join(f"{k} {n}" for k, n in found[f"verdicts, {label}"].items())
+        if verdicts:
+            lines.append(f"| verdicts, {where} | {verdicts} | | {found[f'ground named, {label}']['of']} |")
     share("planted faults among at most three names", "faults found")
     for fault, name in FAULTS.items():
         share(f"... {fault} (`{name}`)", f"fault {fault}")

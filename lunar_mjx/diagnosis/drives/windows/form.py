@@ -323,10 +323,11 @@ class WindowForm(MeasuredForm):
                 field.append(number)
                 std.append(1.0)
         clock, late = by(f"{CALIBRATION}.imu_clock"), by(f"{CALIBRATION}.current_clock")
-        for n in () if self.single or late is None else np.unique(recording):
-            columns.append(np.where(recording == n, late, 0.0))
-            field.append(-1)
-            std.append(LATE_S)
+        if late is not None and not self.single:
+            for n in np.unique(recording):
+                columns.append(np.where(recording == n, late, 0.0))
+                field.append(-1)
+                std.append(LATE_S)
         for n in () if self.single else np.unique(recording):
             flat = cut.unlevelled & set(cut.log[cut.recordings == n].tolist())
             columns.append(np.where(recording == n, tilt, 0.0))

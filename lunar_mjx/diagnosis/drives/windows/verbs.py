@@ -18,7 +18,6 @@ from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, DRIFT, U
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS
 from lunar_mjx.diagnosis.drives.windows.form import DRIVE, INSTEAD, WindowForm, between
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, corners
-from lunar_mjx.diagnosis.drives.windows.settings import DIFFERENCES
 from lunar_mjx.diagnosis.folder.refits import write_refits
 from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE, Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
@@ -254,7 +253,7 @@ def why(run: Run, logs: Sequence[Log], only: Sequence[str] | None, seconds: floa
         tried = {tuple(sorted(h.effects)): h.refit.u for h in found.hypotheses if h.refitted and h.effects}
         write_refits(run.folder, {e: (form.residual(u), form.predicted(u)) for e, u in tried.items()})
         untold = not_told(form, base)
-        diagnosis = _held_to_account(diagnosis, found)
+        diagnosis = _held_to_account(diagnosis, found, {s.name: s.family for s in bench.suspects})
         sentence = diagnosis.sentence
         if diagnosis.verdict in (Verdict.UNKNOWN, Verdict.UNDECIDABLE, Verdict.KNOWN_CLASS):
             sentence += _what_next(bench)
@@ -275,10 +274,18 @@ def why(run: Run, logs: Sequence[Log], only: Sequence[str] | None, seconds: floa
     return diagnosis
 
 
+PORTS = {
+    "ground": "wheel_normal",
+    "friction": "wheel_shear",
+    "drive": "motor_torque",
+    "rover": "geometry",
+    "sensor": "sensor",
+}
+"""The port at which a family of suspects acts."""
 NAMING = (Verdict.KNOWN, Verdict.KNOWN_CLASS, Verdict.MULTIPLE)
 
 
-def _held_to_account(diagnosis: Diagnosis, found: ModelSearch) -> Diagnosis:
+def _held_to_account(diagnosis: Diagnosis, found: ModelSearch, families: Mapping[str, str]) -> Diagnosis:
     """The diagnosis, or UNKNOWN where what it names does not help held-out windows with 95 % (Student's t).
 
     Windows of one drive share what no law here has, such as the shape of friction's rise with slip; what fits some of
@@ -298,11 +305,11 @@ def _held_to_account(diagnosis: Diagnosis, found: ModelSearch) -> Diagnosis:
         f"Something acts that is not explained: {names} would explain the fitted windows, and does not help those that "
         f"were held out (gain of log density {gain:.1f} +- {se:.1f} over {count:.0f} windows)."
     )
-    remains = {k: d["size"] / DIFFERENCES[k].size for k, d in diagnosis.discrepancy.items()}
-    if diagnosis.port is None and remains:
-        worst = max(remains, key=lambda k: remains[k])
-        sentence += f" It is largest at {worst}: {diagnosis.discrepancy[worst]['text']}."
-        diagnosis = dataclasses.replace(diagnosis, port=worst.partition(":")[0])
+    acts = [PORTS[families[n]] for n in diagnosis.effects if n in families]
+    if acts:
+        fields = {k: d for k, d in diagnosis.discrepancy.items() if k.startswith(acts[0])}
+        sentence += f" It acts at {acts[0]}" + "".join(f"; {d['text']} beside it" for d in fields.values()) + "."
+        diagnosis = dataclasses.replace(diagnosis, port=acts[0])
     return dataclasses.replace(diagnosis, verdict=Verdict.UNKNOWN, effects=(), further=(), sentence=sentence)
 
 
