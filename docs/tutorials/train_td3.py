@@ -2,7 +2,7 @@
 # # Train TD3 on a GPU
 #
 # Training is one command. On a GPU it drives thousands of rovers at once; here the same code learns a task so small
-# that two CPU cores need seconds, so that every step can be seen before the large one is started.
+# that two CPU cores need seconds, so that every step can be seen; then a rover, and on a GPU the large task.
 #
 # The small task is a point without physics that has to reach a goal in the plane. It has the interface of the rovers:
 # pure functions `reset` and `step` on a whole batch.
@@ -87,12 +87,30 @@ print("points 0, 1 and 2 reached their goals after", [reached[i] for i in range(
 # %% [markdown]
 # ## The same with rovers
 #
-# Nothing changes but the name of the training:
-#
-#     lunar-mjx train short -o runs/short             # a rover on flat ground: minutes on two CPU cores
-#     lunar-mjx train large-td3 -o runs/large         # rough ground, goals 10 to 40 m away: a GPU
-#
-# For the second, install the extra `gpu` (`pip install "lunar-mjx[gpu]"`) on a machine with an NVIDIA GPU, and check
+# Nothing changes but the name of the training. `short` drives LUVMI-X on flat ground to goals 3 to 5 m away; whole, it
+# takes minutes on two CPU cores. Here are the first 125 steps of 16 rovers, which learn next to nothing:
+
+# %%
+shell(
+    "lunar-mjx train short -o rover --steps 2000 --set envs=16 --eval-episodes 4 --env episode_time=20 --quiet "
+    "--device cpu"
+)
+rover = pd.read_csv("rover/progress.csv")
+assert rover.steps.iloc[-1] >= 2000 and load_policy("rover/policy.npz").network["actions"] > 0
+
+# %% [markdown]
+# `large-td3` is the real one: rough ground with rocks, goals 10 to 40 m away. It wants a GPU, so this cell trains it
+# where there is one (for two minutes; leave `--time-limit` out for the whole):
+
+# %%
+if jax.default_backend() == "gpu":
+    shell("lunar-mjx train large-td3 -o large --time-limit 120 --quiet --device cuda")
+    shell("lunar-mjx evaluate large/policy.npz --device cuda")
+else:
+    print("no GPU here: lunar-mjx train large-td3 -o large --time-limit 120 --device cuda")
+
+# %% [markdown]
+# Install the extra `gpu` (`pip install "lunar-mjx[gpu]"`) on a machine with an NVIDIA GPU, and check
 # that `python -c "import jax; print(jax.devices())"` names it; `--device cuda` refuses to run without one. It drives
 # thousands of rovers with all the physics of the model: it compiles first, then prints a line every few seconds.
 # Meanwhile:
@@ -104,6 +122,6 @@ print("points 0, 1 and 2 reached their goals after", [reached[i] for i in range(
 # - `--time-limit 600` stops after ten minutes, `--target 0.95` as soon as that share of unseen episodes succeeds.
 # - Environments and batches are shared among all the GPUs that JAX sees.
 #
-# Afterwards `lunar-mjx evaluate runs/large/policy.npz` scores it on ground and soil that it has not met, and
-# `lunar-mjx play runs/large/policy.npz` makes a video of an episode. What has been reached so far, and what not yet,
+# Afterwards `lunar-mjx evaluate large/policy.npz` scores it on ground and soil that it has not met, and
+# `lunar-mjx play large/policy.npz` makes a video of an episode. What has been reached so far, and what not yet,
 # with its numbers, is on the page on [reinforcement learning](../reinforcement_learning.md).

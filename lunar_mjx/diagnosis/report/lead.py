@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.words import and_list
+from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.report.page import Lead
 
 _TONES = {
@@ -66,8 +67,8 @@ def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
             f"Use the fitted model: lunar-mjx simulate --model {run}/model.toml",
             "Test it on a manoeuvre that no fit has seen; that is where the next missing effect shows.",
         ],
-        "KNOWN": [f"lunar-mjx add {run} {' '.join(named)} -o NEXT_RUN", "lunar-mjx why NEXT_RUN"],
-        "MULTIPLE": [f"lunar-mjx add {run} {' '.join(named)} -o NEXT_RUN", "lunar-mjx why NEXT_RUN"],
+        "KNOWN": _adding(run, [*_law(judge), *named]),
+        "MULTIPLE": _adding(run, [*_law(judge), *named]),
         "KNOWN_CLASS": [
             f"lunar-mjx next {run}  (names the manoeuvre that tells them apart)",
             "Drive that manoeuvre, and compare with its log too.",
@@ -77,6 +78,28 @@ def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
         "BAD_FIT": ["The sentence above says what failed: look at the log and the model there, and compare again."],
         "BAD_DATA": ["Mend what the findings below name.", f"lunar-mjx log check {log}"],
     }.get(name, [])
+
+
+_SURE = 0.95
+"""Probability from which a rival contact law is to be added: what `why` calls sure, too."""
+
+
+def _law(judge: Result) -> list[str]:
+    """The contact law that explains the measurements better than the model's own, if one surely does."""
+    forms = (judge.verdict or {}).get("forms") or {}
+    best = max(forms, key=lambda n: float(forms[n]), default="")
+    model = judge.model
+    present = {*(judge.run.get("added") or []), *((e.name for e in model.effects) if model is not None else ())}
+    return [best] if best in CATALOGUE and best not in present and float(forms[best]) >= _SURE else []
+
+
+def _adding(run: str, names: Sequence[str]) -> list[str]:
+    """Commands that add effects one after the other, as `add` takes one, and ask again."""
+    steps, last = [], run
+    for name in names:
+        steps.append(f"lunar-mjx add {last} {name} -o with_{name}")
+        last = f"with_{name}"
+    return [*steps, f"lunar-mjx why {last}"]
 
 
 def _and(names: Sequence[str]) -> str:

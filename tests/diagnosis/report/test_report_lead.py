@@ -28,7 +28,21 @@ def test_what_was_named_is_added_by_the_command_that_follows():
     judge = result("run1", {"verdict": "KNOWN", "effects": ["slip_sinkage"]})
     found = lead([judge], judge)
     assert "slip sinkage" in found.sentence
-    assert found.next[0] == "lunar-mjx add run1 slip_sinkage -o NEXT_RUN"
+    assert found.next == ["lunar-mjx add run1 slip_sinkage -o with_slip_sinkage", "lunar-mjx why with_slip_sinkage"]
+
+
+def test_several_are_added_one_by_one_and_a_better_contact_law_first(run):
+    forms = {"closed form": 1e-9, "stress_integral": 1.0}
+    judge = result("run1", {"verdict": "MULTIPLE", "effects": ["side_wall", "bulldozing"], "forms": forms})
+    steps = lead([judge], judge).next
+    added = [s.split()[3] for s in steps[:-1]]
+    assert added == ["stress_integral", "side_wall", "bulldozing"]
+    assert steps[-1] == "lunar-mjx why with_bulldozing"
+    for step in steps:  # each is a command that exists and takes these arguments
+        answer = run(*step.split()[1:])
+        assert "unexpected extra argument" not in answer.out + answer.err
+    judge = result("run1", {"verdict": "KNOWN", "effects": ["side_wall"], "forms": {"stress_integral": 0.6}})
+    assert lead([judge], judge).next[0].split()[3] == "side_wall"
 
 
 def test_a_run_that_was_not_diagnosed_asks_for_it():
