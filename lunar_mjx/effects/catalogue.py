@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
 import sys
 from collections.abc import Iterable, Mapping
@@ -138,7 +139,7 @@ def get(name: str) -> Effect:
     """The effect called `name` in the catalogue, or `file.py:name` in a user's own file.
 
     Raises:
-      UserError: no such effect; the sentence lists the known ones.
+      UserError: no such effect; the sentence names those that are spelt alike.
     """
     if ".py" in name:
         vouch(name)
@@ -154,9 +155,12 @@ def get(name: str) -> Effect:
             raise UserError(f"{file}: no effect is called {member!r} there; it holds {', '.join(found)}.")
         return found[member]
     if name not in CATALOGUE:
+        # The whole catalogue would fill half a screen.
+        alike = difflib.get_close_matches(name, CATALOGUE, n=3, cutoff=0.5)
+        meant = f"; did you mean {' or '.join(alike)}" if alike else ""
         raise UserError(
-            f"effect {name!r} is not in the catalogue; use a file (my_effects.py:{name}) or one of "
-            f"{', '.join(CATALOGUE)}."
+            f"effect {name!r} is not in the catalogue{meant}; use a name of `lunar-mjx effect list` or a file "
+            f"(my_effects.py:{name})."
         )
     return CATALOGUE[name]
 

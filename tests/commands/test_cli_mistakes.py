@@ -184,7 +184,7 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
     "preset of an unknown rover": (["preset", "paper", "--rover", "moonbuggy"], {}, ["moonbuggy", "viper"]),
     "preset saved nowhere": (["preset", "paper", "--save", "FILES/no/m.toml"], {}, ["m.toml", "cannot be written"]),
     "preset saved on a folder": (["preset", "paper", "--save", "OUT"], {}, ["out", "cannot be written"]),
-    "effect unknown": (["effect", "show", "warp"], {}, ["'warp'", "soil"]),
+    "effect unknown": (["effect", "show", "warp"], {}, ["'warp'", "lunar-mjx effect list"]),
     "effect file missing": (SHOW, {}, ["mine.py", "not there"]),
     "effect file fails": (
         SHOW,
