@@ -20,7 +20,15 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-NAMES = ("drive_a_rover", "own_terrain", "own_rover", "find_missing_effect", "your_rovers_log", "train_td3")
+NAMES = (
+    "drive_a_rover",
+    "own_terrain",
+    "own_rover",
+    "find_missing_effect",
+    "your_rovers_log",
+    "train_td3",
+    "see_and_drive",
+)
 
 
 def cells(name: str) -> list[tuple[str, str]]:
