@@ -51,7 +51,10 @@ GROUND = frozenset({"soft_ground", "rolling_resistance"})
 """The family of soft ground."""
 TRUE_OF = {"ice": {"hard_ground.mu"}}
 """What beside soft ground may be named of a ground."""
-LOOKED_AT = ("ICE-02", "SANDY_LOAM-05", "SNOW-14", "FLOORING-05", "ASPHALT-05", "FLOORING-02")
+LOOKED_AT = (
+    *("ICE-02", "SANDY_LOAM-05", "SANDY_LOAM-08", "SNOW-14"),
+    *("FLOORING-02", "FLOORING-05", "FLOORING-08", "ASPHALT-05"),
+)
 """Sequences to report that had been looked at while the method was made."""
 LONG_ENOUGH_S = 30.0
 """Driving of a soft ground's sequence that is asked about; hard floors have few sequences, so that all are."""
