@@ -11,6 +11,7 @@ import numpy as np
 from scipy import linalg
 
 from lunar_mjx.diagnosis.drives.channel_errors import chosen_errors
+from lunar_mjx.diagnosis.drives.instruments import usual_errors
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
@@ -71,6 +72,8 @@ class DriveForm(MeasuredForm):
         self._fit = self.observations.in_split("fit")
         self._seen: np.ndarray | None = None  # (n, coordinates + inputs) derivatives at the base, SI
         self._fields: tuple[np.ndarray, np.ndarray] | None = None
+        self._errors = np.zeros((len(self.observations), 0))  # (n, instruments) whitened, of usual size
+        self._instruments: Mapping[str, np.ndarray] = {}
         self._slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}
         self._sizes: tuple[np.ndarray, np.ndarray] | None = None
         self.channel_errors: Mapping[str, float] = {}
@@ -151,9 +154,10 @@ class DriveForm(MeasuredForm):
         columns = whiten(self._seen[:, :count])
         columns[:, free] = whiten(slopes)
         fields, field_of = self._fields
-        columns = np.column_stack([columns, fields])
+        errors = self._errors.shape[1]
+        columns = np.column_stack([columns, self._errors, fields])
         residual = whiten(self.observations.value - value)
-        std = np.concatenate([self._std, np.ones(len(field_of))])
+        std = np.concatenate([self._std, np.ones(errors + len(field_of))])
         low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
         at, mean = np.zeros(len(std)), np.zeros(len(std))
         mean[:count] = [c.centre for c in self.coordinates]
@@ -172,13 +176,13 @@ class DriveForm(MeasuredForm):
         return Linear(
             gram=Gram.of(columns[fit], residual[fit], self._group[fit], kinds),
             held_out=held,
-            amplitudes=Amplitudes(std, np.concatenate([np.full(count, -1), field_of]), mean),
+            amplitudes=Amplitudes(std, np.concatenate([np.full(count + errors, -1), field_of]), mean),
             low=low,
             high=high,
-            always=np.concatenate([self.baseline, count + np.arange(len(field_of))]).astype(int),
+            always=np.concatenate([self.baseline, np.arange(count, len(std))]).astype(int),
             effects=self.candidates,
             at=at,
-            calibration={},
+            calibration={name: count + places for name, places in self._instruments.items()},
             following={},
             fields=tuple(Field(label, settings.usual_discrepancy) for label in self.words),
             noises=tuple(NoiseSize(name, settings.stated_spread) for name in self.noise_names),
@@ -257,16 +261,17 @@ class DriveForm(MeasuredForm):
         columns = self._seen.copy()
         columns[:, free] = slopes
         held = self.drives.observations
+        errors, self._instruments = usual_errors(held, value)
         unlisted = np.full(len(self._inputs), self.settings.unlisted_discrepancy)
         self.observations, self.channel_errors = chosen_errors(
             held,
-            np.column_stack([columns, held.value - value]),
-            np.concatenate([self._std, unlisted]),
+            np.column_stack([columns, errors, held.value - value]),
+            np.concatenate([self._std, unlisted, np.ones(errors.shape[1])]),
             self._group,
             len(self.noise_names),
             self.settings,
         )
-        self._fields = self._field_columns()
+        self._fields, self._errors = self._field_columns(), self.observations.whiten(errors)
         self._slopes[frozenset()] = free, slopes
         self._sizes = np.full(len(self.words), self.settings.usual_discrepancy), np.ones(len(self.noise_names))
         return u
@@ -296,7 +301,7 @@ class DriveForm(MeasuredForm):
         misfit = np.zeros((int(fit.sum()), 0))
         if sizes is not None and self._fields is not None:
             columns, number = self._fields
-            misfit = columns[fit] * (sizes[0][number] * weight[:, None])
+            misfit = np.column_stack([self._errors[fit], columns[fit] * sizes[0][number]]) * weight[:, None]
         factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
         std = self._std[free]
         centre = np.array([self.coordinates[i].centre for i in free])

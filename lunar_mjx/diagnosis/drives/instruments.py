@@ -1,7 +1,8 @@
-"""What a log states of its instruments only within an error: the clocks of its tables, and how the IMU is mounted.
+"""What instruments get wrong: clocks of tables and the IMU's mounting where a log states an error, and what is usual.
 
-Each is a nuisance of its log whose prior is the stated standard deviation. To first order it adds a known vector to the
-predictions: the derivative by time of a table's channels, or the turn of a vector by a small angle.
+A stated error is a nuisance of its log whose prior is the stated standard deviation. To first order it adds a known
+vector to the predictions: the derivative by time of a table's channels, or the turn of a vector by a small angle. Usual
+errors (zeros, scales, clocks) are the same in all logs, and belong to every hypothesis as columns of known size.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lunar_mjx.effects.sensor.channels import family
 from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.logs import Log
@@ -20,6 +22,13 @@ FARTHEST = 6.0
 """Standard deviations at which they are bounded."""
 UNKNOWN_DEG = 60.0
 """A mounting less well known than this is no small angle: its axis tells nothing, and has no nuisance."""
+USUAL_ZERO = {"gyro": 0.002, "accelerometer": 0.02}
+"""Usual bias of an inertial sensor by the first word of its channels, rad/s and m/s2: a MEMS unit's over a day."""
+USUAL_CLOCK_S = 0.005
+"""Usual error between the clocks of kinds of channels, s: a quarter of a sampling interval of 50 Hz."""
+USUAL_SCALE = 0.01
+"""Usual error of the scale of inertial sensors, currents, voltages and torques."""
+_SCALED = ("gyro", "accelerometer", "motor")
 _VECTORS = {"gyro": "gyro_{}_rad_s", "accelerometer": "accelerometer_{}_m_s2"}
 
 
@@ -90,3 +99,31 @@ def _turned(kind: str, one: Series, series: list[Series], log: Log, axis: int, p
             vector[:, k] = np.interp(one.time, other.time, predicted[other.start : other.stop])
     change = mounting.inv().apply(np.cross(mounting.apply(vector), np.eye(3)[axis]))
     return change[:, "xyz".index(one.channel.split("_")[1])]
+
+
+def usual_errors(observations: Observations, predicted: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """What instruments add that err as much as is usual, the same in all logs.
+
+    Args:
+      observations: of the campaign. predicted: (n,) by the model.
+
+    Returns:
+      Columns (n, m) in the channels' units, each of usual size; and places by kind of instrument.
+    """
+    columns: dict[tuple[str, str], np.ndarray] = {}
+    for s in observations.series:
+        word, part = s.channel.partition("_")[0], slice(s.start, s.stop)
+        if word in USUAL_ZERO:
+            columns.setdefault((word, f"zero {s.channel}"), np.zeros(len(observations)))[part] = USUAL_ZERO[word]
+        if word in _SCALED:
+            kind = word if word in USUAL_ZERO else f"{word} {s.channel.rpartition('_')[2]}"
+            scaled = columns.setdefault((kind, "scale"), np.zeros(len(observations)))
+            scaled[part] = USUAL_SCALE * predicted[part]
+        if s.time is not None and s.stop - s.start > 2:
+            clock = f"clock {family(s.channel) or word}"
+            late = columns.setdefault((clock, "clock"), np.zeros(len(observations)))
+            late[part] = USUAL_CLOCK_S * np.gradient(predicted[part], np.asarray(s.time))
+    names = [kind for kind, _ in columns]
+    places = {kind: np.flatnonzero([n == kind for n in names]) for kind in dict.fromkeys(names)}
+    whole = np.stack(list(columns.values()), axis=1) if columns else np.zeros((len(observations), 0))
+    return whole, places
