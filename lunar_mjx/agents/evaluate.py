@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.envs.core import Environment, split_keys
+from lunar_mjx.envs.navigation.tally import METRICS
 from lunar_mjx.envs.scripted import Agent
 
 _PIECE = 50
@@ -25,6 +26,9 @@ class Score:
       episodes: how many. success: share that reached the goal. low, high: its 95 % Wilson interval.
       episode_return: mean; return_deviation: standard deviation. episode_time: mean, s.
       ends: share of every way in which episodes ended, those cut off as `time`.
+      spl: success weighted by path length, the mean of success * shortest / max(shortest, travelled) (Anderson et al.
+        2018, arXiv 1807.06757). collisions_per_km, wh_per_km: of all ways together. slip: mean size. All None where
+        the environment keeps no tally.
     """
 
     episodes: int
@@ -35,6 +39,10 @@ class Score:
     return_deviation: float
     episode_time: float
     ends: dict[str, float]
+    spl: float | None = None
+    collisions_per_km: float | None = None
+    wh_per_km: float | None = None
+    slip: float | None = None
 
     def record(self) -> dict[str, Any]:
         """As JSON holds it."""
@@ -105,14 +113,16 @@ class Evaluator:
             if bool(carry[1].all()):
                 break
         result = jax.device_get(carry[2])
-        return _score(result, self.env.control_interval)
+        return score(result, self.env.control_interval)
 
 
-def _score(result: dict[str, np.ndarray], interval: float) -> Score:
+def score(result: dict[str, np.ndarray], interval: float) -> Score:
+    """The score of episodes whose metrics are given, each (episode,); `interval` of control in s."""
     success, returns = result["success"], result["episode_return"]
     count = len(success)
     low, high = wilson(float(success.sum()), count)
-    ends = {k: float(v.mean()) for k, v in result.items() if k not in ("episode_return", "episode_length", "success")}
+    others = {"episode_return", "episode_length", "success", *METRICS}
+    ends = {k: float(v.mean()) for k, v in result.items() if k not in others}
     return Score(
         episodes=count,
         success=float(success.mean()),
@@ -126,7 +136,20 @@ def _score(result: dict[str, np.ndarray], interval: float) -> Score:
             **ends,
             "time": max(0.0, 1.0 - float(success.mean()) - sum(ends.values())),
         },
+        **(_costs(result) if "travelled" in result else {}),
     )
+
+
+def _costs(result: dict[str, np.ndarray]) -> dict[str, float]:
+    travelled, shortest = (np.asarray(result[k], float) for k in ("travelled", "shortest"))
+    direct = shortest / np.maximum(np.maximum(shortest, travelled), 1e-9)
+    km = max(float(travelled.sum()) / 1000.0, 1e-9)
+    return {
+        "spl": float((result["success"] * direct).mean()),
+        "collisions_per_km": float(result["collisions"].sum()) / km,
+        "wh_per_km": float(result["energy"].sum()) / 3600.0 / km,
+        "slip": float(result["slip"].mean()),
+    }
 
 
 def evaluate(env: Environment, agent: Agent, episodes: int, seed: int, env_params: Any = None) -> Score:

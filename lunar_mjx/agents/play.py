@@ -87,6 +87,11 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     return env, lambda state, key: policy.act(state.obs), dict(made_in.get("unseen", {}))
 
 
+def knowing(name: str, env: Any, params: Any, agent: Agent) -> Agent:
+    """The agent, with the map of the worlds that it is to drive in if it is one that knows them (`planner`)."""
+    return make_agent(name, env, params) if name == "planner" else agent
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Episode:
     """One episode; arrays lead with time.

@@ -116,9 +116,13 @@ def train(
     print(out / "policy.npz")
 
 
-AgentArgument = Annotated[str, typer.Argument(help="policy.npz, a shipped policy's rover, or zero, random, scripted.")]
-AgentOption = Annotated[str | None, typer.Option("--agent", help="The same as an option, for zero, random, scripted.")]
-TaskOption = Annotated[str, typer.Option(help="Task for agents without a policy: paper, consistent or large.")]
+AgentArgument = Annotated[
+    str, typer.Argument(help="policy.npz, a shipped policy's rover, or zero, random, scripted, reactive, planner.")
+]
+AgentOption = Annotated[str | None, typer.Option("--agent", help="The same as an option, for agents without a policy.")]
+TaskOption = Annotated[
+    str, typer.Option(help="Task for agents without a policy: paper, consistent, large, ladder/1 to ladder/5.")
+]
 
 
 def evaluate(
@@ -138,13 +142,14 @@ def evaluate(
 
     select_device(device)
     from lunar_mjx.agents.evaluate import Evaluator
-    from lunar_mjx.agents.play import open_agent
+    from lunar_mjx.agents.play import knowing, open_agent
     from lunar_mjx.agents.run import unseen_params
 
     made, act, unseen = open_agent(agent_option or agent, task, env_options(env))
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}
     params = made.params if seen and terrain is None else unseen_params(made, {} if seen else unseen)
+    act = knowing(agent_option or agent, made, params, act)
     score = Evaluator(made, lambda _, state, key: act(state, key), episodes)(params, (), seed)
     print(
         f"success {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of {score.episodes} "
@@ -152,6 +157,11 @@ def evaluate(
         f"{score.episode_time:.1f} s an episode"
     )
     print(", ".join(f"{name} {100 * share:.1f} %" for name, share in score.ends.items()))
+    if score.spl is not None:
+        print(
+            f"success weighted by path length {score.spl:.3f}, {score.collisions_per_km:.1f} collisions/km, "
+            f"{score.wh_per_km:.0f} Wh/km, mean slip {score.slip:.2f}"
+        )
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_text(out, json.dumps({"agent": agent_option or agent, **score.record()}, indent=1) + "\n")
@@ -174,13 +184,14 @@ def play(
 
     check_folder(out)
     select_device(device)
-    from lunar_mjx.agents.play import open_agent, play_episode
+    from lunar_mjx.agents.play import knowing, open_agent, play_episode
     from lunar_mjx.agents.run import unseen_params
 
     made, act, unseen = open_agent(agent_option or agent, task, env_options(env))
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}
-    episode = play_episode(made, unseen_params(made, unseen), act, seed)
+    params = unseen_params(made, unseen)
+    episode = play_episode(made, params, knowing(agent_option or agent, made, params, act), seed)
     print(episode.sentence)
     for path in episode.write(make_folder(out), view):
         print(path)

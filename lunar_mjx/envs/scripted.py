@@ -1,28 +1,39 @@
-"""Agents that learn nothing, to look at an environment and to beat: zero, random, and straight for the goal."""
+"""Agents that learn nothing, to look at an environment and to beat: zero, random, straight for the goal, around what
+the height scan shows, and along the shortest way of one who knows the map."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lunar_mjx.envs.core import Environment, State
-from lunar_mjx.envs.navigation.env import NavigationEnv
+from lunar_mjx.envs.navigation.env import NavigationEnv, NavigationParams
+from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE
 from lunar_mjx.errors import bad_input
 
 Agent = Callable[[State, Any], Any]
 """Function of the batch's state and a random key to actions (env, action)."""
 
-AGENTS = ("zero", "random", "scripted")
+AGENTS = ("zero", "random", "scripted", "reactive", "planner")
 
 
-def make_agent(name: str, env: Environment) -> Agent:
-    """An agent by name: `zero` does nothing, `random` draws uniformly, `scripted` drives straight for the goal.
+def make_agent(name: str, env: Environment, params: Any = None) -> Agent:
+    """An agent by name.
+
+    `zero` does nothing, `random` draws uniformly, `scripted` drives straight for the goal, `reactive` steers around
+    what the height scan shows, `planner` follows the shortest way over the whole map of a ladder's worlds, which it
+    knows.
+
+    Args:
+      name: of the agent. env: to drive in. params: of the environment, whose map `planner` knows; `env.params` if None.
 
     Raises:
-      UserError: unknown name, or an environment that `scripted` cannot drive.
+      UserError: unknown name, or an environment that the agent cannot drive.
     """
     if name == "zero":
         return lambda state, key: jnp.zeros((state.obs.shape[0], env.action_size), state.obs.dtype)
@@ -30,14 +41,20 @@ def make_agent(name: str, env: Environment) -> Agent:
         return lambda state, key: jax.random.uniform(
             key, (state.obs.shape[0], env.action_size), state.obs.dtype, -1.0, 1.0
         )
-    if name != "scripted":
+    if name not in AGENTS:
         raise bad_input("agent", "agent", name, "does not exist", f"use one of {', '.join(AGENTS)}")
     if not isinstance(env, NavigationEnv):
+        if name != "scripted":
+            raise bad_input("agent", "agent", name, "drives rovers only", "use zero, random or scripted")
         return lambda state, key: _toward(state.info["goal_body"])
-    if env.config.action not in ("paper", "velocity"):
-        raise bad_input(
-            "agent", "scripted", env.config.action, "has one action per motor", "use the action mode paper or velocity"
-        )
+    modes = ("paper", "velocity") if name == "scripted" else ("velocity",)
+    if env.config.action not in modes:
+        remedy = f"use the action mode {' or '.join(modes)}"
+        raise bad_input("agent", name, env.config.action, "is no action mode that it can drive in", remedy)
+    if name == "reactive":
+        return _reactive(env)
+    if name == "planner":
+        return _planner(env, env.params if params is None else params)
     return _driver(env)
 
 
@@ -66,5 +83,112 @@ def _driver(env: NavigationEnv) -> Agent:
             steer, drive = wanted / limit, jnp.ones_like(bearing)
         rest = jnp.zeros((goal.shape[0], env.action_size - 2), goal.dtype)
         return jnp.concatenate([jnp.stack([drive, jnp.clip(steer, -1.0, 1.0)], axis=-1), rest], axis=-1)
+
+    return act
+
+
+@dataclasses.dataclass(frozen=True)
+class Reactive:
+    """Settings of the reactive rule; lengths in m, for a rover as wide as LUVMI-X.
+
+    Attributes:
+      tall: height over the standing plane that is driven around. half_width: of the corridor that must be free.
+      horizon: how far ahead it looks. turn_price: what a radian off the goal's bearing costs, in shares of the horizon.
+      gain: steering angle per radian. near: free way below which it backs off. patience: s without progress after
+        which it does so, too.
+    """
+
+    tall: float = 0.12
+    half_width: float = 0.45
+    horizon: float = 3.0
+    turn_price: float = 0.5
+    gain: float = 1.5
+    near: float = 0.6
+    patience: float = 4.0
+
+
+def _steering_limit(env: NavigationEnv) -> float:
+    rover = env.model.rover
+    return min(rover.joint_limits[w.steer][1] for w in rover.wheels if w.corner in ("lf", "rf") and w.steer)
+
+
+def _wheels(env: NavigationEnv, drive: Any, steer: Any) -> Any:
+    """Actions of the mode `velocity` from speed and steering, each (env,)."""
+    first = jnp.stack([drive, jnp.clip(steer, -1.0, 1.0)], axis=-1)
+    return jnp.pad(first, ((0, 0), (0, env.action_size - 2)))
+
+
+def _reactive(env: NavigationEnv, settings: Reactive | None = None) -> Agent:
+    """Picks, of some headings, the one that is free for longest and nearest to the goal's; backs off where none is."""
+    for block in ("height_scan", "waited"):
+        if block not in env.blocks:
+            raise bad_input("agent", "reactive", env.config.observations, f"lacks the block {block}", "add it")
+    r, limit = settings or Reactive(), _steering_limit(env)
+    scale = SCAN_SCALE.get(env.model.rover.name, 1.0)
+    ahead, aside = (scale * a.ravel() for a in np.meshgrid(SCAN_AHEAD, SCAN_ASIDE, indexing="ij"))
+    headings = np.radians(np.arange(-75.0, 76.0, 15.0))
+    along = ahead * np.cos(headings)[:, None] + aside * np.sin(headings)[:, None]
+    across = np.abs(aside * np.cos(headings)[:, None] - ahead * np.sin(headings)[:, None])
+    corridor = (along > 0.1) & (across < scale * r.half_width)
+    horizon = scale * r.horizon
+
+    def act(state: State, key: Any) -> Any:
+        goal, scan = state.info["goal_body"], state.obs[:, env.blocks["height_scan"]]
+        waited = 10.0 * state.obs[:, env.blocks["waited"]][:, 0]
+        bearing = jnp.arctan2(goal[:, 1], goal[:, 0])
+        far = jnp.sqrt(jnp.sum(goal * goal, axis=-1))
+        wall = (jnp.abs(scan) > scale * r.tall)[:, None, :] & corridor
+        free = jnp.min(jnp.where(wall, along, horizon), axis=-1)
+        # what lies behind the goal does not matter
+        free = jnp.where(free > far[:, None], horizon, jnp.minimum(free, horizon)) / horizon
+        off = jnp.abs(jnp.clip(bearing, -1.4, 1.4)[:, None] - headings)
+        best = jnp.argmax(free - r.turn_price * off, axis=-1)
+        heading = jnp.asarray(headings)[best]
+        room = horizon * jnp.take_along_axis(free, best[:, None], axis=-1)[:, 0]
+        back = (room < scale * r.near) | (waited > r.patience)
+        steer = r.gain * heading / limit
+        return _wheels(env, jnp.where(back, -0.7, 1.0), jnp.where(back, -steer, steer))
+
+    return act
+
+
+def _planner(env: NavigationEnv, params: NavigationParams) -> Agent:
+    """Follows the steepest descent of the distance to the goal over the planning grid."""
+    if params.pool is None or params.side is None:
+        raise bad_input(
+            "agent", "planner", env.config.rung, "is no rung of the ladder", "use a task ladder/1 to ladder/5"
+        )
+    pool, limit, stride = params.pool, _steering_limit(env), 4
+    count = pool.ways.shape[-1]
+    cell = pool.size / count
+    steps = [(j, i) for j in (-1, 0, 1) for i in (-1, 0, 1)]
+
+    def act(state: State, key: Any) -> Any:
+        inner = state.inner
+        way, world = pool.places.way[inner.place], pool.places.world[inner.place]
+        position = inner.physics.qpos[:, :2]
+        local = (position - pool.middles[world] + 0.5 * pool.size) / cell
+        node = jnp.clip(local.astype(jnp.int32), 0, count - 1)
+        column, row = node[:, 0], node[:, 1]
+        for k in range(stride):
+            # off the free nodes every node of the neighbourhood is tried, two cells wide
+            wide = 2 if k == 0 else 1
+            rows = jnp.stack([jnp.clip(row + wide * j, 0, count - 1) for j, _ in steps])
+            columns = jnp.stack([jnp.clip(column + wide * i, 0, count - 1) for _, i in steps])
+            best = jnp.argmin(pool.ways[way, rows, columns], axis=0)[None]
+            row, column = (jnp.take_along_axis(a, best, axis=0)[0] for a in (rows, columns))
+        aim = (jnp.stack([column, row], axis=-1) + 0.5) * cell - 0.5 * pool.size + pool.middles[world]
+        close = jnp.sum((inner.goal - position) ** 2, axis=-1) < (2.0 * cell) ** 2
+        to = jnp.where(close[:, None], inner.goal, aim) - position
+        w, x, y, z = (inner.physics.qpos[:, k] for k in (3, 4, 5, 6))
+        yaw = jnp.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+        turn = jnp.arctan2(to[:, 1], to[:, 0]) - yaw
+        turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
+        # a point behind is reached by backing towards it, which turns the rover on little ground
+        back = jnp.abs(turn) > 1.9
+        turn = jnp.where(back, -jnp.sign(turn) * 1.0, turn)
+        waiting = inner.waited > 4.0
+        drive = jnp.where(back ^ waiting, -0.7, jnp.where(jnp.abs(turn) > 0.6, 0.6, 1.0))
+        return _wheels(env, drive, 1.5 * turn / limit)
 
     return act

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lunar_mjx.agents.evaluate import score
 from lunar_mjx.envs import TASKS, make_navigation, split_keys
 from lunar_mjx.envs.contract import check_environment
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
@@ -126,6 +127,24 @@ def test_a_collision_counts_when_it_begins_and_energy_never_flows_back():
     np.testing.assert_allclose(seen.energy, 4 * 5.0 * 0.1)
     np.testing.assert_allclose(seen.slip, 4 * 0.3)
     np.testing.assert_allclose(seen.travelled, 4.0)
+
+
+def test_a_score_weighs_success_by_the_way():
+    told = {
+        "success": [1.0, 1.0, 0.0],
+        "episode_return": [1.0, 1.0, 0.0],
+        "episode_length": [10.0, 10.0, 10.0],
+        "stuck": [0.0, 0.0, 1.0],
+        "travelled": [20.0, 5.0, 15.0],
+        "shortest": [10.0, 10.0, 10.0],
+        "energy": [3600.0, 0.0, 0.0],
+        "slip": [0.3, 0.3, 0.6],
+        "collisions": [0.0, 0.0, 2.0],
+    }
+    found = score({k: np.array(v) for k, v in told.items()}, 0.1)
+    assert found.spl == pytest.approx((0.5 + 1.0) / 3) and found.slip == pytest.approx(0.4)
+    assert found.collisions_per_km == pytest.approx(50.0) and found.wh_per_km == pytest.approx(25.0)
+    assert found.ends == pytest.approx({"success": 2 / 3, "stuck": 1 / 3, "time": 0.0})
 
 
 def test_every_rung_is_a_task_and_a_gymnasium_id():

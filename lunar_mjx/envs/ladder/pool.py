@@ -49,14 +49,14 @@ class Pool:
     """Worlds side by side.
 
     Attributes:
-      terrain: the map of all.
+      terrain: the map of all; None where it is kept elsewhere.
       places: where to start and go.
       ways: (goal, row, column) distance to each goal over the planning grid of its world, m.
       middles: (world, 2) of the worlds on the map, m.
       size: side of a world, m.
     """
 
-    terrain: Terrain
+    terrain: Any
     places: Places
     ways: Any
     middles: Any

@@ -53,6 +53,7 @@ class NavigationParams:
       arrivals: (place,) heading to arrive in, rad; None where any will do.
       ground: lowest and highest ground, m; None to look anew.
       side: of the worlds that make up the terrain, m: leaving one's own fails; None if it is one.
+      pool: the ladder's worlds, for planners; the step reads nothing of it. None elsewhere.
     """
 
     system: Params
@@ -64,6 +65,7 @@ class NavigationParams:
     arrivals: Any = None
     ground: Any = None
     side: Any = None
+    pool: Pool | None = None
 
 
 @pytree
@@ -249,7 +251,23 @@ class NavigationEnv:
             arrivals=at.arrivals if c.arrive_within < np.pi or "arrival" in c.observations else None,
             ground=jnp.stack([heights.min(), heights.max()]),
             side=pool.size,
+            # the map is in `system` already
+            pool=dataclasses.replace(pool, terrain=None),
         )
+
+    @functools.cached_property
+    def blocks(self) -> dict[str, slice]:
+        """Where each block of the observation lies in it."""
+
+        def widths(params: NavigationParams, keys: Any) -> dict[str, Any]:
+            inner = self._fresh(params, keys)
+            view = self._view(params, inner)
+            scene = self._scene(self.config.observations, params, inner, view)
+            return {name: observe((name,), view, scene) for name in self.config.observations}
+
+        shapes = jax.eval_shape(widths, self.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
+        ends = np.cumsum([0, *(shapes[name].shape[1] for name in self.config.observations)]).tolist()
+        return {name: slice(a, b) for name, a, b in zip(self.config.observations, ends[:-1], ends[1:], strict=True)}
 
     def reset(self, params: NavigationParams, keys: Any) -> State:
         """Begins an episode in every environment; `keys` (env, 2) raw random keys."""
@@ -498,13 +516,16 @@ class NavigationEnv:
         )
 
     def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:
+        scene = self._scene((*self.config.observations, *self.config.privileged), params, inner, view)
+        return observe(self.config.observations, view, scene), observe(self.config.privileged, view, scene)
+
+    def _scene(self, names: Sequence[str], params: NavigationParams, inner: Inner, view: View) -> Scene:
         c, terrain = self.config, params.system.terrain
         seen = None
-        if any(name.startswith(CAMERA) for name in (*c.observations, *c.privileged)):
+        if any(name.startswith(CAMERA) for name in names):
             light = Light(sun=c.sun)
             seen = pictures(terrain, self.model.rover, view.qpos, c.camera, light=light, far=c.camera_far)
-        scene = Scene(terrain, inner.drawn, self._ride, self._scale, seen, c.camera_far)
-        return observe(self.config.observations, view, scene), observe(self.config.privileged, view, scene)
+        return Scene(terrain, inner.drawn, self._ride, self._scale, seen, c.camera_far)
 
     def _info(self, view: View) -> dict[str, Any]:
         return {

@@ -1,0 +1,117 @@
+"""Scores agents that learn nothing on the ladder, and a policy of the task `large` with and without its height scan.
+
+    python benchmarks/rl/ladder.py --rungs 1 2 3 --episodes 32 --out benchmarks/rl/ladder.json
+
+All agents drive the same episodes side by side in one program, in unseen worlds and soil as `lunar-mjx evaluate` takes
+them. Rungs that the file holds already are kept unless they are measured again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from benchmarks.rl.harness import percent, save, say
+from benchmarks.timing import commit
+from lunar_mjx.agents.evaluate import score
+from lunar_mjx.agents.play import UNSEEN_LADDER, shipped_policy
+from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.agents.run import unseen_params
+from lunar_mjx.envs import make_agent, make_navigation, split_keys
+
+SCRIPTED = ("zero", "random", "scripted", "reactive", "planner")
+PIECE = 25
+"""Control steps between looks at whether all episodes are over."""
+
+
+def agents(env: Any, params: Any, rover: str) -> dict[str, Any]:
+    """All agents by name, functions of state and key."""
+    found = {name: make_agent(name, env, params) for name in SCRIPTED}
+    path = shipped_policy(rover)
+    if path is None:
+        return found
+    policy = load_policy(path)
+    seen = policy.network["obs"]
+    blank = jnp.zeros(seen, bool).at[env.blocks["height_scan"]].set(True)
+    mean = jnp.zeros(seen) if policy.mean is None else jnp.asarray(policy.mean)
+    found["policy of large"] = lambda state, key: policy.act(state.obs[:, :seen])
+    # the scan at its mean over training, so that it says nothing
+    found["policy of large, scan blanked"] = lambda state, key: policy.act(jnp.where(blank, mean, state.obs[:, :seen]))
+    return found
+
+
+def drive(env: Any, params: Any, choices: list[Any], episodes: int, seed: int) -> dict[str, np.ndarray]:
+    """Metrics of the first episode of every rover, (agent, episode)."""
+    key_reset, key = jax.random.split(jax.random.PRNGKey(seed))
+    keys = jnp.tile(split_keys(key_reset, episodes), (len(choices), 1))
+    row = jnp.repeat(jnp.arange(len(choices)), episodes)
+
+    @jax.jit
+    def piece(params: Any, carry: Any, key: Any) -> Any:
+        def step(carry: Any, key: Any) -> Any:
+            state, over, kept = carry
+            actions = jnp.stack([agent(state, key) for agent in choices])
+            action = jnp.take_along_axis(actions, row[None, :, None], axis=0)[0]
+            state = env.step(params, state, action)
+            first = state.done & ~over
+            kept = {k: jnp.where(first, state.metrics[k], v) for k, v in kept.items()}
+            return (state, over | state.done, kept), None
+
+        return jax.lax.scan(step, carry, jax.random.split(key, PIECE))[0]
+
+    state = jax.jit(env.reset)(params, keys)
+    blank = {k: jnp.zeros(len(row)) for k in state.metrics if not k.startswith("reward_")}
+    carry = state, jnp.zeros(len(row), bool), blank
+    for i in range(math.ceil(env.episode_steps / PIECE)):
+        carry = piece(params, carry, jax.random.fold_in(key, i))
+        if bool(carry[1].all()):
+            break
+    return {k: np.asarray(v).reshape(len(choices), episodes) for k, v in carry[2].items()}
+
+
+def measure(number: int, episodes: int, seed: int, rover: str, **settings: Any) -> dict[str, Any]:
+    """The rows of one rung."""
+    begin = time.monotonic()
+    env = make_navigation(f"ladder/{number}", rover, **settings)
+    params = unseen_params(env, UNSEEN_LADDER)
+    told = agents(env, params, rover)
+    result = drive(env, params, list(told.values()), episodes, seed)
+    rows = {}
+    for i, name in enumerate(told):
+        row = score({k: v[i] for k, v in result.items()}, env.control_interval)
+        rows[name] = dataclasses.asdict(row)
+        cost = f"SPL {row.spl}, {row.collisions_per_km} collisions/km, {row.wh_per_km} Wh/km"
+        say(f"rung {number} {name}: {percent(rows[name])}, {cost}, slip {row.slip}")
+    about = {"commit": commit(), "seed": seed, "episodes": episodes, "settings": settings}
+    return {**about, "wall_s": time.monotonic() - begin, "rows": rows}
+
+
+def main() -> None:
+    """Measures and writes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rungs", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--episodes", type=int, default=64)
+    parser.add_argument("--seed", type=int, default=54321)
+    parser.add_argument("--rover", default="luvmi_x")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/rl/ladder.json"))
+    parser.add_argument("--worlds", type=int, default=0, help="side by side; as many as the rung says if 0")
+    args = parser.parse_args()
+    old = json.loads(args.out.read_text(encoding="utf-8"))["rungs"] if args.out.exists() else {}
+    for number in args.rungs:
+        old[str(number)] = measure(number, args.episodes, args.seed, args.rover, worlds=args.worlds)
+        save(args.out.parent, args.out.stem, {"rover": args.rover, "rungs": old})
+
+
+if __name__ == "__main__":
+    main()
