@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -150,10 +151,11 @@ def why(
 
     Args:
       folder: of the run. only: candidates to consider; all if None. progress: told what is being done.
-      seconds: time that the search may take, for logs with imposed wheel speeds.
+      seconds: after which the search begins no further refit; without, logs with imposed wheel speeds have
+        `windows.SECONDS` and others as long as it takes.
 
     Raises:
-      UserError: the folder is no run, or a time limit that cannot be kept.
+      UserError: the folder is no run.
     """
     run = folder if isinstance(folder, Run) else load_run(folder)
     try:
@@ -162,10 +164,8 @@ def why(
         return bad.diagnosis
     if windows.imposed(campaign):
         return windows.why(run, campaign, only, windows.SECONDS if seconds is None else seconds, progress)
-    if seconds is not None:
-        raise UserError("why: --seconds is for logs with imposed wheel speeds; drop it.")
     problem = _problem(run, campaign, only, progress)
-    diagnosis, found = answer.diagnose(run, problem, progress)
+    diagnosis, found = answer.diagnose(run, problem, progress, math.inf if seconds is None else seconds)
     if found is not None:
         own = problem.own
         rows = {"refitted": found.base(own.name).refit.u}

@@ -163,6 +163,17 @@ def test_an_interrupt_leaves_a_usable_folder(run, logs, work, monkeypatch):
     assert verbs.why(folder).verdict is Verdict.NOISE_ONLY
 
 
+def test_a_time_limit_ends_the_search_with_what_is_known(run, logs, work):
+    folder = work / "short"
+    shutil.copytree(_asked(run, logs / "null", work / "null"), folder)
+    found = verbs.why(folder, seconds=0.0)
+    laws = found.details["search"]["refits"]
+    assert laws == len(found.forms)
+    assert not found.details["search"]["complete"]
+    assert "ended by its time" in found.sentence
+    assert json.loads((folder / "verdict.json").read_text())["verdict"] == found.verdict.name
+
+
 def test_a_solver_that_fails_is_bad_fit(run, logs, work, monkeypatch):
     def fail(*_args, **_kwargs):
         raise EvidenceError("on purpose")

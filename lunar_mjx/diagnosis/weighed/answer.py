@@ -262,6 +262,8 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         usual = sizes[worst] <= 2.0 * settings.usual_discrepancy
         tail = f"usual: {remains[worst]['text']}, the rest better" if usual else f"large: {remains[worst]['text']}"
         sentence += f" What remains is {tail}."
+    if not found.complete:
+        sentence += " The search ended by its time or its number of refits: what it did not refit is an estimate."
     gain, se, units = _held_out(found, best, own)
     inclusion = found.inclusion()
     evidence, undecidable = _evidence(problem, found, said.effects)
