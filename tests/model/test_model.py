@@ -138,7 +138,7 @@ def test_settled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 Change = Callable[[Model], Any]
 REFUSED: dict[str, tuple[Change, list[str]]] = {
-    "unknown effect": (lambda m: m.add("warp_drive"), ["'warp_drive'", "catalogue", "soil"]),
+    "unknown effect": (lambda m: m.add("warp_drive"), ["'warp_drive'", "catalogue", "lunar-mjx effect list"]),
     "effect twice": (lambda m: m.add("soil"), ["soil", "already in the model"]),
     "effect that another replaces": (
         lambda m: m.add("stress_integral").add("closed_form_shear"),

@@ -265,7 +265,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "effect list is a text": ({"effect_list": "soil"}, ["effect_list = 'soil'", "list effects as strings"]),
     "effect list of numbers": ({"effect_list": [1]}, ["effect_list = [1]", "list effects as strings"]),
-    "unknown effect": ({"effect_list": ["motor", "warp"]}, ["effect_list = 'warp'", "joint_control"]),
+    "unknown effect": ({"effect_list": ["motor", "warp"]}, ["effect_list = 'warp'", "lunar-mjx effect list"]),
     "effect twice": ({"effect_list": ["motor", "soil", "soil"]}, ["effect_list = 'soil'", "twice"]),
     "effect and its replacement": (
         {"effect_list": ["motor", "stress_integral", "closed_form_shear"]},

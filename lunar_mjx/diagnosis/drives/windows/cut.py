@@ -175,7 +175,7 @@ def _held(left: np.ndarray, right: np.ndarray, yaw_rate: np.ndarray, track: floa
       left, right: (window,) rim speeds, m/s. yaw_rate: (window, sample), rad/s. track: m.
     """
     turn = (right - left) / track
-    seen: np.ndarray = np.asarray(np.isfinite(yaw_rate)).any(axis=1)
+    seen = np.asarray(np.isfinite(yaw_rate).any(axis=1))
     mean = np.nanmean(np.where(seen[:, None], yaw_rate, 0.0), axis=1)
     return seen & (left * right < 0.0) & (np.abs(turn) > TURNING_RAD_S) & (np.abs(mean) < HELD * np.abs(turn))
 
