@@ -194,7 +194,11 @@ class DriveForm(MeasuredForm):
         return self.drives.free([e for e in self.candidates if e in effects])
 
     def measuring(self, value: np.ndarray, start: np.ndarray) -> DriveForm:
-        """The same form against other measurements (n,), which begins its refits at (coordinates,)."""
+        """A form of this model against other measurements.
+
+        Args:
+          value: (n,) what is measured instead, in SI units. start: (coordinates,) where its refits begin.
+        """
         drives = copy.copy(self.drives)
         drives.observations = dataclasses.replace(drives.observations, value=value)
         drives.noise_unlearnt = False

@@ -97,7 +97,7 @@ class Rung:
         return np.interp((np.arange(count) + 0.5) / count, above / above[-1], d)
 
     def scaled(self, factor: float) -> Rung:
-        """The same rung for a rover `factor` times as wide: larger boulders, farther apart, on as wide a world."""
+        """This rung scaled to a rover `factor` times as wide: boulders and their distances grow, the world does not."""
         if factor == 1.0:
             return self
         lattice, block = self.lattice * factor, self.block * factor
@@ -204,7 +204,7 @@ RUNGS: dict[int, Rung] = {
         weights={**_ALL, "collision": 10.0},
     ),
 }
-"""The ladder. Rung 1 is today's task `large`; each later rung is harder in every respect."""
+"""The ladder. Rung 1 is as easy as the task `large`; steepness, boulders and distances grow from rung to rung."""
 
 
 def get_rung(number: int) -> Rung:

@@ -68,7 +68,11 @@ class Bench:
         return WindowForm(self.problem, self.base, mine, observations, WindowSettings())
 
     def question(self, noise: Sequence[Noise], suspects: Sequence[Suspect] | None = None) -> Problem:
-        """The same for the search."""
+        """The windows and everything that may be missing, as the problem that the search of hypotheses takes.
+
+        Args:
+          noise: of each channel. suspects: what may be missing; all that the run knows if None.
+        """
         form = self.form(noise, suspects)
         effects = {name: catalogue.CATALOGUE[name] for name in form.candidates if name in catalogue.CATALOGUE}
         return Problem((form,), effects, (), form.settings)
