@@ -34,6 +34,14 @@ def test_only_what_passed_once_can_break_unless_the_whole_is_asked_for():
     assert proofs.broken(FILES[:2], record, whole=True) == FILES[:2]
 
 
+def test_a_failure_beside_another_file_is_tried_alone_and_a_true_one_stays():
+    found = {FILES[0]: {**ENTRY, "ok": False, "commit": "new"}, FILES[1]: {**ENTRY, "ok": False}}
+    outcome = {FILES[0]: True, FILES[1]: False}
+    assert proofs.again_alone(FILES[:2], found, lambda f: {"ok": outcome[f], "seconds": 5}) == FILES[:1]
+    assert found[FILES[0]] == {**ENTRY, "ok": True, "seconds": 5, "commit": "new"}
+    assert found[FILES[1]]["ok"] is False
+
+
 class _Clock:
     now = 0.0
 

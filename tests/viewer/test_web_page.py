@@ -29,9 +29,11 @@ def test_keys_drive_what_the_page_shows(live_viewer, browser, tmp_path):
     assert browser.value("document.getElementById('note').hidden")
     before = _number(browser, "path")
     browser.key("keyDown", "ArrowUp", "ArrowUp")
-    browser.wait(f"parseFloat(document.getElementById('path').textContent) > {before + 0.3}")
-    assert browser.value("document.querySelector('[data-key=forward]').className") == "held"
-    assert _number(browser, "speed") > 0.05
+    # one look at all three: on a busy machine the server lets go of a silent page, and the rover stops in between
+    driven = f"parseFloat(document.getElementById('path').textContent) > {before + 0.3}"
+    moves = "parseFloat(document.getElementById('speed').textContent) > 0.05"
+    held = "document.querySelector('[data-key=forward]').className === 'held'"
+    browser.wait(f"{driven} && {moves} && {held}")
     picture = browser.picture(tmp_path / "page.png")
     browser.key("keyUp", "ArrowUp", "ArrowUp")
     browser.wait("parseFloat(document.getElementById('speed').textContent) < 0.05")
