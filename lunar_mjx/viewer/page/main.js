@@ -58,6 +58,7 @@ class View {
       this.renderer.clearTracks(this.middle);
       this.prints.forEach((bar) => this.renderer.print(bar));
       this.height = fine.height;
+      document.body.dataset.ground = this.middle.join(" ");
     } finally {
       this.fetching = false;
     }

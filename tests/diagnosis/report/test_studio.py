@@ -190,31 +190,34 @@ def test_by_hand_in_a_browser(tmp_path, browser, table):
     page = studio.write_studio(write_run(tmp_path / "run", table, HOSTILE), tmp_path / "studio.html")
     browser.open(page.as_uri())
     browser.wait("document.body?.dataset.ready")
-    text = "document.getElementById('why').textContent"
+    corner = 'document.querySelector(\'#heat [data-row="0"][data-column="{}"]\')'
+    why = "document.getElementById('why').textContent.includes('{}')"
     assert browser.value("document.querySelectorAll('#heat tbody button').length") == 4
     # the first field is the worst; another one is chosen by mouse, and by arrow keys from there
-    browser.value('document.querySelector(\'#heat [data-row="0"][data-column="0"]\').click()')
-    assert browser.value("document.body.dataset.cell") == "0,0"
-    browser.value('document.querySelector(\'#heat [data-row="0"][data-column="0"]\').focus()')
+    browser.value(corner.format(0) + ".click()")
+    browser.wait("document.body.dataset.cell === '0,0'")
+    browser.value(corner.format(0) + ".focus()")
     browser.press("ArrowRight")
     browser.press("ArrowDown")
-    assert browser.value("document.body.dataset.cell") == "1,1"
+    browser.wait("document.body.dataset.cell === '1,1'")
     assert HOSTILE[:9] in browser.value("document.getElementById('traces').getAttribute('aria-label')")
     # an effect by Enter: its model, its error, its reason
-    before = float(browser.value('document.querySelector(\'#heat [data-row="0"][data-column="1"]\').textContent'))
+    before = float(browser.value(corner.format(1) + ".textContent"))
     browser.value("document.querySelector('#effects button').focus()")
     browser.press("End")
-    assert "cannot tell" in browser.value(text)
+    browser.wait(why.format("cannot tell"))
     browser.press("Home")
     browser.press("ArrowDown")
     browser.press("ArrowDown")
-    assert "slip sinkage" in browser.value(text) and browser.value("document.body.dataset.model") == "3"
-    after = float(browser.value('document.querySelector(\'#heat [data-row="0"][data-column="1"]\').textContent'))
+    browser.wait(why.format("slip sinkage"))
+    assert browser.value("document.body.dataset.model") == "3"
+    after = float(browser.value(corner.format(1) + ".textContent"))
     assert after != before
-    assert browser.value("document.querySelectorAll('#traces .trace').length") > 0
-    assert browser.value("document.querySelectorAll('#place .points path').length") > 0
+    # Plotly draws when it has time to
+    browser.wait("document.querySelectorAll('#traces .trace').length > 0")
+    browser.wait("document.querySelectorAll('#place .points path').length > 0")
     browser.resize(360, 740)
-    assert browser.value("document.documentElement.scrollWidth") <= 360
+    browser.wait("innerWidth === 360 && document.documentElement.scrollWidth <= 360")
     assert browser.value("document.title") == "Studio: run" and browser.value("document.images.length") == 0
     assert browser.requests == [page.as_uri()]
     assert not browser.problems
