@@ -29,6 +29,8 @@ with without_warp_notices():
 AXIS = "device"
 EPISODE = ("episode_return", "episode_length", "success")
 """Metrics that every environment gives for episodes that ended."""
+MOST_DEVIATIONS = 10.0
+"""To which normalised observations are cut."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,8 +298,8 @@ class Learner:
 
 
 def normalised(values: Any, mean: Any, deviation: Any) -> Any:
-    """Observations in deviations from the mean, within 10 of them."""
-    return jnp.clip((values - mean) / deviation, -10.0, 10.0)
+    """Observations in deviations from the mean, within `MOST_DEVIATIONS` of them."""
+    return jnp.clip((values - mean) / deviation, -MOST_DEVIATIONS, MOST_DEVIATIONS)
 
 
 def _transition(before: State, action: Any, after: State) -> Transition:

@@ -16,6 +16,7 @@ from lunar_mjx._version import __version__
 from lunar_mjx.commands import bed as bed_commands
 from lunar_mjx.commands import diagnosis as criticism_commands
 from lunar_mjx.commands import effect_test, usage
+from lunar_mjx.commands import export as export_commands
 from lunar_mjx.commands import log as log_commands
 from lunar_mjx.commands import parity as parity_commands
 from lunar_mjx.commands import seeing as seeing_commands
@@ -265,6 +266,7 @@ def effect_show(name: Annotated[str, typer.Argument(help="Catalogue name, or my_
 
 
 train_commands.register(app)
+export_commands.register(app)
 parity_commands.register(app)
 seeing_commands.register(app, terrain_app)
 log_commands.register(app)

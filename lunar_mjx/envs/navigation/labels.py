@@ -1,0 +1,79 @@
+"""Name and unit of every number of an observation, for those who feed a policy outside the simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from lunar_mjx.envs.navigation.env import NavigationEnv
+from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE
+
+
+class Label(NamedTuple):
+    """Of one number: what it is called within its block, and its unit ("1" if it has none)."""
+
+    name: str
+    unit: str
+
+
+def _axes(unit: str, names: str = "x y z") -> Callable[[NavigationEnv], list[Label]]:
+    return lambda env: [Label(name, unit) for name in names.split()]
+
+
+def _goal_body(env: NavigationEnv) -> list[Label]:
+    return [
+        Label("distance", "m"),
+        Label("1 - exp(-distance / 3 m)", "1"),
+        Label("cosine of bearing", "1"),
+        Label("sine of bearing", "1"),
+    ]
+
+
+def _joints(env: NavigationEnv) -> list[Label]:
+    names = env.system.joint_names
+    return [Label(f"sine of {n}", "1") for n in names] + [Label(f"speed of {n}", "rad/s") for n in names]
+
+
+def _per_joint(unit: str) -> Callable[[NavigationEnv], list[Label]]:
+    return lambda env: [Label(name, unit) for name in env.system.joint_names]
+
+
+def _per_wheel(unit: str) -> Callable[[NavigationEnv], list[Label]]:
+    return lambda env: [Label(wheel.corner, unit) for wheel in env.model.rover.wheels]
+
+
+def _scan(env: NavigationEnv) -> list[Label]:
+    scale = SCAN_SCALE.get(env.model.rover.name, 1.0)
+    return [
+        Label(f"{scale * a:.4g} m ahead, {scale * b:.4g} m to the left", "m") for a in SCAN_AHEAD for b in SCAN_ASIDE
+    ]
+
+
+LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
+    "position": _axes("m"),
+    "euler": _axes("rad", "roll pitch yaw"),
+    "velocity": _axes("m/s"),
+    "angular_velocity": _axes("rad/s"),
+    "acceleration": _axes("m/s2"),
+    "goal": _axes("m", "x y"),
+    "goal_body": _goal_body,
+    "up": _axes("1"),
+    "body_velocity": _axes("m/s"),
+    "body_rates": _axes("rad/s"),
+    "joints": _joints,
+    "temperatures": _per_joint("100 K"),
+    "slip": _per_wheel("1"),
+    "sinkage": _per_wheel("cm"),
+    "last_action": lambda env: [Label(name, "1") for name in env.actions.names],
+    "waited": lambda env: [Label("time", "10 s")],
+    "arrival": lambda env: [Label("cosine", "1"), Label("sine", "1")],
+    "height_scan": _scan,
+}
+"""Blocks whose numbers have names of their own. Pictures and what was drawn are counted through."""
+
+
+def labels(env: NavigationEnv) -> dict[str, list[Label]]:
+    """The labels of every block of the environment's observation, in its order."""
+    widths = {name: part.stop - part.start for name, part in env.blocks.items()}
+    counted = {name: [Label(str(i), "1") for i in range(width)] for name, width in widths.items()}
+    return {name: LABELS[name](env) if name in LABELS else counted[name] for name in widths}
