@@ -1,6 +1,7 @@
 """Scores agents that learn nothing on the ladder, and a policy of the task `large` with and without its height scan.
 
     python benchmarks/rl/ladder.py --rungs 1 2 3 --episodes 32 --out benchmarks/rl/ladder.json
+    python benchmarks/rl/ladder.py --tune 24 --rungs 3 --episodes 8 --out benchmarks/rl/ladder.json
 
 All agents drive the same episodes side by side in one program, in unseen worlds and soil as `lunar-mjx evaluate` takes
 them. Rungs that the file holds already are kept unless they are measured again.
@@ -29,6 +30,7 @@ from lunar_mjx.agents.play import UNSEEN_LADDER, shipped_policy
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.envs import make_agent, make_navigation, split_keys
+from lunar_mjx.envs.scripted import Reactive, reactive_rule
 
 SCRIPTED = ("zero", "random", "scripted", "reactive", "planner")
 PIECE = 25
@@ -94,7 +96,42 @@ def measure(number: int, episodes: int, seed: int, rover: str, **settings: Any) 
         cost = f"SPL {row.spl}, {row.collisions_per_km} collisions/km, {row.wh_per_km} Wh/km"
         say(f"rung {number} {name}: {percent(rows[name])}, {cost}, slip {row.slip}")
     about = {"commit": commit(), "seed": seed, "episodes": episodes, "settings": settings}
+    about["device"] = jax.devices()[0].device_kind
     return {**about, "wall_s": time.monotonic() - begin, "rows": rows}
+
+
+SEARCHED = {
+    "tall": (0.06, 0.3),
+    "half_width": (0.3, 0.7),
+    "horizon": (1.0, 4.5),
+    "turn_price": (0.05, 2.0),
+    "gain": (0.8, 3.0),
+    "near": (0.2, 1.2),
+    "patience": (1.5, 8.0),
+}
+"""Ranges of the reactive rule's settings, drawn from evenly in the logarithm."""
+
+
+def tune(number: int, settings: int, episodes: int, seed: int, rover: str, worlds: int) -> dict[str, Any]:
+    """Scores random settings of the reactive rule on a rung's training worlds, those it has now among them."""
+    begin = time.monotonic()
+    env = make_navigation(f"ladder/{number}", rover, worlds=worlds)
+    rng = np.random.default_rng(seed)
+    tried = [Reactive()]
+    for _ in range(settings - 1):
+        drawn = {k: math.exp(rng.uniform(math.log(low), math.log(high))) for k, (low, high) in SEARCHED.items()}
+        tried.append(Reactive(**drawn))
+    result = drive(env, env.params, [reactive_rule(env, s) for s in tried], episodes, seed)
+    rows = []
+    for i, one in enumerate(tried):
+        row = score({k: v[i] for k, v in result.items()}, env.control_interval)
+        # where nobody arrives, the way towards the goal tells settings apart
+        rows.append({"settings": dataclasses.asdict(one), "success": row.success, "return": row.episode_return})
+    rows.sort(key=lambda r: (r["success"], r["return"]), reverse=True)
+    for row in rows:
+        say(f"rung {number} reactive: {row}")
+    about = {"commit": commit(), "seed": seed, "episodes": episodes, "rover": rover, "worlds": worlds}
+    return {**about, "device": jax.devices()[0].device_kind, "wall_s": time.monotonic() - begin, "rows": rows}
 
 
 def main() -> None:
@@ -106,11 +143,17 @@ def main() -> None:
     parser.add_argument("--rover", default="luvmi_x")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/rl/ladder.json"))
     parser.add_argument("--worlds", type=int, default=0, help="side by side; as many as the rung says if 0")
+    parser.add_argument("--tune", type=int, default=0, help="how many settings of the reactive rule to try")
     args = parser.parse_args()
-    old = json.loads(args.out.read_text(encoding="utf-8"))["rungs"] if args.out.exists() else {}
+    old = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
+    old = {"rungs": {}, "tuned": {}, **old, "rover": args.rover}
     for number in args.rungs:
-        old[str(number)] = measure(number, args.episodes, args.seed, args.rover, worlds=args.worlds)
-        save(args.out.parent, args.out.stem, {"rover": args.rover, "rungs": old})
+        if args.tune:
+            tuned = tune(number, args.tune, args.episodes, args.seed, args.rover, args.worlds)
+            old["tuned"][str(number)] = tuned
+        else:
+            old["rungs"][str(number)] = measure(number, args.episodes, args.seed, args.rover, worlds=args.worlds)
+        save(args.out.parent, args.out.stem, old)
 
 
 if __name__ == "__main__":

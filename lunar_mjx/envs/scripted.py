@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.envs.core import Environment, State
+from lunar_mjx.envs.ladder.follower import Follower
 from lunar_mjx.envs.navigation.env import NavigationEnv, NavigationParams
 from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE
 from lunar_mjx.errors import bad_input
@@ -52,7 +53,7 @@ def make_agent(name: str, env: Environment, params: Any = None) -> Agent:
         remedy = f"use the action mode {' or '.join(modes)}"
         raise bad_input("agent", name, env.config.action, "is no action mode that it can drive in", remedy)
     if name == "reactive":
-        return _reactive(env)
+        return reactive_rule(env)
     if name == "planner":
         return _planner(env, env.params if params is None else params)
     return _driver(env)
@@ -118,7 +119,7 @@ def _wheels(env: NavigationEnv, drive: Any, steer: Any) -> Any:
     return jnp.pad(first, ((0, 0), (0, env.action_size - 2)))
 
 
-def _reactive(env: NavigationEnv, settings: Reactive | None = None) -> Agent:
+def reactive_rule(env: NavigationEnv, settings: Reactive | None = None) -> Agent:
     """Picks, of some headings, the one that is free for longest and nearest to the goal's; backs off where none is."""
     for block in ("height_scan", "waited"):
         if block not in env.blocks:
@@ -153,42 +154,15 @@ def _reactive(env: NavigationEnv, settings: Reactive | None = None) -> Agent:
 
 
 def _planner(env: NavigationEnv, params: NavigationParams) -> Agent:
-    """Follows the steepest descent of the distance to the goal over the planning grid."""
+    """Follows the way over the planning grid that is cheapest where room is dear."""
     if params.pool is None or params.side is None:
         raise bad_input(
             "agent", "planner", env.config.rung, "is no rung of the ladder", "use a task ladder/1 to ladder/5"
         )
-    pool, limit, stride = params.pool, _steering_limit(env), 4
-    count = pool.ways.shape[-1]
-    cell = pool.size / count
-    steps = [(j, i) for j in (-1, 0, 1) for i in (-1, 0, 1)]
+    follower, limit = Follower(params.pool), _steering_limit(env)
 
     def act(state: State, key: Any) -> Any:
-        inner = state.inner
-        way, world = pool.places.way[inner.place], pool.places.world[inner.place]
-        position = inner.physics.qpos[:, :2]
-        local = (position - pool.middles[world] + 0.5 * pool.size) / cell
-        node = jnp.clip(local.astype(jnp.int32), 0, count - 1)
-        column, row = node[:, 0], node[:, 1]
-        for k in range(stride):
-            # off the free nodes every node of the neighbourhood is tried, two cells wide
-            wide = 2 if k == 0 else 1
-            rows = jnp.stack([jnp.clip(row + wide * j, 0, count - 1) for j, _ in steps])
-            columns = jnp.stack([jnp.clip(column + wide * i, 0, count - 1) for _, i in steps])
-            best = jnp.argmin(pool.ways[way, rows, columns], axis=0)[None]
-            row, column = (jnp.take_along_axis(a, best, axis=0)[0] for a in (rows, columns))
-        aim = (jnp.stack([column, row], axis=-1) + 0.5) * cell - 0.5 * pool.size + pool.middles[world]
-        close = jnp.sum((inner.goal - position) ** 2, axis=-1) < (2.0 * cell) ** 2
-        to = jnp.where(close[:, None], inner.goal, aim) - position
-        w, x, y, z = (inner.physics.qpos[:, k] for k in (3, 4, 5, 6))
-        yaw = jnp.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
-        turn = jnp.arctan2(to[:, 1], to[:, 0]) - yaw
-        turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
-        # a point behind is reached by backing towards it, which turns the rover on little ground
-        back = jnp.abs(turn) > 1.9
-        turn = jnp.where(back, -jnp.sign(turn) * 1.0, turn)
-        waiting = inner.waited > 4.0
-        drive = jnp.where(back ^ waiting, -0.7, jnp.where(jnp.abs(turn) > 0.6, 0.6, 1.0))
-        return _wheels(env, drive, 1.5 * turn / limit)
+        drive, steer = follower.command(state.inner)
+        return _wheels(env, drive, steer / limit)
 
     return act

@@ -42,8 +42,10 @@ def passable(rung: Rung, world: World, half_width: float) -> tuple[Any, Any]:
     return free, free & (gap > room) & (slope < math.tan(0.7 * STEEPEST))
 
 
-def distances(free: Any, row: Any, column: Any, cell: float) -> Any:
+def distances(free: Any, row: Any, column: Any, cell: float, price: Any = 1.0) -> Any:
     """Length of the shortest way to a node over free nodes and their eight neighbours, m; infinite where there is none.
+
+    With a `price` of a metre at every node, (row, column), it is the cost of the cheapest way.
 
     The relaxation of Bellman and Ford for all nodes at once, until nothing changes. Ways bend by 45 deg at a time, so
     that they are up to 8 % longer than free ones.
@@ -57,7 +59,7 @@ def distances(free: Any, row: Any, column: Any, cell: float) -> Any:
         best = old
         for j, i, length in _STEPS:
             near = jax.lax.dynamic_slice(wide, (1 + j, 1 + i), free.shape)
-            best = jnp.minimum(best, near + length * cell)
+            best = jnp.minimum(best, near + length * cell * price)
         best = best + blocked
         return best, jnp.any(best < old)
 
