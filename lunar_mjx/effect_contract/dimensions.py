@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
-from typing import Any
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from types import ModuleType, SimpleNamespace
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import jax.numpy as jnp
 
@@ -209,6 +211,22 @@ def check_unit(unit: str) -> None:
     si_dimensions(match["unit"] if match else unit)
 
 
+def constants(modules: Sequence[ModuleType]) -> list[tuple[str, float, str]]:
+    """Constants with a unit, `NAME: Annotated[float, "W/m2/K4"] = 5.67e-8`: name, value and unit of each.
+
+    Raises:
+      ValueError: what is wrong with a unit.
+    """
+    found = []
+    for module in modules:
+        for name, hint in get_type_hints(module, include_extras=True).items():
+            if get_origin(hint) is Annotated and get_args(hint)[0] is float:
+                unit = get_args(hint)[1]
+                check_unit(unit)
+                found.append((name, getattr(module, name), unit))
+    return found
+
+
 class Rescaling:
     """Other base units: by what factor the number of a quantity changes.
 
@@ -220,6 +238,27 @@ class Rescaling:
     def __init__(self, factors: Mapping[str, float], effects: Sequence[Effect]):
         self.factors = {**dict.fromkeys(BASES, 1.0), **factors}
         self.effects = {e.name: e for e in effects}
+        own = {f.__module__ for e in effects for f in e.ports.values()}
+        self._modules = [m for n, m in list(sys.modules.items()) if n in own or n.startswith("lunar_mjx.effects.")]
+        self._constants = constants(self._modules)
+
+    @contextlib.contextmanager
+    def constants(self) -> Iterator[None]:
+        """Gives constants with a unit, in every module of effects that holds them, their numbers in the other units."""
+        held = [
+            (vars(module), name, value, value * self.of(unit))
+            for module in self._modules
+            for name, value, unit in self._constants
+            # by identity: two modules may give one name to two constants, and import one from another
+            if vars(module).get(name) is value
+        ]
+        try:
+            for names, name, _, other in held:
+                names[name] = other
+            yield
+        finally:
+            for names, name, value, _ in held:
+                names[name] = value
 
     def of(self, unit: str, n: Any = 1.0) -> Any:
         """Factor of a unit; `n` is the sinkage exponent where its power depends on it."""

@@ -260,7 +260,7 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
             "units",
             False,
             f"the result depends on the unit {told}: a number in the function stands for a "
-            "quantity; make it a parameter with that unit, or mend the unit of a parameter",
+            "quantity; make it a parameter or an Annotated constant with that unit, or mend the unit of a parameter",
         )
     largest = max([w for ports in worst.values() for w in ports.values()], default=0.0)
     return Check("units", bool(largest <= HOMOGENEITY), f"homogeneous to {largest:.1g} in other base units")
@@ -277,17 +277,16 @@ def _watched(effect: Effect, scales: Mapping[str, Rescaling], found: list[tuple[
             for label, scale in scales.items():
                 state = SimpleNamespace(**scale.state(effect, vars(x)))
                 mode = ctx.rover.mode
-                other = function(
-                    scale.value(ctx), scale.parameters(effect, p), state, scale.value(value, unit, mode=mode)
-                )
+                given = scale.value(ctx), scale.parameters(effect, p), state, scale.value(value, unit, mode=mode)
+                with scale.constants():
+                    other = function(*given)
                 want: Any = result
                 if effect.state and isinstance(result, tuple):
                     new, update = result
                     want = scale.value(new, unit, mode=mode), scale.state(effect, update, rates=True)
                 else:
                     want = scale.value(result, unit, mode=mode)
-                error, size = _differences(other, want)
-                found.append((label, port, error, size))
+                found.append((label, port, *_differences(other, want, _summed(effect, want))))
             return result
 
         return both
@@ -296,13 +295,22 @@ def _watched(effect: Effect, scales: Mapping[str, Rescaling], found: list[tuple[
     return dataclasses.replace(effect, ports=ports)
 
 
-def _differences(got: Any, want: Any) -> tuple[list[Any], list[Any]]:
-    """Largest difference and largest size of each number, leaf by leaf."""
+def _summed(effect: Effect, result: Any) -> Any:
+    """The result, with the sum itself in place of a state that keeps its rounding: the scale of what it may be off."""
+    if not (effect.state and isinstance(result, tuple)):
+        return result
+    value, update = result
+    return value, {name: update[effect.state[name].rounding_of or name] for name in update}
+
+
+def _differences(got: Any, want: Any, scale: Any) -> tuple[list[Any], list[Any]]:
+    """Largest difference of each number, and largest size of what it is held against, leaf by leaf."""
     pairs = list(zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True))
     pairs = [(jnp.asarray(a, float), jnp.asarray(b, float)) for a, b in pairs]
     # Equal infinities (a stop that is none) are no difference.
     errors = [jnp.max(jnp.where(a == b, 0.0, jnp.abs(a - b))) for a, b in pairs]
-    return errors, [jnp.max(jnp.where(jnp.isfinite(b), jnp.abs(b), 0.0)) for _, b in pairs]
+    sizes = [jnp.asarray(c, float) for c in jax.tree.leaves(scale)]
+    return errors, [jnp.max(jnp.where(jnp.isfinite(c), jnp.abs(c), 0.0)) for c in sizes]
 
 
 def _cost(cost: float, noise: float) -> Check:

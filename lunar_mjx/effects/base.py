@@ -13,7 +13,8 @@ A user's own effect is a Python file of about ten lines::
         return torque - p.torque * jnp.tanh(ctx.joint_speed / p.speed)
 
 `lunar-mjx effect test my_effects.py` checks what every effect promises: that it vanishes at its null values, has finite
-derivatives, holds in any base units (a bare 0.01 in place of `p.speed` would not), and costs little.
+derivatives, holds in any base units (a bare 0.01 in place of `p.speed` would not), and costs little. A constant of
+nature may stand in the file, if it says its unit: `SIGMA: Annotated[float, "W/m2/K4"] = 5.670374419e-8`.
 
 A port function takes the context, the effect's parameters `p`, its state `x` and the port's value, and returns the new
 value, or (new value, {state: new state}) where the effect owns state. It is written for one rover, elementwise over
@@ -94,6 +95,8 @@ class StateVariable:
       axis: "rover", "wheel" or "joint".
       rate: whether the port function returns its time derivative (integrated by the step) instead of its new value.
       slots: length of a leading axis beside that, for a memory of fixed size; 0 for none.
+      rounding_of: the state whose last sum's rounding this one keeps (Kahan's sum), so that it is zero but for that;
+        "" for none.
     """
 
     initial: float
@@ -102,6 +105,7 @@ class StateVariable:
     axis: str = "wheel"
     rate: bool = False
     slots: int = 0
+    rounding_of: str = ""
 
     def reset(self, like: Any) -> Any:
         """The state at reset; `like` is an array of zeros over its axis."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 
@@ -28,7 +28,7 @@ from lunar_mjx.pytree import pytree
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import inside, sample
 
-SLIP_SPEED_FLOOR = 2e-3
+SLIP_SPEED_FLOOR: Annotated[float, "m/s"] = 2e-3
 """Smallest denominator of the instantaneous slip, m/s; below it slip fades to zero."""
 
 EffectState = dict[str, dict[str, Any]]

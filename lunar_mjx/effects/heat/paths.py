@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 from lunar_mjx.effects.base import Parameter, effect
 
-STEFAN_BOLTZMANN = 5.670374419e-8
-"""W/m2/K4, CODATA 2018."""
+STEFAN_BOLTZMANN: Annotated[float, "W/m2/K4"] = 5.670374419e-8
+"""CODATA 2018."""
 
 
 def _winding_to_housing(ctx):

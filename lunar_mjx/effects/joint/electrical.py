@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import jax.numpy as jnp
 
@@ -10,7 +11,7 @@ from lunar_mjx.effects.base import Parameter, StateVariable, effect
 from lunar_mjx.effects.joint.friction import largest_damping
 from lunar_mjx.effects.joint.motor import constant_at, torque_per_ampere, winding_resistance
 
-BUS_VOLTAGE = 48.0
+BUS_VOLTAGE: Annotated[float, "V"] = 48.0
 """V; bus voltage at which `voltage_saturation.limit` is 1."""
 
 SHARPNESS = 8

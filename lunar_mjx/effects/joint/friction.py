@@ -10,14 +10,14 @@ heats nothing unless gear_friction_heat is in the list.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Parameter, effect
 from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
 
-_LEAST_INERTIA = 1e-3
+_LEAST_INERTIA: Annotated[float, "kg m2"] = 1e-3
 """kg m2 at a joint without a rotor's inertia."""
 
 

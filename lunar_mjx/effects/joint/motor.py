@@ -7,12 +7,13 @@ Motor data: maxon ECX TORQUE 22 XL with GPX 26 HP gearhead, catalogue values at 
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Effect, Parameter, StateVariable, effect
 
-REFERENCE_TEMPERATURE = 298.15
+REFERENCE_TEMPERATURE: Annotated[float, "K"] = 298.15
 """T_R0 of eqs. 6 and 7, K (25 degC): where the catalogue states resistance and torque constant."""
 
 WINDINGS = {

@@ -58,7 +58,7 @@ chassis_node = Effect(
     },
     state={
         "warmer": StateVariable(0.0, "K", "temperature above that at reset", axis="rover"),
-        "warmer_lost": StateVariable(0.0, "K", "rounding that its last sum lost", axis="rover"),
+        "warmer_lost": StateVariable(0.0, "K", "rounding that its last sum lost", axis="rover", rounding_of="warmer"),
     },
     replaces=("housing_conduction",),
     order=50,

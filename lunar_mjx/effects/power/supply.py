@@ -153,7 +153,7 @@ battery = Effect(
     },
     state={
         "used": StateVariable(0.0, "A s", "charge drawn since the reset", axis="rover"),
-        "used_lost": StateVariable(0.0, "A s", "rounding that its last sum lost", axis="rover"),
+        "used_lost": StateVariable(0.0, "A s", "rounding that its last sum lost", axis="rover", rounding_of="used"),
         "flat": StateVariable(0.0, "1", "1 while the motors are cut off", axis="rover"),
     },
     order=100,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import jax.numpy as jnp
 
@@ -61,7 +62,7 @@ def lateral_slip(contact):
     return contact.v_y / jnp.maximum(jnp.abs(contact.rim_speed), travel)
 
 
-_STILL = 2e-3
+_STILL: Annotated[float, "m/s"] = 2e-3
 """m/s; below it a wheel counts as standing, as for the slip ratio."""
 
 

@@ -7,6 +7,7 @@ Sources: Wong & Reece 1967 (normal stress under a rolling wheel), Janosi & Hanam
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import jax.numpy as jnp
 
@@ -19,7 +20,7 @@ _MAX_SINKAGE_RATIO = 1.5
 """The contact arc is followed up to an entrance angle of 120 deg; a wheel buried deeper keeps the force of that arc."""
 
 
-STANDSTILL_SPEED = 1e-3
+STANDSTILL_SPEED: Annotated[float, "m/s"] = 1e-3
 """m/s; below it a wheel counts as standing, and eq. 11's factor for braking, a ratio of speeds, has no meaning."""
 
 

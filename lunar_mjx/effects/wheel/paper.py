@@ -6,6 +6,7 @@ Every flaw is a parameter that goes from 0 (as printed) to 1 (mended), or an eff
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import jax.numpy as jnp
 
@@ -20,7 +21,7 @@ from lunar_mjx.effects.wheel.closed_form import (
 )
 from lunar_mjx.spatial import Vec3
 
-SPEED_FLOOR = 0.02
+SPEED_FLOOR: Annotated[float, "m/s"] = 0.02
 """Smallest denominator of eqs. 8 and 9 in the printed form, m/s."""
 
 REGULARISATIONS = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from lunar_mjx.effects.base import Parameter, effect
 from lunar_mjx.effects.wheel.closed_form import contact_with_soil, grounded, mean_decay, sin_difference
 from lunar_mjx.spatial import Vec3
 
-_STILL = 2e-3
+_STILL: Annotated[float, "m/s"] = 2e-3
 """m/s; below it a wheel counts as standing, as for the slip ratio."""
 _FLAT = 1e-3
 """Slip below which the root of two squares is rounded off."""
