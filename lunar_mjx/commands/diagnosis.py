@@ -124,8 +124,7 @@ def why(
         float, typer.Option(help="Minutes to spend on simulated logs like these: how often is it wrong?")
     ] = 0,
     seconds: Annotated[
-        float | None,
-        typer.Option(help="Begin no further refit after this many seconds; answer with what is known.", min=1.0),
+        float | None, typer.Option(help="Answer after this many seconds with what is known by then.", min=1.0)
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

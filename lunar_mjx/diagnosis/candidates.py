@@ -22,7 +22,9 @@ def usable(
         if name in present:
             continue
         replaced = ", ".join(sorted(present & set(effect.replaces)))
+        needed = ", ".join(n for n in effect.requires if n not in present and n not in candidates)
         reason = unfit(name, effect) or (f"would replace {replaced}" if replaced else "")
+        reason = reason or (f"needs {needed}, which the model lacks" if needed else "")
         if not reason and all(p.null is None for p in effect.parameters.values()):
             reason = "has no null value"
         if reason:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -151,12 +152,13 @@ def why(
 
     Args:
       folder: of the run. only: candidates to consider; all if None. progress: told what is being done.
-      seconds: after which the search begins no further refit; without, logs with imposed wheel speeds have
-        `windows.SECONDS` and others as long as it takes.
+      seconds: after which the answer is to be there, as far as it is known by then; without, logs with imposed wheel
+        speeds have `windows.SECONDS` and others as long as it takes.
 
     Raises:
       UserError: the folder is no run.
     """
+    began = time.monotonic()
     run = folder if isinstance(folder, Run) else load_run(folder)
     try:
         campaign = gate(run)
@@ -165,7 +167,8 @@ def why(
     if windows.imposed(campaign):
         return windows.why(run, campaign, only, windows.SECONDS if seconds is None else seconds, progress)
     problem = _problem(run, campaign, only, progress)
-    diagnosis, found = answer.diagnose(run, problem, progress, math.inf if seconds is None else seconds)
+    left = math.inf if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
+    diagnosis, found = answer.diagnose(run, problem, progress, left)
     if found is not None:
         own = problem.own
         rows = {"refitted": found.base(own.name).refit.u}

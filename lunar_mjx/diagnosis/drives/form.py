@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy import linalg
@@ -18,6 +18,7 @@ from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import SHARES, WORDS, Usual, rotated
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
 from lunar_mjx.effects.sensor.channels import family
+from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Refit, Term
@@ -25,6 +26,8 @@ from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Re
 OWN_FORM = "the model"
 _SHARES = (1.0, 0.5, 0.2, 0.05)
 """Shares of a step that are simulated side by side, as far as they fit into one batch."""
+_TOGETHER = 8
+"""Candidates whose signatures one program simulates: fewer are faster per rover, more are fewer programs to make."""
 
 
 class DriveForm(MeasuredForm):
@@ -94,33 +97,46 @@ class DriveForm(MeasuredForm):
         return value, np.where(np.isfinite(slopes), slopes, 0.0)
 
     def _see(self, u: np.ndarray) -> None:
-        """Takes the signatures of all candidates and unknown inputs at a refit of the model as it is."""
-        self.progress("signatures of all candidates", 0.0)
+        """Takes the signatures of all candidates and unknown inputs at a refit of the model as it is.
+
+        Candidates for which the time does not suffice are `skipped`: they have no signature.
+
+        Raises:
+          TimeUp: not even the unknown inputs were simulated.
+        """
         count = len(self.coordinates)
         seen = np.zeros((len(self.observations), count + len(self._inputs)))
-        amplitudes = [int(i) for p in self.candidates.values() for i in p if self.coordinates[i].amplitude]
-        rows, steps = [self._whole(u)], []
-        for i in amplitudes:
-            low, high = self.coordinates[i].bounds()
-            step = self.settings.secant if high > 0.0 else -self.settings.secant
-            step = float(np.clip(step, 0.5 * low, 0.5 * high))
-            rows.append(self._whole(u))
-            rows[-1][i] = step
-            steps.append(step)
+        names = list(self.candidates)
+        parts = [names[at : at + _TOGETHER] for at in range(0, len(names), _TOGETHER)]
+        self.progress("signatures of unknown inputs", 0.0)
         # to first order in inputs of a hundredth of what is usual
         scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])
-        small = 1e-3 * self._size / scales
-        for i, step in zip(self._inputs, small, strict=True):
-            rows.append(self._whole(u))
-            rows[-1][i] = step
-        values = self.drives.predict(np.array(rows))
+        seen[:, count:] = self._changes(u, self._inputs, 1e-3 * self._size / scales) / 1e-3  # of a field of size 1
+        for number, part in enumerate(parts):
+            self.progress("signatures of all candidates", (number + 1) / (len(parts) + 1))
+            amplitudes = [i for e in part for i in self.candidates[e] if self.coordinates[i].amplitude]
+            steps = np.array([self._secant(i) for i in amplitudes])
+            try:
+                seen[:, amplitudes] = self._changes(u, amplitudes, steps) / steps
+            except TimeUp:
+                self.skipped = tuple(names[names.index(part[0]) :])
+                break
+        self._seen = seen
+
+    def _secant(self, i: int) -> float:
+        """Amount of a candidate's amplitude over which its signature is taken."""
+        low, high = self.coordinates[i].bounds()
+        step = self.settings.secant if high > 0.0 else -self.settings.secant
+        return float(np.clip(step, 0.5 * low, 0.5 * high))
+
+    def _changes(self, u: np.ndarray, which: Sequence[int] | np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """(n, m) changes of the predictions by a step of each of some coordinates alone; 0 where a rover diverged."""
+        rows = np.repeat(self._whole(u)[None], 1 + len(which), axis=0)
+        rows[1 + np.arange(len(which)), which] = steps
+        values = self.drives.predict(rows)
         change = values[1:] - values[:1]
         change[~np.isfinite(change).all(axis=1)] = 0.0
-        many = len(amplitudes)
-        for i, step, column in zip(amplitudes, steps, change[:many], strict=True):
-            seen[:, i] = column / step
-        seen[:, count:] = change[many:].T / 1e-3  # of a field of size 1
-        self._seen = seen
+        return change.T
 
     def _field_columns(self) -> tuple[np.ndarray, np.ndarray]:
         """Whitened columns (n, m) of all fields at size 1, and the field (m,) of each: in common, and of every log."""
@@ -208,8 +224,16 @@ class DriveForm(MeasuredForm):
 
     # --- refits ------------------------------------------------------------------------------------------------------
 
+    def limit(self, until: float) -> None:
+        """See `MeasuredForm`."""
+        self.drives.bench.deadline.until = until
+
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
-        """See `Form`; Gauss-Newton under the covariance of noise and discrepancy, by steps of a shared length."""
+        """See `Form`; Gauss-Newton under the covariance of noise and discrepancy, by steps of a shared length.
+
+        Raises:
+          TimeUp: before the refit had ended; that of the model as it is counts from wherever it has come.
+        """
         free = self._free(effects)
         u = self.origin()
         given = start if start is not None else None if near is None else near.u
@@ -298,6 +322,7 @@ class DriveForm(MeasuredForm):
 
         Raises:
           EvidenceError: the simulation diverged at the start.
+          TimeUp: before the descent of some effects had ended, or before that of the model as it is had begun.
         """
         fit, settings = self._fit, self.settings
         noise = np.ones(len(self.noise_names)) if sizes is None else sizes[1]
@@ -345,7 +370,12 @@ class DriveForm(MeasuredForm):
                 step *= min(1.0, settings.longest_step / float(np.abs(step).max()))
                 rows = np.repeat(u[None], many, axis=0)
                 rows[:, free] = np.clip(u[free] + np.outer(_SHARES[:many], step), low, high)
-                values = self.drives.predict(self._whole(rows))
+                try:
+                    values = self.drives.predict(self._whole(rows))
+                except TimeUp:
+                    if not set(self.baseline) >= set(free):
+                        raise
+                    return u, slopes
                 residuals = [white(self.observations.value - v) for v in values]
                 reached = [chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
                 best = int(np.argmin(reached))
@@ -357,7 +387,12 @@ class DriveForm(MeasuredForm):
                     break
             if not guessed and (promised < settings.settled or first - here < settings.settled):
                 break
-            slopes, guessed = self.jacobian(u, free)[1], False
+            try:
+                slopes, guessed = self.jacobian(u, free)[1], False
+            except TimeUp:
+                if not set(self.baseline) >= set(free):
+                    raise
+                return u, slopes
         return u, slopes
 
 

@@ -21,14 +21,17 @@ from lunar_mjx.diagnosis.runs import (
     Run,
 )
 from lunar_mjx.diagnosis.verdict import Diagnosis, EffectEvidence, Verdict
-from lunar_mjx.diagnosis.weighed.conclusion import conclude, label, probabilities, title
+from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, label, probabilities, title
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm, Problem
 from lunar_mjx.files import replacing
+from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Refit
 from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, Hypothesis, ModelSearch, search
 
+_WRITING = 0.1
+"""1; share of the time given that is kept for writing the answer."""
 _SPLITS = {
     "fit": ("fit",),
     "select": ("select",),
@@ -70,9 +73,10 @@ def diagnose(
 
     Args:
       run: to write to. problem: to be explained. progress: told of every refit.
-      seconds: after which no further refit begins; a verdict is then written after every refit, as provisional.
+      seconds: after which the answer is to be there, as far as it is known then; a verdict is then written after every
+        refit, too, as provisional.
     """
-    settings, begin = problem.settings, time.monotonic()
+    settings, end = problem.settings, time.monotonic() + (1.0 - _WRITING) * seconds
 
     def provisional(found: ModelSearch) -> None:
         # with a limit the next refit may never come, and what is known by then is the answer
@@ -80,6 +84,8 @@ def diagnose(
             best = next(h for h in found.hypotheses if h.refitted)
             run.save(VERDICT_FILE, {**_diagnosis(problem, found, best).to_dict(), "provisional": True})
 
+    for form in problem.forms:
+        form.limit(end)
     try:
         # Matrices of some hundred rows are factored faster by one thread than by several that wait for each other.
         with threadpool_limits(1, "blas"):
@@ -89,11 +95,17 @@ def diagnose(
                 settings.most_terms,
                 settings.window,
                 progress,
-                lambda: time.monotonic() - begin > seconds,
+                lambda: time.monotonic() > end,
                 provisional,
             )
+    except TimeUp:
+        said = f"{seconds:.0f} s did not suffice to refit the model as it is, so nothing is said; give more --seconds."
+        return Diagnosis(Verdict.UNDECIDABLE, (), said), None
     except EvidenceError as error:
         return Diagnosis(Verdict.BAD_FIT, (), f"The solver failed ({error}), so nothing is said about physics."), None
+    finally:
+        for form in problem.forms:
+            form.limit(math.inf)
     own = problem.own
     if not any(h.form == own.name for h in found.hypotheses):
         return Diagnosis(Verdict.BAD_FIT, (), f"The solver failed ({'; '.join(found.failed)})."), None
@@ -264,6 +276,9 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         sentence += f" What remains is {tail}."
     if not found.complete:
         sentence += " The search ended by its time or its number of refits: what it did not refit is an estimate."
+    skipped = problem.own.skipped
+    if skipped:
+        said, sentence = _without(said, sentence, skipped)
     gain, se, units = _held_out(found, best, own)
     inclusion = found.inclusion()
     evidence, undecidable = _evidence(problem, found, said.effects)
@@ -291,6 +306,7 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
             "search": {
                 "refits": found.refits,
                 "complete": found.complete,
+                "skipped": list(skipped),
                 "failed": list(found.failed),
                 "hypotheses": len(found.hypotheses),
             },
@@ -300,6 +316,19 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
             "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
         },
     )
+
+
+def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[Conclusion, str]:
+    """A conclusion and its sentence where the time did not suffice to look at some candidates.
+
+    That nothing is missing stands, for it has been held against unknown inputs at all ports. That something is missing
+    stands, too, but not what: a candidate that was not looked at may be that.
+    """
+    rest = f" Not looked at in the time given: {', '.join(skipped)}; give more --seconds."
+    if said.verdict is Verdict.NOISE_ONLY:
+        return said, sentence + rest
+    said = dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=())
+    return said, "Of what was looked at: " + sentence + rest
 
 
 def _averaged(form: MeasuredForm, found: ModelSearch) -> dict[str, dict[str, Any]]:
@@ -351,7 +380,9 @@ def _evidence(
                     )
         others = {e: v for e, v in cosines.get(name, {}).items() if e != name}
         nearest = max(others.items(), key=lambda item: item[1]) if others else ("", 0.0)
-        if length < LEAST_SIGNAL:
+        if name in problem.own.skipped:
+            status, reason = "not tested", "the time did not suffice to look at it"
+        elif length < LEAST_SIGNAL:
             status, reason = "not tested", f"would show with {length:.2g} sigma after a refit"
         elif name in named:
             status, reason = "accepted", f"probability {p:.3f}"

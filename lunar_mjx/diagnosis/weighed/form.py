@@ -95,6 +95,7 @@ class MeasuredForm(Form):
       candidates: places by effect that may be missing.
       words: fields of discrepancy, and what is "good to so many per cent" in the user's words.
       shares: what a field's size is "good to", over that size, where not 1.
+      skipped: candidates that the time did not suffice to look at.
     """
 
     observations: Observations
@@ -103,10 +104,15 @@ class MeasuredForm(Form):
     candidates: Mapping[str, np.ndarray]
     words: Mapping[str, str]
     shares: Mapping[str, float] = MappingProxyType({})
+    skipped: tuple[str, ...] = ()
 
     @abc.abstractmethod
     def predicted(self, u: np.ndarray) -> np.ndarray:
         """(n,) predictions in SI units at (coordinates,)."""
+
+    def limit(self, until: float) -> None:
+        """Ends simulations by a time of the monotonic clock, where they last: refits then raise `TimeUp`."""
+        del until
 
     def corrected(self, best: Hypothesis) -> tuple[np.ndarray, np.ndarray] | None:
         """Predictions (n,) and whitened residuals (n,) with what is learnt of discrepancy, where a form can tell."""

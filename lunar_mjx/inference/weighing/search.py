@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import Evidence, EvidenceError
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Form, Refit, Term
 
@@ -117,13 +118,14 @@ def search(
       provisional: given what is known after every refit but the first.
 
     Raises:
-      EvidenceError: no form could be fitted.
+      EvidenceError: no form could be fitted. TimeUp: before the first one was.
     """
     known: dict[tuple[str, Terms], Hypothesis] = {}
     done: dict[tuple[str, frozenset[str]], Refit | None] = {}
     failed: list[str] = []
     reasons: list[str] = []
     by_name = {form.name: form for form in forms}
+    over = False
 
     def refit(form: Form, effects: frozenset[str], near: Hypothesis | None, trial: str = "") -> None:
         label = form.name + "".join(f" + {e}" for e in sorted(effects))
@@ -133,6 +135,12 @@ def search(
             start = form.trial(start, trial)
         try:
             made = form.refit(effects, near.refit if near else None, start)
+        except TimeUp:
+            if not known:
+                raise
+            nonlocal over
+            over = True
+            return
         except (EvidenceError, ValueError, np.linalg.LinAlgError) as error:
             done[form.name, effects] = None
             failed.append(label)
@@ -161,7 +169,7 @@ def search(
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
         return ModelSearch(tuple(order), weight / weight.sum(), len(done), tuple(reasons), complete)
 
-    while len(done) < most_refits and not stop():
+    while len(done) < most_refits and not over and not stop():
         # Unlisted inputs are linear and need no refit; effects are not, and gain by theirs. What is unlisted closes the
         # door on no effect before that has been refitted.
         listed = [h for h in known.values() if not any(t.kind == UNLISTED for t in h.terms)]

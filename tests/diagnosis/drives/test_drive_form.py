@@ -13,7 +13,9 @@ from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotated
 from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.diagnosis.weighed.answer import _without
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
+from lunar_mjx.inference.deadline import Deadline, TimeUp
 from lunar_mjx.inference.weighing.search import search
 from tests.inference.toy_problem import coordinate, manoeuvres
 
@@ -132,3 +134,65 @@ def test_fields_are_relative_to_what_is_usual():
     assert USUAL.size("motor_torque", "direction") == pytest.approx(0.4)
     assert USUAL.size("motor_torque", "squared joint speed") == pytest.approx(0.4 * 4.0 / 2.0**2)
     assert USUAL.size("soil: stiffness", "slip") == pytest.approx(1.0)
+
+
+class Hurried(Toy):
+    """A toy whose time is over when some effect is first moved, or in the refit after so many calls."""
+
+    late: str = ""
+    refits_too = False
+
+    def predict(self, u):
+        (place,) = self.candidates[self.late] if self.late else (0,)
+        if self.late and np.any(np.atleast_2d(u)[:, place]):
+            raise TimeUp
+        return super().predict(u)
+
+    def jacobian(self, u, which):
+        if self.refits_too and len(which) > len(self.baseline):
+            raise TimeUp
+        return super().jacobian(u, which)
+
+
+def test_candidates_without_time_are_skipped_and_told(monkeypatch):
+    monkeypatch.setattr(module, "_TOGETHER", 1)
+    toy = Hurried({"a": 0.5, "drag": 0.9})
+    toy.late = "lag"
+    form, _, said = asked(toy)
+    assert form.skipped == ("lag", "idle")
+    assert said.effects == ("drag",)
+    told, sentence = _without(said, said.sentence, form.skipped)
+    assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
+    assert sentence.startswith("Of what was looked at: drag is missing")
+    assert "lag, idle; give more --seconds" in sentence
+    quiet, _ = _without(asked(Toy({"a": 0.5}))[2], "Nothing.", form.skipped)
+    assert quiet.verdict is Verdict.NOISE_ONLY
+
+
+def test_a_refit_without_time_leaves_the_linear_estimate():
+    toy = Hurried({"a": 0.5, "drag": 0.9})
+    toy.refits_too = True
+    _, found, said = asked(toy)
+    assert not found.complete
+    assert found.refits == 1
+    assert said.effects == ("drag",), "the linear estimate tells it, too"
+
+
+def test_without_time_for_the_model_as_it_is_nothing_is_said():
+    toy = Hurried({"a": 0.5})
+    toy.jacobian = _over
+    with pytest.raises(TimeUp):
+        asked(toy)
+
+
+def _over(u, which):
+    raise TimeUp
+
+
+def test_a_deadline_ends_what_needs_longer():
+    Deadline().check(1e9)
+    Deadline(60.0).check(1.0)
+    with pytest.raises(TimeUp):
+        Deadline(60.0).check(61.0)
+    with pytest.raises(TimeUp):
+        Deadline(-1e-3).check()

@@ -96,7 +96,7 @@ def test_another_model_or_bench_or_time_step_is_not_answered_from_what_is_known(
     rubbing = origin.copy()
     rubbing[0, problem.candidates["coulomb_friction"]] = 0.3
     problem.predict(np.concatenate([origin, rubbing]))
-    assert runs[-1][0] == runs[0][0] + len(CANDIDATES) + 1  # with all candidates and the unknown inputs
+    assert runs[-1][0] == runs[0][0] + 1  # with the candidate that moves, and no other
     assert runs[-1][2] == 2  # and the origin anew, since differences are taken within one program
     assert problem.step_error == pytest.approx(-model.timestep)
     assert runs[-1][1:] == (0.5 * model.timestep, 1)
@@ -147,3 +147,24 @@ def test_old_rows_go_first_when_memory_is_spent():
     assert known.get((0,)) is not None
     known.keep((3,), np.zeros(1))
     assert [k for k in range(4) if (k,) in known] == [0, 2, 3]
+
+
+def test_a_program_holds_what_moves_and_what_that_needs(logs, runs):
+    model = make_model("luvmi_x", terrain="flat")
+    plain = [n for n in ("rim_contact", "ruts") if n in model.effect_names]
+    assert not plain
+    problem = DriveProblem(logs, model, {n: catalogue.get(n) for n in (*CANDIDATES, "rim_contact", "ruts")})
+    origin = problem.origin()
+
+    def held(*names):
+        rows = origin[None].copy()
+        for name in names:
+            rows[0, problem.candidates[name]] = 0.1
+        return set(problem._bench_for(rows).model.effect_names) - set(model.effect_names)
+
+    assert held() == set()
+    assert held("ruts") == {"ruts", "rim_contact"}
+    assert held("coulomb_friction", "viscous_friction") == {"coulomb_friction", "viscous_friction"}
+    assert held("viscous_friction") == {"coulomb_friction", "viscous_friction"}, "the smallest that is there already"
+    alone = DriveProblem(logs, model, {"ruts": catalogue.get("ruts")})
+    assert [n.reason for n in alone.not_tested] == ["needs rim_contact, which the model lacks"]

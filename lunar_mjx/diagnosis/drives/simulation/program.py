@@ -7,6 +7,7 @@ import functools
 import itertools
 import math
 import os
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,6 +20,7 @@ from lunar_mjx.dynamics import System, build
 from lunar_mjx.dynamics.signals import measure
 from lunar_mjx.dynamics.state import Params
 from lunar_mjx.inference.coordinates import NUISANCE
+from lunar_mjx.inference.deadline import Deadline
 from lunar_mjx.model import Model
 
 Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
@@ -31,6 +33,15 @@ _FEWEST = 64
 
 
 _NUMBERS = itertools.count()
+
+
+class _Compiling:
+    """How long the last program of this process took until its first piece, s: what the next one will need."""
+
+    seconds = 0.0
+
+
+_compiling = _Compiling()
 
 
 class Program:
@@ -91,11 +102,18 @@ class Program:
         moving = moving.at[self._joint_dofs].set(jnp.where(jnp.isnan(spin), moving[self._joint_dofs], spin))
         return dataclasses.replace(state, qvel=jnp.where(motion["moves"], moving, state.qvel))
 
-    def __call__(self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int) -> np.ndarray:
+    def __call__(
+        self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int, deadline: Deadline
+    ) -> np.ndarray:
         """(rovers, channels, time) of rovers by their log (place in `logs`) and their row of `values`.
 
         The first `count` are wanted, and few beyond them come back from the device.
+
+        Raises:
+          TimeUp: the deadline passed, or comes before the program could be compiled.
         """
+        deadline.check(0.0 if self.compiled else _compiling.seconds)
+        began, first = time.monotonic(), not self.compiled
         params, start = logs.rovers(log, row, values)
         commands = logs.commands[log]
         self.compiled = True
@@ -109,8 +127,13 @@ class Program:
                 state = self._set_moving(state, {name: a[log] for name, a in logs.motion.items()})
             seen = []
             for at in range(0, commands.shape[1], self.segment):
+                if math.isfinite(deadline.until):
+                    jax.block_until_ready(state)  # else all pieces are under way before the first has ended
+                    deadline.check()
                 state, telemetry = self._drive(full, state, commands[:, at : at + self.segment], shared=shared)
                 seen.append(telemetry)
+                if first and not at:
+                    _compiling.seconds = time.monotonic() - began
             found = self._measure(full, seen, shared=shared)
             size = max(_FEWEST, 1 << (count - 1).bit_length())
             return np.asarray(found if size >= len(log) else _first(found, size))

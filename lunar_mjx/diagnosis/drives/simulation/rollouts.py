@@ -16,6 +16,7 @@ from lunar_mjx.diagnosis.drives.simulation.program import Logs, Program, Rows, c
 from lunar_mjx.diagnosis.drives.simulation.simulated_rows import stamp
 from lunar_mjx.dynamics.state import Ambient, Params
 from lunar_mjx.effects.sensor.channels import EULER
+from lunar_mjx.inference.deadline import Deadline
 from lunar_mjx.inference.fitting import Progress
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.model import Model
@@ -34,7 +35,7 @@ _MOST_PROGRAMS = 32
 
 
 class Bench:
-    """All logs of a campaign, grouped by what one program can run.
+    """All logs of a campaign, grouped by what one program can run, until their `deadline`.
 
     Args:
       model: under no log's conditions. logs: of one rover. chunk: rovers simulated at once. engine: of the dynamics.
@@ -53,6 +54,7 @@ class Bench:
         self.runs = _alike(runs)
         self.params = [_params(run.model) for run in self.runs]
         self._stacked: list[Logs] | None = None
+        self.deadline = Deadline() if like is None else like.deadline
 
     def halved(self) -> Bench:
         """The same with half the time step."""
@@ -63,7 +65,7 @@ class Bench:
             dataclasses.replace(r, model=r.model.replace(timestep=0.5 * r.model.timestep), every=2 * r.every)
             for r in self.runs
         ]
-        other.params, other._stacked = self.params, None
+        other.params, other._stacked, other.deadline = self.params, None, self.deadline
         return other
 
     @functools.cached_property
@@ -118,7 +120,11 @@ class Bench:
     def run(
         self, rows: int, values: Rows, observations: Observations, progress: Progress
     ) -> Iterator[tuple[int, slice, np.ndarray]]:
-        """Simulates all logs with all rows and yields (log, rows, (rows, samples) of the log's observations)."""
+        """Simulates all logs with all rows and yields (log, rows, (rows, samples) of the log's observations).
+
+        Raises:
+          TimeUp: the deadline passed.
+        """
         places = _places(self.runs, observations)
         done = 0
         for logs in self._groups():
@@ -143,7 +149,7 @@ class Bench:
 
         def one(part: np.ndarray) -> np.ndarray:
             full = np.concatenate([part, np.repeat(part[-1:], self.chunk - len(part), axis=0)])
-            return logs.program(logs, full[:, 0], full[:, 1], values, len(part))
+            return logs.program(logs, full[:, 0], full[:, 1], values, len(part), self.deadline)
 
         workers = cores() if jax.default_backend() == "cpu" else 1
         if workers < 2 or len(parts) < 2 or not logs.program.compiled:
