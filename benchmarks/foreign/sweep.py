@@ -99,12 +99,15 @@ def _compile(law: str) -> None:
 
 
 def jobs(which: str, seed: int, tables: int, every: int) -> list[Job]:
-    """All cases, then twins of every so many, with other stated noise."""
+    """All cases in the order of the plan, each of every so many followed by its twins with other stated noise."""
     from .__main__ import TWINS
 
-    plan = [(which, seed, n, group, hidden) for n, (group, hidden) in enumerate(cases.plan(which, tables))]
-    found: list[Job] = [(*p, "", 1.0) for p in plan]
-    return found + [(*p, w, f) for p in plan[:: max(every, 1)] for w, f in TWINS.items() if every]
+    found: list[Job] = []
+    for n, (group, hidden) in enumerate(cases.plan(which, tables)):
+        found.append((which, seed, n, group, hidden, "", 1.0))
+        if every and n % every == 0:
+            found += [(which, seed, n, group, hidden, word, factor) for word, factor in TWINS.items()]
+    return found
 
 
 def sweep(args: argparse.Namespace) -> None:
