@@ -83,13 +83,13 @@ class TableSettings(SearchSettings):
     # --- effort ------------------------------------------------------------------------------------------------------
     most_refits: int = 30
     """1; refits of a search: most tables need 3 to 9, a real wheel with seven effects some 25."""
-    most_rounds: int = 4
-    """1; rounds of refit and re-linearisation."""
+    most_rounds: int = 10
+    """1; rounds of refit and re-linearisation: most refits need 2 or 3."""
     settled: float = 0.3
     """nat; change of log evidence by a round below which a refit has settled."""
-    fit_tolerance: float = 1e-4
-    """1; relative fall of the refit's cost below which it ends: less than 0.1 of chi-square at the noise."""
-    most_evaluations: int = 12
+    fit_settled: float = 0.02
+    """nat; what a step still promises below which a round's descent has arrived."""
+    most_evaluations: int = 20
     """1; evaluations of one round of a refit."""
 
     @property

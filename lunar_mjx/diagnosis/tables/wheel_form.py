@@ -8,13 +8,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg
 
 from lunar_mjx.diagnosis.tables.noise import scatter
 from lunar_mjx.diagnosis.tables.port_gains import ADDED, DRAWN, FIELDS, GAINS, Gain
 from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE, Imposed, WheelProgram
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
+from lunar_mjx.inference.bounded_descent import minimise
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
 from lunar_mjx.inference.observations import Observations
@@ -351,7 +352,11 @@ class WheelForm(MeasuredForm):
         return (np.column_stack(columns), np.array(std), {n: np.flatnonzero([o == n for o in of]) for n in names})
 
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
-        """See `Form`; Gauss-Newton with a trust region under the covariance of noise, calibration and discrepancy."""
+        """See `Form`; Levenberg-Marquardt under the covariance of noise, calibration and discrepancy.
+
+        The sizes of these are inferred anew where a descent has ended, and the next begins there, as long as the
+        evidence rises: discrepancies are shares of what is predicted, so that no single function is descended.
+        """
         settings = self.settings
         free = np.concatenate([self.baseline, *(p for e, p in self.candidates.items() if e in effects)]).astype(int)
         u = np.zeros(len(self.coordinates))
@@ -359,19 +364,23 @@ class WheelForm(MeasuredForm):
             u[free] = start[free]
         elif near is not None:
             u[free] = near.u[free]
-        pairs = np.array([self.coordinates[i].bounds() for i in free], float).reshape(-1, 2)
-        u[free] = np.clip(u[free], *(pairs.T + np.array([[1e-9], [-1e-9]])))
+        bounds = np.array([self.coordinates[i].bounds() for i in free], float).reshape(-1, 2)
+        u[free] = np.clip(u[free], *(bounds.T + np.array([[1e-9], [-1e-9]])))
         terms = frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
-        sizes, before, failed = None, -np.inf, ""
         linear, columns, _ = self.linearise(u)
+        value, found, _ = linear.evidence(terms)
+        best = None
         for _ in range(settings.most_rounds):
-            value, found, _ = linear.evidence(terms, sizes)
-            if abs(value - before) < settings.settled:
-                break
-            before, sizes = value, (found.tau, found.noise)
-            u, failed = self._descend(u, free, pairs, linear, columns, sizes)
+            u = self._descend(u, free, bounds, linear, columns, (found.tau, found.noise))
             linear, columns, _ = self.linearise(u)
-        return Refit(self.name, effects, u, linear, failed)
+            value, found, _ = linear.evidence(terms, (found.tau, found.noise))
+            gained = np.inf if best is None else value - best[0]
+            if gained > 0.0:
+                best = value, Refit(self.name, effects, u, linear)
+            if gained < settings.settled:
+                break
+        assert best is not None
+        return best[1]
 
     def _descend(
         self,
@@ -381,8 +390,8 @@ class WheelForm(MeasuredForm):
         linear: Linear,
         columns: np.ndarray,
         sizes: tuple[np.ndarray, np.ndarray],
-    ) -> tuple[np.ndarray, str]:
-        """The most probable coordinates at given sizes of discrepancy and noise, and why the solver failed or ""."""
+    ) -> np.ndarray:
+        """The most probable coordinates at given sizes of discrepancy and noise."""
         fit, group = self._fit, self.noise_group()[self._fit]
         count = len(self.coordinates)
         tau, noise = sizes
@@ -394,42 +403,24 @@ class WheelForm(MeasuredForm):
         factor = linalg.cholesky(covariance, lower=True, check_finite=False)
         std = linear.amplitudes.std[free]
         centre = np.array([self.coordinates[i].centre for i in free])
-        kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
         def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            key = x.tobytes()
-            if key not in kept:
-                place = u.copy()
-                place[free] = x
-                value, slope = self.predict(place)
-                whole = np.column_stack([self.data.observations.value - value, -slope[:, free]])
-                white = self.data.observations.whiten(whole)[fit]
-                white = np.where(np.isfinite(white), white, 1e6)
-                solved = linalg.solve_triangular(factor, white, lower=True, check_finite=False)
-                kept.clear()
-                kept[key] = (
-                    np.concatenate([solved[:, 0], (x - centre) / std]),
-                    np.vstack([solved[:, 1:], np.diag(1.0 / std)]),
-                )
-            return kept[key]
+            place = u.copy()
+            place[free] = x
+            value, slope = self.predict(place)
+            whole = np.column_stack([self.data.observations.value - value, -slope[:, free]])
+            white = self.data.observations.whiten(whole)[fit]
+            if not np.isfinite(white).all():
+                return np.full(len(white) + len(free), np.nan), np.full((len(white) + len(free), len(free)), np.nan)
+            solved = linalg.solve_triangular(factor, white, lower=True, check_finite=False)
+            prior = (x - centre) / std
+            return np.concatenate([solved[:, 0], prior]), np.vstack([solved[:, 1:], np.diag(1.0 / std)])
 
-        x = np.clip(u[free], bounds[:, 0] + 1e-9, bounds[:, 1] - 1e-9)
-        slopes: Any = lambda x: at(x)[1]  # noqa: E731
-        answer = optimize.least_squares(
-            lambda x: at(x)[0],
-            x,
-            slopes,
-            (bounds[:, 0], bounds[:, 1]),
-            method="trf",
-            x_scale="jac",
-            ftol=self.settings.fit_tolerance,
-            xtol=1e-8,
-            gtol=1e-8,
-            max_nfev=self.settings.most_evaluations,
-        )
         out = u.copy()
-        out[free] = answer.x
-        return out, "" if answer.status >= 0 else str(answer.message)
+        out[free] = minimise(
+            at, u[free], bounds[:, 0], bounds[:, 1], 2.0 * self.settings.fit_settled, self.settings.most_evaluations
+        )
+        return out
 
 
 def _instrument(abscissa: str) -> str:
