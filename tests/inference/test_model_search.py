@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
-from lunar_mjx.inference.evidence import EvidenceError
-from lunar_mjx.inference.weighing.hypotheses import shifted
+from lunar_mjx.inference.evidence import EvidenceError, Gram, NoiseSize
+from lunar_mjx.inference.weighing.hypotheses import EFFECT, Term, shifted
 from lunar_mjx.inference.weighing.search import search
-from tests.inference.toy_form import EFFECTS, ToyForm, X, measured
+from tests.inference.toy_form import EFFECTS, NOISE, ToyForm, X, curve, measured
 
 
 def look(value, **more):
@@ -79,3 +81,20 @@ def test_leaving_an_effect_out_agrees_with_its_null():
     keep = [0, 1, 2, 3, 4, 14]  # the gauge's column is the curve itself, which has moved
     at = np.ix_(keep, keep)
     np.testing.assert_allclose(moved.matrix[0][at], null.matrix[0][at], rtol=1e-5, atol=0.1)
+
+
+def test_judged_measurements_weigh_as_if_they_had_been_fitted():
+    """With sizes known, the evidence of one half and the prediction of the other are the evidence of both."""
+    whole = ToyForm(measured(4, wave=0.8)).refit(frozenset({"wave"}), None, None).linear
+    known = dataclasses.replace(whole, fields=(), noises=(NoiseSize("y", 1e-4),), always=np.r_[0, 1, 5])
+    u = np.array([0.5, -0.4, 0.0, 0.8, 0.0])
+    step = 1e-6 * np.eye(5)
+    own = np.stack([(curve(u + h) - curve(u - h)) / 2e-6 for h in step], axis=1)
+    columns = np.column_stack([own, curve(u), np.zeros((len(X), 8))]) / NOISE
+    rows = (measured(4, wave=0.8) - curve(u)) / NOISE
+    half = np.arange(len(X)) % 3 > 0
+    parts = [Gram.of(columns[k], rows[k]) for k in (half, ~half)]
+    for terms in (frozenset[Term](), frozenset({Term("wave", EFFECT, 0.0)})):
+        both = dataclasses.replace(known, gram=parts[0] + parts[1]).evidence(terms)[0]
+        split = dataclasses.replace(known, gram=parts[0], judged=parts[1]).evidence(terms)[0]
+        assert split == pytest.approx(both, rel=1e-5)

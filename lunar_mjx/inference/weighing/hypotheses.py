@@ -51,6 +51,7 @@ class Linear:
       fields: discrepancies. noises: of the noise groups.
       wide: scale of tau's prior where something unlisted acts at a port. far: factor on the prior of an instrument that
         errs more than usual.
+      judged: statistics of measurements that no fit sees and by whose prediction every hypothesis is weighed as well.
     """
 
     gram: Gram
@@ -68,6 +69,7 @@ class Linear:
     wide: float
     far: float
     added: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    judged: Gram | None = None
 
     def evidence(
         self, terms: frozenset[Term], start: tuple[np.ndarray, np.ndarray] | None = None
@@ -78,7 +80,9 @@ class Linear:
           terms: beside the form. start: sizes of discrepancy and noise to begin from.
 
         Returns:
-          The log evidence with priors truncated to their bounds; sizes and posterior; columns of the posterior.
+          The log evidence with priors truncated to their bounds, and with it the log density of what is `judged` as
+          the fitted measurements predict it (together the density of all, part by part: Dawid 1984); sizes and
+          posterior; columns of the posterior.
 
         Raises:
           EvidenceError: the sizes did not settle.
@@ -90,11 +94,10 @@ class Linear:
         places = np.concatenate([self.always, *own]).astype(int)
         # An effect of the refit that is no term of this hypothesis goes back to its null.
         gone = [p for name, p in self.effects.items() if name not in named and np.any(self.at[p] != 0.0)]
-        gram = self.gram
+        gram, back = self.gram, np.zeros(self.gram.width)
+        for p in gone:
+            back[p] = -self.at[p]
         if gone:
-            back = np.zeros(gram.width)
-            for p in gone:
-                back[p] = -self.at[p]
             gram = shifted(gram, back)
         std = self.amplitudes.std.copy()
         for t in terms:
@@ -104,8 +107,11 @@ class Linear:
         prior = Amplitudes(std, self.amplitudes.field, self.amplitudes.mean).select(places)
         fields = tuple(Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields)
         found = infer(gram.select(places), prior, fields, self.noises, start)
-        bounded = found.log_inside(self.low[places], self.high[places])
-        return found.log_evidence + bounded, found, places
+        value = found.log_evidence + found.log_inside(self.low[places], self.high[places])
+        if self.judged is not None:
+            held = self.judged if not gone else shifted(self.judged, back)
+            value += found.log_score(held.select(places))
+        return value, found, places
 
     def shows(self) -> dict[str, float]:
         """Length in sigma of each effect's signature at its prior size that the form's own parameters cannot absorb.

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lunar_mjx.diagnosis.drives.windows import coordinates, verbs
+from lunar_mjx.diagnosis.drives.windows import coordinates
+from lunar_mjx.diagnosis.drives.windows.bench import held_out_parts
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, _held, cut, imu_clock
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, corners, learn_noise, proportions
-from lunar_mjx.diagnosis.drives.windows.settings import WindowSettings
-from lunar_mjx.diagnosis.drives.windows.verbs import _gains, fitted_model
-from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
+from lunar_mjx.diagnosis.drives.windows.settings import WindowSettings, by_motion
+from lunar_mjx.diagnosis.drives.windows.verbs import fitted_model
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.dynamics.imposed import Windows
 from lunar_mjx.errors import UserError
@@ -94,10 +94,14 @@ def test_a_planted_change_is_named(model, changes, name):
     said = conclude(found, 0.95)
     assert name in said.effects
     assert len(said.effects) == 1
-    gains = _gains(found)
-    assert len(gains) == 6
-    assert gains.sum() > 2.0 * np.sqrt(6.0) * gains.std()
     best = next(h for h in found.hypotheses if name in h.effects and h.refitted)
+    base = found.base(form.name)
+    usual = dataclasses.replace(base.evidence, tau=np.array([f.usual for f in base.refit.linear.fields]))
+    scores = [e.log_score(h.refit.linear.judged.select(h.places)) for e, h in ((best.evidence, best), (usual, base))]
+    # what predicts windows that no fit saw better by log 20 does so by chance with 5 % at most (Ville's inequality)
+    assert scores[0] - scores[1] > np.log(20.0)
+    held_out = form.residual(best.refit.u)[form.observations.in_split("test")]
+    assert np.sqrt(np.mean(held_out**2)) < 1.1
     key, value = next(iter(changes.items()))
     at = [i for i, q in enumerate(form.unknowns) if q.key == key]
     start = form.coordinates[at[0]].start
@@ -362,16 +366,19 @@ def test_a_steered_rover_is_refused():
         corners(hard_floor("luvmi_x"))
 
 
-def test_a_name_that_does_not_help_what_was_held_out_is_taken_back(monkeypatch):
-    """Three windows of mixed gain refuse a name and keep its port; eight that all gain keep it."""
-    named = Diagnosis(Verdict.KNOWN, ("soft_ground",), "soft_ground is missing.")
-    families = {"soft_ground": "ground"}
-    monkeypatch.setattr(verbs, "_gains", lambda found: np.array([3.0, -2.0, 1.0]))
-    said = verbs._held_to_account(named, None, families)
-    assert said.verdict is Verdict.UNKNOWN
-    assert (said.effects, said.port) == ((), "wheel_normal")
-    assert "wheel_normal" in said.sentence
-    monkeypatch.setattr(verbs, "_gains", lambda found: np.linspace(1.0, 3.0, 8))
-    assert verbs._held_to_account(named, None, families).verdict is Verdict.KNOWN
-    monkeypatch.setattr(verbs, "_gains", lambda found: np.zeros(0))
-    assert verbs._held_to_account(named, None, families) is named
+def test_like_motions_share_what_a_law_is_off_by():
+    """Two pivots share nearly all of it, straight drives and pivots next to nothing, whichever way they turn."""
+    left = np.array([0.15, 0.17, 0.30, 0.24, -0.15])
+    right = np.array([-0.15, -0.17, 0.30, 0.24, 0.15])
+    columns = by_motion(left, right)
+    covariance = columns @ columns.T
+    np.testing.assert_allclose(np.diag(covariance), 1.0, atol=0.1)
+    assert min(covariance[0, 1], covariance[2, 3]) > 0.8
+    assert np.abs([covariance[0, 2], covariance[0, 4], covariance[2, 4]]).max() < 0.1
+
+
+def test_parts_held_out_are_spread_over_a_drive():
+    held = held_out_parts(np.array([4.0, 0.0, 2.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 18.0]))
+    np.testing.assert_array_equal(np.flatnonzero(held), [0, 5, 8])
+    assert held_out_parts(np.arange(60.0)).mean() == pytest.approx(0.3)
+    assert not held_out_parts(np.zeros(1)).any()

@@ -193,8 +193,8 @@ learnt on other logs never gets narrower than this."""
 def sizes(model: Model) -> dict[str, float]:
     """Sizes of a rover: mass kg; wheel radius, wheelbase and track m; torque N m, damping N m s/rad and current A.
 
-    The torque is weight times wheel radius, with which all of the weight would be lifted at the rim; the damping makes
-    it at a rim speed of 1 m/s; the current makes it through the motors.
+    The torque is weight times wheel radius, with which all of the weight would be lifted at the rim; the damping, one
+    in every wheel, makes it at a rim speed of 1 m/s; the current makes it through the motors.
     """
     rover = model.rover
     compiled = rover.compile()
@@ -213,7 +213,7 @@ def sizes(model: Model) -> dict[str, float]:
         "wheelbase": base,
         "track": max(aside) - min(aside),
         "torque": torque,
-        "damping": torque * radius,
+        "damping": torque * radius / len(rover.wheels),
         "current": torque / per_ampere,
     }
 

@@ -21,6 +21,7 @@ from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS
 from lunar_mjx.diagnosis.drives.windows.problem import SLOPE, STEP, Noise, WindowProblem
 from lunar_mjx.diagnosis.drives.windows.settings import (
     BETWEEN,
+    BY_MOTION,
     DIFFERENCES,
     DRIFTED,
     LATE_S,
@@ -28,6 +29,7 @@ from lunar_mjx.diagnosis.drives.windows.settings import (
     UNEVEN_DEG,
     UNKNOWN_SLOPE_DEG,
     WindowSettings,
+    by_motion,
 )
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
 from lunar_mjx.effects import catalogue
@@ -116,7 +118,7 @@ def observe(
         tuple(split.get(k, "fit") for k in range(len(names))),
         np.concatenate(unit),
         tuple(s for _, s in units),
-        tuple(names[k] + (" (end)" if s == "test" and (k, "fit") in units else "") for k, s in units),
+        tuple(names[k] + (" (held out)" if s == "test" and (k, "fit") in units else "") for k, s in units),
         problem=problem,
         noise=tuple(noise),
         at=at,
@@ -154,9 +156,10 @@ class WindowForm(MeasuredForm):
         for q in base:
             unknowns.append(q)
             coordinates.append(self._coordinate(q.effect, q, 1.0))
-        self.shares = {name: d.unlisted / settings.unlisted_discrepancy for name, d in DIFFERENCES.items()}
+        self.shares = {name: d.share(settings.unlisted_discrepancy) for name, d in DIFFERENCES.items()}
         cut = problem(None).cut
         self.single = len(np.unique(cut.recordings)) == 1
+        self._motions = self._by_motion()
         self._field: dict[int, int] = {}
         for name, q in self._of_the_drive() if self.single else ():
             if name in DIFFERENCES:
@@ -184,7 +187,7 @@ class WindowForm(MeasuredForm):
         self._fields = tuple(Field(name, sizes[name] / self.shares[name]) for name in DIFFERENCES)
         self.terms = (
             *(Term(name, EFFECT, settings.effect_log_odds) for name in candidates),
-            *(Term(name, UNLISTED, settings.unlisted_log_odds) for name in DIFFERENCES),
+            *(Term(name, UNLISTED, settings.unlisted_log_odds) for name, d in DIFFERENCES.items() if d.unlisted),
         )
         self.fit = observations.in_split("fit")
         self._low, self._high = self._bounds()
@@ -207,6 +210,16 @@ class WindowForm(MeasuredForm):
         flat = bool(self.problem(None).cut.unlevelled)
         out.append(("lateness of currents", Unknown(CALIBRATION, "current_clock", LATE_S)))
         out.append(("slope", dataclasses.replace(RISE, std=UNKNOWN_SLOPE_DEG if flat else UNEVEN_DEG)))
+        return out
+
+    def _by_motion(self) -> dict[int, np.ndarray]:
+        """(window, k) columns of what differs from motion to motion, by recording; zero in windows of others."""
+        problem, out = self.problem(None), {}
+        for n in np.unique(problem.cut.recordings):
+            mine = problem.cut.recordings == n
+            columns = by_motion(*problem.rims[:, mine])
+            out[int(n)] = np.zeros((len(mine), columns.shape[1]))
+            out[int(n)][mine] = columns
         return out
 
     def _coordinate(self, effect: str, q: Unknown, prior: float) -> Coordinate:
@@ -293,7 +306,7 @@ class WindowForm(MeasuredForm):
     def differences(
         self, value: np.ndarray, slopes: np.ndarray, soft: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What differs from recording to recording: columns (n, k), the field of each or -1, and its size.
+        """What differs between recordings and motions: columns (n, k), the field of each or -1, and its size.
 
         Resistance of the ground acts on both sides with the sense of rolling; grip as friction does; currents by a
         scale, and by one between the sides. The slope and an IMU's clock are of stated size and belong to no field.
@@ -313,15 +326,18 @@ class WindowForm(MeasuredForm):
         ground = ("friction_angle", "", "shear_modulus") if soft else ("mu", "side", "slip_scale")
         grip, side, slip = (by(f"{SOFT if soft else 'hard_ground'}.{name}") for name in ground)
         drag, tilt = (slopes[:, k] / q.std for k, q in ((-2, DRAG), (-1, RISE)))
-        shapes = (drag, grip, side, slip, size, apart)
+        shapes = (drag, grip, side, slip, size, apart, drag, grip, size)
         columns, field, std = [], [], []
         for number, (name, shape) in enumerate(zip(DIFFERENCES, shapes, strict=True)):
-            if shape is None or self.single:
+            motions = name.endswith(BY_MOTION)
+            if shape is None or (self.single and not motions):
                 continue
             for n in np.unique(recording):
-                columns.append(np.where(recording == n, shape, 0.0) * self.shares[name])
-                field.append(number)
-                std.append(1.0)
+                mine = np.where(recording == n, shape, 0.0) * self.shares[name]
+                parts = self._motions[n][at[1]] if motions else np.ones((len(mine), 1))
+                columns += list((mine[:, None] * parts).T)
+                field += [number] * parts.shape[1]
+                std += [1.0] * parts.shape[1]
         clock, late = by(f"{CALIBRATION}.imu_clock"), by(f"{CALIBRATION}.current_clock")
         if late is not None and not self.single:
             for n in np.unique(recording):
@@ -378,7 +394,7 @@ class WindowForm(MeasuredForm):
         for w in np.unique(observations.window[observations.in_split("select", "test")]):
             rows = observations.window == w
             held[f"window {w}"] = Gram.of(white[rows], left[rows], group[rows], len(CHANNELS))
-        fit = self.fit
+        fit, whole = self.fit, (len(CHANNELS), len(std) + 1, len(std) + 1)
         linear = Linear(
             gram=Gram.of(white[fit], left[fit], group[fit], len(CHANNELS)),
             held_out=held,
@@ -392,6 +408,7 @@ class WindowForm(MeasuredForm):
             following={},
             fields=self._fields,
             noises=tuple(NoiseSize(c, NOISE_LOG_STD) for c in CHANNELS),
+            judged=sum(held.values(), start=Gram(np.zeros(len(CHANNELS), int), np.zeros(whole))) if held else None,
             wide=settings.unlisted_discrepancy,
             far=1.0,
         )

@@ -82,15 +82,20 @@ class WindowProblem:
         self._kept: dict[Any, Seen] = {}
         left = np.array([j.startswith("l") for j in corners(model)])
         self._side = np.stack([left, ~left]).astype(float)
-        self._sense = self._rolling()
+        # the sense in which a side's wheels turn, -1 to 1, smooth where they turn round
+        self._sense = np.tanh(self._rim() / STANDING_M_S)
 
-    def _rolling(self) -> np.ndarray:
-        """(side, window, bin) sense in which a side's wheels turn, -1 to 1, smooth where they turn round."""
+    def _rim(self) -> np.ndarray:
+        """(side, window, bin) mean speed of a side's rims, m/s."""
         edges = np.asarray(self.cut.imposed.speed)
         middle = 0.5 * (edges[:, :-1] + edges[:, 1:])
         radius = float(np.mean([w.radius for w in self.model.rover.wheels]))
-        rim = radius * np.einsum("wbj,sj->swb", middle, self._side) / self._side.sum(axis=1)[:, None, None]
-        return np.asarray(np.tanh(rim / STANDING_M_S))
+        return radius * np.einsum("wbj,sj->swb", middle, self._side) / self._side.sum(axis=1)[:, None, None]
+
+    @property
+    def rims(self) -> np.ndarray:
+        """(side, window) mean speed of a side's rims, m/s."""
+        return self._rim().mean(axis=2)
 
     def predict(self, unknowns: Sequence[Unknown], rows: np.ndarray) -> np.ndarray:
         """Predictions.

@@ -6,6 +6,9 @@ import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
 
+import numpy as np
+
+from lunar_mjx.diagnosis.drives.windows.cut import STANDING_M_S
 from lunar_mjx.diagnosis.weighed.form import SearchSettings
 
 
@@ -24,13 +27,17 @@ class Difference:
     Attributes:
       key: by which a model's file holds its size, `between_drives.KEY`. words: for a reader.
       size: usual standard deviation between recordings, as a share of what `words` says.
-      unlisted: the same where something unlisted acts.
+      unlisted: the same where something unlisted acts; 0 where no such term stands.
     """
 
     key: str
     words: str
     size: float
-    unlisted: float
+    unlisted: float = 0.0
+
+    def share(self, wide: float) -> float:
+        """What an amount of 1 changes, so that a size of `wide` is that of something unlisted."""
+        return (self.unlisted or 6.0 * self.size) / wide
 
 
 DIFFERENCES: Mapping[str, Difference] = MappingProxyType(
@@ -43,15 +50,56 @@ DIFFERENCES: Mapping[str, Difference] = MappingProxyType(
         "motor_torque: left against right": Difference(
             "sides", "left side's current against the right one's", 0.03, 0.15
         ),
+        "wheel_normal: resistance by motion": Difference(
+            "resistance_by_motion", "resistance of the ground over the load from one motion to another", 0.01
+        ),
+        "wheel_shear: friction by motion": Difference(
+            "grip_by_motion", "friction on the ground from one motion to another", 0.1
+        ),
+        "motor_torque: current by motion": Difference(
+            "current_by_motion", "current for a torque from one motion to another", 0.05
+        ),
     }
 )
-"""Usual differences between drives: rolling resistance over load (hard floors and asphalt have 0.01 to 0.02: Wong 2008,
-table 1.1); friction (paint, dust and rubber: 30 %), across over along it, and how stiffly it comes with slip;
-current for the same torque (oil and magnets by temperature: 10 %); the left side's against the right one's. Several
-recordings teach their own sizes. Unlisted: ground that gives way resists with a tenth of the load and more (Wong 2008),
-friction spans from ice to rubber, and gears, magnets and ammeters that are out of order change a current by a quarter.
+"""What usually differs. From drive to drive: rolling resistance over load (hard floors and asphalt have 0.01 to 0.02:
+Wong 2008, table 1.1); friction (paint, dust and rubber: 30 %), across over along it, and how stiffly it comes with
+slip; current for the same torque (oil and magnets by temperature: 10 %); the left side's against the right one's.
+Several recordings teach their own sizes. Unlisted: ground that gives way resists with a tenth of the load and more
+(Wong 2008), friction spans from ice to rubber, and gears, magnets and ammeters that are out of order change a current
+by a quarter.
+
+The last three depend on how the rover moves (see `by_motion`): no contact law and no gear follows its law exactly, to 5
+to 10 % (Wong 2008), and what a law is off by on a pivot it is off by on every pivot, however many windows hold one.
 """
 
+TURNED_RAD, FASTER = 0.5, 0.7
+"""How unlike two motions are of which one says little of a law's error at the other: difference of the angle whose
+tangent is the sides' half difference over their mean (0: straight, pi/2: a pivot), and log of the ratio of speeds."""
+LEAST_SHARE = 0.02
+"""Share of the variance of differences by motion that is left out, to have few columns."""
+
+
+def by_motion(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Columns (window, k) whose random amounts of size 1 differ from motion to motion and are alike for like motions.
+
+    The covariance is Gaussian in the log of the speed and, on the circle, in the angle between straight and pivot.
+
+    Args:
+      left, right: (window,) rim speeds of the sides, m/s.
+    """
+    angle = np.arctan2(0.5 * (right - left), 0.5 * (left + right))
+    pace = np.log(np.maximum(np.hypot(left, right), STANDING_M_S))
+    turned = (1.0 - np.cos(angle[:, None] - angle)) / TURNED_RAD**2
+    faster = 0.5 * ((pace[:, None] - pace) / FASTER) ** 2
+    values, vectors = np.linalg.eigh(np.exp(-turned - faster))
+    # the largest first, until what is left out is little
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    many = int(np.searchsorted(np.cumsum(values), (1.0 - LEAST_SHARE) * values.sum())) + 1
+    return vectors[:, :many] * np.sqrt(values[:many])
+
+
+BY_MOTION = " by motion"
+"""End of the names of `DIFFERENCES` that depend on how the rover moves."""
 BETWEEN = "between_drives"
 """First part of the keys by which a model's file holds what was learnt of the sizes of `DIFFERENCES`."""
 
