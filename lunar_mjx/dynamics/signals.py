@@ -130,6 +130,7 @@ def observe(
             "bus_load_W": supply.load,
             "bus_solar_W": supply.solar,
             "battery_charge_ratio": supply.charge,
+            "bus_voltage_V": supply.voltage,
             "chassis_temperature_degC": None if kelvin is None else kelvin - _ZERO_CELSIUS,
         }
         out |= {name: value for name, value in rest.items() if value is not None}

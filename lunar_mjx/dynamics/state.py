@@ -91,13 +91,14 @@ class Supply:
     """Electric power and the chassis' temperature; None where no effect of the model tells.
 
     Attributes:
-      load: drawn from the bus, W. solar: from the panels, W. charge: of the battery, 0 to 1.
+      load: drawn from the bus, W. solar: from the panels, W. charge: of the battery, 0 to 1. voltage: of the bus, V.
       chassis_temperature: K.
     """
 
     load: Float[AnyArray, "*batch"] | None = None
     solar: Float[AnyArray, "*batch"] | None = None
     charge: Float[AnyArray, "*batch"] | None = None
+    voltage: Float[AnyArray, "*batch"] | None = None
     chassis_temperature: Float[AnyArray, "*batch"] | None = None
 
 

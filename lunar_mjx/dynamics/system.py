@@ -20,7 +20,7 @@ from lunar_mjx.effects.context import Context, Heat, RoverInfo
 from lunar_mjx.effects.joint.motor import MODES, REFERENCE_TEMPERATURE, constant_at, winding_resistance
 from lunar_mjx.effects.ports import EffectState, Pipeline, apply_effects
 from lunar_mjx.effects.power.chassis import chassis_temperature
-from lunar_mjx.effects.power.supply import charge_of
+from lunar_mjx.effects.power.supply import charge_of, terminal_voltage
 from lunar_mjx.model.sun import make_sun
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Vec3
@@ -237,6 +237,7 @@ class System:
             rover=jax.tree.map(lambda a: jnp.asarray(a, dtype) if a.dtype.kind == "f" else jnp.asarray(a), self.info),
             parameters={name: SimpleNamespace(**values) for name, values in params.effects.items()},
             sunlight=None if params.sun is None else params.sun.light(time, k.position.x, k.position.y),
+            bus_voltage=_bus_voltage(params, state),
         )
 
 
@@ -330,12 +331,24 @@ def _telemetry(ctx: Context, k: Kinematics, heat: Heat, effects: EffectState) ->
     )
 
 
+def _bus_voltage(params: Params, state: State) -> Any:
+    """Voltage of the battery as the step before left it, V; None without one.
+
+    The port `command` comes before `power`, so that a step limits its motors by the voltage that it finds.
+    """
+    battery = state.effects.get("battery")
+    if battery is None:
+        return None
+    return terminal_voltage(SimpleNamespace(**params.effects["battery"]), SimpleNamespace(**battery))
+
+
 def _supply(ctx: Context, effects: EffectState) -> Supply | None:
     """Power of the step, and charge and temperature at its beginning; None for a model that has none of them."""
     power, parameters = ctx.power, ctx.parameters
     told: dict[str, Any] = {} if power is None else {"load": power.load, "solar": power.solar}
     if "battery" in effects:
         told["charge"] = charge_of(parameters["battery"], effects["battery"]["used"])
+        told["voltage"] = ctx.bus_voltage
     if "chassis_node" in effects:
         node = SimpleNamespace(**effects["chassis_node"])
         told["chassis_temperature"] = chassis_temperature(parameters["chassis_node"], node)

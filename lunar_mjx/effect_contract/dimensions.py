@@ -149,6 +149,7 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "wheel": _OWN,
         "power": _OWN,
         "sunlight": _OWN,
+        "bus_voltage": "V",
     },
     Terrain: {"field": _OWN, "rocks": _OWN, "soil": _OWN, "origin": "m", "name": _PLAIN, "grids": _OWN},
     HeightField: {"heights": "m", **_GRID},

@@ -270,6 +270,7 @@ class Context:
       parameters: every effect's parameters, by effect and name.
       command, torque, geometry, contact, soil, normal, wheel, power: what the ports before have settled.
       sunlight: where the rover is; None for a model without a Sun.
+      bus_voltage: of the battery under the load of the last steps, V; None for a model without a battery.
     """
 
     time: Any
@@ -301,3 +302,4 @@ class Context:
     wheel: WheelForce | None = None
     power: Power | None = None
     sunlight: Sunlight | None = None
+    bus_voltage: Any = None

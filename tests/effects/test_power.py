@@ -22,7 +22,7 @@ from lunar_mjx.dynamics.system import default_params
 from lunar_mjx.effects.context import Command, Heat, Power
 from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
 from lunar_mjx.effects.ports import Pipeline
-from lunar_mjx.effects.power.supply import charge_of, open_voltage
+from lunar_mjx.effects.power.supply import charge_of, open_voltage, terminal_voltage
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs.schema import find_channel
 from lunar_mjx.model import make_model
@@ -59,6 +59,7 @@ def run(
     """Two motors at given speeds and currents under a Sun from the left: power, heat and states of every step."""
     pipeline = Pipeline(effects_named(names))
     p = parameters(pipeline.effects, values)
+    has_battery = "battery" in names
     zero, one, joint = jnp.zeros(()), jnp.ones(()), jnp.zeros(2)
     speed = jnp.asarray(speed)
     rover = rover_info(joint + 0.25, joint + 0.2, joints=2, mode=CURRENT)
@@ -78,6 +79,7 @@ def run(
             rover=rover,
             parameters=p,
             sunlight=Sunlight(Vec3(zero, zero + 0.6, zero + 0.8), zero + sun),
+            bus_voltage=terminal_voltage(p["battery"], SimpleNamespace(**state["battery"])) if has_battery else None,
         )
         command, state = pipeline.run("command", ctx, state, Command(jnp.asarray(current), joint))
         ctx = dataclasses.replace(ctx, command=command)
@@ -85,7 +87,14 @@ def run(
         power, state = pipeline.run("power", dataclasses.replace(ctx, torque=torque), state, Power(zero, zero, zero))
         ctx = dataclasses.replace(ctx, torque=torque, power=power)
         heat, state, temperature = step_heat(pipeline, "euler", ctx, temperature, state)
-        seen = {"power": power, "heat": heat, "torque": torque, "current": command.current, "history": state}
+        seen = {
+            "bus": ctx.bus_voltage if has_battery else zero,
+            "power": power,
+            "heat": heat,
+            "torque": torque,
+            "current": command.current,
+            "history": state,
+        }
         return (temperature, state), seen
 
     start = Temperature(joint, joint, joint, joint)
@@ -127,6 +136,24 @@ def test_the_battery_is_a_voltage_behind_a_resistance():
     np.testing.assert_allclose(out.power.voltage * out.power.current, 480.0, rtol=1e-12)
     np.testing.assert_allclose(out.power.loss, 480.0 + 0.2 * current**2, rtol=1e-12)
     assert float(out.state["battery"]["used"]) == pytest.approx(10.0 * current, rel=1e-12)
+
+
+@pytest.mark.parametrize("resistance", [0.1, 1.0])
+def test_motors_are_limited_by_the_voltage_of_the_battery(resistance: float):
+    """Two motors ask for more than the battery gives: V' = V/(1 + |V/U|^8)^(1/8), U = U_0 - R I, and U I = P."""
+    names = ("joint_control", "motor", "voltage_saturation", "motor_power", "electronics", "battery")
+    battery = {"full_voltage": 30.0, "empty_voltage": 30.0, "resistance": resistance}
+    free = {"winding_capacity": 1e12, "housing_capacity": 1e12, "alpha": 0.0, "beta": 0.0}
+    out = run(200, current=(9.0, 9.0), names=names, battery=battery, motor=free, motor_power={"efficiency": 1.0})
+    motor, current, bus = out.p["motor"], np.asarray(out.current[-1]), float(out.bus[-1])
+    assert float(out.bus[0]) == 30.0 and bus < 30.0 - resistance
+    back_emf = motor.torque_constant * motor.gear_ratio * out.speed
+    asked = motor.resistance * 9.0 + back_emf
+    voltage = motor.resistance * current + back_emf
+    np.testing.assert_allclose(voltage, asked / (1.0 + (asked / bus) ** 8) ** 0.125, rtol=1e-9)
+    drawn = 60.0 + float(voltage @ current)
+    assert bus == pytest.approx(30.0 - resistance * drawn / bus, rel=1e-9)
+    assert np.ptp(np.asarray(out.bus[-20:])) < 1e-6, "no chatter"
 
 
 def test_float32_keeps_the_charge():
@@ -201,7 +228,7 @@ def test_a_rover_steps_with_all_of_it():
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
     drive = jax.tree.map(lambda a: jnp.ones((3, *a.shape)), seen)
     channels = observe(system, dataclasses.replace(drive, time=jnp.arange(3.0))).channels
-    wanted = {"bus_load_W", "bus_solar_W", "battery_charge_ratio", "chassis_temperature_degC"}
+    wanted = {"bus_load_W", "bus_solar_W", "bus_voltage_V", "battery_charge_ratio", "chassis_temperature_degC"}
     assert wanted <= set(channels) and all(find_channel(name) for name in wanted)
     assert float(channels["chassis_temperature_degC"][0]) == pytest.approx(1.0 - 273.15)
     bare = build(make_model("luvmi_x", "flat", "field"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 
@@ -18,7 +18,7 @@ SHARPNESS = 8
 """Power p of the limit V' = V/(1 + |V/V_bus|^p)^(1/p)."""
 
 
-def limit_of(voltage: float) -> float:
+def limit_of(voltage: Any) -> Any:
     """`voltage_saturation.limit` of a bus of this voltage, V."""
     return (BUS_VOLTAGE / voltage) ** SHARPNESS
 
@@ -49,7 +49,8 @@ def voltage_saturation(ctx, p, x, command):
     1.5 V_bus on. The parameter is limit = (48 V/V_bus)^8, not 1/V_bus: the derivative by 1/V_bus is zero at its null,
     where no limit acts, so that no score test could see it; the derivative by `limit` at 0 is -V |V/48 V|^8/8.
     `limit_of` and `voltage_of` convert. With harness_resistance in the list the amplifier gives R_w I as well, and with
-    bus_droop V_bus sags. Where the back-EMF alone brakes faster than a time step follows (cold windings), the
+    bus_droop V_bus sags. With a battery in the list V_bus is the battery's voltage under load, and `limit` is not read.
+    Where the back-EMF alone brakes faster than a time step follows (cold windings), the
     correction is relaxed over a few steps. Source: MuJoCo's dcmotor note (voltage limit).
     """
     motor = ctx.parameters["motor"]
@@ -58,7 +59,7 @@ def voltage_saturation(ctx, p, x, command):
     resistance = resistance if harness is None else resistance + harness.resistance
     constant = constant_at(ctx.parameters, ctx.winding_temperature) * motor.gear_ratio
     voltage = resistance * command.current + constant * ctx.joint_speed
-    limit = p.limit
+    limit = p.limit if ctx.bus_voltage is None else limit_of(ctx.bus_voltage)
     droop = ctx.parameters.get("bus_droop")
     if droop is not None:
         power = jnp.sum(_limited(voltage, limit) * command.current)
