@@ -41,7 +41,7 @@ from lunar_mjx.backends import NativeBackend
 from lunar_mjx.dynamics import build
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
-from lunar_mjx.report.style import BLUE, GREEN, INK, ORANGE, PAPER, PURPLE, RULE, SKY, VERMILION
+from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, PAPER, PURPLE, SKY, VERMILION, styled
 
 ENGINES = ("pybullet", "native", "structured", "mjx", "bare", "spheres")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -211,10 +211,12 @@ LOOKS = {
 """Colour and marker of every engine; hollow on a CPU where there is a row of a GPU, too."""
 
 
+@styled()
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """Rover-steps per second against the batch, one panel per rover; every row is named beside its marker."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullLocator
 
     rovers = list(dict.fromkeys(r["rover"] for r in rows))
     figure = Figure(figsize=(6.2 * len(rovers), 5.6), layout="constrained")
@@ -241,22 +243,26 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             )
         heights = _spread([own[-1]["steps_per_s"] for own in lines.values()])
         for ((engine, workers), own), height in zip(lines.items(), heights, strict=True):
-            axes.text(
-                1.5 * own[-1]["batch"],
-                height,
+            # labels stand in a column at the right, so that none lies on a marker or a line
+            axes.annotate(
                 f"{engine}, {workers} {_unit(engine, workers)}",
-                fontsize=7,
-                color=INK,
+                (own[-1]["batch"], own[-1]["steps_per_s"]),
+                (_LABELS, height),
+                fontsize=8,
                 va="center",
+                arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 4},
             )
-        axes.set_xlim(0.7, 3e6)
-        axes.set_title(rover, loc="left", fontsize=10)
+        axes.set_xlim(0.7, _RIGHT)
+        axes.set_xticks([10.0**k for k in range(6)])
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_title(rover)
         axes.set_xlabel("rovers at once")
-        axes.grid(color=RULE, linewidth=0.6)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
     panels[0].set_ylabel("rover-steps per second")
     figure.savefig(path, dpi=120)
+
+
+_LABELS, _RIGHT = 3e5, 3e8
+"""Abscissa at which the names of the engines begin, and the panel's right end."""
 
 
 def _spread(values: list[float], least: float = 1.45) -> list[float]:

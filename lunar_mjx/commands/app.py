@@ -214,7 +214,7 @@ def figures(
     ] = None,
     device: DeviceOption = "auto",
 ) -> None:
-    """Make the counterparts of the paper's Figs. 1 to 6, and the slope check; 1 and 4 need OpenGL."""
+    """Make the counterparts of the paper's Figs. 1 to 6, and the slope check."""
     check_folder(out)
     select_device(device)
     from lunar_mjx.paper.figures import FIGURES, available_figures, make_figures

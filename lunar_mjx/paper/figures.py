@@ -13,7 +13,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lunar_mjx.effects.presets import UNSAID
-from lunar_mjx.errors import UserError
 from lunar_mjx.files import replacing, write_text
 from lunar_mjx.paper import hot_motor, slope_runs, soft_ground
 from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, VERMILION, styled
@@ -187,24 +186,16 @@ _FILES = {
     "6": "fig6_training",
     "slope": "slope_stall",
 }
-NEED_OPENGL = ("4",)
-"""Figures that MuJoCo's renderer draws."""
 NEED_TRAININGS = ("6",)
 """Figures of trainings, which must have been made: nothing is trained or invented here."""
 
 
 def available_figures(trainings: Sequence[Path] = ()) -> list[str]:
-    """All figures that can be made here; says on standard error what is left out without OpenGL or trainings."""
-    from lunar_mjx.cameras.gl import context_class
+    """All figures that can be made here; says on standard error what is left out without trainings."""
     from lunar_mjx.paper.training_figure import kept_trainings
 
     names = list(FIGURES)
     if not (trainings or kept_trainings()):
         print("Fig. 6 is left out: it draws trainings; give the folder of one with --training.", file=sys.stderr)
         names = [name for name in names if name not in NEED_TRAININGS]
-    try:
-        context_class()
-    except UserError as missing:
-        print(f"Fig. {' and '.join(NEED_OPENGL)} is left out: {missing}", file=sys.stderr)
-        names = [name for name in names if name not in NEED_OPENGL]
     return names

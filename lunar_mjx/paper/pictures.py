@@ -22,7 +22,6 @@ from lunar_mjx.cameras import (
     Pictures,
     Pinhole,
     Pose,
-    RoverCamera,
     Sun,
     front_mount,
     mounted,
@@ -59,6 +58,8 @@ _FILM = Film(mid=0.12)
 """A little darker than the cameras' own exposure, so that white parts are not burnt out."""
 _ROWS = 300
 """Places of a rover on its way here, from which its tracks are painted."""
+_EDGE = 0.1
+"""Share of the painted ground, at each side, over which its mottling fades out."""
 _LABEL_COLOURS = (SHADOW, MUTED, SKY, ORANGE)
 """Sky, ground, rock, rover: told apart without colour vision, and by their brightness."""
 _BOXES: dict[str, tuple[float, float, str, str, str]] = {
@@ -184,7 +185,11 @@ def _trodden(rovers: Sequence[tuple[Rover, np.ndarray]]) -> HeightField:
         tracks += wheel_tracks(rover, way)
     low = rovers[0][1][:2] - 0.5 * side
     trodden = TrackPainter(regolith(4096, side), low.tolist(), [side, side], tracks).paint(_ROWS)
-    return painted(np.asarray(trodden, np.float32).mean(axis=-1) / (255.0 * float(ALBEDO.mean())), low, side)
+    shade = np.asarray(trodden, np.float32).mean(axis=-1) / (255.0 * float(ALBEDO.mean()))
+    rows = np.linspace(0.0, 1.0, len(shade), dtype=np.float32)
+    inner = np.clip(np.minimum(rows, 1.0 - rows) / _EDGE, 0.0, 1.0)
+    fade = np.minimum(inner[:, None], inner[None, :])  # beyond the paint its border's shade would go on as stripes
+    return painted(1.0 + fade * (shade - 1.0), low, side)
 
 
 def figure_2() -> tuple[Figure, dict[str, Any]]:
@@ -265,17 +270,19 @@ def figure_4() -> tuple[Figure, dict[str, Any]]:
 
 
 def _portrait(name: str, distance: float) -> tuple[np.ndarray, dict[str, Any]]:
+    """A rover by itself on level ground, by the cameras in JAX, and what is said of it."""
     model = make_model(name, "flat")
     rover = model.rover
-    with RoverCamera(rover, model.terrain, sun=Sun(200.0, 25.0), largest=(900, 640), margin=8.0) as camera:
-        qpos = camera.model.qpos0.copy()
-        camera.place(qpos)
-        top = float(rover.chassis_points[:, 2].max())
-        picture = camera.picture(orbit([0.0, 0.0, 0.3 * top], distance, 150.0, 18.0), Pinhole(900, 640, 42.0))
+    stands = ((rover, _standing(model, (0.0, 0.0, 0.0))),)
+    top = float(rover.chassis_points[:, 2].max())
+    pose = orbit(np.array([0.0, 0.0, 0.3 * top]), distance, 150.0, 18.0)
+    light, optics = Light(Sun(200.0, 25.0), film=_FILM), Pinhole(900, 640, 42.0)
+    seen = _taken(model.terrain, stands, pose, optics, light, _trodden(stands), detail=True)
     title = (
         f"{name}: {rover.mass:g} kg, {len(rover.wheels)} wheels, {len(rover.joints)} motors, {len(rover.loops)} loops"
     )
-    return picture, {"title": title, "mass_kg": rover.mass, "motors": len(rover.joints), "loops": len(rover.loops)}
+    about = {"title": title, "mass_kg": rover.mass, "motors": len(rover.joints), "loops": len(rover.loops)}
+    return np.asarray(seen.rgb), about
 
 
 def _picture(axes: Any, picture: np.ndarray, title: str) -> None:

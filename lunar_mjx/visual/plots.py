@@ -209,7 +209,7 @@ def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
     slip = np.nanmean(np.abs(drive.per_wheel("wheel_{}_slip_ratio")), axis=1)
     for n, track in enumerate(drive.tracks()):
         axes.plot(
-            *track.places.T, color=SHADOW, linewidth=1.0, alpha=0.55, zorder=2, label="wheels" if n == 0 else None
+            *track.places.T, "-", color=SHADOW, linewidth=1.0, alpha=0.55, zorder=2, label="wheels" if n == 0 else None
         )
     axes.add_patch(
         Polygon(
@@ -222,7 +222,7 @@ def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
             label="rover at the end",
         )
     )
-    axes.plot(*place.T, color=SHADOW, linewidth=4.5, solid_capstyle="round")
+    axes.plot(*place.T, "-", color=SHADOW, linewidth=4.5, solid_capstyle="round")
     dots = axes.scatter(*place.T, c=np.clip(slip, 0.0, 1.0), cmap=HEIGHTS, vmin=0.0, vmax=1.0, s=7, zorder=3)
     figure.colorbar(dots, ax=axes, label="mean |slip ratio| of the wheels", shrink=0.6, pad=0.01)
     axes.plot(*place[0], "o", color=LIT, markeredgecolor=SHADOW, markersize=8, label="start", zorder=4)
