@@ -38,6 +38,15 @@ _PLAIN = None
 """The field holds no quantity: whole numbers, names, truth values."""
 
 _GRID = {"x0": "m", "y0": "m", "cell": "m"}
+_SOIL = {
+    "k_c": "N/m^(n+1)",
+    "k_phi": "N/m^(n+2)",
+    "n": "1",
+    "cohesion": "Pa",
+    "tan_phi": "1",
+    "shear_modulus_x": "m",
+    "shear_modulus_y": "m",
+}
 UNITS: Mapping[type, Mapping[str, str | None]] = {
     c.Command: {"target": "control", "current": "A"},
     c.Geometry: {
@@ -66,17 +75,7 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "normal": "1",
         "inside": _PLAIN,
     },
-    c.Soil: {
-        "k_c": "N/m^(n+1)",
-        "k_phi": "N/m^(n+2)",
-        "n": "1",
-        "cohesion": "Pa",
-        "tan_phi": "1",
-        "shear_modulus_x": "m",
-        "shear_modulus_y": "m",
-        "rock": "1",
-        "rut": "m",
-    },
+    c.Soil: {**_SOIL, "rock": "1", "rut": "m"},
     c.Arc: {"cos": "1", "sin": "1", "one": "1"},
     c.Stress: {"theta": "rad", "weight": "1", "sigma": "Pa"},
     c.Normal: {
@@ -155,16 +154,7 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
     HeightField: {"heights": "m", **_GRID},
     Rocks: {"centers": "m", "radii": "m", "index": _PLAIN, **_GRID},
     SoilMap: {"rock": "1", **_GRID},
-    SoilGrids: {
-        **_GRID,
-        "k_c": "N/m^(n+1)",
-        "k_phi": "N/m^(n+2)",
-        "n": "1",
-        "cohesion": "Pa",
-        "tan_phi": "1",
-        "shear_modulus_x": "m",
-        "shear_modulus_y": "m",
-    },
+    SoilGrids: {**_GRID, **_SOIL},
     Signals: {"time": "s", "channels": "channels"},
     SensorContext: {
         "time": "s",
