@@ -27,6 +27,7 @@ _KINDS = {
     mujoco.mjtGeom.mjGEOM_MESH: BOX,
 }
 _FAR = 1e9
+"""m; the depth of a ray that meets nothing: a large number, since infinities less infinities are not numbers."""
 
 
 class Shapes(NamedTuple):

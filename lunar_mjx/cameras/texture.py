@@ -16,6 +16,7 @@ CONTRAST = 0.10
 """Deviation of the mottling, of the brightness."""
 
 _OCTAVES = 7
+"""Layers of the mottling at most, from patches of metres down, each 2.6 times as fine as the one before."""
 _RUT, _PRINT = 205, 140
 """Brightness of a track's bottom and of its bars, of 255."""
 

@@ -37,10 +37,12 @@ def step_heat(
             winding_temperature=ctx.winding_temperature + ctx.dt * heat.winding / heat.winding_capacity,
             housing_temperature=ctx.housing_temperature + ctx.dt * heat.housing / heat.housing_capacity,
         )
+        # the states that effects return here are those of a trial step, and are dropped
         then, _ = heat_flow(pipeline, ahead, effects)
         heat = dataclasses.replace(
             heat, winding=0.5 * (heat.winding + then.winding), housing=0.5 * (heat.housing + then.housing)
         )
+    # a step warms a winding by microkelvins, which float32 would drop beside 300 K
     winding = compensated_add(
         temperature.winding, temperature.winding_lost, ctx.dt * heat.winding / heat.winding_capacity
     )

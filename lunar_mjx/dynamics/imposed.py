@@ -175,6 +175,7 @@ class KinematicDrive:
             return state, jax.tree.map(lambda a: a / self.steps, total)
 
         edges = last.speed, Vector(last.up_x, last.up_y, last.up_z)
+        # a window is cut out of a drive: what its contacts remember at the start is made by holding its first speeds
         held = jax.tree.map(lambda a: jnp.broadcast_to(a[0], (round(SETTLE_S / self.bin_s) + 1, *a.shape[1:])), edges)
         state, _ = jax.lax.scan(bin_of, state, (held, held))
         before, after = (jax.tree.map(lambda a, s=s: a[s], edges) for s in (slice(None, -1), slice(1, None)))
@@ -212,6 +213,7 @@ class KinematicDrive:
         system = self.system
         params = dataclasses.replace(params, terrain=system.params.terrain)
         kinematics, finish = self._engine.forward_imposed(params, q, v, system.dt)
+        # a window of seconds warms nothing, and no log tells the windings' temperature at its beginning
         cold = params.ambient_temperature(0.0) - REFERENCE_TEMPERATURE + jnp.zeros_like(speed)
         temperature = Temperature(cold, jnp.zeros_like(cold), cold, jnp.zeros_like(cold))
         pieces: tuple[Any, Any] = (q, v)  # as the engine carries them within a loop
@@ -240,5 +242,6 @@ class KinematicDrive:
             off = made(current) - torque
             moved = current - off / per_ampere
             slope = (made(moved) - torque - off) / jnp.where(moved == current, 1.0, moved - current)
+            # where two trials say almost nothing of each other, the nominal constant is the safer slope
             current = current - off / jnp.where(jnp.abs(slope) > 0.05 * per_ampere, slope, per_ampere)
         return current

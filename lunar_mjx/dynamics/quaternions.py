@@ -32,6 +32,7 @@ def integrate(q: list[Any], spin: Vector, dt: float) -> list[Any]:
     v = spin * dt
     square = v.dot(v)
     small = square < 1e-4
+    # 1 where the series is taken: the root's derivative at 0 is infinite, and infinity times 0 is not a number
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
     # sin(t/2)/t and cos(t/2); their series below 0.01 rad, exact to rounding
     series = 0.5 - square * (1.0 / 48.0 - square * (1.0 / 3840.0))
@@ -40,6 +41,7 @@ def integrate(q: list[Any], spin: Vector, dt: float) -> list[Any]:
     c = jnp.where(small, whole, jnp.cos(0.5 * angle))
     x, y, z = v.x * factor, v.y * factor, v.z * factor
     w0, x0, y0, z0 = q
+    # the product is of unit length but for rounding, which a million steps would add up
     return normalized(
         [
             w0 * c - x0 * x - y0 * y - z0 * z,

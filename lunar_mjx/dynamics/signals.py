@@ -46,7 +46,9 @@ __all__ = [
 ]
 
 _ZERO_CELSIUS = 273.15
+"""K; 0 degC, by definition."""
 _RAD_TO_DEG = 57.29577951308232
+"""deg; one radian, 180/pi."""
 
 
 def joint_channels(rover: Rover) -> list[str]:
@@ -164,6 +166,7 @@ def _felt_gravity(effects: Sequence[Effect], params: Params) -> Any:
 
 def _specific_force(seen: Telemetry, body: Frame, gravity: Any, lever: Sequence[float] | None) -> Vec3:
     """R^T (a + g z) at the accelerometer, m/s2."""
+    # as an IMU that averages over its interval: accelerations of single steps hold the jolts of contacts
     acceleration = Vec3(*(slope(v, seen.time) for v in seen.velocity))
     force = body.from_world(Vec3(acceleration.x, acceleration.y, acceleration.z + gravity))
     if lever is None:

@@ -48,6 +48,7 @@ class System:
         self.pipeline = Pipeline(model.effects)
         self.info = rover_info(model)
         self.params = default_params(model)
+        # unsteered wheels read joint 0 and drop it, so that all wheels go through one gather
         steer = [model.rover.joints.index(w.steer) if w.steer else -1 for w in model.rover.wheels]
         self._steer, self._steered = np.maximum(steer, 0), np.array(steer) >= 0
 
@@ -214,6 +215,7 @@ class System:
 
     def _context(self, params: Params, state: State, k: Kinematics) -> Context:
         dtype = state.qpos.dtype
+        # from the number of steps: sums of dt would drift in float32 by seconds within a day
         time = state.step.astype(dtype) * jnp.asarray(self.dt, dtype)
         return Context(
             time=time,

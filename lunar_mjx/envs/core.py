@@ -91,6 +91,7 @@ def where(condition: Bool[Array, "env"], new: Any, old: Any) -> Any:
 
 
 _WIDEST = 32
+"""Numbers per environment up to which an array counts as narrow: 32 floats are one cache line of 128 bytes."""
 
 
 def _narrow(array: Any) -> bool:

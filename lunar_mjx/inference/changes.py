@@ -98,6 +98,7 @@ class ChangeDetector:
         """
         self.usual, self.names = usual, tuple(jumps)
         self._jumps = np.stack([np.diag(np.asarray(size, float) ** 2) for size in jumps.values()])
+        # while nothing changes, R less the steps seen is a martingale: it reaches A after A steps in the mean, or more
         self._threshold = math.log(between_alarms)
         self.count = 0
         width = len(usual.start)
@@ -120,6 +121,7 @@ class ChangeDetector:
           columns: (n, k). residual: (n,), both in units of the noise, n >= 1.
         """
         kinds = len(self.names)
+        # a jump may begin at any step, so that each step starts a filter for every kind of it
         born = self._cov[:1] + self._jumps
         self._mean = np.concatenate([self._mean, np.repeat(self._mean[:1], kinds, axis=0)])
         self._cov = np.concatenate([self._cov, born])
@@ -127,6 +129,7 @@ class ChangeDetector:
         self._begun = np.append(self._begun, np.full(kinds, self.count))
         self._kind = np.append(self._kind, np.arange(kinds))
         density, self._mean, self._cov = _update(self.usual, self._mean, self._cov, columns, residual)
+        # Shiryaev and Roberts: the sum over beginnings of likelihood ratios, each against the filter without a jump
         self._log_ratio += density[1:] - density[0]
         keep = self._begun > self.count - MEMORY
         there = np.append(True, keep)
@@ -166,6 +169,7 @@ def _compressed(columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
     """The part of a step that tells of amounts, (m, k) and (m,), and what is noise alone: its squares and number."""
     if len(residual) <= columns.shape[1]:
         return columns, residual, 0.0, 0
+    # the rest is orthogonal to all columns: it tells of the noise alone, and goes in as one number
     orthogonal, upper = linalg.qr(columns, mode="economic")
     inside = orthogonal.T @ residual
     rest = max(float(residual @ residual - inside @ inside), 0.0)
@@ -195,11 +199,13 @@ def _update(
         logs.append(math.log(chance) - 0.5 * (np.sum(white**2, axis=1) + log_size + quiet))
         means.append(mean + np.einsum("bkm,bm->bk", gain, innovation))
         covs.append(cov - gain @ np.swapaxes(crossed, 1, 2))
+    # a mixture of two has twice as many parts after every step; merging by moments keeps it at one
     density = np.logaddexp(*logs)
     weight = np.exp(np.stack(logs) - density)
     middle = np.einsum("cb,cbk->bk", weight, np.stack(means))
     spread = np.stack(means) - middle
     merged = np.einsum("cb,cbkl->bkl", weight, np.stack(covs)) + np.einsum("cb,cbk,cbl->bkl", weight, spread, spread)
+    # rounding leaves it a little asymmetric, which would grow from step to step
     return density, middle, 0.5 * (merged + np.swapaxes(merged, 1, 2))
 
 

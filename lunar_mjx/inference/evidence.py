@@ -215,6 +215,7 @@ class Evidence:
             after = _log_between((low[i] - self.mean[i]) / std, (high[i] - self.mean[i]) / std)
             centre = self.amplitudes.mean[i]
             before = _log_between((low[i] - centre) / prior[i], (high[i] - centre) / prior[i])
+            # one by one: the exact probability of a box has no closed form, and bounds rarely bind two at once
             total += after - before
         return total
 
@@ -270,6 +271,7 @@ def infer(
             break
     else:
         raise EvidenceError(f"sizes of discrepancy and noise did not settle: a step still promises {promised:.2g}")
+    # a size is never taken to be known worse than to a factor of 20: Laplace's volume would have no end there
     hessian = _positive(here.hessian)
     log_evidence = here.value + 0.5 * len(x) * _LOG_2PI - 0.5 * float(np.linalg.slogdet(hessian)[1])
     spread = np.sqrt(np.diag(np.linalg.inv(hessian)))
@@ -294,6 +296,7 @@ def _newton_step(here: _At) -> np.ndarray:
 def _positive(hessian: np.ndarray) -> np.ndarray:
     """The matrix with eigenvalues of at least 0.1, that of a size known to a factor of 20."""
     values, vectors = np.linalg.eigh(hessian)
+    # away from the maximum the density may curve upward; a step along such a direction must still go uphill
     if len(values) == 0 or values[0] >= 0.1:
         return hessian
     return (vectors * np.maximum(np.abs(values), 0.1)) @ vectors.T
@@ -337,6 +340,7 @@ def _density(x: np.ndarray, gram: Gram, amplitudes: Amplitudes, usual: np.ndarra
     value, mean, inverse, scale = _condition(gram, amplitudes, tau, noise)
     shift = amplitudes.mean
     member = np.array([amplitudes.field == f for f in range(many)], float).reshape(many, k)
+    # share of each amplitude's prior that the measurements have taken away
     absorbed = np.eye(k) - inverse
     # traces and quadratic forms, each over two: fields first, then noise groups
     trace = np.empty(many + groups)

@@ -16,6 +16,7 @@ AT_NOISE = 1.03
 CHANNEL_AT_NOISE = 1.05
 """The same for the worst single channel."""
 _SAMPLING = 3.5
+"""Standard errors of the mean square that sampling may add: one in four thousand exceeds them."""
 _KNOWN = 1e-2
 """Share of what is known about a direction from which the other manoeuvres count as knowing it."""
 ENOUGH = 4

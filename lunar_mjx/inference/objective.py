@@ -11,6 +11,7 @@ from scipy.optimize import lsq_linear
 from lunar_mjx.inference.problem import Problem
 
 _PROBE = 0.1
+"""Share of a step at which the second derivative along it is measured (Transtrum & Sethna 2012 take 0.1)."""
 _ROOM = 1e-12
 """Width that the solver needs between bounds."""
 

@@ -30,6 +30,7 @@ PARABOLA = 3
 WINDOWS = 200
 """Windows that are looked at, spread over the drive."""
 FEWEST_WINDOWS = 3
+"""Windows of a drive below which its noise is not told."""
 SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97)
 TIMES_S = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """What is tried: shares of the variance that are correlated, and correlation times."""
@@ -42,6 +43,7 @@ STILL_RAD_S = 0.02
 """A wheel that turns slower stands."""
 _NAMES = {"imu": "vibration", "electrical": "ripple", "torque": "ripple"}
 _QUIETEST = 1e-12
+"""Least variance that has a logarithm, in squared units of the channel: below it a channel is constant."""
 
 
 @dataclasses.dataclass(frozen=True)

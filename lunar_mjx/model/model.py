@@ -23,7 +23,9 @@ LUNAR_GRAVITY = 1.625
 """m/s2, the seed paper's value."""
 
 ROOM = 298.15
+"""K; 25 degC."""
 ZERO_CELSIUS = 273.15
+"""K; 0 degC, by definition."""
 GAINS = ("position_gain_Nm_rad", "velocity_gain_Nms_rad")
 """Names in `model.toml` of a joint group's two gains."""
 

@@ -22,6 +22,7 @@ REACH = 3.0
 """Radii at which the ejecta blanket ends; it falls with the cube of the distance (McGetchin et al. 1973)."""
 _ROUND = 0.05  # width of the rounding of the rim's crest, as a share of the depth
 _MOST = 200_000
+"""Craters above which a terrain is refused: they are dug one by one."""
 
 
 @dataclasses.dataclass(frozen=True)

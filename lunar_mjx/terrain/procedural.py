@@ -18,6 +18,7 @@ from lunar_mjx.terrain.soil.maps import SoilMap
 TOLERANCE = 1e-3
 """Most that `add_detail` changes the mean height of a DEM cell, m."""
 _ROUNDS = 60
+"""Corrections of a surface until its means over the coarse cells are within half of `TOLERANCE`."""
 # Independent random streams, so that changing the craters does not move the rocks.
 _ROUGHNESS, _CRATERS, _ROCKS, _SOIL = range(4)
 

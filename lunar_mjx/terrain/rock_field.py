@@ -17,7 +17,9 @@ from lunar_mjx.terrain.checks import require_at_least, require_between, require_
 from lunar_mjx.terrain.rocks import CELL, REACH, Rocks, build_rocks
 
 _MOST = 20_000
+"""Rocks above which a terrain is refused: each is placed beside those before it."""
 _TRIES = 30
+"""Places tried for a rock before it is left out."""
 
 
 @dataclasses.dataclass(frozen=True)

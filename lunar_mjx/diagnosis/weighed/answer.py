@@ -109,6 +109,7 @@ def diagnose(
     own = problem.own
     if not any(h.form == own.name for h in found.hypotheses):
         return Diagnosis(Verdict.BAD_FIT, (), f"The solver failed ({'; '.join(found.failed)})."), None
+    # the model's own form, whichever form won: "refitted" is told of what the user gave
     base = found.base(own.name).refit
     best = next(h for h in found.hypotheses if h.refitted)
     diagnosis = _diagnosis(problem, found, best)

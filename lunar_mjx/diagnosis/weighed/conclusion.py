@@ -58,6 +58,7 @@ def conclude(found: ModelSearch, sure: float) -> Conclusion:
         effects = tuple(dict.fromkeys([*names, *_helpful(found)]))
         return Conclusion(Verdict.UNKNOWN, effects, True, port, unlisted, said, place)
     if named:
+        # each is sure by itself, and all of them together less so: this is the probability that is told
         p = found.probability_of(lambda h: set(named) <= h.terms)
         names = tuple(map(label, named))
         rest = [t for t in inclusion if t not in named]
@@ -168,6 +169,7 @@ def _smallest(
 
     p = 0.0
     while p < sure and len([m for m in members if m != _UNLISTED]) < LARGEST_CLASS:
+        # jointly, not from the terms' own probabilities: hypotheses that hold both must not count twice
         gains = {t: found.probability_of(holds([*members, t])) for t in by_label if t not in members}
         best = max(gains, key=lambda t: gains[t], default=None)
         if best is None or gains[best] <= p:

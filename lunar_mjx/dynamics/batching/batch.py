@@ -88,6 +88,7 @@ def rollout_batch(
                 new, kept = run(params, carry[0], control)
                 return new, kept if last else jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), kept, carry[1])
 
+            # a loop must carry something of this shape; it is overwritten in the first round
             blank = jax.tree.map(
                 lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: run(params, now, control)[1])
             )
@@ -96,6 +97,7 @@ def rollout_batch(
         def hold(now: State, control: Any) -> tuple[State, Any]:
             if one_body:
                 return hold_one(now, control)
+            # unless the last step is asked for, this one alone makes telemetry, and XLA drops it from the silent ones
             new, kept = run(params, now, control)
             if last:
                 return jax.lax.fori_loop(1, every, lambda _, carry: run(params, carry[0], control), (new, kept))
@@ -134,6 +136,7 @@ def _in_chunks(function: Callable[..., Any], params: Params, axes: Axes, varying
     if batch <= size:
         return block(args)
     count = math.ceil(batch / size)
+    # chunks of even size: one program, and the last one is not nearly empty
     size = math.ceil(batch / count)
 
     def split(a: Any) -> Any:

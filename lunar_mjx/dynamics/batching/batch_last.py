@@ -107,6 +107,7 @@ def _apply(eqn: Any, operands: list[_Value]) -> list[_Value]:
     if name == "optimization_barrier":
         out = bind(eqn, [o.array for o in operands])
         return [_Value(x, o.axis) for x, o in zip(out, operands, strict=True)]
+    # a map of the rover's own keeps its batch axis in front, so that its cells lie together
     if name == "reshape" and operands[0].axis == 0:
         x = operands[0].array
         return [_Value(jnp.reshape(x, (x.shape[0], *eqn.params["new_sizes"])), 0)]
@@ -139,6 +140,7 @@ def _elementwise(eqn: Any, operands: list[_Value]) -> Any:
             continue
         shape = jnp.shape(o.array) if o.axis is None else o.array.shape[:-1]
         last = 1 if o.axis is None else o.array.shape[-1]
+        # a rover's number beside an array over its wheels: new axes go in front of the batch axis, which stays the last
         lead = (1,) * (rank - len(shape)) if not shape else ()
         arrays.append(jnp.reshape(o.array, (*lead, *shape, last)))
     full = jnp.broadcast_shapes(*(jnp.shape(a) for a in arrays))

@@ -133,6 +133,7 @@ def _evaluate(steps: list[_Step], results: list[_Value]) -> list[Any]:
         if len(made) > 1 or _own_kernel(eqn):
             continue
         for value in operands:
+            # a set, not a sum: an operation that two operands need is computed once within one kernel
             made[0].pending |= value.pending
         name = eqn.primitive.name
         made[0].pending[number] = 0.0 if name in _MOVES else _ADDITIONS.get(name, 1.0) * size

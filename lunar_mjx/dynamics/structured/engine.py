@@ -223,6 +223,7 @@ class StructuredEngine:
         Raises:
           UnsuitableError: a leg has more joints than its wheel's.
         """
+        # a suspension would move freely, and `impose` takes the motion of every joint as given
         if any(len(g.links) != 1 or g.links[0].actuated is None for g in self.structure.groups):
             raise UnsuitableError("imposed motion needs a rover whose wheels' drives are its only joints.")
         numbers, legs, base = self._kinematic_state(qpos, qvel)
@@ -296,12 +297,14 @@ class StructuredEngine:
         linear = acceleration.linear + motion.angular.cross(motion.linear)
         velocity = base.velocity + frame.apply(linear) * dt
         spin = motion.angular + acceleration.angular * dt
+        # with the new velocity (semi-implicit): with the old one contacts would gain energy
         position = base.position + velocity * dt
         quaternion = integrate(base.quaternion, spin, dt)
         speeds = [
             [leg.speed[k] + dt * r for k, r in zip(n.free, rate, strict=True)]
             for n, leg, rate in zip(numbers, legs, rates, strict=True)
         ]
+        # before the angles are stepped, which are stepped with these
         speeds = self._coupled(speeds)
         free = [
             [leg.angle[k] + dt * w for k, w in zip(n.free, speed, strict=True)]

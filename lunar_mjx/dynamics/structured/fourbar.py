@@ -79,6 +79,7 @@ class FourBar:
             gain = tuple(g for i, g in enumerate(gains) if i != self.given)
             return gain, (0.0, 0.0)  # type: ignore[return-value]
         phi = self._solve(n, mul(own, angle))
+        # the closure r_1 + r_2 - r_3 = const is linear in the rates, so that no further trigonometry is needed
         r = _turn(n.d, phi[0]), _turn(n.e, add(phi[0], phi[1])), _turn(n.f, phi[2])
         # in the absolute angles x = (phi_1, phi_1 + phi_2, phi_3): r_1 x_1' + r_2 x_2' - r_3 x_3' = 0 (turned by J)
         columns = (add(r[0][0], r[1][0]), add(r[0][1], r[1][1])), r[1], (neg(r[2][0]), neg(r[2][1]))
@@ -126,6 +127,7 @@ class FourBar:
 
 
 _PARALLELOGRAM = ((1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, -1.0, 1.0))
+"""Rates of the three joints per rate of the given one: opposite sides stay parallel, angles differ by sign alone."""
 
 
 def _plus(p: Plane, q: Plane) -> Plane:
@@ -197,6 +199,7 @@ def read_fourbar(
         raise UnsuitableError(f"{name} runs over {len(long)} + {len(short)} joints; a four-bar has 2 + 1.")
     chosen = (long[0], long[1], short[0])
     legs = [_measure(links, chosen, leg, anchors[leg][:: -1 if swap else 1], name) for leg in range(count)]
+    # an actuated joint is the independent one: its friction and limits then act on a coordinate of its own
     given = next((i for i in (0, 2, 1) if links[chosen[i]].actuated is not None), 0)
     if sum(links[i].actuated is not None for i in chosen) > 1:
         raise UnsuitableError(f"{name} has more than one actuated joint.")
@@ -257,6 +260,7 @@ def _measure(links: list[Link], chosen: tuple[int, int, int], leg: int, anchors:
         raise UnsuitableError(f"{name} is not planar: its axes are not parallel.")
     if np.linalg.norm(pins[0] - pins[1]) > 1e-6 * reach:
         raise UnsuitableError(f"{name} is open by {np.linalg.norm(pins[0] - pins[1]):.2g} m at zero angles.")
+    # the axis most across the normal: a product with one nearly along it would lose its digits
     u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     u /= np.linalg.norm(u)
     plane = np.stack([u, np.cross(normal, u)])
@@ -274,6 +278,7 @@ def _branch(loop: FourBar, legs: list[_Measured], name: str) -> LoopNumbers:
             vectors: Any = {k: tuple(float(c) for c in getattr(leg, k)) for k in "defb"}
             phi = loop._solve(LoopNumbers(leg.senses, **vectors, branch=sign), np.float64(0.0))
             errors.append(max(abs(float(p)) for p in phi))
+        # at a dead point both assemblies meet, and which one a rover is in would be decided by rounding
         if abs(errors[0] - errors[1]) < 1e-2:
             raise UnsuitableError(f"{name} is at a dead point at zero angles.")
         signs.append(1.0 if errors[0] < errors[1] else -1.0)

@@ -136,6 +136,7 @@ def forward_kinematics(n: LegGroup, base: Motion, turns: tuple[Turn, ...], free:
     for k, link in enumerate(n.links):
         up = ground if link.parent == CHASSIS else links[link.parent]
         origin = up.origin + up.frame.apply(link.numbers.origin)
+        # a turn leaves its own axis alone, so that it is read before the turn, where it has more zeros
         mount = up.frame.then(link.numbers.turn)
         axis = mount[link.axis]
         subspace = Motion(axis, origin.cross(axis))
@@ -170,9 +171,11 @@ def leg_block(
     coupling: list[list[Any]] = [[0.0] * 6 for _ in range(count)]
     for k in reversed(range(count)):
         link, subspace = n.links[k], leg.links[k].subspace
+        # the model's motor, where there is one, in place of what the MJCF draws
         reflected = link.numbers.armature
         if armature is not None and link.actuated is not None:
             reflected = select(armature, link.actuated)
+        # damping acts at the new speed: at the old one it would turn a light joint around within a step
         added = add(reflected, mul(dt, link.numbers.damping))
         bias = add(subspace.dot(force[k]), mul(added, leg.drift[k]))
         torque[k] = sub(_joint_torque(n, leg, k, forces), bias)
@@ -186,6 +189,7 @@ def leg_block(
         if link.parent == CHASSIS:
             hung = hung[0] + composite[k], hung[1] + force[k]
         else:
+            # no shift to the parent: all inertias are about the chassis frame already
             composite[link.parent] = composite[link.parent] + composite[k]
             force[link.parent] = force[link.parent] + force[k]
     return _project(n, leg, LegBlock(mass, coupling, torque, *hung, n.ties))
@@ -250,6 +254,7 @@ def solve(
     """
     pulls = [_pull(coupling, blocks) for coupling in couplings]
     total_inertia, total_force = chassis, [*force.moment, *force.force]
+    # the lower triangle only: the complement is symmetric, and solve_positive reads no more
     corrections: list[list[Any]] = [[0.0] * 6 for _ in range(6)]
     pulled: list[list[Any]] = [[0.0] * 6 for _ in pulls]
     eliminated: list[list[list[Any]]] = []
@@ -289,6 +294,7 @@ def solve(
     answers = [_substituted(eliminated, 7 + c, response) for c, response in enumerate(responses)]
     gaps = [_gap(pull, rates) for pull in pulls]
     compliance = [[_gap(pull, answer) for answer in answers] for pull in pulls]
+    # J H^-1 J^T is positive as long as no two couplings say the same
     (forces,) = solve_positive(compliance, [[neg(gap) for gap in gaps]])
     for force_of, response, answer in zip(forces, responses, answers, strict=True):
         a = [add(old, mul(force_of, more)) for old, more in zip(a, response, strict=True)]

@@ -24,6 +24,7 @@ from lunar_mjx.dynamics.structured.links import Link, LinkNumbers
 from lunar_mjx.dynamics.structured.suitability import UnsuitableError
 
 CHASSIS, WORLD = -1, -2
+"""Parents that are no links of a leg."""
 
 
 class WheelNumbers(NamedTuple):

@@ -19,6 +19,7 @@ EVENTS = 8
 """Changes of the command that a delay remembers."""
 
 _LONG_AGO = 1e3
+"""s; age of a change that no delay reaches back to."""
 
 
 def _delay_memory() -> dict[str, StateVariable]:

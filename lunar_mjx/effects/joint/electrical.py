@@ -63,8 +63,10 @@ def voltage_saturation(ctx, p, x, command):
     droop = ctx.parameters.get("bus_droop")
     if droop is not None:
         power = jnp.sum(_limited(voltage, limit) * command.current)
+        # a fifth at least: beyond the power that the resistance passes on, the formula turns negative
         sagged = jnp.maximum(1.0 - droop.resistance * power / droop.voltage**2, 0.2)
         limit = limit * sagged**-SHARPNESS
+    # only the current can be changed; the back-EMF is given by the speed
     wanted = (_limited(voltage, limit) - voltage) / resistance
     # slope of the braking torque by speed, against what an explicit step takes
     stiffness = torque_per_ampere(motor) * constant / resistance / largest_damping(ctx)
@@ -74,6 +76,7 @@ def voltage_saturation(ctx, p, x, command):
 
 def _limited(voltage, limit):
     excess = limit * jnp.abs(voltage / BUS_VOLTAGE) ** SHARPNESS
+    # expm1 and log1p: far below the limit V' - V is a difference of nearly equal numbers
     return voltage + voltage * jnp.expm1(-jnp.log1p(excess) / SHARPNESS)
 
 

@@ -24,6 +24,7 @@ _LEAST_INERTIA: Annotated[float, "kg m2"] = 1e-3
 def largest_damping(ctx) -> Any:
     """J/dt, N m s/rad: damping that an explicit step still takes without turning the joint around."""
     motor, inertia = ctx.parameters.get("motor"), _LEAST_INERTIA
+    # the larger of the two: the drawn inertia of a joint may leave out its rotor, and a rotor alone its wheel
     if motor is not None:
         inertia = jnp.maximum(motor.rotor_inertia * motor.gear_ratio**2, inertia)
     if ctx.rover.joint_inertia is not None:

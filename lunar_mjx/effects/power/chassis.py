@@ -17,6 +17,7 @@ def chassis_temperature(p, x):
 
 def _exchange(ctx, p, x, heat):
     temperature = chassis_temperature(p, x)
+    # what housings lose the chassis gains: the same number on both sides keeps the energy
     flow = p.conductance * (ctx.housing_temperature - temperature)
     ground = p.ground_view * ctx.ambient_temperature**4
     radiated = p.radiator * STEFAN_BOLTZMANN * (temperature**4 - ground)

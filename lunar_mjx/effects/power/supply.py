@@ -35,6 +35,7 @@ def motor_power(ctx, p, x, power):
     current = ctx.command.current
     back_emf = constant_at(ctx.parameters, ctx.winding_temperature) * motor.gear_ratio * ctx.joint_speed
     each = current * (winding_resistance(motor, ctx.winding_temperature) * current + back_emf)
+    # motor by motor: on one rover some drive while others brake, and only a driving one pays the amplifier's loss
     drawn, braking = jnp.sum(jnp.maximum(each, 0.0)), jnp.sum(jnp.minimum(each, 0.0))
     load = drawn / p.efficiency + p.returned * braking
     return dataclasses.replace(power, load=power.load + load, loss=power.loss + load - drawn - braking)
@@ -120,6 +121,7 @@ def _store(ctx, p, x, power):
     needed = power.load - power.solar
     # U I - R I^2 = P, the root with the smaller current; beyond U^2/(4 R) the battery gives what it can
     root = jnp.sqrt(jnp.maximum(voltage * voltage - 4.0 * p.resistance * needed, 0.0))
+    # the quadratic's root without the difference U - root, which has no digits left at small loads
     current = 2.0 * needed / (voltage + root)
     current = jnp.clip(current, -voltage / (2.0 * p.resistance), voltage / (2.0 * p.resistance))
     # a full battery takes nothing more (panels are turned off), an empty one gives nothing more
@@ -128,6 +130,7 @@ def _store(ctx, p, x, power):
     # Kahan's sum: in float32 a charge of 1e5 A s does not take the 1e-3 A s of a time step
     step = ctx.dt * current - x.used_lost
     used = x.used + step
+    # with hysteresis: without it the first joule from the Sun would start the motors, which would stop again at once
     flat = jnp.where(charge <= p.cut_off, 1.0, jnp.where(charge >= p.cut_off + p.restart, 0.0, x.flat))
     loss = power.loss + p.resistance * current**2
     return dataclasses.replace(power, loss=loss, current=current, voltage=voltage - p.resistance * current), {

@@ -15,7 +15,9 @@ from lunar_mjx.effects.base import Parameter, StateVariable, effect
 from lunar_mjx.spatial import Vec3
 
 _MIN_SINKAGE = 1e-9
+"""Least sinkage over radius: a root has no finite derivative at zero."""
 _TINY = 1e-24
+"""Added below a root of two squares, far below the squared displacements over moduli that move soil."""
 _MAX_SINKAGE_RATIO = 1.5
 """The contact arc is followed up to an entrance angle of 120 deg; a wheel buried deeper keeps the force of that arc."""
 
@@ -48,6 +50,7 @@ def max_normal_stress(soil, width, radius, theta_m, theta_1):
 
 def janosi(displacement, modulus):
     """(1 - exp(-|j|/K)) sign(j): share of the shear strength that a displacement mobilises (Janosi & Hanamoto)."""
+    # the two signs apart: |j| has no derivative at 0, where a wheel at rest is
     forward = jnp.where(displacement >= 0.0, displacement, 0.0)
     backward = jnp.where(displacement >= 0.0, 0.0, displacement)
     return -jnp.expm1(-forward / modulus) + jnp.expm1(backward / modulus)
@@ -106,6 +109,7 @@ def pressure_sinkage(ctx, p, x, normal):
     a, b = geometry_factors(theta_m)
     area = geometry.radius * geometry.width
     load = area * sigma_m * a
+    # no more than the load: soil does not pull a leaving wheel down
     damping = jnp.maximum(normal_damping_force(ctx, p.damping, theta_1), -load)
     return dataclasses.replace(
         normal,
@@ -121,6 +125,7 @@ def pressure_sinkage(ctx, p, x, normal):
 def mean_decay(q):
     """(1 - exp(-q))/q, by its series where the quotient and its derivative would lose digits."""
     small = q < 1e-2
+    # the branch that is not taken must be finite too: its derivative is multiplied by zero, not left out
     safe = jnp.where(small, 1.0, q)
     series = 1.0 - q / 2.0 * (1.0 - q / 3.0 * (1.0 - q / 4.0 * (1.0 - q / 5.0 * (1.0 - q / 6.0))))
     return jnp.where(small, series, -jnp.expm1(-safe) / safe)
@@ -185,6 +190,7 @@ def shear_state(ctx, p, x, wheel):
     rock = ctx.soil.rock > 0.5
     length = jnp.maximum(contact_length(ctx, ctx.normal), _SHORTEST * ctx.geometry.radius)
     length = jnp.where(rock, p.rock_length, length)
+    # eq. 8 divides by the faster of rim and hub
     roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
     # share of the way to the steady value, over the time that it would take at the first rate
     gained = mean_decay(jnp.abs(roll) * ctx.dt / length) / length
@@ -192,8 +198,10 @@ def shear_state(ctx, p, x, wheel):
     lifted = airborne(contact)
 
     def advance(value, speed):
+        # (1 - exp(-V dt/L))/(V dt) in place of 1/L: the exact mean rate over the step, finite where V is 0
         rate = gained * (speed - jnp.abs(roll) * value)
         new = value + ctx.dt * rate
+        # damping acts on soil that is being loaded; it fades with rolling, which brings fresh soil
         return jnp.where(lifted, 0.0, new), jnp.where(lifted, 0.0, new + p.damping_time * rate * held)
 
     slip_x, loaded_x = advance(x.slip_x, contact.rim_speed - contact.v_x)
@@ -207,6 +215,7 @@ def shear_state(ctx, p, x, wheel):
 def lateral_slip_speed(contact):
     """Numerator of (1 - s) tan(beta) over V_r: v_y driving, v_y (2 - r omega/v_x) braking, m/s (eqs. 8-11)."""
     braking = jnp.abs(contact.rim_speed) <= jnp.abs(contact.v_x)
+    # a wheel at rest counts as driving: its ratio of speeds would be 0/0
     rolling = jnp.abs(contact.v_x) > STANDSTILL_SPEED
     speed = jnp.where(rolling, contact.v_x, 1.0)
     factor = jnp.where(braking & rolling, 2.0 - jnp.clip(contact.rim_speed / speed, -1.0, 1.0), 1.0)

@@ -25,6 +25,7 @@ NODES = 12
 """Gauss-Legendre nodes over the contact arc."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(NODES)
 _TINY = 1e-12
+"""m2/s2; added below roots of squared speeds, whose derivative at rest would not be finite: a micrometre per second."""
 
 _POWERS = (
     (0, 0, 0),

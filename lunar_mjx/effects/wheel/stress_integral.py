@@ -44,6 +44,7 @@ def integrate(ctx, contact, theta_1, theta_m, theta_2):
     mirror = theta_1 - (rear - theta_2) / (theta_m - theta_2) * (theta_1 - theta_m)
     theta = jnp.concatenate([rear, front])
     weight = jnp.concatenate([half * (theta_m - theta_2), half * (theta_1 - theta_m)])
+    # depth^n with n < 1 has an infinite derivative at 0, where the arc begins
     depth = jnp.maximum(r * cos_difference(jnp.concatenate([mirror, front]), theta_1), 1e-12 * r)
     sigma = grounded(contact, modulus * depth**ctx.soil.n)
     area = r * b

@@ -10,6 +10,7 @@ from lunar_mjx.errors import bad_input
 from lunar_mjx.terrain import Terrain
 
 _TRIES = 200
+"""Rounds of drawing until the terrain is taken to have too few free places."""
 
 
 def draw_places(

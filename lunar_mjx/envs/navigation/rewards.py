@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from lunar_mjx.pytree import pytree
 
 _TINY = 1e-6
+"""m; least distance to a goal that a direction is divided by, far below any goal radius."""
 
 
 @pytree

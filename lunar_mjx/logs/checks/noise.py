@@ -31,10 +31,12 @@ WHITE = 0.15
 """Largest correlation of neighbouring samples that passes for white noise."""
 
 SHORTEST = 1.2
+"""s; shortest rest that is used: twice `MARGIN`, and as much again for the noise itself."""
 MARGIN = 0.3
 """Seconds at both ends of a rest in which filters and difference quotients still see the motion beside it."""
 
 FEWEST = 20
+"""Samples of rest below which no noise is estimated: its standard deviation would be off by a sixth or more."""
 
 
 def rest_segments(log: Log) -> list[tuple[float, float]]:

@@ -12,6 +12,7 @@ from lunar_mjx.errors import bad_input
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 DAY = 86400.0
+"""s."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,6 +8,7 @@ SEMI_MAJOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
 """WGS84 ellipsoid (NIMA TR8350.2, 2000)."""
 _E2 = FLATTENING * (2.0 - FLATTENING)
 _UTM_SCALE, _UTM_FALSE_EASTING, _UTM_FALSE_NORTHING_SOUTH = 0.9996, 500000.0, 1e7
+"""1, m, m; scale on the central meridian and false origin of the UTM grid, by its definition."""
 
 
 def tangent_plane(

@@ -37,6 +37,7 @@ _KINDS = {
 _LENGTHS = {"M": 1.0, "METER": 1.0, "METERS": 1.0, "KM": 1e3, "KILOMETER": 1e3, "KILOMETERS": 1e3}
 _PAIR = re.compile(r"^\s*(\^?[A-Z][A-Z0-9_:]*)\s*=\s*(.*)$")
 _MOST_LABEL_BYTES = 1 << 20
+"""Bytes of a label that are read: real ones have some kilobytes, and a hostile one must not fill the memory."""
 
 Label = dict[str, str]
 
