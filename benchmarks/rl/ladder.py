@@ -37,9 +37,11 @@ PIECE = 25
 """Control steps between looks at whether all episodes are over."""
 
 
-def agents(env: Any, params: Any, rover: str) -> dict[str, Any]:
-    """All agents by name, functions of state and key."""
+def agents(env: Any, params: Any, rover: str, tuned: dict[str, Any] | None) -> dict[str, Any]:
+    """All agents by name, functions of state and key; the reactive rule with its own and with `tuned` settings."""
     found = {name: make_agent(name, env, params) for name in SCRIPTED}
+    if tuned is not None:
+        found["reactive, tuned"] = reactive_rule(env, Reactive(**tuned))
     path = shipped_policy(rover)
     if path is None:
         return found
@@ -82,22 +84,25 @@ def drive(env: Any, params: Any, choices: list[Any], episodes: int, seed: int) -
     return {k: np.asarray(v).reshape(len(choices), episodes) for k, v in carry[2].items()}
 
 
-def measure(number: int, episodes: int, seed: int, rover: str, **settings: Any) -> dict[str, Any]:
-    """The rows of one rung."""
+def measure(
+    number: int, episodes: int, seed: int, rover: str, names: list[str], tuned: Any, **settings: Any
+) -> dict[str, Any]:
+    """Rows of one rung by agent, all agents if `names` is empty; each tells how it was measured."""
     begin = time.monotonic()
     env = make_navigation(f"ladder/{number}", rover, **settings)
     params = unseen_params(env, UNSEEN_LADDER)
-    told = agents(env, params, rover)
+    told = agents(env, params, rover, tuned)
+    told = {name: agent for name, agent in told.items() if not names or name in names}
     result = drive(env, params, list(told.values()), episodes, seed)
     rows = {}
     for i, name in enumerate(told):
         row = score({k: v[i] for k, v in result.items()}, env.control_interval)
-        rows[name] = dataclasses.asdict(row)
+        rows[name] = dataclasses.asdict(row) | {"commit": commit(), "seed": seed, "settings": settings}
+        rows[name]["device"] = jax.devices()[0].device_kind
         cost = f"SPL {row.spl}, {row.collisions_per_km} collisions/km, {row.wh_per_km} Wh/km"
         say(f"rung {number} {name}: {percent(rows[name])}, {cost}, slip {row.slip}")
-    about = {"commit": commit(), "seed": seed, "episodes": episodes, "settings": settings}
-    about["device"] = jax.devices()[0].device_kind
-    return {**about, "wall_s": time.monotonic() - begin, "rows": rows}
+    say(f"rung {number}: {time.monotonic() - begin:.0f} s")
+    return rows
 
 
 SEARCHED = {
@@ -143,6 +148,7 @@ def main() -> None:
     parser.add_argument("--rover", default="luvmi_x")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/rl/ladder.json"))
     parser.add_argument("--worlds", type=int, default=0, help="side by side; as many as the rung says if 0")
+    parser.add_argument("--agents", nargs="*", default=[], help="which rows to measure; all if left out")
     parser.add_argument("--tune", type=int, default=0, help="how many settings of the reactive rule to try")
     args = parser.parse_args()
     old = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
@@ -152,7 +158,11 @@ def main() -> None:
             tuned = tune(number, args.tune, args.episodes, args.seed, args.rover, args.worlds)
             old["tuned"][str(number)] = tuned
         else:
-            old["rungs"][str(number)] = measure(number, args.episodes, args.seed, args.rover, worlds=args.worlds)
+            rows = old["tuned"].get(str(number), {}).get("rows")
+            tuned = rows[0]["settings"] if rows else None
+            one = (number, args.episodes, args.seed, args.rover, args.agents, tuned)
+            rung = old["rungs"].setdefault(str(number), {"rows": {}})
+            rung["rows"] |= measure(*one, worlds=args.worlds)
         save(args.out.parent, args.out.stem, old)
 
 
