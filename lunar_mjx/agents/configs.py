@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lunar_mjx.agents import ddpg, td3
+from lunar_mjx.agents.from_brax import ppo, sac
 from lunar_mjx.agents.learner import TrainConfig
 from lunar_mjx.errors import bad_input
 from lunar_mjx.resources import shipped
@@ -24,6 +25,8 @@ class Training:
       steps: environment steps, over all environments.
       unseen: options of the environment that evaluations use instead: other terrain, ranges and places.
       note: one sentence.
+      settings: name of the training, or path of the file, that `train` comes from.
+      borrowed: whether that is another file than the training's own.
     """
 
     environment: str
@@ -32,11 +35,18 @@ class Training:
     steps: int
     unseen: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     note: str = ""
+    settings: str = ""
+    borrowed: bool = False
 
 
-ALGORITHMS: Mapping[str, type] = {"td3": td3.TD3Config, "ddpg": ddpg.DDPGConfig}
+ALGORITHMS: Mapping[str, type] = {
+    "td3": td3.TD3Config,
+    "ddpg": ddpg.DDPGConfig,
+    "sac": sac.SACConfig,
+    "ppo": ppo.PPOConfig,
+}
 """Tables of a training file that name the algorithm and hold its settings."""
-_KEYS = ("note", "environment", "steps", "options", "unseen", "train", *ALGORITHMS)
+_KEYS = ("note", "environment", "steps", "learner", "options", "unseen", "train", *ALGORITHMS)
 
 
 def training_names() -> tuple[str, ...]:
@@ -44,18 +54,53 @@ def training_names() -> tuple[str, ...]:
     return tuple(sorted(p.stem for p in shipped("train").glob("*.toml")))
 
 
-def get_training(name: str | Path) -> Training:
+def get_training(name: str | Path, learner: str | None = None) -> Training:
     """A training by the name of a shipped file, or by the path of a file like those.
 
+    Args:
+      name: of the training. learner: another algorithm than the file's, with the settings of the shipped training
+        beside it: of `large-ppo` for `ppo` instead of `large-td3`.
+
     Raises:
-      UserError: there is no such training, or its file says something that no training has.
+      UserError: there is no such training, its file says something that no training has, or no settings of this learner
+        stand beside it.
     """
     if str(name) in training_names():
-        return read_training(shipped("train") / f"{name}.toml")
-    if Path(name).suffix == ".toml":
-        return read_training(Path(name))
+        training = read_training(shipped("train") / f"{name}.toml")
+    elif Path(name).suffix == ".toml":
+        training = read_training(Path(name))
+    else:
+        training = None
+    if training is not None:
+        return training if learner is None else _with_learner(training, learner)
     known = ", ".join(training_names())
     raise bad_input("train", "training", str(name), "does not exist", f"use one of {known}, or a file my_training.toml")
+
+
+def learner_name(training: Training) -> str:
+    """Name of a training's algorithm."""
+    return next(name for name, kind in ALGORITHMS.items() if isinstance(training.train.algorithm, kind))
+
+
+def _with_learner(training: Training, learner: str) -> Training:
+    if learner not in ALGORITHMS:
+        raise bad_input("train", "--learner", learner, "does not exist", f"use one of {', '.join(ALGORITHMS)}")
+    own = learner_name(training)
+    if learner == own:
+        return training
+    family, names = training.settings.removesuffix(f"-{own}"), training_names()
+    for name in (f"{family}-{learner}", family):
+        if name in names and learner_name(other := get_training(name)) == learner:
+            # a file that only names its learner tells its task's steps; else the other learner's file does
+            steps = training.steps if training.borrowed else other.steps
+            return dataclasses.replace(training, train=other.train, steps=steps, settings=name)
+    raise bad_input(
+        "train",
+        "--learner",
+        learner,
+        f"has no settings beside those of {training.settings}",
+        f'give a file with a table [{learner}], or with learner = "large-{learner}" in place of the tables',
+    )
 
 
 def read_training(path: Path) -> Training:
@@ -67,12 +112,20 @@ def read_training(path: Path) -> Training:
     fields = Fields.read(path, "the training")
     fields.known(_KEYS)
     named = [a for a in ALGORITHMS if a in fields.values]
-    if len(named) != 1:
+    settings = path.stem if path.parent == shipped("train") else str(path)
+    if "learner" in fields.values:
+        if named or "train" in fields.values:
+            table = (named or ["train"])[0]
+            raise bad_input(path, "learner", fields.text("learner"), f"stands beside [{table}]", "give one of them")
+        other = get_training(fields.text("learner"))
+        train, settings = other.train, other.settings
+    elif len(named) != 1:
         tables = " or ".join(f"[{a}]" for a in ALGORITHMS)
         raise bad_input(path, "algorithm", " and ".join(named) or "none", "is not one table", f"give one of {tables}")
+    else:
+        algorithm = _settings(ALGORITHMS[named[0]](), fields.table(named[0]))
+        train = _settings(TrainConfig(algorithm), fields.table("train"), _unused(algorithm))
     steps = fields.positive("steps")
-    algorithm = _settings(ALGORITHMS[named[0]](), fields.table(named[0]))
-    train = _settings(TrainConfig(algorithm), fields.table("train"))
     return Training(
         fields.text("environment"),
         _tuples(fields.table("options").values),
@@ -80,12 +133,19 @@ def read_training(path: Path) -> Training:
         int(steps),
         _tuples(fields.table("unseen").values),
         fields.text("note", ""),
+        settings,
+        "learner" in fields.values,
     )
 
 
-def _settings(defaults: Any, table: Fields) -> Any:
+def _unused(algorithm: Any) -> tuple[str, ...]:
+    """Fields of `TrainConfig` that say nothing to an algorithm."""
+    return getattr(algorithm, "UNUSED", ())
+
+
+def _settings(defaults: Any, table: Fields, unused: tuple[str, ...] = ()) -> Any:
     """A dataclass of settings with the values of a table."""
-    table.known([f.name for f in dataclasses.fields(defaults) if f.name != "algorithm"])
+    table.known([f.name for f in dataclasses.fields(defaults) if f.name not in ("algorithm", *unused)])
     return dataclasses.replace(defaults, **{k: _as(getattr(defaults, k), table, k) for k in table.values})
 
 
@@ -112,13 +172,14 @@ def override(training: Training, **values: Any) -> Training:
       UserError: neither has such a field.
     """
     train, algorithm = training.train, training.train.algorithm
+    unused = {"algorithm", *_unused(algorithm)}
     for name, value in values.items():
-        if name in {f.name for f in dataclasses.fields(train)} - {"algorithm"}:
+        if name in {f.name for f in dataclasses.fields(train)} - unused:
             train = dataclasses.replace(train, **{name: _like(getattr(train, name), name, value)})
         elif name in {f.name for f in dataclasses.fields(algorithm)}:
             algorithm = dataclasses.replace(algorithm, **{name: _like(getattr(algorithm, name), name, value)})
         else:
-            known = [f.name for c in (train, algorithm) for f in dataclasses.fields(c) if f.name != "algorithm"]
+            known = [f.name for c in (train, algorithm) for f in dataclasses.fields(c) if f.name not in unused]
             raise bad_input("train", name, value, "is no setting of this training", f"use one of {', '.join(known)}")
     return dataclasses.replace(training, train=dataclasses.replace(train, algorithm=algorithm))
 

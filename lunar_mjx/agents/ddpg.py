@@ -105,6 +105,16 @@ class DDPG:
         """Actions of the policy without noise, (env, action)."""
         return self.actor.apply(actor, obs)
 
+    def policy(self, state: DDPGState) -> Any:
+        """Parameters of the deterministic policy."""
+        return state.actor
+
+    def explore(self, state: DDPGState, obs: Any, deviation: Any, key: Any) -> Any:
+        """Actions of the policy with noise of each environment's `deviation`, (env, action)."""
+        action = self.act(state.actor, obs)
+        noise = jax.random.normal(key, action.shape, obs.dtype)
+        return jnp.clip(action + deviation[:, None] * noise, -1.0, 1.0)
+
     def update(self, state: DDPGState, batch: Batch, key: Any, axis: str | None = None) -> tuple[DDPGState, dict]:
         """One update of critic, policy and targets; arguments as for `TD3.update` (`key` is not used)."""
         c = self.config

@@ -1,4 +1,4 @@
-"""One epoch of off-policy training as a pure function: act, store, learn, many times over, on one or many devices.
+"""One epoch of training as a pure function: act, store, learn, many times over, on one or many devices.
 
 The whole state of a training is one pytree. Every device runs its own share of the environments and of each batch;
 parameters are the same everywhere, because gradients and observation statistics are averaged over the mesh.
@@ -17,6 +17,8 @@ from jax.sharding import PartitionSpec as Spec
 from lunar_mjx._quiet import without_warp_notices
 from lunar_mjx.agents import guard
 from lunar_mjx.agents.ddpg import DDPG, DDPGConfig
+from lunar_mjx.agents.from_brax.ppo import PPO, PPOConfig, Rollout
+from lunar_mjx.agents.from_brax.sac import SAC, SACConfig
 from lunar_mjx.agents.replay import Batch, ReplayBuffer, ReplayState, Transition
 from lunar_mjx.agents.td3 import TD3, TD3Config
 from lunar_mjx.envs.core import Environment, State
@@ -33,12 +35,16 @@ MOST_DEVIATIONS = 10.0
 """To which normalised observations are cut."""
 
 
+AGENTS: dict[type, Any] = {TD3Config: TD3, DDPGConfig: DDPG, SACConfig: SAC, PPOConfig: PPO}
+"""Algorithms by the class of their settings."""
+
+
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """How an agent is trained; the algorithm's own settings are in `algorithm`.
 
     Attributes:
-      algorithm: `TD3Config` or `DDPGConfig`, which also chooses the algorithm.
+      algorithm: settings of the algorithm, whose class also chooses it.
       envs: environments, over all devices.
       batch: transitions per update, over all devices.
       updates: updates per step of all environments.
@@ -52,7 +58,7 @@ class TrainConfig:
       precision: of matrix products: "highest" is float32; "default" lets recent GPUs round to TF32.
     """
 
-    algorithm: TD3Config | DDPGConfig
+    algorithm: TD3Config | DDPGConfig | SACConfig | PPOConfig
     envs: int = 1
     batch: int = 256
     updates: int = 1
@@ -74,7 +80,7 @@ class TrainConfig:
             raise bad_input("TrainConfig", "precision", self.precision, "does not exist", "use highest or default")
         if not 0.0 <= self.noise[0] <= self.noise[1]:
             raise bad_input("TrainConfig", "noise", self.noise, "is no range of deviations", "give (least, greatest)")
-        if self.random_steps < self.algorithm.n_step:
+        if not isinstance(self.algorithm, PPOConfig) and self.random_steps < self.algorithm.n_step:
             raise bad_input(
                 "TrainConfig",
                 "random_steps",
@@ -88,14 +94,15 @@ class TrainConfig:
 class TrainState:
     """Everything that a training needs to go on; `iterations` counts steps of every environment.
 
-    Of one copy on every device: agent, statistics, iterations. Of one share on every device: the rest.
+    Of one copy on every device: agent, statistics, iterations. Of one share on every device: the rest. PPO has neither
+    buffer nor noise.
     """
 
     agent: Any
     statistics: Any
     iterations: Any
     env: State
-    buffer: ReplayState
+    buffer: ReplayState | None
     noise: Any
     key: Any
     guard: guard.Guard
@@ -110,7 +117,8 @@ class Learner:
       mesh: devices along the axis `AXIS`; all devices of all processes if None.
 
     Raises:
-      UserError: environments or batch that do not divide among the devices.
+      UserError: environments or batch that do not divide among the devices, or for PPO environments among minibatches
+        or an epoch among unrolls.
     """
 
     def __init__(self, env: Environment, config: TrainConfig, mesh: Mesh | None = None):
@@ -127,12 +135,21 @@ class Learner:
                     "give a multiple",
                 )
         algorithm = config.algorithm
-        kind = TD3 if isinstance(algorithm, TD3Config) else DDPG
-        self.agent = kind(algorithm, env.observation_size, env.privileged_size, env.action_size)  # type: ignore[arg-type]
-        self.buffer = ReplayBuffer(config.buffer_steps, algorithm.n_step, algorithm.gamma)
+        self.agent: Any = AGENTS[type(algorithm)](algorithm, env.observation_size, env.privileged_size, env.action_size)
         shared, own = Spec(), Spec(AXIS)
-        self.specs = TrainState(shared, shared, shared, own, ReplayState(own, shared, shared), own, own, own)  # type: ignore[arg-type]
-        self._init = self._over_devices(self._init_share, (shared,), self.specs)
+        self.buffer, buffer = None, None
+        if isinstance(algorithm, PPOConfig):
+            if config.epoch_steps % algorithm.unroll:
+                problem = f"is no multiple of unroll = {algorithm.unroll}"
+                raise bad_input("TrainConfig", "epoch_steps", config.epoch_steps, problem, "give one")
+            if config.envs // self.devices % algorithm.minibatches:
+                problem = f"does not divide among {self.devices} devices of {algorithm.minibatches} minibatches"
+                raise bad_input("TrainConfig", "envs", config.envs, problem, "give a multiple")
+        else:
+            self.buffer = ReplayBuffer(config.buffer_steps, algorithm.n_step, algorithm.gamma)
+            buffer = ReplayState(own, shared, shared)  # type: ignore[arg-type]
+        self.specs = TrainState(shared, shared, shared, own, buffer, own, own, own)  # type: ignore[arg-type]
+        self._init = self._over_devices(self._init_share, (shared, shared), self.specs)
         reports = (shared, own) if config.episodes else (shared, shared)
         self._epoch = self._over_devices(self._epoch_share, (shared, self.specs), (self.specs, reports), donate=(1,))
 
@@ -143,7 +160,7 @@ class Learner:
     def init(self, seed: int) -> TrainState:
         """The state before the first step."""
         with jax.default_matmul_precision(self.config.precision):
-            return self._init(jax.random.PRNGKey(seed))
+            return self._init(self.env.params, jax.random.PRNGKey(seed))
 
     def epoch(self, env_params: Any, state: TrainState) -> tuple[TrainState, Any]:
         """Runs `epoch_steps` steps of every environment, and their updates; `state` is used up.
@@ -160,7 +177,8 @@ class Learner:
         with jax.default_matmul_precision(self.config.precision):
             state = self.abstract()
             key = jax.random.PRNGKey(0)
-            begin, epoch = self._init.lower(key), self._epoch.lower(self.env.params, state)
+            params = self.env.params
+            begin, epoch = self._init.lower(params, key), self._epoch.lower(params, state)
             self._init, self._epoch = begin.compile(), epoch.compile()
 
     def shardings(self, state: Any) -> Any:
@@ -170,7 +188,7 @@ class Learner:
 
     def abstract(self) -> TrainState:
         """Shapes, types and shardings of a state, without making one."""
-        shapes = jax.eval_shape(self._init, jax.random.PRNGKey(0))
+        shapes = jax.eval_shape(self._init, self.env.params, jax.random.PRNGKey(0))
         return jax.tree.map(
             lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), shapes, self.shardings(shapes)
         )
@@ -178,15 +196,18 @@ class Learner:
     def policy(self, state: TrainState) -> tuple[Any, Any]:
         """What acting needs: the actor's parameters, and mean and deviation of observations (or None)."""
         statistics = state.statistics
-        return state.agent.actor, (statistics.mean["obs"], statistics.std["obs"]) if self.config.normalise else None
+        return self.agent.policy(state.agent), (
+            statistics.mean["obs"],
+            statistics.std["obs"],
+        ) if self.config.normalise else None
 
     # What runs on every device, over its share of the environments.
 
-    def _init_share(self, key: Any) -> TrainState:
+    def _init_share(self, params: Any, key: Any) -> TrainState:
         c, mine = self.config, self.config.envs // self.devices
         key_agent, key_env, key_run = jax.random.split(key, 3)
         rank = jax.lax.axis_index(AXIS)
-        env = self.env.reset(self.env.params, jax.random.split(jax.random.fold_in(key_env, rank), mine))
+        env = self.env.reset(params, jax.random.split(jax.random.fold_in(key_env, rank), mine))
         action = jnp.zeros((mine, self.env.action_size), env.obs.dtype)
         example = _transition(env, action, env)
         widths = {"obs": env.obs[0], "privileged": env.privileged[0]}
@@ -195,7 +216,7 @@ class Learner:
             statistics=jax.tree.map(jnp.asarray, running_statistics.init_state(widths)),
             iterations=jnp.zeros((), jnp.int32),
             env=env,
-            buffer=self.buffer.init(example),
+            buffer=None if self.buffer is None else self.buffer.init(example),
             noise=jnp.linspace(c.noise[0], c.noise[1], mine),
             key=jax.random.fold_in(key_run, rank)[None],
             guard=guard.start(env, action),
@@ -207,7 +228,15 @@ class Learner:
             state, losses = self._learn(state)
             return state, (seen, losses)
 
-        state, (seen, losses) = jax.lax.scan(iteration, state, length=self.config.epoch_steps)
+        def unroll(state: TrainState, _: Any) -> tuple[TrainState, Any]:
+            return self._unroll(params, state)
+
+        steps = self.config.epoch_steps
+        if isinstance(self.config.algorithm, PPOConfig):
+            state, (seen, losses) = jax.lax.scan(unroll, state, length=steps // self.config.algorithm.unroll)
+            seen = jax.tree.map(lambda a: a.reshape(steps, *a.shape[2:]), seen)
+        else:
+            state, (seen, losses) = jax.lax.scan(iteration, state, length=steps)
         numbers = self._summary(state, seen, losses)
         if not self.config.episodes:
             return state, (numbers, {})
@@ -218,26 +247,55 @@ class Learner:
         c = self.config
         key, key_noise = jax.random.split(state.key[0])
         obs = self._normalised(state.statistics, state.env.obs, "obs")
-        noise = jax.random.normal(key_noise, (obs.shape[0], self.env.action_size), obs.dtype)
-        action = jnp.clip(self.agent.act(state.agent.actor, obs) + state.noise[:, None] * noise, -1.0, 1.0)
+        action = self.agent.explore(state.agent, obs, state.noise, key_noise)
         blind = jax.random.uniform(jax.random.fold_in(key_noise, 1), action.shape, action.dtype, -1.0, 1.0)
         action = jnp.where(state.iterations < c.random_steps, blind, action)
         env = self.env.step(params, state.env, action)
-        statistics = state.statistics
-        if c.normalise:
-            statistics = running_statistics.update(
-                statistics, {"obs": env.final_obs, "privileged": env.final_privileged}, pmap_axis_name=AXIS
-            )
+        assert self.buffer is not None and state.buffer is not None
         new = dataclasses.replace(
             state,
             env=env,
-            statistics=statistics,
+            statistics=self._counted(state.statistics, env.final_obs, env.final_privileged),
             buffer=self.buffer.insert(state.buffer, _transition(state.env, action, env)),
             key=key[None],
             iterations=state.iterations + 1,
             guard=guard.watch(state.guard, state.env, action, env, state.iterations),
         )
         return new, self._seen(env)
+
+    def _counted(self, statistics: Any, obs: Any, privileged: Any) -> Any:
+        """The statistics after more observations."""
+        if not self.config.normalise:
+            return statistics
+        return running_statistics.update(statistics, {"obs": obs, "privileged": privileged}, pmap_axis_name=AXIS)
+
+    def _unroll(self, params: Any, state: TrainState) -> tuple[TrainState, Any]:
+        """Some steps of every environment with one policy, and the updates that follow."""
+        statistics = state.statistics
+
+        def side_by_side(obs: Any, privileged: Any) -> Any:
+            parts = (obs, "obs"), (privileged, "privileged")
+            return jnp.concatenate([self._normalised(statistics, values, name) for values, name in parts], axis=-1)
+
+        def step(state: TrainState, _: Any) -> tuple[TrainState, Any]:
+            key, key_action = jax.random.split(state.key[0])
+            seen = side_by_side(state.env.obs, state.env.privileged)
+            action, raw, logits, log_prob = self.agent.draw(state.agent, seen, key_action)
+            env = self.env.step(params, state.env, action)
+            next_seen = side_by_side(env.final_obs, env.final_privileged)
+            done, truncated = (a.astype(env.reward.dtype) for a in (env.done, env.truncated))
+            row = Rollout(seen, raw, logits, log_prob, env.reward, done, truncated, next_seen)
+            watched = guard.watch(state.guard, state.env, action, env, state.iterations)
+            new = dataclasses.replace(state, env=env, key=key[None], iterations=state.iterations + 1, guard=watched)
+            return new, (self._seen(env), row, (env.final_obs, env.final_privileged))
+
+        algorithm = self.config.algorithm
+        assert isinstance(algorithm, PPOConfig)
+        state, (seen, rows, observed) = jax.lax.scan(step, state, length=algorithm.unroll)
+        rollout = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), rows)
+        agent, losses = self.agent.update(state.agent, rollout, jax.random.fold_in(state.key[0], 1), AXIS)
+        # after the updates: divergence and ratios are of the policy that acted
+        return dataclasses.replace(state, agent=agent, statistics=self._counted(statistics, *observed)), (seen, losses)
 
     def _seen(self, env: State) -> dict[str, Any]:
         """Of a step, what the reports need: sums over episodes that ended, means over steps for `reward_` terms."""
@@ -255,6 +313,7 @@ class Learner:
         def once(carry: Any, _: Any) -> Any:
             agent, key = carry
             key, key_sample, key_update = jax.random.split(key, 3)
+            assert self.buffer is not None and state.buffer is not None
             batch = self.buffer.sample(state.buffer, key_sample, c.batch // self.devices)
             agent, losses = self.agent.update(agent, self._normalised_batch(state.statistics, batch), key_update, AXIS)
             return (agent, key), losses

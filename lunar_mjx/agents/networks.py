@@ -28,7 +28,8 @@ _TORCH = jax.nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
 """PyTorch's default for linear layers, U(-1/sqrt(fan_in), 1/sqrt(fan_in)), which SB3 keeps."""
 
 
-def _mlp(sizes: Sequence[int], activation: str, layer_norm: bool) -> Any:
+def mlp(sizes: Sequence[int], activation: str, layer_norm: bool) -> Any:
+    """brax's module of layers of these widths, the last one linear, begun as PyTorch would."""
     if activation not in ACTIVATIONS:
         raise bad_input("networks", "activation", activation, "does not exist", f"use one of {', '.join(ACTIVATIONS)}")
     return brax_networks.MLP(
@@ -64,7 +65,7 @@ def make_actor(
       layer_norm: normalise each hidden layer.
       last_scale: of the last layer's weights at the start; a small one makes the first actions near zero.
     """
-    module = _mlp((*layers, actions), activation, layer_norm)
+    module = mlp((*layers, actions), activation, layer_norm)
 
     def init(key: Any) -> Any:
         params = module.init(key, jnp.zeros((1, obs)))
@@ -85,7 +86,7 @@ def make_critics(
     layer_norm: bool = False,
 ) -> Network:
     """Several critics: `apply(params, obs, action) -> (critic, batch, outputs)`; params lead with the axis `critic`."""
-    module = _mlp((*layers, outputs), activation, layer_norm)
+    module = mlp((*layers, outputs), activation, layer_norm)
 
     def init(key: Any) -> Any:
         one = jnp.zeros((1, obs + actions))

@@ -121,6 +121,16 @@ class TD3:
         """Actions of the policy without noise, (env, action)."""
         return self.actor.apply(actor, obs)
 
+    def policy(self, state: TD3State) -> Any:
+        """Parameters of the deterministic policy."""
+        return state.actor
+
+    def explore(self, state: TD3State, obs: Any, deviation: Any, key: Any) -> Any:
+        """Actions of the policy with noise of each environment's `deviation`, (env, action)."""
+        action = self.act(state.actor, obs)
+        noise = jax.random.normal(key, action.shape, obs.dtype)
+        return jnp.clip(action + deviation[:, None] * noise, -1.0, 1.0)
+
     def update(self, state: TD3State, batch: Batch, key: Any, axis: str | None = None) -> tuple[TD3State, dict]:
         """One update of the critics, and of policy and targets every `policy_delay` of them.
 

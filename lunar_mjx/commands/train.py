@@ -48,6 +48,9 @@ def train(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to resume from.")] = Path(
         "runs/train"
     ),
+    learner: Annotated[
+        str | None, typer.Option(help="td3, ddpg, sac or ppo instead of the training's own, with settings to match.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; the training's own if left out.")] = None,
     time_limit: Annotated[float | None, typer.Option(help="s after which it saves and stops, to be resumed.")] = None,
@@ -90,7 +93,7 @@ def train(
         for name in training_names():
             print(f"{name:12} {get_training(name).note}")
         return
-    chosen = override(get_training(training), **pairs("--set", settings))
+    chosen = override(get_training(training, learner), **pairs("--set", settings))
     options = env_options(env)
     if environment is not None:
         chosen = dataclasses.replace(chosen, environment=environment, options=options, unseen={})
