@@ -1,4 +1,4 @@
-"""`lunar-mjx compare | why | next | add | unknown | report | improve`: criticism, verb by verb, on run folders."""
+"""`lunar-mjx compare | why | next | add | unknown | report | improve | watch`: criticism by verbs on run folders."""
 
 from __future__ import annotations
 
@@ -75,6 +75,7 @@ def register(app: typer.Typer) -> None:
         ("report", report),
         ("studio", studio),
         ("improve", improve),
+        ("watch", watch),
     ):
         app.command(name)(function)
 
@@ -271,6 +272,36 @@ def improve(
         if not as_json:
             _print_steps(runs)
     _finish(diagnosis, as_json)
+
+
+def watch(
+    log: Annotated[Path, typer.Argument(help="Log of a drive with imposed wheel speeds; may still be growing.")],
+    run: Annotated[Path, typer.Option("--run", help="Run folder of undisturbed drives of the same rover.")],
+    once: Annotated[bool, typer.Option("--once", help="The log has ended: read it once and do not wait.")] = False,
+    hours: Annotated[
+        float, typer.Option(help="Hours of driving from one false alarm to the next, at least, in the mean.")
+    ] = 10.0,
+    idle: Annotated[float, typer.Option(help="Seconds without growth after which the log has ended.", min=0.0)] = 60.0,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for each alarm's evidence; RUN/watch if left out.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print each event as a line of JSON.")] = False,
+) -> None:
+    """Follow a growing log and raise an alarm where something begins; the exit status is the last alarm's verdict."""
+    from lunar_mjx.diagnosis import watch as watching
+    from lunar_mjx.report.progress import console_progress
+
+    keep_compiled()
+    status = count = 0
+    with console_progress() as progress:
+        for alarm in watching.watch(log, run, hours, once, out, idle, progress):
+            print(json.dumps(alarm.to_dict()) if as_json else alarm.sentence, flush=True)
+            count = max(count, alarm.number)
+            if alarm.diagnosis is not None:
+                status = alarm.diagnosis.verdict.exit_status
+    if not count and not as_json:
+        print("No alarm: nothing began that is larger than what these drives do anyway.")
+    raise typer.Exit(status)
 
 
 def _write_animation(runs: Sequence[Path], animation: Path | None, dark: bool) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lunar_mjx.inference.changes import ChangeDetector, Undisturbed, learn, log_density
+from lunar_mjx.inference.changes import Amounts, ChangeDetector, Undisturbed, learn, log_density
 
 START, WALK, SCATTER, SIZE = (np.array(v) for v in ([1.0, 1.0], [0.02, 0.02], [0.1, 0.1], [3.0, 3.0]))
 JUMPS = {"first": SIZE * [1, 0], "second": SIZE * [0, 1]}
@@ -75,7 +75,9 @@ def test_a_step_may_hold_one_measurement():
 
 def test_what_is_undisturbed_is_learnt():
     rng = np.random.default_rng(5)
-    found = learn([series(60, rng, noise=1.5) for _ in range(2)], START, np.ones(2), SIZE)
+    amounts = Amounts(START, np.ones(2), SIZE, np.zeros(2, bool))
+    found = learn([(amounts, series(50, rng, noise=1.5)) for _ in range(2)])
     assert found.noise == pytest.approx(1.5, rel=0.1)
-    assert found.scatter[0] < 0.3
-    assert found.walk[0] < 0.1
+    assert found.scatter < 0.3
+    assert found.walk < 0.1
+    assert found.rare < 0.05

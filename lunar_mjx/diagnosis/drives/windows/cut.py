@@ -70,6 +70,17 @@ class Cut:
     def __len__(self) -> int:
         return len(self.log)
 
+    def part(self, windows: np.ndarray) -> Cut:
+        """Some of the windows, by number."""
+        return dataclasses.replace(
+            self,
+            log=self.log[windows],
+            start_s=self.start_s[windows],
+            imposed=Windows(*(np.asarray(getattr(self.imposed, f.name))[windows] for f in dataclasses.fields(Windows))),
+            measured={c: v[windows] for c, v in self.measured.items()},
+            recording=None if self.recording is None else self.recording[windows],
+        )
+
     @property
     def samples(self) -> int:
         """Samples of a window."""
@@ -92,7 +103,13 @@ class Cut:
 
 
 def cut(
-    logs: Sequence[Log], joints: Sequence[str], radius: float, most: int, seed: int = 0, track: float = math.inf
+    logs: Sequence[Log],
+    joints: Sequence[str],
+    radius: float,
+    most: int,
+    seed: int = 0,
+    track: float = math.inf,
+    interval_s: float | None = None,
 ) -> Cut:
     """Windows of some logs, at most `most`, spread evenly over speeds and turns.
 
@@ -106,6 +123,7 @@ def cut(
       most: windows at most.
       seed: of the draw.
       track: distance of the sides, m; infinite where windows of a rover that was held are to be kept.
+      interval_s: between samples, as other windows of the same rover have it; that of the wheel speeds if None.
 
     Raises:
       UserError: no log is long enough, or tells anything that the windows could be judged by.
@@ -115,6 +133,8 @@ def cut(
     interval = max(SHORTEST_BIN_S, float(np.median(intervals)))
     slow = interval > SLOW_S
     interval = WINDOW_S / SLOW_BINS if slow else interval
+    if interval_s is not None:
+        interval = interval_s
     clocks = {}
     for n, log in enumerate(logs):
         found = imu_clock(log, *_sides(speeds[n], joints))

@@ -192,6 +192,10 @@ class WindowForm(MeasuredForm):
         self.fit = observations.in_split("fit")
         self._low, self._high = self._bounds()
 
+    def usual_differences(self) -> dict[str, float]:
+        """Usual size of every difference between drives, in units of its coordinates' priors."""
+        return {f.name: f.usual for f in self._fields}
+
     def _of_the_drive(self) -> list[tuple[str, Unknown]]:
         """What may differ in the one recording there is, by field; the slope belongs to none."""
         ground = SOFT if SOFT in self.model.effect_names else "hard_ground"

@@ -315,23 +315,43 @@ def proportions(residual: np.ndarray, there: np.ndarray, size: np.ndarray) -> np
       residual: (channel, window, sample). there: where something was measured.
       size: (channel, window) root mean square of what is predicted.
     """
-    out = np.ones(size.shape)
-    for c in range(len(residual)):
-        count = there[c].sum(axis=1)
-        mine = count > 0
-        if mine.sum() < 3:
-            continue
-        power = np.sum(np.where(there[c], residual[c] ** 2, 0.0), axis=1)[mine] / count[mine]
-        usual = power <= np.quantile(power, 0.9)
-        own = size[c][mine] / max(float(np.sqrt(np.mean(size[c][mine] ** 2))), 1e-12)
-        best, scale = np.inf, np.ones(len(own))
-        for share in SHARES:
-            grown = (1.0 - share) ** 2 + (share * own) ** 2
-            score = np.log(np.mean(power[usual] / grown[usual])) + np.mean(np.log(grown[usual]))
-            if score < best - 1e-9:
-                best, scale = score, grown
-        out[c][mine] = np.sqrt(scale)
-    return out
+    found = (proportion(*channel) for channel in zip(residual, there, size, strict=True))
+    return np.stack([p.scale(s) for p, s in zip(found, size, strict=True)])
+
+
+@dataclasses.dataclass(frozen=True)
+class Proportion:
+    """How a channel's noise grows with what it measures.
+
+    Attributes:
+      share: of noise in proportion to the size, at the usual one. usual: root mean square size, in the channel's unit.
+    """
+
+    share: float = 0.0
+    usual: float = 1.0
+
+    def scale(self, size: np.ndarray) -> np.ndarray:
+        """Standard deviation at root mean square sizes over that where nothing acts, over 1 - share."""
+        return np.hypot(1.0 - self.share, self.share * size / self.usual) if self.share else np.ones(np.shape(size))
+
+
+def proportion(residual: np.ndarray, there: np.ndarray, size: np.ndarray) -> Proportion:
+    """The same of one channel, from residuals (window, sample) and sizes (window,); none of fewer than 3 windows."""
+    count = there.sum(axis=1)
+    mine = count > 0
+    if mine.sum() < 3:
+        return Proportion()
+    power = np.sum(np.where(there, residual**2, 0.0), axis=1)[mine] / count[mine]
+    usual = power <= np.quantile(power, 0.9)
+    whole = max(float(np.sqrt(np.mean(size[mine] ** 2))), 1e-12)
+    best, found = np.inf, Proportion()
+    for share in SHARES:
+        tried = Proportion(share, whole)
+        grown = tried.scale(size[mine]) ** 2
+        score = np.log(np.mean(power[usual] / grown[usual])) + np.mean(np.log(grown[usual]))
+        if score < best - 1e-9:
+            best, found = score, tried
+    return found
 
 
 def learn_noise(residual: np.ndarray, there: np.ndarray, interval_s: float) -> list[Noise]:
