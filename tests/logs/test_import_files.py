@@ -368,6 +368,7 @@ def test_the_documented_map_is_read(tmp_path: Path) -> None:
         (b"t,c\n", "holds no drive"),
         (b"\x00\xff\xfe\x81", "is not a text table"),
         (b"t,c\n0,1\n1,2\n2,3,4\n3,4\n", "is not a table of even rows"),
+        (b"# logger 2.3\nt,c\n0,1\n1,2\n", "comment = "),
         (b"t,c\n0,1\n", "short: has 1 rows"),
         (b"t,c\n0,1\n0,2\n0,3\n", "clock: repeats"),
         (b"t,c\n3,1\n2,2\n1,3\n", "clock: goes back"),

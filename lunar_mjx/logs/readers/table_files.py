@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import importlib.util
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -75,18 +76,30 @@ def _text(path: Path, layout: Layout) -> pd.DataFrame:
         raise UserError(f"{path}: is empty; record it again or leave it out.")
     separator = SEPARATORS[layout.separator] if layout.separator else guess_separator(start, layout.decimal)
     try:
-        return pd.read_csv(
+        with warnings.catch_warnings():
+            # rows longer than the header: pandas would drop what no name stands above
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            return pd.read_csv(
+                path,
+                sep=separator,
+                header=0 if layout.header else None,
+                decimal=layout.decimal,
+                skiprows=layout.skip_rows,
+                comment=layout.comment or None,
+                index_col=False,
+                skipinitialspace=True,
+                encoding="utf-8-sig",
+                low_memory=False,
+            )
+    except pd.errors.ParserWarning:
+        lines = [line for line in start.splitlines()[layout.skip_rows :] if line.strip()]
+        raise bad_input(
             path,
-            sep=separator,
-            header=0 if layout.header else None,
-            decimal=layout.decimal,
-            skiprows=layout.skip_rows,
-            comment=layout.comment or None,
-            index_col=False,
-            skipinitialspace=True,
-            encoding="utf-8-sig",
-            low_memory=False,
-        )
+            "header",
+            lines[0][:60],
+            "has fewer names than the rows below it have cells",
+            'state skip_rows = 1 (rows before the header), comment = "#" or header = false in the map\'s table',
+        ) from None
     except (ValueError, pd.errors.ParserError) as error:
         shown = str(error).strip().split("\n")[0]
         raise UserError(f"{path}: is not a table of even rows ({shown}); state its separator and skip_rows.") from None
