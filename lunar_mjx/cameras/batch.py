@@ -23,8 +23,9 @@ from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.shapes import Placed, hit, normal, placed, rover_shapes, together
 from lunar_mjx.cameras.texture import ALBEDO
 from lunar_mjx.rover import Rover
+from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import HeightField, Terrain, sample
-from lunar_mjx.terrain.rocks import nearest_rock
+from lunar_mjx.terrain.rocks import form_at, nearest_rock
 
 SKY, GROUND, ROCK, ROVER = range(4)
 """Labels, as `LABELS` names them."""
@@ -207,6 +208,12 @@ def _surface_normal(terrain: Terrain, point: Any) -> tuple[Any, Any]:
         return face, jnp.zeros(x.shape, bool)
     cx, cy, cz, radius = nearest_rock(terrain.rocks, x, y)
     away = jnp.stack([x - cx, y - cy, point[..., 2] - cz], axis=-1)
+    if terrain.rocks.forms is not None:
+        form = form_at(terrain.rocks, x, y)
+        above = cz + form.height(away[..., 0], away[..., 1]) > sample(terrain.field, x, y)[0]
+        on_rock = (form.outline(away[..., 0], away[..., 1]) < 1.0001) & above & (radius > 0.0)
+        outward = form.times(Vec3.of(away)).unit(1e-9).stack()
+        return jnp.where(on_rock[..., None], outward, face), on_rock
     flat = away[..., 0] ** 2 + away[..., 1] ** 2
     above = cz + jnp.sqrt(jnp.maximum(radius**2 - flat, 0.0)) > sample(terrain.field, x, y)[0]
     on_rock = (flat < radius**2 * 1.0001) & above & (radius > 0.0)

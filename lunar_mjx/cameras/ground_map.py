@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lunar_mjx.cameras.relief import relief, rocks_within
+from lunar_mjx.cameras.relief import relief, ring, rocks_within
 from lunar_mjx.terrain import Terrain
 
 ROVER, GOAL, PATH = (255, 196, 60), (90, 255, 120), (86, 180, 233)
@@ -40,10 +40,13 @@ class GroundMap:
         placed = grey.resize((max(1, round(east - west)), max(1, round(south - north))), Image.Resampling.BICUBIC)
         self.base.paste(placed.convert("RGB"), (round(west), round(north)))
         draw = ImageDraw.Draw(self.base)
-        for x, y, radius in rocks_within(terrain, self.low, high):
+        for x, y, a, b, angle in rocks_within(terrain, self.low, high):
             u, v = self.pixel((x, y))
-            r = max(1.0, radius * self.scale)
-            draw.ellipse([u - r, v - r, u + r, v + r], fill=_STONE)
+            a, b = max(1.0, a * self.scale), max(1.0, b * self.scale)
+            if a == b:
+                draw.ellipse([u - a, v - a, u + a, v + a], fill=_STONE)
+            else:  # rows go down the picture
+                draw.polygon([tuple(corner) for corner in ring(np.array([u, v, a, b, -angle]))], fill=_STONE)
 
     def pixel(self, place: Any) -> tuple[float, float]:
         """Column and row of a place (2 or more,) m."""

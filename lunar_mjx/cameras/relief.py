@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lunar_mjx.terrain import Terrain
+from lunar_mjx.terrain.rocks import Form
 
 LIGHT = (315.0, 20.0)
 """Compass azimuth and elevation of the light, deg: from the north-west, as maps are lit."""
@@ -54,9 +55,31 @@ def relief(terrain: Terrain, low: np.ndarray, high: np.ndarray, most: int = 700,
 
 
 def rocks_within(terrain: Terrain, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Centre x, y and radius of the rocks between two corners, (n, 3) m."""
+    """Outlines of the rocks between two corners, seen from above.
+
+    Returns:
+      x and y of the centre and the two half widths, m, and the angle from x (east) to the first, rad; (n, 5).
+    """
     if terrain.rocks is None:
-        return np.zeros((0, 3))
+        return np.zeros((0, 5))
     centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
     near = (radii > 0) & (centers[:, :2] > low).all(axis=1) & (centers[:, :2] < high).all(axis=1)
-    return np.column_stack([centers[near, :2], radii[near]])
+    x, y, radius = *centers[near, :2].T, radii[near]
+    if terrain.rocks.forms is None:
+        return np.column_stack([x, y, radius, radius, np.zeros(len(x))])
+    form = Form(*np.asarray(terrain.rocks.forms, float)[near].T)
+    # twice the outline's matrix: differences of its values over the plane
+    xx, yy = form.outline(1.0, 0.0), form.outline(0.0, 1.0)
+    matrix = np.stack([xx, *(0.5 * (form.outline(1.0, 1.0) - xx - yy),) * 2, yy], axis=-1).reshape(-1, 2, 2)
+    values, turns = np.linalg.eigh(matrix)
+    return np.column_stack([x, y, values**-0.5, np.arctan2(turns[:, 1, 0], turns[:, 0, 0])])
+
+
+def ring(outline: np.ndarray, corners: int = 32) -> np.ndarray:
+    """Corners of a polygon for an outline of `rocks_within`, (corners, 2) m."""
+    x, y, a, b, angle = outline
+    t = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.column_stack(
+        [x + a * cos * np.cos(t) - b * sin * np.sin(t), y + a * sin * np.cos(t) + b * cos * np.sin(t)]
+    )

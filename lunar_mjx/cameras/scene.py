@@ -24,6 +24,7 @@ from lunar_mjx.rover import Rover
 from lunar_mjx.rover.look import seen_spec
 from lunar_mjx.rover.mjcf import quaternion
 from lunar_mjx.terrain import Terrain
+from lunar_mjx.terrain.rocks import semi_axes
 
 GROUND, FAR_GROUND, ROCK, FRONT = "ground", "far_ground", "rock", "front"
 NODES, FAR_NODES, TEXELS = 420, 160, 2048
@@ -211,15 +212,17 @@ def _add_rocks(spec: Any, terrain: Terrain, low: np.ndarray, high: np.ndarray) -
     """All rocks between two corners (2,) m."""
     if terrain.rocks is None:
         return
-    centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
+    centers = np.asarray(terrain.rocks.centers, float)
     spec.add_material(name=ROCK, rgba=[0.5, 0.48, 0.46, 1], specular=0.1, shininess=0.1)
-    for i, (center, radius) in enumerate(zip(centers, radii, strict=True)):
-        if radius > 0 and (center[:2] > low).all() and (center[:2] < high).all():
+    for i, (center, axes, turn) in enumerate(zip(centers, *semi_axes(terrain.rocks), strict=True)):
+        if axes[0] > 0 and (center[:2] > low).all() and (center[:2] < high).all():
+            ball = terrain.rocks.forms is None
             spec.worldbody.add_geom(
                 name=f"{ROCK}_{i}",
-                type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=[radius, 0, 0],
+                type=mujoco.mjtGeom.mjGEOM_SPHERE if ball else mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+                size=[axes[0], 0, 0] if ball else axes,
                 pos=center,
+                quat=quaternion(turn),
                 material=ROCK,
                 contype=0,
                 conaffinity=0,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from PIL import Image
 from plotly.subplots import make_subplots
 
-from lunar_mjx.cameras.relief import relief, rocks_within
+from lunar_mjx.cameras.relief import relief, ring, rocks_within
 from lunar_mjx.criticism import SteadyStateTable, replicate_scatter
 from lunar_mjx.demo.drive import Drive
 from lunar_mjx.demo.husky import HuskyCase
@@ -100,20 +101,20 @@ def _relief(
     return uri, (ground.west, ground.east, ground.south, ground.north)
 
 
+def _drawn(stone: np.ndarray) -> dict[str, Any]:
+    """An outline of `rocks_within` as a shape of Plotly, which turns no ellipses."""
+    x, y, a, b, _ = stone
+    if a == b:
+        return {"type": "circle", "x0": x - a, "x1": x + a, "y0": y - a, "y1": y + a}
+    return {"type": "path", "path": "M" + "L".join(f"{u:.3f},{v:.3f}" for u, v in ring(stone)) + "Z"}
+
+
 def _add_rocks(figure: go.Figure, terrain: Terrain, box: tuple[float, float, float, float]) -> None:
     if terrain.rocks is None:
         return
     shapes = [
-        {
-            "type": "circle",
-            "x0": x - r,
-            "x1": x + r,
-            "y0": y - r,
-            "y1": y + r,
-            "line": {"width": 0.5},
-            "fillcolor": ROCK,
-        }
-        for x, y, r in rocks_within(terrain, np.array([box[0], box[2]]), np.array([box[1], box[3]]))
+        {**_drawn(stone), "line": {"width": 0.5}, "fillcolor": ROCK}
+        for stone in rocks_within(terrain, np.array([box[0], box[2]]), np.array([box[1], box[3]]))
     ]
     figure.update_layout(shapes=shapes)
     if shapes:

@@ -152,7 +152,7 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
     },
     Terrain: {"field": _OWN, "rocks": _OWN, "soil": _OWN, "origin": "m", "name": _PLAIN, "grids": _OWN},
     HeightField: {"heights": "m", **_GRID},
-    Rocks: {"centers": "m", "radii": "m", "index": _PLAIN, **_GRID},
+    Rocks: {"centers": "m", "radii": "m", "index": _PLAIN, "forms": "1/m2", **_GRID},
     SoilMap: {"rock": "1", **_GRID},
     SoilGrids: {**_GRID, **_SOIL},
     Signals: {"time": "s", "channels": "channels"},

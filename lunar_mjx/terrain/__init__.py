@@ -18,7 +18,9 @@ from lunar_mjx.terrain.procedural import make_surface as make_surface
 from lunar_mjx.terrain.readers.dispatch import read_dem as read_dem
 from lunar_mjx.terrain.rock_field import RockField as RockField
 from lunar_mjx.terrain.rocks import Rocks as Rocks
+from lunar_mjx.terrain.rocks import build_ellipsoids as build_ellipsoids
 from lunar_mjx.terrain.rocks import build_rocks as build_rocks
+from lunar_mjx.terrain.rocks import form_at as form_at
 from lunar_mjx.terrain.rocks import nearest_rock as nearest_rock
 from lunar_mjx.terrain.roughness import Roughness as Roughness
 from lunar_mjx.terrain.soil.maps import SoilGrids as SoilGrids

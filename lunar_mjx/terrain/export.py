@@ -10,6 +10,7 @@ import trimesh
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.files import replacing
+from lunar_mjx.terrain.rocks import semi_axes
 from lunar_mjx.terrain.terrain import Terrain
 
 SUFFIXES = (".stl", ".obj", ".ply")
@@ -23,7 +24,7 @@ def to_mesh(terrain: Terrain, *, rocks: bool = True, solid: bool = False, depth:
 
     Args:
       terrain: one terrain, not a batch.
-      rocks: adds the rocks as closed icospheres.
+      rocks: adds the rocks as closed icospheres, stretched where they are ellipsoids.
       solid: closes the ground by walls and a floor, so that the mesh is watertight.
       depth: of the floor below the lowest node, m.
 
@@ -48,10 +49,11 @@ def to_mesh(terrain: Terrain, *, rocks: bool = True, solid: bool = False, depth:
         vertices, faces = _closed(vertices, faces, node, heights.min() - depth)
     bodies = [trimesh.Trimesh(vertices, faces, process=False)]
     if rocks and terrain.rocks is not None:
-        for center, radius in zip(np.asarray(terrain.rocks.centers), np.asarray(terrain.rocks.radii), strict=True):
-            if radius > 0:
-                body = trimesh.creation.icosphere(subdivisions=2, radius=float(radius))
-                bodies.append(body.apply_translation(center.astype(np.float64)))
+        for center, axes, turn in zip(np.asarray(terrain.rocks.centers), *semi_axes(terrain.rocks), strict=True):
+            if axes[0] > 0:
+                body = trimesh.creation.icosphere(subdivisions=2)
+                body.vertices = body.vertices * axes @ turn.T + center.astype(np.float64)
+                bodies.append(body)
     if len(bodies) == 1:
         return bodies[0]
     starts = np.cumsum([0] + [len(body.vertices) for body in bodies[:-1]])

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from lunar_mjx.errors import bad_input
 from lunar_mjx.terrain.checks import require_at_least, require_between, require_positive
-from lunar_mjx.terrain.rocks import CELL, REACH, Rocks, build_rocks
+from lunar_mjx.terrain.rocks import CELL, REACH, Rocks, build_ellipsoids, build_rocks
 
 _MOST = 20_000
 """Rocks above which a terrain is refused: each is placed beside those before it."""
@@ -30,11 +31,15 @@ class RockField:
       abundance: fraction of the ground covered by rocks of all sizes (k).
       smallest: least diameter that becomes an obstacle, m; smaller ones are roughness.
       largest: greatest diameter, m.
-      burial: share of the sphere's height below ground. 0.4 leaves a height of 0.6 diameters, the mean of rocks on
+      burial: share of a rock's height below ground. 0.4 leaves a height of 0.6 diameters, the mean of rocks on
         panoramas of Lunokhod and Apollo (Demidov & Basilevsky 2014).
       gap: least distance between two rocks' surfaces, m; it makes the look-up unambiguous, see `rocks.clearance`.
       clear: radius around the middle of the terrain that stays free of rocks, m.
       cell: spacing of the look-up grid, m.
+      width: intermediate over longest axis, the two that lie level; they cover as much ground as a disc of the
+        diameter. Fragments of impacts have 0.7 (2 : sqrt 2 : 1, Fujiwara et al. 1978).
+      height: upright axis over longest. Fragments of impacts that lie on their flat side have 0.5. With `width` and
+        `height` of 1 rocks are spheres.
     """
 
     abundance: float = 0.01
@@ -44,6 +49,8 @@ class RockField:
     gap: float = 0.9
     clear: float = 2.0
     cell: float = CELL
+    width: float = 1.0
+    height: float = 1.0
 
     def __post_init__(self) -> None:
         require_at_least(self, "abundance", 0.0, "give the fraction of ground covered by rocks, such as 0.01")
@@ -54,6 +61,10 @@ class RockField:
         require_at_least(self, "gap", 0.0, "give the least gap in m")
         require_at_least(self, "clear", 0.0, "give the radius of the clear circle in m")
         require_positive(self, "cell", "give the spacing of the look-up grid in m")
+        for name in ("width", "height"):
+            require_at_least(self, name, 0.2, "give the axis over the longest one, such as 0.7")
+            if getattr(self, name) > 1.0:
+                raise bad_input("RockField", name, getattr(self, name), "is above 1", "give it over the longest axis")
         if self.smallest >= self.largest:
             raise bad_input("RockField", "smallest", self.smallest, "is not below largest", "swap the two")
 
@@ -97,6 +108,8 @@ def place_rocks(
 ) -> Rocks:
     """Scatters rocks at random over a rectangle, largest first, none nearer to another than the gap.
 
+    Ellipsoids lie on their flat side and turn at random about the vertical.
+
     Args:
       population: statistics; a rock for which no free place is found in 30 tries is left out.
       bounds: west, south, east and north, m.
@@ -112,7 +125,7 @@ def place_rocks(
     middle = np.array([(west + east) / 2, (south + north) / 2])
     # A sphere buried beyond its middle shows a smaller circle than its own: its radius makes up for it.
     share = 2 * population.burial - 1
-    radii = diameters / 2 / (np.sqrt(1 - share**2) if share > 0 else 1.0)
+    radii = diameters / 2 / (np.sqrt(1 - share**2) if share > 0 else 1.0) / np.sqrt(population.width)
     places, kept = np.zeros((len(radii), 2)), np.zeros(len(radii))
     # Rocks nearer than the gap lie in this square or the eight around it.
     side = population.gap + 2 * radii[0] if len(radii) else 1.0
@@ -133,5 +146,12 @@ def place_rocks(
                 break
     places, kept = places[:n], kept[:n]
     height = np.asarray(ground(places[:, 0], places[:, 1])) if n else np.zeros(0)
-    centers = np.column_stack([places, height - share * kept])
-    return build_rocks(centers, kept, bounds, cell=population.cell, reach=REACH, dtype=dtype)
+    centers = np.column_stack([places, height - share * population.height * kept])
+    options: Any = {"cell": population.cell, "reach": REACH, "dtype": dtype}
+    if population.width == population.height == 1.0:
+        return build_rocks(centers, kept, bounds, **options)
+    yaw = rng.uniform(0.0, np.pi, n)
+    zero, one = np.zeros(n), np.ones(n)
+    turns = np.stack([np.cos(yaw), -np.sin(yaw), zero, np.sin(yaw), np.cos(yaw), zero, zero, zero, one], axis=-1)
+    axes = kept[:, None] * np.array([1.0, population.width, population.height])
+    return build_ellipsoids(centers, axes, turns, bounds, **options)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from lunar_mjx.errors import UserError, bad_input, require_finite
 from lunar_mjx.pytree import pytree, static
 from lunar_mjx.terrain.heightfield import HeightField
-from lunar_mjx.terrain.rocks import Rocks
+from lunar_mjx.terrain.rocks import Rocks, padded, with_forms
 from lunar_mjx.terrain.soil.maps import LAYERS, SoilGrids, SoilMap
 
 
@@ -94,22 +94,25 @@ def _with_rocks(terrains: Sequence[Terrain]) -> Sequence[Terrain]:
             "differ in shape",
             "use one extent and one rock cell for all terrains",
         )
+    if any(r.forms is not None for r in given):
+        given = [with_forms(r) for r in given]
+        terrains = [t if t.rocks is None else dataclasses.replace(t, rocks=with_forms(t.rocks)) for t in terrains]
     most = max(r.radii.shape[0] for r in given)
     empty = dataclasses.replace(
         given[0],
         centers=jnp.zeros_like(given[0].centers[:1]),
         radii=jnp.zeros_like(given[0].radii[:1]),
         index=jnp.zeros_like(given[0].index),
+        forms=None,
     )
+    if given[0].forms is not None:
+        empty = with_forms(empty)
 
-    def padded(rocks: Rocks) -> Rocks:
+    def filled(rocks: Rocks) -> Rocks:
         # A dummy's index is the number of rocks: what is appended there has radius 0 and stays a dummy.
-        more = most - rocks.radii.shape[0]
-        return dataclasses.replace(
-            rocks, centers=jnp.pad(rocks.centers, ((0, more), (0, 0))), radii=jnp.pad(rocks.radii, (0, more))
-        )
+        return padded(rocks, most - rocks.radii.shape[0])
 
-    return [dataclasses.replace(t, rocks=padded(t.rocks or empty)) for t in terrains]
+    return [dataclasses.replace(t, rocks=filled(t.rocks or empty)) for t in terrains]
 
 
 def _with_soil(terrains: Sequence[Terrain]) -> Sequence[Terrain]:

@@ -15,6 +15,7 @@ from lunar_mjx.cameras.scene import FAR_NODES, Patch, Sun, cut
 from lunar_mjx.model import Model
 from lunar_mjx.rover.look import HIDDEN, seen_spec
 from lunar_mjx.terrain import Terrain
+from lunar_mjx.terrain.rocks import semi_axes
 
 NEAR, NODES = 20.0, 420
 """How far the ground is drawn finely around the rover, m, and nodes per side there."""
@@ -92,13 +93,14 @@ def _grid(patch: Patch) -> dict[str, Any]:
 
 
 def _rocks(terrain: Terrain, near: Patch) -> list[list[float]]:
-    """Centre x, y, z and radius of the rocks on the fine ground, m."""
+    """Of the rocks on the fine ground the centre x, y, z and the three semi-axes as vectors, (12,) m each."""
     if terrain.rocks is None:
         return []
-    centers, radii = np.asarray(terrain.rocks.centers, float), np.asarray(terrain.rocks.radii, float)
+    centers, (axes, turns) = np.asarray(terrain.rocks.centers, float), semi_axes(terrain.rocks)
     low, high = np.asarray(near.low), np.asarray(near.high)
-    seen = (radii > 0) & (centers[:, :2] > low).all(axis=1) & (centers[:, :2] < high).all(axis=1)
-    return np.column_stack([centers, radii])[seen].round(4).tolist()
+    seen = (axes[:, 0] > 0) & (centers[:, :2] > low).all(axis=1) & (centers[:, :2] < high).all(axis=1)
+    vectors = (turns * axes[:, None, :]).swapaxes(1, 2).reshape(-1, 9)
+    return np.column_stack([centers, vectors])[seen].round(4).tolist()
 
 
 def _packed(values: np.ndarray, kind: str = "<f4") -> str:

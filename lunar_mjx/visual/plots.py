@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon
+from matplotlib.patches import Ellipse, Polygon
 
 from lunar_mjx.cameras.relief import relief, rocks_within
 from lunar_mjx.dynamics.signals import joint_channels
@@ -111,7 +111,10 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray,
             color=LIT,
             bbox={"facecolor": INK, "alpha": 0.65, "edgecolor": "none", "pad": 2.5},
         )
-    stones = [Circle((x, y), r) for x, y, r in rocks_within(terrain, low, high)]
+    stones = [
+        Ellipse((x, y), 2.0 * a, 2.0 * b, angle=np.degrees(angle))
+        for x, y, a, b, angle in rocks_within(terrain, low, high)
+    ]
     axes.add_collection(PatchCollection(stones, facecolor=ROCK, edgecolor=SHADOW, linewidth=0.4))
     axes.grid(False)
     axes.set_aspect("equal")

@@ -41,7 +41,7 @@ class Ground:
 
     Attributes:
       field: heights, m. hard: fraction of hard rock, or None. layers: the soil's parameters by place, in SI units.
-      has_rocks: whether there is any boulder.
+      has_rocks: whether there is any boulder. has_forms: whether boulders are ellipsoids.
     """
 
     def __init__(self, terrain: Terrain) -> None:
@@ -54,6 +54,10 @@ class Ground:
         self.layers = {k: Grid(v, grids.x0, grids.y0, grids.cell) for k, v in given.items()}  # type: ignore[union-attr]
         rocks = terrain.rocks
         self.has_rocks = rocks is not None and bool((np.asarray(rocks.radii) > 0).any())
+        self.has_forms = rocks is not None and rocks.forms is not None
+        if rocks is not None and rocks.forms is not None:
+            # rows of the matrix, of the entries xx, yy, zz, yz, xz, xy
+            self._forms = np.asarray(rocks.forms, float)[:, [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
         if rocks is not None:
             self._centers, self._radii = np.asarray(rocks.centers, float), np.asarray(rocks.radii, float)
             self._index = np.asarray(rocks.index, np.int64)
@@ -61,8 +65,15 @@ class Ground:
 
     def rock(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Centre (..., 3) and radius (...) of the boulder near each point, m; the radius is 0 where there is none."""
+        k = self._number(x, y)
+        return self._centers.take(k, 0), self._radii.take(k)
+
+    def form(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Matrices (..., 3, 3) of the ellipsoids that `rock` finds, 1/m^2; only where `has_forms`."""
+        return self._forms.take(self._number(x, y), 0)
+
+    def _number(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         rows, cols = self._index.shape
         i = clamp(clamp((x - self._x0) / self._cell, 0.0, cols - 1.0).astype(np.int64), 0, cols - 1)
         j = clamp(clamp((y - self._y0) / self._cell, 0.0, rows - 1.0).astype(np.int64), 0, rows - 1)
-        k = self._index[j, i]
-        return self._centers.take(k, 0), self._radii.take(k)
+        return self._index[j, i]

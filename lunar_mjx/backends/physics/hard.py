@@ -1,4 +1,4 @@
-"""Hard things: rock surfaces, boulders (spheres), the chassis' underside, joint stops and the parking brake."""
+"""Hard things: rock surfaces, boulders, the chassis' underside, joint stops and the parking brake."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from lunar_mjx.backends.physics.context import Context, Values
+from lunar_mjx.backends.physics.ellipsoids import box_in_ellipsoid, wheel_in_ellipsoid
 from lunar_mjx.backends.physics.soil import entrance
 from lunar_mjx.backends.physics.vectors import clamp, cross, dot
 
@@ -89,6 +90,10 @@ def boulder_touch(c: Context, p: SimpleNamespace) -> tuple[np.ndarray, np.ndarra
     if not (depth > 0.0).any():
         return None
     toward = apart / distance[..., None]
+    if c.ground.has_forms:  # within the spheres around them
+        form = c.ground.form(place[..., 0], place[..., 1])
+        closest, toward, reached = wheel_in_ellipsoid(form, gap, axle, c.geometry["radius"], c.geometry["width"])
+        depth = np.where(radius > 0.0, reached, -1.0)
     velocity = c.wheel_velocity + cross(c.wheel_angular_velocity, closest)
     return closest, toward, velocity, _pushed(depth, dot(velocity, toward), p)
 
@@ -129,7 +134,7 @@ _CORNERS = np.array([(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
 
 
 def _chassis_boulders(c: Context, p: SimpleNamespace) -> None:
-    """Spheres against the chassis' boxes; every quarter of a box looks for one boulder."""
+    """Boulders against the chassis' boxes; every quarter of a box looks for one boulder."""
     center, half = c.numbers.box_center[:, None], c.numbers.box_half[:, None]
     probe = np.broadcast_to(center, (center.shape[0], 4, 3)).copy()
     probe[..., :2] += _CORNERS * half[..., :2]
@@ -151,6 +156,10 @@ def _chassis_boulders(c: Context, p: SimpleNamespace) -> None:
         return
     toward = np.where(within[..., None], np.array([0.0, 0.0, -1.0]), apart / distance[..., None])
     toward = np.einsum("...ij,...j->...i", rotation, toward)
+    if c.ground.has_forms:
+        form, turn = c.ground.form(world[..., 0], world[..., 1]), np.broadcast_to(rotation, (*gap.shape, 3))
+        nearest, toward, reached = box_in_ellipsoid(form, gap, turn, np.broadcast_to(half, gap.shape))
+        depth = np.where(radius > 0.0, reached, -1.0)
     arm = np.einsum("...ij,...j->...i", rotation, nearest + center)
     spin = np.broadcast_to(c.angular_velocity[:, None, None], arm.shape)
     velocity = c.velocity[:, None, None] + cross(spin, arm)

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Effect, Parameter, StateVariable, effect
 from lunar_mjx.effects.wheel.closed_form import airborne, entrance_angle
+from lunar_mjx.effects.wheel.ellipsoid_contact import contact_with_box, contact_with_wheel
 from lunar_mjx.spatial import Frame, Vec3
-from lunar_mjx.terrain import nearest_rock, sample
+from lunar_mjx.terrain import form_at, nearest_rock, sample
 
 _STIFFNESS = Parameter(2e5, None, (1e2, 1e8), "N/m", "contact stiffness k_N on rock", "paper's release: 5e4 to 1e6")
 _DAMPING = Parameter(400.0, 0.0, (0.0, 1e6), "N s/m", "contact damping c_N on rock", "paper's release: 1e2 to 1e5")
@@ -116,7 +117,8 @@ class _Touch(NamedTuple):
     """One boulder against each wheel.
 
     Attributes:
-      point: of the wheel nearest to the boulder's centre, relative to the wheel's centre, world frame, m.
+      point: of the wheel nearest to the boulder's centre (of an ellipsoid in its scaled space), relative to the wheel's
+        centre, world frame, m.
       toward: unit vector from there into the boulder. velocity: of the wheel at that point, m/s.
       load: normal force, N; 0 where the wheel does not touch.
     """
@@ -130,11 +132,15 @@ class _Touch(NamedTuple):
 def _touch_boulder(ctx, p) -> _Touch:
     geometry, place = ctx.geometry, ctx.wheel_position
     cx, cy, cz, rock_radius = nearest_rock(ctx.terrain.rocks, place.x, place.y)
-    closest, toward, distance = _closest_point_to_sphere(
-        Vec3(cx, cy, cz), place, ctx.wheel_axle, geometry.radius, geometry.width
-    )
+    center, axle = Vec3(cx, cy, cz), ctx.wheel_axle
+    if ctx.terrain.rocks.forms is None:
+        closest, toward, distance = _closest_point_to_sphere(center, place, axle, geometry.radius, geometry.width)
+        depth = rock_radius - distance
+    else:
+        form = form_at(ctx.terrain.rocks, place.x, place.y)
+        closest, toward, depth = contact_with_wheel(form, center - place, axle, geometry.radius, geometry.width)
     velocity = ctx.wheel_velocity + ctx.wheel_angular_velocity.cross(closest)
-    depth = jnp.where(rock_radius > 0.0, rock_radius - distance, -1.0)
+    depth = jnp.where(rock_radius > 0.0, depth, -1.0)
     load = _penalty(depth, velocity.dot(toward), p.stiffness, p.damping)
     return _Touch(closest, toward, velocity, load)
 
@@ -153,7 +159,7 @@ def _push_wheel(ctx, wheel, touch: _Touch, friction: Vec3):
 
 @effect("wheel_shear", order=20, stiffness=_STIFFNESS, damping=_DAMPING, mu=_MU, speed_scale=_SPEED)
 def boulders(ctx, p, x, wheel):
-    """Boulders are spheres that a wheel (a cylinder) runs against: penalty force along the line between them."""
+    """Boulders are spheres or ellipsoids that a wheel (a cylinder) runs against: penalty force along their normal."""
     if ctx.terrain.rocks is None:
         return wheel
     touch = _touch_boulder(ctx, p)
@@ -213,26 +219,31 @@ _QUADRANTS = ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5))
 
 
 def _boulders_under_chassis(ctx, p) -> list[tuple[Vec3, Vec3]]:
-    """Force on the chassis, N, and its arm from the chassis frame, m, per quadrant: sphere against box, world frame."""
+    """Force on the chassis, N, and its arm from the chassis frame, m, per quadrant of a box; world frame."""
     center, half = ctx.rover.box_center, ctx.rover.box_half
     rocks = []
     for fore, side in _QUADRANTS:
         probe = ctx.frame.to_world(Vec3(center.x + fore * half.x, center.y + side * half.y, center.z)) + ctx.position
-        rocks.append(nearest_rock(ctx.terrain.rocks, probe.x, probe.y))
+        form = None if ctx.terrain.rocks.forms is None else form_at(ctx.terrain.rocks, probe.x, probe.y)
+        rocks.append((*nearest_rock(ctx.terrain.rocks, probe.x, probe.y), form))
     out = []
-    for x, y, z, radius in rocks:
+    for x, y, z, radius, form in rocks:
         # quadrants that found the same boulder share its push
         share = 1.0 / sum(jnp.where((x == other[0]) & (y == other[1]), 1.0, 0.0) for other in rocks)
         gap = ctx.frame.from_world(Vec3(x, y, z) - ctx.position) - center
-        nearest = Vec3(*(jnp.clip(g, -h, h) for g, h in zip(gap, half, strict=True)))
-        apart = gap - nearest
-        distance = apart.norm(1e-9)
-        inside = distance < 1e-6
-        down = Vec3(jnp.zeros_like(distance), jnp.zeros_like(distance), -jnp.ones_like(distance))
-        toward = ctx.frame.to_world(down.where(inside, apart * (1.0 / distance)))
+        if form is None:
+            nearest = Vec3(*(jnp.clip(g, -h, h) for g, h in zip(gap, half, strict=True)))
+            apart = gap - nearest
+            distance = apart.norm(1e-9)
+            inside = distance < 1e-6
+            down = Vec3(jnp.zeros_like(distance), jnp.zeros_like(distance), -jnp.ones_like(distance))
+            toward = ctx.frame.to_world(down.where(inside, apart * (1.0 / distance)))
+            reached = radius - jnp.where(inside, 0.0, distance)
+        else:
+            nearest, toward, reached = contact_with_box(form, gap, ctx.frame, half)
         arm = ctx.frame.to_world(nearest + center)
         velocity = ctx.velocity + ctx.angular_velocity.cross(arm)
-        depth = jnp.where(radius > 0.0, radius - jnp.where(inside, 0.0, distance), -1.0)
+        depth = jnp.where(radius > 0.0, reached, -1.0)
         load = share * _penalty(depth, velocity.dot(toward), p.stiffness, p.damping)
         out.append((toward * -load + _sliding_friction(velocity, toward, p.mu, load, p.speed_scale), arm))
     return out

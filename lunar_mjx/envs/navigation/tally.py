@@ -10,7 +10,7 @@ import numpy as np
 from lunar_mjx.dynamics import System
 from lunar_mjx.envs.navigation.view import View
 from lunar_mjx.pytree import pytree
-from lunar_mjx.terrain import Terrain, nearest_rock, sample
+from lunar_mjx.terrain import Terrain, form_at, nearest_rock, sample
 
 METRICS = ("travelled", "shortest", "energy", "slip", "collisions")
 """Of an episode: length of its way and of the shortest one, m; energy drawn, J; mean slip; boulders hit."""
@@ -86,7 +86,7 @@ class Outline:
         """Whether a boulder that stands higher than the belly is under the outline, (env,).
 
         Smaller stones are driven over; those between the six places at which boulders are looked for are told by the
-        nearest place.
+        nearest place. An ellipsoid takes the place of the sphere around it, but not its height.
         """
         count = view.yaw.shape[0]
         if terrain.rocks is None:
@@ -95,8 +95,10 @@ class Outline:
         cos, sin = jnp.cos(view.yaw)[:, None], jnp.sin(view.yaw)[:, None]
         x0, y0 = view.position[:, 0, None], view.position[:, 1, None]
         fore, side = fore * self.half[0], side * self.half[1]
-        cx, cy, cz, radius = nearest_rock(terrain.rocks, x0 + cos * fore - sin * side, y0 + sin * fore + cos * side)
-        tall = cz + radius - sample(terrain.field, cx, cy)[0] > self.belly
+        probe = x0 + cos * fore - sin * side, y0 + sin * fore + cos * side
+        cx, cy, cz, radius = nearest_rock(terrain.rocks, *probe)
+        high = radius if terrain.rocks.forms is None else form_at(terrain.rocks, *probe).apex().z
+        tall = cz + high - sample(terrain.field, cx, cy)[0] > self.belly
         ahead, aside = cos * (cx - x0) + sin * (cy - y0), cos * (cy - y0) - sin * (cx - x0)
         gap = jnp.hypot(
             jnp.maximum(jnp.abs(ahead) - self.half[0], 0.0), jnp.maximum(jnp.abs(aside) - self.half[1], 0.0)

@@ -6,10 +6,9 @@ import dataclasses
 import functools
 from typing import Any
 
-import jax.numpy as jnp
-
 from lunar_mjx.errors import bad_input
 from lunar_mjx.terrain import Terrain, load_terrain
+from lunar_mjx.terrain.rocks import padded
 
 PREFIX = "world:"
 _ROCKS = 512
@@ -70,8 +69,4 @@ def world(name: str) -> Terrain:
     rocks = terrain.rocks
     if rocks is None:
         return terrain
-    spare = -len(rocks.radii) % _ROCKS
-    rocks = dataclasses.replace(
-        rocks, centers=jnp.pad(rocks.centers, ((0, spare), (0, 0))), radii=jnp.pad(rocks.radii, (0, spare))
-    )
-    return dataclasses.replace(terrain, rocks=rocks)
+    return dataclasses.replace(terrain, rocks=padded(rocks, -len(rocks.radii) % _ROCKS))

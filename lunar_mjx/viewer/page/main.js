@@ -50,8 +50,9 @@ class View {
       this.soil.forEach((part) => part.mesh !== this.ball && this.renderer.free(part.mesh));
       this.soil = [{ mesh: this.renderer.upload(fine), model: STILL, colour: GROUND, kind: 1 },
         { mesh: this.renderer.upload(ground(far, under)), model: STILL, colour: GROUND, kind: 2 }];
-      for (const [cx, cy, cz, r] of seen.rocks) {
-        const model = new Float32Array([r, 0, 0, 0, 0, r, 0, 0, 0, 0, r, 0, cx, cy, cz, 1]);
+      for (const [cx, cy, cz, ...axes] of seen.rocks) {
+        const columns = [0, 3, 6].flatMap((i) => [...axes.slice(i, i + 3), 0]);
+        const model = new Float32Array([...columns, cx, cy, cz, 1]);
         this.soil.push({ mesh: this.ball, model, colour: ROCK, kind: 3 });
       }
       this.middle = [x, y];

@@ -27,7 +27,7 @@ void main() {
   vec4 world = model * vec4(place, 1.0);
   at = world.xyz;
   own = place;
-  facing = mat3(model) * normal;
+  facing = transpose(inverse(mat3(model))) * normal;  // a stretched ball's normals lean the other way
   float slant = 1.0 - max(dot(normalize(facing), sun), 0.0);
   shade = light * vec4(world.xyz + normalize(facing) * offset * (0.4 + slant), 1.0);
   gl_Position = camera * world;

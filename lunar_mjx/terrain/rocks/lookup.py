@@ -1,10 +1,12 @@
-"""Rocks as obstacles: spheres partly buried, found through a coarse grid with one gather.
+"""Rocks as spheres or ellipsoids partly buried, found through a coarse grid with one gather.
 
 Rocks are not rasterised into the height field: a rock is analytic, so that a wheel that climbs it meets a smooth
 surface however coarse the terrain's grid is.
 """
 
 from __future__ import annotations
+
+import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from scipy.spatial import KDTree
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.pytree import pytree
 from lunar_mjx.terrain.heightfield import Points, Scalar, grid_index, take
+from lunar_mjx.terrain.rocks.form import Form, forms_of, principal_axes
 
 CELL = 0.25
 """Default spacing of the look-up grid, m."""
@@ -23,15 +26,16 @@ REACH = 0.6
 
 @pytree
 class Rocks:
-    """Spheres and the grid that finds them.
+    """Spheres or ellipsoids and the grid that finds them.
 
     Attributes:
       centers: m; the last entries are dummies of radius 0.
-      radii: m; 0 for a dummy.
+      radii: m; 0 for a dummy. Of an ellipsoid its longest semi-axis: the sphere around it serves the look-up.
       index: for each cell, which rock has its surface nearest to the cell's centre (in plan), or a dummy.
       x0: x of the south-west corner of cell [0, 0], m.
       y0: y of the south-west corner of cell [0, 0], m.
       cell: spacing of the grid, m.
+      forms: the ellipsoids' shapes, see `Form`; None where all rocks are spheres.
     """
 
     centers: Float[Array, "*batch n 3"]
@@ -40,6 +44,7 @@ class Rocks:
     x0: Scalar
     y0: Scalar
     cell: Scalar
+    forms: Float[Array, "*batch n 6"] | None = None
 
 
 def nearest_rock(
@@ -56,18 +61,30 @@ def nearest_rock(
       y: m, north.
 
     Returns:
-      x, y and z of the sphere's centre and its radius, m. Where no rock is near, the radius is 0.
+      x, y and z of the rock's centre and its radius, m; see `form_at` for ellipsoids. Where no rock is near, the
+      radius is 0.
     """
     if rocks is None:
         zero = jnp.zeros_like(x)
         return zero, zero, zero, zero
+    k = _number(rocks, x, y)
+    flat = rocks.centers.reshape(-1)
+    return take(flat, 3 * k), take(flat, 3 * k + 1), take(flat, 3 * k + 2), take(rocks.radii, k)
+
+
+def form_at(rocks: Rocks, x: Points, y: Points) -> Form:
+    """The shapes of the rocks that `nearest_rock` finds; the rocks must have forms. A dummy's is a unit sphere's."""
+    assert rocks.forms is not None
+    flat, k = rocks.forms.reshape(-1), _number(rocks, x, y)
+    return Form(*(take(flat, 6 * k + i) for i in range(6)))
+
+
+def _number(rocks: Rocks, x: Points, y: Points) -> Int[Array, "*points"]:
     rows, cols = rocks.index.shape
     dtype = rocks.radii.dtype
     i = grid_index((jnp.asarray(x, dtype) - rocks.x0) / rocks.cell, cols - 1)
     j = grid_index((jnp.asarray(y, dtype) - rocks.y0) / rocks.cell, rows - 1)
-    k = take(rocks.index.reshape(-1), j * cols + i)
-    flat = rocks.centers.reshape(-1)
-    return take(flat, 3 * k), take(flat, 3 * k + 1), take(flat, 3 * k + 2), take(rocks.radii, k)
+    return take(rocks.index.reshape(-1), j * cols + i)
 
 
 def clearance(gap: float, cell: float = CELL) -> float:
@@ -120,6 +137,79 @@ def build_rocks(
         y0=jnp.asarray(south, dtype),
         cell=jnp.asarray(cell, dtype),
     )
+
+
+MOST_ELONGATED = 5.0
+"""Largest ratio of two semi-axes, up to which a wheel's contact is found within a fixed number of steps."""
+
+
+def build_ellipsoids(
+    centers: np.ndarray,
+    axes: np.ndarray,
+    turns: np.ndarray,
+    bounds: tuple[float, float, float, float],
+    *,
+    cell: float = CELL,
+    reach: float = REACH,
+    dtype: np.dtype | type = np.float32,
+) -> Rocks:
+    """Builds the look-up grid for given ellipsoids; gaps between rocks count from the spheres around them.
+
+    Args:
+      centers: m, shape (n, 3); n may be 0.
+      axes: semi-axes, m, shape (n, 3), positive.
+      turns: rotations, shape (n, 3, 3); the columns are the directions of the semi-axes.
+      bounds, cell, reach, dtype: as for `build_rocks`.
+
+    Raises:
+      UserError: arrays of the wrong shape, not finite, a semi-axis that is not positive, semi-axes of too different
+        length, or turns that are no rotations.
+    """
+    axes, turns = np.asarray(axes, np.float64).reshape(-1, 3), np.asarray(turns, np.float64).reshape(-1, 3, 3)
+    if len(turns) != len(axes):
+        raise bad_input("rocks", "turns", f"{len(turns)} values", f"do not match {len(axes)} axes", "give as many")
+    if not (axes > 0).all():
+        raise bad_input("rocks", "axes", axes.min(), "is not positive", "give semi-axes in m above zero")
+    most = (axes.max(axis=1) / axes.min(axis=1)).max(initial=1.0)
+    if most > MOST_ELONGATED * (1.0 + 1e-9):
+        raise bad_input(
+            "rocks", "axes", f"{most:g} to 1", "are too unequal", f"give semi-axes within {MOST_ELONGATED:g} to 1"
+        )
+    if not np.allclose(turns @ turns.swapaxes(1, 2), np.eye(3), atol=1e-6):
+        raise UserError("rocks: turns hold a matrix that is no rotation; give orthonormal columns.")
+    rocks = build_rocks(centers, axes.max(axis=1), bounds, cell=cell, reach=reach, dtype=dtype)
+    return dataclasses.replace(rocks, forms=jnp.asarray(np.vstack([forms_of(axes, turns), _UNIT]), dtype))
+
+
+_UNIT = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]])
+"""Form of a dummy, by which one may divide."""
+
+
+def with_forms(rocks: Rocks) -> Rocks:
+    """The same rocks, spheres as ellipsoids of three equal semi-axes."""
+    if rocks.forms is not None:
+        return rocks
+    squares = jnp.where(rocks.radii > 0.0, rocks.radii, 1.0) ** -2.0
+    return dataclasses.replace(rocks, forms=squares[..., None] * jnp.asarray(_UNIT[0], rocks.radii.dtype))
+
+
+def padded(rocks: Rocks, more: int) -> Rocks:
+    """The same rocks with `more` dummies behind."""
+    forms = rocks.forms
+    if forms is not None:
+        forms = jnp.concatenate([forms, jnp.broadcast_to(jnp.asarray(_UNIT, forms.dtype), (more, 6))])
+    return dataclasses.replace(
+        rocks, centers=jnp.pad(rocks.centers, ((0, more), (0, 0))), radii=jnp.pad(rocks.radii, (0, more)), forms=forms
+    )
+
+
+def semi_axes(rocks: Rocks) -> tuple[np.ndarray, np.ndarray]:
+    """Semi-axes (n, 3), m, and the rotations (n, 3, 3) whose columns they lie along; those of spheres are equal."""
+    radii = np.asarray(rocks.radii, float)
+    if rocks.forms is None:
+        return np.repeat(radii[:, None], 3, axis=1), np.broadcast_to(np.eye(3), (len(radii), 3, 3))
+    axes, turns = principal_axes(np.asarray(rocks.forms))
+    return np.where(radii[:, None] > 0, axes, 0.0), turns
 
 
 def _nearest_index(
