@@ -2,69 +2,45 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.effects.ports import Pipeline, nominal_geometry, wheel_contact, wheel_ports
 from lunar_mjx.effects.soil.ruts import SIDE
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import flat
-from tests.effects.effects_harness import bare_context, effects_named, parameters, rover_info
+from tests.effects.ruts_harness import DT, GRAVITY, MASS, RADIUS, WIDTH, Wheels, fresh_patch
 
-RADIUS, WIDTH, MASS, GRAVITY, DT = 0.25, 0.2, 110.0, 1.625, 0.02
 CELL = 0.3 * WIDTH
-NAMES = ("rim_contact", "soil", "ruts", "pressure_sinkage", "closed_form_shear")
 STEPS = 6000
 
 
 @functools.cache
 def _program() -> Any:
-    pipeline = Pipeline(effects_named(NAMES))
+    wheels = Wheels(1)
     field = jax.tree.map(jnp.asarray, flat(20.0).field)
-    one = jnp.ones(1)
-    drawn = nominal_geometry(rover_info(RADIUS * one, WIDTH * one))
-    zero = 0.0 * one
+    zero = 0.0 * wheels.one
 
     def step(carry: Any, told: Any) -> Any:
         z, v_z, x, v_x, ruts = carry
         place, speed, rim, free, pull = told
         x, v_x = jnp.where(free > 0.5, x, place), jnp.where(free > 0.5, v_x, speed)
-        ctx = bare_context(
-            dt=jnp.asarray(DT, z.dtype),
-            gravity=GRAVITY,
-            terrain=SimpleNamespace(field=field),
-            wheel_position=Vec3(x * one, zero, z * one),
-            wheel_axle=Vec3(zero, one, zero),
-            wheel_velocity=Vec3(v_x * one, zero, v_z * one),
-            wheel_angular_velocity=Vec3(zero, rim / RADIUS * one, zero),
-            geometry=drawn,
-            parameters=parameters(pipeline.effects, {}),
-        )
-        geometry, state = pipeline.run("geometry", ctx, {"ruts": ruts}, drawn)
-        ctx = dataclasses.replace(ctx, geometry=geometry)
-        ctx = dataclasses.replace(ctx, contact=wheel_contact(ctx))
-        done, state = wheel_ports(pipeline, ctx, state)
-        contact, wheel = done.contact, done.wheel
-        force = contact.forward * wheel.force.x + contact.left * wheel.force.y + contact.normal * wheel.force.z
+        at = Vec3(x * wheels.one, zero, z * wheels.one)
+        done, new, force = wheels.forces(field, at, v_x, v_z, rim, ruts)
         v_z = v_z + DT * (force.z[0] / MASS - GRAVITY)
         v_x = v_x + DT * (force.x[0] - pull) / MASS
-        new = state["ruts"]
-        seen = (z, x, contact.sinkage[0], done.soil.rut[0], new["moved"].sum(), jnp.abs(new["moved"]).sum(), force.x[0])
+        moved = new["moved"]
+        seen = (z, x, done.contact.sinkage[0], done.soil.rut[0], moved.sum(), jnp.abs(moved).sum(), force.x[0])
         return (z + DT * v_z, v_z, x + DT * v_x, v_x, new), seen
 
     return jax.jit(lambda start, told: jax.lax.scan(step, start, told))
 
 
 def _start() -> Any:
-    cells = jnp.zeros(SIDE * SIDE)
-    ruts = {"moved": cells, "pressed": cells, "tile": cells - 1e7}
-    return (*(jnp.asarray(v) for v in (RADIUS - 0.025, 0.0, 0.0, 0.0)), ruts)
+    return (*(jnp.asarray(v) for v in (RADIUS - 0.025, 0.0, 0.0, 0.0)), fresh_patch())
 
 
 def _drive(start: Any, speed: Any, rim: Any, at: float = 0.0, free: float = 0.0, pull: float = 0.0) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from types import SimpleNamespace
 from typing import Any
@@ -18,16 +17,12 @@ from lunar_mjx.backends.physics.ground import Grid
 from lunar_mjx.backends.physics.ruts import relief_of, ruts, untouched
 from lunar_mjx.backends.physics.soil import uniform_soil
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.effects.ports import Pipeline, nominal_geometry, wheel_ports
-from lunar_mjx.effects.ports import wheel_contact as contact_of_wheels
 from lunar_mjx.effects.soil.ruts import SIDE
 from lunar_mjx.model import make_model
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import flat
-from tests.effects.effects_harness import bare_context, effects_named, parameters, rover_info
+from tests.effects.ruts_harness import DT, GRAVITY, MASS, RADIUS, WIDTH, Wheels, fresh_patch
 
-RADIUS, WIDTH, MASS, GRAVITY, DT = 0.25, 0.2, 110.0, 1.625, 0.02
-NAMES = ("rim_contact", "soil", "ruts", "pressure_sinkage", "closed_form_shear")
 FORE = np.array([0.50037, 0.50037, -0.49963, -0.49963])
 ABREAST = np.array([0.513, -0.487, 0.513, -0.487])
 """No point of a wheel lies on the border of a cell, where rounding would decide."""
@@ -36,36 +31,17 @@ SPEED, RIM = 0.05, 0.0625
 
 @functools.cache
 def _program() -> Any:
-    pipeline = Pipeline(effects_named(NAMES))
-    one, zero = jnp.ones(4), jnp.zeros(4)
-    drawn = nominal_geometry(rover_info(RADIUS * one, WIDTH * one))
+    wheels = Wheels(4)
 
     def step(carry: Any, told: Any) -> Any:
         z, v_z, memory = carry
         x, y = told
-        ctx = bare_context(
-            dt=jnp.asarray(DT),
-            gravity=GRAVITY,
-            terrain=SimpleNamespace(field=flat(20.0, dtype=float).field),
-            wheel_position=Vec3(x, y, z),
-            wheel_axle=Vec3(zero, one, zero),
-            wheel_velocity=Vec3(SPEED * one, zero, v_z),
-            wheel_angular_velocity=Vec3(zero, RIM / RADIUS * one, zero),
-            geometry=drawn,
-            parameters=parameters(pipeline.effects, {}),
-        )
-        geometry, state = pipeline.run("geometry", ctx, {"ruts": memory}, drawn)
-        ctx = dataclasses.replace(ctx, geometry=geometry)
-        ctx = dataclasses.replace(ctx, contact=contact_of_wheels(ctx))
-        done, state = wheel_ports(pipeline, ctx, state)
-        contact: Any = done.contact
-        wheel: Any = done.wheel
-        soil: Any = done.soil
-        force = contact.forward * wheel.force.x + contact.left * wheel.force.y + contact.normal * wheel.force.z
+        field = flat(20.0, dtype=float).field
+        done, memory, force = wheels.forces(field, Vec3(x, y, z), SPEED, v_z, RIM, memory)
         faster = v_z + DT * (force.z / MASS - GRAVITY)
-        seen = {"z": z, "v_z": v_z, "sinkage": contact.sinkage, "pull": force.x}
-        seen |= {k: getattr(soil, k) for k in ("k_phi", "cohesion", "tan_phi", "shear_modulus_x", "rut")}
-        return (z + DT * faster, faster, state["ruts"]), seen
+        seen = {"z": z, "v_z": v_z, "sinkage": done.contact.sinkage, "pull": force.x}
+        seen |= {k: getattr(done.soil, k) for k in ("k_phi", "cohesion", "tan_phi", "shear_modulus_x", "rut")}
+        return (z + DT * faster, faster, memory), seen
 
     return jax.jit(lambda start, told: jax.lax.scan(step, start, told))
 
@@ -73,8 +49,7 @@ def _program() -> Any:
 @functools.cache
 def _drive(steps: int, shift: float = 0.0) -> Any:
     """Straight ahead, rear wheels `shift` m beside the front ones' tracks: the patch at the end, and what was seen."""
-    cells = jnp.zeros(SIDE * SIDE)
-    start = (jnp.full(4, RADIUS - 0.025), jnp.zeros(4), {"moved": cells, "pressed": cells, "tile": cells - 1e7})
+    start = (jnp.full(4, RADIUS - 0.025), jnp.zeros(4), fresh_patch())
     x = FORE + SPEED * DT * np.arange(steps)[:, None]
     y = np.broadcast_to(ABREAST + np.where(FORE < 0.0, shift, 0.0), x.shape)
     (_, _, patch), seen = _program()(start, (jnp.asarray(x), jnp.asarray(y)))

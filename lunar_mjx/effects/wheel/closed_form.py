@@ -42,6 +42,11 @@ def sin_difference(a, b):
     return 2.0 * jnp.cos(0.5 * (a + b)) * jnp.sin(0.5 * (a - b))
 
 
+def first_axis(values, like):
+    """Numbers along a new first axis, in front of those of `like`: node by node they would compile for minutes."""
+    return jnp.reshape(jnp.asarray(values, jnp.result_type(like)), (-1,) + (1,) * jnp.ndim(like))
+
+
 def max_normal_stress(soil, width, radius, theta_m, theta_1):
     """sigma_m = (k_c/b + k_phi) [r (cos theta_m - cos theta_1)]^n, Pa."""
     depth = jnp.maximum(radius * cos_difference(theta_m, theta_1), _MIN_SINKAGE * radius)

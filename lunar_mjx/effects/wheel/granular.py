@@ -14,6 +14,7 @@ from lunar_mjx.effects.wheel.closed_form import (
     contact_with_soil,
     cos_difference,
     entrance_angle,
+    first_axis,
     grounded,
     max_normal_stress,
     normal_damping_force,
@@ -63,10 +64,6 @@ FLAT = -float(_FACTORS.sum())
 """Stress per depth and stiffness on a flat plate that is pushed straight down (x_1 = x_2 = x_3 = 1)."""
 
 
-def _first_axis(values, like):
-    return jnp.reshape(jnp.asarray(values, jnp.result_type(like)), (-1,) + (1,) * jnp.ndim(like))
-
-
 def traction(theta, along, across, rim):
     """Stress of the grains on the rim's faces, over that on a flat plate pushed down as deep.
 
@@ -96,8 +93,8 @@ def _normal(ctx, p, x, normal):
     contact, geometry, soil = contact_with_soil(ctx), ctx.geometry, ctx.soil
     r, b = geometry.radius, geometry.width
     theta_1 = entrance_angle(contact.sinkage, r)
-    theta = theta_1 * _first_axis(0.5 * (1.0 + _NODES), theta_1)
-    weight = theta_1 * _first_axis(0.5 * _WEIGHTS, theta_1)
+    theta = theta_1 * first_axis(0.5 * (1.0 + _NODES), theta_1)
+    weight = theta_1 * first_axis(0.5 * _WEIGHTS, theta_1)
     pressure, _, _ = traction(theta, *_travel(contact)[1])
     depth = jnp.maximum(r * cos_difference(theta, theta_1), 1e-12 * r)
     sigma = grounded(contact, (soil.k_c / b + soil.k_phi) * depth**soil.n * jnp.maximum(pressure, 0.0))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.effects.base import Parameter, effect
-from lunar_mjx.effects.wheel.closed_form import contact_with_soil, grounded, mean_decay, sin_difference
+from lunar_mjx.effects.wheel.closed_form import contact_with_soil, first_axis, grounded, mean_decay, sin_difference
 from lunar_mjx.spatial import Vec3
 
 _STILL: Annotated[float, "m/s"] = 2e-3
@@ -20,11 +20,6 @@ _LONGEST = 0.9
 """Share of the true contact time of a braked wheel, which has no limit for a locked one."""
 _ACROSS, _ACROSS_WEIGHTS = (a.tolist() for a in np.polynomial.legendre.leggauss(3))
 _ALONG, _ALONG_WEIGHTS = (a.tolist() for a in np.polynomial.legendre.leggauss(6))
-
-
-def _first_axis(values, like):
-    """Numbers along a new first axis, in front of those of `like`."""
-    return jnp.reshape(jnp.asarray(values, jnp.result_type(like)), (-1,) + (1,) * jnp.ndim(like))
 
 
 def slip_angle_tangent(contact):
@@ -116,7 +111,7 @@ def side_entry(ctx, p, x, normal):
     def factor(theta):
         place = r * jnp.sin(theta)
         now = jnp.maximum(r * (jnp.cos(theta) - jnp.cos(theta_1)), 1e-9 * r)
-        node, weight = _first_axis(_ACROSS, place), _first_axis(_ACROSS_WEIGHTS, place)
+        node, weight = first_axis(_ACROSS, place), first_axis(_ACROSS_WEIGHTS, place)
         enters = place + 0.5 * (1.0 + node) * reach
         beside = enters < entrance * (1.0 - 1e-6)
         height = jnp.sqrt(jnp.where(beside, r * r - jnp.where(beside, enters, 0.0) ** 2, r * r))
@@ -284,7 +279,7 @@ def side_wall(ctx, p, x, wheel):
     axle = r * jnp.cos(normal.entrance)
     turning = contact.rim_speed / r
     ahead = jnp.where(wheel.direction < 0.0, -1.0, 1.0)
-    along = length * _first_axis(_ALONG, length)
+    along = length * first_axis(_ALONG, length)
     h = jnp.maximum(jnp.sqrt(jnp.maximum(r * r - along * along, 1e-12 * r * r)) - axle, 0.0)
     q = (length - along) * _tangent_of_travel(contact, wheel, p.speed_scale) / (p.build_up * soil.shear_modulus_y)
     arm, place = axle + 2.0 / 3.0 * h, ahead * along
@@ -294,7 +289,7 @@ def side_wall(ctx, p, x, wheel):
     tan_delta = p.friction * soil.tan_phi
     bearing = wall_bearing(soil.tan_phi, -tan_delta * u_z / speed)
     wall = h * (0.5 * bearing * weight * h + 2.0 * soil.cohesion * jnp.sqrt(bearing))
-    push = p.pressure * soft * _first_axis(_ALONG_WEIGHTS, length) * length * wall * q * mean_decay(jnp.abs(q))
+    push = p.pressure * soft * first_axis(_ALONG_WEIGHTS, length) * length * wall * q * mean_decay(jnp.abs(q))
     drag = tan_delta * jnp.abs(push) / speed
     d_x, d_z = -drag * u_x, -drag * u_z
     force = Vec3(jnp.sum(d_x, axis=0), -jnp.sum(push, axis=0), jnp.sum(d_z, axis=0))

@@ -14,6 +14,7 @@ from lunar_mjx.effects.wheel.closed_form import (
     contact_with_soil,
     cos_difference,
     entrance_angle,
+    first_axis,
     grounded,
     max_normal_stress,
     normal_damping_force,
@@ -29,16 +30,11 @@ NODES_PER_SIDE = 6
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(NODES_PER_SIDE)
 
 
-def _first_axis(values, like):
-    """Numbers along a new first axis, in front of those of `like`: node by node they would compile for minutes."""
-    return jnp.reshape(jnp.asarray(values, jnp.result_type(like)), (-1,) + (1,) * jnp.ndim(like))
-
-
 def integrate(ctx, contact, theta_1, theta_m, theta_2):
     """Load and resistance of the normal stress, N, and the stress at the nodes, for the angles given in rad."""
     r, b = ctx.geometry.radius, ctx.geometry.width
     modulus = ctx.soil.k_c / b + ctx.soil.k_phi
-    share, half = _first_axis(0.5 * (1.0 + _NODES), theta_1), _first_axis(0.5 * _WEIGHTS, theta_1)
+    share, half = first_axis(0.5 * (1.0 + _NODES), theta_1), first_axis(0.5 * _WEIGHTS, theta_1)
     rear, front = theta_2 + (theta_m - theta_2) * share, theta_m + (theta_1 - theta_m) * share
     # The rear stress at theta is the front stress at the angle that lies as far, in proportion, from theta_m.
     mirror = theta_1 - (rear - theta_2) / (theta_m - theta_2) * (theta_1 - theta_m)
