@@ -47,7 +47,7 @@ def command_channels(model: Model) -> list[str]:
 
 
 def constant_commands(model: Model, duration: float, interval: float | None = None, **groups: float) -> Commands:
-    """The same command for every joint of a group (`drive`, `steer`, `suspension`), zero for groups left out.
+    """One command for every joint of a group (`drive`, `steer`, `suspension`), zero for groups left out.
 
     Args:
       model: whose joints are commanded.

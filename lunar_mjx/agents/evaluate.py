@@ -45,7 +45,7 @@ class Score:
     slip: float | None = None
 
     def record(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """The score's fields as a dictionary for a JSON file."""
         return dataclasses.asdict(self)
 
 

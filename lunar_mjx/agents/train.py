@@ -285,7 +285,7 @@ def _checkpoints(folder: Path, settings: dict[str, Any]) -> Checkpoints:
 
 
 def plain(value: Any) -> Any:
-    """As JSON holds it: not-a-numbers become None."""
+    """A value as JSON can hold it: tuples become lists, numbers that are not finite None."""
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -18,7 +18,7 @@ from lunar_mjx.dynamics.batching.computed_once import computed_once
 
 
 def reversible(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function with its backward pass as one function of the arguments.
+    """A function's equal whose backward pass is one function of the arguments.
 
     Args:
       function: a pure function of pytrees of arrays, such as one from factors on parameters, state and control to the

@@ -222,7 +222,7 @@ def measure(
     imu_position: Sequence[float] | None = None,
     imu_quaternion: Sequence[float] | None = None,
 ) -> Signals:
-    """What the rover's sensors write: `observe`, and then the effects at the port `sensor`; arguments as there."""
+    """What the rover's sensors write: `observe` with its arguments, and then the effects at the port `sensor`."""
     signals = observe(system, telemetry, params, imu_position, imu_quaternion)
     used = system.params if params is None else params
     return apply_sensors(system.model.effects, used, signals, sensor_context(system, signals, params))

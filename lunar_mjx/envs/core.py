@@ -99,7 +99,7 @@ def _narrow(array: Any) -> bool:
 
 
 def side_by_side(tree: Any, wanted: bool | None = None) -> Any:
-    """The same arrays; those of shape (env, n) with neighbouring environments side by side in a GPU's memory.
+    """The arrays of a tree, those of shape (env, n) with neighbouring environments side by side in a GPU's memory.
 
     Shapes and values stay what they are. The physics wants this order inside, so that a loop over steps whose state
     has it needs no transposing on the way in and out, and every kernel reads and writes whole cache lines. Wide arrays

@@ -49,7 +49,7 @@ class Coordinate:
 
     @property
     def nuisance(self) -> bool:
-        """Whether it belongs to the measurements and not to the model."""
+        """Whether the coordinate belongs to the measurements (an offset, a start) and not to the model."""
         return self.effect == NUISANCE
 
     @property

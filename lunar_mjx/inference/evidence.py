@@ -127,7 +127,7 @@ class Amplitudes:
         )
 
     def select(self, places: np.ndarray) -> Amplitudes:
-        """Those of some columns."""
+        """The prior of some columns alone."""
         return Amplitudes(self.std[places], self.field[places], self.mean[places])
 
 

@@ -99,7 +99,7 @@ def hash_tables(tables: Mapping[str, pd.DataFrame]) -> str:
 
 
 def log_hash(log: Log) -> str:
-    """The same hash of a log that was read."""
+    """Hash of a log that was read, equal to `hash_tables` of the tables that it was written from."""
     frames = {
         name: pd.DataFrame({"time_s": t.time_s, **{t.columns.get(c, c): v for c, v in t.channels.items()}})
         for name, t in log.tables.items()

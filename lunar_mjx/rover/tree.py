@@ -76,7 +76,7 @@ def locate(bodies: tuple[Body, ...], link: str) -> tuple[Body, Pose] | None:
 
 
 def flip_axis(body: Body) -> Body:
-    """The same body with its joint's positive direction reversed."""
+    """A body with its joint's positive direction reversed."""
     assert body.joint is not None
     low, high = body.joint.limits
     return replace(body, joint=replace(body.joint, axis=0.0 - body.joint.axis, limits=(-high, -low)))

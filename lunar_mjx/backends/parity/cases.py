@@ -36,7 +36,7 @@ class Tolerance:
 
 
 def cases(rover: Rover, names: Collection[str] | None = None) -> list[Case]:
-    """The grounds, all with the same grids, so that an engine compiles once for all of them.
+    """Grounds of the parity study, all with the same grids, so that an engine compiles once for all of them.
 
     Args:
       rover: boulders lie in front of its front wheels, and one that its chassis strikes.

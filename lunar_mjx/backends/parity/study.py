@@ -86,7 +86,7 @@ def make_runner(engine: str, model: Model) -> Runner:
 
 
 def available(engines: Collection[str]) -> tuple[list[str], str]:
-    """Those of the engines that are installed, and a sentence on what is left out (empty if nothing is)."""
+    """The installed ones of some engines, and a sentence on what is left out (empty if nothing is)."""
     try:
         import_pybullet()
     except UserError as missing:

@@ -22,7 +22,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
 def uniform_soil(p: SimpleNamespace | None, like: np.ndarray) -> Values:
-    """The same soil under every wheel (effect `soil`); without that effect a soil that bears next to nothing."""
+    """One soil under all wheels (effect `soil`); without that effect a soil that bears next to nothing."""
     given = {} if p is None else vars(p) | {"tan_phi": np.tan(p.friction_angle)}
     bare = {
         "k_c": 0.0,

@@ -84,7 +84,7 @@ class Suggestion:
     length: int
 
     def pays(self, chi2: float) -> bool:
-        """Whether it earns its place on manoeuvres left out."""
+        """Whether its gain on manoeuvres left out exceeds its standard error, and half of the gain when fitted."""
         return self.held_out_gain > self.held_out_se and self.held_out_gain > 0.5 * chi2
 
 

@@ -56,7 +56,7 @@ class Choice:
 
     @property
     def early(self) -> bool:
-        """Whether it acts before the forces are made."""
+        """Whether the formula acts before the port's own laws make their forces."""
         return targets()[self.target].order < 0
 
     @property

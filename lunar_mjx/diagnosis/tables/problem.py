@@ -175,7 +175,7 @@ class TableProblem(Problem):
         return {e: {**v, **moved.get(e, {})} for e, v in self._given[0].items()}
 
     def with_constants(self, values: Mapping[str, Mapping[str, float]]) -> TableProblem:
-        """The same with other values of parameters that no fit moves; the compiled programs are shared."""
+        """This problem with other values of parameters that no fit moves; the compiled programs are shared."""
         other, (given, *rest) = copy.copy(self), self._given
         with jax.enable_x64(True):
             changed = {e: {k: jnp.asarray(x, float) for k, x in v.items()} for e, v in values.items()}

@@ -45,7 +45,7 @@ _ADDITIONS = {
 
 
 def computed_once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function with the same derivatives, its costly intermediate values stored where that is faster.
+    """A function's equal, derivatives included, that stores costly intermediate values where that is faster.
 
     Args:
       function: a pure function of pytrees of arrays.

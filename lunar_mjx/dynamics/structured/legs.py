@@ -83,7 +83,7 @@ class LegBlock(NamedTuple):
 
 
 def cast_group(group: LegGroup, dtype: Any) -> LegGroup:
-    """The same group with its arrays in the state's type; floats stay, and fold into the code."""
+    """A group with its arrays in the state's type; floats stay, and fold into the code."""
 
     def cast(tree: Any) -> Any:
         return jax.tree.map(lambda a: jnp.asarray(a, dtype) if isinstance(a, np.ndarray) else a, tree)
@@ -110,7 +110,7 @@ def joint_turns(n: LegGroup, free: list[Any]) -> tuple[Turn, ...]:
 
 
 def once(*values: Any) -> tuple[Any, ...]:
-    """The same values, which XLA computes once and stores instead of again in every kernel that reads them."""
+    """The given values, which XLA computes once and stores instead of again in every kernel that reads them."""
     return jax.lax.optimization_barrier(values)
 
 

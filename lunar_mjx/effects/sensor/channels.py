@@ -55,7 +55,7 @@ class Signals:
     channels: dict[str, Float[AnyArray, "*batch time"]]
 
     def with_channels(self, changed: dict[str, Any]) -> Signals:
-        """The same signals with some channels changed or added."""
+        """These signals with some channels changed or added."""
         return dataclasses.replace(self, channels={**self.channels, **changed})
 
 

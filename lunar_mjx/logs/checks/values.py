@@ -199,7 +199,7 @@ def _possible_run(noise: float, step: float, count: int) -> float:
 
 
 def _siblings(table: LogTable, name: str) -> list[np.ndarray]:
-    """The same channel of the other corners."""
+    """Values of a channel at the other corners of the rover, such as the other wheels' currents."""
     found = find_channel(name)
     corner = found[1].groupdict().get("corner") if found else None
     if corner is None:

@@ -57,7 +57,7 @@ class Bench:
         self.deadline = Deadline() if like is None else like.deadline
 
     def halved(self) -> Bench:
-        """The same with half the time step."""
+        """A bench of these logs that simulates with half the time step."""
         other = Bench.__new__(Bench)
         other.logs, other.engine, other.chunk = self.logs, self.engine, self.chunk
         other.model = self.model.replace(timestep=0.5 * self.model.timestep)

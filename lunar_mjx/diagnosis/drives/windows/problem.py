@@ -336,7 +336,10 @@ class Proportion:
 
 
 def proportion(residual: np.ndarray, there: np.ndarray, size: np.ndarray) -> Proportion:
-    """The same of one channel, from residuals (window, sample) and sizes (window,); none of fewer than 3 windows."""
+    """How one channel's noise grows with its size, from residuals (window, sample) and sizes (window,).
+
+    Fewer than 3 windows tell nothing of it.
+    """
     count = there.sum(axis=1)
     mine = count > 0
     if mine.sum() < 3:
