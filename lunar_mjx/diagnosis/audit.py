@@ -22,6 +22,7 @@ from lunar_mjx.diagnosis.tables.simulated import SimulatedTables
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.errors import bad_input
+from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.weighing.hypotheses import Refit
@@ -143,7 +144,15 @@ def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, se
         return {**case, "verdict": "", "effects": [], "outcome": "diverged"}
     drawn = form.measuring(clean + draw_noise(form.drives.observations, rng), base.u)
     settings = form.settings
-    found = search([drawn], settings.most_refits, settings.most_terms, settings.window)
+    try:
+        found = search([drawn], settings.most_refits, settings.most_terms, settings.window)
+    except EvidenceError:
+        return {
+            **case,
+            "verdict": Verdict.BAD_FIT.label,
+            "effects": [],
+            "outcome": _outcome(truth, Verdict.BAD_FIT, ()),
+        }
     said = conclude(found, settings.sure)
     return {
         **case,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import copy
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -11,9 +13,10 @@ import numpy as np
 from scipy import linalg
 
 from lunar_mjx.diagnosis.drives.channel_errors import chosen_errors
-from lunar_mjx.diagnosis.drives.instruments import usual_errors
+from lunar_mjx.diagnosis.drives.instruments import usual_kind
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.diagnosis.drives.simulation.program import cores
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import SHARES, WORDS, Usual, rotated
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
@@ -28,6 +31,8 @@ _SHARES = (1.0, 0.5, 0.2, 0.05)
 """Shares of a step that are simulated side by side, as far as they fit into one batch."""
 _TOGETHER = 8
 """Candidates whose signatures one program simulates: fewer are faster per rover, more are fewer programs to make."""
+_MOST_AT_ONCE = 4
+"""Such programs that are made and run side by side at most: each holds some hundred rovers in memory."""
 
 
 class DriveForm(MeasuredForm):
@@ -75,8 +80,8 @@ class DriveForm(MeasuredForm):
         self._fit = self.observations.in_split("fit")
         self._seen: np.ndarray | None = None  # (n, coordinates + inputs) derivatives at the base, SI
         self._fields: tuple[np.ndarray, np.ndarray] | None = None
-        self._errors = np.zeros((len(self.observations), 0))  # (n, instruments) whitened, of usual size
-        self._instruments: Mapping[str, np.ndarray] = {}
+        kinds = [usual_kind(c) for c in self.coordinates]
+        self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
         self._slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}
         self._sizes: tuple[np.ndarray, np.ndarray] | None = None
         self.channel_errors: Mapping[str, float] = {}
@@ -112,15 +117,22 @@ class DriveForm(MeasuredForm):
         # to first order in inputs of a hundredth of what is usual
         scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])
         seen[:, count:] = self._changes(u, self._inputs, 1e-3 * self._size / scales) / 1e-3  # of a field of size 1
-        for number, part in enumerate(parts):
-            self.progress("signatures of all candidates", (number + 1) / (len(parts) + 1))
+        done = itertools.count(1)
+
+        def take(part: list[str]) -> tuple[str, ...]:
+            """Fills in the signatures of some candidates; those are returned for which there was no time."""
             amplitudes = [i for e in part for i in self.candidates[e] if self.coordinates[i].amplitude]
             steps = np.array([self._secant(i) for i in amplitudes])
             try:
                 seen[:, amplitudes] = self._changes(u, amplitudes, steps) / steps
             except TimeUp:
-                self.skipped = tuple(names[names.index(part[0]) :])
-                break
+                return tuple(part)
+            self.progress("signatures of all candidates", next(done) / (len(parts) + 1))
+            return ()
+
+        # one program is made while another runs: the first takes Python's lock, and the second a core
+        with concurrent.futures.ThreadPoolExecutor(min(cores(), _MOST_AT_ONCE)) as pool:
+            self.skipped = tuple(name for late in pool.map(take, parts) for name in late)
         self._seen = seen
 
     def _secant(self, i: int) -> float:
@@ -170,10 +182,9 @@ class DriveForm(MeasuredForm):
         columns = whiten(self._seen[:, :count])
         columns[:, free] = whiten(slopes)
         fields, field_of = self._fields
-        errors = self._errors.shape[1]
-        columns = np.column_stack([columns, self._errors, fields])
+        columns = np.column_stack([columns, fields])
         residual = whiten(self.observations.value - value)
-        std = np.concatenate([self._std, np.ones(errors + len(field_of))])
+        std = np.concatenate([self._std, np.ones(len(field_of))])
         low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
         at, mean = np.zeros(len(std)), np.zeros(len(std))
         mean[:count] = [c.centre for c in self.coordinates]
@@ -192,13 +203,13 @@ class DriveForm(MeasuredForm):
         return Linear(
             gram=Gram.of(columns[fit], residual[fit], self._group[fit], kinds),
             held_out=held,
-            amplitudes=Amplitudes(std, np.concatenate([np.full(count + errors, -1), field_of]), mean),
+            amplitudes=Amplitudes(std, np.concatenate([np.full(count, -1), field_of]), mean),
             low=low,
             high=high,
             always=np.concatenate([self.baseline, np.arange(count, len(std))]).astype(int),
             effects=self.candidates,
             at=at,
-            calibration={name: count + places for name, places in self._instruments.items()},
+            calibration=self._instruments,
             following={},
             fields=tuple(Field(label, settings.usual_discrepancy) for label in self.words),
             noises=tuple(NoiseSize(name, settings.stated_spread) for name in self.noise_names),
@@ -289,17 +300,16 @@ class DriveForm(MeasuredForm):
         columns = self._seen.copy()
         columns[:, free] = slopes
         held = self.drives.observations
-        errors, self._instruments = usual_errors(held, value)
         unlisted = np.full(len(self._inputs), self.settings.unlisted_discrepancy)
         self.observations, self.channel_errors = chosen_errors(
             held,
-            np.column_stack([columns, errors, held.value - value]),
-            np.concatenate([self._std, unlisted, np.ones(errors.shape[1])]),
+            np.column_stack([columns, held.value - value]),
+            np.concatenate([self._std, unlisted]),
             self._group,
             len(self.noise_names),
             self.settings,
         )
-        self._fields, self._errors = self._field_columns(), self.observations.whiten(errors)
+        self._fields = self._field_columns()
         self._slopes[frozenset()] = free, slopes
         self._sizes = np.full(len(self.words), self.settings.usual_discrepancy), np.ones(len(self.noise_names))
         return u
@@ -330,7 +340,7 @@ class DriveForm(MeasuredForm):
         misfit = np.zeros((int(fit.sum()), 0))
         if sizes is not None and self._fields is not None:
             columns, number = self._fields
-            misfit = np.column_stack([self._errors[fit], columns[fit] * sizes[0][number]]) * weight[:, None]
+            misfit = columns[fit] * sizes[0][number] * weight[:, None]
         factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
         std = self._std[free]
         centre = np.array([self.coordinates[i].centre for i in free])

@@ -2,7 +2,8 @@
 
 A stated error is a nuisance of its log whose prior is the stated standard deviation. To first order it adds a known
 vector to the predictions: the derivative by time of a table's channels, or the turn of a vector by a small angle. Usual
-errors (zeros, scales, clocks) are the same in all logs, and belong to every hypothesis as columns of known size.
+errors (zeros, scales, clocks) are the same in all logs; every refit finds them, so that its predictions are of what the
+instruments read.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.logs import Log
 from lunar_mjx.logs.attitude import EULER
 
-CLOCK, MOUNTING = "clock ", "mounting "
-"""Names of these nuisances begin so, and go on with the table or the axis."""
+CLOCK, MOUNTING, USUAL = "clock ", "mounting ", "usual "
+"""Names of these nuisances begin so, and go on with the table, the axis, or the kind of instrument and its error."""
 FARTHEST = 6.0
 """Standard deviations at which they are bounded."""
 UNKNOWN_DEG = 60.0
@@ -57,7 +58,7 @@ def _coordinate(name: str, std: float, unit: str, number: int) -> Coordinate:
 
 def is_instrument(c: Coordinate) -> bool:
     """Whether a coordinate is one of these nuisances."""
-    return c.nuisance and c.name.startswith((CLOCK, MOUNTING))
+    return c.nuisance and c.name.startswith((CLOCK, MOUNTING, USUAL))
 
 
 def instrument_direction(c: Coordinate, log: Log, observations: Observations, predicted: np.ndarray) -> np.ndarray:
@@ -101,29 +102,39 @@ def _turned(kind: str, one: Series, series: list[Series], log: Log, axis: int, p
     return change[:, "xyz".index(one.channel.split("_")[1])]
 
 
-def usual_errors(observations: Observations, predicted: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def usual_nuisances(observations: Observations) -> list[Coordinate]:
+    """Coordinates of what instruments get wrong as much as is usual, in units of that, shared by all logs."""
+    names = usual_errors(observations, observations.value)
+    return [Coordinate(NUISANCE, USUAL + name, 0.0, 1.0, -FARTHEST, FARTHEST, prior=1.0) for name in names]
+
+
+def usual_kind(c: Coordinate) -> str:
+    """The kind of instrument that such a nuisance belongs to; empty for other coordinates."""
+    return c.name.removeprefix(USUAL).partition(": ")[0] if c.nuisance and c.name.startswith(USUAL) else ""
+
+
+def usual_errors(observations: Observations, predicted: np.ndarray) -> dict[str, np.ndarray]:
     """What instruments add that err as much as is usual, the same in all logs.
 
     Args:
       observations: of the campaign. predicted: (n,) by the model.
 
     Returns:
-      Columns (n, m) in the channels' units, each of usual size; and places by kind of instrument.
+      (n,) by "kind of instrument: error", in the channels' units.
     """
-    columns: dict[tuple[str, str], np.ndarray] = {}
+    columns: dict[str, np.ndarray] = {}
+
+    def add(name: str, part: slice, error: np.ndarray | float) -> None:
+        columns.setdefault(name, np.zeros(len(observations)))[part] = error
+
     for s in observations.series:
         word, part = s.channel.partition("_")[0], slice(s.start, s.stop)
         if word in USUAL_ZERO:
-            columns.setdefault((word, f"zero {s.channel}"), np.zeros(len(observations)))[part] = USUAL_ZERO[word]
+            add(f"{word}: zero {s.channel}", part, USUAL_ZERO[word])
         if word in _SCALED:
             kind = word if word in USUAL_ZERO else f"{word} {s.channel.rpartition('_')[2]}"
-            scaled = columns.setdefault((kind, "scale"), np.zeros(len(observations)))
-            scaled[part] = USUAL_SCALE * predicted[part]
+            add(f"{kind}: scale", part, USUAL_SCALE * predicted[part])
         if s.time is not None and s.stop - s.start > 2:
-            clock = f"clock {family(s.channel) or word}"
-            late = columns.setdefault((clock, "clock"), np.zeros(len(observations)))
-            late[part] = USUAL_CLOCK_S * np.gradient(predicted[part], np.asarray(s.time))
-    names = [kind for kind, _ in columns]
-    places = {kind: np.flatnonzero([n == kind for n in names]) for kind in dict.fromkeys(names)}
-    whole = np.stack(list(columns.values()), axis=1) if columns else np.zeros((len(observations), 0))
-    return whole, places
+            late = USUAL_CLOCK_S * np.gradient(predicted[part], np.asarray(s.time))
+            add(f"clock {family(s.channel) or word}: late", part, late)
+    return columns

@@ -14,7 +14,14 @@ import numpy as np
 from lunar_mjx.diagnosis.candidates import usable
 from lunar_mjx.diagnosis.drives.baseline import BASELINE, baseline_coordinates, unfit
 from lunar_mjx.diagnosis.drives.differences import Differences
-from lunar_mjx.diagnosis.drives.instruments import instrument_direction, instrument_nuisances, is_instrument
+from lunar_mjx.diagnosis.drives.instruments import (
+    USUAL,
+    instrument_direction,
+    instrument_nuisances,
+    is_instrument,
+    usual_errors,
+    usual_nuisances,
+)
 from lunar_mjx.diagnosis.drives.noise import Noises
 from lunar_mjx.diagnosis.drives.nuisances import (
     STANDING,
@@ -103,6 +110,7 @@ class DriveProblem:
         for number, run in enumerate(self.bench.runs):
             found += nuisances(number, run, self.observations, number in shows)
             found += instrument_nuisances(number, self.logs[number], self.observations)
+        found += usual_nuisances(self.observations)
         self.baseline = np.arange(len(found))
         self.candidates: dict[str, np.ndarray] = {}
         for name, effect in self.effects.items():
@@ -198,10 +206,13 @@ class DriveProblem:
         return direction(c, self.observations, self.step_error if c.name == STEP_ERROR else np.zeros(0))
 
     def _instrument(self, c: Coordinate) -> np.ndarray:
-        """(n,) what one unit of a clock's or a mounting's error adds, about the predictions of the model as given."""
+        """(n,) what one unit of an instrument's error adds, about the predictions of the model as given."""
         if c.key not in self._instruments:
             predicted = self._simulations(self.bench, self.origin()[None], silent)[0]
-            found = instrument_direction(c, self.logs[c.log_index], self.observations, predicted)
+            if c.name.startswith(USUAL):
+                found = usual_errors(self.observations, predicted)[c.name.removeprefix(USUAL)]
+            else:
+                found = instrument_direction(c, self.logs[c.log_index], self.observations, predicted)
             self._instruments[c.key] = np.where(np.isfinite(found), found, 0.0)
         return self._instruments[c.key]
 
@@ -251,7 +262,7 @@ class DriveProblem:
         acting = frozenset(moved | (needed & set(self._additions)))
         if not acting:
             return self.bench
-        wide_enough = [names for names in self._wider if acting <= names]
+        wide_enough = [names for names in list(self._wider) if acting <= names]
         if wide_enough:
             return self._wider[min(wide_enough, key=len)]
         union = self.model

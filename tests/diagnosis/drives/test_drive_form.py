@@ -159,12 +159,12 @@ def test_candidates_without_time_are_skipped_and_told(monkeypatch):
     toy = Hurried({"a": 0.5, "drag": 0.9})
     toy.late = "lag"
     form, _, said = asked(toy)
-    assert form.skipped == ("lag", "idle")
+    assert form.skipped == ("lag",)
     assert said.effects == ("drag",)
     told, sentence = _without(said, said.sentence, form.skipped)
     assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
     assert sentence.startswith("Of what was looked at: drag is missing")
-    assert "lag, idle; give more --seconds" in sentence
+    assert "lag; give more --seconds" in sentence
     quiet, _ = _without(asked(Toy({"a": 0.5}))[2], "Nothing.", form.skipped)
     assert quiet.verdict is Verdict.NOISE_ONLY
 

@@ -6,7 +6,14 @@ import dataclasses
 
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.instruments import USUAL_CLOCK_S, USUAL_SCALE, USUAL_ZERO, usual_errors
+from lunar_mjx.diagnosis.drives.instruments import (
+    USUAL_CLOCK_S,
+    USUAL_SCALE,
+    USUAL_ZERO,
+    usual_errors,
+    usual_kind,
+    usual_nuisances,
+)
 from tests.inference.toy_problem import manoeuvres
 
 
@@ -19,14 +26,14 @@ def test_each_kind_of_instrument_errs_in_its_own_way():
     )
     observations = dataclasses.replace(seen, series=series)
     rise = np.tile(np.arange(50) * 0.02, 4) * np.repeat([1.0, 2.0, 3.0, 4.0], 50)
-    columns, places = usual_errors(observations, rise)
-    assert set(places) == {"gyro", "motor A", "clock imu", "clock electrical", "clock odometry"}
-    assert np.array_equal(np.sort(np.concatenate(list(places.values()))), np.arange(columns.shape[1]))
-    gyro = columns[:, places["gyro"]]
-    assert gyro.shape[1] == 2 and not gyro[50:].any()
-    np.testing.assert_allclose(gyro[:50, 0], USUAL_ZERO["gyro"])
-    np.testing.assert_allclose(gyro[:50, 1], USUAL_SCALE * rise[:50])
-    (current,) = columns[:, places["motor A"]].T
+    found = usual_errors(observations, rise)
+    kinds = [usual_kind(c) for c in usual_nuisances(observations)]
+    assert len(kinds) == len(found)
+    assert set(kinds) == {"gyro", "motor A", "clock imu", "clock electrical", "clock odometry"}
+    zero, scale = found["gyro: zero gyro_z_rad_s"], found["gyro: scale"]
+    assert not zero[50:].any() and not scale[50:].any()
+    np.testing.assert_allclose(zero[:50], USUAL_ZERO["gyro"])
+    np.testing.assert_allclose(scale[:50], USUAL_SCALE * rise[:50])
+    current = found["motor A: scale"]
     np.testing.assert_allclose(current[50:150], USUAL_SCALE * rise[50:150])  # one scale of all motors
-    (late,) = columns[:, places["clock electrical"]].T
-    np.testing.assert_allclose(late, USUAL_CLOCK_S * np.repeat([0.0, 2.0, 3.0, 0.0], 50))
+    np.testing.assert_allclose(found["clock electrical: late"], USUAL_CLOCK_S * np.repeat([0.0, 2.0, 3.0, 0.0], 50))

@@ -100,7 +100,7 @@ class Bench:
         )
         if key not in _PROGRAMS:
             while len(_PROGRAMS) >= _MOST_PROGRAMS:
-                _PROGRAMS.pop(next(iter(_PROGRAMS)))
+                _PROGRAMS.pop(next(iter(_PROGRAMS)), None)
             _PROGRAMS[key] = Program(run.model, run.every, wanted, run.imu, self.engine)
         return _PROGRAMS[key]
 
