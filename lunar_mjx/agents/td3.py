@@ -102,6 +102,7 @@ class TD3:
         )
         self.actor_optimiser = optax.adamw(c.actor_rate, weight_decay=c.weight_decay)
         self.critic_optimiser = optax.adamw(c.critic_rate, weight_decay=c.weight_decay)
+        # the returns on which the critics put their probabilities (C51, Bellemare et al. 2017); None for plain values
         self.support = jnp.linspace(*c.value_range, c.atoms) if c.atoms > 1 else None
 
     def init(self, key: Any) -> TD3State:
@@ -142,6 +143,7 @@ class TD3:
           The state after, and losses by name.
         """
         c = self.config
+        # the gradient of a target network's estimate would pull the target towards the critic (semi-gradient)
         target = jax.lax.stop_gradient(self.targets(state, batch, key))
         loss, critic, critic_optimiser = gradient_update_fn(
             self.critic_loss, _with_params(self.critic_optimiser, state.critic), axis
@@ -156,6 +158,7 @@ class TD3:
                 state,
                 actor=actor,
                 actor_optimiser=optimiser,
+                # targets move with the policy, at its slower pace (Fujimoto et al. 2018, algorithm 1)
                 actor_target=polyak(state.actor_target, actor, c.tau),
                 critic_target=polyak(state.critic_target, state.critic, c.tau),
             )

@@ -168,6 +168,7 @@ def _smallest(
         )
 
     p = 0.0
+    # greedy: the smallest cover is hard to find, and a name too many costs the reader little
     while p < sure and len([m for m in members if m != _UNLISTED]) < LARGEST_CLASS:
         # jointly, not from the terms' own probabilities: hypotheses that hold both must not count twice
         gains = {t: found.probability_of(holds([*members, t])) for t in by_label if t not in members}

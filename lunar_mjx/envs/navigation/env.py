@@ -291,6 +291,7 @@ class NavigationEnv:
         Next episodes are prepared with `params` as they were then: after another terrain or range, call `reset`.
         """
         c, inner = self.config, state.inner
+        # before rewards see it: an agent must not be punished or paid for what the motors never got
         action = jnp.clip(action, -1.0, 1.0).astype(inner.last_action.dtype)
         before = inner.goal - inner.physics.qpos[:, :2]
         inner, view = self._advance(params, inner, action)
@@ -315,6 +316,7 @@ class NavigationEnv:
             running = jnp.where(ends["diverged"], 0.0, bounded(running))
         reward = running + jnp.where(success, c.success, jnp.where(terminated, c.failure, 0.0))
         inner = dataclasses.replace(inner, steps=inner.steps + 1, total=inner.total + reward)
+        # not both: a learner bootstraps from the last state of a truncated episode, and not from that of an ended one
         truncated = ~terminated & (inner.steps >= self.episode_steps)
         metrics = {
             "episode_return": inner.total,
@@ -325,6 +327,7 @@ class NavigationEnv:
         }
         if inner.tally is not None:
             metrics |= tally.metrics(inner.tally, params.shortest[inner.place], inner.steps)
+        # before the restart: the successor in the replay buffer is the old episode's last state, not the new one's
         final_obs, final_privileged = self._observe(params, inner, view)
         if c.divergence == "reset":
             # the successor of a state that is gone carries no value, but must not poison a batch
@@ -356,6 +359,7 @@ class NavigationEnv:
         next depends on the rover's key alone, and not on when it was prepared.
         """
         done, kept = state.done, side_by_side((inner.ready, inner.used))
+        # the prepared episode lies inside the state that it replaces, so that it is taken out before the selection
         alone = dataclasses.replace(inner, ready=None, used=None)
 
         def prepare(carry: Any) -> Any:
@@ -408,6 +412,7 @@ class NavigationEnv:
         moved = rewards.length(physics.qpos[:, :2] - inner.physics.qpos[:, :2])
         position, velocity = physics.qpos[:, :3], physics.qvel[:, :3]
         filtered = kalman.update(params.gains, self.control_interval, inner.filtered, position, velocity)
+        # way from an anchor and not speed: a rover that rocks to and fro in a hole moves and gets nowhere
         away = rewards.length(position[:, :2] - inner.anchor) > c.stuck_distance
         waited = jnp.where(away, 0.0, inner.waited + self.control_interval)
         inner = dataclasses.replace(

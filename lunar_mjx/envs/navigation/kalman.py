@@ -75,11 +75,13 @@ def gains(config: KalmanConfig, dt: float, most: int = 4096) -> np.ndarray:
     f, q = transition(dt), process_noise(dt, config.jerk)
     h = np.eye(2, 3)
     r = np.diag([config.position_deviation**2, config.velocity_deviation**2])
+    # the first measurement is the estimate, so that its errors are the first covariance
     covariance = np.diag([*np.diag(r), config.acceleration_deviation**2])
     table: list[np.ndarray] = []
     for _ in range(most):
         covariance = f @ covariance @ f.T + q
         gain = np.linalg.solve(h @ covariance @ h.T + r, h @ covariance).T
+        # Joseph's form: it stays symmetric and positive under rounding, which (I - K H) P does not
         keep = np.eye(3) - gain @ h
         covariance = keep @ covariance @ keep.T + gain @ r @ gain.T
         table.append(gain)
@@ -115,6 +117,7 @@ def update(
     step: Any = jnp.asarray(dt, position.dtype)
     p = state.position + step * (state.velocity + 0.5 * step * state.acceleration)
     v = state.velocity + step * state.acceleration
+    # the gains depend on the number of measurements alone, so that no rover carries a covariance
     gain = table[jnp.minimum(state.count, table.shape[0] - 1)].astype(position.dtype)
     error_p, error_v = position - p, velocity - v
 

@@ -205,6 +205,7 @@ def _untried(
     scored = list(known)
     top = max(h.log_posterior for h in scored)
     weights = [(math.exp(h.log_posterior - top), any(t.kind == UNLISTED for t in h.terms)) for h in scored]
+    # refits of everything are dear: they are made only where something unlisted would else be believed
     if sum(w for w, other in weights if other) < 0.5 * sum(w for w, _ in weights):
         return []
     linear = {next(iter(h.effects - best.effects)): h.log_posterior for h in scored if _one_more(h, best)}
@@ -223,6 +224,7 @@ def _one_more(h: Hypothesis, best: Hypothesis) -> bool:
 def _start(near: Hypothesis, form: Form) -> np.ndarray:
     """Where a hypothesis scored in linear approximation stands by its own posterior."""
     u = near.refit.u.copy()
+    # beyond the coordinates lie the amplitudes of unlisted inputs, which are integrated out and have no place in u
     own = near.places < len(u)
     u[near.places[own]] += near.evidence.mean[own]
     return u
@@ -257,6 +259,7 @@ def _score_around(
             value, found, places = made.linear.evidence(terms, begin)
         except (EvidenceError, np.linalg.LinAlgError):
             return old
+        # terms are independent beforehand: each has its own odds, and a set the product of theirs
         prior = form.log_prior + sum(t.log_prior for t in terms)
         new = Hypothesis(form.name, terms, value + prior, made, refitted, found, places)
         # Of two linear estimates of one set the one from nearer by counts: that of the more probable refit.
