@@ -68,6 +68,22 @@ def _address(i: Any, j: Any) -> tuple[Any, Any]:
     return jnp.clip(slot.astype(jnp.int32), 0, SIDE * SIDE - 1), tile_i + _TILES * tile_j
 
 
+def cell_numbers(tile: Any) -> tuple[Any, Any]:
+    """Numbers, east and north, of the cells that the slots of a patch (last axis) hold, from their tiles; whole."""
+    slot = jnp.arange(SIDE * SIDE)
+    tile_j = jnp.round(tile / _TILES)
+    return slot % SIDE + SIDE * (tile - _TILES * tile_j), slot // SIDE + SIDE * tile_j
+
+
+def tile_of(u: Any, v: Any) -> Any:
+    """Tiles of all slots (last axis) in the patch whose middle lies nearest to a place, in cells."""
+    slot = jnp.arange(SIDE * SIDE)
+    tile_i, tile_j = (
+        jnp.round((middle[..., None] - 0.5 - number) / SIDE) for middle, number in ((u, slot % SIDE), (v, slot // SIDE))
+    )
+    return tile_i + _TILES * tile_j
+
+
 def _relief(ctx: Any, p: Any, x: Any, geometry: Any) -> Relief:
     return Relief(x.moved, x.pressed, x.tile, p.cell * jnp.mean(geometry.width))
 
