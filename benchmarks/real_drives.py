@@ -52,7 +52,7 @@ GROUND = frozenset({"soft_ground", "rolling_resistance"})
 TRUE_OF = {"ice": {"hard_ground.mu"}}
 """What beside soft ground may be named of a ground."""
 LOOKED_AT = (
-    *("ICE-02", "SANDY_LOAM-05", "SANDY_LOAM-08", "SNOW-14"),
+    *("ICE-02", "SANDY_LOAM-05", "SANDY_LOAM-08", "SNOW-11", "SNOW-14", "SNOW-20"),
     *("FLOORING-02", "FLOORING-05", "FLOORING-08", "ASPHALT-05"),
 )
 """Sequences to report that had been looked at while the method was made."""
@@ -142,7 +142,6 @@ def answer_of(answer: Any) -> dict[str, Any]:
         "inclusion": {k: round(v, 4) for k, v in inclusion[:6]},
         "ground_probability": round(sum(p for n, p in chance.items() if GROUND & set(n.split(" + "))), 4),
         "held_out": answer.details.get("held_out"),
-        "held_out_of_usual": answer.details.get("held_out_of_usual"),
         "discrepancy": {k: round(v["size"], 4) for k, v in answer.discrepancy.items()},
         "sentence": answer.sentence,
         "not_tried": len(answer.details.get("not_tried", [])),
