@@ -3,6 +3,7 @@
     python -m benchmarks.foreign make --set tune --tables 60 --drives 12 -o build/foreign/tune
     python -m benchmarks.foreign run   build/foreign/tune
     python -m benchmarks.foreign score build/foreign/tune
+    python -m benchmarks.foreign experiments --set tune --tables 60 -o build/foreign/experiments   # `next` in a loop
     python -m benchmarks.foreign sweep --set report --tables 640 -o build/foreign/report   # all of it, on all cores
 
 `run` goes on where it was stopped. The report set's seed is drawn from the commit under test, so that nobody can have
@@ -135,6 +136,13 @@ def sweep(args: argparse.Namespace) -> None:
     run_sweep(args)
 
 
+def experiments(args: argparse.Namespace) -> None:
+    """Follows open verdicts with further sweeps."""
+    from .experiments import experiments as follow
+
+    follow(args)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     whole = argparse.ArgumentParser(
@@ -169,6 +177,14 @@ def parser() -> argparse.ArgumentParser:
     swept.add_argument("--cold", action="store_true", help="compile nothing beforehand")
     swept.add_argument("-o", "--out", type=Path, required=True)
     swept.set_defaults(do=sweep)
+    followed = verbs.add_parser("experiments", help="measure what `next` asks for, and ask again")
+    followed.add_argument("--set", choices=("tune", "report"), required=True)
+    followed.add_argument("--tables", type=int, default=60)
+    followed.add_argument("--seed", type=int, help="as for make")
+    followed.add_argument("--minutes", type=float, default=60.0, help="after which no case is begun")
+    followed.add_argument("--choice", action="append", choices=("next", "random", "d_optimal"), help="all if left out")
+    followed.add_argument("-o", "--out", type=Path, required=True)
+    followed.set_defaults(do=experiments)
     scored = verbs.add_parser("score", help="score the answers")
     scored.add_argument("folder", type=Path)
     scored.add_argument("-o", "--out", type=Path)

@@ -156,6 +156,21 @@ def one(logs: Path, out: Path, extra: Sequence[str] = ()) -> dict[str, Any]:
             return {"verdict": "CRASH", "effects": [], "seconds": {}, "error": traceback.format_exc(limit=-6)}
 
 
+def plans(run: Path) -> list[str]:
+    """Names of the measurements that `next` ranks for a run, the best first; none where it cannot."""
+    from lunar_mjx.cli import main
+
+    with (
+        open(os.devnull, "w", encoding="utf-8") as nothing,
+        contextlib.redirect_stdout(nothing),
+        contextlib.redirect_stderr(nothing),
+    ):
+        status = _verb(main, "next", str(run))
+    path = run / "next.json"
+    found = json.loads(path.read_text(encoding="utf-8")) if not status and path.is_file() else {}
+    return [str(p["name"]) for p in found.get("plans", ())]
+
+
 def _answer(main: Any, logs: str, out: Path, extra: Sequence[str] = ()) -> dict[str, Any]:
     """`log check`, `compare` and `why`, as a user calls them."""
     run, status, seconds = out / "run", {}, {}
