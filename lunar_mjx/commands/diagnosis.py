@@ -414,7 +414,7 @@ def _print_steps(runs: Sequence[Run]) -> None:
     from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE
     from lunar_mjx.model.describe import make_console
 
-    console, before = make_console(), 0
+    console, before, foreseen = make_console(), 0, float("inf")
     for run in runs:
         error = (run.load(COMPARISON_FILE) or {}).get("refitted", {})
         said = run.load(VERDICT_FILE) or {}
@@ -422,6 +422,15 @@ def _print_steps(runs: Sequence[Run]) -> None:
         added = ", ".join(run.added[before:]) or "the model as given"
         before = len(run.added)
         console.print(f"{run.folder.name}: {added}; sigma after a refit: {left}", style="bold", highlight=False)
+        held_out = error.get("held_out")
+        if held_out is not None:
+            if held_out > foreseen:
+                console.print(
+                    "  By itself it foresees what was held out worse than the model before: "
+                    f"{_shown(held_out)} in place of {_shown(foreseen)} sigma.",
+                    highlight=False,
+                )
+            foreseen = held_out
         if said:
             console.print(f"  {said.get('verdict')}: {said.get('sentence')}", highlight=False)
 

@@ -173,11 +173,11 @@ def grown_model(
     start = None if kept is None else np.array([kept.get(c.key, 0.0) for c in form.coordinates])
     with threadpool_limits(1, "blas"):
         near = form.refit(frozenset(), None, None) if new and start is None else None
-        refit = form.refit(new, near, start)
+        alone = form.alone(form.refit(new, near, start))
     for i, c in enumerate(form.coordinates):
         mine = i in form.baseline or c.effect in new
         if mine and c.effect in model.effect_names and c.name not in values:
-            value = float(c.value(refit.u[i]))
+            value = float(c.value(alone[i]))
             old = model.parameters[c.effect][c.name]
             model = model.set(
                 c.effect, "fit", **{c.name: tuple(value for _ in old) if isinstance(old, tuple) else value}

@@ -41,6 +41,6 @@ def refit_each(run: Run, logs: Sequence[SteadyLog], sets: Sequence[Sequence[str]
                 refit = form.refit(names, base if start is None else None, start)
             except EvidenceError:
                 continue
-            if not refit.failed:
-                found[tuple(sorted(names))] = (form.residual(refit.u), form.predict(refit.u)[0])
+            alone = form.alone(refit)
+            found[tuple(sorted(names))] = (form.residual(alone), form.predicted(alone))
     write_refits(run.folder, found)

@@ -84,4 +84,4 @@ class SimulatedTables:
         settings = self._problem.settings
         with threadpool_limits(1, "blas"):
             found = search(forms, settings.most_refits, settings.most_terms, settings.window)
-        return truth, amount, conclude(found, settings.sure)
+        return truth, amount, conclude(found, settings.sure, settings.largest_class)

@@ -358,20 +358,22 @@ class WheelForm(MeasuredForm):
         evidence rises: discrepancies are shares of what is predicted, so that no single function is descended.
         """
         settings = self.settings
-        free = np.concatenate([self.baseline, *(p for e, p in self.candidates.items() if e in effects)]).astype(int)
+        free = self._free(effects)
         u = np.zeros(len(self.coordinates))
         if start is not None:
             u[free] = start[free]
         elif near is not None:
             u[free] = near.u[free]
-        bounds = np.array([self.coordinates[i].bounds() for i in free], float).reshape(-1, 2)
-        u[free] = np.clip(u[free], *(bounds.T + np.array([[1e-9], [-1e-9]])))
+        u[free] = np.clip(u[free], *(self._bounds(free) + np.array([[1e-9], [-1e-9]])))
         terms = frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
         linear, columns, _ = self.linearise(u)
         value, found, _ = linear.evidence(terms)
         best = None
         for _ in range(settings.most_rounds):
-            u = self._descend(u, free, bounds, linear, columns, (found.tau, found.noise))
+            scale = linear.amplitudes.std * np.append(found.tau, 1.0)[linear.amplitudes.field]
+            shared = linear.always[linear.always >= len(u)]  # calibration and fields of usual size
+            spread = columns[self._fit][:, shared] * scale[shared], found.noise[self.noise_group()[self._fit]]
+            u = self._descend(u, free, linear, spread)
             linear, columns, _ = self.linearise(u)
             value, found, _ = linear.evidence(terms, (found.tau, found.noise))
             gained = np.inf if best is None else value - best[0]
@@ -382,24 +384,33 @@ class WheelForm(MeasuredForm):
         assert best is not None
         return best[1]
 
+    def alone(self, refit: Refit) -> np.ndarray:
+        """See `MeasuredForm`; least squares under the noise alone, from where the refit has ended."""
+        free = self._free(refit.effects)
+        return self._descend(refit.u, free, refit.linear, None)
+
+    def _bounds(self, free: np.ndarray) -> np.ndarray:
+        """(2, free) lower and upper bounds."""
+        return np.array([self.coordinates[i].bounds() for i in free], float).reshape(-1, 2).T
+
+    def _free(self, effects: frozenset[str]) -> np.ndarray:
+        """Places of what a refit with some effects moves."""
+        return np.concatenate([self.baseline, *(p for e, p in self.candidates.items() if e in effects)]).astype(int)
+
     def _descend(
-        self,
-        u: np.ndarray,
-        free: np.ndarray,
-        bounds: np.ndarray,
-        linear: Linear,
-        columns: np.ndarray,
-        sizes: tuple[np.ndarray, np.ndarray],
+        self, u: np.ndarray, free: np.ndarray, linear: Linear, spread: tuple[np.ndarray, np.ndarray] | None
     ) -> np.ndarray:
-        """The most probable coordinates at given sizes of discrepancy and noise."""
-        fit, group = self._fit, self.noise_group()[self._fit]
-        count = len(self.coordinates)
-        tau, noise = sizes
-        scale = linear.amplitudes.std * np.append(tau, 1.0)[linear.amplitudes.field]
-        own = linear.always[linear.always >= count]  # calibration and fields of usual size
-        nuisance = columns[fit][:, own] * scale[own]
-        covariance = nuisance @ nuisance.T
-        covariance[np.diag_indices(len(group))] += noise[group] ** 2
+        """The most probable coordinates under given noise.
+
+        Args:
+          u: (coordinates,) where from. free: places of what moves. linear: priors.
+          spread: (fitted, k) columns of calibration and discrepancy, each times its size, and (fitted,) factors on the
+            noise; the stated noise alone if None.
+        """
+        fit = self._fit
+        columns, noise = spread or (np.zeros((int(fit.sum()), 0)), np.ones(int(fit.sum())))
+        covariance = columns @ columns.T
+        covariance[np.diag_indices(len(noise))] += noise**2
         factor = linalg.cholesky(covariance, lower=True, check_finite=False)
         std = linear.amplitudes.std[free]
         centre = np.array([self.coordinates[i].centre for i in free])
@@ -416,10 +427,9 @@ class WheelForm(MeasuredForm):
             prior = (x - centre) / std
             return np.concatenate([solved[:, 0], prior]), np.vstack([solved[:, 1:], np.diag(1.0 / std)])
 
+        low, high = self._bounds(free)
         out = u.copy()
-        out[free] = minimise(
-            at, u[free], bounds[:, 0], bounds[:, 1], 2.0 * self.settings.fit_settled, self.settings.most_evaluations
-        )
+        out[free] = minimise(at, u[free], low, high, 2.0 * self.settings.fit_settled, self.settings.most_evaluations)
         return out
 
 

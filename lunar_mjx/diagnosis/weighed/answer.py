@@ -28,7 +28,7 @@ from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Refit
-from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, Hypothesis, ModelSearch, search
+from lunar_mjx.inference.weighing.search import Hypothesis, ModelSearch, search
 
 _WRITING = 0.1
 """1; share of the time given that is kept for writing the answer."""
@@ -50,9 +50,10 @@ def compare(run: Run, problem: Problem, progress: Progress) -> Refit:
         refit = own.refit(frozenset(), None, None)
     # the model as given, by its own numbers: what a refit gains is told beside it
     start = own.residual(own.origin())
-    run.save(COMPARISON_FILE, comparison(problem, start, refit))
+    alone = own.alone(refit)
+    run.save(COMPARISON_FILE, comparison(problem, start, refit, alone))
     run.save(HYPOTHESES_FILE, {own.name: {"u": _by_key(own, refit.u)}})
-    save_series(run, own, start, {"refitted": (own, refit.u)})
+    save_series(run, own, start, {"refitted": (own, alone)})
     return refit
 
 
@@ -115,27 +116,35 @@ def diagnose(
     diagnosis = _diagnosis(problem, found, best)
     start = own.residual(own.origin())
     after = problem.form(best.form)
-    run.save(COMPARISON_FILE, {**(run.load(COMPARISON_FILE) or {}), **comparison(problem, start, base)})
-    fits = {"refitted": (own, base.u)}
+    with threadpool_limits(1, "blas"):
+        own_alone, best_alone = own.alone(base), after.alone(best.refit)
+    run.save(COMPARISON_FILE, {**(run.load(COMPARISON_FILE) or {}), **comparison(problem, start, base, own_alone)})
+    fits = {"refitted": (own, own_alone)}
     if best.effects or best.form != own.name:
         words = [*([best.form] if best.form != own.name else []), *sorted(best.effects)]
-        fits["with " + ", ".join(words)] = (after, best.refit.u)
+        fits["with " + ", ".join(words)] = (after, best_alone)
     save_series(run, own, start, fits, after.corrected(best))
     _save_signatures(run, found.base(best.form).refit, own)
     run.save(HYPOTHESES_FILE, _fits(problem, found))
     diagnosis = dataclasses.replace(
         diagnosis,
-        error_before=errors(own, own.residual(base.u)),
-        error_after=errors(after, after.residual(best.refit.u)),
+        error_before=errors(own, own.residual(own_alone)),
+        error_after=errors(after, after.residual(best_alone)),
     )
     return diagnosis, found
 
 
-def comparison(problem: Problem, start: np.ndarray, refit: Refit) -> dict[str, Any]:
-    """Errors in sigma of the model as given and refitted, by group and channel, and the refitted parameters."""
+def comparison(problem: Problem, start: np.ndarray, refit: Refit, alone: np.ndarray | None = None) -> dict[str, Any]:
+    """Errors in sigma of the model as given and refitted, by group and channel, and the refitted parameters.
+
+    Args:
+      problem: whose own form is told of. start: (n,) whitened residuals of the model as given. refit: of the form.
+      alone: (coordinates,) where the model alone predicts best; where the refit stands if None.
+    """
     form = problem.own
     observations = form.observations
-    residual = form.residual(refit.u)
+    alone = refit.u if alone is None else alone
+    residual = form.residual(alone)
     rows = []
     for s in observations.series:
         part = slice(s.start, s.stop)
@@ -151,15 +160,16 @@ def comparison(problem: Problem, start: np.ndarray, refit: Refit) -> dict[str, A
                     "refitted": _rms(residual[keep]),
                 }
             )
-    value, found, places = refit.linear.evidence(form.listed(refit.effects))
-    del value
+    _, found, places = refit.linear.evidence(form.listed(refit.effects))
     return {
         "unit": "sigma of the measurement noise",
         "as_given": errors(form, start),
         "refitted": errors(form, residual),
         "by_channel": rows,
-        "parameters": parameter_table(form, refit, found.mean, found.covariance, places),
-        "discrepancy": _discrepancy(form, found.tau, found.tau_log_std, refit.linear.felt()),
+        "parameters": parameter_table(form, alone, found.covariance, places),
+        "discrepancy": _discrepancy(
+            form, found.tau, found.tau_log_std, refit.linear.felt(), problem.settings.least_signal
+        ),
         "noise": {n.name: float(s) for n, s in zip(refit.linear.noises, found.noise, strict=True)},
         "solver": refit.failed or "ended",
         "observations": len(observations),
@@ -178,9 +188,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
-def parameter_table(
-    form: MeasuredForm, refit: Refit, mean: np.ndarray, covariance: np.ndarray, places: np.ndarray
-) -> dict[str, Any]:
+def parameter_table(form: MeasuredForm, u: np.ndarray, covariance: np.ndarray, places: np.ndarray) -> dict[str, Any]:
     """Fitted values and standard deviations by effect and name, with units and the values that the model came with."""
     table: dict[str, Any] = {}
     for k, i in enumerate(places):
@@ -188,19 +196,19 @@ def parameter_table(
             continue
         c = form.coordinates[i]
         entry = table.setdefault(c.effect, {"value": {}, "std": {}, "given": {}, "unit": {}})
-        entry["value"][c.name] = float(c.value(refit.u[i]))
-        entry["std"][c.name] = c.std(refit.u[i], math.sqrt(max(float(covariance[k, k]), 0.0)))
+        entry["value"][c.name] = float(c.value(u[i]))
+        entry["std"][c.name] = c.std(u[i], math.sqrt(max(float(covariance[k, k]), 0.0)))
         entry["given"][c.name], entry["unit"][c.name] = c.start, c.unit
     return table
 
 
 def _discrepancy(
-    form: MeasuredForm, tau: np.ndarray, log_std: np.ndarray, felt: Mapping[str, float]
+    form: MeasuredForm, tau: np.ndarray, log_std: np.ndarray, felt: Mapping[str, float], least_signal: float
 ) -> dict[str, dict[str, Any]]:
     """Size of every field of which the data can tell something."""
     found = {}
     for (field, said), size, spread in zip(form.words.items(), tau, log_std, strict=True):
-        if felt[field] < LEAST_SIGNAL:
+        if felt[field] < least_signal:
             continue  # its size would be the prior's, told as if it had been measured
         size = size * form.shares.get(field, 1.0)
         low, high = size * math.exp(-spread), size * math.exp(spread)
@@ -261,10 +269,10 @@ def save_series(
 
 def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagnosis:
     settings = problem.settings
-    said = conclude(found, settings.sure)
+    said = conclude(found, settings.sure, settings.largest_class)
     forms = found.forms()
     own = problem.own.name
-    remains = _averaged(problem.own, found)
+    remains = _averaged(problem.own, found, settings.least_signal)
     sentence = said.sentence
     better = max(forms, key=lambda n: forms[n])
     if forms[better] >= settings.sure and better != own:
@@ -290,7 +298,7 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         evidence=evidence,
         port=said.port,
         ports={t.name: p for t, p in inclusion.items() if t.kind == UNLISTED and p >= 1e-4},
-        isolability=_cosines(found.base(best.form).refit),
+        isolability=_cosines(found.base(best.form).refit, settings.least_signal),
         undecidable=undecidable,
         probability=said.probability,
         probabilities=probabilities(found),
@@ -311,9 +319,7 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
                 "failed": list(found.failed),
                 "hypotheses": len(found.hypotheses),
             },
-            "parameters": parameter_table(
-                problem.form(best.form), best.refit, best.evidence.mean, best.evidence.covariance, best.places
-            ),
+            "parameters": parameter_table(problem.form(best.form), best.refit.u, best.evidence.covariance, best.places),
             "not_tested": [dataclasses.asdict(n) for n in problem.not_tested],
         },
     )
@@ -332,12 +338,12 @@ def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[C
     return said, "Of what was looked at: " + sentence + rest
 
 
-def _averaged(form: MeasuredForm, found: ModelSearch) -> dict[str, dict[str, Any]]:
+def _averaged(form: MeasuredForm, found: ModelSearch, least_signal: float) -> dict[str, dict[str, Any]]:
     """Size of each field, averaged over hypotheses by their probability."""
     # squares, for sizes are standard deviations
     tau = np.sqrt(sum(p * h.evidence.tau**2 for h, p in zip(found.hypotheses, found.probability, strict=True)))
     spread = sum(p * h.evidence.tau_log_std for h, p in zip(found.hypotheses, found.probability, strict=True))
-    return _discrepancy(form, np.asarray(tau), np.asarray(spread), found.best.refit.linear.felt())
+    return _discrepancy(form, np.asarray(tau), np.asarray(spread), found.best.refit.linear.felt(), least_signal)
 
 
 def _held_out(found: ModelSearch, best: Hypothesis, own: str) -> tuple[float, float, int]:
@@ -361,7 +367,7 @@ def _evidence(
     inclusion = {t.name: p for t, p in found.inclusion().items() if t.kind == EFFECT}
     best_form = found.best.form
     shows = found.base(best_form).refit.linear.shows()
-    cosines = _cosines(found.base(best_form).refit)
+    cosines = _cosines(found.base(best_form).refit, problem.settings.least_signal)
     rows = []
     for name, length in shows.items():
         p = inclusion.get(name, 0.0)
@@ -383,7 +389,7 @@ def _evidence(
         nearest = max(others.items(), key=lambda item: item[1]) if others else ("", 0.0)
         if name in problem.own.skipped:
             status, reason = "not tested", "the time did not suffice to look at it"
-        elif length < LEAST_SIGNAL:
+        elif length < problem.settings.least_signal:
             status, reason = "not tested", f"would show with {length:.2g} sigma after a refit"
         elif name in named:
             status, reason = "accepted", f"probability {p:.3f}"
@@ -412,7 +418,7 @@ def _evidence(
     return tuple(rows), tuple(e.effect for e in rows if e.status == "not tested")
 
 
-def _cosines(refit: Refit) -> dict[str, dict[str, float]]:
+def _cosines(refit: Refit, least_signal: float) -> dict[str, dict[str, float]]:
     """|cos| between the signatures of effects at their prior sizes that the form's own parameters cannot absorb."""
     linear = refit.linear
     whole = linear.gram.matrix.sum(axis=0)[:-1, :-1]
@@ -425,7 +431,7 @@ def _cosines(refit: Refit) -> dict[str, dict[str, float]]:
     left = scale[every, None] * whole[np.ix_(every, every)] * scale[every] - across.T @ np.linalg.solve(inner, across)
     index = {i: k for k, i in enumerate(every)}
     shows = linear.shows()
-    names = [n for n in linear.effects if shows[n] >= LEAST_SIGNAL]
+    names = [n for n in linear.effects if shows[n] >= least_signal]
     found: dict[str, dict[str, float]] = {}
     for a in names:
         pa = [index[i] for i in linear.effects[a]]

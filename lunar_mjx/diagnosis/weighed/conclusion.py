@@ -37,7 +37,7 @@ class Conclusion:
     further: tuple[str, ...] = ()
 
 
-def conclude(found: ModelSearch, sure: float) -> Conclusion:
+def conclude(found: ModelSearch, sure: float, largest_class: int = LARGEST_CLASS) -> Conclusion:
     """The strongest statement that has the probability `sure`.
 
     In this order: something unlisted (UNKNOWN), and beside it the effects that are as sure or help; effects that are
@@ -62,7 +62,7 @@ def conclude(found: ModelSearch, sure: float) -> Conclusion:
         p = found.probability_of(lambda h: set(named) <= h.terms)
         names = tuple(map(label, named))
         rest = [t for t in inclusion if t not in named]
-        further, _ = _smallest(found, rest, sure, named)
+        further, _ = _smallest(found, rest, sure, named, largest_class)
         many = len(names) > 1
         said = f"{_list(names)} {'are' if many else 'is'} missing"
         if all(t.kind == CALIBRATION for t in named):
@@ -79,7 +79,7 @@ def conclude(found: ModelSearch, sure: float) -> Conclusion:
     if nothing >= sure:
         said = "Nothing is missing beyond usual errors of model, sensors and noise"
         return Conclusion(Verdict.NOISE_ONLY, (), False, None, nothing, _with(said, nothing))
-    members, p = _smallest(found, list(inclusion), sure)
+    members, p = _smallest(found, list(inclusion), sure, (), largest_class)
     effects = tuple(m for m in members if m != _UNLISTED)
     if members:
         other = _UNLISTED in members
@@ -150,12 +150,12 @@ _UNLISTED = ""
 
 
 def _smallest(
-    found: ModelSearch, terms: Sequence[Term], sure: float, named: Sequence[Term] = ()
+    found: ModelSearch, terms: Sequence[Term], sure: float, named: Sequence[Term], largest_class: int
 ) -> tuple[list[str], float]:
     """Fewest terms, one by one the most useful, of which the truth holds at least one with probability `sure`.
 
     Something unlisted counts as one of them, wherever it acts. Hypotheses that lack what is `named` hold no statement
-    about what acts beside it. Empty where the class would hold more than `LARGEST_CLASS` names.
+    about what acts beside it. Empty where the class would hold more than `largest_class` names.
     """
     by_label = {_UNLISTED if t.kind == UNLISTED else label(t): t for t in terms}
     members: list[str] = []
@@ -169,7 +169,7 @@ def _smallest(
 
     p = 0.0
     # greedy: the smallest cover is hard to find, and a name too many costs the reader little
-    while p < sure and len([m for m in members if m != _UNLISTED]) < LARGEST_CLASS:
+    while p < sure and len([m for m in members if m != _UNLISTED]) < largest_class:
         # jointly, not from the terms' own probabilities: hypotheses that hold both must not count twice
         gains = {t: found.probability_of(holds([*members, t])) for t in by_label if t not in members}
         best = max(gains, key=lambda t: gains[t], default=None)

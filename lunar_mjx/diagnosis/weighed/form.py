@@ -11,13 +11,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from lunar_mjx.diagnosis.weighed.conclusion import LARGEST_CLASS
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.errors import bad_input
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import NotTested
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Form, Refit, Term
-from lunar_mjx.inference.weighing.search import Hypothesis
+from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, UNLISTED_SHARE, Hypothesis
 
 SettingsKind = TypeVar("SettingsKind", bound="SearchSettings")
 """The class itself or one that adds to it: annotations are checked method by method, where `Self` has no meaning."""
@@ -46,6 +47,13 @@ class SearchSettings:
     """1; terms of one hypothesis at most, as the real wheel needs."""
     window: float = 4.0
     """nat; hypotheses further below the best are not refitted: 2 per cent of its probability."""
+    least_signal: float = LEAST_SIGNAL
+    """sigma; length of a signature at its prior size below which no data can speak for or against an effect."""
+    unlisted_share: float = UNLISTED_SHARE
+    """1; probability of something unlisted from which every effect is refitted from where it acts (28 foreign tables:
+    Brier score 0.048 to 0.032)."""
+    largest_class: int = LARGEST_CLASS
+    """1; names of a class at most: "one of six" is no help to its reader."""
 
     @classmethod
     def of(cls: type[SettingsKind], changed: Mapping[str, Any]) -> SettingsKind:
@@ -118,6 +126,16 @@ class MeasuredForm(Form):
         """Predictions (n,) and whitened residuals (n,) with what is learnt of discrepancy, where a form can tell."""
         del best
         return None
+
+    def alone(self, refit: Refit) -> np.ndarray:
+        """(coordinates,) where the model alone predicts the fitted measurements best.
+
+        A refit leaves to discrepancy and instruments what these explain as well as the parameters do: so its parameters
+        are unbiased, and its predictions without the two are not the best. Whoever uses a model without the two, and
+        every error that is told of it, needs these (L2 calibration: Tuo & Wu 2015). A form that does not tell the
+        two apart returns where the refit stands.
+        """
+        return refit.u
 
     def signatures(self, refit: Refit) -> dict[str, np.ndarray]:
         """(fitted,) whitened signature of each effect at its prior size, where told."""

@@ -24,6 +24,9 @@ Terms = frozenset[Term]
 LEAST_SIGNAL = 1.0
 """Length in sigma of a signature at its prior size below which no data can speak for or against an effect or an
 unlisted input: it is undecidable, and keeps its prior probability without being listed."""
+UNLISTED_SHARE = 0.5
+"""Probability of something unlisted from which every effect that could be seen is refitted from where it acts: more
+probable than not."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,6 +110,8 @@ def search(
     progress: Callable[[str, float], None] = lambda text, share: None,
     stop: Callable[[], bool] = lambda: False,
     provisional: Callable[[ModelSearch], None] = lambda found: None,
+    least_signal: float = LEAST_SIGNAL,
+    unlisted_share: float = UNLISTED_SHARE,
 ) -> ModelSearch:
     """Looks for the most probable sets of terms.
 
@@ -116,6 +121,7 @@ def search(
       window: log probability below the best from which a hypothesis is not refitted.
       progress: told of every refit. stop: whether to begin no further refit.
       provisional: given what is known after every refit but the first.
+      least_signal: see `LEAST_SIGNAL`. unlisted_share: see `UNLISTED_SHARE`.
 
     Raises:
       EvidenceError: no form could be fitted. TimeUp: before the first one was.
@@ -150,7 +156,7 @@ def search(
         if made.failed:
             failed.append(label)
             reasons.append(f"{label}: {made.failed}")
-        _score_around(form, made, near, known, done, most_terms, window)
+        _score_around(form, made, near, known, done, most_terms, window, least_signal)
 
     complete = False
     for form in forms:
@@ -187,7 +193,7 @@ def search(
         if others:
             refit(others[0], best.effects, None)
             continue
-        untried = _untried(known.values(), best, by_name[best.form], done)
+        untried = _untried(known.values(), best, by_name[best.form], done, least_signal, unlisted_share)
         if not untried:
             complete = True
             break
@@ -196,21 +202,26 @@ def search(
 
 
 def _untried(
-    known: Iterable[Hypothesis], best: Hypothesis, form: Form, done: Mapping[tuple[str, frozenset[str]], Refit | None]
+    known: Iterable[Hypothesis],
+    best: Hypothesis,
+    form: Form,
+    done: Mapping[tuple[str, frozenset[str]], Refit | None],
+    least_signal: float,
+    unlisted_share: float,
 ) -> list[str]:
     """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.
 
-    Empty where something unlisted is less probable than not: then what is listed explains the measurements.
+    Empty where something unlisted is less probable than its share: then what is listed explains the measurements.
     """
     scored = list(known)
     top = max(h.log_posterior for h in scored)
     weights = [(math.exp(h.log_posterior - top), any(t.kind == UNLISTED for t in h.terms)) for h in scored]
     # refits of everything are dear: they are made only where something unlisted would else be believed
-    if sum(w for w, other in weights if other) < 0.5 * sum(w for w, _ in weights):
+    if sum(w for w, other in weights if other) < unlisted_share * sum(w for w, _ in weights):
         return []
     linear = {next(iter(h.effects - best.effects)): h.log_posterior for h in scored if _one_more(h, best)}
     shows = best.refit.linear.shows()
-    names = [n for n in shows if n not in best.effects and shows[n] >= LEAST_SIGNAL]
+    names = [n for n in shows if n not in best.effects and shows[n] >= least_signal]
     names = [n for n in names if (form.name, best.effects | {n}) not in done]
     return sorted(names, key=lambda n: -linear.get(n, -math.inf))
 
@@ -238,13 +249,14 @@ def _score_around(
     done: dict[tuple[str, frozenset[str]], Refit | None],
     most_terms: int,
     window: float,
+    least_signal: float,
 ) -> None:
     """Scores the refitted set with every choice of terms that need no refit, and their neighbours by one effect."""
     own = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in made.effects)
     felt = made.linear.felt()
-    others = [t for t in form.terms if t.kind != EFFECT and (t.kind != UNLISTED or felt[t.name] >= LEAST_SIGNAL)]
+    others = [t for t in form.terms if t.kind != EFFECT and (t.kind != UNLISTED or felt[t.name] >= least_signal)]
     shows = made.linear.shows()
-    effects = [t for t in form.terms if t.kind == EFFECT and shows[t.name] >= LEAST_SIGNAL]
+    effects = [t for t in form.terms if t.kind == EFFECT and shows[t.name] >= least_signal]
     start = None if near is None else (near.evidence.tau, near.evidence.noise)
 
     def score(terms: Terms, begin: tuple[np.ndarray, np.ndarray] | None) -> Hypothesis | None:

@@ -136,6 +136,33 @@ def test_forms_of_one_law_have_the_same_candidates(folder, monkeypatch):
     assert closed == integral == set(more)
 
 
+def test_a_refit_arrives_from_the_model_as_given_and_from_afar(folder):
+    form = tables(folder, "plain").own
+    far = np.zeros(len(form.coordinates))
+    far[form.baseline] = np.clip(1.5, *form._bounds(form.baseline))
+    found = [form.refit(frozenset(), None, start) for start in (None, far)]
+    values = [r.linear.evidence(frozenset())[0] for r in found]
+    assert values[0] == pytest.approx(values[1], abs=0.5)
+
+
+def test_alone_a_model_predicts_best_without_what_it_leaves_to_instruments(folder):
+    form = tables(folder, "plain").own
+    refit = form.refit(frozenset(), None, None)
+    alone = form.alone(refit)
+    fit = form.observations.in_split("fit")
+    left, least = (float(np.sum(form.residual(u)[fit] ** 2)) for u in (refit.u, alone))
+    assert least < left and least == pytest.approx(fit.sum(), rel=0.2)
+    # along no coordinate is there anything better
+    for i in form.baseline:
+        for step in (-0.05, 0.05):
+            beside = alone.copy()
+            beside[i] += step
+            prior = (beside[i] ** 2 - alone[i] ** 2) / form.coordinates[i].prior ** 2
+            low, high = form.coordinates[i].bounds()
+            if low <= beside[i] <= high:
+                assert np.sum(form.residual(beside)[fit] ** 2) + prior > least - 0.1
+
+
 def test_chunks_of_points_make_no_difference(folder):
     form = tables(folder, "plain").own
     u = np.zeros(len(form.coordinates))
