@@ -9,9 +9,9 @@ import importlib
 from typing import Any
 
 import jax
-import jax.export
 import jax.numpy as jnp
 import numpy as np
+from jax.export import export, symbolic_shape
 
 from lunar_mjx.agents.learner import MOST_DEVIATIONS
 from lunar_mjx.agents.policy import Policy
@@ -85,8 +85,8 @@ def _activation(add: Any, name: str, hidden: str, i: int) -> str:
 
 def to_stablehlo(policy: Policy) -> bytes:
     """The policy as `jax.export.deserialize` reads it, for CPUs and CUDA; its `mlir_module()` is the StableHLO text."""
-    (batch,) = jax.export.symbolic_shape("batch")
+    (batch,) = symbolic_shape("batch")
     shape = jax.ShapeDtypeStruct((batch, policy.network["obs"]), jnp.float32)
     with jax.default_matmul_precision("highest"):
-        exported = jax.export.export(jax.jit(policy.act), platforms=("cpu", "cuda"))(shape)
+        exported = export(jax.jit(policy.act), platforms=("cpu", "cuda"))(shape)
     return bytes(exported.serialize())
