@@ -58,6 +58,7 @@ def policy(env):
 @pytest.fixture(scope="module")
 def exported(policy, tmp_path_factory):
     """The folder without the ONNX graph, which needs a package more."""
+    pytest.importorskip("flatbuffers", reason="needs the extra export")
     folder = tmp_path_factory.mktemp("export")
     export_policy(save_policy(policy, folder / "policy.npz"), folder, ["stablehlo"])
     return folder
@@ -387,6 +388,12 @@ def test_mistakes_are_one_sentence(run, tmp_path, monkeypatch):
     point = save_policy(make_policy(4, 2, {"name": "point", "options": {}}), tmp_path / "point.npz")
     found = run("export", "policy", point)
     assert found.status == 2 and "pip install 'lunar-mjx[export]'" in found.err
+    with monkeypatch.context() as without:
+        for name in ("flatbuffers", "jax._src.export.serialization", "jax._src.export.serialization_generated"):
+            without.setitem(sys.modules, name, None)
+        found = run("export", "policy", point, "--only", "stablehlo")
+    assert found.status == 2 and "flatbuffers" in found.err and found.err.count("\n") == 1
+    pytest.importorskip("flatbuffers", reason="needs the extra export")
     found = run("export", "policy", point, "--only", "stablehlo", "-o", tmp_path / "out")
     assert found.status == 0 and (tmp_path / "out" / "contract.json").is_file()
     assert not (tmp_path / "out" / "ros2_node.py").exists()

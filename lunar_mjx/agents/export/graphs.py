@@ -84,9 +84,19 @@ def _activation(add: Any, name: str, hidden: str, i: int) -> str:
 
 
 def to_stablehlo(policy: Policy) -> bytes:
-    """The policy as `jax.export.deserialize` reads it, for CPUs and CUDA; its `mlir_module()` is the StableHLO text."""
+    """The policy as `jax.export.deserialize` reads it, for CPUs and CUDA; its `mlir_module()` is the StableHLO text.
+
+    Raises:
+      UserError: the package flatbuffers is not installed.
+    """
     (batch,) = symbolic_shape("batch")
     shape = jax.ShapeDtypeStruct((batch, policy.network["obs"]), jnp.float32)
     with jax.default_matmul_precision("highest"):
         exported = export(jax.jit(policy.act), platforms=("cpu", "cuda"))(shape)
-    return bytes(exported.serialize())
+    try:
+        return bytes(exported.serialize())
+    except ImportError:
+        raise UserError(
+            "export: the package flatbuffers, in which JAX writes programs, is not installed; "
+            "give pip install 'lunar-mjx[export]'."
+        ) from None
