@@ -5,13 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lunar_mjx.diagnosis.drives.windows import coordinates
+from lunar_mjx.diagnosis.drives.windows import coordinates, verbs
 from lunar_mjx.diagnosis.drives.windows.bench import held_out_parts
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, _held, cut, imu_clock
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, corners, learn_noise, proportions
 from lunar_mjx.diagnosis.drives.windows.settings import WindowSettings, by_motion
 from lunar_mjx.diagnosis.drives.windows.verbs import fitted_model
+from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.dynamics.imposed import Windows
 from lunar_mjx.errors import UserError
@@ -364,6 +365,21 @@ def test_what_is_known_is_fitted_no_further(model):
 def test_a_steered_rover_is_refused():
     with pytest.raises(UserError, match="drives are its only joints"):
         corners(hard_floor("luvmi_x"))
+
+
+def test_a_name_that_does_not_help_what_was_held_out_is_taken_back(monkeypatch):
+    """Three windows of mixed gain refuse a name and keep its port; eight that all gain keep it."""
+    named = Diagnosis(Verdict.KNOWN, ("soft_ground",), "soft_ground is missing.")
+    families = {"soft_ground": "ground"}
+    monkeypatch.setattr(verbs, "_gains", lambda found: np.array([3.0, -2.0, 1.0]))
+    said = verbs._held_to_account(named, None, families)
+    assert said.verdict is Verdict.UNKNOWN
+    assert (said.effects, said.port) == ((), "wheel_normal")
+    assert "wheel_normal" in said.sentence
+    monkeypatch.setattr(verbs, "_gains", lambda found: np.linspace(1.0, 3.0, 8))
+    assert verbs._held_to_account(named, None, families).verdict is Verdict.KNOWN
+    monkeypatch.setattr(verbs, "_gains", lambda found: np.zeros(0))
+    assert verbs._held_to_account(named, None, families) is named
 
 
 def test_like_motions_share_what_a_law_is_off_by():
