@@ -112,7 +112,7 @@ assert after["refitted"]["fit"] < before["as_given"]["fit"]
 
 # %% [markdown]
 # The certificate says so if an error rises, or if nothing moved: on twenty seconds a refit of the floor's own
-# parameters does as well as soft ground, which is why it was not named alone. The current of the left motor, measured
+# parameters does as well as soft ground, which is why it was not named. The current of the left motor, measured
 # and by both models:
 
 # %%
