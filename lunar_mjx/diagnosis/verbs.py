@@ -314,14 +314,17 @@ def _add(
 
 
 def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> list[str]:
-    """What `improve` adds next: another form of the model first, where it is surely better, then all that is named.
+    """What `improve` adds next: all that is named, and another contact law where it is better.
 
-    Beside something unlisted that is what is sure in itself, or with `keep_going` all that helps.
+    A law alone is exchanged where it is surely better. A model that grows is made of the most probable one: there is
+    no model without a law, so that keeping the old one is a choice like any other. Beside something unlisted what is
+    sure in itself is added, or with `keep_going` all that helps.
     """
-    law = better_law(diagnosis.forms, run.model)
     names = [n for n in diagnosis.effects if not n.startswith("calibration: ")]
     sure = float(run.settings.get("sure", SearchSettings().sure))
     if diagnosis.verdict is Verdict.UNKNOWN and not keep_going:
         names = [n for n in names if diagnosis.inclusion.get(n, 0.0) >= sure]
-    go_on = diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE, Verdict.UNKNOWN)
-    return [*([law] if law else []), *(names if go_on else [])]
+    if diagnosis.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE, Verdict.UNKNOWN):
+        names = []
+    law = better_law(diagnosis.forms, run.model, 0.0 if names else sure)
+    return [*([law] if law else []), *names]

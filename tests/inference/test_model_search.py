@@ -11,7 +11,7 @@ from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
 from lunar_mjx.inference.evidence import EvidenceError, Gram, NoiseSize
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Term, shifted
-from lunar_mjx.inference.weighing.search import search
+from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, search
 from tests.inference.toy_form import EFFECTS, NOISE, ToyForm, X, curve, measured
 
 
@@ -98,3 +98,17 @@ def test_judged_measurements_weigh_as_if_they_had_been_fitted():
         both = dataclasses.replace(known, gram=parts[0] + parts[1]).evidence(terms)[0]
         split = dataclasses.replace(known, gram=parts[0], judged=parts[1]).evidence(terms)[0]
         assert split == pytest.approx(both, rel=1e-5)
+
+
+def test_a_set_promises_beside_another_form_what_its_last_effects_gained():
+    """Counted from the largest set that was refitted beside both forms; no promise where there is none."""
+    terms = {n: Term(n, EFFECT, 0.0) for n in "abc"}
+
+    def hypothesis(form, names, value):
+        chosen = frozenset(terms[n] for n in names)
+        return Hypothesis(form, chosen, value, None, True, None, None)  # pyright: ignore[reportArgumentType]
+
+    known = [hypothesis("one", "", -50.0), hypothesis("one", "a", -40.0), hypothesis("one", "abc", -10.0)]
+    known += [hypothesis("two", "", -60.0), hypothesis("two", "a", -35.0), hypothesis("two", "b", 0.0)]
+    assert _carried_over(known, known[2], "two") == -35.0 + (-10.0 + 40.0)
+    assert _carried_over(known, known[2], "three") == -np.inf

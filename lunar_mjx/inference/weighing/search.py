@@ -182,14 +182,17 @@ def search(
         best = max(listed, key=lambda h: h.log_posterior)
         near = [h for h in listed if h.log_posterior > best.log_posterior - window]
         open_ = [h for h in near if (h.form, h.effects) not in done]
-        if open_:
-            chosen = max(open_, key=lambda h: h.log_posterior)
+        # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
+        # order of what it promises there. Else one form's many neighbours would take the refits that tell which it is.
+        others = [f for f in forms if best.refitted and (f.name, best.effects) not in done]
+        others = [f for f in others if best.effects <= {t.name for t in f.terms}]
+        promise = {f.name: _carried_over(listed, best, f.name) for f in others}
+        others.sort(key=lambda f: -promise[f.name])
+        chosen = max(open_, key=lambda h: h.log_posterior, default=None)
+        if chosen is not None and not (others and promise[others[0].name] > chosen.log_posterior):
             refit(by_name[chosen.form], chosen.effects, chosen)
             provisional(ranked(False))
             continue
-        # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all.
-        others = [f for f in forms if best.refitted and (f.name, best.effects) not in done]
-        others = [f for f in others if best.effects <= {t.name for t in f.terms}]
         if others:
             refit(others[0], best.effects, None)
             continue
@@ -199,6 +202,22 @@ def search(
             break
         refit(by_name[best.form], best.effects | {untried[0]}, best, untried[0])
     return ranked(complete)
+
+
+def _carried_over(listed: Sequence[Hypothesis], best: Hypothesis, form: str) -> float:
+    """Log posterior of the best hypothesis' set beside another form, were its last effects to gain as much there.
+
+    The gain is counted from the largest set of its effects that was refitted beside both forms.
+    """
+    found: dict[tuple[str, frozenset[str]], float] = {}
+    for h in listed:
+        if h.refitted and h.effects <= best.effects:
+            found[h.form, h.effects] = max(h.log_posterior, found.get((h.form, h.effects), -math.inf))
+    common = [e for name, e in found if name == form and (best.form, e) in found]
+    if not common:
+        return -math.inf
+    shared = max(common, key=len)
+    return found[form, shared] + best.log_posterior - found[best.form, shared]
 
 
 def _untried(
