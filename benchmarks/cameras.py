@@ -1,7 +1,7 @@
 """Images per second: pictures, depth and height images in JAX by batch and size, and MuJoCo's renderer beside them.
 
     python benchmarks/cameras.py --batches 4,16 --sizes 64x48,320x240 --repeats 2 --out benchmarks/cameras_2cores.json
-    python benchmarks/cameras.py --only pictures --batches 2048 --sizes 64x48,320x240 --out benchmarks/cameras_h100.json
+    python benchmarks/cameras.py --only pictures --batches 2048 --sizes 64x48,320x240 --out benchmarks/cameras_h200.json
 
 Pictures are colour, depth and labels with shadows. A row of the JAX cameras counts only where `median_error` is there:
 the depth of one picture of the same size against MuJoCo's renderer; `labels` is the share of pixels whose label agrees.
@@ -24,7 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import commit
+from timing import LOCK, alone, commit
 
 from lunar_mjx.cameras import (
     Pinhole,
@@ -53,10 +53,11 @@ def seconds(function: Any, repeats: int) -> tuple[float, float]:
     start = time.perf_counter()
     jax.block_until_ready(function())
     first = time.perf_counter() - start
-    start = time.perf_counter()
-    for _ in range(repeats):
-        jax.block_until_ready(function())
-    return first, (time.perf_counter() - start) / repeats
+    with alone():
+        start = time.perf_counter()
+        for _ in range(repeats):
+            jax.block_until_ready(function())
+        return first, (time.perf_counter() - start) / repeats
 
 
 def spread(model: Model, count: int) -> jax.Array:
@@ -162,8 +163,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--pixels", type=int, default=80_000_000, help="largest number of pixels at once")
     parser.add_argument("--only", choices=("all", "pictures"), default="all", help="leave out depth and height images")
+    parser.add_argument("--lock", type=Path, help="file that is locked while a row is timed, for runs side by side")
     parser.add_argument("--out", type=Path, default=Path("cameras.json"))
     given = parser.parse_args()
+    LOCK[:] = [given.lock] if given.lock else []
     model = make_model(given.rover, given.terrain)
     sizes = [Pinhole(*map(int, s.split("x"))) for s in given.sizes.split(",")]
     batches = [int(b) for b in given.batches.split(",")]

@@ -3,12 +3,13 @@
     python benchmarks/programs.py --out benchmarks/programs_gpu.json
     python benchmarks/programs.py --batches 64 --steps 10 --out build/programs.json     # a trial on a CPU
 
-Programs: the presets `consistent` and `field`, `field` without one of its dearer effects, `consistent` with the stress
-integral, and `field` with a map of its own for every rover; all on `lunar_plain` with its boulders.
+Programs: the presets `field`, `consistent` and `paper`, `consistent` with the stress integral and without any effect,
+`field` with ruts or without one of its dearer effects, a map of its own for every rover, MJX with the effects of
+`consistent`, and `mjx.step` of the rover alone; all on `lunar_plain` with its boulders.
 Gate: of the first call of the timed program, some rovers are driven again by native MuJoCo with the NumPy effects
 (float64, the same start and commands). `parity_gap` is the largest difference of positions and velocities, each over
 the largest change that the drive made. `parity` is false beyond the tolerance, and null where the reference lacks an
-effect.
+effect, and for `mjx.step` alone, which is only a floor.
 """
 
 from __future__ import annotations
@@ -23,13 +24,12 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
-from speed import _terrain_axes, control, per_rover_maps, rollout, starts, timed
+from speed import _terrain_axes, bare_mjx, control, per_rover_maps, rollout, starts, timed
 from timing import LOCK, commit, cpu_name
 
 from lunar_mjx.backends import NativeBackend
 from lunar_mjx.backends.physics import SUPPORTED
 from lunar_mjx.dynamics import Params, System, build
-from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.model import Model, make_model
 
 TOLERANCE = {False: 2e-3, True: 2e-2}
@@ -39,18 +39,39 @@ REFERENCES = 4
 """Rovers that the reference drives again."""
 
 
-def programs(rover: str) -> Iterator[tuple[str, Model, bool]]:
-    """Name, model, and whether every rover has its own map."""
+BARE = "bare mjx.step"
+"""Name of the row without effects, terrain and gate."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """What is timed: a model, its engine, and whether every rover has a map of its own."""
+
+    name: str
+    model: Model
+    own_maps: bool = False
+    engine: str = "structured"
+
+
+def programs(rover: str) -> Iterator[Program]:
+    """All programs of a rover, those that most users run first."""
     field = make_model(rover, preset="field")
     plain = make_model(rover, preset="consistent")
-    yield "consistent", plain, False
-    yield "consistent, stress integral", plain.add("stress_integral"), False
-    yield "field", field, False
-    yield "field without rim_contact", field.remove("rim_contact"), False
-    yield "field without multipass", field.remove("multipass"), False
-    if "ruts" in CATALOGUE:
-        yield "field, ruts", field.add("ruts"), False
-    yield "field, map per rover", field, True
+    bare = plain
+    for effect in plain.effect_names:
+        bare = bare.remove(effect)
+    yield Program("field", field)
+    yield Program("consistent", plain)
+    yield Program("consistent, stress integral", plain.add("stress_integral"))
+    yield Program("field, map per rover", field, own_maps=True)
+    yield Program("consistent, map per rover", plain, own_maps=True)
+    yield Program("field without multipass", field.remove("multipass"))
+    yield Program("no effects", bare)
+    yield Program("paper", make_model(rover, preset="paper"))
+    yield Program("consistent, MJX", plain, engine="mjx")
+    yield Program(BARE, bare, engine="mjx")
+    yield Program("field, ruts", field.add("ruts"))
+    yield Program("field without rim_contact", field.remove("rim_contact"))
 
 
 def gate(model: Model, start: Any, steps: int, terrains: Callable[[int], Any] | None) -> Callable[[Any], dict]:
@@ -84,9 +105,12 @@ def gate(model: Model, start: Any, steps: int, terrains: Callable[[int], Any] | 
     return compare
 
 
-def row(name: str, model: Model, own_maps: bool, batch: int, steps: int) -> dict[str, Any]:
+def row(program: Program, batch: int, steps: int) -> dict[str, Any]:
     """One program: its rate and its gate."""
-    system: System = build(model, "structured")
+    model, own_maps = program.model, program.own_maps
+    if program.name == BARE:
+        return {"program": BARE, "batch": batch, "parity": None, "parity_gap": None} | bare_mjx(model, steps, batch)
+    system: System = build(model, program.engine)
     state = starts(system, batch)
     if not own_maps:
         run, argument, terrains = rollout(system, steps, None), state, None
@@ -115,14 +139,15 @@ def row(name: str, model: Model, own_maps: bool, batch: int, steps: int) -> dict
     check = gate(model, argument, steps, terrains)
     inspect = check if not own_maps else lambda both: check(both[1])
     held = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)) / batch
-    return {"program": name, "batch": batch, "state_bytes": held} | timed(run, argument, steps, batch, inspect=inspect)
+    about = {"program": program.name, "batch": batch, "state_bytes": held}
+    return about | timed(run, argument, steps, batch, inspect=inspect)
 
 
 def main() -> None:
     """See the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rovers", default="luvmi_x,viper")
-    parser.add_argument("--batches", type=lambda text: [int(n) for n in text.split(",")], default=[8192, 65536])
+    parser.add_argument("--batches", type=lambda text: [int(n) for n in text.split(",")], default=[65536, 8192])
     parser.add_argument("--only", help="programs, by semicolon; all if left out")
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--lock", type=Path, help="file that is locked while a row is timed, for runs side by side")
@@ -141,15 +166,14 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     wanted = options.only.split(";") if options.only else None
     for rover in options.rovers.split(","):
-        for name, model, own_maps in programs(rover):
-            if wanted is not None and name not in wanted:
-                continue
-            for batch in options.batches:
-                found = {"rover": rover} | row(name, model, own_maps, batch, options.steps)
+        every = [p for p in programs(rover) if wanted is None or p.name in wanted]
+        for batch in options.batches:
+            for program in every:
+                found = {"rover": rover} | row(program, batch, options.steps)
                 rows.append(found)
-                told = f"gap {found['parity_gap']}, state {found['state_bytes']:.0f} B"
                 rate = f"{found['steps_per_s']:14,.0f} steps/s"
-                print(f"{rover:8s} {name:28s} {batch:8d} {rate}  {told}, {found['compile_s']:.1f} s", flush=True)
+                told = f"gap {found['parity_gap']}, {found['compile_s']:.1f} s"
+                print(f"{rover:8s} {program.name:28s} {batch:8d} {rate}  {told}", flush=True)
                 options.out.parent.mkdir(parents=True, exist_ok=True)
                 options.out.write_text(json.dumps({"about": about, "rows": rows}, indent=1) + "\n")
 

@@ -120,7 +120,8 @@ def timed(
     best = cpu = float("inf")
     with alone():
         new = jax.block_until_ready(compiled(state))
-        found = inspect(new) if inspect is not None else {}
+    found = inspect(new) if inspect is not None else {}
+    with alone():
         meet()
         for _ in range(repeats):
             wall, process = time.perf_counter(), time.process_time()
