@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import fcntl
 import io
 import json
 import os
@@ -90,12 +91,16 @@ def imported(data: Path, ground: str, numbers: Sequence[str], out: Path, fault: 
     logs = []
     for n in numbers:
         folder = out / ground.lower() / n
-        if not (folder / "log.toml").exists():
-            files = [data / "husky_borealtc" / ground / f"{kind}_{n}.csv" for kind in ("pro", "imu")]
-            files = [f for f in files if f.exists()]
-            if fault:
-                files = [spoilt(f, fault, out / "raw" / fault / ground) for f in files]
-            import_log(files, folder, "husky_borealtc", changes={"ground": ground.lower()})
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        # jobs of one sequence may begin at the same time
+        with (folder.parent / f"{n}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / "log.toml").exists():
+                files = [data / "husky_borealtc" / ground / f"{kind}_{n}.csv" for kind in ("pro", "imu")]
+                files = [f for f in files if f.exists()]
+                if fault:
+                    files = [spoilt(f, fault, out / "raw" / fault / ground) for f in files]
+                import_log(files, folder, "husky_borealtc", changes={"ground": ground.lower()})
         logs.append(folder)
     return logs
 
