@@ -93,6 +93,8 @@ def campaign(folder: Path, which: str, seed: int | None) -> dict[str, Any]:
             raise SystemExit(f"{path}: holds set {about['set']} of seed {about['seed']}; name another folder.")
         return about
     head, dirty = commit()
+    if which == "report" and seed is None and not head:
+        raise SystemExit("The report set is drawn from the commit, and there is no git here: set FOREIGN_COMMIT to it.")
     drawn = TUNE_SEED if which == "tune" else int.from_bytes(hashlib.sha256(head.encode()).digest()[:6], "big")
     about = {
         "set": which,
@@ -174,6 +176,7 @@ def parser() -> argparse.ArgumentParser:
     swept.add_argument("--processes", type=int, default=len(os.sched_getaffinity(0)))
     swept.add_argument("--minutes", type=float, default=9.0)
     swept.add_argument("--setting", action="append", default=[], help="NAME=VALUE for `compare`, to ablate a rule")
+    swept.add_argument("--limit", type=float, default=150.0, help="s of wall time for one case, then it is a TIME_OUT")
     swept.add_argument("--cold", action="store_true", help="compile nothing beforehand")
     swept.add_argument("-o", "--out", type=Path, required=True)
     swept.set_defaults(do=sweep)
@@ -182,6 +185,8 @@ def parser() -> argparse.ArgumentParser:
     followed.add_argument("--tables", type=int, default=60)
     followed.add_argument("--seed", type=int, help="as for make")
     followed.add_argument("--minutes", type=float, default=60.0, help="after which no case is begun")
+    followed.add_argument("--processes", type=int, default=len(os.sched_getaffinity(0)))
+    followed.add_argument("--limit", type=float, default=400.0, help="s of wall time for one case and all its sweeps")
     followed.add_argument("--choice", action="append", choices=("next", "random", "d_optimal"), help="all if left out")
     followed.add_argument("-o", "--out", type=Path, required=True)
     followed.set_defaults(do=experiments)

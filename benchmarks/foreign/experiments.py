@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from . import bed, cases, told, work
+from . import bed, cases, pool, sweep, told, work
 from .cases import Case, generator
 from .score import judge, said
 from .wheel import Rows
@@ -159,6 +159,23 @@ def text(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+_HOW: list[Any] = []
+
+
+def _begin(choices: tuple[str, ...], limit_s: float) -> None:
+    _HOW[:] = [choices, limit_s]
+    pool.silent()
+
+
+def _follow(job: tuple[str, int, int, str, tuple[str, ...]]) -> list[dict[str, Any]]:
+    choices, limit_s = _HOW
+    try:
+        with pool.limit(limit_s):
+            return follow(cases.draw(*job), choices)
+    except pool.TooLong:
+        raise TimeoutError(f"longer than {limit_s:.0f} s") from None
+
+
 def experiments(args: argparse.Namespace) -> None:
     """Follows cases with something hidden until the time is up."""
     until = time.monotonic() + 60.0 * args.minutes
@@ -169,13 +186,26 @@ def experiments(args: argparse.Namespace) -> None:
     path = args.out / ROWS
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
     have = {r["case"] for r in rows}
-    for number, (group, hidden) in enumerate(cases.plan(args.set, args.tables)):
-        name = f"{args.set}-{number:03d}"
-        if group not in ("single", "pair") or name in have or time.monotonic() > until:
-            continue
-        found = follow(cases.draw(args.set, seed, number, group, hidden), args.choice or CHOICES)
-        rows += found
-        with path.open("a", encoding="utf-8") as file:
-            file.writelines(json.dumps(r) + "\n" for r in found)
-        print(f"{name} {', '.join(hidden)}: {found[0]['first']['verdict']}", flush=True)
+    todo = [
+        (args.set, seed, number, group, hidden)
+        for number, (group, hidden) in enumerate(cases.plan(args.set, args.tables))
+        if group in ("single", "pair") and f"{args.set}-{number:03d}" not in have
+    ]
+    pool.prepare()
+    processes = pool.Pool(args.processes, _begin, tuple(args.choice or CHOICES), args.limit)
+    try:
+        for _, error in processes.answers(sweep.compile_law, sweep.LAWS.split(","), until):
+            if error:
+                print(f"not compiled: {error}", flush=True)
+        for job, found in processes.answers(_follow, todo, until):
+            name = f"{job[0]}-{job[2]:03d} {', '.join(job[4])}"
+            if isinstance(found, BaseException):
+                print(f"{name}: {type(found).__name__} {found}", flush=True)
+                continue
+            rows += found
+            with path.open("a", encoding="utf-8") as file:
+                file.writelines(json.dumps(r) + "\n" for r in found)
+            print(f"{name}: {found[0]['first']['verdict']}", flush=True)
+    finally:
+        processes.end()
     print(text(rows))

@@ -11,19 +11,15 @@ kept; a second call goes on. `score.json` and `score.txt` are written at the end
 from __future__ import annotations
 
 import argparse
-import concurrent.futures as futures
 import json
-import multiprocessing
-import os
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bed, cases, told, work
+from . import bed, cases, pool, told, work
 from .score import figures, judge, said, text
 
 ROWS, SCORE, TEXT = "rows.jsonl", "score.json", "score.txt"
@@ -35,26 +31,27 @@ Job = tuple[str, int, int, str, tuple[str, ...], str, float]
 """Set, seed, number, group, what is hidden, word of the twin ("" for the case itself), factor on the stated noise."""
 
 
-def prepare() -> None:
-    """Sets this process up to compute on one core; before anything of the tool is imported."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "multi_thread_eigen" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1".strip()
+def ask(job: Job, settings: Mapping[str, str], limit_s: float = 0.0) -> dict[str, Any] | None:
+    """The row of one case; None for a twin whose replicates tell its noise, so that what is stated is not asked.
 
-
-def ask(job: Job, settings: Mapping[str, str]) -> dict[str, Any] | None:
-    """The row of one case; None for a twin whose replicates tell its noise, so that what is stated is not asked."""
+    A case that takes longer than its limit (s of wall time; 0: none) is a `TIME_OUT`.
+    """
     which, seed, number, group, hidden, word, factor = job
     case = cases.draw(which, seed, number, group, hidden)
     if word and case.replicates > 1:
         return None
     truth = cases.summary(case) | {"separable": told.separable(case), "twins": []}
     folder = Path(tempfile.mkdtemp(prefix="foreign-"))
+    cpu = time.process_time()
     try:
         bed.write(case, folder / "logs", factor)
         extra = [w for k, v in settings.items() for w in ("--setting", f"{k}={v}")]
-        answer = work.one(folder / "logs", folder, extra)
+        try:
+            with pool.limit(limit_s):
+                answer = work.one(folder / "logs", folder, extra)
+        except pool.TooLong:
+            answer = {"verdict": "TIME_OUT", "effects": [], "seconds": {"all": limit_s}}
+            shutil.rmtree(folder / "run", ignore_errors=True)
         path = folder / "run" / "verdict.json"
         verdict = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     finally:
@@ -69,6 +66,7 @@ def ask(job: Job, settings: Mapping[str, str]) -> dict[str, Any] | None:
         **what,
         **judge(truth, what),
         "seconds": answer["seconds"].get("all"),
+        "cpu_seconds": time.process_time() - cpu,
         "first": False,
         "place": verdict.get("details", {}).get("place"),
         "noise": verdict.get("details", {}).get("noise"),
@@ -78,24 +76,29 @@ def ask(job: Job, settings: Mapping[str, str]) -> dict[str, Any] | None:
 
 
 _SETTINGS: dict[str, str] = {}
+_LIMIT: list[float] = []
 
 
-def _begin(settings: dict[str, str]) -> None:
+def _begin(settings: dict[str, str], limit_s: float) -> None:
     _SETTINGS.update(settings)
-    sys.stdout = sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    _LIMIT[:] = [limit_s]
+    pool.silent()
 
 
 def _ask(job: Job) -> dict[str, Any] | None:
-    return ask(job, _SETTINGS)
+    return ask(job, _SETTINGS, _LIMIT[0])
 
 
-def _compile(law: str) -> None:
+def compile_law(law: str) -> None:
     """Compiles the program of one contact law into the cache that all processes share."""
     from lunar_mjx.commands.compiled import keep_compiled
 
     keep_compiled()
     job = ("tune", 1, 0, "null", (), "", 1.0)
     ask(job, {**_SETTINGS, "laws": law, "most_refits": "1"})
+
+
+LAWS = "closed form,stress_integral,granular_resistance"
 
 
 def jobs(which: str, seed: int, tables: int, every: int) -> list[Job]:
@@ -113,7 +116,7 @@ def jobs(which: str, seed: int, tables: int, every: int) -> list[Job]:
 def sweep(args: argparse.Namespace) -> None:
     """Asks about all cases that have no row yet, until the time is up."""
     until = time.monotonic() + 60.0 * args.minutes
-    prepare()
+    pool.prepare()
     folder: Path = args.out
     folder.mkdir(parents=True, exist_ok=True)
     from .__main__ import campaign
@@ -126,47 +129,27 @@ def sweep(args: argparse.Namespace) -> None:
     have = {r["case"] for r in rows}
     todo = [j for j in jobs(args.set, seed, args.tables, args.twins) if _name(j) not in have]
     head, dirty = work.commit()
-    context = multiprocessing.get_context("spawn")
-    begun = time.monotonic()
-    pool = futures.ProcessPoolExecutor(args.processes, context, _begin, (settings,))
-    written = time.monotonic()
+    begun = written = time.monotonic()
+    processes = pool.Pool(args.processes, _begin, settings, args.limit)
     try:
         if not args.cold:
-            laws = settings.get("laws") or "closed form,stress_integral,granular_resistance"
-            list(pool.map(_compile, laws.split(","), timeout=max(until - time.monotonic(), 1.0)))
-            print(f"compiled in {time.monotonic() - begun:.0f} s", flush=True)
-        # Few jobs wait in the pool's own queue, so that it can be ended at once.
-        waiting: set[futures.Future[dict[str, Any] | None]] = set()
-        rest = iter(todo)
-        while time.monotonic() < until:
-            for job in rest:
-                waiting.add(pool.submit(_ask, job))
-                if len(waiting) >= 2 * args.processes:
-                    break
-            if not waiting:
-                break
-            done, waiting = futures.wait(waiting, max(until - time.monotonic(), 0.0), futures.FIRST_COMPLETED)
+            for law, error in processes.answers(compile_law, (settings.get("laws") or LAWS).split(","), until):
+                print(f"{law}: {error or f'compiled after {time.monotonic() - begun:.0f} s'}", flush=True)
+        for job, answer in processes.answers(_ask, todo, until):
+            if isinstance(answer, BaseException):  # one case that cannot be made ends no sweep
+                print(f"{_name(job)} failed: {type(answer).__name__}: {answer}", flush=True)
+                continue
+            if answer is None:
+                continue
+            row = answer | {"commit": head, "uncommitted_changes": dirty}
+            rows.append(row)
             with path.open("a", encoding="utf-8") as file:
-                for future in done:
-                    try:
-                        answer = future.result()
-                    except Exception as error:  # one case that cannot be made ends no sweep
-                        print(f"a case failed: {error}", flush=True)
-                        continue
-                    if answer is None:
-                        continue
-                    row = answer | {"commit": head, "uncommitted_changes": dirty}
-                    rows.append(row)
-                    file.write(json.dumps(row) + "\n")
+                file.write(json.dumps(row) + "\n")
             if time.monotonic() - written > SCORE_EVERY:
                 _score(folder, about, rows, settings)
                 written = time.monotonic()
-    except futures.TimeoutError:
-        print("the time was up before all was compiled", flush=True)
     finally:
-        for process in list((pool._processes or {}).values()):
-            process.kill()
-        pool.shutdown(wait=False, cancel_futures=True)
+        processes.end()
         _score(folder, about, rows, settings, show=True)
     print(f"{len(rows)} rows, {time.monotonic() - begun:.0f} s", flush=True)
 
