@@ -142,7 +142,9 @@ def print_catalogue(console: Console) -> None:
 def print_effect(effect: Effect, console: Console) -> None:
     """An effect's equation, ports, parameters and state."""
     console.print(f"{effect.name}: {', '.join(effect.ports)}", style="bold")
-    console.print(inspect.cleandoc(effect.doc))
+    # paragraphs are wrapped to the terminal, not to the source; what is indented keeps its lines
+    paragraphs = inspect.cleandoc(effect.doc).split("\n\n")
+    console.print("\n\n".join(p if "\n " in p else " ".join(p.split()) for p in paragraphs))
     if effect.replaces:
         console.print(f"replaces {', '.join(effect.replaces)}")
     for name, p in effect.parameters.items():
