@@ -138,6 +138,13 @@ def sweep(args: argparse.Namespace) -> None:
     run_sweep(args)
 
 
+def drives(args: argparse.Namespace) -> None:
+    """Makes, asks and scores campaigns of drives on all cores."""
+    from .campaigns import drives as run_drives
+
+    run_drives(args)
+
+
 def experiments(args: argparse.Namespace) -> None:
     """Follows open verdicts with further sweeps."""
     from .experiments import experiments as follow
@@ -180,6 +187,16 @@ def parser() -> argparse.ArgumentParser:
     swept.add_argument("--cold", action="store_true", help="compile nothing beforehand")
     swept.add_argument("-o", "--out", type=Path, required=True)
     swept.set_defaults(do=sweep)
+    driven = verbs.add_parser("drives", help="make, ask and score campaigns of drives on all cores")
+    driven.add_argument("--set", choices=("tune", "report"), required=True)
+    driven.add_argument("--drives", type=int, default=24)
+    driven.add_argument("--seed", type=int, help="as for make")
+    driven.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    driven.add_argument("--minutes", type=float, default=60.0)
+    driven.add_argument("--limit", type=float, default=0.0, help="seconds for one campaign, made and answered; 0: none")
+    driven.add_argument("--cold", action="store_true", help="compile nothing beforehand")
+    driven.add_argument("-o", "--out", type=Path, required=True)
+    driven.set_defaults(do=drives)
     followed = verbs.add_parser("experiments", help="measure what `next` asks for, and ask again")
     followed.add_argument("--set", choices=("tune", "report"), required=True)
     followed.add_argument("--tables", type=int, default=60)

@@ -146,11 +146,11 @@ def sweep(args: argparse.Namespace) -> None:
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             if time.monotonic() - written > SCORE_EVERY:
-                _score(folder, about, rows, settings)
+                score_rows(folder, about, rows, settings)
                 written = time.monotonic()
     finally:
         processes.end()
-        _score(folder, about, rows, settings, show=True)
+        score_rows(folder, about, rows, settings, show=True)
     print(f"{len(rows)} rows, {time.monotonic() - begun:.0f} s", flush=True)
 
 
@@ -158,9 +158,10 @@ def _name(job: Job) -> str:
     return f"{job[0]}-{job[2]:03d}" + (f"-{job[5]}" if job[5] else "")
 
 
-def _score(
+def score_rows(
     folder: Path, about: Mapping[str, Any], rows: list[dict[str, Any]], settings: Mapping[str, str], show: bool = False
 ) -> None:
+    """Writes the score of rows; prints it where it is to be shown."""
     if not rows:
         return
     commits = sorted({r["commit"] for r in rows})

@@ -87,6 +87,12 @@ class DriveForm(MeasuredForm):
         self.channel_errors: Mapping[str, float] = {}
         self.start = self.origin()  # where the first refit begins
 
+    @property
+    def parts(self) -> list[list[str]]:
+        """Candidates whose signatures are simulated by one program each."""
+        names = list(self.candidates)
+        return [names[at : at + _TOGETHER] for at in range(0, len(names), _TOGETHER)]
+
     # --- predictions and derivatives ---------------------------------------------------------------------------------
 
     def _whole(self, u: np.ndarray) -> np.ndarray:
@@ -111,8 +117,7 @@ class DriveForm(MeasuredForm):
         """
         count = len(self.coordinates)
         seen = np.zeros((len(self.observations), count + len(self._inputs)))
-        names = list(self.candidates)
-        parts = [names[at : at + _TOGETHER] for at in range(0, len(names), _TOGETHER)]
+        parts = self.parts
         self.progress("signatures of unknown inputs", 0.0)
         # to first order in inputs of a hundredth of what is usual
         scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])

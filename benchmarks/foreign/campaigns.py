@@ -1,0 +1,237 @@
+"""Makes, asks and scores campaigns of drives at once, on as many cores as there are, until the time is up.
+
+    python -m benchmarks.foreign drives --set report --drives 24 --minutes 9 -o build/foreign/report_drives
+
+One process per core takes campaign after campaign: it draws the world, drives it in plain MuJoCo, asks the tool by its
+own verbs, and hands back one row. Rows lie in `rows.jsonl` and whole verdicts in `verdicts.jsonl`, one a line, so that
+what a machine that is taken away had answered is kept; a second call goes on. Before, every process compiles a part of
+the programs of one rover into the cache that all share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import multiprocessing
+import os
+import time
+import traceback
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from . import drive_cases, pool, work
+from .rovers import ROVERS
+from .score import judge, said
+from .sweep import KEPT, ROWS, score_rows
+
+VERDICTS = "verdicts.jsonl"
+LEAST_SECONDS = 150.0
+"""s that must be left for a campaign to be begun: in less the tool cannot have looked at all candidates."""
+WRITING = 15.0
+"""s before the end by which an answer is asked for."""
+Job = tuple[str, int, int, str, tuple[str, ...], str]
+"""Set, seed, number, group, what is hidden, rover."""
+
+
+def jobs(which: str, seed: int, count: int) -> list[Job]:
+    """All campaigns in the order of the plan."""
+    plan = drive_cases.plan(which, count, [r for r in ROVERS if (work.ROOT / "models" / r).is_dir()])
+    return [(which, seed, n, group, hidden, rover) for n, (group, hidden, rover) in enumerate(plan)]
+
+
+def make(job: Job, folder: Path) -> None:
+    """Draws and drives a campaign, and writes its logs and sealed truth as `make` does; nothing where it is there."""
+    case = drive_cases.draw(*job)
+    sealed = folder / "truth" / f"{case.name}.json"
+    if sealed.is_file():
+        return
+    found, separable = drive_cases.make(case)
+    drive_cases.write(case, found, folder / "logs" / case.name)
+    truth = drive_cases.summary(case) | {"separable": separable, "twins": []}
+    sealed.parent.mkdir(parents=True, exist_ok=True)
+    sealed.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+
+
+def compile_part(job: Job, folder: Path, part: int, of: int) -> None:
+    """Compiles one of so many parts of the programs that a diagnosis of a rover's drives needs, into the cache."""
+    import numpy as np
+
+    from lunar_mjx.commands.compiled import keep_compiled
+    from lunar_mjx.diagnosis.drives.form import DriveForm
+    from lunar_mjx.diagnosis.drives.loop import build_drives
+    from lunar_mjx.diagnosis.runs import Run, log_folders
+    from lunar_mjx.logs import Log
+    from lunar_mjx.model import make_model
+
+    keep_compiled()
+    logs = log_folders([folder / "logs" / _name(job)])
+    run = Run(folder / "programs" / f"{job[5]}-{part}", logs, make_model(job[5], terrain="flat", preset="consistent"))
+    form = build_drives(run, [log for log in run.campaign() if isinstance(log, Log)]).own
+    assert isinstance(form, DriveForm)
+    drives = form.drives
+    moved = [np.zeros(0, int), *drives.inputs.values()]
+    programs = [np.concatenate(moved), *(np.concatenate([form.candidates[e] for e in p]) for p in form.parts)]
+    for which in programs[part::of]:
+        row = drives.origin()[None]
+        row[0, which] = 1e-6
+        drives.predict(row)
+
+
+def ask(job: Job, folder: Path, until: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The row of one campaign, and its verdict.
+
+    Args:
+      job: which campaign. folder: of the set. until: `time.monotonic` by which the answer is to be there.
+    """
+    spent = time.process_time()
+    make(job, folder)
+    made, name = time.process_time(), _name(job)
+    truth = json.loads((folder / "truth" / f"{name}.json").read_text(encoding="utf-8"))
+    out = folder / "runs" / name
+    out.mkdir(parents=True, exist_ok=True)
+    answer = _answer(folder / "logs" / name, out, until)
+    path = out / "run" / "verdict.json"
+    verdict = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    what = said(answer, verdict)
+    what["probabilities"] = dict(list(what["probabilities"].items())[:KEPT])
+    what["inclusion"] = {k: round(p, 5) for k, p in what["inclusion"].items() if p >= 1e-5}
+    row = {
+        "case": name,
+        "twin_of": None,
+        "truth": truth,
+        **what,
+        **judge(truth, what),
+        "seconds": answer["seconds"].get("all"),
+        "seconds_of": answer["seconds"],
+        "seconds_given": answer.get("given"),
+        "cpu_seconds": time.process_time() - made,
+        "cpu_seconds_to_make": made - spent,
+        "first": False,
+        "search": verdict.get("details", {}).get("search"),
+        "noise": verdict.get("details", {}).get("noise"),
+        "sentence": verdict.get("sentence", ""),
+        "error": answer.get("error"),
+    }
+    return row, {"case": name, **verdict}
+
+
+def _answer(logs: Path, out: Path, until: float) -> dict[str, Any]:
+    """What the tool says about the logs of a folder by `compare` and `why`, until a `time.monotonic`."""
+    from lunar_mjx.cli import main
+
+    seconds: dict[str, float] = {}
+    answer: dict[str, Any] = {"verdict": "CRASH", "effects": [], "seconds": seconds}
+    run, began = out / "run", time.monotonic()
+    with (
+        (out / "log.txt").open("w", encoding="utf-8") as text,
+        contextlib.redirect_stdout(text),
+        contextlib.redirect_stderr(text),
+    ):
+        try:
+            status = work._verb(main, "compare", str(logs), "-o", str(run))
+            seconds["compare"] = time.monotonic() - began
+            if status:
+                answer["verdict"] = "BAD_DATA" if status == 10 else "CRASH"
+            else:
+                answer["given"] = max(until - time.monotonic(), 1.0)
+                work._verb(main, "why", str(run), "--seconds", f"{answer['given']:.0f}")
+                seconds["why"] = time.monotonic() - began - seconds["compare"]
+                verdict = json.loads((run / "verdict.json").read_text(encoding="utf-8"))
+                answer |= {"verdict": verdict["verdict"], "effects": verdict["effects"]}
+        except Exception:
+            answer["error"] = traceback.format_exc(limit=-6)
+    seconds["all"] = time.monotonic() - began
+    return answer
+
+
+def drives(args: argparse.Namespace) -> None:
+    """Asks about all campaigns that have no row yet, until the time is up."""
+    begun = time.monotonic()
+    until = begun + 60.0 * args.minutes
+    pool.prepare()
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+    folder: Path = args.out
+    folder.mkdir(parents=True, exist_ok=True)
+    from .__main__ import campaign
+
+    about = campaign(folder, args.set, args.seed)
+    path = folder / ROWS
+    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    have = {r["case"] for r in rows}
+    todo = [j for j in jobs(args.set, int(about["seed"]), args.drives) if _name(j) not in have]
+    head, dirty = work.commit()
+    places = multiprocessing.get_context("spawn").Queue()
+    allowed = sorted(os.sched_getaffinity(0))
+    for k in range(args.processes):
+        places.put(allowed[-1 - k % len(allowed)])
+    processes = pool.Pool(args.processes, _begin, places, folder, until, args.limit)
+    try:
+        first = {j[5]: j for j in reversed(todo)}  # of every rover
+        if not args.cold:
+            early = [*first.values(), *(j for j in todo if j not in first.values())][: args.processes]
+            _report(processes.answers(_make, early, until), begun)
+            of = max(1, args.processes // max(len(first), 1))
+            parts = [(j, k, of) for k in range(of) for j in first.values()]
+            _report(processes.answers(_compile, parts, until), begun)
+            print(f"{time.monotonic() - begun:5.0f} s  compiled", flush=True)
+        for job, answer in processes.answers(_ask, todo, until):
+            if isinstance(answer, BaseException):  # one campaign that cannot be made ends no sweep
+                print(f"{_name(job)} failed: {type(answer).__name__}: {answer}", flush=True)
+                continue
+            if answer is None:
+                continue
+            row = answer[0] | {"commit": head, "uncommitted_changes": dirty}
+            rows.append(row)
+            for name, line in ((ROWS, row), (VERDICTS, answer[1])):
+                with (folder / name).open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(line) + "\n")
+            hidden = ", ".join(row["truth"]["hidden"]) or "nothing"
+            about_it = f"{row['case']}  {row['truth']['rover']:<8} {hidden:<20} {row['verdict']:<12}"
+            print(f"{time.monotonic() - begun:5.0f} s  {about_it} {', '.join(row['effects'])}", flush=True)
+            score_rows(folder, about, rows, {})
+    finally:
+        processes.end()
+        score_rows(folder, about, rows, {}, show=True)
+    print(f"{len(rows)} rows, {time.monotonic() - begun:.0f} s", flush=True)
+
+
+def _report(answers: Iterable[tuple[Any, Any]], begun: float) -> None:
+    """Prints what failed of jobs that prepare others."""
+    for job, answer in answers:
+        if isinstance(answer, BaseException):
+            print(f"{time.monotonic() - begun:5.0f} s  {job} failed: {type(answer).__name__}: {answer}", flush=True)
+
+
+class _Process:
+    """What a process of the pool works on: folder of the set, and by when."""
+
+    folder = Path()
+    until = limit_s = 0.0
+
+
+def _begin(places: Any, folder: Path, until: float, limit_s: float) -> None:
+    # Cores are counted by what a process may use: one each, so that none makes threads for all.
+    os.sched_setaffinity(0, {places.get()})
+    _Process.folder, _Process.until, _Process.limit_s = folder, until, limit_s
+
+
+def _make(job: Job) -> None:
+    make(job, _Process.folder)
+
+
+def _compile(part: tuple[Job, int, int]) -> None:
+    compile_part(part[0], _Process.folder, part[1], part[2])
+
+
+def _ask(job: Job) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """As `ask`; None where too little time is left."""
+    now = time.monotonic()
+    end = min(_Process.until - WRITING, now + (_Process.limit_s or math.inf))
+    return ask(job, _Process.folder, end) if end - now > LEAST_SECONDS else None
+
+
+def _name(job: Job) -> str:
+    return f"{job[0]}-drive-{job[2]:03d}"

@@ -1,0 +1,44 @@
+"""A sweep over foreign drives keeps what it has, and begins nothing that cannot end."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.foreign import campaigns, drive_cases
+
+JOB = ("tune", 5, 1, "null", (), "husky")
+
+
+def test_groups_and_rovers_alternate() -> None:
+    jobs = campaigns.jobs("report", 1, 24)
+    assert len(jobs) == 24 and len({j[2] for j in jobs}) == 24
+    for part in (jobs[:12], jobs[12:]):
+        assert {j[3] for j in part} == {"null", "single", "outside"}
+        assert {j[5] for j in part} == {"luvmi_x", "viper", "husky"}
+
+
+def test_a_campaign_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    monkeypatch.setattr(drive_cases, "make", lambda case: made.append(case) or ({"position": np.zeros((5, 1, 3))}, {}))
+    monkeypatch.setattr(drive_cases, "write", lambda case, found, folder: folder.mkdir(parents=True))
+    campaigns.make(JOB, tmp_path)
+    campaigns.make(JOB, tmp_path)
+    assert len(made) == 1
+    truth = json.loads((tmp_path / "truth" / "tune-drive-001.json").read_text())
+    assert truth["rover"] == "husky" and truth["hidden"] == [] and truth["separable"] == {}
+
+
+def test_nothing_is_begun_for_which_there_is_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ends = []
+    monkeypatch.setattr(campaigns, "ask", lambda job, folder, until: ends.append(until - now))
+    now = time.monotonic()
+    for left, limit in ((100.0, 0.0), (500.0, 0.0), (5000.0, 300.0)):
+        for name, value in (("folder", tmp_path), ("until", now + left), ("limit_s", limit)):
+            monkeypatch.setattr(campaigns._Process, name, value)
+        campaigns._ask(JOB)
+    assert ends == [pytest.approx(485.0), pytest.approx(300.0, abs=5.0)]
