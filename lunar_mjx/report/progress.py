@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 Reporter = Callable[[str, float], None]
-"""Takes what is being done, and the share of the whole that is done, 0 to 1."""
+"""Takes what is being done, and the share of the whole that is done, 0 to 1; NaN where nobody knows it."""
 
 _LINE_EVERY = 5.0
 """Seconds between plain lines."""
@@ -35,7 +36,10 @@ def console_progress(console: Console | None = None) -> Iterator[Reporter]:
         task = bar.add_task("starting", total=1.0)
 
         def report(what: str, done: float) -> None:
-            bar.update(task, description=what, completed=done)
+            # a bar without a total pulses and promises no time; `update` takes None for "as it was"
+            known = math.isfinite(done)
+            bar.tasks[0].total = 1.0 if known else None
+            bar.update(task, description=what, completed=done if known else 0.0)
 
         yield report
 
@@ -50,6 +54,7 @@ def _lines(console: Console) -> Reporter:
             return
         last, stage = now, what
         left = f", about {now * (1.0 - done) / done:.0f} s left" if done > 0.02 else ""
-        console.print(f"{100 * done:3.0f} %  {what} ({now:.0f} s{left})", highlight=False, markup=False)
+        share = f"{100 * done:3.0f} %" if math.isfinite(done) else "  ..."
+        console.print(f"{share}  {what} ({now:.0f} s{left})", highlight=False, markup=False)
 
     return report

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 
 import plotly.graph_objects as go
@@ -54,6 +55,17 @@ def test_progress_without_a_terminal_is_plain_lines():
     lines = out.getvalue().splitlines()
     assert [line.split("%")[0].strip() for line in lines] == ["0", "50", "100"]
     assert "\x1b" not in out.getvalue()
+
+
+def test_progress_whose_share_nobody_knows_promises_no_time():
+    out = io.StringIO()
+    with console_progress(Console(file=out, force_terminal=False, width=100)) as report:
+        report("compiling", math.nan)
+    assert "compiling" in out.getvalue() and "left" not in out.getvalue() and "nan" not in out.getvalue()
+    with console_progress(Console(file=out, force_terminal=True, width=100)) as report:
+        report("half", 0.5)
+        report("fitting", math.nan)
+    assert "fitting" in out.getvalue() and "%" not in out.getvalue().rpartition("fitting")[2]
 
 
 def test_progress_on_a_terminal_shows_a_bar():

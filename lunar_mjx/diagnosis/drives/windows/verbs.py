@@ -70,13 +70,14 @@ def compare(run: Run, logs: Sequence[Log], progress: Progress = silent, like: Be
     if like is None:
         (run.folder / WINDOWS_FILE).unlink(missing_ok=True)
     bench = Bench(run, logs)
-    progress("learning the noise", 0.2)
+    # how long a first simulation compiles on this machine, and how many steps a fit takes, is not known beforehand
+    progress("compiling, and learning the noise", math.nan)
     with threadpool_limits(1, "blas"):
         noise = bench.noise() if like is None else like.noise()
         if like is not None:
             bench.use_weight(like.weight)
         question = bench.question(noise, ())
-        progress("fitting", 0.6)
+        progress("fitting", math.nan)
         refit = _form(question).refit(frozenset(), None, None)
         own = question.own
         start = own.residual(own.origin())
