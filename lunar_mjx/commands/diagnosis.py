@@ -249,7 +249,10 @@ def improve(
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the whole loop unattended; the exit status is the last verdict."""
+    """Run the whole loop unattended; the exit status is the last verdict.
+
+    Where something is named, each round adds every effect that is more probable than not: that model foresees best.
+    """
     from lunar_mjx.diagnosis import verbs
     from lunar_mjx.report.progress import console_progress
 
@@ -410,17 +413,20 @@ def _print_comparison(run: Any) -> None:
 
 
 def _print_steps(runs: Sequence[Run]) -> None:
-    """What every round added, the error that it left, and what was said then."""
+    """What every round added and how probable that was, the error that it left, and what was said then."""
     from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE
     from lunar_mjx.model.describe import make_console
 
     console, before, foreseen = make_console(), 0, float("inf")
+    probability: dict[str, float] = {}
     for run in runs:
         error = (run.load(COMPARISON_FILE) or {}).get("refitted", {})
         said = run.load(VERDICT_FILE) or {}
         left = ", ".join(f"{split} {_shown(value)}" for split, value in error.items())
-        added = ", ".join(run.added[before:]) or "the model as given"
+        new = [f"{n} ({probability[n]:.0%})" if n in probability else n for n in run.added[before:]]
+        added = ", ".join(new) or "the model as given"
         before = len(run.added)
+        probability = {**(said.get("inclusion") or {}), **(said.get("forms") or {})}
         console.print(f"{run.folder.name}: {added}; sigma after a refit: {left}", style="bold", highlight=False)
         held_out = error.get("held_out")
         if held_out is not None:
