@@ -2,6 +2,7 @@
 
     python benchmarks/rl/ladder.py --rungs 1 2 3 --episodes 32 --out benchmarks/rl/ladder.json
     python benchmarks/rl/ladder.py --tune 24 --rungs 3 --episodes 8 --out benchmarks/rl/ladder.json
+    python benchmarks/rl/ladder.py --rungs 3 --policies "TD3=runs/ladder-3/policy.npz"
 
 All agents drive the same episodes side by side in one program, in unseen worlds and soil as `lunar-mjx evaluate` takes
 them. Rungs that the file holds already are kept unless they are measured again.
@@ -24,39 +25,57 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from benchmarks.rl.harness import percent, save, say
-from benchmarks.timing import commit
+from benchmarks.timing import LOCK, alone, commit
 from lunar_mjx.agents.evaluate import score
 from lunar_mjx.agents.play import UNSEEN_LADDER, shipped_policy
-from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.agents.policy import Policy, load_policy
 from lunar_mjx.agents.run import unseen_params
-from lunar_mjx.envs import make_agent, make_navigation, split_keys
+from lunar_mjx.envs import TASKS, make_agent, make_navigation, split_keys
 from lunar_mjx.envs.scripted import Reactive, reactive_rule
 
+SCANS = ("height_scan", "far_scan")
 SCRIPTED = ("zero", "random", "scripted", "reactive", "planner")
 PIECE = 25
 """Control steps between looks at whether all episodes are over."""
 
 
-def agents(env: Any, params: Any, rover: str, tuned: dict[str, Any] | None) -> dict[str, Any]:
-    """All agents by name, functions of state and key; the reactive rule with its own and with `tuned` settings."""
+def agents(
+    env: Any, params: Any, rover: str, tuned: dict[str, Any] | None, policies: dict[str, Path]
+) -> dict[str, Any]:
+    """All agents by name, functions of state and key; the reactive rule with its own and with `tuned` settings, and
+    every policy with and without what it sees ahead."""
     found = {name: make_agent(name, env, params) for name in SCRIPTED}
     if tuned is not None:
         found["reactive, tuned"] = reactive_rule(env, Reactive(**tuned))
     path = shipped_policy(rover)
-    if path is None:
-        return found
-    policy = load_policy(path)
-    seen = policy.network["obs"]
-    blank = jnp.zeros(seen, bool).at[env.blocks["height_scan"]].set(True)
-    mean = jnp.zeros(seen) if policy.mean is None else jnp.asarray(policy.mean)
-    found["policy of large"] = lambda state, key: policy.act(state.obs[:, :seen])
-    # the scan at its mean over training, so that it says nothing
-    found["policy of large, scan blanked"] = lambda state, key: policy.act(jnp.where(blank, mean, state.obs[:, :seen]))
+    for name, place in (({} if path is None else {"policy of large": path}) | policies).items():
+        policy = load_policy(place)
+        found[name] = _driver(env, policy, ())
+        found[f"{name}, scan blanked"] = _driver(env, policy, SCANS)
     return found
 
 
-def drive(env: Any, params: Any, choices: list[Any], episodes: int, seed: int) -> dict[str, np.ndarray]:
-    """Metrics of the first episode of every rover, (agent, episode)."""
+def seen_by(policy: Policy) -> tuple[str, ...]:
+    """The blocks that a policy sees, in its order."""
+    options = policy.environment["options"]
+    return tuple(options.get("observations", TASKS[options["task"]].observations))
+
+
+def _driver(env: Any, policy: Policy, blanked: tuple[str, ...]) -> Any:
+    """A policy as an agent in an environment that shows all that it sees; `blanked` blocks stay at their mean over the
+    training, so that they say nothing."""
+    blocks = seen_by(policy)
+    where = np.concatenate([np.arange(env.blocks[b].start, env.blocks[b].stop) for b in blocks])
+    blank = np.concatenate([np.full(env.blocks[b].stop - env.blocks[b].start, b in blanked) for b in blocks])
+    mean = jnp.zeros(len(where)) if policy.mean is None else jnp.asarray(policy.mean)
+    return lambda state, key: policy.act(jnp.where(blank, mean, state.obs[:, where]))
+
+
+def drive(
+    env: Any, params: Any, choices: list[Any], episodes: int, seed: int
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Metrics of the first episode of every rover, (agent, episode), and s for compiling and for driving."""
+    begin = time.monotonic()
     key_reset, key = jax.random.split(jax.random.PRNGKey(seed))
     keys = jnp.tile(split_keys(key_reset, episodes), (len(choices), 1))
     row = jnp.repeat(jnp.arange(len(choices)), episodes)
@@ -77,23 +96,39 @@ def drive(env: Any, params: Any, choices: list[Any], episodes: int, seed: int) -
     state = jax.jit(env.reset)(params, keys)
     blank = {k: jnp.zeros(len(row)) for k in state.metrics if not k.startswith("reward_")}
     carry = state, jnp.zeros(len(row), bool), blank
-    for i in range(math.ceil(env.episode_steps / PIECE)):
-        carry = piece(params, carry, jax.random.fold_in(key, i))
-        if bool(carry[1].all()):
-            break
-    return {k: np.asarray(v).reshape(len(choices), episodes) for k, v in carry[2].items()}
+    ready = piece.lower(params, carry, key).compile()
+    compiled = time.monotonic()
+    with alone():
+        driving = time.monotonic()
+        for i in range(math.ceil(env.episode_steps / PIECE)):
+            carry = ready(params, carry, jax.random.fold_in(key, i))
+            if bool(carry[1].all()):
+                break
+        told = {k: np.asarray(v).reshape(len(choices), episodes) for k, v in carry[2].items()}
+        return told, {"compile_s": compiled - begin, "drive_s": time.monotonic() - driving}
 
 
 def measure(
-    number: int, episodes: int, seed: int, rover: str, names: list[str], tuned: Any, **settings: Any
+    number: int,
+    episodes: int,
+    seed: int,
+    rover: str,
+    names: list[str],
+    tuned: Any,
+    policies: dict[str, Path],
+    **settings: Any,
 ) -> dict[str, Any]:
     """Rows of one rung by agent, all agents if `names` is empty; each tells how it was measured."""
     begin = time.monotonic()
-    env = make_navigation(f"ladder/{number}", rover, **settings)
+    # all that any of the policies sees
+    blocks = dict.fromkeys(TASKS[f"ladder/{number}"].observations)
+    for path in policies.values():
+        blocks |= dict.fromkeys(seen_by(load_policy(path)))
+    env = make_navigation(f"ladder/{number}", rover, observations=tuple(blocks), **settings)
     params = unseen_params(env, UNSEEN_LADDER)
-    told = agents(env, params, rover, tuned)
+    told = agents(env, params, rover, tuned, policies)
     told = {name: agent for name, agent in told.items() if not names or name in names}
-    result = drive(env, params, list(told.values()), episodes, seed)
+    result, seconds = drive(env, params, list(told.values()), episodes, seed)
     rows = {}
     for i, name in enumerate(told):
         row = score({k: v[i] for k, v in result.items()}, env.control_interval)
@@ -101,7 +136,7 @@ def measure(
         rows[name]["device"] = jax.devices()[0].device_kind
         cost = f"SPL {row.spl}, {row.collisions_per_km} collisions/km, {row.wh_per_km} Wh/km"
         say(f"rung {number} {name}: {percent(rows[name])}, {cost}, slip {row.slip}")
-    say(f"rung {number}: {time.monotonic() - begin:.0f} s")
+    say(f"rung {number}: {time.monotonic() - begin:.0f} s, of it {seconds}")
     return rows
 
 
@@ -126,7 +161,7 @@ def tune(number: int, settings: int, episodes: int, seed: int, rover: str, world
     for _ in range(settings - 1):
         drawn = {k: math.exp(rng.uniform(math.log(low), math.log(high))) for k, (low, high) in SEARCHED.items()}
         tried.append(Reactive(**drawn))
-    result = drive(env, env.params, [reactive_rule(env, s) for s in tried], episodes, seed)
+    result, _ = drive(env, env.params, [reactive_rule(env, s) for s in tried], episodes, seed)
     rows = []
     for i, one in enumerate(tried):
         row = score({k: v[i] for k, v in result.items()}, env.control_interval)
@@ -150,7 +185,11 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=0, help="side by side; as many as the rung says if 0")
     parser.add_argument("--agents", nargs="*", default=[], help="which rows to measure; all if left out")
     parser.add_argument("--tune", type=int, default=0, help="how many settings of the reactive rule to try")
+    parser.add_argument("--policies", nargs="*", default=[], metavar="NAME=FILE", help="policies to measure, too")
+    parser.add_argument("--lock", type=Path, help="file that is locked while rovers drive, for runs side by side")
     args = parser.parse_args()
+    LOCK.extend([args.lock] if args.lock else [])
+    policies = {name: Path(path) for name, _, path in (text.partition("=") for text in args.policies)}
     old = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
     old = {"rungs": {}, "tuned": {}, **old, "rover": args.rover}
     for number in args.rungs:
@@ -160,7 +199,7 @@ def main() -> None:
         else:
             rows = old["tuned"].get(str(number), {}).get("rows")
             tuned = rows[0]["settings"] if rows else None
-            one = (number, args.episodes, args.seed, args.rover, args.agents, tuned)
+            one = (number, args.episodes, args.seed, args.rover, args.agents, tuned, policies)
             rung = old["rungs"].setdefault(str(number), {"rows": {}})
             rung["rows"] |= measure(*one, worlds=args.worlds)
         save(args.out.parent, args.out.stem, old)

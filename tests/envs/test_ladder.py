@@ -16,7 +16,7 @@ from lunar_mjx.envs.contract import check_environment
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
 from lunar_mjx.envs.ladder.ground import make_world
 from lunar_mjx.envs.ladder.planner import Planner, length
-from lunar_mjx.envs.ladder.pool import make_pool
+from lunar_mjx.envs.ladder.pool import make_pool, way_left
 from lunar_mjx.envs.ladder.rungs import RUNGS, get_rung
 from lunar_mjx.envs.ladder.ways import STEEPEST, distances
 from lunar_mjx.envs.navigation import rewards
@@ -112,6 +112,26 @@ def test_distances_go_around_a_wall():
     assert way[8, 0] == pytest.approx(4 * np.sqrt(2) + 4 + 4 * np.sqrt(2) + 4, rel=1e-5)
 
 
+def test_the_way_left_is_that_of_the_nodes_and_straight_between_them(pool):
+    place = jnp.arange(0, len(pool.places.way), 7)
+    start, told = pool.places.starts[place], pool.places.shortest[place]
+    left, known = way_left(pool, place, start)
+    np.testing.assert_allclose(left, told, rtol=1e-5)
+    assert np.asarray(known).all()
+    # in the open around a goal it is the distance of a map whose ways bend by 45 deg, at most 8 % longer
+    aside = jnp.asarray([0.23, -0.41])
+    left, _ = way_left(pool, place, pool.places.goals[place] + aside)
+    straight = float(jnp.hypot(*aside))
+    assert np.mean((np.asarray(left) > 0.9 * straight) & (np.asarray(left) < 1.3 * straight)) > 0.9
+    # boulders of ridges have no node that is free about them
+    radii, rocks = np.asarray(pool.terrain.rocks.radii), np.asarray(pool.terrain.rocks.centers)
+    middle = rocks[np.argmax(radii), :2]
+    world = np.abs(np.asarray(pool.middles) - middle).max(1).argmin()
+    place = np.flatnonzero(np.asarray(pool.places.world) == world)[:1]
+    if len(place):
+        assert not bool(way_left(pool, jnp.asarray(place), jnp.asarray(middle[None], jnp.float32))[1][0])
+
+
 def test_hardness_makes_slopes_and_boulders_of_the_same_world():
     easy, hard = (make_world(SMALL, jax.random.PRNGKey(4), h) for h in (0.3, 1.0))
     assert np.asarray(easy.heights).std() < 0.5 * np.asarray(hard.heights).std()
@@ -166,6 +186,7 @@ def test_every_rung_is_a_task_and_a_gymnasium_id():
         ({"task": "large", "terrain": "flat", "weights": {"energy": 1.0}}, "tally"),
         ({"task": "large", "terrain": "flat", "observations": ("arrival",)}, "ladder"),
         ({"task": "large", "terrain": "flat", "rung": 7}, "does not exist"),
+        ({"task": "large", "terrain": "flat", "weights": {"way": 1.0}}, "ladder"),
     ],
 )
 def test_mistakes_are_told(settings, said):
@@ -192,3 +213,25 @@ def test_a_rung_keeps_the_contract_and_collisions_end_episodes():
     assert bool(touching[0]) and not bool(touching[2])
     ends = env._ends(env.params, moved, view, moved.goal - qpos[:, :2])
     assert bool(ends["off_terrain"][1]) and not bool(ends["off_terrain"][2])
+
+
+@pytest.mark.slow
+def test_the_reward_of_the_way_adds_up_and_the_trail_follows():
+    observations = ("goal_body", "height_scan", "far_scan", "trail")
+    env = make_navigation("ladder/3", worlds=1, decimation=25, observations=observations, weights={"way": 1.0})
+    state = env.reset(env.params, split_keys(jax.random.PRNGKey(2), 3))
+    first, begin, paid = state.inner.left, state.inner.origin[:, :2], 0.0
+    np.testing.assert_allclose(state.obs[:, env.blocks["trail"]], 0.0, atol=1e-3)
+    step = jax.jit(env.step)
+    for _ in range(30):
+        state = step(env.params, state, jnp.tile(jnp.asarray([1.0] + [0.0] * (env.action_size - 1)), (3, 1)))
+        assert not bool(state.done.any())
+        paid = paid + state.reward
+    np.testing.assert_allclose(paid, first - state.inner.left, atol=1e-3)
+    here = state.inner.physics.qpos[:, :2]
+    gone = np.hypot(*(here - begin).T)
+    back = np.asarray(state.obs[:, env.blocks["trail"]]).reshape(3, 2, 3)
+    # the shortest memory lies nearest, all of them behind a rover that drives ahead, none beyond the beginning
+    assert (back[:, 0] < 0.0).all() and (np.diff(back[:, 0], axis=1) < 0.0).all()
+    assert (np.hypot(back[:, 0], back[:, 1]) <= gone[:, None] + 1e-3).all() and (gone > 0.05).all()
+    assert env.blocks["far_scan"].stop - env.blocks["far_scan"].start == 143

@@ -25,6 +25,7 @@ def step() -> Transition:
         vertical_acceleration=jnp.array([-0.7, 0.2]),
         action=jnp.array([[1.0, 0.0], [0.5, 0.5]]),
         last_action=jnp.array([[0.0, 0.0], [0.5, -0.5]]),
+        nearer=jnp.array([0.4, -0.1]),
     )
 
 
@@ -33,6 +34,7 @@ def step() -> Transition:
     [
         ("progress_paper", [3.0, 3.0]),
         ("progress", [1.0, -1.0]),
+        ("way", [0.4, -0.1]),
         ("heading", [0.0, 1.0]),
         ("tilt", [-0.4, -0.25]),
         ("excite", [-0.7, -0.2]),

@@ -63,6 +63,30 @@ class Pool:
     size: Any
 
 
+def way_left(pool: Pool, place: Any, position: Any) -> tuple[Any, Any]:
+    """Length of the shortest way to the goal from where rovers are.
+
+    Args:
+      pool: the worlds. place: (env,) number of the pair of start and goal. position: (env, 2) m on the map.
+
+    Returns:
+      The length between the free nodes around each rover, m, and whether there are any, each (env,).
+    """
+    way, world, count = pool.places.way[place], pool.places.world[place], pool.ways.shape[-1]
+    node = (position - pool.middles[world] + 0.5 * pool.size) / (pool.size / count) - 0.5
+    first = jnp.clip(jnp.floor(node), 0, count - 2)
+    share = jnp.clip(node - first, 0.0, 1.0)
+    column, row = first.astype(jnp.int32).T
+    total = weight = jnp.zeros(place.shape, position.dtype)
+    for j in (0, 1):
+        for i in (0, 1):
+            length = pool.ways[way, row + j, column + i]
+            part = (share[:, 0] if i else 1.0 - share[:, 0]) * (share[:, 1] if j else 1.0 - share[:, 1])
+            part = jnp.where(jnp.isfinite(length), part, 0.0)
+            total, weight = total + part * jnp.where(part > 0.0, length, 0.0), weight + part
+    return total / jnp.maximum(weight, 1e-3), weight > 1e-3
+
+
 def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: float = 1.0) -> Pool:
     """Makes the worlds of a rung with their places.
 

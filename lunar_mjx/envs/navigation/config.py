@@ -172,6 +172,8 @@ def _check(c: NavigationConfig) -> None:
         require_finite("navigation", f"weights.{name}", weight)
         if name in TOLD_BY_TALLY and not c.tally:
             raise bad_input("navigation", "tally", c.tally, f"does not go with the reward term {name}", "give true")
+        if name == "way" and not c.rung:
+            raise bad_input("navigation", "weights", name, "is only known on the ladder", "leave it out")
     if c.collisions != "free" and not c.tally:
         raise bad_input("navigation", "tally", c.tally, f"does not go with collisions = {c.collisions}", "give true")
     for name in ("rung", "worlds"):

@@ -17,14 +17,14 @@ from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.effects.presets import DEFAULT_PRESET
 from lunar_mjx.envs.core import State, side_by_side, where
-from lunar_mjx.envs.ladder.pool import Pool, make_pool
+from lunar_mjx.envs.ladder.pool import Pool, make_pool, way_left
 from lunar_mjx.envs.ladder.rungs import get_rung
 from lunar_mjx.envs.navigation import kalman, randomise, rewards, tally
 from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
 from lunar_mjx.envs.navigation.observations import CAMERA, Scene, observe
 from lunar_mjx.envs.navigation.places import draw_places
-from lunar_mjx.envs.navigation.view import SCAN_SCALE, Reader, View, goal_in_body, read
+from lunar_mjx.envs.navigation.view import SCAN_SCALE, TRAIL, Reader, View, goal_in_body, read
 from lunar_mjx.envs.navigation.worlds import PREFIX, world
 from lunar_mjx.errors import bad_input
 from lunar_mjx.model import Model, make_model
@@ -53,7 +53,7 @@ class NavigationParams:
       arrivals: (place,) heading to arrive in, rad; None where any will do.
       ground: lowest and highest ground, m; None to look anew.
       side: of the worlds that make up the terrain, m: leaving one's own fails; None if it is one.
-      pool: the ladder's worlds, for planners; the step reads nothing of it. None elsewhere.
+      pool: the ladder's worlds, for planners and the reward `way`; None elsewhere.
     """
 
     system: Params
@@ -96,7 +96,9 @@ class Inner:
       last_action: as given.
       anchor: (2,) place that the rover last left by the stuck distance, m. waited: time since then, s.
       steps: control steps of the episode. total: its return.
-      place: number of the pair of start and goal. tally: of the episode. Both None unless the task needs them.
+      place: number of the pair of start and goal. tally: of the episode. left: length of the shortest way to the
+        goal from where the rover last stood on free ground, m. trail: (3, 2) means of past positions, m. All None
+        unless the task needs them.
       ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
     """
 
@@ -115,6 +117,8 @@ class Inner:
     total: Any
     place: Any = None
     tally: tally.Tally | None = None
+    left: Any = None
+    trail: Any = None
     ready: Ready | None = None
     used: Any = None
 
@@ -306,6 +310,7 @@ class NavigationEnv:
             action,
             state.inner.last_action,
             *self._costs(inner),
+            nearer=None if inner.left is None else state.inner.left - inner.left,
         )
         terms = {name: weight * rewards.TERMS[name](transition) for name, weight in c.weights.items()}
         ends = self._ends(params, inner, view, to_goal)
@@ -383,7 +388,7 @@ class NavigationEnv:
     def _costs(self, inner: Inner) -> tuple[Any, ...]:
         """Power, mean slip, hottest winding and collisions of a step, where the task keeps a tally."""
         if inner.tally is None:
-            return ()
+            return (None,) * 4
         hottest = inner.physics.temperature.winding_kelvin.max(-1)
         return inner.tally.power, jnp.abs(jnp.clip(inner.slip, -1.0, 1.0)).mean(-1), hottest, inner.tally.struck
 
@@ -425,6 +430,15 @@ class NavigationEnv:
             anchor=jnp.where(away[:, None], position[:, :2], inner.anchor),
             waited=waited,
         )
+        if inner.trail is not None:
+            fade = jnp.exp(-self.control_interval / jnp.asarray(TRAIL, position.dtype))[:, None]
+            trail = position[:, None, :2] + fade * (inner.trail - position[:, None, :2])
+            inner = dataclasses.replace(inner, trail=trail)
+        if inner.left is not None and params.pool is not None:
+            # the way from where a boulder's margin was entered counts until it is left, so that pressing into a ridge
+            # towards its other side pays nothing
+            left, known = way_left(params.pool, inner.place, position[:, :2])
+            inner = dataclasses.replace(inner, left=jnp.where(known, left, inner.left))
         view = self._view(params, inner)
         if inner.tally is not None and self._outline is not None:
             touching = self._outline.touches(params.system.terrain, view)
@@ -504,6 +518,8 @@ class NavigationEnv:
             total=zero,
             place=pick if params.shortest is not None or params.arrivals is not None else None,
             tally=tally.start(count, position.dtype) if c.tally else None,
+            left=params.pool.places.shortest[pick] if "way" in c.weights and params.pool is not None else None,
+            trail=jnp.repeat(position[:, None, :2], len(TRAIL), axis=1) if "trail" in c.observations else None,
         )
 
     def _view(self, params: NavigationParams, inner: Inner) -> View:
@@ -518,6 +534,7 @@ class NavigationEnv:
             last_action=inner.last_action,
             waited=inner.waited,
             arrival=None if params.arrivals is None else params.arrivals[inner.place],
+            trail=inner.trail,
         )
 
     def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from lunar_mjx.envs.navigation.env import NavigationEnv
-from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE
+from lunar_mjx.envs.navigation.view import FAR_SCAN, SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE, TRAIL
 
 
 class Label(NamedTuple):
@@ -42,8 +42,8 @@ def _per_wheel(unit: str) -> Callable[[NavigationEnv], list[Label]]:
     return lambda env: [Label(wheel.corner, unit) for wheel in env.model.rover.wheels]
 
 
-def _scan(env: NavigationEnv) -> list[Label]:
-    scale = SCAN_SCALE.get(env.model.rover.name, 1.0)
+def _scan(env: NavigationEnv, wider: float = 1.0) -> list[Label]:
+    scale = wider * SCAN_SCALE.get(env.model.rover.name, 1.0)
     return [
         Label(f"{scale * a:.4g} m ahead, {scale * b:.4g} m to the left", "m") for a in SCAN_AHEAD for b in SCAN_ASIDE
     ]
@@ -68,6 +68,8 @@ LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
     "waited": lambda env: [Label("time", "10 s")],
     "arrival": lambda env: [Label("cosine", "1"), Label("sine", "1")],
     "height_scan": _scan,
+    "far_scan": lambda env: _scan(env, FAR_SCAN),
+    "trail": lambda env: [Label(f"{axis}, {time:g} s", "m") for axis in ("ahead", "to the left") for time in TRAIL],
 }
 """Blocks whose numbers have names of their own. Pictures and what was drawn are counted through."""
 

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from lunar_mjx.cameras.batch import Pictures
-from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, View, goal_in_body, height_scan
+from lunar_mjx.envs.navigation.view import FAR_SCAN, SCAN_AHEAD, SCAN_ASIDE, View, goal_in_body, height_scan
 from lunar_mjx.errors import bad_input
 from lunar_mjx.pytree import pytree, static
 from lunar_mjx.terrain import Terrain
@@ -116,6 +116,22 @@ def scan(v: View, s: Scene) -> Any:
     return jnp.clip(height_scan(s.terrain, v, s.scan_scale, s.ride), -1.0, 1.0)
 
 
+def far_scan(v: View, s: Scene) -> Any:
+    """The height scan over a wider and coarser pattern, m, within 2 m of the standing plane. Nothing hides what lies
+    behind a boulder from it."""
+    return jnp.clip(height_scan(s.terrain, v, FAR_SCAN * s.scan_scale, s.ride), -2.0, 2.0)
+
+
+def trail(v: View, s: Scene) -> Any:
+    """Where the rover was: means of its past positions that fade within the times `TRAIL`, along and across the heading
+    from where it is now, m. Dead reckoning tells it; it is all the memory that a policy without any has."""
+    assert v.trail is not None, "the environment keeps the trail that this block asks for"
+    away = v.trail - v.position[:, None, :2]
+    cos, sin = jnp.cos(v.yaw)[:, None], jnp.sin(v.yaw)[:, None]
+    ahead = cos * away[..., 0] + sin * away[..., 1], cos * away[..., 1] - sin * away[..., 0]
+    return jnp.concatenate(ahead, axis=-1)
+
+
 def camera_rgb(v: View, s: Scene) -> Any:
     """Front camera's picture, 0 to 1: rows from the top, pixels from the left, red, green, blue."""
     return _flat(_seen(s).rgb)
@@ -183,6 +199,8 @@ BLOCKS: dict[str, Block] = {
         last_action,
         waited,
         arrival,
+        far_scan,
+        trail,
         drawn,
     )
 } | {"height_scan": scan, "camera/rgb": camera_rgb, "camera/depth": camera_depth, "camera/labels": camera_labels}

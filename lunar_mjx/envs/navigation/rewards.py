@@ -25,6 +25,7 @@ class Transition:
       action, last_action: of this step and the one before, in [-1, 1].
       power: electrical, of all motors, W. slip: mean size over the wheels. hottest: winding, K. struck: 1 where a
         boulder has come under the rover's outline. All None unless the task keeps a tally.
+      nearer: decrease of the shortest way to the goal, m; None unless a term asks for it.
     """
 
     to_goal_before: Float[Array, "env 2"]
@@ -39,6 +40,7 @@ class Transition:
     slip: Any = None
     hottest: Any = None
     struck: Any = None
+    nearer: Any = None
 
 
 def length(vector: Any) -> Any:
@@ -54,6 +56,12 @@ def progress_paper(t: Transition) -> Any:
 def progress(t: Transition) -> Any:
     """Decrease of the distance to the goal, m; negative when driving away."""
     return length(t.to_goal_before) - length(t.to_goal)
+
+
+def way(t: Transition) -> Any:
+    """Decrease of the shortest way to the goal over the ladder's map, m: a way out of a dead end pays. The map is told
+    to the reward alone, and never to the rover. Not in the paper."""
+    return t.nearer
 
 
 def heading(t: Transition) -> Any:
@@ -107,6 +115,7 @@ Term = Callable[[Transition], Any]
 TERMS: dict[str, Term] = {
     "progress_paper": progress_paper,
     "progress": progress,
+    "way": way,
     "heading": heading,
     "tilt": tilt,
     "excite": excite,

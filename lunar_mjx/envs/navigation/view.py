@@ -15,9 +15,13 @@ from lunar_mjx.terrain import Terrain, surface
 SCAN_AHEAD = (-1.0, -0.7, -0.35, 0.0, 0.35, 0.65, 0.95, 1.25, 1.6, 2.0, 2.5, 3.1, 3.8)
 SCAN_ASIDE = (-1.6, -1.1, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.1, 1.6)
 """Places of the height scan relative to the rover, m, along and across its heading; times `SCAN_SCALE`."""
+FAR_SCAN = 2.5
+"""What the far scan's pattern is larger by: places 9.5 m ahead and 4 m aside."""
 SCAN_REACH = 0.2
 """Radius of the cell about each place, m, times `SCAN_SCALE`: the scan keeps the highest rock within it, as elevation
 maps do. Without it the smallest rocks, 0.25 m wide, slip between the places and end up under the chassis."""
+TRAIL = (4.0, 15.0, 60.0)
+"""Time constants of the means of past positions, s: a few metres, a yard, and the way into it."""
 SCAN_SCALE = {"viper": 1.6}
 """Larger rovers look farther."""
 
@@ -41,6 +45,7 @@ class View:
       waited: time since the rover left the place that it is said to be stuck at, s.
       qpos: coordinates of the rover's MJCF.
       arrival: heading to arrive in, rad; None where any will do.
+      trail: where the rover was, averaged over the `TRAIL` times, m; None unless it is observed.
     """
 
     position: Float[Array, "env 3"]
@@ -65,6 +70,7 @@ class View:
     waited: Float[Array, "env"]
     qpos: Float[Array, "env nq"]
     arrival: Any = None
+    trail: Any = None
 
 
 def rotation(quaternion: Float[Array, "env 4"]) -> Float[Array, "env 3 3"]:
