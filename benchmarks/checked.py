@@ -58,7 +58,8 @@ def _rate(row: Mapping[str, Any]) -> str:
         False: f" (not counted: gap {row['parity_gap']:.1e})" if row["parity_gap"] else "",
         None: " (no gate)",
     }
-    return f"{row['steps_per_s'] / 1e6:.1f}{gate[row['parity']]}"
+    broken = "" if row["finite"] else " (not finite in the end)"
+    return f"{row['steps_per_s'] / 1e6:.1f}{gate[row['parity']]}{broken}"
 
 
 TABLES = {"acceptance": acceptance, "programs": programs}
