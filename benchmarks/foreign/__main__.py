@@ -179,6 +179,10 @@ def parser() -> argparse.ArgumentParser:
     swept.add_argument(
         "--twins", type=int, default=4, help="every so many tables twice more with other stated noise; 0: none"
     )
+    groups = (*cases.GROUPS, cases.TWO_OUTSIDE)
+    swept.add_argument(
+        "--group", choices=groups, default="", help="tables of one group alone; two_outside: of none else"
+    )
     swept.add_argument("--seed", type=int, help="as for make")
     swept.add_argument("--processes", type=int, default=len(os.sched_getaffinity(0)))
     swept.add_argument("--minutes", type=float, default=9.0)

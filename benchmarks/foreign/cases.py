@@ -71,8 +71,16 @@ def generator(seed: int, *words: str | int) -> np.random.Generator:
     return np.random.default_rng([seed, *(zlib.crc32(str(w).encode()) for w in words)])
 
 
-def plan(which: str, count: int) -> list[tuple[str, tuple[str, ...]]]:
-    """Group and hidden names of every case of a set, mixed so that any first part is a small copy of the whole."""
+TWO_OUTSIDE = "two_outside"
+"""Group of tables with two effects at once that the catalogue lacks; of no set but by itself."""
+
+
+def plan(which: str, count: int, only: str = "") -> list[tuple[str, tuple[str, ...]]]:
+    """Group and hidden names of every case of a set, mixed so that any first part is a small copy of the whole.
+
+    Args:
+      which: "tune" or "report". count: of cases. only: group of all of them; `GROUPS` by their shares if "".
+    """
     known = kinds.TUNE_KNOWN if which == "tune" else kinds.REPORT_KNOWN
     outside = kinds.TUNE_OUTSIDE if which == "tune" else kinds.REPORT_OUTSIDE
     pairs = [(a, b) for i, a in enumerate(known) for b in known[i + 1 :] if not _clash(a, b)]
@@ -83,8 +91,10 @@ def plan(which: str, count: int) -> list[tuple[str, tuple[str, ...]]]:
         "outside": [(k,) for k in outside],
         "pair": [pairs[i] for i in order],
     }
+    both = [(a, b) for i, a in enumerate(outside) for b in outside[i + 1 :] if _together(a, b)]
+    pools[TWO_OUTSIDE] = [both[i] for i in generator(0, which, TWO_OUTSIDE).permutation(len(both))]
     found = []
-    for group, share in GROUPS.items():
+    for group, share in ({only: 1.0} if only else GROUPS).items():
         number = round(share * count)
         found += [((n + 0.5) / number, group, pools[group][n % len(pools[group])]) for n in range(number)]
     return [(group, hidden) for _, group, hidden in sorted(found, key=lambda f: (f[0], f[1]))]
@@ -99,6 +109,13 @@ def _clash(a: str, b: str) -> bool:
         {"exit_angle", "side_exit"},
     )
     return any({a, b} <= s for s in same)
+
+
+def _together(a: str, b: str) -> bool:
+    """Whether a law holds both of two effects outside the catalogue."""
+    return any(
+        law in kinds.OUTSIDE[a].laws and law in kinds.OUTSIDE[b].laws for law in ("linear", "integral", "granular")
+    )
 
 
 LAW_SHARES = {

@@ -167,6 +167,18 @@ def judge(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> Row:
     }
 
 
+def ports_told(row: Mapping[str, Any]) -> list[bool]:
+    """For each hidden effect that the catalogue lacks whether something unlisted is more probable than not at its port.
+
+    Probabilities at a port are added: "stiffness" and "stiffness with load" of one soil exclude each other.
+    """
+    at: dict[str, float] = defaultdict(float)
+    for name, p in row["inclusion"].items():
+        if name.startswith("unlisted at "):
+            at[name.removeprefix("unlisted at ").partition(":")[0]] += p
+    return [any(at[port] > 0.5 for port in kinds.OUTSIDE[h].ports) for h in row["truth"]["hidden"]]
+
+
 def read(folder: Path) -> list[Row]:
     """Rows of all cases that were answered; twins with other stated noise have `twin_of`."""
     rows: list[Row] = []
@@ -306,6 +318,7 @@ def figures(everything: Sequence[Row]) -> Row:
         groups[row["truth"]["group"]].append(row)
         verdicts[row["truth"]["group"]][row["verdict"]] += 1
     nulls, singles, outside, pairs = (groups[g] for g in ("null", "single", "outside", "pair"))
+    both = [r for r in groups["two_outside"] if _sigma(r) > SEPARABLE]
     told = [r for r in singles if _sigma(r) > SEPARABLE]
     clear = [r for r in outside if _sigma(r) > SEPARABLE]
     twins = [(r, next((o for o in rows if o["case"] == r["twin_of"]), None)) for r in everything if r["twin_of"]]
@@ -330,6 +343,9 @@ def figures(everything: Sequence[Row]) -> Row:
         "separable_outside_unknown_or_unlisted": [
             r["verdict"] == "UNKNOWN" or (r["verdict"] == "KNOWN_CLASS" and r["unlisted"]) for r in clear
         ],
+        "separable_two_outside_both_ports": [all(ports_told(r)) for r in both],
+        "separable_two_outside_one_port": [any(ports_told(r)) for r in both],
+        "wrong_name_two_outside": [r["wrong_name"] for r in groups["two_outside"]],
         "separable_pairs_found": [r["found"] for r in pairs if _sigma(r) > SEPARABLE],
         "bad_fit": [r["verdict"] == "BAD_FIT" for r in rows],
         "bad_data": [r["verdict"] == "BAD_DATA" for r in rows],

@@ -101,12 +101,12 @@ def compile_law(law: str) -> None:
 LAWS = "closed form,stress_integral,granular_resistance"
 
 
-def jobs(which: str, seed: int, tables: int, every: int) -> list[Job]:
+def jobs(which: str, seed: int, tables: int, every: int, only: str = "") -> list[Job]:
     """All cases in the order of the plan, each of every so many followed by its twins with other stated noise."""
     from .__main__ import TWINS
 
     found: list[Job] = []
-    for n, (group, hidden) in enumerate(cases.plan(which, tables)):
+    for n, (group, hidden) in enumerate(cases.plan(which, tables, only)):
         found.append((which, seed, n, group, hidden, "", 1.0))
         if every and n % every == 0:
             found += [(which, seed, n, group, hidden, word, factor) for word, factor in TWINS.items()]
@@ -127,7 +127,7 @@ def sweep(args: argparse.Namespace) -> None:
     path = folder / ROWS
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
     have = {r["case"] for r in rows}
-    todo = [j for j in jobs(args.set, seed, args.tables, args.twins) if _name(j) not in have]
+    todo = [j for j in jobs(args.set, seed, args.tables, args.twins, args.group) if _name(j) not in have]
     head, dirty = work.commit()
     begun = written = time.monotonic()
     processes = pool.Pool(args.processes, _begin, settings, args.limit)

@@ -154,3 +154,17 @@ def test_what_acts_beside_a_neutral_name_counts_as_a_class() -> None:
     assert ask(TRUTH, "KNOWN", ["exit_angle"], further=["side_wall", "bulldozing"])["wrong_name"]
     assert not ask(TRUTH, "KNOWN", ["exit_angle"], further=["side_wall"], unlisted=True)["wrong_name"]
     assert not ask(TRUTH, "KNOWN", ["bulldozing"], further=["grousers"])["found"]
+
+
+def test_two_ports_are_told_where_something_unlisted_is_probable_at_each():
+    row = {
+        "truth": {"hidden": ["soft_tyre", "hard_layer"]},
+        "inclusion": {
+            "unlisted at geometry: radius": 0.3,
+            "unlisted at geometry: radius with load": 0.4,
+            "grousers": 0.9,
+        },
+    }
+    assert score.ports_told(row) == [True, False]
+    row["inclusion"]["unlisted at soil: stiffness"] = 0.8
+    assert score.ports_told(row) == [True, True]

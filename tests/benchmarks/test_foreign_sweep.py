@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from benchmarks.foreign import sweep, work
+from benchmarks.foreign import cases, sweep, work
 
 
 @pytest.fixture
@@ -39,3 +39,12 @@ def test_a_row_is_judged_against_its_truth(answered):
     for twin in twins:
         if twin["twin_of"]:
             assert twin["truth"]["replicates"] == 1 and twin["case"].startswith(twin["twin_of"])
+
+
+def test_two_effects_outside_the_catalogue_are_a_set_of_their_own():
+    assert not any(group == cases.TWO_OUTSIDE for group, _ in cases.plan("report", 200))
+    both = cases.plan("tune", 12, cases.TWO_OUTSIDE)
+    assert len(both) == 12
+    assert all(group == cases.TWO_OUTSIDE and len(set(hidden)) == 2 for group, hidden in both)
+    case = cases.draw("tune", 5, 0, *both[0])
+    assert set(case.world.effects) == set(case.hidden)
