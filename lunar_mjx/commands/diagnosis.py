@@ -459,7 +459,7 @@ def _finish(diagnosis: Diagnosis, as_json: bool) -> NoReturn:
     console.print(diagnosis.sentence, highlight=False)
     tested = [e for e in diagnosis.evidence if e.status != "not tested"]
     if diagnosis.probabilities:
-        _print_probabilities(diagnosis, console)
+        print_probabilities(diagnosis, console)
     elif tested:
         table = make_table("effect", "status", "separable", "chi2", "p", "gain", names=6)
         for e in tested[:15]:
@@ -482,10 +482,11 @@ WORTH_PRINTING = 0.005
 """Probability below which a hypothesis is left to the JSON."""
 
 
-def _print_probabilities(diagnosis: Diagnosis, console: Any) -> None:
+def print_probabilities(diagnosis: Diagnosis, console: Any) -> None:
+    """Prints hypotheses with their probabilities, what remains by port, and what held-out groups gain."""
     from lunar_mjx.model.describe import make_table
 
-    table = make_table("hypothesis", "probability", names=1)
+    table = make_table("hypothesis", "probability", names=0)
     for name, p in diagnosis.probabilities.items():
         if p >= WORTH_PRINTING:
             table.add_row(name, f"{p:.3f}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from pathlib import Path
@@ -9,8 +10,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
 
 from lunar_mjx import __version__
+from lunar_mjx.commands.diagnosis import print_probabilities
+from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.presets import FLAWS, PRESETS, UNSAID
 from lunar_mjx.effects.wheel.paper import REGULARISATIONS
@@ -92,6 +96,17 @@ def test_tables_read_well_on_a_narrow_terminal(command: list[str], run: Run, mon
     words = [len(line.split()) for line in lines if line.strip()]
     assert np.mean(words) > 3.5
     assert len(lines) < (200 if command[0] != "effect" or command[1] == "show" else 3 * len(CATALOGUE) + 20)
+
+
+def test_a_long_hypothesis_leaves_room_for_its_probability(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    name = "calibration.current_left + rolling_resistance + unlisted at motor_torque: current for a torque"
+    diagnosis = Diagnosis(Verdict.UNDECIDABLE, (), "", probabilities={name: 0.123, "rolling_resistance": 0.877})
+    console = Console(record=True, file=io.StringIO())
+    print_probabilities(diagnosis, console)
+    lines = console.export_text().splitlines()
+    assert sum(line.rstrip().endswith(("0.123", "0.877")) for line in lines) == 2
+    assert max(map(len, lines)) <= 80
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
