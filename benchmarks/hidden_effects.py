@@ -96,7 +96,7 @@ def score(args: argparse.Namespace) -> None:
 
 
 def summary(args: argparse.Namespace) -> None:
-    """The table of all results, with intervals, as JSON and text; and the confusion matrix."""
+    """The table of all results, with intervals, as JSON and text; and a figure of the answers."""
     import json
 
     from benchmarks.hidden import runner
@@ -153,7 +153,7 @@ def parser() -> argparse.ArgumentParser:
     )
     scored.add_argument("--keep", type=Path, help="folder in which runs stay")
     scored.set_defaults(do=score)
-    table = verbs.add_parser("summary", help="figures with intervals, and the confusion matrix")
+    table = verbs.add_parser("summary", help="numbers with intervals, and a figure of the answers")
     table.add_argument("results", type=Path, nargs="+", help="JSON lines")
     table.add_argument("--out", type=Path, required=True, help="without ending: .json and .png are written")
     table.set_defaults(do=summary)

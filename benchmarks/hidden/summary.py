@@ -1,4 +1,4 @@
-"""The benchmark's table: every row with counts, Wilson 95 % intervals and its target; and the confusion matrix.
+"""The benchmark's table: every row with counts, Wilson 95 % intervals and its target; and a figure of the answers.
 
 "Who was told" is told what is hidden and how the noise is correlated (`told`), but has no priors.
 """
@@ -159,57 +159,65 @@ def text(figures: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def confusion(rows: Sequence[Row]) -> tuple[list[str], list[str], np.ndarray]:
-    """Counts of answers by truth, over nulls, singles and effects outside the catalogue."""
-    known = sorted({n for r in rows if r["group"] == "singles" for n in r["truth"]["effects"]})
-    truths = ["nothing", *known, "outside"]
-    answers = ["NOISE_ONLY", *known, "another effect", "a class", "MULTIPLE", "UNKNOWN", "BAD_DATA, BAD_FIT"]
-    counts = np.zeros((len(truths), len(answers)), int)
-    for r in rows:
-        if r["group"] not in ("nulls", "singles", "outside"):
-            continue
-        truth = {"nulls": "nothing", "outside": "outside"}.get(r["group"]) or next(iter(r["truth"]["effects"]), "")
-        if truth in truths:
-            counts[truths.index(truth), answers.index(_answer(r, known))] += 1
-    return truths, answers, counts
+GROUPS = {
+    "nulls": "nothing hidden",
+    "singles": "one effect",
+    "singles_x5": "one, at five times the noise",
+    "pairs": "two effects",
+    "triples": "three effects",
+    "outside": "one that is not listed",
+    "undecidable": "one that a refit takes in",
+    "dirt": "a growing disturbance",
+    "sabotaged": "a sabotaged log",
+}
+"""What was hidden, by the first part of a case's name."""
 
 
-def _answer(r: Row, known: Sequence[str]) -> str:
-    if r["verdict"] == "KNOWN":
-        return r["named"][0] if r["named"][0] in known else "another effect"
-    return {"KNOWN_CLASS": "a class"}.get(
-        r["verdict"], r["verdict"] if r["verdict"] in ("NOISE_ONLY", "MULTIPLE", "UNKNOWN") else "BAD_DATA, BAD_FIT"
-    )
+def answers(cases: Sequence[Row]) -> dict[str, tuple[int, int, int]]:
+    """Right answers, those short of it that name nothing wrong, and wrong names, by what was hidden."""
+    found = {}
+    for group, title in GROUPS.items():
+        here = [c for c in cases if str(c["case"]).rsplit("-", 1)[0] == group]
+        if here:
+            wrong = sum(bool(c["wrong_name"]) for c in here)
+            right = sum(bool(c["right"]) and not c["wrong_name"] for c in here)
+            found[title] = right, len(here) - right - wrong, wrong
+    return found
 
 
-def plot(rows: Sequence[Row], path: Path) -> None:
-    """Confusion matrix; counts are written in the cells, the shade is the share of the row (legible in grey)."""
+def plot(cases: Sequence[Row], path: Path) -> None:
+    """Bars of right and wrong answers by what was hidden; `cases` are rows or the `cases` of a record."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from lunar_mjx.report.style import INK, PAPER, SHARES, figure_style
+    from lunar_mjx.report.style import BLUE, PAPER, SKY, VERMILION, styled
 
-    matplotlib.rcParams.update(figure_style())
-
-    truths, answers, counts = confusion(rows)
-    part = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    figure, axes = plt.subplots(figsize=(2.5 + 0.55 * len(answers), 2.0 + 0.45 * len(truths)), layout="constrained")
-    axes.imshow(part, cmap=SHARES, vmin=0.0, vmax=1.0, aspect="auto")
-    for i, j in np.argwhere(counts > 0):
-        axes.text(j, i, str(counts[i, j]), ha="center", va="center", color=PAPER if part[i, j] > 0.5 else INK)
-    axes.set_xticks(range(len(answers)), answers, rotation=45, ha="right")
-    axes.set_yticks(range(len(truths)), [f"{t} ({n})" for t, n in zip(truths, counts.sum(axis=1), strict=True)])
-    axes.set_xlabel("answer")
-    axes.set_ylabel("hidden (cases)")
-    axes.set_xticks(np.arange(-0.5, len(answers)), minor=True)
-    axes.set_yticks(np.arange(-0.5, len(truths)), minor=True)
-    axes.grid(False)
-    axes.grid(which="minor")
-    axes.tick_params(which="minor", length=0)
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    counts = answers(cases)
+    shares = np.array([np.array(c) / sum(c) for c in counts.values()])
+    kinds = (
+        ("right", BLUE, ""),
+        ("short of it, nothing wrong named", SKY, "////"),
+        ("a wrong name", VERMILION, "xxxx"),
+    )
+    with styled():
+        figure, axes = plt.subplots(figsize=(7.2, 1.2 + 0.32 * len(counts)), layout="constrained")
+        left, places = np.zeros(len(counts)), np.arange(len(counts))
+        for (label, colour, hatch), part in zip(kinds, 100 * shares.T, strict=True):
+            axes.barh(places, part, 0.62, left, color=colour, hatch=hatch, edgecolor=PAPER, linewidth=0, label=label)
+            left += part
+        for place, (right, short, wrong) in enumerate(counts.values()):
+            axes.text(101, place, f"{right} of {right + short + wrong}", va="center", fontsize=8)
+        axes.set_yticks(places, list(counts))
+        axes.invert_yaxis()
+        axes.set_xlim(0, 114)
+        axes.set_xticks(range(0, 101, 20))
+        axes.grid(axis="y", visible=False)
+        axes.set_xlabel("share of the cases, %")
+        figure.legend(loc="outside upper left", ncols=3)
+        figure.savefig(path, dpi=150)
+        plt.close(figure)
 
 
 def write(rows: Sequence[Row], out: Path, seeds: Sequence[Mapping[str, Any]]) -> str:

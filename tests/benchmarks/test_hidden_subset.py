@@ -19,7 +19,7 @@ import pytest
 from benchmarks.hidden import bed_effects, cases, drive_effects, drives, runner
 from benchmarks.hidden.judge import outcome
 from benchmarks.hidden.solve import table_row
-from benchmarks.hidden.summary import summarise, wilson
+from benchmarks.hidden.summary import answers, summarise, wilson
 from lunar_mjx.backends import NativeBackend
 from lunar_mjx.logs import check, read_log
 from lunar_mjx.logs.findings import is_bad
@@ -229,3 +229,14 @@ def test_a_crash_counts_as_wrong(tmp_path: Path) -> None:
     figures = summarise(found)["all"]
     assert figures["nulls, false alarm"]["of"] == 2 and figures["nulls, not answered"]["hits"] == 1
     json.dumps(figures)
+
+
+def test_the_figure_counts_the_cases_of_the_record() -> None:
+    root = Path(__file__).parents[2]
+    record = json.loads((root / "benchmarks" / "hidden_effects.json").read_text(encoding="utf-8"))
+    counts = answers(record["cases"])
+    assert sum(map(sum, counts.values())) == len(record["cases"])
+    page = (root / "docs" / "criticism_history.md").read_text(encoding="utf-8")
+    for title in ("one effect", "two effects", "three effects"):
+        right, _, _ = counts[title]
+        assert f"{right} of {sum(counts[title])}" in page
