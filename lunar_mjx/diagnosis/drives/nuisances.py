@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.instruments import is_instrument
-from lunar_mjx.diagnosis.drives.simulation.log_run import SETTLE, STOOD
+from lunar_mjx.diagnosis.drives.simulation.log_run import READS_BEFORE, SETTLE, STOOD
 from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
 from lunar_mjx.inference.observations import Observations, Series
 
@@ -51,6 +51,15 @@ def step_error_share() -> Coordinate:
     """How much of the step's error all logs contain: all where a rover was measured, nothing where steps of the same
     length recorded it."""
     return Coordinate(NUISANCE, STEP_ERROR, 0.0, 1.0, -2.0, 2.0, prior=0.5, centre=0.5, physical=True)
+
+
+def reads_before_share() -> Coordinate:
+    """How far currents and voltages of a row are those from before the row's command: 1 where a controller reads
+    before it acts and a motor's current takes milliseconds to rise, 0 where a simulator records after it.
+
+    The model's motors have no inductance: at the instant of a command's jump their current jumps, too.
+    """
+    return Coordinate(NUISANCE, READS_BEFORE, 0.0, 1.0, 0.0, 1.0, prior=0.5, centre=0.5, physical=True)
 
 
 def nuisances(number: int, run: LogRun, observations: Observations, stood: bool) -> list[Coordinate]:

@@ -30,13 +30,14 @@ from lunar_mjx.diagnosis.drives.nuisances import (
     from_first,
     is_linear,
     nuisances,
+    reads_before_share,
     standing_shows,
     step_error_share,
 )
 from lunar_mjx.diagnosis.drives.observations import observations_of, with_discrepancy
 from lunar_mjx.diagnosis.drives.simulation.log_run import STOOD
 from lunar_mjx.diagnosis.drives.simulation.program import Rows
-from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench
+from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench, at_once
 from lunar_mjx.diagnosis.drives.simulation.simulated_rows import Key, Simulated, keys_of_rows, stamp_of_observations
 from lunar_mjx.diagnosis.drives.unused import unused_sentence
 from lunar_mjx.diagnosis.effect_coordinates import of_candidate
@@ -107,6 +108,8 @@ class DriveProblem:
         self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self._noise_alone.series)
         shows = self._standing_shows()
         found.append(step_error_share())
+        if any(at_once(s.channel) for s in self.observations.series):
+            found.append(reads_before_share())
         for number, run in enumerate(self.bench.runs):
             found += nuisances(number, run, self.observations, number in shows)
             found += instrument_nuisances(number, self.logs[number], self.observations)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def model() -> Model:
     return make_model("luvmi_x", terrain="flat", timestep=0.0025)
 
 
-def make(folder: Path, columns: dict[str, object], speed: float = 1.0, **settings: object) -> Log:
+def make(folder: Path, columns: Mapping[str, object], speed: float = 1.0, **settings: object) -> Log:
     frame = {"time_s": TIME, **{f"command_{c}_drive_speed_rad_s": np.full(len(TIME), speed) for c in CORNERS}}
     frame |= {k: np.broadcast_to(v, len(TIME)) for k, v in columns.items()}  # type: ignore[call-overload]
     write_log(folder, {"drive": pd.DataFrame(frame)}, rover="luvmi_x", gravity_m_s2=1.625, **settings)  # type: ignore[arg-type]
@@ -87,6 +88,30 @@ def test_the_simulation_begins_in_motion(tmp_path: Path, model: Model) -> None:
     assert "drawbar_pull_N" in problem.unused and "joint_lf" not in problem.unused
     widened = next(s for s in problem.observations.series if s.channel == "world_velocity_x_m_s")
     assert widened.coloured >= 0.01 and widened.correlation_time > 0.0
+
+
+def test_motors_may_be_read_before_a_command_acts(tmp_path: Path, model: Model) -> None:
+    names = [f"motor_{c}_drive_current_A" for c in CORNERS]
+    rest = pd.DataFrame({"time_s": TIME, **dict.fromkeys(names, 0.0), "world_velocity_x_m_s": 0.0})
+    steps = pd.DataFrame(
+        {"time_s": TIME, **{f"command_{c}_drive_speed_rad_s": np.where(TIME < 0.999, 0.0, 1.0) for c in CORNERS}}
+    )
+    write_log(tmp_path / "a", {"drive": steps, "other": rest}, rover="luvmi_x", gravity_m_s2=1.625)
+    log = read_log(tmp_path / "a")
+    assert isinstance(log, Log)
+    problem = DriveProblem([log], model, {})
+    place = next(i for i, c in enumerate(problem.coordinates) if c.name == "reads_before")
+    rows = np.tile(problem.origin(), (3, 1))
+    rows[1:, place] = 0.5, 1.0
+    after, half, before = problem.predict(rows)
+    for s in problem.observations.series:
+        own, at = slice(s.start, s.stop), s.start + 20
+        assert s.time is not None and s.time[20] == pytest.approx(1.0)
+        if s.channel in names:
+            assert after[at] > 1.0 and abs(before[at]) < 0.02 * after[at]
+            np.testing.assert_allclose(half[own], 0.5 * (after[own] + before[own]), atol=1e-9)
+        else:
+            np.testing.assert_array_equal(before[own], after[own])
 
 
 def test_the_imus_axes_are_those_of_its_channels(model: Model) -> None:

@@ -19,6 +19,8 @@ from lunar_mjx.terrain.heightfield import slope
 
 SETTLE = 1.0
 """Least time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
+READS_BEFORE = "reads_before"
+"""Name of how far motors are read before a row's command takes effect: a share, which all logs have in common."""
 STOOD = "stood"
 """Name of the time for which a rover had stood before a log, s."""
 _FINEST = 0.01

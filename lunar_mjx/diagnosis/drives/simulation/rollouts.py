@@ -5,17 +5,19 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import functools
+import re
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.simulation.log_run import LogRun, log_run
+from lunar_mjx.diagnosis.drives.simulation.log_run import READS_BEFORE, LogRun, log_run
 from lunar_mjx.diagnosis.drives.simulation.program import Logs, Program, Rows, cores, stack_logs
 from lunar_mjx.diagnosis.drives.simulation.simulated_rows import stamp
 from lunar_mjx.dynamics.state import Ambient, Params
 from lunar_mjx.effects.sensor.channels import EULER
+from lunar_mjx.inference.coordinates import NUISANCE
 from lunar_mjx.inference.deadline import Deadline
 from lunar_mjx.inference.fitting import Progress
 from lunar_mjx.inference.observations import Observations
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 
 CHUNK = {"cpu": 16, "gpu": 512}
 """Rovers simulated at once. (2,048 with 44 effects and channels of 50 Hz need more than 22 GiB.)"""
+
+_AT_ONCE = re.compile(r"motor_\w+_(current_A|voltage_V|torque_Nm)|bus_voltage_V")
 
 _PROGRAMS: dict[Any, Program] = {}
 """Programs take every number as an argument, so that campaigns of one rover share them; a program keeps its model, so
@@ -126,6 +130,8 @@ class Bench:
           TimeUp: the deadline passed.
         """
         places = _places(self.runs, observations)
+        before = values.get((NUISANCE, READS_BEFORE, -1, False))
+        before = np.zeros(rows) if before is None else before
         done = 0
         for logs in self._groups():
             jobs = np.stack(np.meshgrid(np.arange(len(logs.numbers)), np.arange(rows), indexing="ij"), -1).reshape(
@@ -136,8 +142,9 @@ class Bench:
                 edges = np.searchsorted(part[:, 0], np.arange(len(logs.numbers) + 1))
                 for number, low, high in zip(logs.numbers, edges[:-1], edges[1:], strict=True):
                     if low < high:
-                        sampled = _sample(signals[low:high], logs.program.channels, places[number], observations.value)
-                        yield number, slice(part[low, 1], part[high - 1, 1] + 1), sampled
+                        row = slice(part[low, 1], part[high - 1, 1] + 1)
+                        own, names = signals[low:high], logs.program.channels
+                        yield number, row, _sample(own, names, places[number], observations.value, before[row])
                 done += len(part)
                 progress("simulating", done / (rows * len(self.runs)))
 
@@ -166,12 +173,14 @@ class _Place:
 
     Attributes:
       channels: their names. euler: whether they are angles that jump.
+      at_once: whether they jump at once with a command.
       low, share: (samples,) simulated sample before each time, and how far on towards the next one it is.
       begin, parts: where the log's observations begin, and (start, stop) of each series among all observations.
     """
 
     channels: list[str]
     euler: bool
+    at_once: bool
     low: np.ndarray
     share: np.ndarray
     begin: int
@@ -180,24 +189,29 @@ class _Place:
 
 def _places(runs: Sequence[LogRun], observations: Observations) -> list[list[_Place]]:
     """By log, where its observations lie among the simulated samples."""
-    found: list[dict[tuple[bytes, bool], _Place]] = [{} for _ in runs]
+    found: list[dict[tuple[bytes, bool, bool], _Place]] = [{} for _ in runs]
     begin: dict[int, int] = {}
     for s in observations.series:
         assert s.time is not None
-        run, key = runs[s.log], (s.time.tobytes(), s.channel in EULER)
+        run, key = runs[s.log], (s.time.tobytes(), s.channel in EULER, at_once(s.channel))
         begin.setdefault(s.log, s.start)
         if key not in found[s.log]:
             # a logger's clock that ticks with the simulation's, but for rounding, meets samples and nothing between
             place = np.round((s.time - run.begin) / (run.every * run.model.timestep), 9)
             low = np.clip(np.floor(place).astype(int), 0, len(run.commands) - 1)
-            found[s.log][key] = _Place([], key[1], low, place - low, begin[s.log], [])
+            found[s.log][key] = _Place([], key[1], key[2], low, place - low, begin[s.log], [])
         found[s.log][key].channels.append(s.channel)
         found[s.log][key].parts.append((s.start, s.stop))
     return [list(groups.values()) for groups in found]
 
 
-def _sample(signals: np.ndarray, names: Sequence[str], places: Sequence[_Place], measured: np.ndarray) -> np.ndarray:
-    """(rovers, samples) of one log's observations from its (rovers, channels, time) signals."""
+def _sample(
+    signals: np.ndarray, names: Sequence[str], places: Sequence[_Place], measured: np.ndarray, before: np.ndarray
+) -> np.ndarray:
+    """(rovers, samples) of one log's observations from its (rovers, channels, time) signals.
+
+    `before` (rovers,) is how far what jumps at once with a command is read before it.
+    """
     count = sum(len(p.low) * len(p.channels) for p in places)
     out = np.empty((len(signals), count))
     for p in places:
@@ -207,10 +221,19 @@ def _sample(signals: np.ndarray, names: Sequence[str], places: Sequence[_Place],
             if p.euler:
                 one = np.rad2deg(np.unwrap(np.deg2rad(one), axis=1))
             one = one[:, at] * (1.0 - p.share) + one[:, after] * p.share if np.any(p.share) else one[:, at]
+            if p.at_once and np.any(before):
+                # the last simulated sample that ends before the time of the reading
+                earlier = signals[:, names.index(channel)][:, np.maximum(p.low - (p.share == 0.0), 0)]
+                one = one + before[:, None] * (earlier - one)
             if p.euler:
                 one = measured[start:stop] + (one - measured[start:stop] + 180.0) % 360.0 - 180.0
             out[:, start - p.begin : stop - p.begin] = one
     return out
+
+
+def at_once(channel: str) -> bool:
+    """Whether a channel jumps at the instant at which a command does."""
+    return _AT_ONCE.fullmatch(channel) is not None
 
 
 def _run_of(places: np.ndarray) -> np.ndarray | slice:
