@@ -88,6 +88,7 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "damping": "N",
         "stress": _OWN,
         "arc": _OWN,
+        "reversal": "rad",
     },
     c.WheelForce: {
         "slip_x": "1",
@@ -98,6 +99,7 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "circle": "1",
         "lug": "m",
         "grip": "1",
+        "slip_ahead": "1",
     },
     c.BodyWrench: {"force": "N", "moment": "N m", "joint_torque": "N m"},
     c.Power: {"load": "W", "solar": "W", "loss": "W", "current": "A", "voltage": "V"},

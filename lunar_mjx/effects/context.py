@@ -142,6 +142,7 @@ class Normal:
       damping: upward force that resists sinking, N.
       stress: the stress at quadrature nodes, where an effect integrates it.
       arc: integrals of the linearised stress where it does not run from 0 over theta_1/2 to theta_1.
+      reversal: angle in front of which a braked wheel shoves its soil ahead, rad; None where no effect tells it.
     """
 
     entrance: Float[Array, "wheel"]
@@ -153,6 +154,7 @@ class Normal:
     damping: Float[Array, "wheel"]
     stress: Stress | None = None
     arc: Arc | None = None
+    reversal: Any = None
 
 
 @pytree
@@ -169,6 +171,7 @@ class WheelForce:
       circle: share of the shear stress that both directions have in common (friction circle); None for none.
       lug: how far the shearing surface lies beyond the radius of shear, m; None for not at all.
       grip: factor of the shear stress; None for 1.
+      slip_ahead: slip_x of the soil in front of `Normal.reversal`; None where it is the same.
     """
 
     slip_x: Float[Array, "wheel"]
@@ -179,6 +182,7 @@ class WheelForce:
     circle: Any = None
     lug: Any = None
     grip: Any = None
+    slip_ahead: Any = None
 
 
 @pytree

@@ -101,7 +101,8 @@ def _wheels(motions: list[Motion], names: tuple[str, ...] = ON_SOIL, **values: d
 def _reference(m: Motion, bulldozing: bool = True) -> dict[str, float]:
     """Forces by adaptive quadrature of stress and displacement; the displacement itself is integrated over time.
 
-    For forward rolling: a piece of soil that the rim met at theta_1 has been under it for (theta_1 - theta)/omega.
+    For forward rolling: a piece of soil that the rim met at theta_1 has been under it for (theta_1 - theta)/omega. A
+    braked wheel's is shoved ahead, not dragged back, where the rim moves at more than 45 deg - phi/2 from its normal.
     """
     r, b, omega = RADIUS, WIDTH, m.rim / RADIUS
     theta_1 = np.arccos(1.0 - m.sinkage / r)
@@ -112,8 +113,17 @@ def _reference(m: Motion, bulldozing: bool = True) -> dict[str, float]:
         front = t if t > theta_1 / 2 else theta_1 - t
         return modulus * max(r * (np.cos(front) - np.cos(theta_1)), 0.0) ** n
 
+    def moved(low: float, high: float, speed: float) -> float:
+        """Way of the rim over soil that would stay if the wheel travelled at `speed`, m."""
+        return quad(lambda a: (m.rim - speed * np.cos(a)) / omega, low, high)[0]
+
+    theta_0 = min(_angle_of_reversal(m), theta_1)
+    ahead = m.v_x
+    if theta_0 > 0.0 and moved(theta_0, theta_1, m.v_x) < 0.0:
+        ahead = brentq(lambda v: moved(theta_0, theta_1, v), 0.0, m.v_x)
+
     def shear(t: float) -> tuple[float, float]:
-        j_x = quad(lambda a: (m.rim - m.v_x * np.cos(a)) / omega, t, theta_1)[0]
+        j_x = moved(max(t, theta_0), theta_1, ahead) + moved(t, max(t, theta_0), m.v_x)
         j_y = m.v_y / omega * (theta_1 - t)
         q = np.hypot(j_x, j_y) / SOIL["K"]
         strength = SOIL["cohesion"] + sigma(t) * np.tan(SOIL["phi"])
@@ -121,7 +131,8 @@ def _reference(m: Motion, bulldozing: bool = True) -> dict[str, float]:
         return tau * j_x / (q * SOIL["K"]), tau * j_y / (q * SOIL["K"])
 
     def over_arc(f: Any) -> float:
-        return quad(f, 0.0, theta_1, points=[theta_1 / 2], epsabs=1e-9, epsrel=1e-9, limit=200)[0] * r * b
+        ends = sorted({theta_1 / 2, theta_0} - {0.0, theta_1})
+        return quad(f, 0.0, theta_1, points=ends, epsabs=1e-9, epsrel=1e-9, limit=200)[0] * r * b
 
     out = {
         "along": over_arc(lambda t: shear(t)[0] * np.cos(t) - sigma(t) * np.sin(t)),
@@ -148,9 +159,28 @@ def _reference(m: Motion, bulldozing: bool = True) -> dict[str, float]:
     return out
 
 
+def _angle_of_reversal(m: Motion) -> float:
+    """Where the rim of a braked wheel moves at 45 deg - phi/2 from its normal, rad; in front at more. 0 driving."""
+    if m.rim >= m.v_x:
+        return 0.0
+
+    def beyond(t: float) -> float:
+        return np.arctan2(m.v_x * np.cos(t) - m.rim, m.v_x * np.sin(t)) - (np.pi / 4 - SOIL["phi"] / 2)
+
+    return brentq(beyond, 1e-9, np.pi / 2)
+
+
 def test_field_wheel_matches_adaptive_quadrature() -> None:
-    """Slip -0.9 to 0.9, slip angle to 60 deg: within 1e-3 of the load (12 fixed nodes against adaptive ones)."""
-    motions = _motions(24)
+    """Slip -0.9 to 0.9, slip angle to 60 deg: within 1e-3 of the load (18 fixed nodes against adaptive ones).
+
+    The last four are deep and braked, so that their shear turns about within the arc.
+    """
+    deep = [
+        Motion(z, 0.2, 0.2 * np.tan(angle), 0.2 * rim)
+        for z, angle, rim in zip((0.2, 0.2, 0.15, 0.1), (0.0, 0.3, 0.0, 0.0), (0.1, 0.2, 0.3, 0.6), strict=True)
+    ]
+    motions = [*_motions(24), *deep]
+    assert all(_angle_of_reversal(m) < np.arccos(1.0 - m.sinkage / RADIUS) for m in deep)
     wheel = _wheels(motions)
     for i, m in enumerate(motions):
         wanted = _reference(m)

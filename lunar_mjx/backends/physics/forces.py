@@ -20,6 +20,7 @@ EffectState = dict[str, Values]
 
 _SOIL = ("surface_type", "hard_surface", "soil_gradient")
 _NORMAL: dict[str, Callable] = {
+    "skid_shear": outdoors.skid_reversal,
     "pressure_sinkage": soil.pressure_sinkage,
     "stress_integral": soil.integral_normal,
     "penalty_contact": printed.penalty_contact,

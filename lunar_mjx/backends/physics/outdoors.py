@@ -72,12 +72,29 @@ def multipass(c: Context, p: SimpleNamespace, soil: Values, places: Values) -> V
     return {"place_x": pushed(places["place_x"], x), "place_y": pushed(places["place_y"], y), "depth": deep}
 
 
+def skid_reversal(c: Context, p: SimpleNamespace) -> None:
+    """theta_0 with cos(theta_0 + X) = (1 - |s|) cos X, X = 45 deg - phi/2: in front of it soil is shoved ahead; rad."""
+    turning = 1.0 - p.share * np.maximum(-c.contact["soil_slip"], 0.0)
+    break_out = 0.5 * (0.5 * np.pi - np.arctan(c.soil["tan_phi"]))
+    angle = np.arccos(turning * np.cos(break_out)) - break_out
+    c.normal["reversal"] = np.where(turning < 1.0, angle, 0.0)
+
+
 def skid_shear(c: Context, p: SimpleNamespace) -> None:
-    """A skidding wheel's soil stays under it for its own turning: slips of eqs. 8 and 11 over 1 + s and 1 - s^2."""
-    slip = c.slip
+    """A skidding wheel's soil stays under it for its own turning: slips of eqs. 8 and 11 over 1 + s and 1 - s^2.
+
+    Ahead of the angle of reversal the slip is that which brings the displacement back to zero there, if it is less.
+    """
+    slip, theta_1 = c.slip, c.normal["entrance"]
     skid = clamp(-np.sign(slip["direction"]) * slip["slip_x"], 0.0, 1.0)
     left = np.maximum(1.0 - p.share * skid, 0.01)
     slip["slip_x"], slip["slip_y"] = slip["slip_x"] / left, slip["slip_y"] / (left * (1.0 + p.share * skid))
+    theta_0 = np.minimum(c.normal["reversal"], theta_1)
+    half = 0.5 * (theta_1 - theta_0)
+    # a wheel sunk to its axle has an upright front, where the sines of both ends are alike
+    chord = np.maximum(np.cos(theta_1 - half), 0.05) * np.sinc(half / np.pi)
+    kept = np.maximum(1.0 - 1.0 / chord - slip["direction"] * slip["slip_x"], 0.0)
+    slip["slip_ahead"] = slip["slip_x"] + p.share * slip["direction"] * kept
 
 
 def earth_pressure(c: Context, weight: float, depth: np.ndarray, squared: np.ndarray) -> np.ndarray:

@@ -5,12 +5,14 @@ Sources: Wong & Reece 1967, Janosi & Hanamoto 1961, Ding et al. 2011, Ishigami e
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
 
 from lunar_mjx.backends.physics.contact import faster, side_speed
 from lunar_mjx.backends.physics.context import Context, Values
+from lunar_mjx.backends.physics.vectors import clamp
 
 SHALLOW, DEEP = 1e-9, 1.5
 """Sinkage over radius is followed within these bounds (up to an entrance angle of 120 deg)."""
@@ -159,6 +161,21 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     return {"slip_x": slip_x, "slip_y": slip_y, "direction": direction}
 
 
+def shear_along(c: Context, theta: np.ndarray, r_s: np.ndarray) -> np.ndarray:
+    """j = r_s (theta_1 - theta) - r (1 - s)(sin theta_1 - sin theta) at nodes (rover, wheel, node), m.
+
+    Ahead of the angle of reversal s is that of the soil there.
+    """
+    r, slip, theta_1 = c.geometry["radius"][..., None], c.slip, c.normal["entrance"][..., None]
+    way, s = slip["direction"][..., None], slip["slip_x"][..., None]
+    chord = np.sin(theta_1) - np.sin(theta)
+    j = way * (r_s[..., None] * (theta_1 - theta) - r * chord) + r * s * chord
+    if "slip_ahead" in slip:
+        turn = np.minimum(c.normal["reversal"][..., None], theta_1)
+        j = j + r * (slip["slip_ahead"][..., None] - s) * (np.sin(theta_1) - np.sin(np.maximum(theta, turn)))
+    return j
+
+
 def closed_form_shear(c: Context, p: SimpleNamespace) -> None:
     """tau at theta_m from j = r_s (theta_1 - theta_m) - r (1 - s)(sin theta_1 - sin theta_m), applied over the arc.
 
@@ -168,12 +185,11 @@ def closed_form_shear(c: Context, p: SimpleNamespace) -> None:
     normal, soil, slip = c.normal, c.soil, c.slip
     r, b = c.geometry["radius"], c.geometry["width"]
     r_s = p.shear_radius * r
-    theta_1, theta_m, way = normal["entrance"], normal["theta_m"], slip["direction"]
+    theta_m, way = normal["theta_m"], slip["direction"]
     a_factor, b_factor = arc_factors(theta_m)
     sin_m = np.sin(theta_m)
-    chord = np.sin(theta_1) - sin_m
     strength = (soil["cohesion"] + normal["sigma_m"] * soil["tan_phi"]) * (c.contact["sinkage"] > 0.0)
-    j = way * (r_s * (theta_1 - theta_m) - r * chord) + r * slip["slip_x"] * chord
+    j = shear_along(c, theta_m[..., None], r_s)[..., 0]
     tau, tau_y = shear_stress(
         c, strength, j / soil["shear_modulus_x"], r * theta_m * slip["slip_y"] / soil["shear_modulus_y"]
     )
@@ -196,12 +212,15 @@ def integral_normal(c: Context, p: SimpleNamespace) -> None:
     theta_1 = entrance(sinkage, r)
     theta_m = 0.5 * theta_1
     share = 0.5 * (1.0 + _NODES)
-    rear = theta_m[..., None] * share
-    front = theta_m[..., None] * (1.0 + share)
+    ends = [np.zeros_like(theta_1), theta_m, theta_1]
+    if "reversal" in c.normal:
+        turn = clamp(c.normal["reversal"], ends[0], theta_1)
+        ends = [ends[0], np.minimum(turn, theta_m), np.maximum(turn, theta_m), theta_1]
+    parts = [(low[..., None], (high - low)[..., None]) for low, high in itertools.pairwise(ends)]
+    theta = np.concatenate([low + long * share for low, long in parts], axis=-1)
+    weight = np.concatenate([0.5 * long * _WEIGHTS for _, long in parts], axis=-1)
     # behind theta_m the stress mirrors the front in proportion: with theta_2 = 0 the mirror of t is theta_1 - t
-    mirror = np.concatenate([theta_1[..., None] - rear, front], axis=-1)
-    theta = np.concatenate([rear, front], axis=-1)
-    weight = np.concatenate([_WEIGHTS, _WEIGHTS]) * (0.5 * theta_m[..., None])
+    mirror = np.where(theta < theta_m[..., None], theta_1[..., None] - theta, theta)
     depth = np.maximum(r[..., None] * (np.cos(mirror) - np.cos(theta_1)[..., None]), 1e-12 * r[..., None])
     sigma = (soil["k_c"] / b + soil["k_phi"])[..., None] * depth ** soil["n"][..., None] * touching[..., None]
     load = r * b * np.sum(weight * sigma * np.cos(theta), axis=-1)
@@ -223,11 +242,9 @@ def integral_shear(c: Context, p: SimpleNamespace) -> None:
     r_s = p.shear_radius * r
     theta, weight, sigma = normal["stress"]
     theta_1, way = normal["entrance"][..., None], slip["direction"]
-    chord = np.sin(theta_1) - np.sin(theta)
     touching = (c.contact["sinkage"] > 0.0)[..., None]
     strength = weight * (soil["cohesion"][..., None] + sigma * soil["tan_phi"][..., None]) * touching
-    j = way[..., None] * (r_s[..., None] * (theta_1 - theta) - r[..., None] * chord)
-    j = j + (r * slip["slip_x"])[..., None] * chord
+    j = shear_along(c, theta, r_s)
     across = (r * slip["slip_y"])[..., None] * (theta_1 - theta)
     tau, tau_y = shear_stress(
         c, strength, j / soil["shear_modulus_x"][..., None], across / soil["shear_modulus_y"][..., None]

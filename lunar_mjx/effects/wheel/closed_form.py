@@ -243,6 +243,20 @@ def shear_stress(wheel, soil, strength, j_x, j_y):
     return tau_x + wheel.circle * (common * q_x - tau_x), tau_y + wheel.circle * (common * q_y - tau_y)
 
 
+def shear_along(wheel, normal, theta, r_s, r):
+    """Displacement of the rim over its soil at theta, m: r_s (theta_1 - theta) - r (1 - s)(sin theta_1 - sin theta).
+
+    In front of the angle of reversal, where there is one, with the slip that the soil has there.
+    """
+    theta_1 = normal.entrance
+    arc = sin_difference(theta_1, theta)
+    j = wheel.direction * (r_s * (theta_1 - theta) - r * arc) + r * wheel.slip_x * arc
+    if wheel.slip_ahead is None:
+        return j
+    ahead = sin_difference(theta_1, jnp.maximum(theta, jnp.minimum(normal.reversal, theta_1)))
+    return j + r * (wheel.slip_ahead - wheel.slip_x) * ahead
+
+
 def shearing_radius(p, geometry, wheel):
     """r_s, m: the radius, its factor, and what grousers add."""
     radius = p.shear_radius * geometry.radius
@@ -270,9 +284,8 @@ def closed_form_shear(ctx, p, x, wheel):
         (a_factor, b_factor), whole, front = geometry_factors(theta_m), theta_m, theta_m
     else:
         a_factor, b_factor, whole, front = normal.arc.cos, normal.arc.sin, normal.arc.one, theta_1 - theta_m
-    arc = sin_difference(theta_1, theta_m)
     strength = grounded(ctx.contact, soil.cohesion + normal.sigma_m * soil.tan_phi)
-    j_x = wheel.direction * (r_s * (theta_1 - theta_m) - r * arc) + r * wheel.slip_x * arc
+    j_x = shear_along(wheel, normal, theta_m, r_s, r)
     tau, tau_y = shear_stress(wheel, soil, strength, j_x, r * front * wheel.slip_y)
     side = -r * b * whole * tau_y
     force = Vec3(

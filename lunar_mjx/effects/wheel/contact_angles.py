@@ -59,7 +59,7 @@ def exit_angle(ctx, p, x, normal):
     theta_2 = -behind * theta_1
     sigma_m = grounded(contact, max_normal_stress(ctx.soil, geometry.width, geometry.radius, theta_m, theta_1))
     if normal.stress is not None:
-        load, resistance, stress = integrate(ctx, contact, theta_1, theta_m, theta_2)
+        load, resistance, stress = integrate(ctx, contact, theta_1, theta_m, theta_2, normal.reversal)
         return dataclasses.replace(
             normal, exit=theta_2, theta_m=theta_m, sigma_m=sigma_m, load=load, resistance=resistance, stress=stress
         )

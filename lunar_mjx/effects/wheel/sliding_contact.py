@@ -8,7 +8,7 @@ from typing import Annotated
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.effects.base import Parameter, effect
+from lunar_mjx.effects.base import Effect, Parameter, effect
 from lunar_mjx.effects.wheel.closed_form import contact_with_soil, first_axis, grounded, mean_decay, sin_difference
 from lunar_mjx.spatial import Vec3
 
@@ -183,35 +183,63 @@ def side_exit(ctx, p, x, normal):
     return scaled_stress(ctx, normal, lambda theta: jnp.where(theta < 0.0, 1.0 - gone, 1.0))
 
 
-@effect(
-    "wheel_shear",
+def _angle_of_reversal(ctx, p, x, normal):
+    skid = p.share * jnp.maximum(-ctx.contact.soil_slip, 0.0)
+    break_out = 0.25 * jnp.pi - 0.5 * jnp.arctan(ctx.soil.tan_phi)
+    turned = jnp.arccos((1.0 - skid) * jnp.cos(break_out)) - break_out
+    return dataclasses.replace(normal, reversal=jnp.where(skid > 0.0, turned, 0.0))
+
+
+def _own_turning(ctx, p, x, wheel):
+    skid = jnp.clip(-jnp.sign(wheel.direction) * wheel.slip_x, 0.0, 1.0)
+    stretch = 1.0 / jnp.maximum(1.0 - p.share * skid, _SHORTEST_TURN)
+    slip_x = wheel.slip_x * stretch
+    theta_1 = ctx.normal.entrance
+    theta_0 = jnp.minimum(ctx.normal.reversal, theta_1)
+    # (theta_1 - theta_0)/(sin theta_1 - sin theta_0), by half angles
+    half = 0.5 * (theta_1 - theta_0)
+    upright = jnp.maximum(jnp.cos(0.5 * (theta_1 + theta_0)), _SHORTEST_ARC)
+    undone = 1.0 / (upright * jnp.sinc(half / jnp.pi))
+    kept = jnp.maximum(1.0 - undone - wheel.direction * slip_x, 0.0)
+    return dataclasses.replace(
+        wheel,
+        slip_x=slip_x,
+        slip_y=wheel.slip_y * stretch / (1.0 + p.share * skid),
+        slip_ahead=slip_x + p.share * wheel.direction * kept,
+    )
+
+
+skid_shear = Effect(
+    name="skid_shear",
+    ports={"wheel_normal": _angle_of_reversal, "wheel_shear": _own_turning},
     order=-8,
-    share=Parameter(
-        0.9,
-        0.0,
-        (0.0, 1.0),
-        "1",
-        "0: contact time of eq. 9; 1: that of the wheel's own turning",
-        "choice: a locked wheel's contact has no end; the preset field takes 1",
-    ),
-)
-def skid_shear(ctx, p, x, wheel):
-    """Soil stays under a braked wheel for (theta_1 - theta)/omega: j grows by v_x/(r omega) over what eq. 9 says.
+    parameters={
+        "share": Parameter(
+            0.9,
+            0.0,
+            (0.0, 1.0),
+            "1",
+            "0: contact time of eq. 9, sheared one way; 1: that of the wheel's own turning, reversed in front",
+            "choice: a locked wheel's contact has no end; the preset field takes 1",
+        )
+    },
+    doc="""Soil stays under a braked wheel for (theta_1 - theta)/omega, and in front of theta_0 it is shoved ahead.
 
     The slip of eq. 8, referred to v_x when braking, makes the displacement finite for a locked wheel, and much too
     small. With s = 1 - r omega/v_x: slip_x/(1 - q s) and slip_y/((1 - q s)(1 + q s)), which at q = 1 is the
     kinematics of Janosi & Hanamoto 1961, j_x = int (r omega - v_x cos) dt and j_y = int v_y dt. The stretch ends at
     100, where the soil of a locked wheel is fully mobilised.
-    """
-    skid = jnp.clip(-jnp.sign(wheel.direction) * wheel.slip_x, 0.0, 1.0)
-    stretch = 1.0 / jnp.maximum(1.0 - p.share * skid, _SHORTEST_TURN)
-    return dataclasses.replace(
-        wheel, slip_x=wheel.slip_x * stretch, slip_y=wheel.slip_y * stretch / (1.0 + p.share * skid)
-    )
 
+    That holds where soil stays and the rim passes over it. Where the rim moves at more than X = 45 deg - phi/2 from its
+    normal, cos(theta_0 + X) = (1 - s) cos X, the soil gives way ahead and up along that slip line instead: in front of
+    theta_0 it is not dragged back, j_x(theta_0) >= 0, and behind it the shear begins anew (Wong & Reece 1967, part II:
+    towed wheels, whose shear turns about there). Driving, theta_0 = 0 and nothing changes.""",
+)
 
 _SHORTEST_TURN = 0.01
 """Least 1 + s: beyond a skid of 99 % the displacement is 100 times that of eq. 9 and more, tens of moduli K."""
+_SHORTEST_ARC = 0.05
+"""Least mean cosine over the front of the arc: wheels sunk to the axle, where the front stands upright."""
 
 
 def wall_bearing(tan_phi, tan_delta):

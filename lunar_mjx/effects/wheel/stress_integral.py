@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,9 +19,9 @@ from lunar_mjx.effects.wheel.closed_form import (
     grounded,
     max_normal_stress,
     normal_damping_force,
+    shear_along,
     shear_stress,
     shearing_radius,
-    sin_difference,
 )
 from lunar_mjx.spatial import Vec3
 
@@ -30,18 +31,25 @@ NODES_PER_SIDE = 6
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(NODES_PER_SIDE)
 
 
-def integrate(ctx, contact, theta_1, theta_m, theta_2):
-    """Load and resistance of the normal stress, N, and the stress at the nodes, for the angles given in rad."""
+def integrate(ctx, contact, theta_1, theta_m, theta_2, reversal=None):
+    """Load and resistance of the normal stress, N, and the stress at the nodes, for the angles given in rad.
+
+    Where the shear turns about at an angle of reversal, the part of the arc that holds it is divided there.
+    """
     r, b = ctx.geometry.radius, ctx.geometry.width
     modulus = ctx.soil.k_c / b + ctx.soil.k_phi
     share, half = first_axis(0.5 * (1.0 + _NODES), theta_1), first_axis(0.5 * _WEIGHTS, theta_1)
-    rear, front = theta_2 + (theta_m - theta_2) * share, theta_m + (theta_1 - theta_m) * share
+    edges = [theta_2, theta_m, theta_1]
+    if reversal is not None:
+        turn = jnp.clip(reversal, theta_2, theta_1)
+        edges = [theta_2, jnp.minimum(turn, theta_m), jnp.maximum(turn, theta_m), theta_1]
+    parts = list(itertools.pairwise(edges))
+    theta = jnp.concatenate([low + (high - low) * share for low, high in parts])
+    weight = jnp.concatenate([half * (high - low) for low, high in parts])
     # The rear stress at theta is the front stress at the angle that lies as far, in proportion, from theta_m.
-    mirror = theta_1 - (rear - theta_2) / (theta_m - theta_2) * (theta_1 - theta_m)
-    theta = jnp.concatenate([rear, front])
-    weight = jnp.concatenate([half * (theta_m - theta_2), half * (theta_1 - theta_m)])
+    mirror = theta_1 - (theta - theta_2) / (theta_m - theta_2) * (theta_1 - theta_m)
     # depth^n with n < 1 has an infinite derivative at 0, where the arc begins
-    depth = jnp.maximum(r * cos_difference(jnp.concatenate([mirror, front]), theta_1), 1e-12 * r)
+    depth = jnp.maximum(r * cos_difference(jnp.where(theta < theta_m, mirror, theta), theta_1), 1e-12 * r)
     sigma = grounded(contact, modulus * depth**ctx.soil.n)
     area = r * b
     load = area * jnp.sum(weight * sigma * jnp.cos(theta), axis=0)
@@ -53,7 +61,7 @@ def _normal(ctx, p, x, normal):
     contact, geometry = contact_with_soil(ctx), ctx.geometry
     theta_1 = entrance_angle(contact.sinkage, geometry.radius)
     theta_m, theta_2 = 0.5 * theta_1, jnp.zeros_like(theta_1)
-    load, resistance, stress = integrate(ctx, contact, theta_1, theta_m, theta_2)
+    load, resistance, stress = integrate(ctx, contact, theta_1, theta_m, theta_2, normal.reversal)
     damping = jnp.maximum(normal_damping_force(ctx, p.damping, theta_1), -load)
     sigma_m = max_normal_stress(ctx.soil, geometry.width, geometry.radius, theta_m, theta_1)
     return dataclasses.replace(
@@ -76,9 +84,8 @@ def _shear(ctx, p, x, wheel):
     theta, weight, sigma = (
         jnp.stack([v + 0.0 * theta_1 for v in values]) for values in (stress.theta, stress.weight, stress.sigma)
     )
-    arc = sin_difference(theta_1, theta)
     strength = grounded(ctx.contact, soil.cohesion + sigma * soil.tan_phi)
-    j_x = wheel.direction * (r_s * (theta_1 - theta) - r * arc) + r * wheel.slip_x * arc
+    j_x = shear_along(wheel, normal, theta, r_s, r)
     tau, tau_y = shear_stress(wheel, soil, weight * strength, j_x, r * (theta_1 - theta) * wheel.slip_y)
     cos, sin = jnp.cos(theta), jnp.sin(theta)
     along, lift, turn = jnp.sum(tau * cos, axis=0), jnp.sum(tau * sin, axis=0), jnp.sum(tau, axis=0)
