@@ -26,7 +26,12 @@ CASES_PER_WORKER = 40
 
 
 def commit() -> tuple[str, bool]:
-    """The commit of this checkout and whether tracked files of tool or bench differ from it; "" without git."""
+    """The commit of this checkout and whether tracked files of tool or bench differ from it; "" without git.
+
+    FOREIGN_COMMIT, where it is set, is the commit of a copy that has no history of its own.
+    """
+    if told := os.environ.get("FOREIGN_COMMIT"):
+        return told, False
     try:
         head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True)
         changed = subprocess.run(
@@ -37,7 +42,7 @@ def commit() -> tuple[str, bool]:
             check=True,
         )
     except (OSError, subprocess.CalledProcessError):
-        return os.environ.get("FOREIGN_COMMIT", ""), False
+        return "", False
     return head.stdout.strip(), bool(changed.stdout.strip())
 
 

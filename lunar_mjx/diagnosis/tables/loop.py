@@ -101,7 +101,15 @@ def build_tables(
         forms.append(WheelForm(name, data, union, coordinates, baseline, places, settings, math.log(share)))
         beds[name] = bed
         all_effects |= effects
-    return Tables(tuple(forms), all_effects, refused, settings, beds=beds)
+    return Tables(tuple(forms), all_effects, refused, settings, _not_used(run.model), beds)
+
+
+def _not_used(model: Model) -> str:
+    """Effects of a model that read channels of drives and no table's columns, as one sentence; empty if it has none."""
+    names = [e.name for e in model.effects if "sensor" in e.ports]
+    if not names:
+        return ""
+    return f"Not used: {', '.join(names)} of the model ({tables.SENSORS})."
 
 
 def contact_laws(model: Model, rivals: Sequence[str]) -> dict[str, Model]:

@@ -83,6 +83,9 @@ def _radius(ctx: Any, a: Any, geometry: Any) -> Any:
     return dataclasses.replace(geometry, radius=geometry.radius * (1.0 + a))
 
 
+MOMENT = "wheel_shear: driving moment"
+"""Field of the moment about the axle: the shear stress along the wheel at one lever, the radius, whatever its place."""
+
 GAINS: tuple[Gain, ...] = (
     Gain("soil: stiffness", "soil", _stiffness, SCALED),
     Gain("soil: shear strength", "soil", _strength, SCALED),
@@ -91,8 +94,8 @@ GAINS: tuple[Gain, ...] = (
     Gain("wheel_shear: longitudinal force", "wheel_shear", _thrust, SCALED),
     Gain("wheel_shear: lateral force", "wheel_shear", _side, SCALED),
     Gain("wheel_shear: lateral force", "wheel_shear", _push_aside, ADDED),
-    Gain("wheel_shear: driving moment", "wheel_shear", _moment, SCALED),
-    Gain("wheel_shear: driving moment", "wheel_shear", _seal, ADDED),
+    Gain(MOMENT, "wheel_shear", _moment, SCALED),
+    Gain(MOMENT, "wheel_shear", _seal, ADDED),
     Gain("geometry: radius", "geometry", _radius, DRAWN),
 )
 """Gains of all fields; a wheel bed takes one amount of each, which may differ between points."""
@@ -103,7 +106,7 @@ FIELDS: Mapping[str, str] = {
     "wheel_normal: resistance": "resistance of the normal stress",
     "wheel_shear: longitudinal force": "shear stress along the wheel",
     "wheel_shear: lateral force": "side force",
-    "wheel_shear: driving moment": "driving torque",
+    MOMENT: "driving torque",
     "geometry: radius": "radius of the wheel under its load",
 }
 """Fields of discrepancy, and what is "good to so many per cent" in the user's words."""

@@ -230,9 +230,14 @@ def _programs(
     return _PROGRAMS[key][1:]
 
 
+SENSORS = "reads channels of drives; of a table's instruments scale, zero and cross-talk are weighed as calibration"
+
+
 def _unfit(name: str, effect: Effect) -> str:
     """Why a steady-state bed cannot hold an effect beside the model's own, or ""."""
     del name
+    if "sensor" in effect.ports:
+        return SENSORS
     held = not effect.transient and any(port in PORTS for port in effect.ports)
     return "" if held else "does not act on a wheel in steady state"
 

@@ -260,7 +260,7 @@ class WheelForm(MeasuredForm):
             calibration={name: calibrated[places] for name, places in instruments.items()},
             following={name: last + places for name, places in followed.items()},
             added={f: more + np.flatnonzero(added_to == k) for k, f in enumerate(FIELDS) if np.any(added_to == k)},
-            fields=tuple(Field(f, settings.usual_discrepancy) for f in FIELDS),
+            fields=tuple(Field(f, settings.usual(f)) for f in FIELDS),
             noises=tuple(NoiseSize(_NAMES[q], s) for q, s in data.noise_std.items()),
             wide=settings.unlisted_discrepancy,
             far=settings.bad_calibration,

@@ -266,3 +266,19 @@ def test_a_model_that_an_effect_was_added_to_shares_its_program(folder):
     place = next(i for i, c in enumerate(first.coordinates) if c.key == "rolling_resistance.coefficient")
     u[place] = 0.05 / first.coordinates[place].scale
     np.testing.assert_allclose(first.predict(u)[0], second.predict(v)[0], rtol=1e-9, atol=1e-12)
+
+
+def test_the_moment_errs_with_the_shear_stress_and_little_beyond(folder):
+    form = tables(folder, "plain").own
+    linear, _, _ = form.linearise(np.zeros(len(form.coordinates)))
+    usual = {f.name: f.usual for f in linear.fields}
+    assert usual["wheel_shear: driving moment"] == pytest.approx(0.2 * usual["wheel_shear: longitudinal force"])
+    assert len(set(usual.values())) == 2
+
+
+def test_effects_on_sensors_of_drives_are_not_used_and_that_is_said(folder):
+    path = folder / "plain"
+    model = make_model("luvmi_x", terrain="flat", preset="consistent").add("channel_scale")
+    problem = build_tables(Run(folder / "run", (path,), model), read_campaign([path]), only=())
+    assert "channel_scale" in problem.unused and "calibration" in problem.unused
+    assert not tables(folder, "plain").unused
