@@ -172,8 +172,10 @@ def score_rows(
         "asked_with_uncommitted_changes": any(r["uncommitted_changes"] for r in rows),
         "cases_made": len(rows),
         "cases_answered": sum(r["twin_of"] is None for r in rows),
-        **figures(rows),
+        **figures([r for r in rows if r["truth"]["kind"] == "table"]),
     }
+    if driven := [r for r in rows if r["truth"]["kind"] == "drive"]:
+        found["drives"] = figures(driven)
     (folder / SCORE).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     (folder / TEXT).write_text(text(found) + "\n", encoding="utf-8")
     if show:

@@ -37,8 +37,8 @@ def test_nothing_is_begun_for_which_there_is_no_time(tmp_path: Path, monkeypatch
     ends = []
     monkeypatch.setattr(campaigns, "ask", lambda job, folder, until: ends.append(until - now))
     now = time.monotonic()
-    for left, limit in ((100.0, 0.0), (500.0, 0.0), (5000.0, 300.0)):
+    for left, limit in ((300.0, 0.0), (500.0, 0.0), (5000.0, 400.0)):
         for name, value in (("folder", tmp_path), ("until", now + left), ("limit_s", limit)):
             monkeypatch.setattr(campaigns._Process, name, value)
         campaigns._ask(JOB)
-    assert ends == [pytest.approx(485.0), pytest.approx(300.0, abs=5.0)]
+    assert ends == [pytest.approx(485.0), pytest.approx(400.0, abs=5.0)]
