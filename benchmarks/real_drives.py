@@ -569,6 +569,17 @@ SHOWN = {
 }
 
 
+def joined(samples: np.ndarray, time: np.ndarray) -> list[np.ndarray]:
+    """Samples of a drive, cut where more than two of its usual steps lie between two of them."""
+    steps = np.diff(time[samples])
+    return np.split(samples, np.flatnonzero(steps > 2.0 * np.median(steps)) + 1) if len(samples) > 1 else [samples]
+
+
+def apart(values: np.ndarray, windows: Sequence[np.ndarray]) -> np.ndarray:
+    """Values of windows one after another with a gap between them, since no time joins them."""
+    return np.concatenate([np.append(values[window], np.nan) for window in windows if len(window)])
+
+
 def picture(runs: Sequence[Path], file: Path) -> None:
     """Draws held-out windows, one after another: measured, the model as given and refitted, and a later run's refit.
 
@@ -593,25 +604,22 @@ def picture(runs: Sequence[Path], file: Path) -> None:
             zip(figure.subplots(len(channels), squeeze=False)[:, 0], channels, strict=True)
         ):
             parts = [
-                np.arange(a, b)[held[a:b]]
+                part
                 for a, b, c in zip(first["series_start"], stops, first["series_channel"], strict=True)
                 if c == channel
+                for part in joined(np.arange(a, b)[held[a:b]], first["time"])
             ]
-            at = np.concatenate(parts)
-            lines = [
-                ("as given", first["predicted"][0][at], MUTED, ":"),
-                ("refitted", first["predicted"][1][at], ORANGE, "--"),
-            ]
+            lines = [("as given", first["predicted"][0], MUTED, ":"), ("refitted", first["predicted"][1], ORANGE, "--")]
             if len(stored) > 1:
-                grown = stored[1]
-                lines.append((f"with {runs[1].name}", grown["predicted"][1][at], BLUE, "-"))
+                added = json.loads((runs[1] / "run.json").read_text(encoding="utf-8"))["added"]
+                lines.append((f"with {', '.join(added)}", stored[1]["predicted"][1], BLUE, "-"))
             for label, values, colour, line in lines:
-                axes.plot(values, color=colour, linestyle=line, linewidth=1.2, label=label)
-            axes.plot(first["measured"][at], ".", color=INK, markersize=2.5, label="measured")
+                axes.plot(apart(values, parts), color=colour, linestyle=line, linewidth=1.2, label=label)
+            axes.plot(apart(first["measured"], parts), ".", color=INK, markersize=2.5, label="measured")
             axes.set_ylabel(SHOWN[channel], fontsize=8)
             if k == 0:
                 axes.legend(frameon=False, ncols=4, fontsize=8)
-        figure.supxlabel("samples of held-out windows, one after another", fontsize=9)
+        figure.supxlabel("samples of held-out windows, one after another, with a gap between them", fontsize=9)
         figure.savefig(file, dpi=110)
 
 
