@@ -131,7 +131,8 @@ def test_another_learner_takes_the_settings_that_stand_beside():
     assert learner_name(get_training("short-ppo", "td3")) == "td3"
     for number in range(1, 6):
         rung = get_training(f"ladder-{number}")
-        assert rung.train == large.train and rung.options["task"] == f"ladder/{number}"
+        assert rung.train == get_training(f"large-{learner_name(rung)}").train
+        assert rung.options["task"] == f"ladder/{number}"
         ppo = get_training(f"ladder-{number}", "ppo")
         assert ppo.train == get_training("large-ppo").train and ppo.steps == rung.steps
     assert {"short-ppo", "short-sac", "large-ppo", "large-sac"} <= set(training_names())

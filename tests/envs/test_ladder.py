@@ -217,7 +217,7 @@ def test_a_rung_keeps_the_contract_and_collisions_end_episodes():
 
 @pytest.mark.slow
 def test_the_reward_of_the_way_adds_up_and_the_trail_follows():
-    observations = ("goal_body", "height_scan", "far_scan", "trail")
+    observations = ("goal_body", "height_scan", "far_scan", "trail", "border", "visited")
     env = make_navigation("ladder/3", worlds=1, decimation=25, observations=observations, weights={"way": 1.0})
     state = env.reset(env.params, split_keys(jax.random.PRNGKey(2), 3))
     first, begin, paid = state.inner.left, state.inner.origin[:, :2], 0.0
@@ -235,3 +235,35 @@ def test_the_reward_of_the_way_adds_up_and_the_trail_follows():
     assert (back[:, 0] < 0.0).all() and (np.diff(back[:, 0], axis=1) < 0.0).all()
     assert (np.hypot(back[:, 0], back[:, 1]) <= gone[:, None] + 1e-3).all() and (gone > 0.05).all()
     assert env.blocks["far_scan"].stop - env.blocks["far_scan"].start == 143
+    corners = env._view(env.params, state.inner).corners
+    gap = np.concatenate([corners[:, 1] - here, here - corners[:, 0]], axis=1).min(1)
+    seen = np.asarray(state.obs[:, env.blocks["border"]])
+    # the shortest of four rays that cross at right angles is at most sqrt(2) times the distance
+    assert ((10.0 * seen.min(1) >= np.minimum(gap, 10.0) - 1e-3) & (10.0 * seen.min(1) <= 1.42 * gap)).all()
+    # one place so far, where the first step ended
+    been = np.asarray(state.obs[:, env.blocks["visited"]]).reshape(3, 5, 5)
+    np.testing.assert_allclose(been[:, 2, 2], np.exp(-0.125 * gone**2), atol=0.05)
+    assert (been.reshape(3, -1).argmax(1) == 12).all()
+
+
+@pytest.mark.slow
+def test_the_top_rung_drives_on_a_battery_in_sun_and_shadow(monkeypatch):
+    small = dataclasses.replace(get_rung(5), size=80.0, cell=0.4, goal_distance=(10.0, 40.0), worlds=1)
+    monkeypatch.setitem(RUNGS, 5, small)
+    env = make_navigation("ladder/5", decimation=25, observations=("goal_body", "power"))
+    state = env.reset(env.params, split_keys(jax.random.PRNGKey(1), 4))
+    charge, lit, *sun = np.asarray(state.obs[:, env.blocks["power"]]).T
+    assert (charge > 0.4).all() and (charge < 2.6).all() and (lit >= 0.0).all() and (lit <= 1.0).all()
+    np.testing.assert_allclose(np.hypot(*sun), 1.0, atol=1e-5)
+    # where the relief rises above the Sun there is less light than in the open
+    places = np.random.default_rng(0).uniform(-35.0, 35.0, (2000, 2))
+    light = np.asarray(env.params.system.sun.light(0.0, *places.T).irradiance)
+    assert 0.02 < (light < 100.0).mean() < 0.5 and light.max() > 1300.0
+    # a battery that cuts the motors off ends the episode of its rover alone
+    effects = state.inner.physics.effects
+    flat = {**effects, "battery": {**effects["battery"], "flat": jnp.asarray([1.0, 0.0, 0.0, 0.0])}}
+    empty = dataclasses.replace(state.inner, physics=dataclasses.replace(state.inner.physics, effects=flat))
+    ends = env._ends(env.params, empty, env._view(env.params, empty), jnp.full((4, 2), 9.0))
+    assert np.asarray(ends["drained"]).tolist() == [True, False, False, False]
+    with pytest.raises(UserError, match="battery"):
+        make_navigation("ladder/1", worlds=1, observations=("goal_body", "power"))

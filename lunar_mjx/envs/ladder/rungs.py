@@ -38,6 +38,7 @@ class Rung:
       episode_time: s.
       collisions: "free", "cost" (a reward term) or "end" (of the episode, as failed).
       weights: of reward terms.
+      battery: an almost empty battery, panels and a low Sun behind the relief; motors that it cuts off fail.
       worlds: made side by side unless told otherwise.
     """
 
@@ -61,6 +62,7 @@ class Rung:
     block: float = 8.0
     arrival_deg: float = 180.0
     plan_cell: float = 0.4
+    battery: bool = False
     worlds: int = 16
 
     def __post_init__(self) -> None:
@@ -185,7 +187,7 @@ RUNGS: dict[int, Rung] = {
         weights={**_ALL, "collision": 10.0},
     ),
     5: Rung(
-        note="goals 200 to 500 m away, slopes to 25 deg, a collision ends the drive",
+        note="goals 200 to 500 m away, slopes to 25 deg, battery and shadow; a collision ends the drive",
         size=520.0,
         cell=0.2,
         slope_deg=25.0,
@@ -199,6 +201,7 @@ RUNGS: dict[int, Rung] = {
         arrival_deg=30.0,
         episode_time=2400.0,
         collisions="end",
+        battery=True,
         plan_cell=0.8,
         worlds=2,
         weights={**_ALL, "collision": 10.0},

@@ -224,6 +224,10 @@ UNSEEN_SOIL = (
 motors; outside training's range in every parameter. The weak end of all ranges at once is no test: slip is 0.7 on flat
 ground, and 9 rovers of 10 dig in on the slopes of `world:train` without any rock."""
 
+LOW_CHARGE = Range("battery.initial", 0.055, 0.075)
+"""State of charge at which drives on a battery begin: 0.5 to 2.5 % above the cut-off, 10 to 48 W h. Electronics of 60 W
+alone empty that in 10 to 48 minutes of shadow, and 500 m take LUVMI-X 12 minutes or more."""
+
 TASKS: dict[str, NavigationConfig] = {
     "paper": NavigationConfig(
         weights=dict(PAPER_WEIGHTS), goal_distance=(4.0, 6.0), start_within=2.0, start_yaw=np.pi / 2
@@ -259,7 +263,8 @@ def _ladder(number: int) -> NavigationConfig:
         collisions=rung.collisions,
         weights=dict(rung.weights),
         arrive_within=np.pi if any_heading else float(np.radians(rung.arrival_deg)),
-        observations=EGOCENTRIC if any_heading else (*EGOCENTRIC, "arrival"),
+        observations=(*EGOCENTRIC, *(() if any_heading else ("arrival",)), *(("power",) if rung.battery else ())),
+        randomise=(*SOIL_RANGES, LOW_CHARGE) if rung.battery else SOIL_RANGES,
         # a drive that is given up must stay dearer than any that goes on: a price on time is none
         stuck_time=15.0,
     )

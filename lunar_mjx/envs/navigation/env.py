@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from lunar_mjx.cameras.batch import Light, pictures
 from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics import State as Physics
+from lunar_mjx.effects.power.supply import charge_of
 from lunar_mjx.effects.presets import DEFAULT_PRESET
 from lunar_mjx.envs.core import State, side_by_side, where
 from lunar_mjx.envs.ladder.pool import Pool, make_pool, way_left
@@ -24,18 +26,33 @@ from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
 from lunar_mjx.envs.navigation.observations import CAMERA, Scene, observe
 from lunar_mjx.envs.navigation.places import draw_places
-from lunar_mjx.envs.navigation.view import SCAN_SCALE, TRAIL, Reader, View, goal_in_body, read
+from lunar_mjx.envs.navigation.view import (
+    NOWHERE,
+    SCAN_SCALE,
+    TRAIL,
+    VISITED_APART,
+    VISITED_KEPT,
+    Reader,
+    View,
+    goal_in_body,
+    read,
+)
 from lunar_mjx.envs.navigation.worlds import PREFIX, world
 from lunar_mjx.errors import bad_input
 from lunar_mjx.model import Model, make_model
+from lunar_mjx.model.sun import SunSettings
 from lunar_mjx.pytree import pytree
 
 ENDS = ("reached", "rolled_over", "stuck", "off_terrain", "diverged")
 """Ways in which an episode terminates; the first is success, the others bring the failure reward. Where collisions end
-an episode, `collided` is one more."""
+an episode, `collided` is one more, and `drained` where a battery can cut the motors off."""
 LADDER_PRESET = "consistent"
 """Physics of the ladder unless told otherwise. In `field` LUVMI-X slips 0.68 on 5 deg and slides back on 10 deg: the
 upper rungs' slopes could not be driven."""
+SUPPLY = ("motor_power", "electronics", "solar_panels", "battery")
+"""Effects that a rung with a battery adds to a model that has none."""
+LOW_SUN = SunSettings(azimuth_deg=135.0, elevation_deg=6.0)
+"""Sun of such a rung: near the poles it stays this low, and relief of some degrees casts shadows."""
 _USED = 0.125
 """Share of the rovers that may be without a prepared episode before all are prepared anew."""
 
@@ -97,8 +114,8 @@ class Inner:
       anchor: (2,) place that the rover last left by the stuck distance, m. waited: time since then, s.
       steps: control steps of the episode. total: its return.
       place: number of the pair of start and goal. tally: of the episode. left: length of the shortest way to the
-        goal from where the rover last stood on free ground, m. trail: (3, 2) means of past positions, m. All None
-        unless the task needs them.
+        goal from where the rover last stood on free ground, m. trail: (3, 2) means of past positions, m.
+        visited: (place, 2) where it was, newest first, m. All None unless the task needs them.
       ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
     """
 
@@ -119,6 +136,7 @@ class Inner:
     tally: tally.Tally | None = None
     left: Any = None
     trail: Any = None
+    visited: Any = None
     ready: Ready | None = None
     used: Any = None
 
@@ -176,7 +194,12 @@ class NavigationEnv:
         self._ride = model.rover.standing_height
         self._scale = SCAN_SCALE.get(model.rover.name, 1.0)
         self._outline = tally.Outline(self.system) if config.tally else None
-        self._ends_told = (*ENDS, "collided") if config.collisions == "end" else ENDS
+        self._battery = "battery" in model.effect_names
+        if "power" in config.observations and not (self._battery and model.sun is not None):
+            remedy = "add the effect battery and a Sun to the model, or leave it out"
+            raise bad_input("navigation", "observations", "power", "needs a battery and a Sun", remedy)
+        more = ("collided",) if config.collisions == "end" else ()
+        self._ends_told = (*ENDS, *more, *(("drained",) if self._battery else ()))
         self.params = self.place(model)
         self.action_size = self.actions.size
         shapes = jax.eval_shape(self.reset, self.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
@@ -434,6 +457,10 @@ class NavigationEnv:
             fade = jnp.exp(-self.control_interval / jnp.asarray(TRAIL, position.dtype))[:, None]
             trail = position[:, None, :2] + fade * (inner.trail - position[:, None, :2])
             inner = dataclasses.replace(inner, trail=trail)
+        if inner.visited is not None:
+            far = rewards.length(position[:, :2] - inner.visited[:, 0]) > VISITED_APART
+            more = jnp.concatenate([position[:, None, :2], inner.visited[:, :-1]], axis=1)
+            inner = dataclasses.replace(inner, visited=jnp.where(far[:, None, None], more, inner.visited))
         if inner.left is not None and params.pool is not None:
             # the way from where a boulder's margin was entered counts until it is left, so that pressing into a ridge
             # towards its other side pays nothing
@@ -449,17 +476,8 @@ class NavigationEnv:
     def _ends(self, params: NavigationParams, inner: Inner, view: View, to_goal: Any) -> dict[str, Any]:
         """Which end each episode came to; exclusive, in the order of `ENDS` but divergence first."""
         c, field = self.config, params.system.terrain.field
-        rows, cols = field.heights.shape
         physics = inner.physics
-        west, south = field.x0, field.y0
         fine = jnp.isfinite(physics.qpos).all(-1) & jnp.isfinite(physics.qvel).all(-1)
-        x, y = view.position[:, 0], view.position[:, 1]
-        east, north = west + (cols - 1) * field.cell, south + (rows - 1) * field.cell
-        if params.side is not None:
-            # the world in which the episode began
-            corner = jnp.stack([west, south]) - 0.5 * field.cell
-            west, south = (corner + jnp.floor((inner.origin[:, :2] - corner) / params.side) * params.side).T
-            east, north = west + params.side, south + params.side
         if c.divergence == "reset":
             ground = params.ground
             if ground is None:
@@ -467,7 +485,8 @@ class NavigationEnv:
             diverged = ~(fine & plausible(physics.qpos, physics.qvel, ground))
         else:
             diverged = jnp.zeros_like(fine)
-        inside = (x > west + c.edge) & (x < east - c.edge) & (y > south + c.edge) & (y < north - c.edge)
+        here = view.position[:, :2]
+        inside = ((here > view.corners[:, 0]) & (here < view.corners[:, 1])).all(-1)
         reached = rewards.reached(to_goal, c.goal_radius)
         if c.arrive_within < np.pi and view.arrival is not None:
             reached = reached & (jnp.cos(view.arrival - view.yaw) > np.cos(c.arrive_within))
@@ -480,6 +499,8 @@ class NavigationEnv:
         }
         if c.collisions == "end" and inner.tally is not None:
             found["collided"] = inner.tally.struck > 0.0
+        if self._battery:
+            found["drained"] = physics.effects["battery"]["flat"] > 0.5
         taken = jnp.zeros_like(fine)
         for name, happened in found.items():
             found[name] = happened & ~taken
@@ -520,7 +541,34 @@ class NavigationEnv:
             tally=tally.start(count, position.dtype) if c.tally else None,
             left=params.pool.places.shortest[pick] if "way" in c.weights and params.pool is not None else None,
             trail=jnp.repeat(position[:, None, :2], len(TRAIL), axis=1) if "trail" in c.observations else None,
+            visited=jnp.full((count, VISITED_KEPT, 2), NOWHERE, position.dtype)
+            if "visited" in c.observations
+            else None,
         )
+
+    def _corners(self, params: NavigationParams, inner: Inner) -> Any:
+        """South-western and north-eastern corner of the ground that each rover must not leave, (env, 2, 2) m."""
+        field = params.system.terrain.field
+        rows, cols = field.heights.shape
+        low = jnp.stack([field.x0, field.y0])
+        high = low + jnp.asarray([cols - 1, rows - 1]) * field.cell
+        start = inner.origin[:, :2]
+        if params.side is None:
+            low, high = (jnp.broadcast_to(corner, start.shape) for corner in (low, high))
+        else:
+            # the world in which the episode began
+            corner = low - 0.5 * field.cell
+            low = corner + jnp.floor((start - corner) / params.side) * params.side
+            high = low + params.side
+        return jnp.stack([low + self.config.edge, high - self.config.edge], axis=1)
+
+    def _charge(self, params: NavigationParams, inner: Inner) -> Any:
+        """Charge of the battery above its cut-off, 0 to 1, (env,); None without one."""
+        if not self._battery:
+            return None
+        system, _ = randomise.apply(params.system, inner.drawn)
+        p = SimpleNamespace(**system.effects["battery"])
+        return charge_of(p, inner.physics.effects["battery"]["used"]) - p.cut_off
 
     def _view(self, params: NavigationParams, inner: Inner) -> View:
         return read(
@@ -534,6 +582,9 @@ class NavigationEnv:
             last_action=inner.last_action,
             waited=inner.waited,
             arrival=None if params.arrivals is None else params.arrivals[inner.place],
+            charge=self._charge(params, inner),
+            visited=inner.visited,
+            corners=self._corners(params, inner),
             trail=inner.trail,
         )
 
@@ -547,7 +598,7 @@ class NavigationEnv:
         if any(name.startswith(CAMERA) for name in names):
             light = Light(sun=c.sun)
             seen = pictures(terrain, self.model.rover, view.qpos, c.camera, light=light, far=c.camera_far)
-        return Scene(terrain, inner.drawn, self._ride, self._scale, seen, c.camera_far)
+        return Scene(terrain, inner.drawn, self._ride, self._scale, params.system.sun, seen, c.camera_far)
 
     def _info(self, view: View) -> dict[str, Any]:
         return {
@@ -618,6 +669,10 @@ def make_navigation(
         model = make_model(rover, terrain or "lunar_plain", preset or default_preset(task))
     elif terrain is not None:
         model = model.replace(terrain=terrain)
+    if config.rung and get_rung(config.rung).battery and "battery" not in model.effect_names:
+        for name in SUPPLY:
+            model = model if name in model.effect_names else model.add(name)
+        model = model.replace(sun=model.sun or LOW_SUN)
     if isinstance(task, str) and "episode_time" not in settings:
         # a task's time is for its top speed, which the bus voltage may not allow
         slower = max(1.0, config.top_speed / reachable_speed(model))

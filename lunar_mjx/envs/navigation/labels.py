@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from lunar_mjx.envs.navigation.env import NavigationEnv
-from lunar_mjx.envs.navigation.view import FAR_SCAN, SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE, TRAIL
+from lunar_mjx.envs.navigation.view import FAR_SCAN, SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE, TRAIL, VISITED_GRID
 
 
 class Label(NamedTuple):
@@ -67,6 +67,16 @@ LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
     "last_action": lambda env: [Label(name, "1") for name in env.actions.names],
     "waited": lambda env: [Label("time", "10 s")],
     "arrival": lambda env: [Label("cosine", "1"), Label("sine", "1")],
+    "border": lambda env: [Label(side, "10 m") for side in ("ahead", "to the left", "behind", "to the right")],
+    "visited": lambda env: [
+        Label(f"{a:g} m ahead, {b:g} m to the left", "1") for a in VISITED_GRID for b in VISITED_GRID
+    ],
+    "power": lambda env: [
+        Label("charge above the cut-off", "%"),
+        Label("sunlight", "1361 W/m2"),
+        Label("cosine of the Sun's bearing", "1"),
+        Label("sine of the Sun's bearing", "1"),
+    ],
     "height_scan": _scan,
     "far_scan": lambda env: _scan(env, FAR_SCAN),
     "trail": lambda env: [Label(f"{axis}, {time:g} s", "m") for axis in ("ahead", "to the left") for time in TRAIL],

@@ -8,10 +8,21 @@ from typing import Any
 import jax.numpy as jnp
 
 from lunar_mjx.cameras.batch import Pictures
-from lunar_mjx.envs.navigation.view import FAR_SCAN, SCAN_AHEAD, SCAN_ASIDE, View, goal_in_body, height_scan
+from lunar_mjx.envs.navigation.view import (
+    FAR_SCAN,
+    SCAN_AHEAD,
+    SCAN_ASIDE,
+    VISITED_APART,
+    VISITED_GRID,
+    View,
+    goal_in_body,
+    height_scan,
+)
 from lunar_mjx.errors import bad_input
 from lunar_mjx.pytree import pytree, static
 from lunar_mjx.terrain import Terrain
+from lunar_mjx.terrain.sky import Sun
+from lunar_mjx.terrain.sky.sun import SOLAR_CONSTANT
 
 PAPER_OBSERVATION = ("position", "euler", "velocity", "angular_velocity", "acceleration", "goal")
 """The 17 numbers of section V: p, Euler angles, v, omega, filtered a (three each) and the goal (two)."""
@@ -25,6 +36,7 @@ class Scene:
       terrain: the ground.
       drawn: parameters drawn for the episode, by name.
       ride: standing height of the chassis frame, m. scan_scale: of the height scan's pattern.
+      sun: over the terrain; None where there is none.
       seen: what the front cameras see, where a block asks for it. far: depth that counts as 1, m.
     """
 
@@ -32,6 +44,7 @@ class Scene:
     drawn: dict[str, Any]
     ride: float = static(default=0.0)
     scan_scale: float = static(default=1.0)
+    sun: Sun | None = None
     seen: Pictures | None = None
     far: float = static(default=60.0)
 
@@ -132,6 +145,42 @@ def trail(v: View, s: Scene) -> Any:
     return jnp.concatenate(ahead, axis=-1)
 
 
+def border(v: View, s: Scene) -> Any:
+    """Distance to the border of the ground that the rover may drive on, ahead, to the left, behind and to the right,
+    in units of 10 m and at most one: a fence that the operators have drawn."""
+    low, high = v.corners[:, 0] - v.position[:, :2], v.corners[:, 1] - v.position[:, :2]
+    rays = v.yaw[:, None] + 0.5 * jnp.pi * jnp.arange(4)
+    way = []
+    for k, along in enumerate((jnp.cos(rays), jnp.sin(rays))):
+        gap = jnp.where(along > 0.0, high[:, k, None], -low[:, k, None])
+        way.append(gap / jnp.maximum(jnp.abs(along), 1e-6))
+    return jnp.clip(jnp.minimum(*way) / 10.0, 0.0, 1.0)
+
+
+def visited(v: View, s: Scene) -> Any:
+    """How often the rover has been near the places of a grid around it: a sum of bells two metres wide over the places
+    that it remembers. Dead reckoning tells it; it shows which ways have been tried."""
+    assert v.visited is not None, "the environment remembers the places that this block asks for"
+    away = v.visited - v.position[:, None, :2]
+    cos, sin = jnp.cos(v.yaw)[:, None], jnp.sin(v.yaw)[:, None]
+    ahead, aside = cos * away[..., 0] + sin * away[..., 1], cos * away[..., 1] - sin * away[..., 0]
+    grid = jnp.asarray(VISITED_GRID)
+    # the bell of a place is the product of one along and one across
+    fore, side = (jnp.exp(-0.5 * ((a[..., None] - grid) / VISITED_APART) ** 2) for a in (ahead, aside))
+    return jnp.einsum("epi,epj->eij", fore, side).reshape(v.yaw.shape[0], -1)
+
+
+def power(v: View, s: Scene) -> Any:
+    """The battery's charge above its cut-off, %; sunlight as a share of that in free space, which falls in shadow; and
+    cosine and sine of the Sun's bearing from the heading, as a Sun sensor or the panels' currents tell them. For models
+    with `battery` and a Sun at rest."""
+    assert v.charge is not None and s.sun is not None, "the environment refuses this block without battery and Sun"
+    light = s.sun.light(0.0, v.position[:, 0], v.position[:, 1])
+    bearing = jnp.arctan2(light.direction.y, light.direction.x) - v.yaw
+    parts = 100.0 * v.charge, light.irradiance / SOLAR_CONSTANT, jnp.cos(bearing), jnp.sin(bearing)
+    return jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
+
+
 def camera_rgb(v: View, s: Scene) -> Any:
     """Front camera's picture, 0 to 1: rows from the top, pixels from the left, red, green, blue."""
     return _flat(_seen(s).rgb)
@@ -201,6 +250,9 @@ BLOCKS: dict[str, Block] = {
         arrival,
         far_scan,
         trail,
+        border,
+        visited,
+        power,
         drawn,
     )
 } | {"height_scan": scan, "camera/rgb": camera_rgb, "camera/depth": camera_depth, "camera/labels": camera_labels}

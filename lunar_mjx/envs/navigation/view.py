@@ -22,6 +22,12 @@ SCAN_REACH = 0.2
 maps do. Without it the smallest rocks, 0.25 m wide, slip between the places and end up under the chassis."""
 TRAIL = (4.0, 15.0, 60.0)
 """Time constants of the means of past positions, s: a few metres, a yard, and the way into it."""
+VISITED_APART, VISITED_KEPT = 2.0, 32
+"""m between the places that a rover remembers to have been at, and how many it remembers."""
+VISITED_GRID = (-8.0, -4.0, 0.0, 4.0, 8.0)
+"""m along and across the heading at which the memory is looked up."""
+NOWHERE = 1e4
+"""m; coordinates of places not yet visited."""
 SCAN_SCALE = {"viper": 1.6}
 """Larger rovers look farther."""
 
@@ -45,6 +51,10 @@ class View:
       waited: time since the rover left the place that it is said to be stuck at, s.
       qpos: coordinates of the rover's MJCF.
       arrival: heading to arrive in, rad; None where any will do.
+      corners: south-western and north-eastern corner of the world that the rover must not leave, (env, 2, 2) m.
+      visited: places where it has been, newest first, (env, place, 2) m, far away where there is none yet; None unless
+        they are observed.
+      charge: of the battery above that at which it cuts the motors off, 0 to 1; None without one.
       trail: where the rover was, averaged over the `TRAIL` times, m; None unless it is observed.
     """
 
@@ -70,6 +80,9 @@ class View:
     waited: Float[Array, "env"]
     qpos: Float[Array, "env nq"]
     arrival: Any = None
+    corners: Any = None
+    visited: Any = None
+    charge: Any = None
     trail: Any = None
 
 
