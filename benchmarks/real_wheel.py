@@ -100,29 +100,36 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
 
 
 def draw(rows: list[dict[str, Any]]) -> None:
-    """The error from step to step."""
+    """The error from step to step, downwards; last with what the fitted angles taught of the model's own error."""
+    import textwrap
+
     import matplotlib
 
     matplotlib.use("svg")
     import matplotlib.pyplot as plt
 
-    from lunar_mjx.report.style import MUTED, figure_style
+    from lunar_mjx.report.style import LINES, MUTED, styled
 
-    matplotlib.rcParams.update(figure_style())
-
-    fig, ax = plt.subplots(figsize=(9.0, 4.2), layout="constrained")
-    for part, mark in (("fitted", "o"), ("inside", "s"), ("extrapolated", "^")):
-        angles = ", ".join(str(a) for a in PARTS[part])
-        ax.plot([r[part] for r in rows], mark + "-", label=f"{part}: {angles} deg", linewidth=1.2, markersize=5)
-    for level, label in ((2.5, "target inside"), (5.0, "target extrapolated"), (1.0, "replicates")):
-        ax.axhline(level, color=MUTED, linewidth=0.8, linestyle=":")
-        ax.annotate(label, (0, level), fontsize=7, color=MUTED, va="bottom")
-    ax.set_yscale("log")
-    ax.set_yticks([1, 2, 5, 10, 20, 40], ["1", "2", "5", "10", "20", "40"])
-    ax.set_ylabel("error, sigma of single runs")
-    ax.set_xticks(range(len(rows)), [r["model"] for r in rows], rotation=35, ha="right", fontsize=8)
-    ax.legend()
-    fig.savefig(FIGURE, metadata={"Date": None})
+    steps = [*rows, {"model": "the same, with the discrepancy as learnt", **rows[-1].get("corrected", rows[-1])}]
+    with styled():
+        fig, ax = plt.subplots(figsize=(8.0, 1.4 + 0.55 * len(steps)), layout="constrained")
+        parts = (("fitted", "o"), ("inside", "s"), ("extrapolated", "^"))
+        for (part, mark), (colour, line) in zip(parts, LINES, strict=False):
+            angles = ", ".join(str(a) for a in PARTS[part])
+            errors = [s[part] for s in steps]
+            ax.plot(errors, range(len(steps)), mark, color=colour, linestyle=line, label=f"{part}: {angles} deg")
+        for level, label in ((2.5, "target inside"), (5.0, "target extrapolated"), (1.0, "replicates")):
+            ax.axvline(level, color=MUTED, linewidth=0.8, linestyle=":")
+            ax.annotate(label, (level, -0.6), fontsize=7, color=MUTED, ha="center", va="bottom")
+        ax.set_xscale("log")
+        ax.set_xticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
+        ax.minorticks_off()
+        ax.set_xlabel("error, sigma of single runs")
+        ax.set_yticks(range(len(steps)), [textwrap.fill(s["model"], 42) for s in steps])
+        ax.set_ylim(len(steps) - 0.6, -0.6)
+        fig.legend(loc="outside upper right", ncols=3)
+        fig.savefig(FIGURE, metadata={"Date": None})
+        plt.close(fig)
 
 
 def main() -> None:

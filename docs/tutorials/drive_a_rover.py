@@ -2,7 +2,8 @@
 # # Drive a rover
 #
 # A model is a rover, a terrain and a list of physical effects. `make_model` takes the corrected physics, preset
-# `consistent`, unless told otherwise.
+# `consistent`, unless told otherwise. (Commands such as `lunar-mjx simulate` take `field`, with
+# all that a drive outdoors needs.)
 
 # %%
 from lunar_mjx.model import make_model
