@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Learn from what the cameras see
 #
-# Every rover of a batch can carry a camera: colour, depth and labels come from the same pure JAX functions as the
-# physics, without OpenGL, with the ground, rocks, shadows and rovers that the physics knows. This tutorial looks
+# Every rover of a batch can carry a camera. Colour, depth and labels come from pure JAX functions as the physics does,
+# without OpenGL. They show the ground, rocks, shadows and rovers that the physics knows. This tutorial looks
 # through four front cameras, gives a task the depth image as its observation, and trains on it. The numbers are tiny,
 # so that two CPU cores manage; on a GPU the same lines see thousands of rovers at once.
 
