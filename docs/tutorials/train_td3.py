@@ -2,7 +2,7 @@
 # # Train TD3 on a GPU
 #
 # Training is one command. On a GPU it drives thousands of rovers at once. Here the same code first learns a task so
-# small that two CPU cores need seconds, so that every step can be seen. Then comes a rover, and on a GPU the large task.
+# small that two CPU cores need seconds, so that every step can be seen. Then comes a rover, on a GPU the large task.
 #
 # The small task is a point without physics that has to reach a goal in the plane. It has the interface of the rovers:
 # pure functions `reset` and `step` on a whole batch.
