@@ -4,8 +4,8 @@
 # A model that does not fit its measurements is wrong somewhere, and refitting its parameters hides where. This
 # tutorial takes a log whose secret is known, lets the tool find it, and looks at the secret only at the end.
 #
-# The log is a table from a single-wheel test bed: a small wheel is driven through soil at slip ratios from -0.2 to
-# 0.6, four slip angles and three loads, and one row per run says what the force sensors and the sinkage gauge read.
+# The log is a table from a single-wheel test bed. A small wheel is driven through soil at slip ratios from -0.2 to
+# 0.6, four slip angles and three loads. One row per run says what the force sensors and the sinkage gauge read.
 # Your own table would begin with `lunar-mjx log new runs/bed --steady`. A log of a whole rover takes the same steps;
 # `lunar-mjx log simulate` makes one with any effect hidden in it.
 
@@ -83,18 +83,15 @@ print(diagnosis.sentence)
 assert diagnosis.verdict.label == "KNOWN"
 
 # %% [markdown]
-# `KNOWN` means: one effect of the catalogue explains the misfit, better than every other one listed, and it does so
-# on the slip angles that were held out. The evidence, effect by effect:
-#
-# - *separable*: how many standard deviations of its signal are left once everything that a refit could imitate is
-#   taken away. Below 5 an effect is not tested: these measurements cannot see it.
-# - *p*: how often noise alone would let the best of all effects look this good.
-# - *gain*: by how much it improves what was held out, with its standard error.
+# `KNOWN` means: this effect is missing, with a probability of at least 95 %. What is weighed against each other are
+# *hypotheses*: nothing, one effect, several, or something that is not in the catalogue. To each of them belong the
+# usual errors of model, instruments and noise, so that a name must explain more than these ever could.
 
 # %%
-columns = ["effect", "status", "separable", "p", "gain", "+-"]
-rows = [(e.effect, e.status, e.separable_sigma, e.p, e.held_out_gain, e.held_out_se) for e in diagnosis.evidence]
-print(pd.DataFrame(rows[:6], columns=columns).round(3).to_string(index=False))
+hypotheses = pd.Series(diagnosis.probabilities).sort_values(ascending=False)
+print(hypotheses.head(4).round(3).to_string())
+print("\neach effect, whatever else is missing:")
+print(pd.Series(diagnosis.inclusion).sort_values(ascending=False).head(4).round(3).to_string())
 
 # %% [markdown]
 # Add it and refit: `lunar-mjx add run1 slip_sinkage -o run2`.
@@ -143,8 +140,8 @@ for name, value in found.values.items():
 assert found.effect == secret[0]
 
 # %% [markdown]
-# `lunar-mjx report run1 run2 -o report.html` puts all of this on one page that needs no network: the error falling
-# step by step, where the model failed, every effect with its evidence, and which effects look alike.
+# `lunar-mjx report run1 run2 -o report.html` puts all of this on one page that needs no network. It shows the error
+# falling step by step, where the model failed, every effect with its evidence, and which effects look alike.
 #
 # It does not always end so well. The [guide](../criticism.md) says what the other verdicts mean, above all the honest
 # ones: several effects that these measurements cannot tell apart, none that suffices, or logs that are unfit. On a
