@@ -49,8 +49,8 @@ print("findings:", check(read_campaign([log])))
 
 # %% [markdown]
 # No findings: the log is fit to be used (`lunar-mjx log check bed`). Now hold the model against it, as `lunar-mjx
-# compare bed -o run1` does. Half of the slip angles are fitted; the others are *held out*: no parameter ever sees
-# them, they only judge.
+# compare bed -o run1` does. Three of the slip angles are fitted; the fourth is *held out*: no parameter ever sees
+# it, it only judges.
 
 # %%
 from lunar_mjx.criticism import compare
@@ -71,7 +71,7 @@ before = errors(run1)["refitted"]["held_out"]
 assert before > 1.5
 
 # %% [markdown]
-# Refitting the soil helps, and it is not enough: on slip angles that it has not seen the refitted model is still
+# Refitting the soil helps, and it is not enough: on a slip angle that it has not seen the refitted model is still
 # wrong by much more than one standard deviation. Something is missing. `lunar-mjx why run1` asks what.
 
 # %%
