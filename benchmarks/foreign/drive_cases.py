@@ -347,7 +347,7 @@ def draw(which: str, seed: int, number: int, group: str, hidden: tuple[str, ...]
     load_at = amounts.get("payload")
     build = Build(
         mass=_u(rng, 0.985, 1.015),
-        inertia=tuple(_u(rng, 0.85, 1.15) for _ in range(3)),  # type: ignore[arg-type]
+        inertia=_other_inertia(rng, rover.chassis_inertia),
         com=tuple(shift),  # type: ignore[arg-type]
         payload=load_at["mass"] if load_at else 0.0,
         payload_at=(load_at["x"], 0.0, load_at["z"]) if load_at else (0, 0, 0),
@@ -389,6 +389,17 @@ def draw(which: str, seed: int, number: int, group: str, hidden: tuple[str, ...]
         imu,
         seed,
     )
+
+
+def _other_inertia(rng: np.random.Generator, inertia: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Factors of the principal inertias of a chassis whose mass spreads by 15 % more or less along each axis.
+
+    Inertias drawn by themselves may belong to no body: each is at most the sum of the other two.
+    """
+    whole = 0.5 * sum(inertia)
+    spread = [(whole - i) * _u(rng, 0.85, 1.15) for i in inertia]
+    a, b, c = ((sum(spread) - s) / i for s, i in zip(spread, inertia, strict=True))
+    return a, b, c
 
 
 def _ground(rng: np.random.Generator, rover: Rover, slope: float) -> Ground:

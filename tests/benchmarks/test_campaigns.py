@@ -42,3 +42,14 @@ def test_nothing_is_begun_for_which_there_is_no_time(tmp_path: Path, monkeypatch
             monkeypatch.setattr(campaigns._Process, name, value)
         campaigns._ask(JOB)
     assert ends == [pytest.approx(485.0), pytest.approx(400.0, abs=5.0)]
+
+
+@pytest.mark.parametrize("rover", ["luvmi_x", "viper", "husky"])
+def test_a_chassis_as_built_is_a_body(rover: str) -> None:
+    """Each principal inertia is at most the sum of the other two, and within 15 % of the description's."""
+    nominal = np.array(drive_cases.ROVERS[rover].chassis_inertia)
+    for number in range(40):
+        case = drive_cases.draw("report", 7, number, "null", (), rover)
+        factors = np.array(case.setups[0].build.inertia)
+        assert np.all(np.abs(factors - 1.0) <= 0.15 + 1e-12)
+        assert np.all(2.0 * factors * nominal <= np.sum(factors * nominal) + 1e-12)

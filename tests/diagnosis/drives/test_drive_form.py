@@ -13,7 +13,7 @@ from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotated
 from lunar_mjx.diagnosis.verdict import Verdict
-from lunar_mjx.diagnosis.weighed.answer import _without
+from lunar_mjx.diagnosis.weighed.answer import _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.inference.deadline import Deadline, TimeUp
 from lunar_mjx.inference.weighing.search import search
@@ -176,6 +176,11 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     assert not found.complete
     assert found.refits == 1
     assert said.effects == ("drag",), "the linear estimate tells it, too"
+    refitted = [h.effects for h in found.hypotheses if h.refitted]
+    told, sentence = _unrefitted(said, said.sentence, refitted)
+    assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
+    assert sentence.startswith("To first order: drag is missing") and "No refit with drag" in sentence
+    assert _unrefitted(said, said.sentence, [*refitted, frozenset({"drag", "lag"})]) == (said, said.sentence)
 
 
 def test_without_time_for_the_model_as_it_is_nothing_is_said():
