@@ -131,7 +131,7 @@ class Discovery:
         for i, s in enumerate(self.suggestions, 1):
             lines.append(f"  {i}. " + "; and ".join(p.text() for p in s.parts))
             lines.append(
-                f"     chi2 -{s.chi2:.0f}, held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
+                f"     chi2 {-s.chi2:+.0f}, held-out gain {s.held_out_gain:.0f} +- {s.held_out_se:.0f}"
                 + (", at the noise" if s.at_noise else "")
             )
         if self.files:
