@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -10,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lunar_mjx.dynamics import build
 from lunar_mjx.effects.soil.ruts import SIDE, cell_numbers, tile_of
 from lunar_mjx.effects.soil.shared_ruts import SharedGround, exchange, shared_ground
 from lunar_mjx.errors import UserError
+from lunar_mjx.model import make_model
 from tests.effects.test_ruts import CELL, DT, _program, _start
 
 EVERY, PARTS = 25, 100
@@ -84,6 +87,40 @@ def test_two_that_dig_at_one_place_dig_one_hole() -> None:
     first = -ground.first[0] + round(1.5 / CELL)
     left, right = np.abs(moved[:, :first]).sum(), np.abs(moved[:, first:]).sum()
     assert 1.2 < left / right < 2.2
+
+
+@pytest.mark.slow
+def test_a_whole_rover_that_follows_meets_the_ruts_of_the_one_ahead() -> None:
+    """LUVMI-X under `field`, 1.2 m behind another: it sinks deeper and slips less than one in a world of its own."""
+    model = make_model("luvmi_x", "flat", "field").add("ruts")
+    system = build(model)
+    wheels = model.rover.wheels
+    state = jax.vmap(lambda x: system.reset(system.params, x))(jnp.array([1.2, 0.0, 0.0]))
+    cell = model.parameters["ruts"]["cell"] * float(np.mean([w.width for w in wheels]))
+    ground = shared_ground(state.effects["ruts"], jnp.array([0, 0, 1]), (-3.0, -3.0), (6.0, 3.0), cell)
+    drives = np.array([1.0 if g.name == "drive" else 0.0 for g in model.rover.groups for _ in g.joints])
+    told = jnp.broadcast_to(jnp.asarray(drives * 0.2 / wheels[0].radius, jnp.float32), (3, 5, len(drives)))
+
+    def part(carry: Any, _: Any) -> Any:
+        state, ground = carry
+        state, seen = system.rollout_batch(
+            system.params, state, told, 50, report=lambda t: (t.position.x, t.sinkage, t.slip)
+        )
+        ground, ruts = exchange(ground, state.effects["ruts"], state.qpos[:, 0], state.qpos[:, 1])
+        return (dataclasses.replace(state, effects={**state.effects, "ruts": ruts}), ground), seen
+
+    (_, ground), seen = jax.jit(lambda c: jax.lax.scan(part, c, length=12))((state, ground))
+    # (rover, tenth of a second, wheel), front wheels first
+    x, sinkage, slip = (np.moveaxis(np.asarray(a), 1, 0).reshape(3, 60, *a.shape[3:]) for a in seen)
+    follows, alone = 1, 2
+    sinkage, slip = sinkage[..., :2], slip[..., :2]
+    before = x[follows] < 0.2
+    np.testing.assert_allclose(sinkage[follows][before], sinkage[alone][before], atol=1e-5)
+    late = slice(50, 60)
+    assert 1.08 < sinkage[follows, late].mean() / sinkage[alone, late].mean() < 1.41
+    assert slip[follows, late].mean() < 0.8 * slip[alone, late].mean()
+    moved = np.asarray(ground.moved)
+    assert np.abs(moved.sum(axis=(1, 2))).max() < 1e-4 * np.abs(moved).sum()
 
 
 def test_every_slot_holds_the_cell_nearest_to_the_rover() -> None:
