@@ -85,8 +85,8 @@ class TableSettings(SearchSettings):
     """rad; slip angle beyond which the error of a wheel-frame slip grows no further."""
 
     # --- effort ------------------------------------------------------------------------------------------------------
-    most_refits: int = 30
-    """1; refits of a search: most tables need 3 to 9, a real wheel with seven effects some 25."""
+    most_refits: int = 50
+    """1; refits of a search: most tables need 3 to 10, a real wheel with seven effects some 45."""
     most_rounds: int = 10
     """1; rounds of refit and re-linearisation: most refits need 2 or 3."""
     settled: float = 0.3

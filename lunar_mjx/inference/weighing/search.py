@@ -2,7 +2,7 @@
 
 Best first: around each refit all neighbours (one term more, one less) are scored in linear approximation; the most
 probable set that has not been refitted is refitted next, until no other comes near the best. So every accepted effect
-is challenged by leaving it out again, and a greedy step that led into a trap is undone. Before something unlisted is
+is challenged by a refit without it, and a greedy step that led into a trap is undone. Before something unlisted is
 believed, every effect that could be seen is refitted from a place where it acts: where a signature saturates, the
 linear estimate at its null is much too low.
 """
@@ -195,6 +195,12 @@ def search(
             continue
         if others:
             refit(others[0], best.effects, None)
+            continue
+        # What leaving an effect out costs is told by a refit: where several do the work of one another, the linear
+        # estimate about the full set is much too high, and a set that grew around a wrong first step would stand.
+        unchallenged = [e for e in sorted(best.effects) if (best.form, best.effects - {e}) not in done]
+        if unchallenged:
+            refit(by_name[best.form], best.effects - {unchallenged[0]}, best)
             continue
         untried = _untried(known.values(), best, by_name[best.form], done, least_signal, unlisted_share)
         if not untried:
