@@ -36,9 +36,12 @@ def test_a_missed_limit_and_a_lacking_gate_are_told() -> None:
     row = {"proof": "parked", "rover": "viper", "value": 2e-3, "limit": 1e-3, "unit": "m", "passed": False}
     row["commit"] = "abc"
     assert "0.002 m (missed) | 0.001 m | abc |" in checked.acceptance({"about": about, "rows": [row]})
-    base = {"rover": "viper", "batch": 8, "steps_per_s": 2e6}
+    base = {"rover": "viper", "batch": 8, "steps_per_s": 2e6, "finite": True}
     rows = [
         {**base, "program": str(p), "parity": p, "parity_gap": None if p is None else 0.1} for p in (True, False, None)
     ]
     table = checked.programs({"about": about, "rows": rows})
     assert "| True | 2.0 |" in table and "not counted: gap 1.0e-01" in table and "no gate" in table
+    assert "not finite" not in table
+    lost = checked.programs({"about": about, "rows": [{**rows[2], "finite": False}]})
+    assert "2.0 (no gate) (not finite in the end)" in lost
