@@ -83,7 +83,7 @@ def diagnose(
         # with a limit the next refit may never come, and what is known by then is the answer
         if math.isfinite(seconds):
             best = next(h for h in found.hypotheses if h.refitted)
-            run.save(VERDICT_FILE, {**_diagnosis(problem, found, best, True).to_dict(), "provisional": True})
+            run.save(VERDICT_FILE, {**_diagnosis(problem, found, best).to_dict(), "provisional": True})
 
     for form in problem.forms:
         form.limit(end)
@@ -113,7 +113,7 @@ def diagnose(
     # the model's own form, whichever form won: "refitted" is told of what the user gave
     base = found.base(own.name).refit
     best = next(h for h in found.hypotheses if h.refitted)
-    diagnosis = _diagnosis(problem, found, best, math.isfinite(seconds))
+    diagnosis = _diagnosis(problem, found, best)
     start = own.residual(own.origin())
     after = problem.form(best.form)
     with threadpool_limits(1, "blas"):
@@ -267,8 +267,7 @@ def save_series(
         )
 
 
-def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis, limited: bool) -> Diagnosis:
-    """What a search says; `limited` tells whether it had only so much time."""
+def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagnosis:
     settings = problem.settings
     said = conclude(found, settings.sure, settings.largest_class)
     forms = found.forms()
@@ -289,7 +288,7 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis, limited: 
     skipped = problem.own.skipped
     if skipped:
         said, sentence = _without(said, sentence, skipped)
-    elif limited and not found.complete:
+    elif not found.complete:
         said, sentence = _unrefitted(said, sentence, [h.effects for h in found.hypotheses if h.refitted])
     gain, se, units = _held_out(found, best, own)
     inclusion = found.inclusion()
@@ -342,7 +341,7 @@ def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[C
 
 
 def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]]) -> tuple[Conclusion, str]:
-    """A conclusion and its sentence where the time did not suffice for a refit with all that it names.
+    """A conclusion and its sentence where time or refits did not suffice for a refit with all that it names.
 
     A first-order estimate about a model that misfits by many sigma is no name: on seven foreign campaigns of drives
     whose searches ended so, six such names were wrong, each with more than 99 %.
@@ -351,8 +350,8 @@ def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[st
     if said.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE) or any(named <= effects for effects in refitted):
         return said, sentence
     sentence = (
-        f"To first order: {sentence} No refit with {' and '.join(sorted(named))} was made in the time given, so "
-        "nothing is named; give more --seconds."
+        f"To first order: {sentence} No refit with {' and '.join(sorted(named))} was made, so nothing is named; give "
+        "more --seconds, or name the candidates with --only."
     )
     return dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=()), sentence
 
