@@ -178,12 +178,7 @@ def drives(args: argparse.Namespace) -> None:
             parts = [(j, k, of) for k in range(of) for j in first.values()]
             _report(processes.answers(_compile, parts, until), begun)
             print(f"{time.monotonic() - begun:5.0f} s  compiled", flush=True)
-        for job, answer in processes.answers(_ask, todo, until):
-            if isinstance(answer, BaseException):  # one campaign that cannot be made ends no sweep
-                print(f"{_name(job)} failed: {type(answer).__name__}: {answer}", flush=True)
-                continue
-            if answer is None:
-                continue
+        for answer in pool.told(processes.answers(_ask, todo, until), _name):
             row = answer[0] | {"commit": head, "uncommitted_changes": dirty}
             rows.append(row)
             for name, line in ((ROWS, row), (VERDICTS, answer[1])):

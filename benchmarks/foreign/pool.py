@@ -95,3 +95,12 @@ class Pool:
                 waiting.clear()
                 self.end()
                 self._start()
+
+
+def told(answers: Iterable[tuple[Any, Any]], name: Callable[[Any], str]) -> Iterator[Any]:
+    """Answers that are not None; a job that failed is printed by its name and ends no other."""
+    for job, answer in answers:
+        if isinstance(answer, BaseException):
+            print(f"{name(job)} failed: {type(answer).__name__}: {answer}", flush=True)
+        elif answer is not None:
+            yield answer

@@ -135,12 +135,7 @@ def sweep(args: argparse.Namespace) -> None:
         if not args.cold:
             for law, error in processes.answers(compile_law, (settings.get("laws") or LAWS).split(","), until):
                 print(f"{law}: {error or f'compiled after {time.monotonic() - begun:.0f} s'}", flush=True)
-        for job, answer in processes.answers(_ask, todo, until):
-            if isinstance(answer, BaseException):  # one case that cannot be made ends no sweep
-                print(f"{_name(job)} failed: {type(answer).__name__}: {answer}", flush=True)
-                continue
-            if answer is None:
-                continue
+        for answer in pool.told(processes.answers(_ask, todo, until), _name):
             row = answer | {"commit": head, "uncommitted_changes": dirty}
             rows.append(row)
             with path.open("a", encoding="utf-8") as file:

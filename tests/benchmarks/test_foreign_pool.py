@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from concurrent.futures.process import BrokenProcessPool
 
@@ -21,7 +22,7 @@ def answer(job: str) -> str:
     if job == "dies":
         os._exit(1)
     if job == "waits":
-        time.sleep(60.0)
+        threading.Event().wait()
     return job.upper()
 
 
@@ -29,7 +30,7 @@ def test_a_case_that_raises_or_kills_its_process_ends_nothing_else():
     processes = pool.Pool(1, nothing)
     try:
         jobs = ["a", "raises", "dies", "b", "c", "d"]
-        found = dict(processes.answers(answer, iter(jobs), time.monotonic() + 60.0))
+        found = dict(processes.answers(answer, iter(jobs), time.monotonic() + 1e6))
     finally:
         processes.end()
     assert set(found) == set(jobs)
@@ -39,19 +40,20 @@ def test_a_case_that_raises_or_kills_its_process_ends_nothing_else():
 
 def test_answers_end_when_the_time_is_up():
     processes = pool.Pool(1, nothing)
-    begun = time.monotonic()
     try:
-        assert list(processes.answers(answer, ["waits"], begun + 2.0)) == []
+        assert list(processes.answers(answer, ["waits"], time.monotonic() + 0.5)) == []
+        begun = list(processes._pool._processes.values())
     finally:
         processes.end()
-    assert time.monotonic() - begun < 30.0
+    for process in begun:
+        process.join()  # would wait for ever for one that still answers
 
 
 def test_a_limit_is_no_error_that_a_case_can_catch():
     with pytest.raises(pool.TooLong), pool.limit(0.05):
         try:
-            time.sleep(5.0)
+            threading.Event().wait()
         except Exception:
             pytest.fail("caught")
-    with pool.limit(0.5):
+    with pool.limit(3600.0):
         pass

@@ -46,6 +46,15 @@ def test_two_effects_are_both_named():
     assert said.verdict in (Verdict.KNOWN, Verdict.MULTIPLE)  # the square has a twin
 
 
+def test_every_accepted_effect_is_challenged_by_a_refit_without_it():
+    found = look(measured(2, wave=0.8, square=0.6))
+    listed = [h for h in found.hypotheses if h.refitted and h.effects == h.names]
+    best = listed[0]
+    assert len(best.effects) == 2
+    refitted = {h.effects for h in listed}
+    assert {best.effects - {e} for e in best.effects} <= refitted
+
+
 def test_something_unlisted_is_unknown_at_its_port():
     value = measured(3) + 0.5 * np.where(X > 0.2, X - 0.2, 0.0) * np.cos(6.0 * X)
     found = look(value)
