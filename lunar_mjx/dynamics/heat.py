@@ -32,6 +32,7 @@ def step_heat(
         return Heat(zero, zero, one, one), effects, temperature
     heat, effects = heat_flow(pipeline, ctx, effects)
     if integrator == "heun":
+        # Heun's trial step: the slope at its end is averaged with the one at the beginning.
         ahead = dataclasses.replace(
             ctx,
             winding_temperature=ctx.winding_temperature + ctx.dt * heat.winding / heat.winding_capacity,

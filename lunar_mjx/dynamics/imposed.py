@@ -19,7 +19,6 @@ import numpy as np
 
 from lunar_mjx.dynamics.batching.batch_last import batch_last
 from lunar_mjx.dynamics.indexing import select
-from lunar_mjx.dynamics.spatial_algebra import Vector, mul
 from lunar_mjx.dynamics.state import Params, State, Temperature
 from lunar_mjx.dynamics.structured.engine import Pieces, StructuredEngine
 from lunar_mjx.dynamics.structured.legs import cast_group, joint_turns
@@ -30,6 +29,7 @@ from lunar_mjx.effects.ports import apply_effects
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model
 from lunar_mjx.pytree import pytree
+from lunar_mjx.spatial import Vec3, mul
 from lunar_mjx.terrain.terrain import flat
 
 SETTLE_S = 0.5
@@ -90,6 +90,7 @@ def on_a_plane(model: Model) -> Model:
             model = model.remove(name)
     if "shear_state" in model.effect_names:
         model = model.set("shear_state", "imposed motion", damping_time=DAMPING_TIME_S)
+    # Eight metres are more than a window of some seconds drives; the plane has no edge that matters.
     return model.replace(terrain=flat(8.0))
 
 
@@ -128,9 +129,11 @@ class KinematicDrive:
           UserError: the rover has other joints, which imposed wheel speeds do not move.
         """
         require_drives_alone(model)
+        # The small number keeps an exact multiple from rounding up to one step more.
         self.steps = max(1, int(np.ceil(bin_s / longest_step_s - 1e-9)))
         self.bin_s = bin_s
         self.model = on_a_plane(model).replace(timestep=bin_s / self.steps)
+        # MJX cannot take joint accelerations as given without a constraint for each.
         self.system = System(self.model, "structured")
         engine = self.system.engine
         assert isinstance(engine, StructuredEngine)
@@ -147,9 +150,12 @@ class KinematicDrive:
         Returns:
           Means over the bins, as arrays.
         """
+        # The terrain is one plane for all windows: left out here, it is not copied for every one of them, and `_step`
+        # puts it back.
         return jax.tree.map(np.asarray, self._run(dataclasses.replace(params, terrain=None), windows))
 
     def _run_batch(self, params: Params, windows: Windows) -> Seen:
+        # The batch goes last, so that neighbouring windows lie side by side in memory (see `batch_last`).
         first = jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), params)
         last = jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), windows)  # (edge, joint, batch) and (edge, batch)
         begin = (last.speed[0], last.up_x[0], last.up_y[0], last.up_z[0], last.yaw_rate)
@@ -162,6 +168,8 @@ class KinematicDrive:
 
             def inside(k: Any, carry: Any) -> Any:
                 state, total = carry
+                # Speeds are linear between the edges of a bin, and imposed at the end of each step, where the semi-
+                # implicit step applies them.
                 share = (k + 1.0) / self.steps
                 speed, up = (
                     jax.tree.map(lambda a, b: a + share * (b - a), o, n) for o, n in zip(old, new, strict=True)
@@ -174,7 +182,7 @@ class KinematicDrive:
             state, total = jax.lax.fori_loop(0, self.steps, inside, (state, zeros))
             return state, jax.tree.map(lambda a: a / self.steps, total)
 
-        edges = last.speed, Vector(last.up_x, last.up_y, last.up_z)
+        edges = last.speed, Vec3(last.up_x, last.up_y, last.up_z)
         # a window is cut out of a drive: what its contacts remember at the start is made by holding its first speeds
         held = jax.tree.map(lambda a: jnp.broadcast_to(a[0], (round(SETTLE_S / self.bin_s) + 1, *a.shape[1:])), edges)
         state, _ = jax.lax.scan(bin_of, state, (held, held))
@@ -197,6 +205,8 @@ class KinematicDrive:
             assert drives is not None
             own = mul(n.links[0].numbers.sign, select(speed, drives))
             joints.append(joint_turns(n, [jnp.zeros_like(own)]))
+            # Wheels begin at their measured speed, the body at their mean rolling speed: what is wrong with that has
+            # settled by the time the window begins.
             speeds.append((own,))
         wheel = jnp.zeros_like(speed)
         shapes = {"joint": wheel, "wheel": wheel, "rover": zero}
@@ -208,7 +218,7 @@ class KinematicDrive:
         place = (zero, zero, height, zero + 1.0, zero, zero, zero)
         return Pieces(place, tuple(joints)), Pieces((forward, zero, zero, zero, zero, yaw_rate), tuple(speeds)), effects
 
-    def _step(self, params: Params, q: Pieces, v: Pieces, effects: Any, speed: Any, up: Vector) -> Any:
+    def _step(self, params: Params, q: Pieces, v: Pieces, effects: Any, speed: Any, up: Vec3) -> Any:
         """One time step of one rover towards the joint speeds `speed`: ((positions, velocities, states), seen)."""
         system = self.system
         params = dataclasses.replace(params, terrain=system.params.terrain)
@@ -220,6 +230,7 @@ class KinematicDrive:
         state = State(jnp.zeros((), jnp.int32), pieces[0], pieces[1], temperature, effects)
         ctx = system._context(params, state, kinematics)
         forces, ctx, effects = apply_effects(system.pipeline, ctx, kinematics.joint_speed, effects)
+        # The acceleration that brings every wheel to its imposed speed in exactly this step.
         acceleration = (speed - kinematics.joint_speed) / ctx.dt
         q, v, torque, body = finish(forces, acceleration, up)
         beside = forces.joint_torque - ctx.torque  # of brakes and stops, which help the motor or load it
@@ -241,6 +252,7 @@ class KinematicDrive:
         for _ in range(SECANT_STEPS):
             off = made(current) - torque
             moved = current - off / per_ampere
+            # A secant instead of a derivative: friction has kinks, where a derivative tells nothing of the next ampere.
             slope = (made(moved) - torque - off) / jnp.where(moved == current, 1.0, moved - current)
             # where two trials say almost nothing of each other, the nominal constant is the safer slope
             current = current - off / jnp.where(jnp.abs(slope) > 0.05 * per_ampere, slope, per_ampere)

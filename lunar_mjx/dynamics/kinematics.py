@@ -57,5 +57,6 @@ def chassis_boxes(model: mujoco.MjModel, chassis: int) -> tuple[np.ndarray, np.n
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
         rotation = rotation.reshape(3, 3)
         centers.append(model.geom_pos[geom] + rotation @ model.geom_aabb[geom, :3])
+        # The box that holds a turned box: each half side is the sum of the projections.
         halves.append(np.abs(rotation) @ model.geom_aabb[geom, 3:])
     return np.reshape(centers, (-1, 3)), np.reshape(halves, (-1, 3))

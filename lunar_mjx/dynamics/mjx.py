@@ -58,6 +58,7 @@ class MjxEngine:
         dtype = qpos.dtype
         m = jax.tree.map(lambda a: _cast(a, dtype), self._mjx)
         d = jax.tree.map(lambda a: _cast(a, dtype), self._data)
+        # The time step is the model's, not the MJCF's: halving it needs no new file.
         m = m.replace(opt=m.opt.replace(timestep=jnp.asarray(dt, dtype)))
         m = _with_gravity(m, jnp.asarray(params.gravity, dtype))
         d = d.replace(qpos=qpos, qvel=qvel)
@@ -102,15 +103,19 @@ class MjxEngine:
 
     @jax.default_matmul_precision("highest")
     def _finish(self, params: Any, m: mjx.Model, d: mjx.Data, forces: Forces) -> tuple[Any, Any]:
+        # Armature enters the mass matrix, so that it must be set before `crb`.
         m = m.replace(dof_armature=self._armature(params, d.qpos.dtype))
         if forces.geometry.gravity is not None:
             m = _with_gravity(m, jnp.asarray(forces.geometry.gravity, d.qpos.dtype))
         d = self._carry_payload(m, d, forces)
+        # The order of MuJoCo's own mj_fwdPosition, minus collisions, which the effects replace.
         d = mjx.tendon(m, mjx.camlight(m, d))
         d = mjx.transmission(m, mjx.make_constraint(m, mjx.factor_m(m, mjx.crb(m, d))))
         d = mjx.fwd_velocity(m, d)
         d = self._apply(m, d, forces)
         d = mjx.fwd_acceleration(m, mjx.fwd_actuation(m, d))
+        # Without constraints the smooth acceleration is the answer; with them `mjx.solve` is passed by (see the
+        # module).
         d = d.replace(qacc=d.qacc_smooth) if m.neq == 0 else _hold_equalities(m, d, self._pins)
         d = mjx.euler(m, d)
         return d.qpos, d.qvel
@@ -126,6 +131,8 @@ class MjxEngine:
 
     def _carry_payload(self, m: mjx.Model, d: mjx.Data, forces: Forces) -> mjx.Data:
         """Adds a point mass to the chassis and shifts its centre of mass, in the inertia that crb and rne read."""
+        # The change is added to `cinert` and not to the model's masses, because these may differ from rover to rover
+        # while the model is shared.
         geometry, chassis = forces.geometry, self._chassis
         rotation = d.xmat[chassis]
         about = d.subtree_com[chassis]
@@ -147,6 +154,7 @@ class MjxEngine:
         wheels, chassis = self._wheels, self._chassis
 
         def row(body: Any, force: Any, moment: Any) -> Any:
+            # Effects give moments about the wheel's centre; xfrc_applied acts at the body's centre of mass.
             moment = moment + jnp.cross(d.xpos[body] - d.xipos[body], force)
             return jnp.concatenate([force, moment], axis=-1)
 
@@ -201,6 +209,7 @@ def _hold_equalities(m: mjx.Model, d: mjx.Data, pins: _Pins) -> mjx.Data:
     """What `mjx.solve` converges to for equality constraints alone: (J M^-1 J^T + R) f = a_ref - J' v - J a_smooth."""
     implementation: Any = d._impl
     jacobian = implementation.efc_J
+    # Each row is one solve with the factor of M that the step has made anyhow.
     moved = jax.vmap(lambda row: solve_m(m, d, row))(jacobian)  # M^-1 J^T, a row per constraint
     matrix = jacobian @ moved.T + jnp.diag(1.0 / implementation.efc_D)
     wanted = implementation.efc_aref.at[: pins.rows].add(-pins.bias(d))
@@ -211,6 +220,8 @@ def _hold_equalities(m: mjx.Model, d: mjx.Data, pins: _Pins) -> mjx.Data:
 
 def _solve_positive(a: Any, b: Any) -> Any:
     """Solves a x = b for a (n, n), symmetric and positive definite, by L D L^T with rows of L as vectors."""
+    # Unrolled: n is three numbers for each loop of the rover, and LAPACK calls inside a batched loop are what hung (see
+    # the module).
     n = len(b)
     low, pivots = [], []
     for j in range(n):
@@ -256,4 +267,5 @@ def _check_options(model: mujoco.MjModel, rover: Rover) -> None:
         problems.append('the integrator is not Euler (set integrator="Euler")')
     if problems:
         raise UserError(f"{rover.mjcf}: the solver must see equality constraints only, but {'; '.join(problems)}.")
+    # The dense form would fill a mass matrix whose legs do not touch each other.
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE

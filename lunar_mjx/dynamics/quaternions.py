@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from lunar_mjx.dynamics.spatial_algebra import Rotation, Vector
+from lunar_mjx.spatial import Frame, Vec3
 
 
 def normalized(q: list[Any]) -> list[Any]:
@@ -14,17 +14,17 @@ def normalized(q: list[Any]) -> list[Any]:
     return [c * scale for c in q]
 
 
-def rotation(q: list[Any]) -> Rotation:
+def rotation(q: list[Any]) -> Frame:
     """Body to world."""
     w, x, y, z = q
-    return Rotation(
-        Vector(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
-        Vector(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
-        Vector(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
+    return Frame(
+        Vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+        Vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
+        Vec3(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
 
 
-def integrate(q: list[Any], spin: Vector, dt: float) -> list[Any]:
+def integrate(q: list[Any], spin: Vec3, dt: float) -> list[Any]:
     """Turns `q` by the angular velocity `spin`, rad/s in body coordinates, over `dt`: q exp(spin dt/2).
 
     The exponential map, as MuJoCo's mju_quatIntegrate.

@@ -38,6 +38,7 @@ def reversible(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def backward(args: Any, given: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
+        # Step counters are whole numbers, of which JAX takes no derivative.
         real = [i for i, leaf in enumerate(leaves) if _is_real(leaf)]
 
         def pull(leaves: list[Any], given: list[Any]) -> Any:

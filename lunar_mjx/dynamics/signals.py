@@ -97,6 +97,7 @@ def observe(
     _vector(out, "position_{}_m", seen.position)
     _vector(out, "world_velocity_{}_m_s", seen.velocity)
     _vector(out, "body_velocity_{}_m_s", body.from_world(seen.velocity))
+    # Attitude is given in both forms: logs hold either, and a fit compares what its log holds.
     for i, name in enumerate(QUATERNION):
         out[name] = seen.quaternion[..., i]
     for name, part in zip(EULER, seen.euler, strict=True):
@@ -152,13 +153,14 @@ def _entries(out: dict[str, Any], values: dict[str, Any], names: Sequence[str]) 
 
 
 def _body_frame(quaternion: Float[AnyArray, "*batch time 4"]) -> Frame:
-    columns = rotation([quaternion[..., i] for i in range(4)])
-    return Frame(*(Vec3(c.x, c.y, c.z) for c in columns))
+    """Axes of the chassis in world coordinates."""
+    return rotation([quaternion[..., i] for i in range(4)])
 
 
 def _felt_gravity(effects: Sequence[Effect], params: Params) -> Any:
     """Gravity after the effects at the port `geometry` that change it, m/s2."""
     gravity = jnp.asarray(params.gravity)
+    # An accelerometer at rest shows the gravity that the rover feels, not the one that the model was told.
     if any(e.name == "gravity_error" for e in effects):
         gravity = gravity * (1.0 + params.effects["gravity_error"]["relative"])
     return gravity
@@ -204,11 +206,14 @@ def apply_sensors(effects: Sequence[Effect], params: Params, signals: Signals, c
     Returns:
       Measured channels at the same times.
     """
+    # By rising order, as at every port: a delay comes before the quantisation of what it delays.
     for effect in sorted(effects, key=lambda e: e.order):
         port = effect.ports.get("sensor")
         if port is None:
             continue
         own = SimpleNamespace(**params.effects[effect.name])
+        # Sensors see a whole drive at once, so that no state is carried from step to step: what they remember begins
+        # anew with every log.
         memory = SimpleNamespace(**{k: v.initial for k, v in effect.state.items()})
         result = port(ctx, own, memory, signals)
         signals = result[0] if isinstance(result, tuple) else result
@@ -256,6 +261,7 @@ def sample_signals(signals: Signals, channel: str, times: Float[AnyArray, "*batc
     if channel not in QUATERNION:
         value = interpolate(signals.time, unwrapped(channel, signals), times)
         return wrapped_degrees(value) if channel in EULER else value
+    # q and -q are one attitude; a straight line between samples of opposite sign would pass through zero.
     sign = quaternion_signs(signals)
     parts = {c: interpolate(signals.time, sign * signals.channels[c], times) for c in QUATERNION}
     return parts[channel] / jnp.sqrt(sum(p * p for p in parts.values()))

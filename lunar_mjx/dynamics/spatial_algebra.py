@@ -1,7 +1,6 @@
-"""Spatial vectors and inertias as named components, after Featherstone 2008 (Rigid Body Dynamics Algorithms).
+"""Spatial forces, motions and inertias as named components.
 
-Every component is a Python float or an array, so that XLA sees elementwise code only. Products with a Python 0 or 1
-vanish while the step is traced: the zeros of a rover's geometry (an axle along y, a diagonal inertia) cost nothing.
+After Featherstone 2008 (Rigid Body Dynamics Algorithms).
 """
 
 from __future__ import annotations
@@ -10,48 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-
-def add(a: Any, b: Any) -> Any:
-    """a + b, where a Python 0 vanishes."""
-    if isinstance(a, float) and a == 0.0:
-        return b
-    if isinstance(b, float) and b == 0.0:
-        return a
-    return a + b
-
-
-def neg(a: Any) -> Any:
-    return -a
-
-
-def sub(a: Any, b: Any) -> Any:
-    """a - b, where a Python 0 vanishes."""
-    if isinstance(b, float) and b == 0.0:
-        return a
-    if isinstance(a, float) and a == 0.0:
-        return neg(b)
-    return a - b
-
-
-def mul(a: Any, b: Any) -> Any:
-    """a b, where a Python 0, 1 or -1 leaves no product."""
-    for p, q in ((a, b), (b, a)):
-        if isinstance(p, float):
-            if p == 0.0:
-                return 0.0
-            if p == 1.0:
-                return q
-            if p == -1.0:
-                return neg(q)
-    return a * b
-
-
-def total(*terms: Any) -> Any:
-    """Sum of the terms."""
-    result: Any = 0.0
-    for term in terms:
-        result = add(result, term)
-    return result
+from lunar_mjx.spatial import Frame, Vec3, add, mul, neg, sub, total
 
 
 def uniform(values: Any, unit: float = 1.0) -> Any:
@@ -60,72 +18,6 @@ def uniform(values: Any, unit: float = 1.0) -> Any:
     v[np.abs(v) < 1e-14 * unit] = 0.0
     v[np.abs(np.abs(v) - 1.0) < 1e-14] = np.sign(v[np.abs(np.abs(v) - 1.0) < 1e-14])
     return float(v[0]) if np.all(np.abs(v - v[0]) <= 4e-16 * np.abs(v[0])) else v
-
-
-# Beside `lunar_mjx.spatial.Vec3`, because a component here may be a Python 0 that takes its products with it: a rover's
-# axles and inertias are mostly zeros. The effects' vectors are all arrays, and would pay a test for each sum.
-class Vector(NamedTuple):
-    """A vector in the coordinates of the chassis frame."""
-
-    x: Any
-    y: Any
-    z: Any
-
-    def __add__(self, other: Vector) -> Vector:  # type: ignore[override]
-        return Vector(add(self.x, other.x), add(self.y, other.y), add(self.z, other.z))
-
-    def __sub__(self, other: Vector) -> Vector:
-        return Vector(sub(self.x, other.x), sub(self.y, other.y), sub(self.z, other.z))
-
-    def __mul__(self, scale: Any) -> Vector:  # type: ignore[override]
-        return Vector(mul(self.x, scale), mul(self.y, scale), mul(self.z, scale))
-
-    def __neg__(self) -> Vector:
-        return Vector(neg(self.x), neg(self.y), neg(self.z))
-
-    def dot(self, other: Vector) -> Any:
-        return total(mul(self.x, other.x), mul(self.y, other.y), mul(self.z, other.z))
-
-    def cross(self, other: Vector) -> Vector:
-        return Vector(
-            sub(mul(self.y, other.z), mul(self.z, other.y)),
-            sub(mul(self.z, other.x), mul(self.x, other.z)),
-            sub(mul(self.x, other.y), mul(self.y, other.x)),
-        )
-
-
-ZERO = Vector(0.0, 0.0, 0.0)
-
-
-class Rotation(NamedTuple):
-    """A rotation as its three columns: the axes of the rotated frame."""
-
-    x: Vector
-    y: Vector
-    z: Vector
-
-    def apply(self, v: Vector) -> Vector:
-        """From the rotated frame's coordinates."""
-        return self.x * v.x + self.y * v.y + self.z * v.z
-
-    def undo(self, v: Vector) -> Vector:
-        """Into the rotated frame's coordinates."""
-        return Vector(self.x.dot(v), self.y.dot(v), self.z.dot(v))
-
-    def then(self, inner: Rotation) -> Rotation:
-        """The product of this rotation and `inner`."""
-        return Rotation(self.apply(inner.x), self.apply(inner.y), self.apply(inner.z))
-
-    def turn(self, axis: int, cos: Any, sin: Any) -> Rotation:
-        """The product of this rotation and a turn about its own coordinate axis `axis`."""
-        columns = list(self)
-        first, second = columns[(axis + 1) % 3], columns[(axis + 2) % 3]
-        columns[(axis + 1) % 3] = first * cos + second * sin
-        columns[(axis + 2) % 3] = second * cos - first * sin
-        return Rotation(*columns)
-
-
-IDENTITY = Rotation(Vector(1.0, 0.0, 0.0), Vector(0.0, 1.0, 0.0), Vector(0.0, 0.0, 1.0))
 
 
 class Symmetric(NamedTuple):
@@ -144,21 +36,17 @@ class Symmetric(NamedTuple):
     def __mul__(self, scale: Any) -> Symmetric:  # type: ignore[override]
         return Symmetric(*(mul(a, scale) for a in self))
 
-    def apply(self, v: Vector) -> Vector:
-        return Vector(
+    def apply(self, v: Vec3) -> Vec3:
+        return Vec3(
             total(mul(self.xx, v.x), mul(self.xy, v.y), mul(self.xz, v.z)),
             total(mul(self.xy, v.x), mul(self.yy, v.y), mul(self.yz, v.z)),
             total(mul(self.xz, v.x), mul(self.yz, v.y), mul(self.zz, v.z)),
         )
 
-    def rotated(self, r: Rotation) -> Symmetric:
+    def rotated(self, r: Frame) -> Symmetric:
         """R A R^T."""
-        columns = (
-            Vector(self.xx, self.xy, self.xz),
-            Vector(self.xy, self.yy, self.yz),
-            Vector(self.xz, self.yz, self.zz),
-        )
-        ra = Rotation(*(r.apply(c) for c in columns))
+        columns = (Vec3(self.xx, self.xy, self.xz), Vec3(self.xy, self.yy, self.yz), Vec3(self.xz, self.yz, self.zz))
+        ra = Frame(*(r.to_world(c) for c in columns))
 
         def entry(i: int, j: int) -> Any:
             return total(*(mul(ra[k][i], r[k][j]) for k in range(3)))
@@ -170,7 +58,7 @@ class Symmetric(NamedTuple):
         return cls(value, value, value, 0.0, 0.0, 0.0)
 
     @classmethod
-    def of_point(cls, mass: Any, c: Vector) -> Symmetric:
+    def of_point(cls, mass: Any, c: Vec3) -> Symmetric:
         """Moments of inertia about the origin of a point mass at `c`: m (|c|^2 1 - c c^T)."""
         mx, my, mz = c * mass
         xx, yy, zz = mul(mx, c.x), mul(my, c.y), mul(mz, c.z)
@@ -180,8 +68,8 @@ class Symmetric(NamedTuple):
 class Force(NamedTuple):
     """A spatial force: moment about the chassis frame's origin, and force."""
 
-    moment: Vector
-    force: Vector
+    moment: Vec3
+    force: Vec3
 
     def __add__(self, other: Force) -> Force:  # type: ignore[override]
         return Force(self.moment + other.moment, self.force + other.force)
@@ -193,8 +81,8 @@ class Force(NamedTuple):
 class Motion(NamedTuple):
     """A spatial motion: angular part, and linear part of the body-fixed point at the chassis frame's origin."""
 
-    angular: Vector
-    linear: Vector
+    angular: Vec3
+    linear: Vec3
 
     def __add__(self, other: Motion) -> Motion:  # type: ignore[override]
         return Motion(self.angular + other.angular, self.linear + other.linear)
@@ -221,7 +109,7 @@ class Inertia(NamedTuple):
     """A spatial inertia about the chassis frame's origin: mass, mass times centre of mass, moments of inertia."""
 
     mass: Any
-    h: Vector
+    h: Vec3
     moments: Symmetric
 
     def __add__(self, other: Inertia) -> Inertia:  # type: ignore[override]
@@ -241,13 +129,13 @@ class Body(NamedTuple):
     """
 
     mass: Any
-    com: Vector
+    com: Vec3
     spherical: Any
     rest: Symmetric
 
-    def at(self, origin: Vector, frame: Rotation) -> Inertia:
+    def at(self, origin: Vec3, frame: Frame) -> Inertia:
         """Its spatial inertia when the link's frame stands at `origin` turned by `frame`."""
-        c = origin + frame.apply(self.com)
+        c = origin + frame.to_world(self.com)
         moments = self.rest.rotated(frame) + Symmetric.isotropic(self.spherical)
         return Inertia(self.mass, c * self.mass, moments + Symmetric.of_point(self.mass, c))
 

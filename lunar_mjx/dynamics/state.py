@@ -38,6 +38,7 @@ class Temperature:
 
 def compensated_add(total: Any, lost: Any, increment: Any) -> tuple[Any, Any]:
     """Kahan's sum: returns the new total and the rounding that it lost."""
+    # Do not simplify: the parentheses are the algorithm, and XLA keeps the order of float operations.
     increment = increment - lost
     new = total + increment
     return new, (new - total) - increment

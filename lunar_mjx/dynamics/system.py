@@ -77,6 +77,8 @@ class System:
           The state.
         """
         dtype = jnp.result_type(float)
+        # A rover starts in MuJoCo's reference pose (joints at zero, loops closed); only the free joint's seven numbers
+        # are set here.
         qpos = jnp.asarray(self.engine.qpos0, dtype)
         position, quaternion = self._stand(
             params, jnp.asarray(x, dtype), jnp.asarray(y, dtype), jnp.asarray(yaw, dtype)
@@ -85,6 +87,7 @@ class System:
         joint = jnp.zeros(len(self.joint_names), dtype)
         ambient = params.ambient_temperature(jnp.zeros((), dtype))
         warm = ambient if winding_temperature is None else winding_temperature
+        # Temperatures are kept as offsets, whose small sums float32 does not lose (see `Temperature`).
         offset = joint + (jnp.asarray(warm, dtype) - REFERENCE_TEMPERATURE)
         wheel = jnp.zeros(len(self.model.rover.wheels), dtype)
         shapes = {"joint": joint, "wheel": wheel, "rover": jnp.zeros((), dtype)}
@@ -110,8 +113,13 @@ class System:
         wheel_x, wheel_y = x + cos * feet[:, 0] - sin * feet[:, 1], y + sin * feet[:, 0] + cos * feet[:, 1]
         height, _, _ = sample(params.terrain.field, wheel_x, wheel_y)
         design = np.column_stack([np.ones(len(feet)), feet[:, :2]])
+        # Least squares, since a rover of six wheels stands on more points than a plane has; the pseudo-inverse depends
+        # on the rover alone and is a constant of the program.
         fit = jnp.asarray(np.linalg.pinv(design), height.dtype) @ height
+        # Roll is the second rotation, so the cross slope counts along an axis that pitch has already tilted.
         pitch, roll = jnp.arctan(-fit[1]), jnp.arctan(fit[2] * jnp.cos(jnp.arctan(fit[1])))
+        # The wheel that the fitted plane cuts deepest sets the height: a wheel that began below the surface would be
+        # thrown up by its contact.
         above = jnp.max(height - jnp.asarray(design, height.dtype) @ fit)
         quaternion = _quaternion(roll, pitch, yaw)
         up = Vec3(*_rotate_z(quaternion))
@@ -131,6 +139,8 @@ class System:
         Returns:
           The state at the end of the step, and what the step saw at its beginning.
         """
+        # The engine hands back a closure, so that kinematics are computed once: effects read them, and the end of the
+        # step goes on with them.
         kinematics, finish = self.engine.forward(params, state.qpos, state.qvel, self.dt)
         ctx = self._context(params, state, kinematics)
         forces, ctx, effects = apply_effects(self.pipeline, ctx, jnp.asarray(control, state.qpos.dtype), state.effects)
@@ -161,6 +171,7 @@ class System:
                 new = jax.lax.fori_loop(0, every, lambda _, s: self.step(params, s, control)[0], state)
             return new, telemetry
 
+        # A scan and not a Python loop: one compiled step whatever the length of the drive.
         return jax.lax.scan(hold, state, controls)
 
     def step_batch(
@@ -258,6 +269,7 @@ def build(model: Model, engine: str = "auto") -> System:
 def rover_info(model: Model) -> RoverInfo:
     """The rover as drawn, with the control modes and gains of the model."""
     rover: Rover = model.rover
+    # The order of `RoverInfo.joint_group`, which effects compare with.
     names = ("drive", "steer", "suspension")
     groups = [(g, names.index(g.name)) for g in rover.groups for _ in g.joints]
     limits = np.array([rover.joint_limits[j] for j in rover.joints], float)
@@ -276,6 +288,7 @@ def rover_info(model: Model) -> RoverInfo:
         chassis_points=Vec3(*points.T),
         box_center=Vec3(*center.T) if len(center) else None,
         box_half=Vec3(*half.T) if len(half) else None,
+        # MuJoCo's inverse weight is the joint's own inverse inertia in the whole mechanism at the reference pose.
         joint_inertia=1.0 / compiled.dof_invweight0[[compiled.joint(j).dofadr[0] for j in rover.joints]],
         name=rover.name,
     )

@@ -110,6 +110,7 @@ class StateVariable:
     def reset(self, like: Any) -> Any:
         """The state at reset; `like` is an array of zeros over its axis."""
         like = jnp.broadcast_to(like, (self.slots, *like.shape)) if self.slots else like
+        # Added to the array of zeros, so that the state gets its type and shape from it.
         return like + self.initial
 
 
@@ -199,6 +200,7 @@ class Effect:
         if isinstance(value, list | tuple):
             if parameter.axis == "rover":
                 raise UserError(f"{source}: {field} = {value} has several values; {self.name} takes one number here.")
+            # Each entry is checked by itself: one wheel out of bounds is named like a single number.
             return tuple(float(self.check(name, v, source)) for v in value)  # type: ignore[arg-type]
         number = require_finite(source, field, value)
         low, high = parameter.bounds

@@ -141,6 +141,7 @@ def get(name: str) -> Effect:
     Raises:
       UserError: no such effect; the sentence names those that are spelt alike.
     """
+    # A user's file is code that runs: `vouch` asks for consent where a file names it that the user did not write.
     if ".py" in name:
         vouch(name)
         file, _, member = name.partition(":")
@@ -178,11 +179,13 @@ def load_file(path: str | Path) -> dict[str, Effect]:
     if spec is None or spec.loader is None:
         raise UserError(f"{path}: is not a Python file; give a file ending in .py.")
     module = importlib.util.module_from_spec(spec)
+    # Pickling and dataclasses look their module up by name.
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+    # Whatever a user's file does wrong becomes one sentence; SystemExit because scripts end with it.
     except (Exception, SystemExit) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{path}: does not run: {type(error).__name__}: {reason}; mend the file.") from error

@@ -59,6 +59,7 @@ class Pipeline:
     def __init__(self, effects: tuple[Effect, ...]):
         self.effects = effects
         self._at = {}
+        # Python's sort is stable: effects of one order keep their place in the model's list.
         for effect in sorted(effects, key=lambda e: e.order):
             for port in effect.ports:
                 self._at.setdefault(port, []).append(effect)
@@ -110,16 +111,24 @@ def wheel_contact(ctx: Context) -> Contact:
     geometry: Geometry = ctx.geometry  # type: ignore[assignment]
     place = ctx.wheel_position
     height, slope_x, slope_y = _ground_below(ctx, geometry)
+    # A wheel is shorter than a terrain's cell is wide, so the plane below its centre stands for the ground that it
+    # meets.
     normal = Vec3(-slope_x, -slope_y, jnp.ones_like(slope_x)).unit()
     tilt = ctx.wheel_axle.dot(normal)
+    # A wheel that leans reaches less far down; the floor keeps the root's derivative finite for one that lies flat.
     lowest = geometry.radius * jnp.sqrt(jnp.maximum(1.0 - tilt * tilt, 1e-6))
+    # Along the normal: on a slope the vertical distance overstates it.
     sinkage = jnp.maximum(lowest - (place.z - height) * normal.z, 0.0)
+    # Heading in the ground plane; undefined for a wheel that lies on its side, where the floor gives a short vector and
+    # hence no force.
     ahead = ctx.wheel_axle.cross(normal).unit(1e-6)
     across = normal.cross(ahead)
     cos, sin = jnp.cos(geometry.toe), jnp.sin(geometry.toe)
     forward, left = ahead * cos + across * sin, across * cos - ahead * sin
     v_x, v_y = ctx.wheel_velocity.dot(forward), ctx.wheel_velocity.dot(left)
     rim_speed = geometry.radius * ctx.wheel_angular_velocity.dot(ctx.wheel_axle)
+    # The faster of rim and travel decides the direction: it is the one that is not zero for a spinning or a sliding
+    # wheel.
     roll = jnp.where(jnp.abs(rim_speed) > jnp.abs(v_x), rim_speed, v_x)
     heading = jnp.where(roll < 0.0, -1.0, 1.0)
     slip = heading * (rim_speed - v_x) / jnp.maximum(jnp.abs(roll), SLIP_SPEED_FLOOR)
@@ -163,6 +172,7 @@ def initial_soil(like: Any) -> Soil:
 
 def initial_normal(like: Any) -> Normal:
     zero = jnp.zeros_like(like)
+    # Angles of an airborne wheel: an empty arc, but not one of length zero, through which effects divide.
     tiny = zero + 1e-4
     return Normal(2.0 * tiny, zero, tiny, zero, zero, zero, zero)
 
@@ -210,6 +220,7 @@ def apply_effects(
     zero = jnp.zeros_like(ctx.position.x)
     none = Vec3(zero, zero, zero)
     wrench, state = pipeline.run("body_wrench", ctx, state, BodyWrench(none, none, jnp.zeros_like(ctx.joint_angle)))
+    # Models without electric power carry no zeros for it through every step.
     if "power" in pipeline:
         power, state = pipeline.run("power", ctx, state, Power(zero, zero, zero))
         ctx = dataclasses.replace(ctx, power=power)

@@ -43,6 +43,7 @@ def minimise(
     here, damping, growth = float(residual @ residual), DAMPING, 2.0
     evaluations = 1
     while True:
+        # The undamped step decides: a damped one is short by construction and always promises little.
         if _promise(residual, slope, _step(residual, slope, low - x, high - x, 0.0)) < settled:
             return x
         while True:
@@ -55,7 +56,11 @@ def minimise(
             reached = float(trial @ trial) if np.isfinite(trial).all() and np.isfinite(trial_slope).all() else np.inf
             if reached < here:
                 break
+            # Nielsen's rule: failures double the growth of the damping, so that a hopeless region is left in a few
+            # trials.
             damping, growth = damping * growth, 2.0 * growth
+        # Share of the promised fall that the step kept: near 1 the model is linear here and the damping may fall to a
+        # third.
         kept = (here - reached) / max(_promise(residual, slope, step), 1e-300)
         damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * kept - 1.0) ** 3), 2.0
         x, residual, slope, here = there, trial, trial_slope, reached

@@ -137,6 +137,7 @@ class ChangeDetector:
         self._kind = np.append(self._kind, np.arange(kinds))
         density, self._mean, self._cov = _update(self.usual, self._mean, self._cov, columns, residual)
         self._log_ratio += self.usual.power * (density[1:] - density[0])
+        # The filter without a jump (first) always stays; of the others only those that began within memory.
         keep = self._begun > self.count - MEMORY
         there = np.append(True, keep)
         self._mean, self._cov = self._mean[there], self._cov[there]
@@ -145,10 +146,12 @@ class ChangeDetector:
         self.log_statistic = float(np.logaddexp.reduce(self._log_ratio)) - math.log(kinds)
         self.count += 1
         if self.log_statistic < self._threshold:
+            # The walk between this step and the next.
             self._cov = self._cov + np.diag(self.usual.walk**2)
             return None
         found = self._alarm()
         best = 1 + int(np.argmax(self._log_ratio))
+        # From here on the most probable jump is taken for granted, and the next one is looked for beside it.
         self._mean[0], self._cov[0] = self._mean[best], self._cov[best] + np.diag(self.usual.walk**2)
         self._forget()
         return found

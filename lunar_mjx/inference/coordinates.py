@@ -68,8 +68,10 @@ class Coordinate:
     def bounds(self) -> tuple[float, float]:
         """Bounds of the coordinate."""
         if self.log:
+            # A logarithm never reaches zero: a lower bound of zero binds nothing.
             low = -np.inf if self.low <= 0.0 else math.log(self.low / self.start) / self.scale
             return low, math.log(self.high / self.start) / self.scale
+        # Sorted, because a negative scale turns the bounds around.
         return tuple(sorted(((self.low - self.start) / self.scale, (self.high - self.start) / self.scale)))  # type: ignore[return-value]
 
 

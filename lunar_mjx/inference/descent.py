@@ -43,6 +43,7 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS) -
       goal: what is minimised. start: (coordinates,) where from. iterations: most steps.
     """
     u = start.copy()
+    # A start may come from another problem with wider bounds.
     u[goal.free] = np.clip(u[goal.free], goal.low, goal.high)
     residuals, chi2s = goal.residuals(u[None])
     if not np.isfinite(chi2s[0]):
@@ -62,6 +63,7 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS) -
             bent, probes, _ = goal.bent(here.u, here.residual, here.jacobian, hessian, trials, dampings)
             rows = np.concatenate([trials, bent, probes])
         residuals, chi2s = goal.residuals(rows)
+        # All trials are simulated anyhow, so the best one is taken and not the first that helps.
         k = int(np.argmin(chi2s))
         if chi2s[k] < here.chi2:
             # a step that keeps less than half of its promise went round a bend: the next one is bent, too, at the

@@ -80,6 +80,7 @@ class Gram:
         whole = np.column_stack([columns, residual])
         if not np.isfinite(whole).all():
             raise EvidenceError("derivatives or residuals are not finite")
+        # Groups are kept apart, since each has a noise factor of its own that is not known yet.
         number = np.zeros(len(residual), int) if group is None else np.asarray(group)
         count = np.bincount(number, minlength=groups)
         matrix = np.zeros((groups, whole.shape[1], whole.shape[1]))
@@ -313,6 +314,8 @@ def _condition(
     """
     k = gram.width
     scale = amplitudes.std * np.append(tau, 1.0)[amplitudes.field]  # field -1 picks the 1 at the end
+    # Noise factors enter here, after the measurements have been summed: trying other sizes costs nothing in their
+    # number.
     whole = np.einsum("g,gij->ij", 1.0 / noise**2, gram.matrix)
     inner, across = whole[:k, :k], whole[:k, k]
     shift = amplitudes.mean
@@ -323,6 +326,7 @@ def _condition(
     factor = linalg.cholesky(np.eye(k) + scale[:, None] * inner * scale, lower=True, check_finite=False)
     covariance = linalg.cho_solve((factor, True), np.eye(k), check_finite=False)
     mean = covariance @ downhill
+    # log |V| by Sylvester's identity: the determinant of the small matrix in place of one as large as the data.
     log_det = 2.0 * float(np.sum(np.log(np.diag(factor))))
     size = float(np.sum(gram.count * (_LOG_2PI + 2.0 * np.log(noise))))
     return -0.5 * (size + square - float(downhill @ mean) + log_det), mean, covariance, scale
@@ -341,6 +345,7 @@ def _density(x: np.ndarray, gram: Gram, amplitudes: Amplitudes, usual: np.ndarra
     shift = amplitudes.mean
     member = np.array([amplitudes.field == f for f in range(many)], float).reshape(many, k)
     # share of each amplitude's prior that the measurements have taken away
+    # Identity less posterior covariance in prior units: 0 where the data are silent, 1 where they know all.
     absorbed = np.eye(k) - inverse
     # traces and quadratic forms, each over two: fields first, then noise groups
     trace = np.empty(many + groups)
@@ -374,6 +379,7 @@ def _density(x: np.ndarray, gram: Gram, amplitudes: Amplitudes, usual: np.ndarra
     gradient = power - trace
     hessian = 4.0 * quadratic - 2.0 * traces + np.diag(2.0 * (trace - power))
     for i in range(many):
+        # Half-normal prior of tau with the Jacobian of its logarithm.
         share = (tau[i] / usual[i]) ** 2
         value += 0.5 * math.log(2.0 / math.pi) + x[i] - math.log(usual[i]) - 0.5 * share
         gradient[i] += 1.0 - share

@@ -77,6 +77,7 @@ def fit(
     for i, place in enumerate([origin, *_other_starts(problem, free, origin, starts - 1, seed, spread, goal)]):
         progress("fitting", i / starts)
         found.append(descend(goal, place))
+    # Descents that ended elsewhere are local minima: only the lowest counts.
     best = min(found, key=lambda d: d.chi2)
     return Fit(best.u, np.asarray(free), best.chi2, best.residual, best.jacobian, fitted)
 

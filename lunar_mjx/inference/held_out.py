@@ -34,6 +34,7 @@ def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
     _, scale = problem.prior_rows(fit.u, fit.free)
     j = fit.jacobian[fit.fitted]
     hessian = j.T @ j + np.diag(scale**2)
+    # Coordinates have units of their own; scaled, the eigenvalues can be compared.
     size = np.sqrt(np.diag(hessian))
     size = np.where(size > 0.0, size, 1.0)
     known, axes = np.linalg.eigh(hessian / np.outer(size, size))
@@ -41,6 +42,7 @@ def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
     unit = axes[:, kept] / np.sqrt(known[kept]) / size[:, None]  # in which all that is known weighs one
     for part in _left_out(problem, fit):
         jb, rb = fit.jacobian[part], fit.residual[part]
+        # What this manoeuvre alone says, in units of what all of them say together.
         mine = jb @ unit
         values, vectors = np.linalg.eigh(np.eye(mine.shape[1]) - mine.T @ mine)
         # A direction of which the other manoeuvres know next to nothing stays where the fit put it.
@@ -87,6 +89,7 @@ def predictive_gain(
     """
     keep = problem.observations.in_split(*splits)
     few = len(np.unique(problem.observations.unit[before.fitted])) < ENOUGH
+    # Two manoeuvres hardly determine a model that has to predict a third.
     if few and problem.observations.in_split("select").any():
         # Leaving one of two or three groups out of a fit extrapolates too far; those never fitted judge alone.
         keep = problem.observations.in_split("select")
@@ -127,6 +130,7 @@ def noise_test(problem: Problem, fit: Fit, splits: tuple[str, ...] = ("fit", "se
     keep = observations.in_split(*splits)
     n = int(keep.sum())
     fitted_share = float((keep & fit.fitted).sum()) / max(n, 1)
+    # Fitted parameters take up residual; at most three quarters of it, where a table is very short.
     freedom = max(n - fitted_share * len(fit.free), 0.25 * n, 1.0)
     squares = np.where(keep, fit.residual**2, 0.0)
     rms = float(np.sqrt(squares.sum() / freedom))

@@ -33,6 +33,7 @@ class Objective:
         """(k,) chi-square of (k, n) residuals at (k, coordinates); infinite where a prediction is not finite."""
         prior = np.array([np.sum(self.problem.prior_rows(row, self.free)[0] ** 2) for row in u])
         with np.errstate(over="ignore", invalid="ignore"):
+            # A simulation that diverges overflows here, and counts as infinitely bad instead of stopping the descent.
             chi2 = np.sum(r[:, self.fitted] ** 2, axis=1) + prior
         return np.where(np.isfinite(chi2), chi2, np.inf)
 
@@ -82,6 +83,7 @@ class Objective:
         for i, (step, damping) in enumerate(zip(steps, dampings, strict=True)):
             if not np.isfinite(ahead[i]).all() or not np.any(step):
                 continue
+            # Second derivative along the step from one more residual, since the first derivative is known.
             second = -2.0 / _PROBE * ((ahead[i] - r) / _PROBE + j @ step)
             inner = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
             bend = -0.5 * np.linalg.lstsq(inner, j[self.fitted].T @ second[self.fitted], rcond=None)[0]

@@ -126,6 +126,7 @@ class Observations:
                 if s.chain is not None:
                     out[part] = s.chain.whiten(out[part])
             else:
+                # Series sampled at one clock share the filter's loop over time, which is what costs.
                 batches.setdefault((s.stop - s.start, np.asarray(s.time).tobytes()), []).append(s)
         for group in batches.values():
             _innovations(group, flat, out)
@@ -160,6 +161,7 @@ def _innovations(group: Sequence[Series], flat: np.ndarray, out: np.ndarray) -> 
     white = np.stack([np.broadcast_to(np.square(s.white), time.shape) for s in group], axis=1)
     power = np.array([s.coloured**2 for s in group])
     tau = np.array([s.correlation_time for s in group])
+    # The process begins in its stationary state: nothing is known of its past.
     mean, variance = np.zeros_like(data[0], dtype=float), power.copy()
     for i in range(len(time)):
         if i:

@@ -30,6 +30,7 @@ def blocks(observations: Observations, residual: np.ndarray, keep: np.ndarray, m
         last = max(float(np.asarray(s.time)[-1]) for s in timed)
         tau = max([_correlation_time(residual[s.start : s.stop], np.asarray(s.time)) for s in timed], default=0.0)
         length = max(5.0 * tau, (last - first) / max(4, most // max(1, len(observations.logs))), 1e-9)
+        # Whole blocks only: a short one at the end would be noisier than the others.
         pieces = max(1, int((last - first) / length))
         edges = np.linspace(first, last, pieces + 1)[1:-1]
         for s in timed:
@@ -70,6 +71,7 @@ def _correlation_time(residual: np.ndarray, time: np.ndarray) -> float:
     if power <= 0.0:
         return 0.0
     step = float(np.median(np.diff(time)))
+    # Padded to twice the length, so that the end does not wrap around to the beginning.
     size = 1 << (2 * len(r) - 1).bit_length()
     spectrum = np.abs(np.fft.rfft(r, size)) ** 2
     auto = np.fft.irfft(spectrum, size)[: len(r) // 8] / power
@@ -85,6 +87,7 @@ def span(jacobian: np.ndarray, prior_scale: np.ndarray) -> np.ndarray:
       jacobian: (n, p) whitened. prior_scale: (p,) reciprocal prior standard deviations.
     """
     stacked = np.vstack([jacobian, np.diag(prior_scale)])
+    # Columns of one length, or the rank would be judged by units.
     size = np.linalg.norm(stacked, axis=0)
     stacked = stacked / np.where(size > 0.0, size, 1.0)
     q, s, _ = np.linalg.svd(stacked, full_matrices=False)

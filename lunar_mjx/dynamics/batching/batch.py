@@ -112,12 +112,14 @@ def rollout_batch(
 
 
 def _once(system: Steps, function: Callable[..., Any]) -> Callable[..., Any]:
+    # MJX's step is made of matrix products, which are kernels of their own already.
     return computed_once(function) if system.engine.name == "structured" else function
 
 
 def _in_chunks(function: Callable[..., Any], params: Params, axes: Axes, varying: Any, chunk: int | None) -> Any:
     """Calls `function(params, axes, *varying)` with the batch last, chunk by chunk, and returns it leading again."""
     batch = varying[0].step.shape[0]
+    # Shared parameters are closed over and not mapped: they lie in memory once for all chunks.
     leaves, treedef = jax.tree.flatten(params)
     flags = jax.tree.map(lambda a: a is not None, axes, is_leaf=lambda a: a is None)
     per_rover = jax.tree.leaves(jax.tree.broadcast(flags, params))
@@ -133,6 +135,7 @@ def _in_chunks(function: Callable[..., Any], params: Params, axes: Axes, varying
 
     args = ([leaf for leaf, own in zip(leaves, per_rover, strict=True) if own], varying)
     size = chunk or CHUNK.get(jax.default_backend(), 65536)
+    # One chunk needs no loop around it, which would keep XLA from fusing across it.
     if batch <= size:
         return block(args)
     count = math.ceil(batch / size)

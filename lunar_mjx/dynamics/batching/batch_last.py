@@ -98,9 +98,11 @@ def _run(jaxpr: Any, consts: Any, args: list[_Value]) -> list[_Value]:
 
 def _apply(eqn: Any, operands: list[_Value]) -> list[_Value]:
     name = eqn.primitive.name
+    # Calls are opened up: a rule can only see an elementwise operation that is not hidden in a function.
     if name in INLINE:
         inner = eqn.params[INLINE[name]]
         return _run(inner.jaxpr, inner.consts, operands)
+    # What no batched value enters is computed once for the batch.
     if all(o.axis is None for o in operands):
         out = bind(eqn, [o.array for o in operands])
         return [_Value(x, None) for x in out]
@@ -111,6 +113,7 @@ def _apply(eqn: Any, operands: list[_Value]) -> list[_Value]:
     if name == "reshape" and operands[0].axis == 0:
         x = operands[0].array
         return [_Value(jnp.reshape(x, (x.shape[0], *eqn.params["new_sizes"])), 0)]
+    # A rule may decline (None), as for gathers of a form that it does not know; then vmap does it.
     rule = _elementwise if name in _ELEMENTWISE else _RULES.get(name)
     if rule is not None and all(o.axis in (None, -1) for o in operands):
         done = rule(eqn, operands)
@@ -179,6 +182,7 @@ def _gather(eqn: Any, operands: list[_Value]) -> Any:
     """Look-up of single entries of a shared array."""
     table, index = operands
     numbers = eqn.params["dimension_numbers"]
+    # Only the look-up of a terrain's height is common enough to deserve a rule.
     if table.axis is not None or numbers.offset_dims or index.axis is None:
         return None
     return bind(eqn, [table.array, jnp.moveaxis(index.array, -1, -2)])[0]

@@ -113,6 +113,7 @@ def _needed(steps: list[_Step], results: list[_Value]) -> list[_Step]:
     for value in results:
         value.uses += 1
     kept = []
+    # From the results backward, so that dead equations are dropped and count as no reader.
     for step in reversed(steps):
         if any(value.uses for value in step[2]):
             kept.append(step)
@@ -130,6 +131,7 @@ def _evaluate(steps: list[_Step], results: list[_Value]) -> list[Any]:
             _store_if_dear(value, size / max(int(np.size(value.array)), 1))
         for value, array in zip(made, bind(eqn, [v.array for v in operands]), strict=True):
             value.array = array
+        # XLA writes these results to memory anyhow; their readers recompute nothing.
         if len(made) > 1 or _own_kernel(eqn):
             continue
         for value in operands:

@@ -22,18 +22,7 @@ from jaxtyping import Array, Float
 from lunar_mjx.dynamics.indexing import assemble, select
 from lunar_mjx.dynamics.kinematics import Finish, Kinematics, wheel_feet
 from lunar_mjx.dynamics.quaternions import integrate, normalized, rotation
-from lunar_mjx.dynamics.spatial_algebra import (
-    IDENTITY,
-    ZERO,
-    Body,
-    Force,
-    Inertia,
-    Motion,
-    Rotation,
-    Symmetric,
-    Vector,
-    mul,
-)
+from lunar_mjx.dynamics.spatial_algebra import Body, Force, Inertia, Motion, Symmetric
 from lunar_mjx.dynamics.structured.legs import (
     LegState,
     cast_group,
@@ -49,7 +38,7 @@ from lunar_mjx.dynamics.structured.topology import LegGroup, Structure, read_str
 from lunar_mjx.effects.ports import Forces
 from lunar_mjx.pytree import pytree
 from lunar_mjx.rover import Rover
-from lunar_mjx.spatial import Frame, Vec3
+from lunar_mjx.spatial import IDENTITY, ZERO, Frame, Vec3, mul
 
 
 @pytree
@@ -73,10 +62,10 @@ class Pieces:
 class Base(NamedTuple):
     """The chassis: pose and velocity in the world, and its spatial velocity in its own frame."""
 
-    position: Vector
+    position: Vec3
     quaternion: list[Any]
-    frame: Rotation
-    velocity: Vector
+    frame: Frame
+    velocity: Vec3
     motion: Motion
 
 
@@ -128,10 +117,11 @@ class StructuredEngine:
     def _kinematic_state(self, qpos: Pieces, qvel: Pieces) -> tuple[list[LegGroup], list[LegState], Base]:
         """The legs' numbers in the state's type, what their forward pass leaves, and the chassis."""
         numbers = [cast_group(group, qpos.dtype) for group in self.structure.groups]
-        position, velocity = Vector(*qpos.base[:3]), Vector(*qvel.base[:3])
+        position, velocity = Vec3(*qpos.base[:3]), Vec3(*qvel.base[:3])
+        # A state that was set by hand, or stepped in float32, is of unit length only about.
         quaternion = normalized(list(qpos.base[3:]))
         frame = rotation(quaternion)
-        base = Base(position, quaternion, frame, velocity, Motion(Vector(*qvel.base[3:]), frame.undo(velocity)))
+        base = Base(position, quaternion, frame, velocity, Motion(Vec3(*qvel.base[3:]), frame.from_world(velocity)))
         legs = [
             forward_kinematics(n, base.motion, angle, speed)
             for n, angle, speed in zip(numbers, qpos.joints, qvel.joints, strict=True)
@@ -181,26 +171,25 @@ class StructuredEngine:
         for group, leg in zip(numbers, legs, strict=True):
             for slot in group.wheels:
                 link = leg.links[slot.link]
-                at = link.origin + link.frame.apply(slot.numbers.center)
+                at = link.origin + link.frame.to_world(slot.numbers.center)
                 moving = link.velocity.linear + link.velocity.angular.cross(at)
-                vectors = at, link.frame.apply(slot.numbers.axle), moving, link.velocity.angular
+                vectors = at, link.frame.to_world(slot.numbers.axle), moving, link.velocity.angular
                 for into, vector in zip((places, axles, travels, spins), vectors, strict=True):
-                    into.append([_over_legs(c, group.count) for c in base.frame.apply(vector)])
+                    into.append([_over_legs(c, group.count) for c in base.frame.to_world(vector)])
                 order.append(slot.index)
 
         def of_wheels(pieces: list[list[Any]]) -> Vec3:
             return Vec3(*(assemble([piece[i] for piece in pieces], order) for i in range(3)))
 
-        place = Vec3(*base.position)
         return Kinematics(
-            position=place,
+            position=base.position,
             quaternion=jnp.stack(base.quaternion),
-            frame=Frame(*(Vec3(*column) for column in base.frame)),
-            velocity=Vec3(*base.velocity),
-            angular_velocity=Vec3(*base.frame.apply(base.motion.angular)),
+            frame=base.frame,
+            velocity=base.velocity,
+            angular_velocity=base.frame.to_world(base.motion.angular),
             joint_angle=assemble(angles, drives),
             joint_speed=assemble(speeds, drives),
-            wheel_position=of_wheels(places) + place,
+            wheel_position=of_wheels(places) + base.position,
             wheel_axle=of_wheels(axles),
             wheel_velocity=of_wheels(travels),
             wheel_angular_velocity=of_wheels(spins),
@@ -228,7 +217,7 @@ class StructuredEngine:
             raise UnsuitableError("imposed motion needs a rover whose wheels' drives are its only joints.")
         numbers, legs, base = self._kinematic_state(qpos, qvel)
 
-        def finish(forces: Forces, joint_acceleration: Any, up: Vector) -> tuple[Pieces, Pieces, Any, Vector]:
+        def finish(forces: Forces, joint_acceleration: Any, up: Vec3) -> tuple[Pieces, Pieces, Any, Vec3]:
             return self._finish_imposed(params, numbers, legs, base, forces, joint_acceleration, up, dt)
 
         return self._kinematics(numbers, legs, base), finish
@@ -241,9 +230,9 @@ class StructuredEngine:
         base: Base,
         forces: Forces,
         joint_acceleration: Any,
-        up: Vector,
+        up: Vec3,
         dt: Any,
-    ) -> tuple[Pieces, Pieces, Any, Vector]:
+    ) -> tuple[Pieces, Pieces, Any, Vec3]:
         dtype = forces.joint_torque.dtype
         armature = _reflected_inertia(params, self._joints, dtype)
         unpowered = dataclasses.replace(forces, joint_torque=jnp.zeros_like(forces.joint_torque))
@@ -267,7 +256,7 @@ class StructuredEngine:
         """Accelerations from the forces, and a step of semi-implicit Euler."""
         dtype, frame = forces.joint_torque.dtype, base.frame
         gravity = params.gravity if forces.geometry.gravity is None else forces.geometry.gravity
-        up = frame.undo(Vector(0.0, 0.0, jnp.asarray(gravity, dtype)))
+        up = frame.from_world(Vec3(0.0, 0.0, jnp.asarray(gravity, dtype)))
         armature = _reflected_inertia(params, self._joints, dtype)
         blocks = [
             leg_block(group, leg, up, forces, frame, armature, dt) for group, leg in zip(numbers, legs, strict=True)
@@ -275,11 +264,11 @@ class StructuredEngine:
         acceleration, rates = solve(*self._chassis(base, forces, up), blocks, self.structure.couplings)
         return self._integrate(numbers, legs, base, acceleration, rates, dt)
 
-    def _chassis(self, base: Base, forces: Forces, up: Vector) -> tuple[Inertia, Force]:
+    def _chassis(self, base: Base, forces: Forces, up: Vec3) -> tuple[Inertia, Force]:
         """The chassis' inertia, and the force that it needs to move as it does."""
         chassis, motion = _chassis_inertia(self.structure.base, forces), base.motion
-        moment, push = Vector(*forces.chassis_moment), Vector(*forces.chassis_force)
-        applied = Force(base.frame.undo(moment), base.frame.undo(push))
+        moment, push = forces.chassis_moment, forces.chassis_force
+        applied = Force(base.frame.from_world(moment), base.frame.from_world(push))
         return chassis, chassis.apply(Motion(ZERO, up)) + motion.cross_force(chassis.apply(motion)) - applied
 
     def _integrate(
@@ -295,7 +284,7 @@ class StructuredEngine:
         frame, motion = base.frame, base.motion
         # the classical acceleration of the chassis frame's origin
         linear = acceleration.linear + motion.angular.cross(motion.linear)
-        velocity = base.velocity + frame.apply(linear) * dt
+        velocity = base.velocity + frame.to_world(linear) * dt
         spin = motion.angular + acceleration.angular * dt
         # with the new velocity (semi-implicit): with the old one contacts would gain energy
         position = base.position + velocity * dt
@@ -312,6 +301,7 @@ class StructuredEngine:
         ]
         angles = [joint_turns(n, angle) for n, angle in zip(numbers, self._coupled(free), strict=True)]
         speeds = [tuple(speed) for speed in speeds]
+        # Angles travel as turns, with cosine and sine: the next step needs them, and a loop keeps what it carries.
         return Pieces((*position, *quaternion), tuple(angles)), Pieces((*velocity, *spin), tuple(speeds))
 
     def _coupled(self, values: list[list[Any]]) -> list[list[Any]]:
@@ -339,8 +329,8 @@ def _reflected_inertia(params: Any, joints: int, dtype: Any) -> Any:
 def _chassis_inertia(base: Body, forces: Forces) -> Inertia:
     """The chassis with its centre of mass shifted and a point mass on it."""
     geometry = forces.geometry
-    moved = base._replace(com=base.com + Vector(*geometry.com_offset)).at(ZERO, IDENTITY)
-    place = Vector(*geometry.payload_position)
+    moved = base._replace(com=base.com + Vec3(*geometry.com_offset)).at(ZERO, IDENTITY)
+    place = Vec3(*geometry.payload_position)
     mass = geometry.payload_mass
     return moved + Inertia(mass, place * mass, Symmetric.of_point(mass, place))
 

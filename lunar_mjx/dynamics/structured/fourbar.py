@@ -20,9 +20,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.dynamics.spatial_algebra import Rotation, Vector, add, mul, neg, sub, uniform
+from lunar_mjx.dynamics.spatial_algebra import uniform
 from lunar_mjx.dynamics.structured.links import Link
 from lunar_mjx.dynamics.structured.suitability import UnsuitableError
+from lunar_mjx.spatial import Frame, Vec3, add, mul, neg, sub
 
 Plane = tuple[Any, Any]
 
@@ -85,6 +86,8 @@ class FourBar:
         columns = (add(r[0][0], r[1][0]), add(r[0][1], r[1][1])), r[1], (neg(r[2][0]), neg(r[2][1]))
         known = columns[self.given]
         p, q = (c for i, c in enumerate(columns) if i != self.given)
+        # Zero at a dead point, where the dependent links are parallel; `read_fourbar` refuses rovers that are assembled
+        # there.
         determinant = 1.0 / _cross(p, q)
         gain = mul(neg(_cross(known, q)), determinant), mul(neg(_cross(p, known)), determinant)
         rate = self._all(gain, 1.0)
@@ -112,11 +115,13 @@ class FourBar:
         if self.parallelogram:
             return tuple(mul(r, phi) for r in _PARALLELOGRAM[self.given])  # type: ignore[return-value]
         if self.given == 0:
+            # With the first link's direction known, coupler and third link close a triangle on its end.
             known = _minus(_turn(n.d, phi), n.b)
             coupler = _freudenstein(known, n.e, n.f, n.branch)
             third = _between(n.f, _plus(known, _turn(n.e, coupler)))
             return phi, _wrap(coupler - phi), third
         if self.given == 1:
+            # With the coupler's angle known, first link and coupler are one rigid bar.
             link = _plus(n.d, _turn(n.e, phi))
             first = _freudenstein((neg(n.b[0]), neg(n.b[1])), link, n.f, n.branch)
             return first, phi, _between(n.f, _minus(_turn(link, first), n.b))
@@ -167,6 +172,7 @@ def _freudenstein(known: Plane, link: Plane, length: Plane, branch: Any) -> Any:
 
     Where the loop cannot close, the angle at which it comes nearest.
     """
+    # The cosine rule in vectors: |known + R(x) link|^2 = |length|^2 is a cos x + b sin x = c.
     a, b = _dot(known, link), _cross(link, known)
     c = 0.5 * (_dot(length, length) - _dot(known, known) - _dot(link, link))
     rest = a * a + b * b - c * c
@@ -191,10 +197,12 @@ def read_fourbar(
       UnsuitableError: the loop is no planar four-bar, or is assembled at a dead point.
     """
     chains = [_chain(links, i) for i in pinned]
+    # Links above the place where the two chains part carry the loop and are no part of it.
     common = {*chains[0]} & {*chains[1]}
     sides = [[i for i in chain if i not in common] for chain in chains]
     swap = len(sides[0]) < len(sides[1])
     long, short = (sides[1], sides[0]) if swap else (sides[0], sides[1])
+    # Longer loops have no closed form; MJX runs such rovers.
     if (len(long), len(short)) != (2, 1):
         raise UnsuitableError(f"{name} runs over {len(long)} + {len(short)} joints; a four-bar has 2 + 1.")
     chosen = (long[0], long[1], short[0])
@@ -241,8 +249,8 @@ def _pose(links: list[Link], i: int, leg: int) -> tuple[np.ndarray, np.ndarray]:
     """Turn and origin of a link's frame in the chassis frame at zero angles."""
     turn, origin = np.eye(3), np.zeros(3)
     for k in _chain(links, i):
-        place: Vector = links[k].numbers.origin
-        columns: Rotation = links[k].numbers.turn
+        place: Vec3 = links[k].numbers.origin
+        columns: Frame = links[k].numbers.turn
         origin = origin + turn @ [_leg_value(c, leg) for c in place]
         turn = turn @ np.column_stack([[_leg_value(c, leg) for c in column] for column in columns])
     return turn, origin
@@ -261,6 +269,7 @@ def _measure(links: list[Link], chosen: tuple[int, int, int], leg: int, anchors:
     if np.linalg.norm(pins[0] - pins[1]) > 1e-6 * reach:
         raise UnsuitableError(f"{name} is open by {np.linalg.norm(pins[0] - pins[1]):.2g} m at zero angles.")
     # the axis most across the normal: a product with one nearly along it would lose its digits
+    # Any basis of the plane will do.
     u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     u /= np.linalg.norm(u)
     plane = np.stack([u, np.cross(normal, u)])
@@ -274,6 +283,8 @@ def _branch(loop: FourBar, legs: list[_Measured], name: str) -> LoopNumbers:
     signs = []
     for leg in legs:
         errors = []
+        # The cosine rule has two roots, a loop and its mirror image; the rover is in the one that gives zero angles at
+        # its reference pose.
         for sign in (1.0, -1.0):
             vectors: Any = {k: tuple(float(c) for c in getattr(leg, k)) for k in "defb"}
             phi = loop._solve(LoopNumbers(leg.senses, **vectors, branch=sign), np.float64(0.0))

@@ -14,24 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.dynamics.indexing import select
-from lunar_mjx.dynamics.spatial_algebra import (
-    IDENTITY,
-    ZERO,
-    Force,
-    Inertia,
-    Motion,
-    Rotation,
-    Symmetric,
-    Vector,
-    add,
-    mul,
-    neg,
-    solve_positive,
-    sub,
-    total,
-)
+from lunar_mjx.dynamics.spatial_algebra import Force, Inertia, Motion, Symmetric, solve_positive
 from lunar_mjx.dynamics.structured.topology import CHASSIS, Coupling, LegGroup
 from lunar_mjx.effects.ports import Forces
+from lunar_mjx.spatial import IDENTITY, ZERO, Frame, Vec3, add, mul, neg, sub, total
 
 STILL = Motion(ZERO, ZERO)
 
@@ -47,8 +33,8 @@ class Turn(NamedTuple):
 class LinkState(NamedTuple):
     """A link in the chassis frame's coordinates, for every leg of a group."""
 
-    origin: Vector
-    frame: Rotation
+    origin: Vec3
+    frame: Frame
     subspace: Motion
     velocity: Motion
     bias: Motion
@@ -86,6 +72,7 @@ def cast_group(group: LegGroup, dtype: Any) -> LegGroup:
     """A group with its arrays in the state's type; floats stay, and fold into the code."""
 
     def cast(tree: Any) -> Any:
+        # Python floats stay: zeros and ones among them drop out of every product while the step is traced.
         return jax.tree.map(lambda a: jnp.asarray(a, dtype) if isinstance(a, np.ndarray) else a, tree)
 
     loop = group.loop
@@ -135,10 +122,12 @@ def forward_kinematics(n: LegGroup, base: Motion, turns: tuple[Turn, ...], free:
     links: list[LinkState] = []
     for k, link in enumerate(n.links):
         up = ground if link.parent == CHASSIS else links[link.parent]
-        origin = up.origin + up.frame.apply(link.numbers.origin)
+        origin = up.origin + up.frame.to_world(link.numbers.origin)
         # a turn leaves its own axis alone, so that it is read before the turn, where it has more zeros
         mount = up.frame.then(link.numbers.turn)
         axis = mount[link.axis]
+        # A revolute joint's motion about the chassis frame's origin: all spatial vectors share that reference, so that
+        # no transform stands between links.
         subspace = Motion(axis, origin.cross(axis))
         velocity = up.velocity + subspace * speed[k]
         bias = up.bias + velocity.cross(subspace) * speed[k] + subspace * drift[k]
@@ -147,9 +136,7 @@ def forward_kinematics(n: LegGroup, base: Motion, turns: tuple[Turn, ...], free:
     return LegState([turn.angle for turn in turns], speed, gain, drift, links)
 
 
-def leg_block(
-    n: LegGroup, leg: LegState, up: Vector, forces: Forces, frame: Rotation, armature: Any, dt: float
-) -> LegBlock:
+def leg_block(n: LegGroup, leg: LegState, up: Vec3, forces: Forces, frame: Frame, armature: Any, dt: float) -> LegBlock:
     """Newton-Euler inward for the bias forces, composite rigid bodies for the mass matrix, then the loop's projection.
 
     Gravity enters as an upward acceleration `up` of the base (Featherstone 2008, sec. 5.3). Damping is implicit as in
@@ -163,6 +150,7 @@ def leg_block(
     lift = Motion(ZERO, up)
     force = []
     for k, (inertia, state) in enumerate(zip(composite, leg.links, strict=True)):
+        # Newton-Euler at zero joint accelerations: what remains is the force that the motion itself needs.
         own = inertia.apply(state.bias + lift) + state.velocity.cross_force(inertia.apply(state.velocity))
         force.append(own - wheel[k] if k in wheel else own)
     hung = Inertia(0.0, ZERO, Symmetric.isotropic(0.0)), Force(ZERO, ZERO)
@@ -178,10 +166,14 @@ def leg_block(
         # damping acts at the new speed: at the old one it would turn a light joint around within a step
         added = add(reflected, mul(dt, link.numbers.damping))
         bias = add(subspace.dot(force[k]), mul(added, leg.drift[k]))
+        # Actuator minus bias is what is left to accelerate the joint.
         torque[k] = sub(_joint_torque(n, leg, k, forces), bias)
         momentum = composite[k].apply(subspace)
+        # The force that a unit acceleration of this joint asks of the base: a column of F.
         coupling[k] = [*momentum.moment, *momentum.force]
         mass[k][k] = add(subspace.dot(momentum), added)
+        # A joint's composite inertia couples with its ancestors in the leg, and with nothing else: that is the block-
+        # arrow shape.
         j = link.parent
         while j != CHASSIS:
             mass[k][j] = mass[j][k] = leg.links[j].subspace.dot(momentum)
@@ -195,15 +187,16 @@ def leg_block(
     return _project(n, leg, LegBlock(mass, coupling, torque, *hung, n.ties))
 
 
-def _wheel_forces(n: LegGroup, leg: LegState, forces: Forces, frame: Rotation) -> dict[int, Force]:
+def _wheel_forces(n: LegGroup, leg: LegState, forces: Forces, frame: Frame) -> dict[int, Force]:
     """Forces of the ground about the chassis frame's origin, by link."""
     found: dict[int, Force] = {}
     for slot in n.wheels:
         link = leg.links[slot.link]
-        push = frame.undo(Vector(*(select(c, slot.index) for c in forces.wheel_force)))
-        moment = frame.undo(Vector(*(select(c, slot.index) for c in forces.wheel_moment)))
-        at = link.origin + link.frame.apply(slot.numbers.center)
+        push = frame.from_world(Vec3(*(select(c, slot.index) for c in forces.wheel_force)))
+        moment = frame.from_world(Vec3(*(select(c, slot.index) for c in forces.wheel_moment)))
+        at = link.origin + link.frame.to_world(slot.numbers.center)
         force = Force(moment + at.cross(push), push)
+        # Several wheels may hang on one link, as on a bogie whose axle is rigid.
         found[slot.link] = found[slot.link] + force if slot.link in found else force
     return found
 
@@ -212,6 +205,7 @@ def _joint_torque(n: LegGroup, leg: LegState, k: int, forces: Forces) -> Any:
     """Actuator, spring and damper at a joint, in the link's own sense."""
     link = n.links[k]
     sign, spring = link.numbers.sign, link.numbers.stiffness
+    # Most joints have no spring; leaving the stretch out keeps a subtraction for every leg out of the program.
     stretch = sub(leg.angle[k], mul(sign, link.numbers.springref)) if _present(spring) else 0.0
     passive = add(mul(spring, stretch), mul(link.numbers.damping, leg.speed[k]))
     if link.actuated is None:
@@ -229,6 +223,7 @@ def _project(n: LegGroup, leg: LegState, block: LegBlock) -> LegBlock:
     if loop is None:
         return block
     free = n.free
+    # Which joints move, and how fast, when one independent joint moves at unit speed: a row of G^T.
     moved = {k: [(k, 1.0)] for k in free}
     moved[loop.independent] += [(k, leg.gain[k]) for k in loop.dependent]
 
@@ -252,6 +247,8 @@ def solve(
     Couplings J u' = 0 add J^T lambda to tau. The response to each row of J is one more right side of the same
     factorisation, and J u' = 0 gives the lambda of all of them.
     """
+    # Couplings tie joints of different legs (a differential), which the block-arrow shape does not allow: they are
+    # solved for as constraint forces, a few at most.
     pulls = [_pull(coupling, blocks) for coupling in couplings]
     total_inertia, total_force = chassis, [*force.moment, *force.force]
     # the lower triangle only: the complement is symmetric, and solve_positive reads no more
@@ -262,10 +259,11 @@ def solve(
         count = _legs_of(block)
         total_inertia = total_inertia + Inertia(
             _sum_over_legs(block.inertia.mass, count),
-            Vector(*(_sum_over_legs(c, count) for c in block.inertia.h)),
+            Vec3(*(_sum_over_legs(c, count) for c in block.inertia.h)),
             Symmetric(*(_sum_over_legs(c, count) for c in block.inertia.moments)),
         )
         rows_of_j = [pull[len(eliminated)] for pull in pulls]
+        # One factorisation of the leg's mass matrix serves its torque, the six columns of F and every row of J.
         columns = [block.torque, *([row[i] for row in block.coupling] for i in range(6)), *rows_of_j]
         mass = block.mass_matrix
         if block.ties:
@@ -285,14 +283,17 @@ def solve(
                 through = total(*(mul(block.coupling[k][i], solved[7 + c][k]) for k in rows))
                 pulled[c][i] = add(pulled[c][i], _sum_over_legs(through, count))
         eliminated.append(solved)
+    # What is left after the legs are eliminated is the Schur complement: the inertia that the base feels, legs
+    # included.
     matrix = _matrix(total_inertia)
     schur = [[sub(matrix[i][j], corrections[i][j]) if j <= i else 0.0 for j in range(6)] for i in range(6)]
     a, *responses = solve_positive(schur, [[neg(f) for f in hung] for hung in (total_force, *pulled)])
     rates = _substituted(eliminated, 0, a)
     if not pulls:
-        return Motion(Vector(*a[:3]), Vector(*a[3:])), rates
+        return Motion(Vec3(*a[:3]), Vec3(*a[3:])), rates
     answers = [_substituted(eliminated, 7 + c, response) for c, response in enumerate(responses)]
     gaps = [_gap(pull, rates) for pull in pulls]
+    # How far each constraint force closes each gap: the small matrix J H^-1 J^T.
     compliance = [[_gap(pull, answer) for answer in answers] for pull in pulls]
     # J H^-1 J^T is positive as long as no two couplings say the same
     (forces,) = solve_positive(compliance, [[neg(gap) for gap in gaps]])
@@ -302,7 +303,7 @@ def solve(
             [add(old, mul(force_of, more)) for old, more in zip(own, extra, strict=True)]
             for own, extra in zip(rates, answer, strict=True)
         ]
-    return Motion(Vector(*a[:3]), Vector(*a[3:])), rates
+    return Motion(Vec3(*a[:3]), Vec3(*a[3:])), rates
 
 
 def _substituted(eliminated: list[list[list[Any]]], column: int, a: list[Any]) -> list[list[Any]]:
@@ -352,7 +353,7 @@ def impose(chassis: Inertia, force: Force, blocks: list[LegBlock], rates: list[A
         count = _legs_of(block)
         whole = whole + Inertia(
             _sum_over_legs(block.inertia.mass, count),
-            Vector(*(_sum_over_legs(c, count) for c in block.inertia.h)),
+            Vec3(*(_sum_over_legs(c, count) for c in block.inertia.h)),
             Symmetric(*(_sum_over_legs(c, count) for c in block.inertia.moments)),
         )
         hung = [*block.force.moment, *block.force.force]
@@ -360,6 +361,7 @@ def impose(chassis: Inertia, force: Force, blocks: list[LegBlock], rates: list[A
             pushed = mul(block.coupling[0][i], rate)
             applied[i] = add(applied[i], _sum_over_legs(add(hung[i], pushed), count))
     matrix = _matrix(whole)
+    # With the joints' motion given, the base sees all masses as one rigid body.
     lower = [[matrix[i][j] if j <= i else 0.0 for j in range(6)] for i in range(6)]
     (a,) = solve_positive(lower, [[neg(f) for f in applied]])
     torques = [
@@ -369,7 +371,7 @@ def impose(chassis: Inertia, force: Force, blocks: list[LegBlock], rates: list[A
         )
         for block, rate in zip(blocks, rates, strict=True)
     ]
-    return Motion(Vector(*a[:3]), Vector(*a[3:])), torques
+    return Motion(Vec3(*a[:3]), Vec3(*a[3:])), torques
 
 
 def _over_ties(value: Any, block: LegBlock) -> Any:
@@ -386,12 +388,14 @@ def _legs_of(block: LegBlock) -> int:
 def _sum_over_legs(value: Any, count: int) -> Any:
     if isinstance(value, float):
         return count * value
+    # A number that all legs share stands for each of them.
     return count * value if jnp.ndim(value) == 0 else jnp.sum(value)
 
 
 def _matrix(inertia: Inertia) -> list[list[Any]]:
     """The 6 x 6 matrix of a spatial inertia, angular part first."""
     i, h, m = inertia.moments, inertia.h, inertia.mass
+    # The matrix of h x, the coupling of spin and push through the centre of mass.
     cross = [[0.0, neg(h.z), h.y], [h.z, 0.0, neg(h.x)], [neg(h.y), h.x, 0.0]]
     moments = [[i.xx, i.xy, i.xz], [i.xy, i.yy, i.yz], [i.xz, i.yz, i.zz]]
     top = [moments[r] + cross[r] for r in range(3)]

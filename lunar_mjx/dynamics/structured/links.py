@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lunar_mjx.dynamics.spatial_algebra import Body, Rotation, Vector
+from lunar_mjx.dynamics.spatial_algebra import Body
+from lunar_mjx.spatial import Frame, Vec3
 
 
 class LinkNumbers(NamedTuple):
@@ -22,8 +23,8 @@ class LinkNumbers(NamedTuple):
     """
 
     sign: Any
-    origin: Vector
-    turn: Rotation
+    origin: Vec3
+    turn: Frame
     body: Body
     damping: Any
     stiffness: Any

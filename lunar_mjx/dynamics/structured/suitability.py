@@ -42,6 +42,7 @@ def check_model(model: mujoco.MjModel, name: str) -> None:
       model: the compiled model.
       name: what to name in the message.
     """
+    # All problems at once, so that a user mends a file in one go.
     problems = [*_options(model), *_joints(model), *_bodies(model), *_others(model)]
     if problems:
         raise UnsuitableError(f"{name}: the structured engine cannot honour {'; '.join(problems)}.")
@@ -56,6 +57,7 @@ def _options(model: mujoco.MjModel) -> list[str]:
         problems.append('contact pairs (set <flag contact="disable"/>)')
     if not option.disableflags & int(disable.mjDSBL_LIMIT) and model.jnt_limited.any():
         problems.append('joint limits in the solver (set <flag limit="disable"/>; limits are an effect)')
+    # Flags that MuJoCo adds in later releases are refused by name until someone has thought about them.
     for flag, bit in disable.__members__.items():
         if flag.startswith("mjDSBL_") and option.disableflags & int(bit) & ~_IGNORABLE:
             problems.append(f"the disable flag {flag}")
@@ -75,6 +77,7 @@ def _joints(model: mujoco.MjModel) -> list[str]:
         joint = model.joint(j)
         if model.jnt_type[j] not in (free, hinge):
             problems.append(f"the slide or ball joint {joint.name!r}")
+    # The base is solved as a rigid body, without damping or rotor of its own.
     of_free = np.isin(model.dof_jntid, np.flatnonzero(model.jnt_type == free))
     for field in ("damping", "armature"):
         if getattr(model, f"dof_{field}")[of_free].any():

@@ -18,10 +18,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from lunar_mjx.dynamics.spatial_algebra import Body, Rotation, Symmetric, Vector, uniform
+from lunar_mjx.dynamics.spatial_algebra import Body, Symmetric, uniform
 from lunar_mjx.dynamics.structured.fourbar import FourBar, read_fourbar
 from lunar_mjx.dynamics.structured.links import Link, LinkNumbers
 from lunar_mjx.dynamics.structured.suitability import UnsuitableError
+from lunar_mjx.spatial import Frame, Vec3
 
 CHASSIS, WORLD = -1, -2
 """Parents that are no links of a leg."""
@@ -30,8 +31,8 @@ CHASSIS, WORLD = -1, -2
 class WheelNumbers(NamedTuple):
     """Centre of a wheel, m, and direction of its axle, in the frame of the link that carries it."""
 
-    center: Vector
-    axle: Vector
+    center: Vec3
+    axle: Vec3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -145,9 +146,12 @@ def read_structure(
     patterns: dict[Any, list[_Leg]] = {}
     for members in legs:
         leg = _leg(members, links, places, pins, wheels, axles, order)
+        # Legs of one pattern become one group, computed side by side: a rover of six alike legs costs little more than
+        # one leg.
         patterns.setdefault(leg.pattern, []).append(leg)
     groups, members = [], []
     for same in patterns.values():
+        # In the order of the rover's wheels, so that results are slices and not gathers.
         same.sort(key=lambda leg: [w[0] for w in leg.wheels] or [leg.links[0].joint])
         groups.append(_group(model, same, order, name))
         members.append(same)
@@ -186,6 +190,7 @@ def _couplings(
     found = []
     for e in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
         ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
+        # Taken care of already: tied legs are one joint.
         if any(groups[place[j][0]].ties for j in ends):
             continue
         follower, leader = (end(j, model.eq(e).name) for j in ends)
@@ -210,6 +215,7 @@ def _walk(model: mujoco.MjModel, chassis: int, name: str) -> tuple[list[_RawLink
     for body in range(1, model.nbody):
         up = places[model.body_parentid[body]]
         turn = up.turn @ _matrix(model.body_quat[body])
+        # A body without joints is carried rigidly: its mass goes to whatever carries it.
         place = _Place(up.owner, turn, up.shift + up.turn @ model.body_pos[body])
         if body == chassis:
             place = _Place(CHASSIS, np.eye(3), np.zeros(3))
@@ -220,6 +226,7 @@ def _walk(model: mujoco.MjModel, chassis: int, name: str) -> tuple[list[_RawLink
                 pivot = model.jnt_pos[joint]
                 origin = place.shift + place.turn @ pivot
                 links.append(_RawLink(joint, place.owner, origin, place.turn, np.array(model.jnt_axis[joint]), []))
+                # A link's frame has its origin on the joint's axis, where most offsets vanish.
                 place = _Place(len(links) - 1, np.eye(3), -np.array(pivot))
         places.append(place)
         if place.owner == WORLD:
@@ -255,9 +262,11 @@ def _legs(links: list[_RawLink], pins: list[_Pin], name: str) -> list[list[int]]
     for i, link in enumerate(links):
         root.append(i if link.parent == CHASSIS else root[link.parent])
     for pin in pins:
+        # A pin to the chassis closes a loop through the base, which the elimination leg by leg cannot honour.
         if min(pin.links) < 0:
             raise UnsuitableError(f"{name}: the connect {pin.name!r} ties a leg to the chassis or the world.")
         a, b = sorted(root[i] for i in pin.links)
+        # Two chains that a pin ties are one leg.
         root = [a if r == b else r for r in root]
     return [[i for i, r in enumerate(root) if r == leg] for leg in dict.fromkeys(root)]
 
@@ -308,6 +317,7 @@ def _group(model: mujoco.MjModel, legs: list[_Leg], actuated: dict[int, int], na
         raw = [leg.links[k] for leg in legs]
         above = [np.eye(3) if parent == CHASSIS else leg.links[parent].align for leg in legs]
         ids = [r.joint for r in raw]
+        # Damping and armature belong to degrees of freedom, springs to joints; for hinges these are one to one.
         dof = model.jnt_dofadr[ids]
         numbers = LinkNumbers(
             sign=uniform([float(np.sign(r.align[:, axes[k]] @ r.axis)) for r in raw]),
@@ -354,6 +364,7 @@ def _ties(
         # what ties legs of several joints, or not one to one, is a coupling (see `_couplings`)
         if None in ends or loop is not None or len(links) > 1 or model.eq_data[i, 1] != 1.0:
             continue
+        # Union of the two clusters.
         (first, _), (second, _) = ends  # type: ignore[misc]
         cluster[cluster == cluster[second]] = cluster[first]
         tied = True
@@ -368,6 +379,7 @@ def _ties(
 
 def _coordinate_axis(links: list[_RawLink]) -> int:
     """Coordinate axis about which these links turn; oblique axes become y by turning the links' frames."""
+    # An axis along a coordinate needs one cosine and one sine instead of a full rotation matrix.
     for axis in range(3):
         if all(np.linalg.norm(np.delete(link.axis, axis)) < 1e-14 for link in links):
             return axis
@@ -379,13 +391,13 @@ def _coordinate_axis(links: list[_RawLink]) -> int:
     return 1
 
 
-def _vector(vectors: list[np.ndarray]) -> Vector:
-    return Vector(*(uniform(c) for c in np.array(vectors).T))
+def _vector(vectors: list[np.ndarray]) -> Vec3:
+    return Vec3(*(uniform(c) for c in np.array(vectors).T))
 
 
-def _rotation(matrices: list[np.ndarray]) -> Rotation:
+def _rotation(matrices: list[np.ndarray]) -> Frame:
     m = np.array(matrices)
-    return Rotation(*(_vector(list(m[:, :, j])) for j in range(3)))
+    return Frame(*(_vector(list(m[:, :, j])) for j in range(3)))
 
 
 def _body(masses: list[list[tuple[float, np.ndarray, np.ndarray]]], aligns: list[np.ndarray]) -> Body:
@@ -395,6 +407,8 @@ def _body(masses: list[list[tuple[float, np.ndarray, np.ndarray]]], aligns: list
     moments = np.array([a.T @ i @ a for (_, _, i), a in zip(fused, aligns, strict=True)])
     size = max(float(np.abs(moments).max()), 1e-30)
     entries = np.stack([moments[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
+    # The moment that most diagonal entries share is taken out as a sphere, which needs no rotation; for a wheel one
+    # number is left.
     best = min(
         (entries[k] for k in range(3)), key=lambda s: sum(np.abs(entries[k] - s).max() > 1e-13 * size for k in range(3))
     )

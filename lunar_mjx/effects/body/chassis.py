@@ -71,6 +71,7 @@ def steering_toe(ctx, p, x, geometry):
 def wheel_wear(ctx, p, x, geometry):
     """r(d) = r_0 - w d with d the distance rolled: wheels that wear, or grow as soil cakes on them (Archard 1953)."""
     rolled = geometry.radius * jnp.abs(ctx.wheel_angular_velocity.dot(ctx.wheel_axle))
+    # Half the radius is far beyond any wear that is meant; it keeps a radius of a long drive from reaching zero.
     worn = jnp.maximum(geometry.radius - p.wear * x.distance, 0.5 * geometry.radius)
     return dataclasses.replace(geometry, radius=worn), {"distance": rolled}
 
@@ -107,6 +108,7 @@ def gravity_error(ctx, p, x, geometry):
 def parking_brake(ctx, p, x, wrench):
     """Holds every drive joint at the angle where the brake caught it, as a stiff damped spring; blocks the wheels."""
     held = (ctx.rover.joint_group == 0) & (p.engaged > 0.5)
+    # While released the state follows the joint, so that the brake catches the wheel where it is.
     angle = jnp.where(held, x.angle, ctx.joint_angle)
     hold = p.stiffness * (angle - ctx.joint_angle) - p.damping * ctx.joint_speed
     torque = wrench.joint_torque + jnp.where(held, hold, 0.0)
@@ -134,6 +136,7 @@ def _pull(axis: str, nominal: float) -> Parameter:
 )
 def tether(ctx, p, x, wrench):
     """A constant force F at the hitch, moment r x F: a long tether for drawbar tests (d'Alembert's equivalence)."""
+    # Parameters may be one number for a batch of rovers; the sum gives each rover its own.
     nil = jnp.zeros_like(ctx.position.x)
     force = Vec3(p.force_x + nil, p.force_y + nil, p.force_z + nil)
     arm = ctx.frame.to_world(Vec3(p.x, p.y, p.z))

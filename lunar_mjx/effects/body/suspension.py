@@ -13,6 +13,7 @@ DRIVE, SUSPENSION = 0, 2
 
 
 def _resist(ctx, wrench, group, torque, speed_scale):
+    # tanh instead of a sign: an explicit force that jumped at zero would shake a joint at rest from step to step.
     against = torque * jnp.tanh(ctx.joint_speed / speed_scale)
     mine = jnp.where(ctx.rover.joint_group == group, against, 0.0)
     return dataclasses.replace(wrench, joint_torque=wrench.joint_torque - mine)

@@ -16,6 +16,7 @@ from lunar_mjx.spatial import Vec3
 def _iron_damping(ctx, p):
     """N m s/rad at the joint."""
     motor = ctx.parameters["motor"]
+    # Squared: once for the rotor's speed, once for its torque, both seen through the gear.
     return jnp.minimum(p.drag * p.coefficient * motor.gear_ratio**2, largest_damping(ctx))
 
 
@@ -80,6 +81,7 @@ def gear_friction_heat(ctx, p, x, heat):
     own joint damping is not among the losses.
     """
     motor = ctx.parameters["motor"]
+    # Torque of the rotor without any loss; whatever does not arrive at the joint was lost between.
     rotor = motor.gear_ratio * constant_at(ctx.parameters, ctx.winding_temperature) * ctx.command.current
     iron = ctx.parameters.get("iron_loss")
     drag = 0.0 if iron is None else _iron_damping(ctx, iron) * ctx.joint_speed

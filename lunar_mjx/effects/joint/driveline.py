@@ -57,6 +57,7 @@ def actuator_delay(ctx, p, x, command):
     """
     values = [getattr(x, f"value_{i}") for i in range(EVENTS + 1)]
     ages = [getattr(x, f"age_{i}") for i in range(EVENTS)]
+    # Commands of all joints share one list of times: they come from one computer, in one message.
     changed = jnp.any(command.target != values[0])
     values = [jnp.where(changed, new, old) for new, old in zip([command.target, *values[:-1]], values, strict=True)]
     ages = [jnp.where(changed, new, old) for new, old in zip([0.0, *ages[:-1]], ages, strict=True)]
@@ -100,6 +101,7 @@ def driveline_compliance(ctx, p, x, command):
     k_p, k_d, _ = _loop_gains(ctx.rover)
     rigid = command.current
     softening = k_p * ctx.dt * rigid + k_d * (rigid - x.current)
+    # Implicit: an explicit spring as stiff as a gearhead's would need steps of microseconds.
     current = rigid - p.compliance * softening / (ctx.dt + p.compliance * (k_p * ctx.dt + k_d))
     return dataclasses.replace(command, current=current), {"current": current}
 
@@ -130,6 +132,8 @@ def backlash(ctx, p, x, command):
     per_ampere = torque_per_ampere(ctx.parameters["motor"])
     stiffness = k_d + k_p * ctx.dt
     acts = closed & (stiffness > 0.0)
+    # Where no loop is closed the division below is computed all the same and dropped: it must stay finite for its
+    # derivative.
     stiffness = jnp.where(acts, stiffness, 1.0)
     free = (k_d * x.gap + ctx.dt * per_ampere * command.current) / stiffness
     gap = jnp.where(free > p.half_gap, p.half_gap, jnp.where(free < -p.half_gap, -p.half_gap, free))

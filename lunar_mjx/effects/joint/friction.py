@@ -111,6 +111,7 @@ def stribeck_friction(ctx, p, x, torque):
 )
 def viscous_friction(ctx, p, x, torque):
     """tau_f = b omega (MuJoCo's dcmotor note)."""
+    # Beyond J/dt an explicit step would turn the joint around.
     return torque - jnp.minimum(p.damping, largest_damping(ctx)) * ctx.joint_speed
 
 
@@ -176,8 +177,10 @@ def directional_gear_efficiency(ctx, p, x, torque):
     power than it takes up.
     """
     eta = ctx.parameters["motor"].gear_efficiency
+    # The loss acts as a friction that grows with the torque: half of the difference between driving and being driven.
     level = 0.5 * p.asymmetry * (eta**-2 - 1.0) * jnp.abs(torque)
     way = jnp.sign(torque) * speed_sign(ctx, level, p.speed)
+    # expm1, because while driving (way = 1) the change must be exactly zero.
     return torque + p.asymmetry * jnp.expm1((way - 1.0) * jnp.log(eta)) * torque
 
 

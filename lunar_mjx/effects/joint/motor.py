@@ -56,6 +56,7 @@ def joint_control(ctx, p, x, command):
     position = rover.position_gain * (target - ctx.joint_angle) - rover.velocity_gain * ctx.joint_speed
     velocity = rover.velocity_gain * (target - ctx.joint_speed)
     torque = jnp.where(mode == POSITION, position, jnp.where(mode == VELOCITY, velocity, target))
+    # The controller does not know how warm the winding is: it asks for the current that gives the torque at 25 degC.
     current = jnp.where(mode == CURRENT, target, torque / torque_per_ampere(motor))
     return dataclasses.replace(command, current=jnp.clip(current, -p.current_limit, p.current_limit))
 
@@ -87,6 +88,7 @@ def thermal_cutoff(ctx, p, x, command):
     Without hysteresis the current returns at the next step and the motor chatters at the cut-off.
     """
     closes_at = p.temperature - p.hysteresis
+    # A state of floats holds the flag, since states of all effects are one kind of array.
     stays = (x.tripped > 0.5) & (ctx.winding_temperature >= closes_at)
     tripped = (ctx.winding_temperature >= p.temperature) | stays
     current = jnp.where(tripped, 0.0, command.current)
@@ -104,6 +106,7 @@ def _motor_heat(ctx, p, x, heat):
     return dataclasses.replace(
         heat,
         winding=heat.winding + joule,
+        # The motor sets the capacities that every other heat path uses; there is one motor for every joint.
         winding_capacity=p.winding_capacity * one,
         housing_capacity=p.housing_capacity * one,
     )

@@ -120,9 +120,11 @@ def _store(ctx, p, x, power):
     voltage = open_voltage(p, charge)
     needed = power.load - power.solar
     # U I - R I^2 = P, the root with the smaller current; beyond U^2/(4 R) the battery gives what it can
+    # Clipped at zero: more power than U^2/(4 R) is not to be had.
     root = jnp.sqrt(jnp.maximum(voltage * voltage - 4.0 * p.resistance * needed, 0.0))
     # the quadratic's root without the difference U - root, which has no digits left at small loads
     current = 2.0 * needed / (voltage + root)
+    # U/(2 R) is where a battery gives its largest power: more current would give less.
     current = jnp.clip(current, -voltage / (2.0 * p.resistance), voltage / (2.0 * p.resistance))
     # a full battery takes nothing more (panels are turned off), an empty one gives nothing more
     current = jnp.where(charge >= 1.0, jnp.maximum(current, 0.0), current)

@@ -173,6 +173,7 @@ def odometry_drift(ctx, p, x, signals):
     dx, dy = jnp.diff(px, axis=-1), jnp.diff(py, axis=-1)
     length = _length(dx, dy)
     travelled = _running_sum(length)
+    # The turn in the middle of an increment: taken at its end the error would be of first order in the sampling.
     half_way = travelled[..., 1:] - 0.5 * length
     turn = p.heading * half_way
     less = -2.0 * jnp.sin(0.5 * turn) ** 2  # cos - 1 without loss of digits
@@ -189,6 +190,8 @@ def odometry_drift(ctx, p, x, signals):
 def _length(dx: Any, dy: Any) -> Any:
     """Euclidean length with a finite derivative where it is zero."""
     square = dx * dx + dy * dy
+    # The inner `where` keeps the root's infinite derivative at zero out of the gradient, which NaN times 0 would
+    # poison.
     some = square > 0.0
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
 

@@ -126,6 +126,7 @@ def _smooth(channel: str, values: Any, sign: Any) -> Any:
 def quaternion_signs(signals: Signals) -> Any:
     """+1 or -1 at every sample: the factor that makes the quaternion continuous from its first sample on."""
     parts = [jnp.asarray(signals.channels[c]) for c in QUATERNION]
+    # Neighbours of one attitude have a positive scalar product, unless one of them has the other sign.
     turn = sum(p[..., 1:] * p[..., :-1] for p in parts)
     flips = jnp.where(turn < 0.0, -1.0, 1.0).astype(parts[0].dtype)
     first = jnp.ones_like(parts[0][..., :1])
@@ -234,6 +235,7 @@ def lag(time: Any, values: Any, constant: Any) -> Any:
     step = jnp.diff(time, axis=-1)
     some = constant > 0.0
     safe = jnp.where(some, constant, 1.0)
+    # At tau = 0 the output is the input: no memory, and a finite derivative.
     decay = jnp.where(some, jnp.exp(-step / safe), 0.0)
     behind = constant * jnp.diff(values, axis=-1) / step
     # e = u - y obeys e_k = decay e_(k-1) + behind (1 - decay)
@@ -242,5 +244,6 @@ def lag(time: Any, values: Any, constant: Any) -> Any:
     def chain(first: Any, second: Any) -> Any:
         return first[0] * second[0], first[1] * second[0] + second[1]
 
+    # A parallel scan: the recursion is linear, so that a log of n samples takes log n rounds on a GPU.
     error = jax.lax.associative_scan(chain, (decay, source), axis=-1)[1]
     return values - jnp.concatenate([jnp.zeros_like(values[..., :1]), error], axis=-1)

@@ -86,6 +86,7 @@ def surface_type(ctx, p, x, ground):
     if terrain.soil is None:
         return ground
     fraction = rock_fraction(terrain.soil, here.x, here.y)
+    # Half and half counts as soil: laws of rock and soil do not mix under one wheel.
     return dataclasses.replace(ground, rock=jnp.where(fraction > 0.5, 1.0, 0.0) * jnp.ones_like(ground.rock))
 
 
@@ -142,5 +143,6 @@ def _slope(direction: str) -> Parameter:
 @effect("soil", order=-70, east=_slope("the east"), north=_slope("the north"))
 def soil_gradient(ctx, p, x, ground):
     """Soil that grows stiffer in one direction: k_c and k_phi times exp(g_x x + g_y y)."""
+    # An exponential stays positive wherever the rover drives; within e^5 the moduli stay within what soils have.
     factor = jnp.exp(jnp.clip(p.east * ctx.wheel_position.x + p.north * ctx.wheel_position.y, -5.0, 5.0))
     return dataclasses.replace(ground, k_c=ground.k_c * factor, k_phi=ground.k_phi * factor)

@@ -55,9 +55,11 @@ def rut_under(ctx, p, x):
     """
     here_x, here_y = ctx.wheel_position.x[None, None, :], ctx.wheel_position.y[None, None, :]
     squared = (x.place_x[:, :, None] - here_x) ** 2 + (x.place_y[:, :, None] - here_y) ** 2
+    # A bump of compact support: a place two spacings away no longer counts, and the depth changes without jumps.
     near = jnp.maximum(1.0 - squared / (4.0 * p.spacing**2), 0.0)
     near = near * near
     places, wheels = x.depth.shape
+    # A wheel stands in the soil that it is pressing now; its own latest places are that soil and no earlier pass.
     own = jnp.eye(wheels, dtype=bool)[None] & (jnp.arange(places) < _FRESH)[:, None, None]
     near = jnp.where(own, 0.0, near)
     total = jnp.sum(near, axis=(0, 1))
@@ -131,6 +133,7 @@ def multipass(ctx, p, x, ground):
     last 20 places (their position and depth), and finds those of all wheels but the latest three of its own.
     """
     depth, inside = rut_under(ctx, p, x)
+    # The factor by which a shorter sinkage, (1 - e) z_u, has to give the pressure of z_u.
     firm = 1.0 + inside * (jnp.power(1.0 - p.plastic, -ground.n) - 1.0)
     pressed = p.plastic * depth
     rut = pressed if ground.rut is None else jnp.maximum(pressed, ground.rut)

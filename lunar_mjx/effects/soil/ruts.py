@@ -108,6 +108,7 @@ def _soil(ctx, p, x, ground):
     relief = _relief(ctx, p, x, geometry)
     radius, width = geometry.radius, geometry.width
     here, ahead, beside = ctx.wheel_position, contact.forward, contact.left
+    # Which way the wheel rolls, without a jump at rest.
     way = jnp.clip(contact.rim_speed / p.turning, -1.0, 1.0)
     reach = radius * jnp.sin(entrance_angle(contact.sinkage, radius))
     lead_x, lead_y = here.x + 0.5 * way * reach * ahead.x, here.y + 0.5 * way * reach * ahead.y
@@ -126,6 +127,7 @@ def _soil(ctx, p, x, ground):
     share = jnp.reshape(jnp.asarray(_ACROSS, here.x.dtype), (-1, 1))
     side_x, side_y = here.x + share * width * beside.x, here.y + share * width * beside.y
     slide = contact.rim_speed - contact.v_x
+    # A spinning wheel throws soil back, a braked one shoves it ahead.
     toward = jnp.sign(slide)
 
     def along(*off):
@@ -142,6 +144,7 @@ def _soil(ctx, p, x, ground):
     room = 1.0 - (heap - hole) / (_BEHIND[0] * radius * ground.tan_phi)
     deep = jnp.minimum(jnp.maximum(contact.sinkage - rut, 0.0), radius)
     volume = ctx.dt * p.carried * deep * jnp.abs(slide) * jnp.clip(room, 0.0, 1.0) * width
+    # A volume spread over cells: what is taken from some is brought to others, so that soil is conserved.
     height = jnp.where(working, volume, 0.0) / relief.cell**2
     press = jnp.where(working, p.plastic * contact.sinkage, 0.0)
 
@@ -150,6 +153,7 @@ def _soil(ctx, p, x, ground):
     taken, brought, none = (0.0 * v for v in (dug_x, back_x, trail_x))
     change = jnp.concatenate([taken - height / len(dug_x), brought + height / len(back_x), none])
     moved = relief.moved.at[slot].add(change.reshape(-1))
+    # The deepest pass counts: pressing twice to one depth presses once.
     pressed = relief.pressed.at[slot].max(jnp.concatenate([taken, brought, none + press]).reshape(-1))
     return soil, {"moved": moved, "pressed": pressed, "tile": relief.tile}
 

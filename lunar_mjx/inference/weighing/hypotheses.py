@@ -96,6 +96,7 @@ class Linear:
         gone = [p for name, p in self.effects.items() if name not in named and np.any(self.at[p] != 0.0)]
         gram, back = self.gram, np.zeros(self.gram.width)
         for p in gone:
+            # From where the refit stands to zero amplitude, by the linear model.
             back[p] = -self.at[p]
         if gone:
             gram = shifted(gram, back)
@@ -120,6 +121,8 @@ class Linear:
         """
         whole = self.gram.matrix.sum(axis=0)
         own = self.always[(self.amplitudes.field[self.always] < 0)]
+        # Discrepancy and calibration could absorb anything: with them, this would tell of the priors and not of the
+        # data.
         own = np.setdiff1d(own, np.concatenate([*self.calibration.values(), np.zeros(0)]).astype(int))
         scale = self.amplitudes.std
         inner = np.eye(len(own)) + scale[own, None] * whole[np.ix_(own, own)] * scale[own]

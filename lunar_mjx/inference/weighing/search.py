@@ -147,6 +147,7 @@ def search(
             nonlocal over
             over = True
             return
+        # A solver that fails says nothing against a hypothesis: it is recorded and the search goes on.
         except (EvidenceError, ValueError, np.linalg.LinAlgError) as error:
             done[form.name, effects] = None
             failed.append(label)
