@@ -202,6 +202,15 @@ def run(args: argparse.Namespace) -> None:
     print(f"{number} cases done, {len(left) - number} left")
 
 
+def _rounded(value: Any) -> Any:
+    """A record with four digits of every number."""
+    if isinstance(value, float):
+        return float(f"{value:.4g}")
+    if isinstance(value, Mapping):
+        return {k: _rounded(v) for k, v in value.items()}
+    return [_rounded(v) for v in value] if isinstance(value, list | tuple) else value
+
+
 def summary(args: argparse.Namespace) -> None:
     """Writes `OUT.json` and prints the figures."""
     from benchmarks.hidden import runner
@@ -230,8 +239,11 @@ def summary(args: argparse.Namespace) -> None:
         if case["sindy"]:  # the dearest terms are those that count
             case["sindy"] = case["sindy"] | {"terms": {c: t[:2] for c, t in case["sindy"]["terms"].items()}}
     campaigns = [json.loads(p.read_text(encoding="utf-8")) for p in seeds if p.is_file()]
-    content = {"figures": found, "campaigns": campaigns, "cases": cases}
-    args.out.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    # one case a line, four digits: the page's tables need no more
+    lines = ",\n".join(json.dumps(_rounded(case)) for case in cases)
+    head = json.dumps({"figures": found, "campaigns": campaigns}, indent=1).removesuffix("\n}")
+    text = f'{head},\n "cases": [\n{lines}\n]}}\n'
+    args.out.with_suffix(".json").write_text(text, encoding="utf-8")
     for group, table in found.items():
         print(group)
         for name, f in table.items():

@@ -185,8 +185,12 @@ def answers(cases: Sequence[Row]) -> dict[str, tuple[int, int, int]]:
     return found
 
 
-def plot(cases: Sequence[Row], path: Path) -> None:
-    """Bars of right and wrong answers by what was hidden; `cases` are rows or the `cases` of a record."""
+def plot(counts: Mapping[str, Sequence[int]], path: Path) -> None:
+    """Draws bars of right and wrong answers by what was hidden.
+
+    Args:
+      counts: of right answers, those short of it and wrong names, by what was hidden (`answers`). path: of the picture.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -194,7 +198,6 @@ def plot(cases: Sequence[Row], path: Path) -> None:
 
     from lunar_mjx.report.style import BLUE, PAPER, SKY, VERMILION, styled
 
-    counts = answers(cases)
     shares = np.array([np.array(c) / sum(c) for c in counts.values()])
     kinds = (
         ("right", BLUE, ""),
@@ -221,12 +224,17 @@ def plot(cases: Sequence[Row], path: Path) -> None:
 
 
 def write(rows: Sequence[Row], out: Path, seeds: Sequence[Mapping[str, Any]]) -> str:
-    """Writes `OUT.json` and `OUT.png`; returns the table as text."""
+    """Writes `OUT.json` and `OUT.png`; returns the table as text.
+
+    The record keeps the figures, the counts of answers and the cases that were not answered rightly; the seed of the
+    campaign makes any of the others anew.
+    """
     figures = summarise(rows)
     out.parent.mkdir(parents=True, exist_ok=True)
-    shown = ("case", "kind", "seed", "verdict", "named", "outcome", "right", "wrong_name")
-    cases = [{k: r.get(k) for k in shown} for r in rows]
-    content = {"figures": figures, "campaigns": list(seeds), "cases": cases}
+    counts = answers(rows)
+    shown = ("case", "kind", "verdict", "named", "outcome", "right", "wrong_name")
+    missed = [{k: r.get(k) for k in shown} for r in rows if not r.get("right") or r.get("wrong_name")]
+    content = {"figures": figures, "campaigns": list(seeds), "answers": counts, "missed": missed}
     out.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    plot(rows, out.with_suffix(".png"))
+    plot(counts, out.with_suffix(".png"))
     return "\n\n".join(f"{kind}\n{text(f)}" for kind, f in figures.items())
