@@ -12,6 +12,7 @@ import numpy as np
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, SteadyLog
 from lunar_mjx.logs.log import LogTable, Noise
+from lunar_mjx.logs.schema import is_command
 from lunar_mjx.manoeuvres import MANOEUVRES, commands, load_manoeuvre
 from lunar_mjx.model import ZERO_CELSIUS, Model
 from lunar_mjx.simulate import command_channels
@@ -51,7 +52,7 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
         drive = dict(zip(command_channels(own), moves.values.T, strict=True))
         tables = {"commands": LogTable("commands", Path(name), time, drive, 1.0 / moves.interval)}
         for table in template.tables.values():
-            channels = [c for c in table.channels if not c.startswith("command_")]
+            channels = [c for c in table.channels if not is_command(c)]
             count = int(time[-1] * table.rate_hz) + 1
             if channels and count > 1:
                 fill = {c: np.full(count, _first(c, plan.start, kelvin)) for c in channels}

@@ -18,7 +18,7 @@ from scipy.special import polygamma
 from scipy.stats import chi2
 
 from lunar_mjx.logs.log import Log
-from lunar_mjx.logs.schema import find_channel
+from lunar_mjx.logs.schema import find_channel, is_command, is_quantity
 
 WINDOW_S = 2.0
 """Windows about whose own parabola a channel is noise: what changes within two seconds in any other way than that is
@@ -107,7 +107,7 @@ def estimated_noise(log: Log, channel: str, moving: bool) -> ChannelNoise | None
       log: of a drive. channel: that it holds; commands have no noise. moving: which part of the drive.
     """
     found = log.channel(channel)
-    if found is None or channel.startswith("command_"):
+    if found is None or is_command(channel):
         return None
     time, values = found
     step, windows = _windows(time, values, _moving(log, time, channel), moving)
@@ -135,7 +135,7 @@ def estimated_noise(log: Log, channel: str, moving: bool) -> ChannelNoise | None
 def noise_table(logs: Sequence[Log]) -> dict[str, dict[str, ChannelNoise]]:
     """Noise by channel of a campaign: `stated`, `drive` and `rest`, the median log's where several tell it."""
     out: dict[str, dict[str, ChannelNoise]] = {}
-    names = dict.fromkeys(c for log in logs for c in log.channel_names if not c.startswith("command_"))
+    names = dict.fromkeys(c for log in logs for c in log.channel_names if not is_command(c))
     for name in names:
         mine = [log for log in logs if name in log.channel_names]
         found: dict[str, list[ChannelNoise]] = {}
@@ -156,8 +156,8 @@ def noise_table(logs: Sequence[Log]) -> dict[str, dict[str, ChannelNoise]]:
 
 def _moving(log: Log, time: np.ndarray, channel: str) -> np.ndarray:
     """(n,) whether any wheel turns at some times; everywhere where no channel tells."""
-    for kind in ("joint_", "command_"):
-        names = [c for c in log.channel_names if c.startswith(kind) and c.endswith("_drive_speed_rad_s")]
+    for quantity in ("joint_speed", "command_speed"):
+        names = [c for c in log.channel_names if is_quantity(c, quantity, "drive")]
         series = [s for c in names if (s := log.channel(c)) is not None and s[0].size]
         if series:
             moves = np.zeros(len(time), bool)

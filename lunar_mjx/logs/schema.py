@@ -175,6 +175,16 @@ class ChannelName:
         """Whether one reading stands for all wheels of a side."""
         return self.corner in SIDES
 
+    @property
+    def is_command(self) -> bool:
+        """Whether the channel is what the rover was told, not what was measured."""
+        return self.quantity.startswith("command_")
+
+    @property
+    def kind(self) -> str:
+        """The name without its corner: one kind of sensor, wherever on the rover it sits."""
+        return str(dataclasses.replace(self, corner=""))
+
     def at(self, corner: str) -> ChannelName:
         """The channel of the same quantity at another corner or side."""
         return dataclasses.replace(self, corner=corner)
@@ -191,15 +201,42 @@ def channel_name(name: str) -> ChannelName:
     Raises:
       UserError: the name is no channel of the schema.
     """
+    parts = parse_name(name)
+    if parts is None:
+        raise bad_input("channel", "name", name, "is no channel", "list them with lunar-mjx log channels")
+    return parts
+
+
+@functools.cache
+def parse_name(name: str) -> ChannelName | None:
+    """The parts of a channel's name; None for a name that is not of the schema."""
     found = find_channel(name)
     if found is None:
-        raise bad_input("channel", "name", name, "is no channel", "list them with lunar-mjx log channels")
+        return None
     channel, match = found
     parts = match.groupdict()
     quantity = re.sub(r"_?\{.\}", "", channel.stem)
     return ChannelName(
         quantity, parts.get("corner") or "", parts.get("joint") or "", parts.get("axis") or "", channel.suffix
     )
+
+
+def is_command(name: str) -> bool:
+    """Whether a channel is what the rover was told, not what was measured."""
+    parts = parse_name(name)
+    return parts is not None and parts.is_command
+
+
+def is_quantity(name: str, quantity: str, joint: str = "") -> bool:
+    """Whether a channel is of a quantity such as `joint_speed`, at a kind of joint or at any, wherever on the rover."""
+    parts = parse_name(name)
+    return parts is not None and parts.quantity == quantity and joint in ("", parts.joint)
+
+
+def channel_kind(name: str) -> str:
+    """A channel's name without its corner; names that are not of the schema as they are."""
+    parts = parse_name(name)
+    return name if parts is None else parts.kind
 
 
 def find_channel(name: str) -> tuple[Channel, re.Match[str]] | None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lunar_mjx.logs.log import Log
+from lunar_mjx.logs.schema import is_quantity
 
 PERIODS = {"yaw_deg": 360.0, "roll_deg": 360.0}
 
@@ -19,7 +20,7 @@ def continuous(log: Log, name: str) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     time, values = found
     period = PERIODS.get(name)
-    if period is None and name.startswith("joint_") and name.endswith("_angle_rad") and np.ptp(values) <= 6.5:
+    if period is None and is_quantity(name, "joint_angle") and np.ptp(values) <= 6.5:
         period = 2.0 * np.pi
     return time, values if period is None else np.unwrap(values, period=period)
 

@@ -7,6 +7,7 @@ follow it. As an Ornstein-Uhlenbeck process beside the noise it is as many as it
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -15,6 +16,7 @@ from lunar_mjx.diagnosis.drives.observations import with_discrepancy
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.inference.evidence import Amplitudes, Gram, NoiseSize, infer
 from lunar_mjx.inference.observations import Observations
+from lunar_mjx.logs.schema import parse_name
 
 
 def chosen_errors(
@@ -89,5 +91,6 @@ def _spread(observations: Observations) -> dict[str, float]:
 
 
 def _kind(channel: str) -> str:
-    """A channel without its axis and corner."""
-    return "_".join(w for w in channel.split("_") if w not in ("x", "y", "z", "lf", "rf", "lm", "rm", "lr", "rr"))
+    """A channel's name without its axis and corner."""
+    parts = parse_name(channel)
+    return channel if parts is None else dataclasses.replace(parts, axis="").kind

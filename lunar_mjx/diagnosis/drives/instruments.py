@@ -16,6 +16,7 @@ from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.logs import Log
 from lunar_mjx.logs.attitude import EULER
+from lunar_mjx.logs.schema import channel_name
 
 CLOCK, MOUNTING, USUAL = "clock ", "mounting ", "usual "
 """Names of these nuisances begin so, and go on with the table, the axis, or the kind of instrument and its error."""
@@ -99,7 +100,7 @@ def _turned(kind: str, one: Series, series: list[Series], log: Log, axis: int, p
         if other is not None and other.time is not None:
             vector[:, k] = np.interp(one.time, other.time, predicted[other.start : other.stop])
     change = mounting.inv().apply(np.cross(mounting.apply(vector), np.eye(3)[axis]))
-    return change[:, "xyz".index(one.channel.split("_")[1])]
+    return change[:, "xyz".index(channel_name(one.channel).axis)]
 
 
 def usual_nuisances(observations: Observations) -> list[Coordinate]:

@@ -13,6 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from lunar_mjx.effects.sensor.channels import family
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.logs.noise import ChannelNoise, noise_of
+from lunar_mjx.logs.schema import is_command
 
 if TYPE_CHECKING:
     from lunar_mjx.logs import Log
@@ -113,7 +114,7 @@ class Noises:
             for channel in log.channel_names:
                 found = log.channel(channel)
                 # a slip ratio at rest is noise over zero
-                if channel.startswith("command_") or channel.endswith("slip_ratio") or found is None:
+                if is_command(channel) or channel.endswith("slip_ratio") or found is None:
                     continue
                 key = _kind(log, channel)
                 for begin, end in rests:
@@ -200,7 +201,7 @@ def _kind(log: Log, channel: str) -> tuple[str, float]:
 
 def _rests(log: Log) -> list[tuple[float, float]]:
     """Spans in which all commands are zero, without what the rover needs to come to rest."""
-    commands = [found for c in log.channel_names if c.startswith("command_") and (found := log.channel(c)) is not None]
+    commands = [found for c in log.channel_names if is_command(c) and (found := log.channel(c)) is not None]
     if not commands:
         return []
     # A command stays until the next one.

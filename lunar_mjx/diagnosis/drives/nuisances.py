@@ -11,6 +11,7 @@ from lunar_mjx.diagnosis.drives.instruments import is_instrument
 from lunar_mjx.diagnosis.drives.simulation.log_run import READS_BEFORE, SETTLE, STOOD
 from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
 from lunar_mjx.inference.observations import Observations, Series
+from lunar_mjx.logs.schema import is_quantity
 
 if TYPE_CHECKING:
     from lunar_mjx.diagnosis.drives.simulation.rollouts import LogRun
@@ -19,7 +20,6 @@ STEP_ERROR = "step_error"
 """Name of the nuisance by which logs differ from what steps of finite length predict."""
 _COUNTED = re.compile(r"position|angle|yaw")
 """What another pose at the start moves as a whole."""
-_ENCODER = re.compile(r"joint_\w*drive_angle_rad")
 _START = {"x": (0.01, 1.0), "y": (0.01, 1.0), "yaw": (0.01, 0.6), "temperature": (1.0, 100.0)}
 """Scale and reach of what is measured with noise at the start, m, rad, K."""
 _STOOD_SCALE, _STOOD_MOST = 0.5, 6.0
@@ -34,7 +34,7 @@ thousands, six of LUVMI-X some fifty."""
 
 def is_encoder(series: Series) -> bool:
     """Whether a channel counts a wheel's turns from a zero of its own."""
-    return _ENCODER.fullmatch(series.channel) is not None
+    return is_quantity(series.channel, "joint_angle", "drive")
 
 
 def standing_shows(change: np.ndarray, number: int, observations: Observations) -> bool:
@@ -116,7 +116,7 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
 
 def is_linear(c: Coordinate) -> bool:
     """Whether a coordinate adds a known vector to the predictions, whatever the others are."""
-    return c.nuisance and (c.name == STEP_ERROR or _ENCODER.fullmatch(c.name) is not None or is_instrument(c))
+    return c.nuisance and (c.name == STEP_ERROR or is_quantity(c.name, "joint_angle", "drive") or is_instrument(c))
 
 
 def direction(c: Coordinate, observations: Observations, step_error: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from lunar_mjx.logs import Log
 from lunar_mjx.logs.attitude import EULER, QUATERNION
+from lunar_mjx.logs.schema import is_command, is_quantity
 
 REASONS: Mapping[str, str] = {
     "drawbar_pull": "a pull on a tether is no input of the model yet; compare drives without one",
@@ -34,8 +35,8 @@ def unused_channels(log: Log, compared: Collection[str]) -> dict[str, str]:
         read |= set(QUATERNION)
     out = {}
     for name in log.channel_names:
-        speed = name.startswith("joint_") and name.endswith("_drive_speed_rad_s")
-        if name in compared or name in read or name.startswith("command_") or (log.imposed and speed):
+        speed = is_quantity(name, "joint_speed", "drive")
+        if name in compared or name in read or is_command(name) or (log.imposed and speed):
             continue
         out[name] = next((why for start, why in REASONS.items() if name.startswith(start)), OTHERWISE)
     return out

@@ -28,6 +28,7 @@ from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Fit, Progress, fit, silent
 from lunar_mjx.inference.held_out import errors
 from lunar_mjx.logs import Log, SteadyLog
+from lunar_mjx.logs.schema import channel_kind, is_command
 
 UNKNOWN_FILE = "unknown.json"
 REFITS = 5
@@ -302,6 +303,4 @@ def _of_trial(trial: Trial, base: Fit) -> Row:
 
 def sensor_kinds(run: Run, logs: Sequence[Log]) -> list[str]:
     """Kinds of measured channels: their names without corners."""
-    corners = ("lf", "rf", "lm", "rm", "lr", "rr")
-    names = [c for log in logs for c in log.channel_names if not c.startswith("command_")]
-    return list(dict.fromkeys("_".join(w for w in c.split("_") if w not in corners) for c in names))
+    return list(dict.fromkeys(channel_kind(c) for log in logs for c in log.channel_names if not is_command(c)))

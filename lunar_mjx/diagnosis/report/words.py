@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from lunar_mjx.diagnosis.unknown_inputs.inputs import PROBES
-from lunar_mjx.logs.schema import CHANNELS, STEADY_CHANNELS
+from lunar_mjx.logs.schema import STEADY_CHANNELS, find_channel
 
 SPLIT_NAMES = {
     "fit": "fitted",
@@ -39,11 +39,11 @@ def channel_label(channel: str) -> str:
         unit = STEADY_CHANNELS[channel][0]
         stem = channel.removesuffix("_" + unit.replace("/", "_").replace(" ", "")) if unit != "1" else channel
         return f"{stem.replace('_', ' ')}, {unit}"
-    for kind in CHANNELS:
-        stem = channel.removesuffix("_" + kind.suffix) if kind.suffix else channel
-        if (not kind.suffix or stem != channel) and kind.pattern.fullmatch(stem):
-            return f"{stem.replace('_', ' ')}, {kind.unit}"
-    return channel.replace("_", " ")
+    found = find_channel(channel)
+    if found is None:
+        return channel.replace("_", " ")
+    kind, match = found
+    return f"{match[0].replace('_', ' ')}, {kind.unit}"
 
 
 def port_label(label: str) -> str:

@@ -10,6 +10,7 @@ from scipy import stats
 from lunar_mjx.logs.checks.values import CHANCE, quantum
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, Noise
+from lunar_mjx.logs.schema import is_command, is_quantity
 
 FACTOR = 2.0
 """A stated noise that is wrong by less than this does not mislead; the data sheets themselves are no better."""
@@ -41,7 +42,7 @@ FEWEST = 20
 
 def rest_segments(log: Log) -> list[tuple[float, float]]:
     """Spans of common time, s, at which all commands are constant, drives are commanded to rest and no joint moves."""
-    commands = [c for c in log.channel_names if c.startswith("command_")]
+    commands = [c for c in log.channel_names if is_command(c)]
     if not commands:
         return []
     start, end = log.span_s
@@ -50,7 +51,7 @@ def rest_segments(log: Log) -> list[tuple[float, float]]:
     for name in commands:
         rest &= _quiet_command(log, name, grid)
     for name in log.channel_names:
-        if name.startswith("joint_") and name.endswith("_speed_rad_s"):
+        if is_quantity(name, "joint_speed"):
             found = log.channel(name)
             if found is None or len(found[0]) < FEWEST:
                 continue
@@ -72,7 +73,7 @@ def _quiet_command(log: Log, name: str, grid: np.ndarray) -> np.ndarray:
         return np.ones(len(grid), bool)
     time, values = found
     held = values[np.maximum(np.searchsorted(time, grid + 1e-6, side="right") - 1, 0)]
-    quiet = np.ones(len(grid), bool) if name.endswith("_angle_rad") else held == 0.0
+    quiet = np.ones(len(grid), bool) if is_quantity(name, "command_angle") else held == 0.0
     for when in time[1:][np.diff(values) != 0.0]:
         quiet &= (grid < when) | (grid > when + SETTLE)
     return quiet
@@ -129,7 +130,7 @@ def check_noise(log: Log) -> list[Finding]:
         return []
     found: list[Finding] = []
     for name, noise in log.noise.items():
-        estimate = rest_noise(log, name, spans) if noise.std > 0.0 and not name.startswith("command_") else None
+        estimate = rest_noise(log, name, spans) if noise.std > 0.0 and not is_command(name) else None
         if estimate is None:
             continue
         text = _contradiction(log, name, noise, *estimate)

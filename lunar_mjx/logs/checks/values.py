@@ -10,7 +10,7 @@ from lunar_mjx.logs.apply import environment_value
 from lunar_mjx.logs.checks.clock import LOST_SHARE
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, LogTable
-from lunar_mjx.logs.schema import MIRROR, find_channel, limits
+from lunar_mjx.logs.schema import MIRROR, find_channel, is_command, is_quantity, limits
 from lunar_mjx.logs.series import sigma
 
 CHANCE = 1e-6
@@ -69,7 +69,7 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
         )
     if name.endswith("_temperature_degC") and (text := _kelvin(log, values[there])):
         return finding(int(np.argmax(there)), "unit", text)
-    if name.startswith("command_"):
+    if is_command(name):
         return []
     # a receiver that holds its fix at rest, and an encoder that stands, are not broken
     judged = _judged(log, table, name, there)
@@ -149,8 +149,8 @@ def _judged(log: Log, table: LogTable, name: str, there: np.ndarray) -> np.ndarr
     found = find_channel(name)
     if found is None or found[0].family not in MOVED:
         return np.ones(len(there), bool)
-    speeds = [c for c in log.channel_names if c.endswith("_drive_speed_rad_s") and c.startswith("joint_") and c != name]
-    speeds = speeds or [c for c in log.channel_names if c.endswith("_drive_speed_rad_s") and c.startswith("command_")]
+    speeds = [c for c in log.channel_names if is_quantity(c, "joint_speed", "drive") and c != name]
+    speeds = speeds or [c for c in log.channel_names if is_quantity(c, "command_speed", "drive")]
     series = [s for c in speeds if (s := log.channel(c)) is not None and s[0].size]
     if not series:
         return np.ones(len(there), bool)

@@ -14,7 +14,7 @@ from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Imu, Log, LogTable, Noise, SteadyLog
 from lunar_mjx.logs.readers.steady import read_steady
 from lunar_mjx.logs.readers.table import read_log_table
-from lunar_mjx.logs.schema import FORMAT, IMPOSED, NOISE_SOURCES, SPLITS, find_channel, parse_column
+from lunar_mjx.logs.schema import FORMAT, IMPOSED, NOISE_SOURCES, SPLITS, find_channel, is_quantity, parse_column
 from lunar_mjx.toml_fields import Fields
 
 LOG_FILE = "log.toml"
@@ -160,7 +160,7 @@ def _read_drive(folder: Path, top: Fields) -> Log:
 
 def _imposed(top: Fields, channels: Sequence[str]) -> str | None:
     imposed = top.choice("imposed", IMPOSED)
-    if imposed is not None and not any(c.startswith("joint_") and c.endswith("_drive_speed_rad_s") for c in channels):
+    if imposed is not None and not any(is_quantity(c, "joint_speed", "drive") for c in channels):
         raise bad_input(
             top.path,
             "imposed",

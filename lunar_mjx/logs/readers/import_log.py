@@ -13,7 +13,7 @@ from lunar_mjx.logs.readers.drives_from_bags import drive_of_bag
 from lunar_mjx.logs.readers.drives_from_files import drives_of_files
 from lunar_mjx.logs.readers.import_map import ImportMap, read_map
 from lunar_mjx.logs.readers.recorded_drive import Copies, RecordedDrive, cut
-from lunar_mjx.logs.schema import find_channel
+from lunar_mjx.logs.schema import find_channel, is_quantity
 from lunar_mjx.logs.write import refuse_used, write_log
 
 
@@ -147,7 +147,7 @@ def _settings(drive: RecordedDrive, mapping: ImportMap, changes: Mapping[str, An
         stated = settings["magnitudes"]
         kept = [m for m in stated if _names(m, channels)]
         settings["magnitudes"] = {m: stated[m] for m in kept} if isinstance(stated, Mapping) else kept
-    if not any(c.startswith("joint_") and c.endswith("_drive_speed_rad_s") for c in channels):
+    if not any(is_quantity(c, "joint_speed", "drive") for c in channels):
         settings.pop("imposed", None)
     return {**settings, "source": {**settings.get("source", {}), **drive.source}}
 

@@ -12,7 +12,7 @@ import pandas as pd
 from lunar_mjx.logs.readers.geodesy import tangent_plane, utm, utm_zone
 from lunar_mjx.logs.readers.held import held_samples
 from lunar_mjx.logs.readers.import_map import Geodetic
-from lunar_mjx.logs.schema import channel_name, parse_column
+from lunar_mjx.logs.schema import channel_name, is_command, is_quantity, parse_column
 
 TIME = "time_s"
 LATITUDE, LONGITUDE = "latitude_deg", "longitude_deg"
@@ -102,7 +102,7 @@ def without_copies(frame: pd.DataFrame, time: np.ndarray) -> tuple[dict[str, pd.
             others.append(column)
             continue
         quantity = channel_name(found.name).quantity
-        if not quantity.startswith("command_"):
+        if not is_command(found.name):
             # angles of one attitude come in one message
             family = "attitude" if found.channel.family == "attitude" else quantity
             groups.setdefault(family, []).append(column)
@@ -176,12 +176,12 @@ def _gaps(drive: RecordedDrive, gap_s: float) -> list[float]:
 
 def _rests(drive: RecordedDrive, rest_s: float) -> list[float]:
     """Middles of spans in which every wheel speed that is measured, else commanded, is zero."""
-    for kind in ("joint_", "command_"):
+    for quantity in ("joint_speed", "command_speed"):
         series = [
             (f[TIME].to_numpy(float)[keep], f[c].to_numpy(float)[keep])
             for f in drive.tables.values()
             for c in f.columns
-            if c.startswith(kind) and c.endswith("_drive_speed_rad_s") and (keep := f[c].notna().to_numpy()).any()
+            if is_quantity(c, quantity, "drive") and (keep := f[c].notna().to_numpy()).any()
         ]
         if series:
             break

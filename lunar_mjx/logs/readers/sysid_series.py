@@ -11,7 +11,7 @@ import pandas as pd
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.logs.log import Log, Noise
-from lunar_mjx.logs.schema import find_channel, parse_column
+from lunar_mjx.logs.schema import find_channel, is_command, parse_column
 from lunar_mjx.logs.write import write_log
 
 
@@ -60,7 +60,7 @@ def to_time_series(
             raise UserError(f"{table.file}: time_s does not rise; run lunar-mjx log check on the log first.")
         signals = []
         for c in mine:
-            kind = sysid.SignalType.MjCtrl if c.startswith("command_") else sysid.SignalType.CustomObs
+            kind = sysid.SignalType.MjCtrl if is_command(c) else sysid.SignalType.CustomObs
             name = (names or {}).get(c, c)
             name, kind = (name, kind) if isinstance(name, str) else name
             signals.append((name, 1, kind))

@@ -12,6 +12,7 @@ import pandas as pd
 
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.logs.log import Noise
+from lunar_mjx.logs.schema import is_command
 
 
 class Instrument(NamedTuple):
@@ -157,7 +158,7 @@ def _measured(
     channel: str, when: np.ndarray, time: np.ndarray, values: np.ndarray, recording: Recording, rng: np.random.Generator
 ) -> np.ndarray:
     values = np.asarray(values, float)
-    if channel.startswith("command_"):
+    if is_command(channel):
         return values[np.maximum(np.searchsorted(time, when + 1e-6, side="right") - 1, 0)]
     turn = channel in ("roll_deg", "pitch_deg", "yaw_deg")
     sampled = np.interp(when, time, np.unwrap(values, period=360.0) if turn else values)
@@ -188,7 +189,7 @@ def _noise(when: np.ndarray, recording: Recording, rng: np.random.Generator) -> 
 def _lossy(frame: pd.DataFrame, share: float, rng: np.random.Generator) -> pd.DataFrame:
     if share <= 0.0:
         return frame
-    for channel in [c for c in frame.columns if c != "time_s" and not c.startswith("command_")]:
+    for channel in [c for c in frame.columns if c != "time_s" and not is_command(c)]:
         frame.loc[rng.random(len(frame)) < 0.5 * share, channel] = np.nan
     keep = rng.random(len(frame)) >= 0.5 * share
     keep[0] = keep[-1] = True

@@ -5,7 +5,6 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import functools
-import re
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from lunar_mjx.inference.coordinates import NUISANCE
 from lunar_mjx.inference.deadline import Deadline
 from lunar_mjx.inference.fitting import Progress
 from lunar_mjx.inference.observations import Observations
+from lunar_mjx.logs.schema import parse_name
 from lunar_mjx.model import Model
 from lunar_mjx.model.sun import make_sun
 
@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 CHUNK = {"cpu": 16, "gpu": 512}
 """Rovers simulated at once. (2,048 with 44 effects and channels of 50 Hz need more than 22 GiB.)"""
 
-_AT_ONCE = re.compile(r"motor_\w+_(current_A|voltage_V|torque_Nm)|bus_voltage_V")
+_AT_ONCE = frozenset({"motor_current", "motor_voltage", "motor_torque", "bus_voltage"})
+"""Quantities that jump at the instant at which a command does: no inertia stands between them and the controller."""
 
 _PROGRAMS: dict[Any, Program] = {}
 """Programs take every number as an argument, so that campaigns of one rover share them; a program keeps its model, so
@@ -233,7 +234,8 @@ def _sample(
 
 def at_once(channel: str) -> bool:
     """Whether a channel jumps at the instant at which a command does."""
-    return _AT_ONCE.fullmatch(channel) is not None
+    parts = parse_name(channel)
+    return parts is not None and parts.quantity in _AT_ONCE
 
 
 def _run_of(places: np.ndarray) -> np.ndarray | slice:
