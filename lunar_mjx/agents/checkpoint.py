@@ -27,7 +27,9 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any] | None = None, keep: int = _KEEP):
+        # orbax reports each of its steps through absl, in the middle of the table of a training.
         logging.getLogger("absl").setLevel(logging.ERROR)
+        # Synchronous: a state is donated to the next epoch, which would overwrite what is still being written.
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True, enable_async_checkpointing=False)
         self.folder, self.settings = Path(folder).resolve(), settings
         self._manager = ocp.CheckpointManager(self.folder, options=options)
@@ -67,6 +69,7 @@ class Checkpoints:
           UserError: the checkpoint belongs to other settings, or none can be read.
         """
         failed: list[tuple[int, Exception]] = []
+        # Newest first: a kill may have damaged the last one, and the one before it is only an interval older.
         for step in sorted(self._manager.all_steps(), reverse=True):
             try:
                 found = self.restore(step, like)
@@ -92,6 +95,7 @@ class Checkpoints:
     def restore(self, step: int, like: Any) -> tuple[Any, dict[str, Any]]:
         """Reads one checkpoint; see `newest`. Whatever orbax raises goes through."""
         notes = self._manager.restore(step, args=ocp.args.Composite(notes=ocp.args.JsonRestore()))["notes"]
+        # Settings first: arrays of another network would fail later, with a message that names a shape.
         self._compare(notes.get("settings"))
         what = ocp.args.Composite(state=ocp.args.StandardRestore(_flat(like)))
         found = self._manager.restore(step, args=what)["state"]

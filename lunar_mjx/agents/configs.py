@@ -88,6 +88,7 @@ def _with_learner(training: Training, learner: str) -> Training:
     own = learner_name(training)
     if learner == own:
         return training
+    # The shipped files are named family-learner; the family's own name stands for its usual learner.
     family, names = training.settings.removesuffix(f"-{own}"), training_names()
     for name in (f"{family}-{learner}", family):
         if name in names and learner_name(other := get_training(name)) == learner:
@@ -155,6 +156,7 @@ def _as(old: Any, table: Fields, key: str) -> Any:
     if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(old, tuple) and isinstance(value, list):
+        # TOML has lists; frozen settings hold tuples, so that they can be hashed and compared.
         return tuple(float(v) if old and isinstance(old[0], float) else v for v in value)
     if old is not None and type(value) is not type(old):
         raise bad_input(table.path, table.field(key), value, f"is not like {old}", f"write it like {old}")

@@ -78,6 +78,7 @@ def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path,
     for name, records in groups.items():
         curves = [moving_mean(r["episodes"]["episode_return"]) for r in records]
         count = min(len(c) for c in curves) if most is None else most
+        # A seed that ended early leaves a gap: its mean must not be carried on by the others alone.
         curves = [np.pad(c[:count], (0, max(0, count - len(c))), constant_values=np.nan) for c in curves]
         mean, low, high = mean_interval(np.stack(curves))
         axes.plot(np.arange(1, count + 1), mean, label=name)

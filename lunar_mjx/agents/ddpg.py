@@ -112,6 +112,8 @@ class DDPG:
     def explore(self, state: DDPGState, obs: Any, deviation: Any, key: Any) -> Any:
         """Actions of the policy with noise of each environment's `deviation`, (env, action)."""
         action = self.act(state.actor, obs)
+        # White noise as in Stable-Baselines3; the Ornstein-Uhlenbeck process of Lillicrap et al. gains nothing by its
+        # memory (Fujimoto et al. 2018).
         noise = jax.random.normal(key, action.shape, obs.dtype)
         return jnp.clip(action + deviation[:, None] * noise, -1.0, 1.0)
 

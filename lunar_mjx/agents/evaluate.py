@@ -74,6 +74,8 @@ class Evaluator:
             def step(carry: Any, key: Any) -> Any:
                 state, over, result = carry
                 state = env.step(params, state, agent(agent_params, state, key))
+                # Environments go on after their first episode: later ones would favour short episodes, and are not
+                # counted.
                 first = state.done & ~over
                 seen = {k: v for k, v in state.metrics.items() if not k.startswith("reward_")}
                 result = jax.tree.map(lambda old, new: jnp.where(first, new, old), result, seen)
@@ -110,6 +112,7 @@ class Evaluator:
         carry = self._carry(state)
         for i in range(math.ceil(self.env.episode_steps / _PIECE)):
             carry = self._piece(env_params, agent_params, carry, jax.random.fold_in(key, i))
+            # Looked at between pieces only: a test in every step would wait for the device.
             if bool(carry[1].all()):
                 break
         result = jax.device_get(carry[2])

@@ -47,7 +47,9 @@ def watch(guard: Guard, before: State, action: Any, after: State, iteration: Any
     """Looks at one step of a batch; remembers the first environment that broke, as it was before the step."""
     fine = jnp.isfinite(after.reward) & jnp.isfinite(after.final_obs).all(-1) & jnp.isfinite(after.obs).all(-1)
     fine = fine & jnp.isfinite(after.final_privileged).all(-1)
+    # argmin of booleans is the first false one.
     first = jnp.argmin(fine)
+    # The first break is kept: what follows it is its consequence.
     trips = ~jnp.all(fine) & ~guard.tripped[0]
 
     def keep(old: Any, new: Any) -> Any:

@@ -113,6 +113,7 @@ def picture(
         near, which = hit(rovers, position, direction)
         on_rover = (near < depth) & (near > camera.near)
         depth, label = jnp.where(on_rover, near, depth), jnp.where(on_rover, ROVER, label)
+    # Pixels of the sky are shaded like the others and blanked at the end: any finite distance will do.
     there = jnp.where(jnp.isfinite(depth), depth, 1.0)
     point = position + there[..., None] * direction
     face, on_rock = _surface_normal(terrain, point)
@@ -120,6 +121,7 @@ def picture(
     if rovers is not None:
         face = jnp.where((label == ROVER)[..., None], normal(rovers, which, point), face)
     to_eye = -direction / jnp.sqrt(jnp.sum(direction**2, axis=-1, keepdims=True))
+    # Lifted off its own surface, which would otherwise shade itself where the march's bilinear patch lies above it.
     lit = _sunlit(terrain, point + _SKIN * face, to_sun, rovers, shadow_steps)
     bright = _brightness(terrain, light, label, face, to_eye, to_sun, lit, point, paint)
     if rovers is not None:
@@ -165,6 +167,7 @@ def pictures(
         return picture(terrain, position, turn, optics, light, seen, **more)
 
     given = (qpos,) if others is None else (qpos, others)
+    # All at once is fastest; in parts, where the pictures do not fit into memory together.
     if at_once is None:
         return jax.vmap(lambda *a: one(a))(*given)
     return jax.lax.map(one, given, batch_size=at_once)
@@ -228,6 +231,7 @@ def _sunlit(terrain: Terrain, point: Any, to_sun: Any, rovers: Placed | None, st
     top = jnp.max(terrain.field.heights)
     if terrain.rocks is not None:
         top = jnp.maximum(top, jnp.max(terrain.rocks.centers[:, 2] + terrain.rocks.radii))
+    # A low Sun asks for long rays, whose steps would grow coarse: cut off, far shadows are lost before near ones.
     end = jnp.clip((top - point[..., 2]) / jnp.maximum(to_sun[2], 1e-4), 0.0, _FAR_SHADOW)
     blocked = jnp.isfinite(march(terrain, point, towards, end, steps, start=0.03, refine=0))
     if rovers is not None:
@@ -278,6 +282,7 @@ def _exposed(bright: Any, light: Light, camera: Pinhole, to_sun: Any, key: Any) 
         rays = camera.rays()
         value = value * jnp.asarray(1.0 / np.sum(rays**2, axis=-1, keepdims=True) ** 2, value.dtype)
     if film.dust > 0.0:
+        # Dust on the lens spreads light over the whole picture: a veil of the picture's own mean.
         veil = jnp.mean(value, axis=(-3, -2), keepdims=True)
         value = (1.0 - film.dust) * value + film.dust * veil
     if key is not None and film.full_well > 0.0:

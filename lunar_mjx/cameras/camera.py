@@ -83,6 +83,7 @@ class RoverCamera:
         )
         self.data = mujoco.MjData(self.model)
         self._chassis = self.model.body(rover.chassis).id
+        # The last entry is the sky: geom -1 picks it.
         self._labels = np.array([_label(self.model.geom(i).name) for i in range(self.model.ngeom)] + [0])
         self._offscreen = Offscreen(
             self.model, max(largest[0], self.camera.width), max(largest[1], self.camera.height), backends

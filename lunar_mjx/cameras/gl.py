@@ -123,6 +123,7 @@ class Offscreen:
 
     def depth_and_geoms(self) -> tuple[np.ndarray, np.ndarray]:
         """Depth, m (infinite where nothing is), and the geom that each pixel shows (-1 for none), (height, width)."""
+        # The scene is shared with the pass for colours, which must not see the flags of this one.
         flags = self._scene.flags.copy()
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = True
         self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
@@ -130,6 +131,7 @@ class Offscreen:
         colour, buffer = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
         self._render(colour, buffer)
         np.copyto(self._scene.flags, flags)
+        # The renderer writes each segment's number into the three bytes of a pixel's colour.
         number = colour.astype(np.int64) @ np.array([1, 256, 65536])
         geoms = np.full(self._scene.ngeom + 1, -1, np.int32)
         for geom in self._scene.geoms[: self._scene.ngeom]:

@@ -176,11 +176,6 @@ class ChannelName:
         return self.corner in SIDES
 
     @property
-    def is_command(self) -> bool:
-        """Whether the channel is what the rover was told, not what was measured."""
-        return self.quantity.startswith("command_")
-
-    @property
     def kind(self) -> str:
         """The name without its corner: one kind of sensor, wherever on the rover it sits."""
         return str(dataclasses.replace(self, corner=""))
@@ -222,9 +217,8 @@ def parse_name(name: str) -> ChannelName | None:
 
 
 def is_command(name: str) -> bool:
-    """Whether a channel is what the rover was told, not what was measured."""
-    parts = parse_name(name)
-    return parts is not None and parts.is_command
+    """Whether a channel is what the rover was told, not what was measured: such names alone begin with `command_`."""
+    return name.startswith("command_")
 
 
 def is_quantity(name: str, quantity: str, joint: str = "") -> bool:

@@ -136,6 +136,7 @@ def _record(model: Model, path: Path) -> dict[str, Any]:
                 f"put it into a file and add it as my_effects.py:{effect.name}",
             )
     noon, night, noon_time, period = (float(v) for v in model.ambient)
+    # A constant temperature is written as one, so that a file reads as its author would write it.
     if noon == night and (noon_time, period) == (0.0, SYNODIC_DAY):
         ambient: dict[str, float] = {"temperature_degC": _celsius(noon)}
     else:
@@ -247,6 +248,7 @@ def _list_effects(path: Path, names: Any, model: Model) -> Model:
     parameters, effects, files = {}, [], {}
     for name in names:
         near = _near_effect(path, name)
+        # Before anything is loaded: naming an effect file in a model runs it.
         require_trust(path, "effect_list", near)
         effect = _named(path, "effect_list", name, catalogue.get, near)
         if effect.name in parameters:
@@ -329,6 +331,7 @@ def _named(path: Path, field: str, value: str, load: Callable[[str], T], spec: s
 
 def _near(path: Path, kind: str, name: str) -> str:
     """The shipped rover or terrain called `name`, else a relative path counted from the file; else `name`."""
+    # A shipped name wins over a folder that happens to be called so; a path (with a slash) means the user's own.
     if name == Path(name).name and (shipped(kind) / name / _MARKERS[kind]).is_file():
         return str(shipped(kind) / name)
     near = path.parent.resolve() / name
@@ -356,6 +359,7 @@ def _known(path: Path, field: str, table: Mapping[str, Any], known: tuple[str, .
 
 
 def _number(path: Path, field: str, value: Any) -> float:
+    # bool is an int to Python; `true` is no number to a reader.
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise bad_input(path, field, value, "is not a number", "give a number")
     try:

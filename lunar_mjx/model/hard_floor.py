@@ -53,6 +53,7 @@ def hard_floor(rover: str | Path | Rover, gravity: float | None = None) -> Model
     wheels = model.rover.wheels
     radius = sum(w.radius for w in wheels) / len(wheels)
     load = model.rover.mass * model.gravity / len(wheels)
+    # In proportion to weight and wheel, so that any rover stands on its tyres like the one that was measured.
     stiffness = load / (TYRE_SINKAGE * radius)
     damping = 2.0 * TYRE_DAMPING * (stiffness * model.rover.mass / len(wheels)) ** 0.5
     model = model.set(

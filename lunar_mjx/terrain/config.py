@@ -170,6 +170,7 @@ def _convert(hint: Any, value: Any, source: str, where: str) -> Any:
         list: "a list",
         dict: "a table",
     }
+    # The exact type: `true` is an int to isinstance, and no number to a reader.
     if type(value) is not hint:
         raise bad_input(source, where, value, f"is not {kinds[hint]}", f"give {kinds[hint]}")
     if hint is float and not math.isfinite(value):

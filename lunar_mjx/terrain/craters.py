@@ -75,6 +75,7 @@ def profile(r: Any, depth: Any, xp: Any = np) -> Any:
     """
     rim = RIM * depth
     bowl = rim + depth * (r * r - 1)
+    # Inside half a radius the bowl is far below the blanket, whose value there only has to be finite.
     blanket = rim * xp.maximum(r, 0.5) ** -3.0
     width = _ROUND * depth
     # Beyond this many widths the smooth minimum is the minimum, and exp() would overflow.
@@ -100,6 +101,7 @@ def draw(
       UserError: there would be too many to draw.
     """
     west, south, east, north = bounds
+    # Craters beyond the edge throw ejecta onto the terrain.
     margin = 0.5 * REACH * craters.largest
     wide, high = east - west + 2 * margin, north - south + 2 * margin
     expected = wide * high * craters.number(craters.smallest)
@@ -110,6 +112,7 @@ def draw(
     n = int(rng.poisson(expected))
     b = craters.exponent
     most, least = craters.smallest**-b, craters.largest**-b
+    # Inverse of the power law's cumulative distribution, cut off at both ends.
     diameter = (most - rng.random(n) * (most - least)) ** (-1 / b)
     x, y = west - margin + wide * rng.random(n), south - margin + high * rng.random(n)
     ratio = craters.shallowest * (craters.deepest / craters.shallowest) ** rng.random(n)

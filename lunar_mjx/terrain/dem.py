@@ -108,6 +108,7 @@ class Dem:
                     "leaves the DEM",
                     f"stay within {low:g} .. {high:g} m",
                 )
+            # The slack keeps a node on the rectangle's edge from falling out by rounding.
             first = max(0, int(np.ceil((start - low - slack) / self.cell)))
             last = min(round((high - low) / self.cell), int(np.floor((stop - low + slack) / self.cell)))
             spans.append((first, last + 1))
@@ -195,6 +196,7 @@ def require_size(source: str, rows: int, cols: int) -> None:
 def spline(heights: np.ndarray, rows: int, cols: int, ratio: float) -> np.ndarray:
     """Bicubic spline through `heights`, at rows x cols nodes that lie `ratio` of a cell apart."""
     y, x = np.arange(heights.shape[0]), np.arange(heights.shape[1])
+    # A cubic needs four nodes; a strip of two or three takes what it can.
     degrees = [min(3, n - 1) for n in heights.shape]
     patch = interpolate.RectBivariateSpline(y, x, heights, kx=degrees[0], ky=degrees[1])
     return patch(np.minimum(np.arange(rows) * ratio, y[-1]), np.minimum(np.arange(cols) * ratio, x[-1]))
@@ -275,6 +277,7 @@ def undeclared_nodata(raw: np.ndarray, source: str) -> tuple[np.ndarray, tuple[s
         rest = raw[~usual & np.isfinite(raw)]
         for mark in USUAL_NODATA:
             here = raw == mark
+            # A number amid the real heights may be a height; one far from all of them is a mark.
             alone = rest.size == 0 or not rest.min() - NODATA_GAP < mark < rest.max() + NODATA_GAP
             if alone and here.any():
                 raw = np.where(here, np.nan, raw)

@@ -35,9 +35,11 @@ def dequantise(heights: np.ndarray, quantum: float) -> np.ndarray:
     # A type-II cosine transform is the spectrum of the grid mirrored at its edges: frequencies k / 2n.
     rows, cols = heights.shape
     k = np.hypot(np.arange(cols)[None, :] / (2 * cols), np.arange(rows)[:, None] / (2 * rows))
+    # The mean is kept as it is: an infinite prior power there filters nothing.
     k[0, 0] = 1e-9
     power = amplitude * k ** -(2 * HURST + 2)
     filtered = fft.idctn(fft.dctn(relief, norm="ortho") * (power / (power + noise)), norm="ortho")
+    # Rounding is known to be at most half a level: whatever the prior says, the data bound it.
     return np.clip(plane + filtered, heights - quantum / 2, heights + quantum / 2)
 
 

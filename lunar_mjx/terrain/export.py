@@ -75,6 +75,7 @@ def _closed(vertices: np.ndarray, faces: np.ndarray, node: np.ndarray, floor: fl
     count = len(vertices)
     foot = vertices[rim] * [1, 1, 0] + [0, 0, floor]
     middle = np.append(foot[:, :2].mean(axis=0), floor)
+    # The floor is a fan about its middle, which any rectangle's outline allows.
     below, beside = count + np.arange(len(rim)), np.roll(np.arange(len(rim)), -1)
     walls = _quads(rim, below, below[beside], rim[beside])
     fan = np.stack([below[beside], below, np.full(len(rim), count + len(rim))], -1)

@@ -72,6 +72,7 @@ def bilinear(
     south, north = z10 - z00, z11 - z01
     low, high = z00 + s * south, z01 + s * north
     zero = jnp.zeros_like(s)
+    # Beyond the edge the ground goes on flat, and so do its slopes (see the module).
     du = jnp.where((u < 0) | (u > cols - 1), zero, south + t * (north - south))
     dv = jnp.where((v < 0) | (v > rows - 1), zero, high - low)
     return low + t * (high - low), du, dv

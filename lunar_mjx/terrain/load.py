@@ -143,6 +143,7 @@ def build_terrain(
         west, south, east, north = ground.bounds
         bounds = (west - origin[0], south - origin[1], east - origin[0], north - origin[1])
 
+        # Rocks are placed in float64 on the host, on the surface that the simulator samples: bilinear.
         def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             at = np.stack([(y - bounds[1]) / ground.cell, (x - bounds[0]) / ground.cell])
             return ndimage.map_coordinates(ground.heights - origin[2], at, order=1, mode="nearest")

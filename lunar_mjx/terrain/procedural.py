@@ -122,6 +122,7 @@ def add_detail(
 
 def cell_means(fine: np.ndarray, ratio: int) -> np.ndarray:
     """Means of a fine grid over the cells of the coarse grid whose nodes are every `ratio`-th of its nodes."""
+    # An even ratio has nodes on the border of two cells, half of which belongs to each.
     kernel = np.ones(ratio) if ratio % 2 else np.concatenate([[0.5], np.ones(ratio - 1), [0.5]])
     kernel /= ratio
     half = ndimage.correlate1d(fine, kernel, axis=0, mode="mirror")[::ratio]
@@ -139,6 +140,7 @@ def _without_means(detail: np.ndarray, ratio: int, coarse: tuple[int, int]) -> n
         rest = wanted - cell_means(taken, ratio)
         if np.abs(rest).max() < TOLERANCE / 2:
             return detail - taken
+        # Over-relaxed: a spline through the means falls short of them in the same way in every round.
         carrier += 1.3 * rest
     raise bad_input("detail", "mean of a cell", f"{np.abs(rest).max():.2g} m", "does not vanish", "use another seed")
 
@@ -163,6 +165,7 @@ def make_soil_patches(
     if require_finite("soil", "patch", patch) <= 0:
         raise bad_input("soil", "patch", patch, "is not positive", "give the extent of a patch in m")
     west, south, east, north = dem.bounds
+    # Eight cells show the outline of a patch; finer ones than the DEM's would show nothing more.
     cell = max(patch / 8, dem.cell)
     rows, cols = (max(2, int(np.ceil(extent / cell)) + 1) for extent in (north - south, east - west))
     noise = ndimage.gaussian_filter(stream(seed, _SOIL).standard_normal((rows, cols)), patch / cell / 2, mode="wrap")

@@ -129,6 +129,7 @@ def wheel_test(
     rim = jnp.where(slip >= 0.0, 1.0, 1.0 + slip)
     along = jnp.where(slip >= 0.0, 1.0 - slip, 1.0)
     travel = along if slip_definition == "travel_speed" else along / jnp.cos(angle)
+    # The faster of the two runs at the bed's speed, whatever the slip: neither becomes so slow that a speed floor acts.
     scale = SPEED / jnp.maximum(rim, travel)
     return WheelTest(scale * rim, scale * travel, angle, load, radius, width)
 
@@ -211,6 +212,7 @@ class WheelBed:
         Returns:
           The results as NumPy arrays.
         """
+        # Tables are compared to a tenth of their noise and fits take derivatives: float32 would show.
         with jax.enable_x64(True):
             return jax.device_get(self._compiled(self.parameters, test))
 
@@ -256,6 +258,7 @@ class WheelBed:
         still_parameters, still_test = jax.lax.stop_gradient((parameters, test))
 
         deepest = _DEEPEST * still_test.radius
+        # In proportion, because loads range over decades and so do sinkages.
         grid = deepest * jnp.geomspace(_SHALLOWEST, 1.0, _SCAN, dtype=deepest.dtype)
 
         # One loop for scan and bisection: the forces are then compiled once.

@@ -101,6 +101,7 @@ def compare(
     Raises:
       UserError: the table has no scatter to measure by.
     """
+    # Written so that a scatter of NaN counts as missing, too.
     missing = [q for q in table.measured if not table.sigma.get(q, 0.0) > 0.0]
     if missing:
         raise UserError(

@@ -30,5 +30,7 @@ def most_likely(params: Any, layers: Sequence[int], actions: int) -> Any:
     """Parameters of the deterministic actor (`make_actor`) that does what the distribution's mode is."""
     last = f"hidden_{len(layers)}"
     inner = params["params"]
+    # The last layer gives means first and deviations after them; tanh of the mean is where the squashed density is
+    # highest, to first order.
     means = {name: a[..., :actions] for name, a in inner[last].items()}
     return {"params": {**inner, last: means}}

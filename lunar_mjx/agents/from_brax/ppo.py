@@ -200,6 +200,7 @@ class PPO:
         def minibatch(state: PPOState, part: Any) -> tuple[PPOState, Any]:
             data, key = part
             (_, told), gradient = gradients(state.params, data, key)
+            # The rate must follow one divergence on all devices, or their parameters would drift apart.
             kl = told["kl_mean"] if axis is None else jax.lax.pmean(told["kl_mean"], axis)
             optimiser, rate = adaptive_kl_learning_rate(state.optimiser, kl, c.kl)
             change, optimiser = self.optimiser.update(gradient, optimiser)
@@ -211,6 +212,7 @@ class PPO:
             state, key = carry
             key, key_order, key_loss = jax.random.split(key, 3)
             order = jax.random.permutation(key_order, rollout.reward.shape[0])
+            # Whole environments are shuffled, not steps: advantages are sums along an environment's time.
             parts = jax.tree.map(lambda a: a[order].reshape(c.minibatches, -1, *a.shape[1:]), data)
             state, losses = jax.lax.scan(minibatch, state, (parts, jax.random.split(key_loss, c.minibatches)))
             return (state, key), losses

@@ -98,9 +98,11 @@ def exchange(
     # a cell that was given up for the next tile on keeps in the grid what it had been told
     done = moved - jnp.where(tile == told_tile, told, 0.0)
     col, row, _ = places(tile)
+    # Scatters of all rovers at once: soil adds up, whoever moved it, and what lies beyond the grid is dropped.
     total = ground.moved.at[world, row, col].add(done, mode="drop")
     deepest = ground.pressed.at[world, row, col].max(pressed, mode="drop")
 
+    # Every patch is laid anew about where its rover is now, whatever it held before.
     here = tile_of(x / ground.cell, y / ground.cell)
     col, row, inside = places(here)
     at = world, row, col

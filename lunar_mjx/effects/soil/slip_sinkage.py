@@ -18,6 +18,7 @@ def with_exponent(ctx, ground, change):
 
     p (z/r)^change = k r^-change z^(n + change), so that the moduli carry the unit that belongs to the new exponent.
     """
+    # Bekker's moduli change their unit with the exponent; normalised by the radius they keep their meaning.
     factor = ctx.geometry.radius**-change
     return dataclasses.replace(ground, k_c=ground.k_c * factor, k_phi=ground.k_phi * factor, n=ground.n + change)
 
@@ -85,5 +86,6 @@ def angle_sinkage(ctx, p, x, ground):
     has no preferred direction), less the share along the wheel that `slip_sinkage` holds.
     """
     s_x, s_y = ctx.contact.soil_slip, lateral_slip(ctx.contact)
+    # Rounded off, because |s_x| has no derivative where a wheel rolls freely.
     along = jnp.sqrt(s_x**2 + _FLAT**2)
     return with_exponent(ctx, ground, p.lateral * (jnp.sqrt(s_x**2 + s_y**2 + _FLAT**2) - along))

@@ -47,6 +47,7 @@ def gravity_soil(ctx, p, x, ground):
     The frictional modulus of dry soil stands for gamma k'_phi with gamma = rho g (Reece 1965), whence a = 1: the same
     mass sinks as deep in any gravity, and slips more in low gravity (Kobayashi et al. 2010; Wong & Kobayashi 2012).
     """
+    # A power of zero gravity would have no finite derivative by its exponent.
     ratio = jnp.maximum(ctx.gravity / p.reference, 1e-6)
     firm, sticky = ratio**p.stiffness, ratio**p.cohesion
     return dataclasses.replace(
@@ -82,8 +83,10 @@ def slope_stiffness(ctx, p, x, ground):
     literature gives bearing capacity factors on slopes (Meyerhof 1957), which fall likewise.
     """
     up = ctx.contact.normal
+    # tan^2 of the slope from the normal, without an angle: smooth on level ground.
     grade = (up.x * up.x + up.y * up.y) / (up.z * up.z)
     taken = grade / jnp.maximum(ground.tan_phi, 0.05) ** 2
+    # Beyond twice its strength no slope stands; there the soil grows no softer.
     soft = jnp.exp(-p.stiffness * jnp.minimum(taken, 2.0))
     return dataclasses.replace(
         ground,

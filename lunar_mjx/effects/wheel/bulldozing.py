@@ -21,6 +21,7 @@ def passive_pressure(soil, weight, depth, depth_squared):
       weight: gamma = rho g, N/m3.
       depth, depth_squared: means of h and h^2 over the wall, m, m2.
     """
+    # cot(45 deg - phi/2) = tan phi + 1/cos phi, so that no angle has to be taken.
     cotangent = soil.tan_phi + jnp.sqrt(1.0 + soil.tan_phi**2)
     d_1 = 2.0 * cotangent
     d_2 = cotangent * (1.0 + cotangent * soil.tan_phi)
@@ -57,6 +58,7 @@ def bulldozing(ctx, p, x, wheel):
     z, r = contact.sinkage, geometry.radius
     weight = p.density * ctx.gravity
     soft = grounded(contact, jnp.where(soil.rock > 0.5, 0.0, 1.0))
+    # Travel per rolling, 1 - s: a wheel that spins on the spot pushes no wall of soil before it.
     ahead = jnp.clip(wheel.direction - wheel.slip_x, -1.0, 1.0)
     front = -p.front * soft * geometry.width * passive_pressure(soil, weight, z, z * z) * ahead
     length = r * jnp.sin(jnp.minimum(normal.entrance, 0.5 * jnp.pi))

@@ -28,6 +28,7 @@ STANDSTILL_SPEED: Annotated[float, "m/s"] = 1e-3
 
 def entrance_angle(sinkage, radius):
     """theta_1 = arccos((r - z)/r), written as 2 arcsin sqrt(z/2r), which keeps its digits at small sinkage; rad."""
+    # Clipped below, since the root has no finite derivative at zero, where every wheel touches down.
     ratio = jnp.clip(sinkage / radius, _MIN_SINKAGE, _MAX_SINKAGE_RATIO)
     return 2.0 * jnp.arcsin(jnp.sqrt(0.5 * ratio))
 
@@ -64,6 +65,7 @@ def janosi(displacement, modulus):
 def geometry_factors(theta_m):
     """A and B of eq. 10 in half-angle form: A = 4 cos(t) sin^2(t/2)/t, B = 4 sin(t) sin^2(t/2)/t with t = theta_m."""
     half = 0.5 * theta_m
+    # 4 sin^2(t/2)/t without the difference 1 - cos t, which loses its digits at a sinkage of micrometres.
     common = theta_m * (jnp.sin(half) / half) ** 2
     return jnp.cos(theta_m) * common, jnp.sin(theta_m) * common
 
@@ -238,6 +240,7 @@ def shear_stress(wheel, soil, strength, j_x, j_y):
     tau_y = strength * janosi(j_y, soil.shear_modulus_y)
     if wheel.circle is None:
         return tau_x, tau_y
+    # Displacements in units of their moduli: an ellipse in metres becomes the circle of the law.
     q_x, q_y = j_x / soil.shear_modulus_x, j_y / soil.shear_modulus_y
     common = strength * mean_decay(jnp.sqrt(q_x * q_x + q_y * q_y + _TINY))
     return tau_x + wheel.circle * (common * q_x - tau_x), tau_y + wheel.circle * (common * q_y - tau_y)

@@ -99,6 +99,7 @@ def dynamic_sinkage(ctx, p, x, normal):
     Linear in the rate of sinking, after the rate-dependent pressure-sinkage relations of Grahn 1991 and of the dynamic
     wheel model of Irani et al. 2013; it comes beyond the contact's own damping per area.
     """
+    # A wheel that leaves the soil fast is let go, not held back: soil does not pull.
     factor = jnp.maximum(1.0 + p.rate * ctx.contact.sinkage_rate, 0.0)
     stress = normal.stress
     if stress is not None:

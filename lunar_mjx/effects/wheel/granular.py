@@ -96,6 +96,7 @@ def _normal(ctx, p, x, normal):
     theta = theta_1 * first_axis(0.5 * (1.0 + _NODES), theta_1)
     weight = theta_1 * first_axis(0.5 * _WEIGHTS, theta_1)
     pressure, _, _ = traction(theta, *_travel(contact)[1])
+    # depth^n with n < 1 has an infinite derivative at 0, where the arc begins.
     depth = jnp.maximum(r * cos_difference(theta, theta_1), 1e-12 * r)
     sigma = grounded(contact, (soil.k_c / b + soil.k_phi) * depth**soil.n * jnp.maximum(pressure, 0.0))
     load = r * b * jnp.sum(weight * sigma * jnp.cos(theta), axis=0)
@@ -122,6 +123,7 @@ def _shear(ctx, p, x, wheel):
     way, (along, across, rim) = _travel(ctx.contact)
     pressure, forward, aside = traction(theta, along, across, rim * r_s / r)
     size = jnp.sqrt(forward**2 + aside**2 + _TINY)
+    # The theory gives any ratio of shear to pressure; grains slide at tan(phi).
     ratio = size / jnp.maximum(pressure, 1e-6)
     share = weight * sigma * jnp.minimum(ratio, soil.tan_phi) / size
     if wheel.grip is not None:

@@ -39,6 +39,7 @@ def grousers(ctx, p, x, wheel):
     r_s = r + h_g: Ishigami et al. 2007, Ding et al. 2011 (with the share mu of the tips); the factor is Iizuka &
     Kubota's (2011) ratio of the grousers' faces to the rim, up to a largest value.
     """
+    # Area of the grousers' faces over that of the rim between them.
     faces = p.count * p.height / (_TURN * ctx.geometry.radius)
     lug = p.area_share * p.height * jnp.ones_like(wheel.slip_x)
     return dataclasses.replace(wheel, lug=lug, grip=1.0 + jnp.minimum(faces, p.largest - 1.0))
@@ -76,4 +77,5 @@ def grouser_pulsation(ctx, p, x, ground):
     soil = dataclasses.replace(
         ground, k_c=ground.k_c * factor, k_phi=ground.k_phi * factor, cohesion=ground.cohesion * factor
     )
+    # Kept within one turn: in float32 the angle of a long drive would lose the position of the teeth.
     return soil, {"angle": jnp.mod(x.angle + ctx.dt * turn, _TURN)}

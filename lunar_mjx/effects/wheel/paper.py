@@ -114,10 +114,12 @@ def printed_shear(ctx, p, x, wheel):
     arc = sin_difference(theta_1, theta_m)
     heading = jnp.where(p.mend_slip > 0.5, jnp.where(wheel.direction < 0.0, -1.0, 1.0), 1.0)
     slip = jnp.where(p.mend_slip > 0.5, heading * wheel.slip_x, printed_slip(contact))
+    # As printed, the second term of j has no radius: a length is subtracted from a pure number.
     lever = p.mend_j * r_s + (1.0 - p.mend_j)
     j = r_s * (theta_1 - theta_m) - lever * (1.0 - slip) * arc
     strength = jnp.where(soil.rock > 0.5, 0.0, grounded(contact, soil.cohesion + normal.sigma_m * soil.tan_phi))
     sigma_m = jnp.where(soil.rock > 0.5, 0.0, normal.sigma_m)
+    # As printed j can be negative, where the exponential grows without bound (see REGULARISATIONS).
     printed_share = -jnp.expm1(jnp.minimum(-j / soil.shear_modulus_x, 3.0))
     tau = strength * jnp.where(p.mend_j > 0.5, janosi(j, soil.shear_modulus_x), printed_share)
     normal_radius = p.mend_shear_radius * r + (1.0 - p.mend_shear_radius) * r_s

@@ -34,6 +34,7 @@ def fitted_plane(height_at, center, axle, radius, width):
     Returns:
       Height below the wheels' centres, m, and slopes by x and by y, per wheel.
     """
+    # Along and across in the horizontal plane, where heights are sampled; a wheel on its side has neither.
     size = jnp.sqrt(axle.x * axle.x + axle.y * axle.y + 1e-12)
     ahead_x, ahead_y = axle.y / size, -axle.x / size
     share = jnp.reshape(jnp.asarray(ALONG, jnp.result_type(radius)), (-1,) + (1,) * jnp.ndim(radius))
@@ -45,6 +46,7 @@ def fitted_plane(height_at, center, axle, radius, width):
     along, left, right = height[:-2] - foot, height[-2], height[-1]
     clear = center.z - foot - along
     within = radius * (1.0 + MARGIN) - jnp.sqrt(u * u + clear * clear)
+    # Far above ground no sample lies within the rim; those next to the axle then define a plane all the same.
     near = jnp.where(jnp.abs(share) < 0.3, _AIRBORNE, 0.0)
     weight = jnp.maximum(within / radius, 0.0) ** 2 + near
     total = jnp.sum(weight, axis=0)

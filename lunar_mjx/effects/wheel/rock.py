@@ -44,6 +44,7 @@ def _rock_shear(ctx, p, x, wheel):
     """Replaces the soil's shear by f = mu F_N (1 - exp(-|k| L/K)) k/|k|, with k the slip vector of the shear state."""
     rock = ctx.soil.rock > 0.5
     load = ctx.normal.load + ctx.normal.damping
+    # The floor keeps the root's derivative finite for a wheel that has not slipped at all.
     slip = jnp.sqrt(wheel.slip_x**2 + wheel.slip_y**2 + 1e-12)
     friction = -p.mu * load * jnp.expm1(-slip / p.slip_scale) / slip
     along, side = friction * wheel.slip_x, -p.side * friction * wheel.slip_y
@@ -140,6 +141,7 @@ def _touch_boulder(ctx, p) -> _Touch:
         form = form_at(ctx.terrain.rocks, place.x, place.y)
         closest, toward, depth = contact_with_wheel(form, center - place, axle, geometry.radius, geometry.width)
     velocity = ctx.wheel_velocity + ctx.wheel_angular_velocity.cross(closest)
+    # Places without a boulder have radius zero: no contact there, whatever the geometry says.
     depth = jnp.where(rock_radius > 0.0, depth, -1.0)
     load = _penalty(depth, velocity.dot(toward), p.stiffness, p.damping)
     return _Touch(closest, toward, velocity, load)
@@ -207,6 +209,7 @@ def static_boulders(ctx, p, x, wheel):
     moved = Vec3(x.bristle_x, x.bristle_y, x.bristle_z) + sliding * ctx.dt
     moved = moved - touch.toward * moved.dot(touch.toward)
     most = p.mu * touch.load
+    # Beyond mu F_N the bristle slides along: its length is cut to what friction can hold.
     moved = moved * jnp.minimum(most / (p.tangential_stiffness * moved.norm(1e-9)), 1.0)
     pull = moved * -p.tangential_stiffness - sliding * p.tangential_damping
     friction = pull * jnp.minimum(most / pull.norm(1e-9), 1.0)

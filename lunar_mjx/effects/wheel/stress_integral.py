@@ -42,6 +42,7 @@ def integrate(ctx, contact, theta_1, theta_m, theta_2, reversal=None):
     edges = [theta_2, theta_m, theta_1]
     if reversal is not None:
         turn = jnp.clip(reversal, theta_2, theta_1)
+        # Quadrature across a kink converges slowly, so the arc is divided where the shear turns about.
         edges = [theta_2, jnp.minimum(turn, theta_m), jnp.maximum(turn, theta_m), theta_1]
     parts = list(itertools.pairwise(edges))
     theta = jnp.concatenate([low + (high - low) * share for low, high in parts])

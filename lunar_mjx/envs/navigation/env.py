@@ -202,6 +202,7 @@ class NavigationEnv:
         self._ends_told = (*ENDS, *more, *(("drained",) if self._battery else ()))
         self.params = self.place(model)
         self.action_size = self.actions.size
+        # Sizes are read off the program itself, so that no table of widths can be wrong.
         shapes = jax.eval_shape(self.reset, self.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
         self.observation_size = shapes.obs.shape[1]
         self.privileged_size = shapes.privileged.shape[1]
@@ -437,6 +438,7 @@ class NavigationEnv:
     def _advance(self, params: NavigationParams, inner: Inner, action: Any) -> tuple[Inner, View]:
         c = self.config
         physics, (slip, sinkage, *power) = self._drive(params, inner, action)
+        # In the plane, like the shortest way that it is compared with.
         moved = rewards.length(physics.qpos[:, :2] - inner.physics.qpos[:, :2])
         position, velocity = physics.qpos[:, :3], physics.qvel[:, :3]
         filtered = kalman.update(params.gains, self.control_interval, inner.filtered, position, velocity)
@@ -455,6 +457,7 @@ class NavigationEnv:
         )
         if inner.trail is not None:
             fade = jnp.exp(-self.control_interval / jnp.asarray(TRAIL, position.dtype))[:, None]
+            # Exponential means over three times: a memory of fixed size of where the rover has been.
             trail = position[:, None, :2] + fade * (inner.trail - position[:, None, :2])
             inner = dataclasses.replace(inner, trail=trail)
         if inner.visited is not None:
@@ -501,6 +504,7 @@ class NavigationEnv:
             found["collided"] = inner.tally.struck > 0.0
         if self._battery:
             found["drained"] = physics.effects["battery"]["flat"] > 0.5
+        # Exclusive, so that the shares of all ends add up to one.
         taken = jnp.zeros_like(fine)
         for name, happened in found.items():
             found[name] = happened & ~taken
@@ -511,6 +515,7 @@ class NavigationEnv:
         """New episodes, all at their beginning."""
         c, count = self.config, keys.shape[0]
         split = _split(keys)
+        # One key for each environment: what an episode draws does not depend on how many others run beside it.
         pick = jax.vmap(lambda k: jax.random.randint(k, (), 0, params.starts.shape[0]))(split[:, 1])
         start, goal = params.starts[pick], params.goals[pick]
         turn = jax.vmap(lambda k: jax.random.uniform(k, (), minval=-1.0, maxval=1.0))(split[:, 2])

@@ -80,6 +80,7 @@ def batches(runs: Sequence[Run], most_particles: int) -> list[list[Run]]:
     for r in runs:
         groups.setdefault(_setting(r), []).append(r)
     for group in groups.values():
+        # By length, so that neighbours in the list end together.
         for r in sorted(group, key=lambda r: r.steps):
             last = out[-1] if out else None
             alike = last and _setting(last[0]) == _setting(r) and r.steps <= _ALIKE * last[0].steps
@@ -106,6 +107,7 @@ def read_results(folder: Path) -> list[dict[str, Any]]:
         try:
             out.append(json.loads(line))
         except json.JSONDecodeError as error:
+            # The process was killed while it wrote this line; the run is computed again.
             if number == len(lines):
                 break
             raise bad_input(path, f"line {number}", line[:40], "is no result", "remove the line") from error
