@@ -39,14 +39,15 @@ def chosen_errors(
       settings: sizes that are tried, and their prior.
     """
     fit = observations.in_split("fit")
-    spread = _spread(observations)
+    sizes = spread(observations)
     grams, log_det = [], []
-    tried = [with_errors(observations, spread, size) for size in settings.errors]
+    tried = [with_errors(observations, sizes, size) for size in settings.errors]
     for one in tried:
         white = one.whiten(whole)[fit]
         grams.append(Gram.of(white[:, :-1], white[:, -1], group[fit], kinds))
         log_det.append(np.bincount(group[fit], one.log_widths()[fit], minlength=kinds))
-    prior = -0.5 * (np.array(settings.errors) / settings.usual_error) ** 2
+    # heavy tails, for nobody knows the order of what a model leaves out (half-Cauchy: Gelman 2006)
+    prior = -np.log1p((np.array(settings.errors) / settings.usual_error) ** 2)
     amplitudes = Amplitudes.of(std)
     noises = [NoiseSize(str(g), settings.stated_spread) for g in range(kinds)]
 
@@ -70,18 +71,18 @@ def chosen_errors(
         if np.array_equal(before, levels):
             break
     shares = {s.channel: settings.errors[levels[group[s.start]]] for s in observations.series}
-    sizes = {c: share * spread[c] for c, share in shares.items() if share > 0.0}
-    return with_discrepancy(observations, sizes), shares
+    chosen = {c: share * sizes[c] for c, share in shares.items() if share > 0.0}
+    return with_discrepancy(observations, chosen), shares
 
 
-def with_errors(observations: Observations, spread: Mapping[str, float], share: float) -> Observations:
+def with_errors(observations: Observations, sizes: Mapping[str, float], share: float) -> Observations:
     """Observations whose channels all err by a share of what they do."""
     if share == 0.0:
         return observations
-    return with_discrepancy(observations, {c: share * size for c, size in spread.items()})
+    return with_discrepancy(observations, {c: share * size for c, size in sizes.items()})
 
 
-def _spread(observations: Observations) -> dict[str, float]:
+def spread(observations: Observations) -> dict[str, float]:
     """Root mean square of what a channel does, about its first value, by channel, over all logs, its axes together."""
     found: dict[str, list[float]] = {}
     for s in observations.series:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import linalg
 
-from lunar_mjx.diagnosis.drives.channel_errors import chosen_errors
+from lunar_mjx.diagnosis.drives.channel_errors import chosen_errors, spread, with_errors
 from lunar_mjx.diagnosis.drives.instruments import usual_kind
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
@@ -294,11 +294,15 @@ class DriveForm(MeasuredForm):
         Returns:
           (coordinates,) the refit, with noise alone.
         """
-        drives = self.drives
-        u, slopes = self._descend(self.start, free)
+        drives, usual = self.drives, self.settings.usual_error
+        self.observations = with_errors(drives.observations, spread(drives.observations), usual)
+        # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after it,
+        # and a descent that moves everything at once follows them into soil that nothing brings it back from.
+        nuisances = free[[self.coordinates[i].nuisance for i in free]]
+        u, _ = self._descend(self.start, nuisances)
+        u, slopes = self._descend(u, free)
         if drives.noise_unlearnt:
             drives.learn_noise(self._whole(u))
-            self.observations = drives.observations
         self._see(u)
         value = self.predicted(u)
         assert self._seen is not None

@@ -16,9 +16,9 @@ class DriveSettings(SearchSettings):
     own_share: float = 0.5
     """1; share of a discrepancy's variance that each log has for itself; the rest all logs share."""
     usual_error: float = 0.02
-    """1; scale of the half-normal prior of the error that a model's channels have beyond its ports, as a share of what
+    """1; scale of the half-Cauchy prior of the error that a model's channels have beyond its ports, as a share of what
     a channel does: ground that no map has, play, dynamics that are left out."""
-    errors: tuple[float, ...] = (0.0, 0.003, 0.01, 0.03, 0.1)
+    errors: tuple[float, ...] = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
     """1; sizes of that error which are tried."""
     least_length: float = 0.3
     """sigma; a direction in which even an unlisted discrepancy is shorter is left out."""
@@ -31,7 +31,7 @@ class DriveSettings(SearchSettings):
     """1; refits of a search, each of which simulates some hundred drives."""
     most_rounds: int = 2
     """1; rounds of refit and re-linearisation."""
-    most_jacobians: int = 6
+    most_jacobians: int = 12
     """1; Jacobians of one descent."""
     settled: float = 0.5
     """chi-square; what a further step must promise."""
