@@ -113,7 +113,7 @@ def row(group: str, number: int, seed: int) -> dict[str, Any]:
     """Asks all tools about one case, opens the seal, and judges."""
     from benchmarks.hidden import cases, solve
     from benchmarks.hidden.judge import outcome
-    from lunar_mjx.diagnosis.build_problem import build_problem
+    from lunar_mjx.diagnosis.build_problem import candidate_effects, table_problem
     from lunar_mjx.diagnosis.runs import Run
     from lunar_mjx.logs import read_log
 
@@ -122,7 +122,8 @@ def row(group: str, number: int, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="baselines-") as folder:
         case.write(Path(folder) / "log")
         log = read_log(Path(folder) / "log")
-        problem = build_problem(Run(Path(folder) / "run", (Path(folder) / "log",), solve.nominal_model()), [log])
+        run = Run(Path(folder) / "run", (Path(folder) / "log",), solve.nominal_model())
+        problem = table_problem(run, [log], candidate_effects(run))
         began = time.monotonic()
         found = tools.refits(problem)
         between = time.monotonic()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from lunar_mjx.criticism import WheelBed, fit, load_figures
 from lunar_mjx.wheel_bed.comparison import compare
-from lunar_mjx.wheel_bed.soil_fit import BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
+from lunar_mjx.wheel_bed.soil_fit import PAPER_CONTACT, SOIL, SOIL_FIT
 
 
 def main() -> None:
@@ -28,10 +28,10 @@ def main() -> None:
     for name, bed, free in cases:
         before, found = compare(bed, table, name), fit(bed, table, free, name)
         nominal = {
-            "fitted": before.score(FIT_ANGLES),
-            "held_out": before.score(INSIDE_ANGLES + BEYOND_ANGLES),
-            "inside": before.score(INSIDE_ANGLES),
-            "beyond": before.score(BEYOND_ANGLES),
+            "fitted": before.score(SOIL_FIT.fit_angles),
+            "held_out": before.score(SOIL_FIT.inside_angles + SOIL_FIT.beyond_angles),
+            "inside": before.score(SOIL_FIT.inside_angles),
+            "beyond": before.score(SOIL_FIT.beyond_angles),
             "all_angles_rms": before.rms,
         }
         results.append({"nominal": nominal, **found.to_dict()})

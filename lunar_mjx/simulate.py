@@ -22,13 +22,20 @@ from lunar_mjx.model import Model, check_effects
 COMMAND_UNITS: dict[str, str] = dict(zip(MODES, ("angle_rad", "speed_rad_s", "torque_Nm", "current_A"), strict=True))
 """Ending of a command channel's name by control mode."""
 
-INTERVAL = 0.05
-"""About the time between commands, and between rows of telemetry, s."""
 
-MOST_COMMANDS = 1_000_000
+@dataclasses.dataclass(frozen=True)
+class SimulateSettings:
+    """Pace of a simulated drive, and how long its commands may be."""
 
-PIECE = 100
-"""Commands driven in one call of the compiled program, which so fits drives of every length."""
+    interval: float = 0.05
+    """About the time between commands, and between rows of telemetry, s."""
+    most_commands: int = 1_000_000
+    """14 hours of commands at 20 Hz."""
+    piece: int = 100
+    """Commands driven in one call of the compiled program, which so fits drives of every length."""
+
+
+SIMULATE = SimulateSettings()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +67,7 @@ def constant_commands(model: Model, duration: float, interval: float | None = No
         too many.
     """
     if interval is None:
-        interval = max(1, round(INTERVAL / model.timestep)) * model.timestep
+        interval = max(1, round(SIMULATE.interval / model.timestep)) * model.timestep
     value = []
     for name, number in groups.items():
         if model.rover.group(name) is None:
@@ -74,9 +81,13 @@ def constant_commands(model: Model, duration: float, interval: float | None = No
         raise bad_input("command", "duration", duration, "is not finite", "give a time in s")
     if duration < interval:
         raise bad_input("command", "duration", duration, f"is below {interval:g} s", "give a longer time in s")
-    if duration > MOST_COMMANDS * interval:
+    if duration > SIMULATE.most_commands * interval:
         raise bad_input(
-            "command", "duration", duration, f"is above {MOST_COMMANDS * interval:g} s", "drive in several parts"
+            "command",
+            "duration",
+            duration,
+            f"is above {SIMULATE.most_commands * interval:g} s",
+            "drive in several parts",
         )
     return Commands(np.tile(np.array(value, float), (round(duration / interval), 1)), interval)
 
@@ -165,15 +176,15 @@ def simulate(
     state = system.reset(system.params, x, y, yaw)
     run = jax.jit(lambda p, s, c: system.rollout(p, s, c, every=every))
     count = len(commands.values)
-    values = jnp.asarray(np.pad(commands.values, ((0, -count % PIECE), (0, 0)), mode="edge"))
+    values = jnp.asarray(np.pad(commands.values, ((0, -count % SIMULATE.piece), (0, 0)), mode="edge"))
     try:
-        compiled = run.lower(system.params, state, values[:PIECE]).compile()
+        compiled = run.lower(system.params, state, values[: SIMULATE.piece]).compile()
     except Exception as error:
         _blame_user_effect(model, error)
         raise
     parts = []
-    for first in range(0, count, PIECE):
-        state, seen = compiled(system.params, state, values[first : first + PIECE])
+    for first in range(0, count, SIMULATE.piece):
+        state, seen = compiled(system.params, state, values[first : first + SIMULATE.piece])
         parts.append(jax.device_get(seen))
     telemetry = jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
     check_finite(telemetry)

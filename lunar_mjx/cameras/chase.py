@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from lunar_mjx.cameras.camera import RoverCamera
-from lunar_mjx.cameras.ground_map import GOAL
+from lunar_mjx.cameras.ground_map import MAP_COLOURS
 from lunar_mjx.cameras.pinhole import Pinhole, look_at, project
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.texture import Track
@@ -94,7 +94,7 @@ class Chase:
         ends = project(pose, self._optics, np.stack([foot, top]))
         if (ends[:, 2] > 0.1).all():
             width = max(1, round(0.06 * self._optics.focal / float(ends[0, 2])))
-            ImageDraw.Draw(image).line([tuple(p[:2]) for p in ends], fill=GOAL, width=width)
+            ImageDraw.Draw(image).line([tuple(p[:2]) for p in ends], fill=MAP_COLOURS.goal, width=width)
         return np.asarray(image)
 
     def close(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,9 +13,20 @@ from PIL import Image, ImageDraw
 from lunar_mjx.cameras.relief import relief, ring, rocks_within
 from lunar_mjx.terrain import Terrain
 
-ROVER, GOAL, PATH = (255, 196, 60), (90, 255, 120), (86, 180, 233)
-"""Colours of a rover, its goal and its path, wherever they are drawn upon the ground."""
-_STONE, _BEYOND = (58, 58, 58), (30, 30, 30)
+
+@dataclasses.dataclass(frozen=True)
+class MapColours:
+    """Colours of the map, red, green and blue."""
+
+    # Colours of a rover, its goal and its path, wherever they are drawn upon the ground.
+    rover: tuple[int, int, int] = (255, 196, 60)
+    goal: tuple[int, int, int] = (90, 255, 120)
+    path: tuple[int, int, int] = (86, 180, 233)
+    stone: tuple[int, int, int] = (58, 58, 58)
+    beyond: tuple[int, int, int] = (30, 30, 30)
+
+
+MAP_COLOURS = MapColours()
 
 
 class GroundMap:
@@ -36,7 +48,7 @@ class GroundMap:
         grey = Image.fromarray((255 * ground.grey[::-1]).astype(np.uint8))
         west, north = self.pixel((ground.west, ground.north))
         east, south = self.pixel((ground.east, ground.south))
-        self.base = Image.new("RGB", (self.width, self.height), _BEYOND)
+        self.base = Image.new("RGB", (self.width, self.height), MAP_COLOURS.beyond)
         placed = grey.resize((max(1, round(east - west)), max(1, round(south - north))), Image.Resampling.BICUBIC)
         self.base.paste(placed.convert("RGB"), (round(west), round(north)))
         draw = ImageDraw.Draw(self.base)
@@ -44,9 +56,9 @@ class GroundMap:
             u, v = self.pixel((x, y))
             a, b = max(1.0, a * self.scale), max(1.0, b * self.scale)
             if a == b:
-                draw.ellipse([u - a, v - a, u + a, v + a], fill=_STONE)
+                draw.ellipse([u - a, v - a, u + a, v + a], fill=MAP_COLOURS.stone)
             else:  # rows go down the picture
-                draw.polygon([tuple(corner) for corner in ring(np.array([u, v, a, b, -angle]))], fill=_STONE)
+                draw.polygon([tuple(corner) for corner in ring(np.array([u, v, a, b, -angle]))], fill=MAP_COLOURS.stone)
 
     def pixel(self, place: Any) -> tuple[float, float]:
         """Column and row of a place (2 or more,) m."""
@@ -65,10 +77,10 @@ class GroundMap:
         image = self.base.copy()
         draw = ImageDraw.Draw(image)
         if len(path) > 1:
-            draw.line([self.pixel(p) for p in path], fill=PATH, width=3)
+            draw.line([self.pixel(p) for p in path], fill=MAP_COLOURS.path, width=3)
         u, v = self.pixel(goal)
         r = max(3.0, radius * self.scale)
-        draw.ellipse([u - r, v - r, u + r, v + r], outline=GOAL, width=2)
+        draw.ellipse([u - r, v - r, u + r, v + r], outline=MAP_COLOURS.goal, width=2)
         self.arrow(draw, position, yaw, max(0.5 * length * self.scale, 4.0))
         return np.asarray(image)
 
@@ -78,4 +90,4 @@ class GroundMap:
         forward, left = (np.array([np.cos(yaw + t), -np.sin(yaw + t)]) for t in (0.0, np.pi / 2))
         corners = ((1, 1), (1.4, 0), (1, -1), (-1, -1), (-1, 1))
         nose = [tuple(np.array([u, v]) + half * (a * forward + 0.6 * b * left)) for a, b in corners]
-        draw.polygon(nose, fill=ROVER, outline=(60, 40, 0))
+        draw.polygon(nose, fill=MAP_COLOURS.rover, outline=(60, 40, 0))

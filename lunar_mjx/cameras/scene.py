@@ -27,14 +27,24 @@ from lunar_mjx.terrain import Terrain
 from lunar_mjx.terrain.rocks import semi_axes
 
 GROUND, FAR_GROUND, ROCK, FRONT = "ground", "far_ground", "rock", "front"
-NODES, FAR_NODES, TEXELS = 420, 160, 2048
-"""Most nodes per side of the near and the far height field, and pixels of the ground's picture."""
 
-FAR_ROCKS = 60.0
-"""How far beyond the near ground rocks are drawn, m: as far as the cameras in JAX look."""
 
-_DROP, _SEAM = 3.0, 0.05
-"""How far the far ground is lowered under the near one, and everywhere, so that the two never meet, m."""
+@dataclasses.dataclass(frozen=True)
+class SceneDetail:
+    """How finely a scene is drawn."""
+
+    # Most nodes per side of the near and the far height field, and pixels of the ground's picture.
+    nodes: int = 420
+    far_nodes: int = 160
+    texels: int = 2048
+    far_rocks: float = 60.0
+    """How far beyond the near ground rocks are drawn, m: as far as the cameras in JAX look."""
+    # How far the far ground is lowered under the near one, and everywhere, so that the two never meet, m.
+    drop: float = 3.0
+    seam: float = 0.05
+
+
+SCENE_DETAIL = SceneDetail()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,11 +149,11 @@ def build_scene(
         specular=[0.15] * 3,
     )
     low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
-    near = cut(terrain, low, high, NODES)
+    near = cut(terrain, low, high, SCENE_DETAIL.nodes)
     _add_far(spec, terrain, near)
     painter = _painter(near, tracks)
     _add_ground(spec, GROUND, near, painter.paint(0))
-    _add_rocks(spec, terrain, low - FAR_ROCKS, high + FAR_ROCKS)
+    _add_rocks(spec, terrain, low - SCENE_DETAIL.far_rocks, high + SCENE_DETAIL.far_rocks)
     pose = mount or front_mount(rover)
     spec.body(rover.chassis).add_camera(name=FRONT, pos=pose.position, quat=quaternion(pose.rotation), fovy=fovy_deg)
     return spec.compile(), painter
@@ -151,7 +161,7 @@ def build_scene(
 
 def _painter(patch: Patch, tracks: Sequence[Track]) -> TrackPainter:
     extent = np.subtract(patch.high, patch.low)
-    picture = regolith(TEXELS, float(extent.max()))
+    picture = regolith(SCENE_DETAIL.texels, float(extent.max()))
     return TrackPainter(picture, patch.low, extent.tolist(), tracks)
 
 
@@ -198,14 +208,14 @@ def _add_far(spec: Any, terrain: Terrain, near: Patch) -> None:
     field = terrain.field
     rows, cols = np.asarray(field.heights).shape
     origin, cell = np.array([float(field.x0), float(field.y0)]), float(field.cell)
-    whole = cut(terrain, origin, origin + cell * np.array([cols - 1, rows - 1]), FAR_NODES)
+    whole = cut(terrain, origin, origin + cell * np.array([cols - 1, rows - 1]), SCENE_DETAIL.far_nodes)
     x, y = (np.linspace(a, b, n) for a, b, n in zip(whole.low, whole.high, whole.heights.shape[::-1], strict=True))
     step = max(x[1] - x[0], y[1] - y[0])
     inside = [(v > a + step) & (v < b - step) for v, a, b in zip((x, y), near.low, near.high, strict=True)]
     if all(i.all() for i in inside) or (near.low == whole.low and near.high == whole.high):
         return
     hidden = inside[1][:, None] & inside[0][None, :]
-    _add_ground(spec, FAR_GROUND, whole, None, np.where(hidden, _DROP, _SEAM))
+    _add_ground(spec, FAR_GROUND, whole, None, np.where(hidden, SCENE_DETAIL.drop, SCENE_DETAIL.seam))
 
 
 def _add_rocks(spec: Any, terrain: Terrain, low: np.ndarray, high: np.ndarray) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lunar_mjx.rover import Rover
-from lunar_mjx.rover.look import DETAIL, HIDDEN, seen_spec
+from lunar_mjx.rover.look import LOOK, seen_spec
 
 BOX, CYLINDER, CAPSULE, ELLIPSOID = range(4)
 _KINDS = {
@@ -67,7 +67,9 @@ def rover_shapes(rover: Rover, detail: bool = False) -> Shapes:
     seen = [
         i
         for i in range(m.ngeom)
-        if m.geom_group[i] < (HIDDEN if detail else DETAIL) and m.geom_rgba[i, 3] > 0 and int(m.geom_type[i]) in _KINDS
+        if m.geom_group[i] < (LOOK.hidden if detail else LOOK.detail)
+        and m.geom_rgba[i, 3] > 0
+        and int(m.geom_type[i]) in _KINDS
     ]
     size = m.geom_size[seen].copy()
     place, turn = m.geom_pos[seen].copy(), np.stack([_matrix(q) for q in m.geom_quat[seen]])

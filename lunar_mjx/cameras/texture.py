@@ -12,13 +12,21 @@ from PIL import Image, ImageDraw
 ALBEDO = np.array([0.60, 0.585, 0.565])
 """Colour of sunlit regolith on screen. The Moon reflects 12 %; a camera exposes for that."""
 
-CONTRAST = 0.10
-"""Deviation of the mottling, of the brightness."""
 
-_OCTAVES = 7
-"""Layers of the mottling at most, from patches of metres down, each 2.6 times as fine as the one before."""
-_RUT, _PRINT = 205, 140
-"""Brightness of a track's bottom and of its bars, of 255."""
+@dataclasses.dataclass(frozen=True)
+class SoilTexture:
+    """How soil and wheel tracks look."""
+
+    contrast: float = 0.10
+    """Deviation of the mottling, of the brightness."""
+    octaves: int = 7
+    """Layers of the mottling at most, from patches of metres down, each 2.6 times as fine as the one before."""
+    # Brightness of a track's bottom and of its bars, of 255.
+    rut: int = 205
+    print: int = 140
+
+
+SOIL_TEXTURE = SoilTexture()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,14 +47,14 @@ def regolith(size: int, metres: float, seed: int = 0) -> np.ndarray:
     """Mottled ground of `metres` x `metres`, (size, size, 3) uint8: noise of octaves down to some millimetres."""
     random = np.random.default_rng(seed)
     grey = np.zeros((size, size), np.float32)
-    for k in range(_OCTAVES):
+    for k in range(SOIL_TEXTURE.octaves):
         cells = max(2, round(metres / 2.0 * 2.6**k))
         if cells > 2 * size:
             break
         small = random.standard_normal((min(cells, size), min(cells, size))).astype(np.float32)
         image = Image.fromarray(small).resize((size, size), Image.Resampling.BICUBIC)
         grey += np.asarray(image) * (0.55 if k < 2 else 1.0)
-    grey *= CONTRAST / grey.std()
+    grey *= SOIL_TEXTURE.contrast / grey.std()
     return np.clip(255.0 * ALBEDO * (1.0 + grey[..., None]), 0, 255).astype(np.uint8)
 
 
@@ -85,7 +93,7 @@ class TrackPainter:
     def _ruts(self, track: Track) -> list[tuple[int, list, int]]:
         kept = thinned(track.places, 0.02)
         return [
-            (int(j), self._bar(track.places[i], track.places[j], track.width), _RUT)
+            (int(j), self._bar(track.places[i], track.places[j], track.width), SOIL_TEXTURE.rut)
             for i, j in itertools.pairwise(kept)
         ]
 
@@ -106,7 +114,7 @@ class TrackPainter:
         # a little after the rut beneath it, which would else be painted over it
         when = np.searchsorted(length, np.minimum(at + 0.03, length[-1]))
         return [
-            (int(w) + 1, self._bar(m - d, m + d, 0.94 * track.width), _PRINT)
+            (int(w) + 1, self._bar(m - d, m + d, 0.94 * track.width), SOIL_TEXTURE.print)
             for w, m, d in zip(when, middle, way, strict=True)
         ]
 

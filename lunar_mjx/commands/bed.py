@@ -144,7 +144,7 @@ def _points(
     import numpy as np
 
     from lunar_mjx.wheel_bed.particles.points import points_of_table
-    from lunar_mjx.wheel_bed.particles.settings import SLOWEST
+    from lunar_mjx.wheel_bed.particles.settings import BOX_SIZE
     from lunar_mjx.wheel_bed.table import SteadyStateTable as Table
 
     if table is not None:
@@ -166,9 +166,13 @@ def _points(
             indexing="ij",
         )
         slip, angle, load = (a.reshape(-1) for a in grid)
-        if slip.max() > 1.0 - SLOWEST:
+        if slip.max() > 1.0 - BOX_SIZE.slowest:
             raise bad_input(
-                "bed simulate", "--slips", float(slip.max()), "has no steady state", f"give {1 - SLOWEST:g} at most"
+                "bed simulate",
+                "--slips",
+                float(slip.max()),
+                "has no steady state",
+                f"give {1 - BOX_SIZE.slowest:g} at most",
             )
         if slip.min() < -1.0 or np.abs(angle).max() > 85.0 or load.min() <= 0.0:
             raise UserError(

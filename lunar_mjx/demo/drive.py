@@ -18,18 +18,34 @@ from lunar_mjx.terrain import Terrain, sample
 
 RIM_SPEEDS = {"viper": (0.12, 0.25), "luvmi_x": (0.08, 0.15)}
 """Least and largest commanded rim speed of a rover, m/s; VIPER's top speed is about 0.2 m/s."""
-_OTHER_SPEEDS = (0.08, 0.15)
 
-RECORDS_PER_SECOND = 10
-_CHUNK_SECONDS = 1.0
-_STEERING_AMPLITUDE = (0.15, 0.4)
-_STEERING_PERIOD = (20.0, 60.0)
-_SPIN_UP = 1.0
-"""Seconds over which the wheels come up to speed."""
+
+@dataclasses.dataclass(frozen=True)
+class DemoDrive:
+    """The drives of the demo."""
+
+    other_speeds: tuple[float, float] = (0.08, 0.15)
+    """Least and greatest speed of the wheels' rims of rovers that `RIM_SPEEDS` does not name, m/s."""
+    records_per_second: int = 10
+    """Rows of a log per second: what a plot of a minute shows."""
+    chunk_seconds: float = 1.0
+    """Simulated at once, s, between two looks at the clock."""
+    steering_amplitude: tuple[float, float] = (0.15, 0.4)
+    """Least and greatest, rad: within the steering range of all rovers that ship."""
+    steering_period: tuple[float, float] = (20.0, 60.0)
+    """Least and greatest, s."""
+    spin_up: float = 1.0
+    """Seconds over which the wheels come up to speed."""
+    spacing: float = 8.0
+    """Between neighbouring rovers at the start, m."""
+    clearance: float = 1.5
+    """Distance from rocks at which a rover may start, beyond the rock's radius, m."""
+
+
+DEMO_DRIVE = DemoDrive()
+
+
 _STEEPEST = np.tan(np.radians(10.0))
-_SPACING = 8.0
-_CLEARANCE = 1.5
-"""Distance from rocks at which a rover may start, beyond the rock's radius, m."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,14 +126,14 @@ def drive(
     model = make_model(rover, terrain)
     system = build(model)
     rng = np.random.default_rng([seed, *rover.encode()])
-    starts = _starts(terrain, count, rng, shift * _SPACING)
-    hold = round(1.0 / RECORDS_PER_SECOND / system.dt)
+    starts = _starts(terrain, count, rng, shift * DEMO_DRIVE.spacing)
+    hold = round(1.0 / DEMO_DRIVE.records_per_second / system.dt)
     controls, speed = _controls(system, count, seconds, rng)
     state = jax.jit(jax.vmap(system.reset, in_axes=(None, 0, 0, 0)))(system.params, *map(jnp.asarray, starts))
 
     run = jax.jit(lambda params, state, controls: system.rollout_batch(params, state, controls, hold))
     records: list[Telemetry] = []
-    chunk = max(1, round(_CHUNK_SECONDS * RECORDS_PER_SECOND))
+    chunk = max(1, round(DEMO_DRIVE.chunk_seconds * DEMO_DRIVE.records_per_second))
     for first in range(0, controls.shape[1], chunk):
         part = controls[:, first : first + chunk]
         state, telemetry = run(system.params, state, jnp.asarray(part))
@@ -133,7 +149,7 @@ def _starts(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x, y and yaw of every rover: a jittered grid about the origin, clear of rocks and of steep ground."""
     rows = int(np.ceil(np.sqrt(count)))
-    line = (np.arange(rows) - (rows - 1) / 2) * _SPACING + shift
+    line = (np.arange(rows) - (rows - 1) / 2) * DEMO_DRIVE.spacing + shift
     cells = [(cx, cy) for cy in line for cx in line]
     places = []
     for cx, cy in cells[:count]:
@@ -156,7 +172,7 @@ def _good(terrain: Terrain, x: float, y: float) -> bool:
         return True
     centers, radii = np.asarray(terrain.rocks.centers), np.asarray(terrain.rocks.radii)
     apart = np.hypot(centers[:, 0] - x, centers[:, 1] - y)
-    return bool(np.all(apart > radii + _CLEARANCE))
+    return bool(np.all(apart > radii + DEMO_DRIVE.clearance))
 
 
 def _controls(
@@ -164,12 +180,15 @@ def _controls(
 ) -> tuple[Float[np.ndarray, "rover time joint"], Float[np.ndarray, "rover"]]:
     """Constant rim speed after a ramp, and front and rear wheels that steer against each other in a slow wave."""
     rover = system.model.rover
-    steps = max(1, round(seconds * RECORDS_PER_SECOND))
-    time = np.arange(steps) / RECORDS_PER_SECOND
-    speed = rng.uniform(*RIM_SPEEDS.get(rover.name, _OTHER_SPEEDS), count)
-    amplitude, period = rng.uniform(*_STEERING_AMPLITUDE, count), rng.uniform(*_STEERING_PERIOD, count)
+    steps = max(1, round(seconds * DEMO_DRIVE.records_per_second))
+    time = np.arange(steps) / DEMO_DRIVE.records_per_second
+    speed = rng.uniform(*RIM_SPEEDS.get(rover.name, DEMO_DRIVE.other_speeds), count)
+    amplitude, period = (
+        rng.uniform(*DEMO_DRIVE.steering_amplitude, count),
+        rng.uniform(*DEMO_DRIVE.steering_period, count),
+    )
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
-    ramp = np.minimum(time / _SPIN_UP, 1.0)
+    ramp = np.minimum(time / DEMO_DRIVE.spin_up, 1.0)
     wave = amplitude[:, None] * np.sin(2.0 * np.pi * time[None, :] / period[:, None] + phase[:, None]) * ramp
     controls = np.zeros((count, steps, len(system.joint_names)))
     for wheel in rover.wheels:
@@ -211,7 +230,7 @@ def _record(system: System, t: Telemetry, speed: np.ndarray) -> Drive:
         winding_degC=winding.max(axis=-1) - 273.15,
         hottest=tuple(system.joint_names[i] for i in winding.max(axis=0).argmax(axis=-1)),
         power=power,
-        energy=power.sum(axis=0) / RECORDS_PER_SECOND,
+        energy=power.sum(axis=0) / DEMO_DRIVE.records_per_second,
         distance=np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)).sum(axis=0),
         command_speed=speed,
     )

@@ -19,7 +19,7 @@ from lunar_mjx.demo.husky import HuskyCase
 from lunar_mjx.demo.wheel import Case, dense_curves
 from lunar_mjx.report.style import BLUE, INK, MEASURED, ROCK, SERIES, VERMILION, Series, faded, finish
 from lunar_mjx.terrain import Terrain
-from lunar_mjx.wheel_bed.soil_fit import APART_ANGLES, FIT_ANGLES
+from lunar_mjx.wheel_bed.soil_fit import SOIL_FIT
 
 ROVERS = {"viper": ("VIPER", BLUE), "luvmi_x": ("LUVMI-X", VERMILION)}
 _MARGIN = 5.0
@@ -266,7 +266,7 @@ def _band(figure, time, values, colour, row, column, individuals, legend) -> Non
 
 def _split_of(angle_deg: float) -> str:
     """Whether the points at a slip angle were fitted."""
-    for angles, name in ((FIT_ANGLES, "fitted"), (APART_ANGLES, "set apart")):
+    for angles, name in ((SOIL_FIT.fit_angles, "fitted"), (SOIL_FIT.apart_angles, "set apart")):
         if any(abs(angle_deg - a) < 0.01 for a in angles):
             return name
     return "held out"

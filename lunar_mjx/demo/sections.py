@@ -26,7 +26,7 @@ from lunar_mjx.demo.wheel import Case
 from lunar_mjx.report.page import Facts, Figure, Lead, Pair, Section, Table, Text
 from lunar_mjx.terrain import Terrain
 from lunar_mjx.wheel_bed.comparison import as_bed
-from lunar_mjx.wheel_bed.soil_fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, held_out_rms
+from lunar_mjx.wheel_bed.soil_fit import SOIL_FIT, held_out_rms
 from lunar_mjx.wheel_bed.table import QUANTITIES
 
 LEAD = Lead(
@@ -62,7 +62,7 @@ def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
         "A model as good as a repeated measurement would be off by about 1 scatter of single runs. With nominal soil, "
         f"the equations of the seed paper are off by {paper.comparison.overall:.0f}, the corrected equations by "
         f"{plain.comparison.overall:.0f}.",
-        f"With the soil refitted at {_angles(FIT_ANGLES)}, the corrected equations are off by "
+        f"With the soil refitted at {_angles(SOIL_FIT.fit_angles)}, the corrected equations are off by "
         f"{fitted.fit.held_out:.1f} at slip angles that the fit did not see, most of it in the "
         f"{QUANTITIES[quantity][2]}: physics is missing, not only parameters.",
     ]
@@ -178,9 +178,9 @@ def wheel_section(cases: Sequence[Case]) -> Section:
     beds = [case.fit.bed if case.fit else as_bed(case.name) for case in cases]
     caption = (
         "Columns are slip angles; slip compares the rim speed with the travel speed. Each curve follows the measured "
-        f"load from point to point. Fitted at {_angles(FIT_ANGLES)}; held out at "
-        f"{_angles(INSIDE_ANGLES + BEYOND_ANGLES)}; {_angles(APART_ANGLES)} set apart, because the wheel sinks to its "
-        "axle there. What no fit saw stands on a tinted ground."
+        f"load from point to point. Fitted at {_angles(SOIL_FIT.fit_angles)}; held out at "
+        f"{_angles(SOIL_FIT.inside_angles + SOIL_FIT.beyond_angles)}; {_angles(SOIL_FIT.apart_angles)} set apart, "
+        "because the wheel sinks to its axle there. What no fit saw stands on a tinted ground."
     )
     sigma = ", ".join(f"{QUANTITIES[q][2]} {_scatter(q, s)}" for q, s in table.sigma.items())
     about = (
@@ -214,10 +214,10 @@ def _error_table(cases: Sequence[Case]) -> Table:
         "model",
         *(QUANTITIES[q][2] for q in quantities),
         "all",
-        f"fitted ({_angles(FIT_ANGLES)})",
-        f"held out inside ({_angles(INSIDE_ANGLES)})",
-        f"beyond ({_angles(BEYOND_ANGLES)})",
-        f"apart ({_angles(APART_ANGLES)})",
+        f"fitted ({_angles(SOIL_FIT.fit_angles)})",
+        f"held out inside ({_angles(SOIL_FIT.inside_angles)})",
+        f"beyond ({_angles(SOIL_FIT.beyond_angles)})",
+        f"apart ({_angles(SOIL_FIT.apart_angles)})",
     ]
     note = (
         "A model as good as a repeated run would score about 1. Nominal soils are never fitted to these measurements."

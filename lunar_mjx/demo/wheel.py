@@ -11,7 +11,7 @@ import numpy as np
 from lunar_mjx.criticism import Comparison, SteadyStateTable, WheelBed, WheelFit, fit, load_figures
 from lunar_mjx.wheel_bed.bed import wheel_test
 from lunar_mjx.wheel_bed.comparison import compare
-from lunar_mjx.wheel_bed.soil_fit import APART_ANGLES, BEYOND_ANGLES, FIT_ANGLES, INSIDE_ANGLES, PAPER_CONTACT, SOIL
+from lunar_mjx.wheel_bed.soil_fit import PAPER_CONTACT, SOIL, SOIL_FIT
 
 
 class Case(NamedTuple):
@@ -26,10 +26,10 @@ class Case(NamedTuple):
         """Root mean square error in sigma at the fitted, the held-out and the set-apart slip angles."""
         c = self.comparison
         return {
-            "fitted angles": c.score(FIT_ANGLES),
-            "held out, inside": c.score(INSIDE_ANGLES),
-            "held out, beyond": c.score(BEYOND_ANGLES),
-            "set apart": c.score(APART_ANGLES),
+            "fitted angles": c.score(SOIL_FIT.fit_angles),
+            "held out, inside": c.score(SOIL_FIT.inside_angles),
+            "held out, beyond": c.score(SOIL_FIT.beyond_angles),
+            "set apart": c.score(SOIL_FIT.apart_angles),
         }
 
     def to_dict(self) -> dict[str, Any]:
@@ -48,7 +48,7 @@ _CURVE_POINTS = 61
 
 PAPER_SOIL = "nominal: the paper's release"
 LUNAR_SOIL = "nominal: Lunar Sourcebook"
-REFITTED = f"refitted at {', '.join(f'{a:g}' for a in FIT_ANGLES)} deg"
+REFITTED = f"refitted at {', '.join(f'{a:g}' for a in SOIL_FIT.fit_angles)} deg"
 
 
 def wheel_cases(starts: int = 8, seed: int = 0, progress: Callable[[float], None] | None = None) -> list[Case]:

@@ -28,12 +28,21 @@ from lunar_mjx.logs import SteadyLog
 
 NEXT_FILE = "next.json"
 NOTHING = "no further effect"
-SECONDS = 30.0
-"""Longest planned drive by default, s."""
-_MOST = 4
-"""Hypotheses at most."""
-SEPARABLE = 5.0
-"""sigma; difference of two hypotheses from which a measurement tells them apart."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NextExperiment:
+    """How experiments are chosen."""
+
+    seconds: float = 30.0
+    """Longest planned drive by default, s."""
+    most: int = 4
+    """Hypotheses at most."""
+    separable: float = 5.0
+    """sigma; difference of two hypotheses from which a measurement tells them apart."""
+
+
+NEXT = NextExperiment()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +78,7 @@ class NextExperiment:
 
 
 def next_experiment(
-    folder: str | Path | Run, between: Sequence[str] = (), seconds: float = SECONDS, progress: Progress = silent
+    folder: str | Path | Run, between: Sequence[str] = (), seconds: float = NEXT.seconds, progress: Progress = silent
 ) -> NextExperiment:
     """The manoeuvre (or sweep of a test bed) that best separates what the logs leave open; writes `next.json`.
 
@@ -128,15 +137,15 @@ def _hypotheses(verdict: dict[str, Any], between: Sequence[str], candidates: set
         return list(between) if len(between) > 1 else [*between, NOTHING]
     named = [e for e in verdict["effects"] if e in candidates]
     if verdict["verdict"] == "KNOWN_CLASS" and len(named) > 1:
-        return named[:_MOST]
+        return named[: NEXT.most]
     if verdict["verdict"] == "NOISE_ONLY":
         # What these logs could not have shown, the most nearly visible first.
         hidden = sorted((e for e in evidence if e["status"] == "not tested"), key=lambda e: -e["separable_sigma"])
-        return [*(e["effect"] for e in hidden[: _MOST - 1]), NOTHING]
+        return [*(e["effect"] for e in hidden[: NEXT.most - 1]), NOTHING]
     open_ = [e["effect"] for e in evidence if e["status"] in ("accepted", "confounded")]
     near = [e["nearest"][0] for e in evidence if e["effect"] in named and e["nearest"][0] in candidates]
     rest = [e["effect"] for e in sorted(evidence, key=lambda e: -(e["z"] or 0.0)) if e["effect"] in candidates]
-    return list(dict.fromkeys([*named[:2], *open_, *near, *rest]))[: max(2, min(_MOST, len(named) + 2))]
+    return list(dict.fromkeys([*named[:2], *open_, *near, *rest]))[: max(2, min(NEXT.most, len(named) + 2))]
 
 
 class _Knowledge:
@@ -237,7 +246,7 @@ def _sentence(names: Sequence[str], plans: Sequence[Plan]) -> str:
         return f"No planned measurement could be simulated to tell {said} apart."
     best = plans[0]
     pair = f" (least for {best.pair[0]} against {best.pair[1]})" if len(names) > 2 else ""
-    if best.separation < SEPARABLE:
+    if best.separation < NEXT.separable:
         return (
             f"No planned measurement tells {said} apart with these instruments: the best, {best.name}, would show a "
             f"difference of {best.separation:.2g} sigma{pair}; measure longer, or with less noise."

@@ -18,12 +18,21 @@ from lunar_mjx.model import ZERO_CELSIUS, Model
 from lunar_mjx.simulate import command_channels
 from lunar_mjx.wheel_bed.table import QUANTITIES, SteadyStateTable, average
 
-ANGLES = (0.0, 15.0, 30.0, 45.0, 60.0)
-"""Slip angles of planned sweeps, deg."""
-LOADS = (0.5, 1.0, 2.0)
-"""Loads of planned sweeps, as a share of the median one so far."""
+
+@dataclasses.dataclass(frozen=True)
+class PlannedSweeps:
+    """Sweeps of a test bed that are proposed."""
+
+    angles: tuple[float, ...] = (0.0, 15.0, 30.0, 45.0, 60.0)
+    """Slip angles of planned sweeps, deg."""
+    loads: tuple[float, float, float] = (0.5, 1.0, 2.0)
+    """Loads of planned sweeps, as a share of the median one so far."""
+    replicates: int = 3
+
+
+PLANNED = PlannedSweeps()
+
 SLIPS = np.linspace(-0.3, 0.8, 12)
-REPLICATES = 3
 
 
 def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tuple[str, str, Log]]:
@@ -104,8 +113,8 @@ def planned_sweeps(logs: Sequence[SteadyLog]) -> list[tuple[str, str, SteadyLog]
         "sinkage": 5e-4,
     }
     found = []
-    for share in LOADS:
-        for angle in ANGLES:
+    for share in PLANNED.loads:
+        for angle in PLANNED.angles:
             name = f"slip sweep at {angle:g} deg slip angle, {share * load:.3g} N"
             found.append(
                 (
@@ -146,5 +155,5 @@ def _sweep(template: SteadyLog, name: str, angle: float, load: float, sigma: dic
         replicates=np.ones(count, int),
         sigma={},
     )
-    noise = {QUANTITIES[q][0]: Noise(s / np.sqrt(REPLICATES), "replicate") for q, s in sigma.items()}
+    noise = {QUANTITIES[q][0]: Noise(s / np.sqrt(PLANNED.replicates), "replicate") for q, s in sigma.items()}
     return dataclasses.replace(template, folder=Path(name), table=table, noise=noise, split="fit")

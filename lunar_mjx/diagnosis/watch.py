@@ -23,12 +23,22 @@ from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.logs import Log, check, read_log
 from lunar_mjx.logs.findings import is_bad
 
-HOURS = 10.0
-"""Driving from one false alarm to the next, at least, h."""
-EVERY_S, IDLE_S = 2.0, 60.0
-"""Time between two looks at a growing log; time without growth after which it has ended, s."""
-CHUNK = 64
-"""Windows of a finished log that are simulated at once."""
+
+@dataclasses.dataclass(frozen=True)
+class Watching:
+    """Pace of a watch over a drive."""
+
+    hours: float = 10.0
+    """Driving from one false alarm to the next, at least, h."""
+    # Time between two looks at a growing log; time without growth after which it has ended, s.
+    every_s: float = 2.0
+    idle_s: float = 60.0
+    chunk: int = 64
+    """Windows of a finished log that are simulated at once."""
+
+
+WATCHING = Watching()
+
 RECORDINGS = (".mcap", ".bag", ".db3")
 """Endings of recordings that have to be imported before."""
 
@@ -80,10 +90,10 @@ class Alarm:
 def watch(
     log: str | Path,
     run: str | Path | Run,
-    hours: float = HOURS,
+    hours: float = WATCHING.hours,
     once: bool = False,
     out: str | Path | None = None,
-    idle_s: float = IDLE_S,
+    idle_s: float = WATCHING.idle_s,
     progress: Progress = silent,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Alarm]:
@@ -179,15 +189,15 @@ class _Watch:
                 if once or waited >= idle_s:
                     yield from self._name(log, found, True)
                     return
-            sleep(EVERY_S)
-            waited += EVERY_S
+            sleep(WATCHING.every_s)
+            waited += WATCHING.every_s
 
     def _follow(self, log: Log, found: Cut, until_s: float, once: bool) -> Iterator[Alarm]:
         """Takes the windows that are new and complete."""
         begun = self.seen[-1] if self.seen else -math.inf
         new = np.flatnonzero((found.start_s > begun + 1e-6) & (found.start_s + found.seconds <= until_s + 1e-6))
-        for at in range(0, len(new), CHUNK):
-            part = new[at : at + CHUNK]
+        for at in range(0, len(new), WATCHING.chunk):
+            part = new[at : at + WATCHING.chunk]
             self.progress("following", float(part[0]) / max(len(found), 1))
             steps = self.follower.steps(found.part(part), log)
             if self.detector is None:

@@ -32,20 +32,28 @@ from lunar_mjx.pytree import pytree
 from lunar_mjx.spatial import Vec3, mul
 from lunar_mjx.terrain.terrain import flat
 
-SETTLE_S = 0.5
-"""Time for which a window's first speeds are held before it begins: ten times as long as a wheel's load takes to settle
-and as the yaw rate takes to follow (0.05 s for a Husky on its tyres)."""
+
+@dataclasses.dataclass(frozen=True)
+class ImposedMotion:
+    """How windows of imposed motion are simulated."""
+
+    settle_s: float = 0.5
+    """Time for which a window's first speeds are held before it begins: ten times as long as a wheel's load takes to
+    settle and as the yaw rate takes to follow (0.05 s for a Husky on its tyres)."""
+    damping_time_s: float = 0.02
+    """Damping of the sheared ground in place of `shear_state`'s 0.1 s, which calms parked rovers and would make a time
+    step of 8 ms unstable on grippy ground (a limit cycle of two steps with 0.7 A at friction 0.6 over a slip of
+    0.01)."""
+    secant_steps: int = 2
+    """Steps from torque to current. One is exact where the torque is affine in the current, as all motors and frictions
+    of the catalogue are; the second serves a gear whose efficiency depends on the direction of power."""
+
+
+IMPOSED = ImposedMotion()
+
 
 LEFT_OUT = ("boulders", "chassis_contact", "joint_limits", "thermal_cutoff")
 """Effects of a whole rover that cannot act in a window on a plane: nothing but the wheels touches it."""
-
-DAMPING_TIME_S = 0.02
-"""Damping of the sheared ground in place of `shear_state`'s 0.1 s, which calms parked rovers and would make a time step
-of 8 ms unstable on grippy ground (a limit cycle of two steps with 0.7 A at friction 0.6 over a slip of 0.01)."""
-
-SECANT_STEPS = 2
-"""Steps from torque to current. One is exact where the torque is affine in the current, as all motors and frictions of
-the catalogue are; the second serves a gear whose efficiency depends on the direction of power."""
 
 
 @pytree
@@ -89,7 +97,7 @@ def on_a_plane(model: Model) -> Model:
         if name in model.effect_names:
             model = model.remove(name)
     if "shear_state" in model.effect_names:
-        model = model.set("shear_state", "imposed motion", damping_time=DAMPING_TIME_S)
+        model = model.set("shear_state", "imposed motion", damping_time=IMPOSED.damping_time_s)
     # Eight metres are more than a window of some seconds drives; the plane has no edge that matters.
     return model.replace(terrain=flat(8.0))
 
@@ -184,7 +192,9 @@ class KinematicDrive:
 
         edges = last.speed, Vec3(last.up_x, last.up_y, last.up_z)
         # a window is cut out of a drive: what its contacts remember at the start is made by holding its first speeds
-        held = jax.tree.map(lambda a: jnp.broadcast_to(a[0], (round(SETTLE_S / self.bin_s) + 1, *a.shape[1:])), edges)
+        held = jax.tree.map(
+            lambda a: jnp.broadcast_to(a[0], (round(IMPOSED.settle_s / self.bin_s) + 1, *a.shape[1:])), edges
+        )
         state, _ = jax.lax.scan(bin_of, state, (held, held))
         before, after = (jax.tree.map(lambda a, s=s: a[s], edges) for s in (slice(None, -1), slice(1, None)))
         _, seen = jax.lax.scan(bin_of, state, (before, after))
@@ -249,7 +259,7 @@ class KinematicDrive:
             return self.system.pipeline.run("motor_torque", at, effects, jnp.zeros_like(torque))[0]
 
         current = torque / per_ampere
-        for _ in range(SECANT_STEPS):
+        for _ in range(IMPOSED.secant_steps):
             off = made(current) - torque
             moved = current - off / per_ampere
             # A secant instead of a derivative: friction has kinks, where a derivative tells nothing of the next ampere.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,10 +16,20 @@ from lunar_mjx.effect_contract import random_rovers as probe
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.ports import Pipeline
 
-BATCH = 2048
-"""Rovers side by side; their state stays in the cache of a CPU."""
-_REPEATS = 12
-_CALLS = 5
+
+@dataclasses.dataclass(frozen=True)
+class CostMeasurement:
+    """How the cost of an effect is timed."""
+
+    batch: int = 2048
+    """Rovers side by side; their state stays in the cache of a CPU."""
+    repeats: int = 12
+    """Turns of both lists, of which the quickest counts."""
+    calls: int = 5
+    """Steps per turn, so that reading the clock costs nothing."""
+
+
+COST = CostMeasurement()
 
 
 def measure_overhead(without: Sequence[Effect], full: Sequence[Effect]) -> tuple[float, float]:
@@ -34,14 +45,14 @@ def measure_overhead(without: Sequence[Effect], full: Sequence[Effect]) -> tuple
     # On a CPU the time that the process itself has spent, in which others on the machine count little.
     clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
     times: list[list[float]] = [[], []]
-    for _ in range(_REPEATS):
+    for _ in range(COST.repeats):
         for run, spent in zip(runs, times, strict=True):
             start, done = clock(), None
-            for _ in range(_CALLS):
+            for _ in range(COST.calls):
                 done = run()
             jax.block_until_ready(done)
-            spent.append((clock() - start) / _CALLS)
-    half = _REPEATS // 2
+            spent.append((clock() - start) / COST.calls)
+    half = COST.repeats // 2
     drift = [abs(min(t[:half]) - min(t[half:])) / min(t) for t in times]
     return min(times[1]) / min(times[0]) - 1.0, max(drift)
 
@@ -50,11 +61,13 @@ def _compiled(effects: Sequence[Effect]) -> Callable[[], Any]:
     pipeline, world = Pipeline(tuple(effects)), jax.tree.map(_real, probe.terrain())
     wheels = 4
     s = probe.states(64, wheels)
-    s = {k: np.moveaxis(np.tile(v, (BATCH // 64, *(1,) * (v.ndim - 1))), 0, -1) for k, v in s.items()}
-    memory = jax.tree.map(lambda a: np.repeat(np.asarray(a)[..., None], BATCH, -1), probe.reset_memory(effects, wheels))
+    s = {k: np.moveaxis(np.tile(v, (COST.batch // 64, *(1,) * (v.ndim - 1))), 0, -1) for k, v in s.items()}
+    memory = jax.tree.map(
+        lambda a: np.repeat(np.asarray(a)[..., None], COST.batch, -1), probe.reset_memory(effects, wheels)
+    )
 
     def one(s: Any, memory: Any) -> Any:
-        return probe.step(pipeline, world, {}, s, probe.WARM_UP, memory)
+        return probe.step(pipeline, world, {}, s, probe.RANDOM_ROVERS.warm_up, memory)
 
     run = jax.jit(batch_last(one, (-1, -1)))
     arguments = jax.tree.map(_real, (s, memory))

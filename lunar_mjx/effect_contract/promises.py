@@ -21,14 +21,23 @@ from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.presets import PRESETS
 from lunar_mjx.errors import UserError
 
-ROVERS = 24
-"""Random rovers in a check; derivatives and null value are looked at on each."""
-ULP = 4
-"""Largest deviation at the null value, in units in the last place (float64)."""
-HOMOGENEITY = 1e-9
-"""Largest relative change of a result with the choice of base units."""
-OVERHEAD = 0.05
-"""Largest cost of an effect, relative to the effects of a step."""
+
+@dataclasses.dataclass(frozen=True)
+class Tolerances:
+    """How exactly effects have to keep their promises."""
+
+    rovers: int = 24
+    """Random rovers in a check; derivatives and null value are looked at on each."""
+    ulp: int = 4
+    """Largest deviation at the null value, in units in the last place (float64)."""
+    homogeneity: float = 1e-9
+    """Largest relative change of a result with the choice of base units."""
+    overhead: float = 0.05
+    """Largest cost of an effect, relative to the effects of a step."""
+
+
+TOLERANCES = Tolerances()
+
 
 _FACTORS = {"[length]": 1.7, "[mass]": 0.6, "[time]": 2.3, "[temperature]": 0.8, "[current]": 1.4}
 Outputs = dict[str, Any]
@@ -43,7 +52,9 @@ class Check(NamedTuple):
     detail: str
 
 
-def check_effect(effect: Effect, *, rovers: int = ROVERS, seed: int = 0, overhead: bool = True) -> list[Check]:
+def check_effect(
+    effect: Effect, *, rovers: int = TOLERANCES.rovers, seed: int = 0, overhead: bool = True
+) -> list[Check]:
     """Checks an effect on random rovers with four and six wheels, in float64; about a minute of compiling on a CPU.
 
     Checks of a list with the preset `consistent`: declared units; agreement with the list without it at its null
@@ -173,9 +184,9 @@ def _null(effect: Effect, runs: Sequence[tuple[_Act, Any]]) -> Check:
             if not ulp <= worst:
                 worst, where = ulp, key
     detail = f"{worst:.2g} ulp" + (f" in {where}" if worst else "")
-    if not worst <= ULP:
+    if not worst <= TOLERANCES.ulp:
         detail += "; give a null value only to parameters that switch the effect off, and see that they do"
-    return Check(name, bool(worst <= ULP), detail)
+    return Check(name, bool(worst <= TOLERANCES.ulp), detail)
 
 
 def _ulps(got: Outputs, want: Outputs) -> dict[str, float]:
@@ -253,7 +264,7 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
         for e, m in zip(error, size, strict=True):
             relative = float(np.max(e) / max(float(np.max(m)), 1e-300)) if np.isfinite(e).all() else np.inf
             worst[label][port] = max(worst[label].get(port, 0.0), relative)
-    guilty = [(base, port, w) for base in BASES for port, w in worst[base].items() if not w <= HOMOGENEITY]
+    guilty = [(base, port, w) for base in BASES for port, w in worst[base].items() if not w <= TOLERANCES.homogeneity]
     if guilty:
         told = ", ".join(f"of {BASES[base]} (port {port}, {w:.0e})" for base, port, w in guilty)
         return Check(
@@ -263,7 +274,7 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
             "quantity; make it a parameter or an Annotated constant with that unit, or mend the unit of a parameter",
         )
     largest = max([w for ports in worst.values() for w in ports.values()], default=0.0)
-    return Check("units", bool(largest <= HOMOGENEITY), f"homogeneous to {largest:.1g} in other base units")
+    return Check("units", bool(largest <= TOLERANCES.homogeneity), f"homogeneous to {largest:.1g} in other base units")
 
 
 def _watched(effect: Effect, scales: Mapping[str, Rescaling], found: list[tuple[str, str, Any, Any]]) -> Effect:
@@ -315,8 +326,8 @@ def _differences(got: Any, want: Any, scale: Any) -> tuple[list[Any], list[Any]]
 
 def _cost(cost: float, noise: float) -> Check:
     told = f"{100 * cost:+.1f} % of the effects of a step, repeats differ by {100 * noise:.1f} %"
-    if cost <= OVERHEAD:
+    if cost <= TOLERANCES.overhead:
         return Check("cost", True, told)
-    if cost - noise <= OVERHEAD:
+    if cost - noise <= TOLERANCES.overhead:
         return Check("cost", None, told + ": too near the limit of 5 % for a verdict on this machine")
     return Check("cost", False, told + "; the limit is 5 %")

@@ -64,8 +64,8 @@ def act_on_channels(effect: Effect, values: Mapping[str, Any] | None, channels: 
     time = jnp.arange(_SAMPLES) / _RATE
     ctx = SensorContext(
         time=time,
-        gravity=jnp.asarray(probe.GRAVITY),
-        ambient_temperature=jnp.full_like(time, probe.AMBIENT),
+        gravity=jnp.asarray(probe.RANDOM_ROVERS.gravity),
+        ambient_temperature=jnp.full_like(time, probe.RANDOM_ROVERS.ambient),
         rover=probe.rover(len(WHEELS)),
         parameters={effect.name: SimpleNamespace(**values)},
         joints=tuple(f"{w}_{k}" for w in WHEELS for k in KINDS),

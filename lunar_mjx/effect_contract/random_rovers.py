@@ -17,11 +17,29 @@ from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import SoilGrids, SoilMap, Terrain, build_rocks, inclined
 from lunar_mjx.terrain.sky import Sunlight
 
-SLOPE = 0.1
-"""Inclination of the probe's ground, rad."""
-RADIUS, WIDTH, TIMESTEP, GRAVITY, AMBIENT = 0.25, 0.2, 0.002, 1.625, 250.0
-WARM_UP = 2
-"""Steps before the one that is looked at, from which effects have their memory."""
+
+@dataclasses.dataclass(frozen=True)
+class RandomRovers:
+    """The rovers and grounds on which effects are tried."""
+
+    slope: float = 0.1
+    """Inclination of the probe's ground, rad."""
+    radius: float = 0.25
+    """Of the wheels, m."""
+    width: float = 0.2
+    """Of the wheels, m."""
+    timestep: float = 0.002
+    """s, that of a model unless it says otherwise."""
+    gravity: float = 1.625
+    """m/s2, on the Moon."""
+    ambient: float = 250.0
+    """K."""
+    warm_up: int = 2
+    """Steps before the one that is looked at, from which effects have their memory."""
+
+
+RANDOM_ROVERS = RandomRovers()
+
 
 Values = Mapping[str, Mapping[str, Any]]
 Memory = dict[str, dict[str, Any]]
@@ -30,7 +48,7 @@ Memory = dict[str, dict[str, Any]]
 def terrain() -> Terrain:
     """A slope with rock and ever firmer soil in the east, under some of the wheels, and boulders beside two of them."""
     dtype = jnp.result_type(float)
-    plane = inclined(SLOPE, 20.0, dtype=dtype)
+    plane = inclined(RANDOM_ROVERS.slope, 20.0, dtype=dtype)
     bounds = (-10.0, -10.0, 10.0, 10.0)
     centers = np.array([[1.0, 0.5, 0.1], [-1.0, -0.5, -0.1], [5.0, 5.0, 0.5]])
     rocks = build_rocks(centers, np.array([0.35, 0.35, 0.3]), bounds, dtype=dtype)
@@ -51,8 +69,8 @@ def rover(wheels: int) -> RoverInfo:
     points = Vec3(jnp.asarray([0.5, -0.5]), jnp.asarray([0.3, -0.3]), jnp.asarray([-0.2, 0.05]))
     group = number % 3
     return RoverInfo(
-        RADIUS * jnp.ones(wheels),
-        WIDTH * jnp.ones(wheels),
+        RANDOM_ROVERS.radius * jnp.ones(wheels),
+        RANDOM_ROVERS.width * jnp.ones(wheels),
         group,
         jnp.where(group == 0, -jnp.inf, -0.2 * one),
         jnp.where(group == 0, jnp.inf, 0.2 * one),
@@ -68,14 +86,14 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def states(count: int, wheels: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Random rovers over `WARM_UP` + 1 moments, of shape (count, moment, ...).
+    """Random rovers over `RANDOM_ROVERS.warm_up` + 1 moments, of shape (count, moment, ...).
 
     The first six of them at their last moment: standstill, airborne, touching, deep, rolling without slip, and backing
     up; one wheel in five is airborne. From moment to moment the wheels change places, so that each stands where another
     has been.
     """
     rng = np.random.default_rng(seed)
-    moments, joints = WARM_UP + 1, 3 * wheels
+    moments, joints = RANDOM_ROVERS.warm_up + 1, 3 * wheels
 
     def normal(*shape: int, scale: float = 1.0) -> np.ndarray:
         return scale * rng.normal(size=(count, moments, *shape))
@@ -110,7 +128,7 @@ def states(count: int, wheels: int, seed: int = 0) -> dict[str, np.ndarray]:
     for i, way in ((4, 1.0), (5, -1.0)):
         if i < count:
             s["axle"][i, -1], s["velocity"][i, -1] = [0.0, 1.0, 0.0], [0.1 * way, 0.0, 0.0]
-            s["spin"][i, -1] = [0.0, 0.1 * way / RADIUS, 0.0]
+            s["spin"][i, -1] = [0.0, 0.1 * way / RANDOM_ROVERS.radius, 0.0]
     return s
 
 
@@ -121,10 +139,10 @@ def context(effects: Sequence[Effect], values: Values, world: Terrain, s: Mappin
     zero, one = jnp.zeros(()), jnp.ones(())
     axes = (Vec3(one, zero, zero), Vec3(zero, one, zero), Vec3(zero, zero, one))
     return Context(
-        time=zero + TIMESTEP * moment,
-        dt=zero + TIMESTEP,
-        gravity=zero + GRAVITY,
-        ambient_temperature=zero + AMBIENT,
+        time=zero + RANDOM_ROVERS.timestep * moment,
+        dt=zero + RANDOM_ROVERS.timestep,
+        gravity=zero + RANDOM_ROVERS.gravity,
+        ambient_temperature=zero + RANDOM_ROVERS.ambient,
         position=Vec3(zero, zero, s["chassis_height"][moment]),
         frame=Frame(*axes),
         velocity=Vec3.of(s["chassis_velocity"][moment]),
@@ -134,7 +152,11 @@ def context(effects: Sequence[Effect], values: Values, world: Terrain, s: Mappin
         winding_temperature=s["winding"][moment],
         housing_temperature=s["housing"][moment],
         steering_angle=s["steering"][moment],
-        wheel_position=Vec3(place[:, 0], place[:, 1], RADIUS - s["sinkage"][moment] + np.tan(SLOPE) * place[:, 0]),
+        wheel_position=Vec3(
+            place[:, 0],
+            place[:, 1],
+            RANDOM_ROVERS.radius - s["sinkage"][moment] + np.tan(RANDOM_ROVERS.slope) * place[:, 0],
+        ),
         wheel_axle=Vec3.of(s["axle"][moment]),
         wheel_velocity=Vec3.of(s["velocity"][moment]),
         wheel_angular_velocity=Vec3.of(s["spin"][moment]),
@@ -182,6 +204,6 @@ def act(effects: Sequence[Effect], world: Terrain, values: Values, s: Mapping[st
     """`step` at the last moment, with the memory that the moments before have left."""
     pipeline = Pipeline(tuple(effects))
     memory = reset_memory(effects, s["sinkage"].shape[-1])
-    for moment in range(WARM_UP):
+    for moment in range(RANDOM_ROVERS.warm_up):
         _, memory = step(pipeline, world, values, s, moment, memory)
-    return step(pipeline, world, values, s, WARM_UP, memory)[0]
+    return step(pipeline, world, values, s, RANDOM_ROVERS.warm_up, memory)[0]

@@ -20,30 +20,40 @@ from scipy.stats import chi2
 from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.schema import find_channel, is_command, is_quantity
 
-WINDOW_S = 2.0
-"""Windows about whose own parabola a channel is noise: what changes within two seconds in any other way than that is
-faster than a rover on its wheels, and what is slower is motion."""
-FEWEST, MOST = 12, 100
-"""Samples of a window: with fewer three are too many for the parabola; of more, as many as these tell the colour."""
-PARABOLA = 3
-"""Coefficients of a parabola."""
-WINDOWS = 200
-"""Windows that are looked at, spread over the drive."""
-FEWEST_WINDOWS = 3
-"""Windows of a drive below which its noise is not told."""
-SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97)
-TIMES_S = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
-"""What is tried: shares of the variance that are correlated, and correlation times."""
-COLOURED = 9.2
-"""Twice the log-likelihood that a colour must gain over white noise: a chi-square of two degrees exceeds it once in a
-hundred times."""
+
+@dataclasses.dataclass(frozen=True)
+class NoiseEstimate:
+    """How noise is estimated from a drive."""
+
+    window_s: float = 2.0
+    """Windows about whose own parabola a channel is noise: what changes within two seconds in any other way than that
+    is faster than a rover on its wheels, and what is slower is motion."""
+    # Samples of a window: with fewer three are too many for the parabola; of more, as many as these tell the colour.
+    fewest: int = 12
+    most: int = 100
+    parabola: int = 3
+    """Coefficients of a parabola."""
+    windows: int = 200
+    """Windows that are looked at, spread over the drive."""
+    fewest_windows: int = 3
+    """Windows of a drive below which its noise is not told."""
+    shares: tuple[float, ...] = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97)
+    times_s: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+    """What is tried: shares of the variance that are correlated, and correlation times."""
+    coloured: float = 9.2
+    """Twice the log-likelihood that a colour must gain over white noise: a chi-square of two degrees exceeds it once in
+    a hundred times."""
+    still_rad_s: float = 0.02
+    """A wheel that turns slower stands."""
+    quietest: float = 1e-12
+    """Least variance that has a logarithm, in squared units of the channel: below it a channel is constant."""
+
+
+NOISE_ESTIMATE = NoiseEstimate()
+
 STATED_LOG_STD = {"datasheet": 0.3, "rest": 0.1, "replicate": 0.1}
 """Standard deviation of the logarithm of a stated noise by its source: data sheets are right within a third."""
-STILL_RAD_S = 0.02
-"""A wheel that turns slower stands."""
 _NAMES = {"imu": "vibration", "electrical": "ripple", "torque": "ripple"}
-_QUIETEST = 1e-12
-"""Least variance that has a logarithm, in squared units of the channel: below it a channel is constant."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,17 +121,17 @@ def estimated_noise(log: Log, channel: str, moving: bool) -> ChannelNoise | None
         return None
     time, values = found
     step, windows = _windows(time, values, _moving(log, time, channel), moving)
-    if windows.shape[1] < FEWEST_WINDOWS:
+    if windows.shape[1] < NOISE_ESTIMATE.fewest_windows:
         return None
     share, correlation_time = _colour(step, windows)
     weight, _ = _about_parabola(len(windows), step, share, correlation_time)
-    free = len(windows) - PARABOLA
+    free = len(windows) - NOISE_ESTIMATE.parabola
     size = np.sum(windows * (weight @ windows), axis=0) / free
     # half of the windows are quieter than this; a chi-square's median lies below its mean
     variance = float(np.median(size)) * free / float(chi2.median(free))
-    if variance <= _QUIETEST:
+    if variance <= NOISE_ESTIMATE.quietest:
         return None
-    logs = 0.5 * np.log(np.maximum(size, _QUIETEST))
+    logs = 0.5 * np.log(np.maximum(size, NOISE_ESTIMATE.quietest))
     # the middle half tells the spread: a few windows hold a kerb
     scatter = (float(np.quantile(logs, 0.75)) - float(np.quantile(logs, 0.25))) / 1.349
     spread = float(np.sqrt(max(scatter**2 - 0.25 * float(polygamma(1, 0.5 * free)), 0.0)))
@@ -164,20 +174,20 @@ def _moving(log: Log, time: np.ndarray, channel: str) -> np.ndarray:
             for t, v in series:
                 after = np.clip(np.searchsorted(t, time), 0, len(t) - 1)
                 before = np.clip(after - 1, 0, len(t) - 1)
-                moves |= np.maximum(np.abs(v[before]), np.abs(v[after])) > STILL_RAD_S
+                moves |= np.maximum(np.abs(v[before]), np.abs(v[after])) > NOISE_ESTIMATE.still_rad_s
             return moves
     return np.ones(len(time), bool)
 
 
 def _windows(time: np.ndarray, values: np.ndarray, moves: np.ndarray, moving: bool) -> tuple[float, np.ndarray]:
     """Time step in s, and pieces (samples, windows) of a channel that lie wholly in motion or wholly at rest."""
-    step = float(np.median(np.diff(time))) if len(time) >= FEWEST else 0.0
+    step = float(np.median(np.diff(time))) if len(time) >= NOISE_ESTIMATE.fewest else 0.0
     if step <= 0.0:
-        return step, np.zeros((FEWEST, 0))
-    count = int(np.clip(round(WINDOW_S / step), FEWEST, MOST))
+        return step, np.zeros((NOISE_ESTIMATE.fewest, 0))
+    count = int(np.clip(round(NOISE_ESTIMATE.window_s / step), NOISE_ESTIMATE.fewest, NOISE_ESTIMATE.most))
     starts = list(range(0, len(time) - count + 1, count))
     out = []
-    for k in starts[:: max(1, len(starts) // WINDOWS)]:
+    for k in starts[:: max(1, len(starts) // NOISE_ESTIMATE.windows)]:
         piece = slice(k, k + count)
         even = np.diff(time[piece]).max() < 2.5 * step
         # a sensor that stands still in its resolution shows no noise
@@ -190,20 +200,20 @@ def _colour(step: float, windows: np.ndarray) -> tuple[float, float]:
     """Share of the variance that is correlated, and its correlation time in s, by restricted likelihood."""
     best, most = (0.0, 0.0), -np.inf
     white = _likelihood(step, windows, 0.0, 1.0)
-    for tau in TIMES_S:
-        for share in SHARES[1:] if tau >= 0.5 * step else ():
+    for tau in NOISE_ESTIMATE.times_s:
+        for share in NOISE_ESTIMATE.shares[1:] if tau >= 0.5 * step else ():
             likelihood = _likelihood(step, windows, share, tau)
             if likelihood > most:
                 best, most = (share, tau), likelihood
-    return best if 2.0 * (most - white) > COLOURED else (0.0, 0.0)
+    return best if 2.0 * (most - white) > NOISE_ESTIMATE.coloured else (0.0, 0.0)
 
 
 def _likelihood(step: float, windows: np.ndarray, share: float, tau: float) -> float:
     """Restricted log-likelihood of windows (samples, windows), the size of each at its best."""
     weight, determinant = _about_parabola(len(windows), step, share, tau)
     squares = np.sum(windows * (weight @ windows), axis=0)
-    free = len(windows) - PARABOLA
-    return -0.5 * float(np.sum(free * np.log(np.maximum(squares, _QUIETEST)) + determinant))
+    free = len(windows) - NOISE_ESTIMATE.parabola
+    return -0.5 * float(np.sum(free * np.log(np.maximum(squares, NOISE_ESTIMATE.quietest)) + determinant))
 
 
 @functools.lru_cache(maxsize=512)
@@ -211,7 +221,7 @@ def _about_parabola(count: int, step: float, share: float, tau: float) -> tuple[
     """Inverse covariance (count, count) of what is left about a parabola, and that covariance's log determinant."""
     t = step * np.arange(count)
     parabola = np.stack([np.ones(count), t - t.mean(), (t - t.mean()) ** 2], axis=1)
-    contrasts = np.linalg.qr(parabola, mode="complete")[0][:, PARABOLA:]
+    contrasts = np.linalg.qr(parabola, mode="complete")[0][:, NOISE_ESTIMATE.parabola :]
     covariance = (1.0 - share) * np.eye(count)
     if share > 0.0:
         covariance += share * np.exp(-np.abs(t[:, None] - t) / tau)

@@ -14,7 +14,7 @@ from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.manoeuvres.stand import stand
 from lunar_mjx.model import Model
 from lunar_mjx.rover import Rover, Wheel
-from lunar_mjx.simulate import INTERVAL, Commands
+from lunar_mjx.simulate import SIMULATE, Commands
 from lunar_mjx.toml_fields import Fields
 
 FORMAT = "lunar-mjx-manoeuvre/1"
@@ -214,7 +214,7 @@ def commands(manoeuvre: Manoeuvre, model: Model, scale: float = 1.0) -> Commands
             "is not that of its drive commands",
             f'set control.drive.mode = "{manoeuvre.drive_mode}"',
         )
-    interval = max(1, round(INTERVAL / model.timestep)) * model.timestep
+    interval = max(1, round(SIMULATE.interval / model.timestep)) * model.timestep
     count = round(scale * manoeuvre.duration_s / interval)
     if count < 2:
         raise bad_input(

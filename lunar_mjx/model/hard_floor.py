@@ -23,14 +23,26 @@ EFFECTS = (
     "hard_ground",
 )
 """Motors with friction in their gears, and tyres with friction that hardly sink."""
-TYRE_SINKAGE = 0.018
-"""Depth by which a tyre under its share of the rover yields, over its radius: 3 mm of a Husky's 0.165 m."""
-TYRE_DAMPING = 0.23
-"""Damping of the rover on its tyres over the critical one."""
-GEAR_FRICTION = 0.02
-"""Coulomb friction of a drive over the torque that lifts the whole weight at the rim; 2 N m of a Husky's 97."""
-FRICTION, SLIP_SCALE, SIDE = 0.6, 0.05, 0.75
-"""Rubber on floors and asphalt: friction; slip at which it is reached to 1/e; friction across a tyre over along it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tyres:
+    """Tyres and gears of a rover on hard ground."""
+
+    tyre_sinkage: float = 0.018
+    """Depth by which a tyre under its share of the rover yields, over its radius: 3 mm of a Husky's 0.165 m."""
+    tyre_damping: float = 0.23
+    """Damping of the rover on its tyres over the critical one."""
+    gear_friction: float = 0.02
+    """Coulomb friction of a drive over the torque that lifts the whole weight at the rim; 2 N m of a Husky's 97."""
+    # Rubber on floors and asphalt: friction; slip at which it is reached to 1/e; friction across a tyre over along
+    # it.
+    friction: float = 0.6
+    slip_scale: float = 0.05
+    side: float = 0.75
+
+
+TYRES = Tyres()
 
 
 def hard_floor(rover: str | Path | Rover, gravity: float | None = None) -> Model:
@@ -54,9 +66,15 @@ def hard_floor(rover: str | Path | Rover, gravity: float | None = None) -> Model
     radius = sum(w.radius for w in wheels) / len(wheels)
     load = model.rover.mass * model.gravity / len(wheels)
     # In proportion to weight and wheel, so that any rover stands on its tyres like the one that was measured.
-    stiffness = load / (TYRE_SINKAGE * radius)
-    damping = 2.0 * TYRE_DAMPING * (stiffness * model.rover.mass / len(wheels)) ** 0.5
+    stiffness = load / (TYRES.tyre_sinkage * radius)
+    damping = 2.0 * TYRES.tyre_damping * (stiffness * model.rover.mass / len(wheels)) ** 0.5
     model = model.set(
-        "hard_ground", "hard floor", stiffness=stiffness, damping=damping, mu=FRICTION, slip_scale=SLIP_SCALE, side=SIDE
+        "hard_ground",
+        "hard floor",
+        stiffness=stiffness,
+        damping=damping,
+        mu=TYRES.friction,
+        slip_scale=TYRES.slip_scale,
+        side=TYRES.side,
     )
-    return model.set("coulomb_friction", "hard floor", torque=GEAR_FRICTION * load * len(wheels) * radius)
+    return model.set("coulomb_friction", "hard floor", torque=TYRES.gear_friction * load * len(wheels) * radius)

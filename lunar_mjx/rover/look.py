@@ -9,6 +9,7 @@ MJCF. A rover without the file is seen as its plain shapes.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,22 @@ from lunar_mjx.rover.description import at_least, check_keys, numbers, one_of, r
 from lunar_mjx.rover.rover import Rover
 
 FILE = "look.toml"
-HIDDEN = 3
-"""MuJoCo's convention: geoms of this group and above are not for the eye."""
-DETAIL = 2
-"""Group of parts too small for a picture of 64 x 48: drawn by OpenGL, and in JAX where detail is asked for."""
-MOST_PARTS = 2000
-"""Geoms of a rover's look: beyond it, pictures take longer than the physics."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """How a rover's parts are drawn."""
+
+    hidden: int = 3
+    """MuJoCo's convention: geoms of this group and above are not for the eye."""
+    detail: int = 2
+    """Group of parts too small for a picture of 64 x 48: drawn by OpenGL, and in JAX where detail is asked for."""
+    most_parts: int = 2000
+    """Geoms of a rover's look: beyond it, pictures take longer than the physics."""
+
+
+LOOK = Look()
+
 _KINDS = {
     "box": (mujoco.mjtGeom.mjGEOM_BOX, 3),
     "cylinder": (mujoco.mjtGeom.mjGEOM_CYLINDER, 2),
@@ -54,12 +65,14 @@ def seen_spec(rover: Rover) -> mujoco.MjSpec:
     bodies = {b.name: b for b in spec.bodies}
     for name in _names(path, "plain", data.get("plain", []), bodies):
         for geom in bodies[name].geoms:
-            geom.group = HIDDEN
+            geom.group = LOOK.hidden
     count = 0
     for i, part in enumerate(tables(path, "parts", data)):
         count += _add(path, f"parts[{i}]", part, bodies, colours)
-        if count > MOST_PARTS:
-            raise bad_input(path, f"parts[{i}]", count, f"geoms are more than {MOST_PARTS}", "leave small parts out")
+        if count > LOOK.most_parts:
+            raise bad_input(
+                path, f"parts[{i}]", count, f"geoms are more than {LOOK.most_parts}", "leave small parts out"
+            )
     return spec
 
 
@@ -94,7 +107,7 @@ def _add(path: Path, where: str, part: Any, bodies: dict[str, Any], colours: dic
                 pos=turn @ at,
                 quat=quaternion,
                 rgba=[*colours[colour], 1.0],
-                group=DETAIL if part.get("detail") is True else 1,
+                group=LOOK.detail if part.get("detail") is True else 1,
                 mass=0.0,
                 contype=0,
                 conaffinity=0,

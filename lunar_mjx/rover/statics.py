@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import mujoco
@@ -14,12 +15,25 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.rover.description import GROUPS, Description, GroupDescription
 from lunar_mjx.rover.roles import Roles
 
-# Shares of the stability bound of an explicit step, so that the gains also hold at twice the time step.
-_VELOCITY_SHARE = 0.25  # kv dt / I
-_POSITION_SHARE = 0.05  # kp dt^2 / I
-_BANDWIDTH = 20.0  # rad/s, about 3 Hz: above the rover's own motion, below the bound
-_DAMPING_RATIO = 0.7
-_SAG = 0.02  # rad that a suspension without a spring may give way under the rover's weight
+
+@dataclasses.dataclass(frozen=True)
+class GainRules:
+    """Rules by which controller gains and springs follow from a rover's masses."""
+
+    # Shares of the stability bound of an explicit step, so that the gains also hold at twice the time step.
+    velocity_share: float = 0.25
+    """kv dt / I"""
+    position_share: float = 0.05
+    """kp dt^2 / I"""
+    bandwidth: float = 20.0
+    """rad/s, about 3 Hz: above the rover's own motion, below the bound"""
+    damping_ratio: float = 0.7
+    """Damping of position control over the critical one."""
+    sag: float = 0.02
+    """rad that a suspension without a spring may give way under the rover's weight"""
+
+
+GAIN_RULES = GainRules()
 
 
 @dataclass(frozen=True)
@@ -103,14 +117,14 @@ def gains(model: mujoco.MjModel, roles: Roles, description: Description, name: s
         inertia = min(effective_inertia(model, j) for j in joints)
         dt = description.timestep
         if group.mode == "velocity":
-            velocity = _VELOCITY_SHARE * inertia / dt
+            velocity = GAIN_RULES.velocity_share * inertia / dt
         else:
             load = 0.0
             if name == "suspension" and group.stiffness == 0:
                 load = max(abs(t) for t in holding_torques(model, roles).values())
-            wanted = max(inertia * _BANDWIDTH**2, load / _SAG)
-            position = min(wanted, _POSITION_SHARE * inertia / dt**2)
-            velocity = 2 * _DAMPING_RATIO * np.sqrt(position * inertia)
+            wanted = max(inertia * GAIN_RULES.bandwidth**2, load / GAIN_RULES.sag)
+            position = min(wanted, GAIN_RULES.position_share * inertia / dt**2)
+            velocity = 2 * GAIN_RULES.damping_ratio * np.sqrt(position * inertia)
     chosen = Gains(float(f"{position:.3g}"), float(f"{velocity:.3g}"))
     return Gains(
         chosen.position if group.position_gain is None else group.position_gain,

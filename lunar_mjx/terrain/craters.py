@@ -16,13 +16,22 @@ import numpy as np
 from lunar_mjx.errors import bad_input
 from lunar_mjx.terrain.checks import require_at_least, require_between, require_positive
 
-RIM = 0.036 / 0.196
-"""Height of the rim as a share of the crater's depth from rim to floor (Pike 1977)."""
-REACH = 3.0
-"""Radii at which the ejecta blanket ends; it falls with the cube of the distance (McGetchin et al. 1973)."""
-_ROUND = 0.05  # width of the rounding of the rim's crest, as a share of the depth
-_MOST = 200_000
-"""Craters above which a terrain is refused: they are dug one by one."""
+
+@dataclasses.dataclass(frozen=True)
+class CraterShape:
+    """Shape of craters, and how many are dug."""
+
+    rim: float = 0.036 / 0.196
+    """Height of the rim as a share of the crater's depth from rim to floor (Pike 1977)."""
+    reach: float = 3.0
+    """Radii at which the ejecta blanket ends; it falls with the cube of the distance (McGetchin et al. 1973)."""
+    round: float = 0.05
+    """Width of the rounding of the rim's crest, as a share of the depth"""
+    most: int = 200_000
+    """Craters above which a terrain is refused: they are dug one by one."""
+
+
+CRATER_SHAPE = CraterShape()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,17 +80,17 @@ def profile(r: Any, depth: Any, xp: Any = np) -> Any:
       xp: `numpy`, or `jax.numpy` for arrays on the device.
 
     Returns:
-      Height in m: a parabolic bowl and an r^-3 rim, joined by a smooth minimum, zero beyond `REACH`.
+      Height in m: a parabolic bowl and an r^-3 rim, joined by a smooth minimum, zero beyond `CRATER_SHAPE.reach`.
     """
-    rim = RIM * depth
+    rim = CRATER_SHAPE.rim * depth
     bowl = rim + depth * (r * r - 1)
     # Inside half a radius the bowl is far below the blanket, whose value there only has to be finite.
     blanket = rim * xp.maximum(r, 0.5) ** -3.0
-    width = _ROUND * depth
+    width = CRATER_SHAPE.round * depth
     # Beyond this many widths the smooth minimum is the minimum, and exp() would overflow.
     lower, gap = xp.minimum(bowl, blanket), xp.minimum(xp.abs(bowl - blanket) / width, 40.0)
     joined = lower - width * xp.log1p(xp.exp(-gap))
-    return xp.where(r < REACH, joined - rim * REACH**-3.0, 0.0)
+    return xp.where(r < CRATER_SHAPE.reach, joined - rim * CRATER_SHAPE.reach**-3.0, 0.0)
 
 
 def draw(
@@ -102,10 +111,10 @@ def draw(
     """
     west, south, east, north = bounds
     # Craters beyond the edge throw ejecta onto the terrain.
-    margin = 0.5 * REACH * craters.largest
+    margin = 0.5 * CRATER_SHAPE.reach * craters.largest
     wide, high = east - west + 2 * margin, north - south + 2 * margin
     expected = wide * high * craters.number(craters.smallest)
-    if expected > _MOST:
+    if expected > CRATER_SHAPE.most:
         raise bad_input(
             "Craters", "smallest", craters.smallest, f"gives {expected:.0f} craters", "raise it or shrink the terrain"
         )
@@ -116,7 +125,7 @@ def draw(
     diameter = (most - rng.random(n) * (most - least)) ** (-1 / b)
     x, y = west - margin + wide * rng.random(n), south - margin + high * rng.random(n)
     ratio = craters.shallowest * (craters.deepest / craters.shallowest) ** rng.random(n)
-    far = 0.5 * REACH * diameter
+    far = 0.5 * CRATER_SHAPE.reach * diameter
     near = (x > west - far) & (x < east + far) & (y > south - far) & (y < north + far)
     return x[near], y[near], diameter[near], (ratio * diameter)[near]
 
@@ -132,7 +141,7 @@ def stamp(
     rows, cols = heights.shape
     for x, y, diameter, depth in zip(*population, strict=True):
         radius = diameter / 2
-        far = REACH * radius
+        far = CRATER_SHAPE.reach * radius
         i0, i1 = max(0, int((x - far - x0) / cell)), min(cols, int((x + far - x0) / cell) + 2)
         j0, j1 = max(0, int((y - far - y0) / cell)), min(rows, int((y + far - y0) / cell) + 2)
         if i0 >= i1 or j0 >= j1:

@@ -13,18 +13,26 @@ from scipy import interpolate, ndimage
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.terrain.heightfield import HeightField
 
-MOST_NODATA = 0.5
-"""A DEM that misses more than this share of its heights is refused."""
-USUAL_NODATA = (-9999.0, -99999.0, -32768.0, -32767.0, 32767.0)
-"""What programs write where they have no height."""
-NODATA_GAP = 100.0
-"""A mark of nodata that is as near as this to real heights, in the file's numbers, may be one itself."""
-HIGHEST = 1e7
-"""m; radii of the Moon (1.7e6 m) pass for heights, marks of nodata such as -3.4e38 do not."""
-LARGEST = 1e12
-"""Numbers other than heights that are larger count as marks of nodata; the stiffest soil has 1e9."""
-MOST_CELLS = 50_000_000
-"""A grid of more nodes than this is refused before memory runs out."""
+
+@dataclasses.dataclass(frozen=True)
+class DemLimits:
+    """What a file of heights may hold."""
+
+    most_nodata: float = 0.5
+    """A DEM that misses more than this share of its heights is refused."""
+    usual_nodata: tuple[float, ...] = (-9999.0, -99999.0, -32768.0, -32767.0, 32767.0)
+    """What programs write where they have no height."""
+    nodata_gap: float = 100.0
+    """A mark of nodata that is as near as this to real heights, in the file's numbers, may be one itself."""
+    highest: float = 1e7
+    """m; radii of the Moon (1.7e6 m) pass for heights, marks of nodata such as -3.4e38 do not."""
+    largest: float = 1e12
+    """Numbers other than heights that are larger count as marks of nodata; the stiffest soil has 1e9."""
+    most_cells: int = 50_000_000
+    """A grid of more nodes than this is refused before memory runs out."""
+
+
+DEM_LIMITS = DemLimits()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +57,7 @@ class Dem:
     source: str = "array"
     reference: str = "as in the source"
     notes: tuple[str, ...] = ()
-    highest: float = HIGHEST
+    highest: float = DEM_LIMITS.highest
 
     def __post_init__(self) -> None:
         heights = np.asarray(self.heights, np.float64)
@@ -187,9 +195,13 @@ def require_cell(source: str, field: str, value: float) -> float:
 
 def require_size(source: str, rows: int, cols: int) -> None:
     """Raises `UserError` for a grid too large to hold."""
-    if rows * cols > MOST_CELLS:
+    if rows * cols > DEM_LIMITS.most_cells:
         raise bad_input(
-            source, "grid", f"{rows} x {cols}", f"has more than {MOST_CELLS} nodes", "crop it or use a larger cell"
+            source,
+            "grid",
+            f"{rows} x {cols}",
+            f"has more than {DEM_LIMITS.most_cells} nodes",
+            "crop it or use a larger cell",
         )
 
 
@@ -223,7 +235,7 @@ def fill_holes(heights: np.ndarray, source: str) -> tuple[np.ndarray, tuple[str,
         return heights, ()
     if count == heights.size:
         raise bad_input(source, "heights", "only nodata", "leave nothing to drive on", "give a DEM with heights in it")
-    if count > MOST_NODATA * heights.size:
+    if count > DEM_LIMITS.most_nodata * heights.size:
         raise bad_input(
             source, "heights", f"{count} of {heights.size} nodata", "are more than half", "crop to the part with data"
         )
@@ -272,13 +284,13 @@ def undeclared_nodata(raw: np.ndarray, source: str) -> tuple[np.ndarray, tuple[s
       The numbers with NaN at the marks, and a note that says how many there were.
     """
     notes: tuple[str, ...] = ()
-    usual = np.isin(raw, USUAL_NODATA)
+    usual = np.isin(raw, DEM_LIMITS.usual_nodata)
     if usual.any():
         rest = raw[~usual & np.isfinite(raw)]
-        for mark in USUAL_NODATA:
+        for mark in DEM_LIMITS.usual_nodata:
             here = raw == mark
             # A number amid the real heights may be a height; one far from all of them is a mark.
-            alone = rest.size == 0 or not rest.min() - NODATA_GAP < mark < rest.max() + NODATA_GAP
+            alone = rest.size == 0 or not rest.min() - DEM_LIMITS.nodata_gap < mark < rest.max() + DEM_LIMITS.nodata_gap
             if alone and here.any():
                 raw = np.where(here, np.nan, raw)
                 told = f"taken for nodata, which {Path(source).name} does not declare"

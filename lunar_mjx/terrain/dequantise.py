@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from scipy import fft
 
-HURST = 0.9
-"""Prior Hurst exponent: 0.95 is the median of the lunar highlands (Rosenburg et al. 2011), the maria have less."""
-_LAG = 8  # cells; at this distance the terrain's own relief is well above the rounding
-_SPECTRUM = 512  # grid on which the prior's amplitude is scaled
+
+@dataclasses.dataclass(frozen=True)
+class Smoothing:
+    """The prior by which rounded heights are smoothed."""
+
+    hurst: float = 0.9
+    """Prior Hurst exponent: 0.95 is the median of the lunar highlands (Rosenburg et al. 2011), the maria have less."""
+    lag: int = 8
+    """cells; at this distance the terrain's own relief is well above the rounding"""
+    spectrum: int = 512
+    """grid on which the prior's amplitude is scaled"""
+
+
+SMOOTHING = Smoothing()
 
 
 def dequantise(heights: np.ndarray, quantum: float) -> np.ndarray:
@@ -37,7 +49,7 @@ def dequantise(heights: np.ndarray, quantum: float) -> np.ndarray:
     k = np.hypot(np.arange(cols)[None, :] / (2 * cols), np.arange(rows)[:, None] / (2 * rows))
     # The mean is kept as it is: an infinite prior power there filters nothing.
     k[0, 0] = 1e-9
-    power = amplitude * k ** -(2 * HURST + 2)
+    power = amplitude * k ** -(2 * SMOOTHING.hurst + 2)
     filtered = fft.idctn(fft.dctn(relief, norm="ortho") * (power / (power + noise)), norm="ortho")
     # Rounding is known to be at most half a level: whatever the prior says, the data bound it.
     return np.clip(plane + filtered, heights - quantum / 2, heights + quantum / 2)
@@ -54,12 +66,12 @@ def _plane(heights: np.ndarray) -> np.ndarray:
 
 def _amplitude(relief: np.ndarray, noise: float) -> float:
     """Scale of the prior's spectrum at which it has the data's mean square difference at a lag of some cells."""
-    lag = max(1, min(_LAG, min(relief.shape) // 2))
+    lag = max(1, min(SMOOTHING.lag, min(relief.shape) // 2))
     east, north = relief[:, lag:] - relief[:, :-lag], relief[lag:] - relief[:-lag]
     measured = 0.5 * ((east**2).mean() + (north**2).mean()) - 2 * noise
-    f = np.fft.fftfreq(_SPECTRUM)
+    f = np.fft.fftfreq(SMOOTHING.spectrum)
     k = np.hypot(f[None, :], f[:, None])
     k[0, 0] = np.inf
-    unit = (2 * k ** -(2 * HURST + 2) * (1 - np.cos(2 * np.pi * f[None, :] * lag))).mean()
+    unit = (2 * k ** -(2 * SMOOTHING.hurst + 2) * (1 - np.cos(2 * np.pi * f[None, :] * lag))).mean()
     # A surface that shows nothing but its rounding still has some relief: a tenth of the noise.
     return max(measured, 0.2 * noise) / unit

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sys
 import threading
@@ -25,17 +26,24 @@ from lunar_mjx.simulate import Commands, check_start
 from lunar_mjx.viewer.pilot import Pilot, drivable
 
 ENGINES = ("auto", "native", "structured", "mjx")
-HOLD = 0.02
-"""About how long a target of the motors is held, s."""
 
-TICK = 0.04
-"""Time between pictures, s."""
 
-_MOST = 0.2
-"""Simulated time that one tick may catch up with, s: a slow machine falls behind rather than stops."""
+@dataclasses.dataclass(frozen=True)
+class DrivePace:
+    """Pace of a drive in the viewer."""
 
-_CREEP = 0.01
-"""Speed of rim and wheel below which a wheel counts as at rest, m/s."""
+    hold: float = 0.02
+    """About how long a target of the motors is held, s."""
+    tick: float = 0.04
+    """Time between pictures, s."""
+    most: float = 0.2
+    """Simulated time that one tick may catch up with, s: a slow machine falls behind rather than stops."""
+    creep: float = 0.01
+    """Speed of rim and wheel below which a wheel counts as at rest, m/s."""
+
+
+PACE = DrivePace()
+
 
 _ROLLED = math.cos(math.radians(75.0))
 
@@ -122,7 +130,7 @@ class LiveDrive:
         self.backend = open_engine(self.model, engine)
         self.note, self.scene = "", {}
         self._start = (x, y, yaw)
-        self._steps = max(1, round(HOLD / self.model.timestep))
+        self._steps = max(1, round(PACE.hold / self.model.timestep))
         self._scene = self.model.rover.compile()
         self._data = mujoco.MjData(self._scene)
         self._chassis = self._scene.body(self.model.rover.chassis).id
@@ -143,7 +151,7 @@ class LiveDrive:
     def advance(self, duration: float) -> float:
         """Drives on, in whole control intervals; what is left over is driven next time. Returns the time driven, s."""
         interval = self._steps * self.model.timestep
-        self._behind = min(self._behind + duration, _MOST + interval)
+        self._behind = min(self._behind + duration, PACE.most + interval)
         driven = 0.0
         while self._behind >= interval - 1e-9:
             self._go()
@@ -204,7 +212,7 @@ class LiveDrive:
     def _rests(self) -> list[bool]:
         """Wheels whose rim and centre both creep: their ratio is that of two roundings."""
         rim = self._radius * np.abs(self._seen["joint_speed"][self._drives])
-        return (np.maximum(rim, np.linalg.norm(self._seen["wheel_velocity"], axis=-1)) < _CREEP).tolist()
+        return (np.maximum(rim, np.linalg.norm(self._seen["wheel_velocity"], axis=-1)) < PACE.creep).tolist()
 
     def _warning(self, seen: dict[str, np.ndarray]) -> str:
         x, y = self.qpos[4:6]
@@ -255,7 +263,7 @@ class Pace:
     def _run(self) -> None:
         self._last = self.clock()
         try:
-            while not self._stop.wait(max(0.0, self._last + TICK - self.clock())):
+            while not self._stop.wait(max(0.0, self._last + PACE.tick - self.clock())):
                 self.tick()
         except Exception as failure:
             self.failure = failure

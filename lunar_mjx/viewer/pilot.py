@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable
 
@@ -13,17 +14,22 @@ from lunar_mjx.model import Model
 KEYS = ("forward", "back", "left", "right", "brake")
 """What can be held down."""
 
-ACCELERATION = 0.6
-"""m/s2 of the rims; hard enough to feel, soft enough for the soil."""
 
-STEER_TIME = 0.8
-"""s from straight to the limit of the steering."""
+@dataclasses.dataclass(frozen=True)
+class Handling:
+    """How a rover answers to keys."""
 
-NOTCH = 0.2
-"""What one press adds in the window, which hears presses only: a share of the top speed or of the steering."""
+    acceleration: float = 0.6
+    """m/s2 of the rims; hard enough to feel, soft enough for the soil."""
+    steer_time: float = 0.8
+    """s from straight to the limit of the steering."""
+    notch: float = 0.2
+    """What one press adds in the window, which hears presses only: a share of the top speed or of the steering."""
+    span: float = 0.5
+    """Steering angle of a joint without limits, rad."""
 
-_SPAN = 0.5
-"""Steering angle of a joint without limits, rad."""
+
+HANDLING = Handling()
 
 
 class Pilot:
@@ -81,9 +87,11 @@ class Pilot:
     def control(self, interval: float) -> np.ndarray:
         """Targets (joint,) of all motors after `interval` s more."""
         wanted = 0.0 if self.braking else self.throttle * self.top_speed
-        most = ACCELERATION * interval * (3.0 if self.braking else 1.0)
+        most = HANDLING.acceleration * interval * (3.0 if self.braking else 1.0)
         self.speed += float(np.clip(wanted - self.speed, -most, most))
-        self.turn += float(np.clip(self.wheel - self.turn, -interval / STEER_TIME, interval / STEER_TIME))
+        self.turn += float(
+            np.clip(self.wheel - self.turn, -interval / HANDLING.steer_time, interval / HANDLING.steer_time)
+        )
         targets = np.zeros(self._joints)
         for joint, radius, left in self._drives:
             # without steering, the inner side is slowed down; on the spot the sides run against each other
@@ -108,9 +116,9 @@ def drivable(model: Model) -> Model:
 
 
 def _notched(value: float, sign: float) -> float:
-    return float(np.clip(round((value + sign * NOTCH) / NOTCH) * NOTCH, -1.0, 1.0))
+    return float(np.clip(round((value + sign * HANDLING.notch) / HANDLING.notch) * HANDLING.notch, -1.0, 1.0))
 
 
 def _span(low: float, high: float) -> float:
     span = min(-low, high)
-    return 0.9 * span if 0.0 < span < math.inf else _SPAN
+    return 0.9 * span if 0.0 < span < math.inf else HANDLING.span

@@ -11,9 +11,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lunar_mjx.cameras.scene import FAR_NODES, Patch, Sun, cut
+from lunar_mjx.cameras.scene import SCENE_DETAIL, Patch, Sun, cut
 from lunar_mjx.model import Model
-from lunar_mjx.rover.look import HIDDEN, seen_spec
+from lunar_mjx.rover.look import LOOK, seen_spec
 from lunar_mjx.terrain import Terrain
 from lunar_mjx.terrain.rocks import semi_axes
 
@@ -34,7 +34,9 @@ def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
     """The rover's shapes, wheels, and the light, as plain data for JSON."""
     rover = model.rover
     mj = seen_spec(rover).compile()
-    shapes = [_shape(mj, i) for i in range(mj.ngeom) if mj.geom_group[i] < HIDDEN and int(mj.geom_type[i]) in _SHAPES]
+    shapes = [
+        _shape(mj, i) for i in range(mj.ngeom) if mj.geom_group[i] < LOOK.hidden and int(mj.geom_type[i]) in _SHAPES
+    ]
     return {
         "rover": rover.name,
         "terrain": model.terrain.name,
@@ -84,7 +86,11 @@ def ground_scene(terrain: Terrain, x: float, y: float) -> dict[str, Any]:
     end = origin + cell * np.array([cols - 1, rows - 1])
     middle = np.clip([x, y], origin, end)
     near = cut(terrain, middle - NEAR, middle + NEAR, NODES)
-    return {"near": _grid(near), "far": _grid(cut(terrain, origin, end, FAR_NODES)), "rocks": _rocks(terrain, near)}
+    return {
+        "near": _grid(near),
+        "far": _grid(cut(terrain, origin, end, SCENE_DETAIL.far_nodes)),
+        "rocks": _rocks(terrain, near),
+    }
 
 
 def _grid(patch: Patch) -> dict[str, Any]:

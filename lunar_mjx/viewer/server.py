@@ -7,6 +7,7 @@ and `Sec-Fetch-Site`; and a foreign name that was made to point here (DNS rebind
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
 import socket
@@ -29,9 +30,23 @@ from lunar_mjx.viewer.pilot import KEYS
 from lunar_mjx.viewer.scene import ground_scene, rover_scene
 
 LOOPBACK = "127.0.0.1"
-PORT = 8600
-DEAD_MAN = 1.0
-"""Held keys are let go when the page has not repeated them for so long, s: it was closed, or hangs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ServerLimits:
+    """Where the viewer's server listens, and what it bears."""
+
+    port: int = 8600
+    dead_man: float = 1.0
+    """Held keys are let go when the page has not repeated them for so long, s: it was closed, or hangs."""
+    longest: int = 4096
+    """Bytes of a message from the page."""
+    most_connections: int = 64
+    """Connections, and threads, at once: a page needs three. Beyond it the idlest one is closed."""
+
+
+SERVER = ServerLimits()
+
 
 _SCRIPT = "text/javascript; charset=utf-8"
 _FILES = {
@@ -39,10 +54,6 @@ _FILES = {
     "/style.css": ("style.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 } | {f"/{name}.js": (f"{name}.js", _SCRIPT) for name in ("main", "maths", "panel", "render", "replay", "shapes")}
-_LONGEST = 4096
-"""Bytes of a message from the page."""
-_MOST_CONNECTIONS = 64
-"""Connections, and threads, at once: a page needs three. Beyond it the idlest one is closed."""
 
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -78,7 +89,7 @@ class Viewer(ThreadingHTTPServer):
     """Connections that wait to be taken: one that finds no place tries again only after a second."""
 
     def __init__(
-        self, drive: Drive, port: int = PORT, sun: Sun | None = None, clock: Callable[[], float] = time.monotonic
+        self, drive: Drive, port: int = SERVER.port, sun: Sun | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         check_port(port)
         self.drive = drive
@@ -90,7 +101,7 @@ class Viewer(ThreadingHTTPServer):
         self._let_go = math.inf
         self._connections: OrderedDict[Any, bool] = OrderedDict()
         self._counting = threading.Lock()
-        self._slots = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        self._slots = threading.BoundedSemaphore(SERVER.most_connections)
         try:
             super().__init__((LOOPBACK, port), _Handler)
         except OSError as error:
@@ -127,10 +138,10 @@ class Viewer(ThreadingHTTPServer):
         self.server_close()
 
     def hold(self, keys: list[str]) -> None:
-        """Takes the keys that are held down, for `DEAD_MAN` s."""
+        """Takes the keys that are held down, for `SERVER.dead_man` s."""
         with self.pace.lock:
             self.drive.pilot.hold(keys)
-            self._let_go = self.pace.clock() + DEAD_MAN
+            self._let_go = self.pace.clock() + SERVER.dead_man
 
     def reset(self) -> None:
         """Puts the rover back to its start."""
@@ -163,7 +174,7 @@ class Viewer(ThreadingHTTPServer):
         """Gives a connection its thread; closes the idlest one if there are too many."""
         with self._counting:
             self._connections[request] = False
-            if len(self._connections) > _MOST_CONNECTIONS:
+            if len(self._connections) > SERVER.most_connections:
                 # the longest silent one of those that have asked for nothing yet; if all have, of all
                 idlest = min(self._connections, key=self._connections.__getitem__)
                 del self._connections[idlest]
@@ -226,11 +237,11 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             length = int(self.headers.get("Content-Length", ""))
-            if not 0 < length <= _LONGEST:
+            if not 0 < length <= SERVER.longest:
                 raise ValueError
             message = json.loads(self.rfile.read(length))
         except (ValueError, RecursionError):
-            self._refuse(400, f"send at most {_LONGEST} bytes of JSON")
+            self._refuse(400, f"send at most {SERVER.longest} bytes of JSON")
             return
         held = message.get("held") if isinstance(message, dict) else None
         if self.path == "/keys" and isinstance(held, list) and all(k in KEYS for k in held):

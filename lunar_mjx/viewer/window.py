@@ -17,7 +17,7 @@ import numpy as np
 
 from lunar_mjx.cameras.scene import Sun, build_scene
 from lunar_mjx.errors import UserError
-from lunar_mjx.viewer.drive import TICK, LiveDrive, Pace
+from lunar_mjx.viewer.drive import PACE, LiveDrive, Pace
 
 _KEYS = {265: "forward", 264: "back", 263: "left", 262: "right", 32: "brake"}
 """GLFW's codes of the arrow keys and space."""
@@ -122,7 +122,7 @@ def _show(window: Any, model: mujoco.MjModel, data: mujoco.MjData, drive: LiveDr
             data.light_xpos[0] = qpos[:3] + 10.0 * sun.direction  # shadows are drawn around the light
         window.set_texts((font, corner, names, values))
         window.sync()
-        time.sleep(max(0.0, TICK - (time.monotonic() - begin)))
+        time.sleep(max(0.0, PACE.tick - (time.monotonic() - begin)))
 
 
 def captions(drive: LiveDrive) -> tuple[str, str]:

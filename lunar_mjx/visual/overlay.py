@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from lunar_mjx.cameras.ground_map import PATH, GroundMap
+from lunar_mjx.cameras.ground_map import MAP_COLOURS, GroundMap
 from lunar_mjx.report.style import MUTED
 from lunar_mjx.visual.plots import WHEEL_STYLES, bounds
 from lunar_mjx.visual.recorded import RecordedDrive
 
-_GLASS = (10, 12, 16, 170)
-_TEXT, _FAINT, _PATH, _HOT = (240, 240, 240), (150, 155, 160), (120, 190, 255), (255, 140, 70)
+
+@dataclasses.dataclass(frozen=True)
+class OverlayColours:
+    """Colours of the overlay, red, green, blue and opacity."""
+
+    glass: tuple[int, ...] = (10, 12, 16, 170)
+    text: tuple[int, int, int] = (240, 240, 240)
+    faint: tuple[int, int, int] = (150, 155, 160)
+    path: tuple[int, int, int] = (120, 190, 255)
+    hot: tuple[int, int, int] = (255, 140, 70)
+
+
+COLOURS = OverlayColours()
 
 
 def wheel_colour(corner: str) -> tuple[int, int, int]:
@@ -51,7 +63,9 @@ class Overlay:
         share = (self._drive.time[row] - self._drive.time[0]) / (self._drive.time[-1] - self._drive.time[0])
         for left, right, top, bottom in self._frames:
             x = left + share * (right - left)
-            draw.line([x, height - self._strip.height + top, x, height - self._strip.height + bottom], fill=_TEXT)
+            draw.line(
+                [x, height - self._strip.height + top, x, height - self._strip.height + bottom], fill=COLOURS.text
+            )
         self._draw_numbers(image, row)
         if self._map is not None:
             inset = self._map.draw(row)
@@ -73,20 +87,20 @@ class Overlay:
         ]
         pad = self._line // 2
         widest = max(self._font.getlength(lines[0]), 10.0 * self._line)
-        glass = Image.new("RGBA", (round(widest) + 2 * pad, len(lines) * self._line + 2 * pad), _GLASS)
+        glass = Image.new("RGBA", (round(widest) + 2 * pad, len(lines) * self._line + 2 * pad), COLOURS.glass)
         draw = ImageDraw.Draw(glass)
         for i, line in enumerate(lines):
             name, rest = (line, "") if i == 0 else (line[:10].strip(), line[10:])
             y = pad + i * self._line
-            draw.text((pad, y), name, font=self._font, fill=_TEXT if i == 0 else _FAINT)
+            draw.text((pad, y), name, font=self._font, fill=COLOURS.text if i == 0 else COLOURS.faint)
             if rest:
-                draw.text((pad + 4.6 * self._line, y), rest.strip(), font=self._font, fill=_TEXT)
+                draw.text((pad + 4.6 * self._line, y), rest.strip(), font=self._font, fill=COLOURS.text)
         image.alpha_composite(glass, (8, 8))
 
     def _draw_strip(self) -> tuple[Image.Image, list[tuple[float, float, float, float]]]:
         """Slip of the wheels and the hottest winding over the whole drive, and where the two plots lie."""
         width, height = self._size[0], round(0.2 * self._size[1])
-        strip = Image.new("RGBA", (width, height), _GLASS)
+        strip = Image.new("RGBA", (width, height), COLOURS.glass)
         draw = ImageDraw.Draw(strip)
         top, bottom = 1.6 * self._line, height - 0.5 * self._line
         frames = [
@@ -108,7 +122,7 @@ class Overlay:
             hot,
             float(hot.min()),
             max(float(hot.max()), float(hot.min()) + 1.0),
-            [_HOT],
+            [COLOURS.hot],
             "hottest winding, °C",
         )
         return strip, frames
@@ -124,13 +138,16 @@ class Overlay:
         title: str,
     ) -> None:
         left, right, top, bottom = frame
-        draw.text((left, 0.3 * self._line), title, font=self._font, fill=_TEXT)
+        draw.text((left, 0.3 * self._line), title, font=self._font, fill=COLOURS.text)
         for value in (low, high):
             y = bottom - (value - low) / (high - low) * (bottom - top)
             draw.line([left, y, right, y], fill=(90, 95, 100))
             label = f"{value:.3g}"
             draw.text(
-                (left - 6 - self._font.getlength(label), y - 0.6 * self._line), label, font=self._font, fill=_FAINT
+                (left - 6 - self._font.getlength(label), y - 0.6 * self._line),
+                label,
+                font=self._font,
+                fill=COLOURS.faint,
             )
         time = self._drive.time
         x = left + (time - time[0]) / (time[-1] - time[0]) * (right - left)
@@ -159,7 +176,7 @@ class MapInset:
         image = self.ground.base.copy()
         draw = ImageDraw.Draw(image)
         if row:
-            draw.line(self._path[: row + 1], fill=PATH, width=3)
+            draw.line(self._path[: row + 1], fill=MAP_COLOURS.path, width=3)
         yaw = np.radians(self._drive.table["yaw_deg"].to_numpy(float)[row])
         self.ground.arrow(draw, self._drive.position[row], float(yaw), max(5.0, 0.035 * self.ground.width))
         return image.convert("RGBA")

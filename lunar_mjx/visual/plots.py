@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -53,15 +54,23 @@ CORNER_WORDS = {
 }
 """Corners of a rover in words."""
 
-_MARGIN = 0.12
-_LEAST = 2.0
-"""Least width of a map, m."""
-_SLIM = 0.75
-"""Height over width below which a map leaves room for a profile."""
-_SLIMMEST = 0.45
-"""Least height of a map over its width: a straight drive shows some ground beside it."""
-_LEAST_CONTRAST = 0.08
-"""Least range of shades that a relief is stretched from: even ground stays even."""
+
+@dataclasses.dataclass(frozen=True)
+class PlotLayout:
+    """Layout of plots of drives."""
+
+    margin: float = 0.12
+    least: float = 2.0
+    """Least width of a map, m."""
+    slim: float = 0.75
+    """Height over width below which a map leaves room for a profile."""
+    slimmest: float = 0.45
+    """Least height of a map over its width: a straight drive shows some ground beside it."""
+    least_contrast: float = 0.08
+    """Least range of shades that a relief is stretched from: even ground stays even."""
+
+
+LAYOUT = PlotLayout()
 
 
 def style(axes: Axes, y: str, x: str = "") -> None:
@@ -84,7 +93,7 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray,
     ground = relief(terrain, low, high)
     extent = (ground.west, ground.east, ground.south, ground.north)
     dark, bright = (float(v) for v in np.percentile(ground.grey, (1.0, 99.0)))
-    spare = max(0.0, 0.5 * (_LEAST_CONTRAST - (bright - dark)))
+    spare = max(0.0, 0.5 * (LAYOUT.least_contrast - (bright - dark)))
     # gentle ground is stretched to most of the shades, so that its shape shows
     span: dict[str, Any] = {
         "vmin": dark - spare - 0.35 * (bright - dark + 2 * spare),
@@ -129,7 +138,7 @@ def _round_step(step: float) -> float:
 
 
 def bounds(
-    places: np.ndarray, margin: float = _MARGIN, slimmest: float = 1.0, pad: float = 0.0
+    places: np.ndarray, margin: float = LAYOUT.margin, slimmest: float = 1.0, pad: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corners of a rectangle around places (n, 2), with a margin.
 
@@ -141,7 +150,7 @@ def bounds(
     """
     low, high = places.min(axis=0), places.max(axis=0)
     extent = high - low + 2.0 * pad
-    longest = max(float(extent.max()), _LEAST)
+    longest = max(float(extent.max()), LAYOUT.least)
     half = 0.5 * (np.maximum(extent, slimmest * longest) + 2.0 * margin * longest)
     middle = 0.5 * (low + high)
     return middle - half, middle + half
@@ -153,8 +162,8 @@ def drive_summary(drive: RecordedDrive) -> Figure:
     figure = Figure(figsize=(13.0, 7.4), layout="constrained")
     grid = figure.add_gridspec(5, 2, width_ratios=(1.15, 1.0))
     reach = float(np.abs(np.asarray(drive.model.rover.chassis_points)[:, :2]).max())
-    low, high = bounds(drive.position[:, :2], 0.08, _SLIMMEST, reach)
-    slim = float((high - low)[1] / (high - low)[0]) < _SLIM
+    low, high = bounds(drive.position[:, :2], 0.08, LAYOUT.slimmest, reach)
+    slim = float((high - low)[1] / (high - low)[0]) < LAYOUT.slim
     ground = figure.add_subplot(grid[:4, 0] if slim else grid[:, 0])
     draw_relief(ground, drive.terrain, low, high)
     ground.set_xlim(low[0], high[0])

@@ -40,11 +40,23 @@ SPEED = 1.0
 """Larger of rim and travel speed at which the bed runs, m/s. The steady force of the effects that ship does not depend
 on speed, and well above the speed floors that regularise standstill the imposed slip is exact."""
 
-_DEEPEST = 1.5
-"""Largest sinkage looked at, in wheel radii: up to there the contact arc is followed."""
-_SHALLOWEST = 1e-6
-_SCAN = 48
-_BISECTIONS = 33
+
+@dataclasses.dataclass(frozen=True)
+class BedSearch:
+    """How the bed looks for the sinkage that carries the load."""
+
+    deepest: float = 1.5
+    """Largest sinkage looked at, in wheel radii: up to there the contact arc is followed."""
+    shallowest: float = 1e-6
+    """Least sinkage looked at, in wheel radii: a tenth of a micrometre, far below what any load makes."""
+    scan: int = 48
+    """Sinkages at which a bracket is looked for, 35 % apart."""
+    bisections: int = 33
+    """Halvings of the bracket: to 3e-11 of the sinkage, before one Newton step."""
+
+
+BED_SEARCH = BedSearch()
+
 
 Parameters = Mapping[str, Mapping[str, Any]]
 
@@ -257,15 +269,15 @@ class WheelBed:
         # The search carries no derivative; the step after it does.
         still_parameters, still_test = jax.lax.stop_gradient((parameters, test))
 
-        deepest = _DEEPEST * still_test.radius
+        deepest = BED_SEARCH.deepest * still_test.radius
         # In proportion, because loads range over decades and so do sinkages.
-        grid = deepest * jnp.geomspace(_SHALLOWEST, 1.0, _SCAN, dtype=deepest.dtype)
+        grid = deepest * jnp.geomspace(BED_SEARCH.shallowest, 1.0, BED_SEARCH.scan, dtype=deepest.dtype)
 
         # One loop for scan and bisection: the forces are then compiled once.
         def probe(i: Any, bracket: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
             low, high, found = bracket
-            scanning = i < _SCAN
-            at = jnp.where(scanning, grid[jnp.minimum(i, _SCAN - 1)], 0.5 * (low + high))
+            scanning = i < BED_SEARCH.scan
+            at = jnp.where(scanning, grid[jnp.minimum(i, BED_SEARCH.scan - 1)], 0.5 * (low + high))
             enough = self._loads(still_parameters, still_test, terrain, at).vertical >= still_test.normal_load
             live = jnp.logical_not(scanning & found)
             return (
@@ -275,7 +287,7 @@ class WheelBed:
             )
 
         start = (jnp.zeros_like(deepest), deepest, jnp.asarray(False))
-        low, high, reached = jax.lax.fori_loop(0, _SCAN + _BISECTIONS, probe, start)
+        low, high, reached = jax.lax.fori_loop(0, BED_SEARCH.scan + BED_SEARCH.bisections, probe, start)
         root = jnp.where(reached, 0.5 * (low + high), deepest)
         here, slope = jax.jvp(loads, (root,), (jnp.ones_like(root),))
         slope = jax.lax.stop_gradient(slope)

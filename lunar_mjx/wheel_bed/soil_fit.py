@@ -47,15 +47,25 @@ PAPER_CONTACT: tuple[Free, ...] = (
 )
 """What carries the wheel in the preset `paper`: its soil cannot."""
 
-FIT_ANGLES = (0.0, 30.0, 60.0)
-INSIDE_ANGLES = (15.0, 45.0)
-"""Held out, inside the range of the fitted slip angles."""
-BEYOND_ANGLES = (75.0,)
-"""Held out, beyond every fitted slip angle. 90 deg is set apart: the sinkage there reaches the wheel's radius."""
-APART_ANGLES = (90.0,)
 
-_AGREE, _EXACT = 1e-3, 1e-6
-"""Starts agree with the best where their root mean square residual exceeds it by at most this share, or sigma."""
+@dataclasses.dataclass(frozen=True)
+class SoilFit:
+    """Which slip angles are fitted and which are held out, and when a fit has ended."""
+
+    fit_angles: tuple[float, float, float] = (0.0, 30.0, 60.0)
+    """Fitted slip angles, deg."""
+    inside_angles: tuple[float, float] = (15.0, 45.0)
+    """Held out, inside the range of the fitted slip angles."""
+    beyond_angles: tuple[float] = (75.0,)
+    """Held out, beyond every fitted slip angle. 90 deg is set apart: the sinkage there reaches the wheel's radius."""
+    apart_angles: tuple[float] = (90.0,)
+    """Neither fitted nor held out."""
+    # Starts agree with the best where their root mean square residual exceeds it by at most this share, or sigma.
+    agree: float = 0.001
+    exact: float = 1e-06
+
+
+SOIL_FIT = SoilFit()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,8 +77,8 @@ class WheelFit:
       bed: the test bed with the fitted values.
       values: fitted, by effect and name, SI units. fixed: held, likewise.
       comparison: of the fitted model with the whole table.
-      fitted, inside, beyond, apart: root mean square residual in sigma over `FIT_ANGLES`, `INSIDE_ANGLES`,
-        `BEYOND_ANGLES` and `APART_ANGLES`; held_out: over inside and beyond together.
+      fitted, inside, beyond, apart: root mean square residual in sigma over the angles of `SOIL_FIT` called
+        so; held_out: over inside and beyond together.
       starts: root mean square residual that each start ended with, rising. agreeing: how many reached the least one.
       at_bound: parameters that ended at the edge of their range.
     """
@@ -93,9 +103,9 @@ class WheelFit:
         for left_out in ("bed", "comparison"):
             del plain[left_out]
         return plain | {
-            "fit_angles_deg": FIT_ANGLES,
-            "inside_angles_deg": INSIDE_ANGLES,
-            "beyond_angles_deg": BEYOND_ANGLES,
+            "fit_angles_deg": SOIL_FIT.fit_angles,
+            "inside_angles_deg": SOIL_FIT.inside_angles,
+            "beyond_angles_deg": SOIL_FIT.beyond_angles,
             "held_out_rms": {q: held_out_rms(self.comparison, q) for q in self.comparison.residual},
         }
 
@@ -103,7 +113,7 @@ class WheelFit:
 def held_out_rms(comparison: Comparison, quantity: str) -> float:
     """Root mean square residual of one quantity at the held-out slip angles, in sigma."""
     one = dataclasses.replace(comparison, residual={quantity: comparison.residual[quantity]})
-    return one.score(INSIDE_ANGLES + BEYOND_ANGLES)
+    return one.score(SOIL_FIT.inside_angles + SOIL_FIT.beyond_angles)
 
 
 def _solve(
@@ -144,7 +154,7 @@ def fit(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> WheelFit:
-    """Fits parameters at `FIT_ANGLES` by least squares on exact forward-mode Jacobians, from several Sobol starts.
+    """Fits parameters at the fitted angles of `SOIL_FIT` by least squares on exact Jacobians, from Sobol starts.
 
     Args:
       bed: the wheel model; parameters that are not free keep their values, but for `FIXED`.
@@ -158,9 +168,9 @@ def fit(
     Raises:
       UserError: a free parameter's effect does not act on the wheel, or the table lacks the slip angles.
     """
-    seen = table.at_angles(FIT_ANGLES)
+    seen = table.at_angles(SOIL_FIT.fit_angles)
     if not len(seen):
-        raise UserError(f"{table.name}: holds none of the slip angles {FIT_ANGLES} deg; the fit needs them.")
+        raise UserError(f"{table.name}: holds none of the slip angles {SOIL_FIT.fit_angles} deg; the fit needs them.")
     fixed = {e: dict(v) for e, v in FIXED.items() if e in bed.parameters}
     base = bed.with_values(fixed)
     base.merged({f.effect: {f.name: f.low} for f in free})
@@ -178,13 +188,13 @@ def fit(
         values=values,
         fixed=fixed,
         comparison=whole,
-        fitted=whole.score(FIT_ANGLES),
-        held_out=whole.score(INSIDE_ANGLES + BEYOND_ANGLES),
-        inside=whole.score(INSIDE_ANGLES),
-        beyond=whole.score(BEYOND_ANGLES),
-        apart=whole.score(APART_ANGLES),
+        fitted=whole.score(SOIL_FIT.fit_angles),
+        held_out=whole.score(SOIL_FIT.inside_angles + SOIL_FIT.beyond_angles),
+        inside=whole.score(SOIL_FIT.inside_angles),
+        beyond=whole.score(SOIL_FIT.beyond_angles),
+        apart=whole.score(SOIL_FIT.apart_angles),
         starts=rms,
-        agreeing=sum(r <= rms[0] * (1.0 + _AGREE) + _EXACT for r in rms),
+        agreeing=sum(r <= rms[0] * (1.0 + SOIL_FIT.agree) + SOIL_FIT.exact for r in rms),
         at_bound=tuple(f"{f.effect}.{f.name}" for f, u in zip(free, best, strict=True) if u < 1e-4 or u > 1 - 1e-4),
     )
 

@@ -12,7 +12,7 @@ import pytest
 
 from lunar_mjx.errors import UserError
 from lunar_mjx.rover import load_rover
-from lunar_mjx.rover.look import DETAIL, FILE, HIDDEN, seen_spec
+from lunar_mjx.rover.look import FILE, LOOK, seen_spec
 
 LARGEST = 2_000_000
 """Bytes that the look of a shipped rover may take."""
@@ -41,12 +41,12 @@ def test_it_has_wheels_with_grousers_a_mast_and_panels(name: str) -> None:
     m = seen_spec(rover).compile()
     data = mujoco.MjData(m)
     mujoco.mj_forward(m, data)
-    shown = m.geom_group < HIDDEN
+    shown = m.geom_group < LOOK.hidden
     for wheel in rover.wheels:
         own = (m.geom_bodyid == m.body(wheel.body).id) & shown
         rims = own & (m.geom_type == mujoco.mjtGeom.mjGEOM_CYLINDER)
         assert m.geom_size[rims, 0].max() == pytest.approx(wheel.radius)
-        away = np.linalg.norm(m.geom_pos[own & (m.geom_group == DETAIL)], axis=1)
+        away = np.linalg.norm(m.geom_pos[own & (m.geom_group == LOOK.detail)], axis=1)
         assert (away > 0.9 * wheel.radius).sum() >= 12
     top = data.geom_xpos[shown, 2].max()
     assert top > 0.85 * (rover.standing_height + rover.chassis_points[:, 2].max())
@@ -64,7 +64,7 @@ def test_the_front_camera_does_not_look_into_the_head() -> None:
         mujoco.mj_forward(m, data)
         body = m.body(rover.chassis).id
         eye = data.xpos[body] + data.xmat[body].reshape(3, 3) @ front_mount(rover).position
-        shown = (m.geom_group < HIDDEN) & (m.geom_bodyid == body)
+        shown = (m.geom_group < LOOK.hidden) & (m.geom_bodyid == body)
         reach = data.geom_xpos[shown, 0] + np.abs(
             data.geom_xmat[shown].reshape(-1, 3, 3)[:, 0, :] * m.geom_size[shown]
         ).sum(1)

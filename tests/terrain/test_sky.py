@@ -17,7 +17,7 @@ from lunar_mjx.model.ambient import Ambient
 from lunar_mjx.model.sun import SunSettings, camera_sun, make_sun, read_sun
 from lunar_mjx.terrain import Dem, flat
 from lunar_mjx.terrain.sky import fixed_sun
-from lunar_mjx.terrain.sky.horizon import MOON_RADIUS, compute_horizon, horizon_elevation
+from lunar_mjx.terrain.sky.horizon import HORIZON_GRID, compute_horizon, horizon_elevation
 from lunar_mjx.terrain.sky.sun import SUN_RADIUS, share_above
 
 
@@ -63,7 +63,7 @@ def test_distant_ground_sinks_with_the_curvature_and_other_dems_count():
     far[:, 350:] = 800.0  # 15 km east
     around = Dem(far, 100.0, -20e3, -20e3)
     horizon = compute_horizon(level, [around], places=1, eye=0.0, dtype=np.float64)
-    drop = 15e3**2 / (2.0 * MOON_RADIUS)
+    drop = 15e3**2 / (2.0 * HORIZON_GRID.moon_radius)
     seen = float(horizon_elevation(horizon, 0.0, 0.0, 1.0, 0.0))
     assert seen == pytest.approx(math.atan2(800.0 - drop, 15e3), rel=0.03)
     assert float(horizon_elevation(horizon, 0.0, 0.0, -1.0, 0.0)) == 0.0

@@ -13,7 +13,7 @@ import pytest
 
 from lunar_mjx.model import make_model
 from lunar_mjx.viewer import window
-from lunar_mjx.viewer.drive import HOLD, TICK, LiveDrive, Pace
+from lunar_mjx.viewer.drive import PACE, LiveDrive, Pace
 from lunar_mjx.viewer.pilot import Pilot, drivable
 from tests.cli_harness import MAIN
 from tests.viewer.viewer_client import Clock
@@ -137,9 +137,9 @@ def test_pace_is_that_of_the_clock(model):
     pace = Pace(LiveDrive(model, "native"), lambda: shown.append(pace.drive.time), clock)
     start = pace.drive.time
     for _ in range(30):
-        clock.now += TICK
+        clock.now += PACE.tick
         pace.tick()
-    assert shown[-1] - start == pytest.approx(30 * TICK, abs=HOLD)
+    assert shown[-1] - start == pytest.approx(30 * PACE.tick, abs=PACE.hold)
     assert len(shown) == 30 and pace.drive.rate == pytest.approx(1.0, abs=0.01)
     clock.now += 60.0  # a machine that was asleep falls behind rather than stops
     pace.tick()

@@ -13,8 +13,8 @@ import pytest
 
 from lunar_mjx.errors import UserError
 from lunar_mjx.terrain import sample
-from lunar_mjx.viewer.drive import TICK
-from lunar_mjx.viewer.server import DEAD_MAN, Viewer
+from lunar_mjx.viewer.drive import PACE
+from lunar_mjx.viewer.server import SERVER, Viewer
 from tests.viewer.viewer_client import ask, pictures
 
 PATHS = ("/", "/main.js", "/scene", "/ground?x=0&y=0", "/pictures", "/nothing")
@@ -133,8 +133,8 @@ def test_ground_is_the_terrains(viewer):
 def _drive(viewer, clock, seconds):
     """Lets time go by, tick by tick; returns the pictures."""
     shown = []
-    for _ in range(round(seconds / TICK)):
-        clock.now += TICK
+    for _ in range(round(seconds / PACE.tick)):
+        clock.now += PACE.tick
         viewer.pace.tick()
         shown.append(json.loads(viewer.next_picture(0)[1]))
     return shown
@@ -145,37 +145,37 @@ def test_keys_move_the_rover_and_a_silent_page_lets_go(viewer, clock):
     still = _drive(viewer, clock, 1.0)[-1]
     assert still["path_m"] < 0.05 and still["asked_m_s"] == 0.0
     assert ask(viewer, "POST", "/keys", {"held": ["forward", "left"]})[0] == 200
-    driven = _drive(viewer, clock, DEAD_MAN)
+    driven = _drive(viewer, clock, SERVER.dead_man)
     assert all(p["asked_m_s"] > 0 for p in driven[:-1])
     assert ask(viewer, "POST", "/keys", {"held": ["forward", "left"]})[0] == 200
-    last = _drive(viewer, clock, 0.9 * DEAD_MAN)[-1]
+    last = _drive(viewer, clock, 0.9 * SERVER.dead_man)[-1]
     assert last["asked_m_s"] > 0 and last["speed_m_s"] > 0.05 and 0.0 < last["heading_deg"] < 90.0
     assert last["path_m"] > 0.1 and last["bodies"][1][0] > still["bodies"][1][0] + 0.05
     assert len(last["slip"]) == len(last["sinkage_mm"]) == len(last["winding_degC"]) == 4
     assert max(last["sinkage_mm"]) > 1.0 and last["hottest_degC"] > 20.0
-    # nothing more is said: after DEAD_MAN the keys are let go and the rover stops
+    # nothing more is said: after SERVER.dead_man the keys are let go and the rover stops
     silent = _drive(viewer, clock, 3.0)
     released = next(p for p in silent if p["asked_m_s"] == 0.0)
-    assert released["time_s"] == pytest.approx(last["time_s"] + 0.1 * DEAD_MAN, abs=2 * TICK)
+    assert released["time_s"] == pytest.approx(last["time_s"] + 0.1 * SERVER.dead_man, abs=2 * PACE.tick)
     assert all(p["asked_m_s"] == 0.0 for p in silent if p["time_s"] > released["time_s"])
     assert silent[-1]["speed_m_s"] < 0.05
     ask(viewer, "POST", "/reset", {})
-    assert _drive(viewer, clock, TICK)[-1]["path_m"] < 0.05
+    assert _drive(viewer, clock, PACE.tick)[-1]["path_m"] < 0.05
 
 
 def test_the_page_gets_every_new_picture(viewer, clock):
-    _drive(viewer, clock, TICK)
+    _drive(viewer, clock, PACE.tick)
     stream = pictures(viewer)
     for _ in range(5):
         time_s = next(stream)["time_s"]
         assert time_s == pytest.approx(viewer.drive.time, abs=1e-4)
-        _drive(viewer, clock, TICK)
+        _drive(viewer, clock, PACE.tick)
     stream.close()
 
 
 def test_many_who_connect_and_say_nothing_do_not_shut_the_page_out(viewer, clock):
     """Neither do they get threads without bound; a page that listens meanwhile is not cut off."""
-    _drive(viewer, clock, TICK)
+    _drive(viewer, clock, PACE.tick)
     stream = pictures(viewer)
     next(stream)
     before = threading.active_count()
@@ -187,7 +187,7 @@ def test_many_who_connect_and_say_nothing_do_not_shut_the_page_out(viewer, clock
     for _ in range(5):
         assert ask(viewer, "GET", "/style.css")[0] == 200
         most = max(most, threading.active_count())
-        _drive(viewer, clock, TICK)
+        _drive(viewer, clock, PACE.tick)
         assert next(stream)["time_s"] == pytest.approx(viewer.drive.time, abs=1e-4)
     assert most <= before + 64
     for connection in silent:

@@ -5,6 +5,7 @@ Both take observations as the environment gives them and return actions in [-1, 
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from typing import Any
 
@@ -17,11 +18,20 @@ from lunar_mjx.agents.learner import MOST_DEVIATIONS
 from lunar_mjx.agents.policy import Policy
 from lunar_mjx.errors import UserError
 
-OPSET, IR_VERSION = 17, 8
-"""Of the ONNX file: the first that has layer normalisation, and the file format of that time (ONNX 1.12, 2022), so that
-the runtimes of older robots read it."""
-_LAYER_NORM_EPSILON = 1e-6
-"""Of Flax's `LayerNorm`, which the actor's layers use."""
+
+@dataclasses.dataclass(frozen=True)
+class OnnxVersion:
+    """The version of ONNX that is written."""
+
+    # Of the ONNX file: the first that has layer normalisation, and the file format of that time (ONNX 1.12, 2022), so
+    # that the runtimes of older robots read it.
+    opset: int = 17
+    ir_version: int = 8
+    layer_norm_epsilon: float = 1e-6
+    """Of Flax's `LayerNorm`, which the actor's layers use."""
+
+
+ONNX = OnnxVersion()
 
 
 def to_onnx(policy: Policy) -> bytes:
@@ -64,7 +74,7 @@ def to_onnx(policy: Policy) -> bytes:
         if policy.network["layer_norm"]:
             norm = inner[f"LayerNorm_{i}"]
             parts = [weight(f"norm_scale_{i}", norm["scale"]), weight(f"norm_bias_{i}", norm["bias"])]
-            hidden = add("LayerNormalization", [hidden, *parts], f"norm_{i}", axis=-1, epsilon=_LAYER_NORM_EPSILON)
+            hidden = add("LayerNormalization", [hidden, *parts], f"norm_{i}", axis=-1, epsilon=ONNX.layer_norm_epsilon)
     add("Tanh", [hidden], "action")
     real = onnx.TensorProto.FLOAT
     ends = [
@@ -72,7 +82,7 @@ def to_onnx(policy: Policy) -> bytes:
         for name, size in (("obs", "obs"), ("action", "actions"))
     ]
     graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", ONNX.opset)], ir_version=ONNX.ir_version)
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
 

@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 
 from lunar_mjx.backends.parity.cases import DRIVE_EXCEPTIONS, EXCEPTIONS, QUANTITIES, RELATIVE, SOFT_STEP
 from lunar_mjx.backends.parity.compare import first_failure, traces
-from lunar_mjx.backends.parity.record import COMPLIANCE, RUNS_DOUBLE, RUNS_SINGLE, SPREAD
+from lunar_mjx.backends.parity.record import RECORDING
 from lunar_mjx.backends.parity.study import Pair, Study
 from lunar_mjx.files import write_text
 from lunar_mjx.report import Figure, Section, Table, Text, write_page
@@ -89,7 +89,7 @@ def _method(study: Study) -> list[str]:
     but = "; ".join(f"{k}: {', '.join(f'{q} {v:g}' for q, v in own.items())}" for k, own in EXCEPTIONS.items())
     apart = "; ".join(f"{k}: {', '.join(f'{q} {v:g}' for q, v in own.items())}" for k, own in DRIVE_EXCEPTIONS.items())
     loops = ", ".join(f"{q} {v:g}" for q, v in SOFT_STEP.items())
-    shares = ", ".join(f"{c:g}" for c in COMPLIANCE)
+    shares = ", ".join(f"{c:g}" for c in RECORDING.compliance)
     return [
         "Native MuJoCo (C, float64) with forces computed in NumPy from the equations is the reference. Level 1 "
         "evaluates one state stage by stage, level 2 makes one step, both from states recorded along the reference's "
@@ -98,9 +98,10 @@ def _method(study: Study) -> list[str]:
         f"{kinds} (with exceptions, {but}), ten times that for drives (there {apart}); atol is rtol times the "
         "quantity's typical size.",
         "Drives may also depart by ten times the noise floor. That is the farthest of the reference's own drives, once "
-        f"with coordinates rounded to float32 at the start, and {RUNS_DOUBLE} times with coordinates and speeds moved "
-        f"by chance within {SPREAD:g} units in the last place of float64 after every step; where an engine holds "
-        f"coordinates in float32, or is PyBullet, also {RUNS_SINGLE} times in float32's last place, which makes the "
+        f"with coordinates rounded to float32 at the start, and {RECORDING.runs_double} times with coordinates and "
+        f"speeds moved by chance within {RECORDING.spread:g} units in the last place of float64 after every step; "
+        f"where an engine holds coordinates in float32, or is PyBullet, also {RECORDING.runs_single} times in "
+        "float32's last place, which makes the "
         "sinkage err as it was measured to err in float32, by 4e-8 m. A slip of 2 and one of -2 are the same.",
         "MuJoCo's loops give way by a micrometre. Engines that close them exactly are compared with it from states "
         "whose loops are closed: there every stage before the acceleration must agree as if there were no loop, and "

@@ -15,21 +15,27 @@ from lunar_mjx.dynamics.state import Telemetry
 from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands
 
-RUNS_DOUBLE, RUNS_SINGLE = 4, 16
-"""Drives of the reference with errors of float64 and of float32 drawn anew.
 
-A rover that stands on rock chatters, and may come to rest in more than one place: 2 of 16 drives of VIPER with errors
-of float32 ended 5e-5 m from the reference and the others within 5e-6 m (slope of rock), which four did not show."""
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """What a record of parity holds."""
 
-SPREAD = 4.0
-"""Width of roundings in units of the last place. A float32 engine's sinkage on uneven ground is off by 4e-8 m
-(root mean square, measured at level 1): rounding alone would make it 1e-8 m, but heights and wheels are sums."""
+    # Drives of the reference with errors of float64 and of float32 drawn anew. A rover that stands on rock chatters,
+    # and may come to rest in more than one place: 2 of 16 drives of VIPER with errors of float32 ended 5e-5 m from
+    # the reference and the others within 5e-6 m (slope of rock), which four did not show.
+    runs_double: int = 4
+    runs_single: int = 16
+    spread: float = 4.0
+    """Width of roundings in units of the last place. A float32 engine's sinkage on uneven ground is off by 4e-8 m (root
+    mean square, measured at level 1): rounding alone would make it 1e-8 m, but heights and wheels are sums."""
+    compliance: tuple[float, ...] = (0.1, 0.5, 1.5, 2.0)
+    """Compliance of the loops in drives of the reference, over its own: how far it matters that they give way at all.
+    The reference's impedance is 0.999. From closed loops an acceleration differs from that of a rigid loop in
+    proportion to the compliance: by 4.5, 0.45 and 0.046 rad/s2 at an impedance of 0.99, 0.999 and 0.9999 (VIPER, slope
+    of rock)."""
 
-COMPLIANCE = (0.1, 0.5, 1.5, 2.0)
-"""Compliance of the loops in drives of the reference, over its own: how far it matters that they give way at all.
 
-The reference's impedance is 0.999. From closed loops an acceleration differs from that of a rigid loop in proportion to
-the compliance: by 4.5, 0.45 and 0.046 rad/s2 at an impedance of 0.99, 0.999 and 0.9999 (VIPER, slope of rock)."""
+RECORDING = Recording()
 
 
 @dataclasses.dataclass
@@ -88,10 +94,12 @@ def record(model: Model, case: Case, commands: Commands, count: int) -> tuple[Sa
     Returns:
       Samples, telemetry of the reference, and telemetry of the reference under an engine's errors.
     """
-    groups = np.cumsum([1, 1, RUNS_DOUBLE, RUNS_SINGLE, len(COMPLIANCE) if model.rover.loops else 0])
+    groups = np.cumsum(
+        [1, 1, RECORDING.runs_double, RECORDING.runs_single, len(RECORDING.compliance) if model.rover.loops else 0]
+    )
     backend = NativeBackend(model.replace(terrain=case.terrain), rovers=groups[-1])
     exact, start, double, single, soft = (slice(a, b) for a, b in zip([0, *groups], groups, strict=False))
-    for rover, share in zip(range(groups[-1])[soft], COMPLIANCE, strict=False):
+    for rover, share in zip(range(groups[-1])[soft], RECORDING.compliance, strict=False):
         backend.soften_loops(rover, share)
     chance = np.random.default_rng(0)
     state = backend.reset()
@@ -168,8 +176,8 @@ def _rounded(qpos: np.ndarray) -> np.ndarray:
 
 
 def _rounded_by_chance(values: np.ndarray, chance: np.random.Generator, precision: type) -> np.ndarray:
-    """Values as a precision holds them, moved by chance within `SPREAD` units in the last place."""
-    unit = SPREAD * np.spacing(np.abs(values).astype(precision))
+    """Values as a precision holds them, moved by chance within `RECORDING.spread` units in the last place."""
+    unit = RECORDING.spread * np.spacing(np.abs(values).astype(precision))
     return (values + unit * (chance.random(values.shape) - 0.5)).astype(precision).astype(float)
 
 

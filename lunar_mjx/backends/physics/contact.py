@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -12,11 +13,23 @@ from lunar_mjx.backends.physics.vectors import clamp, cross, dot
 
 Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """From x and y, m, to the height of soil that wheels have moved there, m."""
-SLOW = 2e-3
-"""m/s; smallest denominator of the slip ratio."""
 
-STANDING = 1e-3
-"""m/s; below it a braking wheel counts as standing."""
+
+@dataclasses.dataclass(frozen=True)
+class Contact:
+    """Numbers of contact that the effects have, written again for the independent check."""
+
+    slow: float = 2e-3
+    """m/s; smallest denominator of the slip ratio."""
+    standing: float = 1e-3
+    """m/s; below it a braking wheel counts as standing."""
+    margin: float = 0.02
+    """Clearance, in radii, within which ground counts as near the rim."""
+    airborne: float = 1e-6
+    """Weight of the three middle samples whatever the rim's clearance."""
+
+
+CONTACT = Contact()
 
 
 def wheel_contact(
@@ -44,7 +57,7 @@ def wheel_contact(
     v_x, v_y = dot(c.wheel_velocity, forward), dot(c.wheel_velocity, left)
     rim = radius * dot(c.wheel_angular_velocity, c.wheel_axle)
     fastest = faster(rim, v_x)
-    speed = np.maximum(np.abs(fastest), SLOW)
+    speed = np.maximum(np.abs(fastest), CONTACT.slow)
     heading = 1.0 - 2.0 * (fastest < 0.0)
     slip = heading * (rim - v_x) / speed
     return {
@@ -52,7 +65,7 @@ def wheel_contact(
         "sinkage_rate": -dot(c.wheel_velocity, normal),
         "slip": slip,
         "soil_slip": clamp(slip, -1.0, 1.0),
-        "slip_angle": np.arctan2(v_y, np.maximum(np.abs(v_x), SLOW)),
+        "slip_angle": np.arctan2(v_y, np.maximum(np.abs(v_x), CONTACT.slow)),
         "v_x": v_x,
         "v_y": v_y,
         "rim_speed": rim,
@@ -65,10 +78,6 @@ def wheel_contact(
 
 ALONG = np.linspace(-0.9, 0.9, 11)
 """Places of the samples along the wheel, in radii."""
-MARGIN = 0.02
-"""Clearance, in radii, within which ground counts as near the rim."""
-AIRBORNE = 1e-6
-"""Weight of the three middle samples whatever the rim's clearance."""
 
 
 def rim_plane(c: Context, field: Grid, moved: Moved | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,8 +105,8 @@ def rim_plane(c: Context, field: Grid, moved: Moved | None = None) -> tuple[np.n
     foot = along[..., len(ALONG) // 2].copy()
     along -= foot[..., None]
     clear = center[..., 2, None] - foot[..., None] - along
-    depth = 1.0 + MARGIN - np.sqrt(u * u + clear * clear) / r[..., None]
-    weight = np.maximum(depth, 0.0) ** 2 + AIRBORNE * (np.abs(ALONG) < 0.3)
+    depth = 1.0 + CONTACT.margin - np.sqrt(u * u + clear * clear) / r[..., None]
+    weight = np.maximum(depth, 0.0) ** 2 + CONTACT.airborne * (np.abs(ALONG) < 0.3)
     weight /= weight.sum(-1, keepdims=True)
     mean_u, mean_h = (weight * u).sum(-1), (weight * along).sum(-1)
     off = u - mean_u[..., None]
@@ -114,7 +123,7 @@ def faster(rim: np.ndarray, travel: np.ndarray) -> np.ndarray:
 def side_speed(contact: Values) -> np.ndarray:
     """Numerator of (1 - s) tan(beta): v_y when driving, v_y (2 - r omega/v_x) when braking, m/s (eqs. 8, 9, 11)."""
     rim, v_x, v_y = contact["rim_speed"], contact["v_x"], contact["v_y"]
-    braking = (np.abs(rim) <= np.abs(v_x)) & (np.abs(v_x) > STANDING)
+    braking = (np.abs(rim) <= np.abs(v_x)) & (np.abs(v_x) > CONTACT.standing)
     if not braking.any():
         return v_y
     ratio = np.divide(rim, v_x, out=np.ones_like(rim), where=braking)
@@ -124,9 +133,9 @@ def side_speed(contact: Values) -> np.ndarray:
 def momentary_slip(contact: Values) -> Values:
     """Slip without memory of the soil: rim less travel speed over the larger, eq. 11's factor, and the direction."""
     fastest = faster(contact["rim_speed"], contact["v_x"])
-    speed = np.maximum(np.abs(fastest), SLOW)
+    speed = np.maximum(np.abs(fastest), CONTACT.slow)
     return {
         "slip_x": (contact["rim_speed"] - contact["v_x"]) / speed,
         "slip_y": side_speed(contact) / speed,
-        "direction": clamp(fastest / SLOW, -1.0, 1.0),
+        "direction": clamp(fastest / CONTACT.slow, -1.0, 1.0),
     }

@@ -6,6 +6,7 @@ Janosi & Hanamoto 1961 (displacement of a skidding wheel), Cundall & Strack 1979
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,16 +16,25 @@ from lunar_mjx.backends.physics.hard import boulder_touch, push_wheels
 from lunar_mjx.backends.physics.soil import below_surface, mobilised
 from lunar_mjx.backends.physics.vectors import clamp, dot
 
-PLACES = 20
-"""Places that a wheel remembers."""
-NOWHERE = 1e6
-"""Coordinate of a place that has not been visited, m."""
-_OWN_LATEST = 3
-_FAINT = 0.05
+
+@dataclasses.dataclass(frozen=True)
+class Multipass:
+    """Numbers of multipass, written again for the independent check."""
+
+    places: int = 20
+    """Places that a wheel remembers."""
+    nowhere: float = 1e6
+    """Coordinate of a place that has not been visited, m."""
+    own_latest: int = 3
+    faint: float = 0.05
+    most_pressed: float = 0.14
+    """Largest share by which a layer is pressed together: 1.50 to 1.74 g/cm3."""
+
+
+MULTIPASS = Multipass()
+
 DENSITY_POWERS = {"cohesion": 11.0, "tan_phi": 2.7, "shear_modulus_x": -1.0, "shear_modulus_y": -1.0}
 """Powers of the density with which strength and shear moduli go (Carrier et al. 1991; Senatore & Sandu 2011)."""
-MOST_PRESSED = 0.14
-"""Largest share by which a layer is pressed together: 1.50 to 1.74 g/cm3."""
 
 
 def slip_sinkage(c: Context, p: SimpleNamespace, soil: Values) -> None:
@@ -37,8 +47,12 @@ def slip_sinkage(c: Context, p: SimpleNamespace, soil: Values) -> None:
 
 def no_places(rovers: int, wheels: int) -> Values:
     """The memory of `multipass` at reset, (rover, place, wheel)."""
-    shape = (rovers, PLACES, wheels)
-    return {"place_x": np.full(shape, NOWHERE), "place_y": np.full(shape, NOWHERE), "depth": np.zeros(shape)}
+    shape = (rovers, MULTIPASS.places, wheels)
+    return {
+        "place_x": np.full(shape, MULTIPASS.nowhere),
+        "place_y": np.full(shape, MULTIPASS.nowhere),
+        "depth": np.zeros(shape),
+    }
 
 
 def multipass(c: Context, p: SimpleNamespace, soil: Values, places: Values) -> Values:
@@ -50,13 +64,13 @@ def multipass(c: Context, p: SimpleNamespace, soil: Values, places: Values) -> V
     ) ** 2
     weight = np.maximum(1.0 - gap / (4.0 * p.spacing**2), 0.0) ** 2
     wheels = np.arange(x.shape[1])
-    weight[:, :_OWN_LATEST, wheels, wheels] = 0.0
+    weight[:, : MULTIPASS.own_latest, wheels, wheels] = 0.0
     total = weight.sum(axis=(1, 2))
-    met = np.sum(weight * places["depth"][..., None], axis=(1, 2)) / (total + _FAINT)
-    stiffer = 1.0 + total / (total + _FAINT) * ((1.0 - p.plastic) ** -soil["n"] - 1.0)
+    met = np.sum(weight * places["depth"][..., None], axis=(1, 2)) / (total + MULTIPASS.faint)
+    stiffer = 1.0 + total / (total + MULTIPASS.faint) * ((1.0 - p.plastic) ** -soil["n"] - 1.0)
     soil["k_c"], soil["k_phi"], soil["rut"] = soil["k_c"] * stiffer, soil["k_phi"] * stiffer, p.plastic * met
     layer = p.compacted_depth * c.geometry["width"]
-    density = layer / (layer - np.minimum(soil["rut"], MOST_PRESSED * layer))
+    density = layer / (layer - np.minimum(soil["rut"], MULTIPASS.most_pressed * layer))
     for name, power in DENSITY_POWERS.items():
         soil[name] = soil[name] * density**power
     sinkage = c.contact["sinkage"]

@@ -8,25 +8,35 @@ from types import SimpleNamespace
 import numpy as np
 
 from lunar_mjx.backends.physics.context import Context, Values
-from lunar_mjx.backends.physics.outdoors import DENSITY_POWERS, MOST_PRESSED
+from lunar_mjx.backends.physics.outdoors import DENSITY_POWERS, MULTIPASS
 from lunar_mjx.backends.physics.soil import entrance
 from lunar_mjx.backends.physics.vectors import clamp
 
-SIDE = 64
-"""Cells along each side of a patch, which repeats."""
-TILES = 1024.0
-"""Tiles per row of their numbers."""
-NOWHERE = -1e7
-"""Number of the tile of a cell that no wheel has touched."""
+
+@dataclasses.dataclass(frozen=True)
+class RutPatch:
+    """Numbers of ruts, written again for the independent check."""
+
+    side: int = 64
+    """Cells along each side of a patch, which repeats."""
+    tiles: float = 1024.0
+    """Tiles per row of their numbers."""
+    nowhere: float = -1e7
+    """Number of the tile of a cell that no wheel has touched."""
+    dug: tuple[float, ...] = (-0.5, 0.0, 0.5, 1.0)
+    behind: tuple[float, float] = (0.8, 1.0)
+    faint: float = 1e-3
+
+
+RUT_PATCH = RutPatch()
+
 _ACROSS = np.linspace(-0.4, 0.4, 5)[:, None]
-_DUG, _BEHIND = (-0.5, 0.0, 0.5, 1.0), (0.8, 1.0)
-_FAINT = 1e-3
 
 
 def untouched(rovers: int) -> Values:
     """The patches at reset, (rover, cell)."""
-    cells = np.zeros((rovers, SIDE * SIDE))
-    return {"moved": cells, "pressed": cells.copy(), "tile": cells + NOWHERE}
+    cells = np.zeros((rovers, RUT_PATCH.side * RUT_PATCH.side))
+    return {"moved": cells, "pressed": cells.copy(), "tile": cells + RUT_PATCH.nowhere}
 
 
 @dataclasses.dataclass
@@ -59,10 +69,10 @@ class Relief:
 
 def _address(i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Place of the cells i, j in the patch, and the number of their tile."""
-    tile_i, tile_j = np.floor(i / SIDE), np.floor(j / SIDE)
-    slot = (i - SIDE * tile_i) + SIDE * (j - SIDE * tile_j)
+    tile_i, tile_j = np.floor(i / RUT_PATCH.side), np.floor(j / RUT_PATCH.side)
+    slot = (i - RUT_PATCH.side * tile_i) + RUT_PATCH.side * (j - RUT_PATCH.side * tile_j)
     # not-a-number becomes the smallest integer
-    return clamp(slot.astype(np.int64), 0, SIDE * SIDE - 1), tile_i + TILES * tile_j
+    return clamp(slot.astype(np.int64), 0, RUT_PATCH.side * RUT_PATCH.side - 1), tile_i + RUT_PATCH.tiles * tile_j
 
 
 def relief_of(c: Context, p: SimpleNamespace, state: Values) -> Relief:
@@ -80,11 +90,11 @@ def ruts(c: Context, p: SimpleNamespace, soil: Values, state: Values) -> Values:
     reach = radius * np.sin(entrance(sinkage, radius))
     rut = relief.at(x + 0.5 * way * reach * ahead_x, y + 0.5 * way * reach * ahead_y)[1]
     rut = np.where(soil["rock"] > 0.5, 0.0, rut)
-    firmer = 1.0 + rut / (rut + _FAINT * radius) * ((1.0 - p.plastic) ** -soil["n"] - 1.0)
+    firmer = 1.0 + rut / (rut + RUT_PATCH.faint * radius) * ((1.0 - p.plastic) ** -soil["n"] - 1.0)
     soil["k_c"], soil["k_phi"], soil["rut"] = soil["k_c"] * firmer, soil["k_phi"] * firmer, rut
     tan_phi = soil["tan_phi"]  # loose soil stands in the heap, whatever lies pressed below
     layer = p.compacted_depth * width
-    density = layer / (layer - np.minimum(rut, MOST_PRESSED * layer))
+    density = layer / (layer - np.minimum(rut, MULTIPASS.most_pressed * layer))
     for name, power in DENSITY_POWERS.items():
         soil[name] = soil[name] * density**power
 
@@ -102,10 +112,13 @@ def ruts(c: Context, p: SimpleNamespace, soil: Values, state: Values) -> Values:
             np.concatenate([side_y + (d * ahead_y)[:, None] for d in distances], axis=1),
         )
 
-    dug, back = along(*(toward * f * reach for f in _DUG)), along(*(-toward * f * radius for f in _BEHIND))
+    dug, back = (
+        along(*(toward * f * reach for f in RUT_PATCH.dug)),
+        along(*(-toward * f * radius for f in RUT_PATCH.behind)),
+    )
     trail = along(-way * relief.cell)
     heap, hole = relief.at(*back)[0].mean(axis=1), relief.at(*dug)[0].mean(axis=1)
-    room = 1.0 - (heap - hole) / (_BEHIND[0] * radius * tan_phi)
+    room = 1.0 - (heap - hole) / (RUT_PATCH.behind[0] * radius * tan_phi)
     deep = np.minimum(np.maximum(sinkage - rut, 0.0), radius)
     volume = c.dt * p.carried * deep * np.abs(slide) * clamp(room, 0.0, 1.0) * width
     height = (np.where(working, volume, 0.0) / relief.cell**2)[:, None]

@@ -5,6 +5,7 @@ Sources: Wong & Reece 1967, Janosi & Hanamoto 1961, Ding et al. 2011, Ishigami e
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from types import SimpleNamespace
 
@@ -14,10 +15,20 @@ from lunar_mjx.backends.physics.contact import faster, side_speed
 from lunar_mjx.backends.physics.context import Context, Values
 from lunar_mjx.backends.physics.vectors import clamp
 
-SHALLOW, DEEP = 1e-9, 1.5
-"""Sinkage over radius is followed within these bounds (up to an entrance angle of 120 deg)."""
-SHORTEST = 0.05
-"""Contact length, in radii, below which soil is too little touched to remember by how far it was sheared."""
+
+@dataclasses.dataclass(frozen=True)
+class ClosedForm:
+    """Numbers of the closed form, written again for the independent check."""
+
+    # Sinkage over radius is followed within these bounds (up to an entrance angle of 120 deg).
+    shallow: float = 1e-09
+    deep: float = 1.5
+    shortest: float = 0.05
+    """Contact length, in radii, below which soil is too little touched to remember by how far it was sheared."""
+
+
+CLOSED_FORM = ClosedForm()
+
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 """The nodes of the JAX effect, so that engines agree to rounding; that effect has a test of their error."""
@@ -68,13 +79,13 @@ def below_surface(c: Context) -> np.ndarray:
 def entrance(sinkage: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """theta_1, at which the rim enters the soil: cos theta_1 = 1 - z/r; rad."""
     # by the half angle: arccos(1 - z/r) loses half of the digits where z is small
-    ratio = np.minimum(np.maximum(sinkage / radius, SHALLOW), DEEP)
+    ratio = np.minimum(np.maximum(sinkage / radius, CLOSED_FORM.shallow), CLOSED_FORM.deep)
     return 2.0 * np.arctan2(np.sqrt(ratio), np.sqrt(2.0 - ratio))
 
 
 def peak_stress(soil: Values, width: np.ndarray, radius: np.ndarray, cos_m: np.ndarray, cos_1: np.ndarray):
     """sigma_m = (k_c/b + k_phi) [r (cos theta_m - cos theta_1)]^n, Pa."""
-    depth = np.maximum(radius * (cos_m - cos_1), SHALLOW * radius)
+    depth = np.maximum(radius * (cos_m - cos_1), CLOSED_FORM.shallow * radius)
     return (soil["k_c"] / width + soil["k_phi"]) * depth ** soil["n"]
 
 
@@ -137,7 +148,7 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     """
     contact, r = c.contact, c.geometry["radius"]
     theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
-    length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), SHORTEST * r)
+    length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), CLOSED_FORM.shortest * r)
     # rock has no arc in the ground over which shear could build up: bristles take the place of soil
     length = np.where(c.soil["rock"] > 0.5, p.rock_length, length)
     roll = faster(contact["rim_speed"], contact["v_x"])

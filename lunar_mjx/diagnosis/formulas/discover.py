@@ -15,7 +15,7 @@ import numpy as np
 from lunar_mjx.diagnosis.build_problem import table_problem
 from lunar_mjx.diagnosis.drives.loop import build_drives
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
-from lunar_mjx.diagnosis.formulas.search import PENALTY, Settings, Trial, search_formulas
+from lunar_mjx.diagnosis.formulas.search import FORMULA_SEARCH, Settings, Trial, search_formulas
 from lunar_mjx.diagnosis.formulas.slots import WHEEL_PORTS, Slots
 from lunar_mjx.diagnosis.formulas.targets import CONSTANTS
 from lunar_mjx.diagnosis.formulas.terms import FORMULA_PORTS, SUGGESTED, Term, effect_of, terms, with_amount
@@ -237,7 +237,7 @@ def _in_drives(
         name: base.linear.evidence(form.listed(frozenset([name])), (nothing.tau, nothing.noise))[0] - before
         for name in form.candidates
     }
-    order = sorted(gains, key=lambda n: -(2.0 * gains[n] - PENALTY * library[n].length))
+    order = sorted(gains, key=lambda n: -(2.0 * gains[n] - FORMULA_SEARCH.penalty * library[n].length))
     scored = [(f"{library[n].target}: {library[n].formula}", max(2.0 * gains[n], 0.0)) for n in order]
     found: list[Row] = []
     for i, name in enumerate(order[:REFITS]):
@@ -263,7 +263,7 @@ def _in_drives(
         quiet = bool(np.max(posterior.noise) < 1.0 + DriveSettings().stated_spread)
         suggestion = _suggestion([part], 2.0 * (after - before), gained, answer.errors(form, residual), quiet, t.length)
         found.append((suggestion, (t,)))
-    found.sort(key=lambda row: -(row[0].chi2 - PENALTY * row[0].length))
+    found.sort(key=lambda row: -(row[0].chi2 - FORMULA_SEARCH.penalty * row[0].length))
     return answer.errors(form, form.residual(base.u)), found, scored
 
 

@@ -20,20 +20,32 @@ from lunar_mjx.inference.held_out import ENOUGH, noise_test, predictive_gain, pr
 from lunar_mjx.inference.objective import Objective
 from lunar_mjx.inference.score import leash, project
 
-PENALTY = 5.0
-"""Chi-square that every operation and symbol of a formula must earn: choosing one of ten costs 4.6."""
-_FIRST, _NEXT, _ROUNDS = 16, 12, 3
-"""Formulas refitted at the model as it is, in each later round, and later rounds."""
-_STEPS, _FINISHED = 10, 6
-"""Steps of a descent that sorts formulas out, and formulas whose descent is finished."""
-_SEEDS, _SECONDS = 2, 8
-"""Single formulas beside which a second is sought, and how many of these are refitted."""
-_ALIKE = (0.97, 0.999)
-"""|cos| of projected signatures from which only the better scored of two is refitted: in the first round, later."""
-_SAME = 1.0
-"""Squared difference of two fits' predictions, in sigma, below which they are one."""
-_FAR = 30.0
-"""Amounts beyond so many visible ones are no linear estimate."""
+
+@dataclasses.dataclass(frozen=True)
+class FormulaSearch:
+    """How widely formulas are searched, and what counts as better."""
+
+    penalty: float = 5.0
+    """Chi-square that every operation and symbol of a formula must earn: choosing one of ten costs 4.6."""
+    # Formulas refitted at the model as it is, in each later round, and later rounds.
+    first: int = 16
+    next: int = 12
+    rounds: int = 3
+    # Steps of a descent that sorts formulas out, and formulas whose descent is finished.
+    steps: int = 10
+    finished: int = 6
+    # Single formulas beside which a second is sought, and how many of these are refitted.
+    seeds: int = 2
+    seconds: int = 8
+    alike: tuple[float, float] = (0.97, 0.999)
+    """|cos| of projected signatures from which only the better scored of two is refitted: in the first round, later."""
+    same: float = 1.0
+    """Squared difference of two fits' predictions, in sigma, below which they are one."""
+    far: float = 30.0
+    """Amounts beyond so many visible ones are no linear estimate."""
+
+
+FORMULA_SEARCH = FormulaSearch()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +88,7 @@ class Trial:
     @property
     def merit(self) -> float:
         """What they are ordered by: how far the squared residual falls, less what their length costs."""
-        return self.drop - PENALTY * self.length
+        return self.drop - FORMULA_SEARCH.penalty * self.length
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,7 +115,9 @@ class _Scores:
 
     def order(self) -> np.ndarray:
         """Places, best first."""
-        return np.argsort(-(self.chi2 - PENALTY * np.array([long(c) for c in self.choices])), kind="stable")
+        return np.argsort(
+            -(self.chi2 - FORMULA_SEARCH.penalty * np.array([long(c) for c in self.choices])), kind="stable"
+        )
 
 
 _LENGTHS: dict[tuple[int, int, int], int] = {}
@@ -134,21 +148,21 @@ def search_formulas(
     first = search.scores(empty, base, choices)
     at = first.order()
     scored = tuple((first.choices[i], float(first.chi2[i])) for i in at)
-    trials = search.refit(empty, base, first, _FIRST, _ALIKE[0])
-    for k in range(_ROUNDS):
+    trials = search.refit(empty, base, first, FORMULA_SEARCH.first, FORMULA_SEARCH.alike[0])
+    for k in range(FORMULA_SEARCH.rounds):
         best = max(trials, key=lambda t: t.merit, default=None)
         if best is None:
             break
-        progress("refitting formulas", (k + 1) / (_ROUNDS + 2))
+        progress("refitting formulas", (k + 1) / (FORMULA_SEARCH.rounds + 2))
         (only,) = best.slots.held
         again = search.scores(best.slots, best.fit, choices, only)
-        new = search.refit(best.slots, best.fit, again, _NEXT, _ALIKE[1], only)
+        new = search.refit(best.slots, best.fit, again, FORMULA_SEARCH.next, FORMULA_SEARCH.alike[1], only)
         trials += new
         if not any(t.merit > best.merit for t in new):
             break
     trials += search.linear(trials)
     trials = search.finished(trials)
-    progress("refitting pairs of formulas", _ROUNDS / (_ROUNDS + 2))
+    progress("refitting pairs of formulas", FORMULA_SEARCH.rounds / (FORMULA_SEARCH.rounds + 2))
     trials += search.pairs(trials, choices)
     trials = search.finished(trials)
     return Found(empty, base, tuple(told_apart(sorted(trials, key=lambda t: -t.merit))), scored)
@@ -161,7 +175,7 @@ def told_apart(trials: Sequence[Trial]) -> list[Trial]:
         laws = {dataclasses.replace(c, linear=False) for c in t.choices}
         if not any(
             laws == {dataclasses.replace(c, linear=False) for c in k.choices}
-            or float(np.sum((t.fit.residual - k.fit.residual)[t.fit.fitted] ** 2)) < _SAME
+            or float(np.sum((t.fit.residual - k.fit.residual)[t.fit.fitted] ** 2)) < FORMULA_SEARCH.same
             for k in kept
         ):
             kept.append(t)
@@ -200,7 +214,7 @@ class _Search:
         signature = np.concatenate([o[1] for o in out], axis=1)
         power = np.sum(signature**2, axis=0)
         amount = signature.T @ residual[keep] / np.where(power > 1e-6, power, np.inf)
-        chi2 = np.where(np.abs(amount) < _FAR, amount**2 * power, 0.0)
+        chi2 = np.where(np.abs(amount) < FORMULA_SEARCH.far, amount**2 * power, 0.0)
         return _Scores(
             [c for o in out for c in o[0]],
             chi2,
@@ -260,7 +274,7 @@ class _Search:
         choices = tuple(c for c, _ in slots.held.values())
         self.tried.add(frozenset(choices))
         goal = Objective(slots.problem, slots.free, self.base.fitted)
-        down = descend(goal, start, iterations=_STEPS)
+        down = descend(goal, start, iterations=FORMULA_SEARCH.steps)
         if not np.isfinite(down.chi2):
             return None
         found = Fit(down.u, slots.free, down.chi2, down.residual, down.jacobian, self.base.fitted)
@@ -293,16 +307,16 @@ class _Search:
         """The best with their descents at an end, and the others."""
         ordered = sorted(trials, key=lambda t: -t.merit)
         done = []
-        for t in ordered[:_FINISHED]:
+        for t in ordered[: FORMULA_SEARCH.finished]:
             found = fit(t.slots.problem, t.slots.free, t.fit.u, starts=1)
             done.append(self._judged(t.choices, t.slots, found) if found.chi2 <= t.fit.chi2 else t)
-        return done + ordered[_FINISHED:]
+        return done + ordered[FORMULA_SEARCH.finished :]
 
     def pairs(self, trials: Sequence[Trial], choices: Sequence[Choice]) -> list[Trial]:
         """The best singles with a second formula, where they leave a rest."""
         out: list[Trial] = []
-        for t in sorted(trials, key=lambda t: -t.merit)[:_SEEDS]:
+        for t in sorted(trials, key=lambda t: -t.merit)[: FORMULA_SEARCH.seeds]:
             if not t.at_noise:
                 more = self.scores(t.slots, t.fit, choices)
-                out += self.refit(t.slots, t.fit, more, _SECONDS, _ALIKE[0])
+                out += self.refit(t.slots, t.fit, more, FORMULA_SEARCH.seconds, FORMULA_SEARCH.alike[0])
         return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -17,18 +18,27 @@ from lunar_mjx.inference.observations import Observations
 from lunar_mjx.report.page import Block, Explorer, Figure
 from lunar_mjx.report.style import BLUE, INK, MEASURED, MUTED, ORANGE, SERIES, faded, finish
 
-_MOST_VALUES = 250_000
-"""Numbers in the panels of one page; longer series are thinned."""
-_BINS, _LEAST = 16, 8
-"""Bins of a covariate; observations that make a bin."""
-_FEW = 4
-"""Observations that make a shape."""
-_LINES = 5
-"""Channels drawn over a covariate."""
-_MAPS = 6
-"""Models of a chain whose heat maps are shown; of longer chains the first five and the last."""
-_SHAPES = 6
-"""Effects in the gallery."""
+
+@dataclasses.dataclass(frozen=True)
+class ExploreSizes:
+    """How much a page to explore holds."""
+
+    most_values: int = 250_000
+    """Numbers in the panels of one page; longer series are thinned."""
+    # Bins of a covariate; observations that make a bin.
+    bins: int = 16
+    least: int = 8
+    few: int = 4
+    """Observations that make a shape."""
+    lines: int = 5
+    """Channels drawn over a covariate."""
+    maps: int = 6
+    """Models of a chain whose heat maps are shown; of longer chains the first five and the last."""
+    shapes: int = 6
+    """Effects in the gallery."""
+
+
+EXPLORE = ExploreSizes()
 
 
 def panels(steps: Sequence[Step]) -> list[Block]:
@@ -41,7 +51,7 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     if not places:
         return []
     channels, units = list(dict.fromkeys(c for c, _ in places)), sorted({u for _, u in places})
-    shown_steps = [*steps[: _MAPS - 1], steps[-1]] if len(steps) > _MAPS else list(steps)
+    shown_steps = [*steps[: EXPLORE.maps - 1], steps[-1]] if len(steps) > EXPLORE.maps else list(steps)
     rms = [{key: _rms(s.residual[at]) for key, at in places.items()} for s in shown_steps]
     most = max(v for row in rms for v in row.values() if v is not None)
     titles = [f"{_number(steps, s)}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for s in shown_steps]
@@ -70,11 +80,11 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     figure.update_yaxes(autorange="reversed", showgrid=False, type="category")
     figure.update_xaxes(tickangle=0 if len(units) <= 8 else -45, showgrid=False, type="category", automargin=True)
     figure.update_annotations(x=0.0, xanchor="left")
-    thin = max(1, int(np.ceil(len(o) * 5 / _MOST_VALUES)))
+    thin = max(1, int(np.ceil(len(o) * 5 / EXPLORE.most_values)))
     worst = sorted(places, key=lambda key: -(rms[0][key] or 0.0))
     models = _compared(steps)
     found = {_key(*key): _panel(models, *key, places[key][::thin]) for key in worst}
-    left = f" {len(steps) - _MAPS} models in between are left out." if len(steps) > _MAPS else ""
+    left = f" {len(steps) - EXPLORE.maps} models in between are left out." if len(steps) > EXPLORE.maps else ""
     caption = (
         "Root mean square residual in sigma, 1 is the noise: one map for each model of the chain, in one scale of "
         f"shades.{left} What is held out was never fitted. Click a field, or choose from the list, to see what was "
@@ -123,7 +133,7 @@ def dependence(result: Result) -> list[Block]:
     size: dict[str, float] = {}
     for s in o.series:
         size[s.channel] = size.get(s.channel, 0.0) + float(np.nansum(residual[s.start : s.stop] ** 2))
-    worst = sorted(size, key=lambda c: -size[c])[:_LINES]
+    worst = sorted(size, key=lambda c: -size[c])[: EXPLORE.lines]
     columns = min(3, len(known))
     rows = -(-len(known) // columns)
     figure = make_subplots(rows, columns, shared_yaxes=True, horizontal_spacing=0.03, vertical_spacing=0.3 / rows)
@@ -169,7 +179,7 @@ def gallery(result: Result) -> list[Block]:
         if e.get("status") != "not tested" and signature is not None and len(signature) == len(fitted):
             shapes[e["effect"]] = np.zeros(len(o))
             shapes[e["effect"]][fitted] = signature
-    chosen = sorted(shapes, key=lambda e: -float(np.linalg.norm(shapes[e])))[:_SHAPES]
+    chosen = sorted(shapes, key=lambda e: -float(np.linalg.norm(shapes[e])))[: EXPLORE.shapes]
     drawn = {e: found for e in chosen if (found := _largest(o, shapes[e])) is not None}
     if not drawn:
         return []
@@ -353,7 +363,7 @@ def covariate_along(o: Observations, begin: str, end: str) -> np.ndarray:
 
 def _spread(values: np.ndarray) -> bool:
     known = values[np.isfinite(values)]
-    return len(known) >= 2 * _LEAST and bool(np.ptp(known) > 1e-6 * max(float(np.abs(known).max()), 1e-12))
+    return len(known) >= 2 * EXPLORE.least and bool(np.ptp(known) > 1e-6 * max(float(np.abs(known).max()), 1e-12))
 
 
 def _binned(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float], list[float]]:
@@ -361,7 +371,7 @@ def _binned(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float], lis
     keep = np.isfinite(x) & np.isfinite(y)
     x, y = x[keep], y[keep]
     rows = []
-    for part in np.array_split(np.argsort(x, kind="stable"), min(_BINS, max(1, len(x) // _LEAST))):
+    for part in np.array_split(np.argsort(x, kind="stable"), min(EXPLORE.bins, max(1, len(x) // EXPLORE.least))):
         if len(part) >= 2:
             rows.append((x[part].mean(), y[part].mean(), 1.96 * y[part].std(ddof=1) / np.sqrt(len(part))))
     centres, means, errors = zip(*rows, strict=True) if rows else ((), (), ())
@@ -370,6 +380,6 @@ def _binned(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float], lis
 
 def _largest(o: Observations, shape: np.ndarray) -> tuple[str, int, np.ndarray] | None:
     """Channel, manoeuvre and observations where a shape has most of its length."""
-    seen = [(c, u, at) for c, u, at in cells(o) if len(at) >= _FEW]
+    seen = [(c, u, at) for c, u, at in cells(o) if len(at) >= EXPLORE.few]
     best = max(seen, key=lambda cell: float(np.sum(shape[cell[2]] ** 2)), default=None)
     return best if best is not None and np.any(shape[best[2]]) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,20 +19,29 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.report.style import BLUE, DARK, INK, ORANGE, SKY, styled
 from lunar_mjx.visual.encode import writer
 
-_FPS = 12
-_HOLD, _MOVE = 14, 12
-"""Pictures for which a model stands still, and in which it passes into the next."""
-_SIZE = (9.6, 4.1)
-"""Inches, at 100 pixels each."""
-_MOST_PANELS = 3
-_LEAST_POINTS = 5
-"""Fewer observations show no course."""
-_MANY_POINTS = 60
-"""From so many on, points are drawn small and models without marks."""
-_GAP = 5.0
-"""Lines break where two observations are so many times further apart than is usual."""
-_TITLE_WIDTH = 104
-"""Characters of a line above the bar."""
+
+@dataclasses.dataclass(frozen=True)
+class FallingFilm:
+    """Layout and pace of the film of a falling misfit."""
+
+    fps: int = 12
+    # Pictures for which a model stands still, and in which it passes into the next.
+    hold: int = 14
+    move: int = 12
+    size: tuple[float, float] = (9.6, 4.1)
+    """Inches, at 100 pixels each."""
+    most_panels: int = 3
+    least_points: int = 5
+    """Fewer observations show no course."""
+    many_points: int = 60
+    """From so many on, points are drawn small and models without marks."""
+    gap: float = 5.0
+    """Lines break where two observations are so many times further apart than is usual."""
+    title_width: int = 104
+    """Characters of a line above the bar."""
+
+
+FILM = FallingFilm()
 
 
 def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark: bool = False) -> Path:
@@ -67,7 +77,7 @@ def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark
     course = _course(len(steps))
     with styled(dark):
         drawn = {place: _picture(steps, errors, panels, place, measure, dark) for place in sorted(set(course))}
-    with writer(path, _FPS) as put:
+    with writer(path, FILM.fps) as put:
         for place in course:
             put(drawn[place])
     return path
@@ -75,10 +85,10 @@ def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark
 
 def _course(models: int) -> list[float]:
     """Where the animation is at each picture: 0 is the first model, 1 the second."""
-    ease = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, _MOVE + 1) / (_MOVE + 1))
+    ease = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, FILM.move + 1) / (FILM.move + 1))
     course: list[float] = []
     for i in range(models):
-        course += [float(i)] * (_HOLD if i < models - 1 else 2 * _HOLD)
+        course += [float(i)] * (FILM.hold if i < models - 1 else 2 * FILM.hold)
         if i < models - 1:
             course += [i + float(e) for e in ease]
     return course
@@ -90,18 +100,19 @@ def _worst(steps: Sequence[Step], splits: Sequence[str]) -> list[tuple[str, str,
     judges = o.in_split(*splits)
     found = [(channel, unit, at[judges[at] & np.isfinite(residual[at])]) for channel, unit, at in cells(o)]
     ranked = sorted(
-        (c for c in found if len(c[2]) >= _LEAST_POINTS), key=lambda c: -float(np.sqrt(np.mean(residual[c[2]] ** 2)))
+        (c for c in found if len(c[2]) >= FILM.least_points),
+        key=lambda c: -float(np.sqrt(np.mean(residual[c[2]] ** 2))),
     )
     worst: dict[str, tuple[str, str, np.ndarray]] = {}
     for channel, unit, at in ranked:
         worst.setdefault(channel, (channel, o.unit_names[unit], at))
-    return list(worst.values())[:_MOST_PANELS]
+    return list(worst.values())[: FILM.most_panels]
 
 
 def _broken(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places and values of a line that breaks where measurements pause."""
     steps = np.diff(x)
-    pauses = np.flatnonzero(steps > _GAP * max(float(np.median(steps)), 1e-12)) + 1 if len(x) > 2 else []
+    pauses = np.flatnonzero(steps > FILM.gap * max(float(np.median(steps)), 1e-12)) + 1 if len(x) > 2 else []
     return np.insert(x.astype(float), pauses, np.nan), np.insert(y.astype(float), pauses, np.nan)
 
 
@@ -117,7 +128,7 @@ def _picture(
     ink = DARK[INK] if dark else INK
     low = min(int(place), len(steps) - 1)
     high, share = min(low + 1, len(steps) - 1), place - low
-    figure = Figure(_SIZE, dpi=100)
+    figure = Figure(FILM.size, dpi=100)
     grid = figure.add_gridspec(
         2, len(panels), height_ratios=(3, 1), left=0.075, right=0.985, top=0.83, bottom=0.07, hspace=0.72, wspace=0.3
     )
@@ -133,7 +144,7 @@ def _picture(
         every = np.concatenate([measured, *(s.predicted[at] for s in steps)])
         margin = 0.06 * max(float(np.nanmax(every) - np.nanmin(every)), 1e-12)
         axes.set_ylim(float(np.nanmin(every)) - margin, float(np.nanmax(every)) + margin)
-        many = len(x) > _MANY_POINTS
+        many = len(x) > FILM.many_points
         axes.plot(
             *_broken(x, predicted),
             color=SKY if dark else BLUE,
@@ -155,7 +166,7 @@ def _picture(
     bar.text(now + 0.012 * max(errors), 0, f"{shown(now)} sigma", va="center", fontsize=12, weight="bold")
     name = steps[low if share < 0.5 else high].label
     title = f"{name}: error on {measure} points (dashed: the noise)"
-    bar.set_title(textwrap.fill(title, _TITLE_WIDTH))
+    bar.set_title(textwrap.fill(title, FILM.title_width))
     bar.grid(False)
     for spine in bar.spines.values():
         spine.set_visible(False)

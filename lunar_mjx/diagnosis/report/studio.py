@@ -27,12 +27,21 @@ from lunar_mjx.files import write_text
 from lunar_mjx.report.page import packed
 from lunar_mjx.report.style import BLUE, DARK, FONT, INK, MUTED, ORANGE, PAPER, RULE
 
-_MOST_VALUES = 400_000
-"""Numbers in all traces of a page; longer series are thinned."""
-_MOST_MODELS = 14
-"""Models to choose from: as many buttons as a reader looks through."""
-_MOST_MAP = 2_000
-"""Points of the map."""
+
+@dataclasses.dataclass(frozen=True)
+class StudioSizes:
+    """How much a studio holds."""
+
+    most_values: int = 400_000
+    """Numbers in all traces of a page; longer series are thinned."""
+    most_models: int = 14
+    """Models to choose from: as many buttons as a reader looks through."""
+    most_map: int = 2_000
+    """Points of the map."""
+
+
+STUDIO_SIZES = StudioSizes()
+
 _STYLE = {
     "font": FONT,
     "ink": INK,
@@ -116,7 +125,7 @@ def _page_data(result: Result, traces: Traces) -> dict[str, Any]:
     found = {(c, u): at for c, u, at in cells(o) if np.isfinite(models[0].residual[at]).any()}
     channels = list(dict.fromkeys(c for c, _ in found))
     units = sorted({u for _, u in found})
-    thin = max(1, int(np.ceil(len(o) * (2 + 2 * len(models)) / _MOST_VALUES)))
+    thin = max(1, int(np.ceil(len(o) * (2 + 2 * len(models)) / STUDIO_SIZES.most_values)))
     held = o.in_split("select", "test")
     fitted = o.in_split("fit")
     verdict = result.verdict or {}
@@ -180,7 +189,7 @@ def _models(result: Result, traces: Traces) -> list[_Model]:
             residual[fitted] = left
             more.append(_Model("+ " + _words((name,)), (name,), "estimate", residual, None))
     more.sort(key=lambda m: (m.kind != "refit", _rms(m.residual[fitted]) or np.inf))
-    return [*found, *more][:_MOST_MODELS]
+    return [*found, *more][: STUDIO_SIZES.most_models]
 
 
 def _estimate(residual: np.ndarray, signature: np.ndarray) -> np.ndarray | None:
@@ -248,7 +257,7 @@ def _map(traces: Traces, models: Sequence[_Model]) -> dict[str, Any] | None:
     _, first, number = np.unique(np.column_stack([grid, o.unit[known]]), axis=0, return_index=True, return_inverse=True)
     number = np.ravel(number)
     units = sorted(set(o.unit.tolist()))
-    keep = np.arange(len(first))[:: max(1, int(np.ceil(len(first) / _MOST_MAP)))]
+    keep = np.arange(len(first))[:: max(1, int(np.ceil(len(first) / STUDIO_SIZES.most_map)))]
     here = where[known][first][keep]
 
     def errors(residual: np.ndarray) -> list[float | None]:

@@ -16,7 +16,7 @@ import numpy as np
 from lunar_mjx.envs.ladder.rungs import BURIAL, Rung
 from lunar_mjx.pytree import pytree
 from lunar_mjx.terrain import Craters
-from lunar_mjx.terrain.craters import REACH, profile
+from lunar_mjx.terrain.craters import CRATER_SHAPE, profile
 from lunar_mjx.terrain.rocks import CELL
 
 RIM = 3.0
@@ -101,7 +101,7 @@ def add_craters(rung: Rung, heights: Any, key: Any, hardness: Any) -> Any:
     """The heights with craters, octave by octave: all of an octave are stamped on patches of one size."""
     count = heights.shape[0]
     least = max(1.0, 6.0 * rung.cell)
-    octaves = [(d, 2.0 * d) for d in least * 2.0 ** np.arange(5) if 2.0 * REACH * d < rung.size]
+    octaves = [(d, 2.0 * d) for d in least * 2.0 ** np.arange(5) if 2.0 * CRATER_SHAPE.reach * d < rung.size]
     for i, (small, large) in enumerate(octaves):
         population = Craters(small, large, rung.craters, 2.0, 0.02, rung.deepest)
         mean = population.number(small) * rung.size**2
@@ -111,7 +111,7 @@ def add_craters(rung: Rung, heights: Any, key: Any, hardness: Any) -> Any:
         diameter = (small**-2 - draws[0] * (small**-2 - large**-2)) ** -0.5
         ratio = 0.02 * (rung.deepest / 0.02) ** draws[1] * hardness
         place = (draws[2:] - 0.5) * rung.size
-        patch = min(count, math.ceil(REACH * large / rung.cell) + 2)
+        patch = min(count, math.ceil(CRATER_SHAPE.reach * large / rung.cell) + 2)
 
         def stamp(ground: Any, crater: Any, patch: int = patch) -> tuple[Any, None]:
             x, y, diameter, depth = crater

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, LogTable
 
-RATE_TOLERANCE = 0.1
-"""Relative; loggers keep their rate to a per cent, and a fitted drift stays below it."""
 
-WINDOW = 25
-"""Intervals per window whose median is its rate: jitter of 20 % leaves 5 % in it."""
+@dataclasses.dataclass(frozen=True)
+class ClockLimits:
+    """What the checks of clocks tolerate."""
 
-STEADY, MOSTLY = 0.2, 0.9
-"""Steps count as one and the same, or as multiples of it, if this share of them lie within `STEADY` of it."""
+    rate_tolerance: float = 0.1
+    """Relative; loggers keep their rate to a per cent, and a fitted drift stays below it."""
+    window: int = 25
+    """Intervals per window whose median is its rate: jitter of 20 % leaves 5 % in it."""
+    # Steps count as one and the same, or as multiples of it, if this share of them lie within `steady` of it.
+    steady: float = 0.2
+    mostly: float = 0.9
+    lost_share: float = 0.3
+    """A log that lost more than this share of its samples is no record any more; links lose a few per cent."""
 
-LOST_SHARE = 0.3
-"""A log that lost more than this share of its samples is no record any more; links lose a few per cent."""
+
+CLOCK_LIMITS = ClockLimits()
+
 
 _RATES = (("joint_{}_angle_rad", "joint_{}_speed_rad_s"), ("position_{}_m", "world_velocity_{}_m_s"))
 
@@ -63,7 +72,7 @@ def _check_table(log: Log, table: LogTable) -> list[Finding]:
 
 def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
     base = float(np.median(steps))
-    if abs(base * table.rate_hz - 1.0) > RATE_TOLERANCE:
+    if abs(base * table.rate_hz - 1.0) > CLOCK_LIMITS.rate_tolerance:
         return [
             _finding(
                 log,
@@ -74,17 +83,23 @@ def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
                 f"rate_hz = {table.rate_hz:g}; correct one of them (is the time in seconds?)",
             )
         ]
-    windows = np.lib.stride_tricks.sliding_window_view(steps, WINDOW) if len(steps) >= 2 * WINDOW else None
+    windows = (
+        np.lib.stride_tricks.sliding_window_view(steps, CLOCK_LIMITS.window)
+        if len(steps) >= 2 * CLOCK_LIMITS.window
+        else None
+    )
     if windows is None:
         return []
     rate = np.median(windows, axis=1) / base
-    changed = np.abs(rate - 1.0) > RATE_TOLERANCE + _resolution(table.time_s) / base
+    changed = np.abs(rate - 1.0) > CLOCK_LIMITS.rate_tolerance + _resolution(table.time_s) / base
     # Lost samples make some steps multiples of the base, and a sensor that reports when it has news makes all sorts of
     # steps: only a run of one and the same step is another rate.
-    changed &= (np.abs(windows / base - rate[:, None]) < STEADY * rate[:, None]).mean(axis=1) > MOSTLY
+    changed &= (np.abs(windows / base - rate[:, None]) < CLOCK_LIMITS.steady * rate[:, None]).mean(
+        axis=1
+    ) > CLOCK_LIMITS.mostly
     if not changed.any():
         return []
-    row = int(np.argmax(changed)) + WINDOW // 2
+    row = int(np.argmax(changed)) + CLOCK_LIMITS.window // 2
     return [
         _finding(
             log,
@@ -122,7 +137,7 @@ def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
                     )
                 ]
     share = lost / (lost + len(table))
-    if share > LOST_SHARE and not table.on_change and _is_regular(steps, base):
+    if share > CLOCK_LIMITS.lost_share and not table.on_change and _is_regular(steps, base):
         row = int(np.argmax(steps)) + 1
         return [
             _finding(
@@ -131,7 +146,7 @@ def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
                 row,
                 "dropout",
                 f"lacks {100 * share:.0f} % of its samples (at most "
-                f"{100 * LOST_SHARE:.0f} % may be lost); the longest gap lasts {steps.max():.4g} s",
+                f"{100 * CLOCK_LIMITS.lost_share:.0f} % may be lost); the longest gap lasts {steps.max():.4g} s",
             )
         ]
     return []
@@ -148,7 +163,7 @@ def _resolution(time: np.ndarray) -> float:
 def _is_regular(steps: np.ndarray, base: float) -> bool:
     """Whether samples come at a rate, some of them lost, and not whenever a sensor has news."""
     multiples = np.maximum(np.round(steps / base), 1.0)
-    return float((np.abs(steps / base - multiples) < STEADY).mean()) > MOSTLY
+    return float((np.abs(steps / base - multiples) < CLOCK_LIMITS.steady).mean()) > CLOCK_LIMITS.mostly
 
 
 def _pairs(table: LogTable) -> list[tuple[str, str]]:

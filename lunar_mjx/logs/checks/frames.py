@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,23 +12,33 @@ from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.schema import SIDES
 from lunar_mjx.logs.series import Agreement, agreement, at, edges, guess, increments, integrals, means, sigma, span
 
-NORM_TOLERANCE = 0.02
-"""A quaternion of four components with 1 % noise has a norm within 2 %."""
 
-GRAVITY_TOLERANCE = 0.15
-"""Relative; the bias of the poorest accelerometer is a few per cent of lunar gravity."""
+@dataclasses.dataclass(frozen=True)
+class FrameLimits:
+    """What the checks of frames and units tolerate."""
 
-TILT_TOLERANCE = 15.0
-"""deg between measured and expected specific force: mounting errors and biases are a few degrees."""
+    norm_tolerance: float = 0.02
+    """A quaternion of four components with 1 % noise has a norm within 2 %."""
+    gravity_tolerance: float = 0.15
+    """Relative; the bias of the poorest accelerometer is a few per cent of lunar gravity."""
+    tilt_tolerance: float = 15.0
+    """deg between measured and expected specific force: mounting errors and biases are a few degrees."""
+    factor_tolerance: float = 0.3
+    """Relative, between two channels of which one is the other's rate: scale errors are a few per cent."""
+    # Cosine between two series above which they are proportional, and below which they have nothing in common.
+    alike: float = 0.9
+    unlike: float = 0.5
+    course_tolerance: float = 60.0
+    """deg between heading and course of a rover that does not crab: on side slopes they differ by less than 30."""
+    ground_speed: float = 1.6
+    """Factor between a velocity and the way in the same time that a winding course does not explain."""
+    unknown_yaw: float = 60.0
+    """Standard deviation of the IMU's mounting about z, deg, from which its yaw tells no heading."""
+    level: float = 2.0
+    """deg of pitch up to which no rover slides back on its own."""
 
-FACTOR_TOLERANCE = 0.3
-"""Relative, between two channels of which one is the other's rate: scale errors are a few per cent."""
 
-ALIKE, UNLIKE = 0.9, 0.5
-"""Cosine between two series above which they are proportional, and below which they have nothing in common."""
-
-COURSE_TOLERANCE = 60.0
-"""deg between heading and course of a rover that does not crab: on side slopes they differ by less than 30."""
+FRAME_LIMITS = FrameLimits()
 
 
 def check_frames(log: Log) -> list[Finding]:
@@ -56,7 +67,7 @@ def _quaternion(log: Log) -> list[Finding]:
     if not tables:
         return []
     norm = np.sqrt(sum(tables[0].channels[q] ** 2 for q in QUATERNION))
-    tolerance = max(NORM_TOLERANCE, 6.0 * max(sigma(log, q) for q in QUATERNION))
+    tolerance = max(FRAME_LIMITS.norm_tolerance, 6.0 * max(sigma(log, q) for q in QUATERNION))
     wrong = np.isfinite(norm) & (np.abs(norm - 1.0) > tolerance)
     if not wrong.any():
         return []
@@ -155,7 +166,7 @@ def _gravity(log: Log) -> list[Finding]:
                 "belongs: its sign is reversed; specific force points up at rest",
             )
         ]
-    if abs(size / g - 1.0) > GRAVITY_TOLERANCE + 6.0 * max(sigma(log, n) for n in names) / g / 20.0:
+    if abs(size / g - 1.0) > FRAME_LIMITS.gravity_tolerance + 6.0 * max(sigma(log, n) for n in names) / g / 20.0:
         return [
             _finding(
                 log,
@@ -167,7 +178,7 @@ def _gravity(log: Log) -> list[Finding]:
             )
         ]
     # without a known attitude the rover may stand on any slope
-    if angle > (TILT_TOLERANCE if turn is not None else 45.0):
+    if angle > (FRAME_LIMITS.tilt_tolerance if turn is not None else 45.0):
         return [
             _finding(
                 log,
@@ -207,7 +218,7 @@ def _velocities(log: Log) -> list[Finding]:
         speed[frame] = np.hypot(x, y)  # type: ignore[arg-type]
     noise = max(sigma(log, f"{k}_velocity_x_m_s") for k in ("world", "body"))
     both = agreement(speed["body"], speed["world"], noise)
-    if both is not None and both.cosine > ALIKE and abs(both.factor - 1.0) > FACTOR_TOLERANCE:
+    if both is not None and both.cosine > FRAME_LIMITS.alike and abs(both.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
         return [
             _finding(
                 log,
@@ -230,14 +241,14 @@ def _ground_speed(log: Log) -> list[Finding]:
     driven = np.abs(integrals(log, names[2], windows))
     # a rover that turns within a window goes further than its positions are apart: what goes straight is compared
     pair = agreement(driven, way, sigma(log, names[0]) / np.sqrt(5.0), least=0.5)
-    if pair is None or pair.cosine < ALIKE or 1.0 / GROUND_SPEED < pair.factor < GROUND_SPEED:
+    if (
+        pair is None
+        or pair.cosine < FRAME_LIMITS.alike
+        or 1.0 / FRAME_LIMITS.ground_speed < pair.factor < FRAME_LIMITS.ground_speed
+    ):
         return []
     shown = f"is {pair.factor:.3g} times as fast as the positions change{guess(pair.factor)}"
     return [_finding(log, names[2], "unit", f"{shown}; correct its unit")]
-
-
-GROUND_SPEED = 1.6
-"""Factor between a velocity and the way in the same time that a winding course does not explain."""
 
 
 def _turning(log: Log) -> list[Finding]:
@@ -254,12 +265,12 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
         others = [p[1] for k, p in pairs.items() if k != key]
         twin = next((o for o in others if _alike(rate_agreement(log, integral, o, scale))), None)
         cosine = 0.0 if own is None else own.cosine
-        if twin is not None and abs(cosine) < UNLIKE and span(log, (rate,)) is not None:
+        if twin is not None and abs(cosine) < FRAME_LIMITS.unlike and span(log, (rate,)) is not None:
             text = f"has nothing in common with {what} {integral} (cosine {cosine:.2f}), which {twin} follows"
             found.append(_finding(log, rate, "swap", f"{text}; these two are swapped"))
         elif own is None:
             continue
-        elif abs(own.cosine) > ALIKE and abs(own.factor - 1.0) > FACTOR_TOLERANCE:
+        elif abs(own.cosine) > FRAME_LIMITS.alike and abs(own.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
             kind = "frame" if own.factor < 0.0 else "unit"
             found.append(
                 _finding(
@@ -271,7 +282,7 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
                     f"as fast{guess(own.factor)}; correct one of the two",
                 )
             )
-        elif abs(own.cosine) < UNLIKE and own.series < 0.2 * own.reference:
+        elif abs(own.cosine) < FRAME_LIMITS.unlike and own.series < 0.2 * own.reference:
             found.append(
                 _finding(
                     log,
@@ -285,7 +296,9 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
 
 
 def _alike(pair: Agreement | None) -> bool:
-    return pair is not None and pair.cosine > ALIKE and abs(pair.factor - 1.0) < FACTOR_TOLERANCE
+    return (
+        pair is not None and pair.cosine > FRAME_LIMITS.alike and abs(pair.factor - 1.0) < FRAME_LIMITS.factor_tolerance
+    )
 
 
 def wheel_means(log: Log, windows: np.ndarray, corners: Sequence[str], kind: str) -> np.ndarray | None:
@@ -365,13 +378,6 @@ def _left_right(log: Log) -> list[Finding]:
     return []
 
 
-UNKNOWN_YAW = 60.0
-"""Standard deviation of the IMU's mounting about z, deg, from which its yaw tells no heading."""
-
-_LEVEL = 2.0
-"""deg of pitch up to which no rover slides back on its own."""
-
-
 def _climbs(log: Log, windows: np.ndarray, spin: np.ndarray) -> np.ndarray:
     """Windows in which the wheels drive uphill while the rover, as far as its altitude is known, does not rise.
 
@@ -381,7 +387,7 @@ def _climbs(log: Log, windows: np.ndarray, spin: np.ndarray) -> np.ndarray:
     limits = span(log, ("pitch_deg",))
     if limits is None or limits[0] > windows[0] or limits[1] < windows[-1]:
         return np.zeros(len(windows) - 1, bool)
-    uphill = -means(log, "pitch_deg", windows) * np.sign(spin) > _LEVEL
+    uphill = -means(log, "pitch_deg", windows) * np.sign(spin) > FRAME_LIMITS.level
     height = span(log, ("position_z_m",))
     if height is None or height[0] > windows[0] or height[1] < windows[-1]:
         return uphill
@@ -404,7 +410,7 @@ def _course(log: Log) -> list[Finding]:
     heading = np.radians(means(log, "yaw_deg", windows))
     along, across = east * np.cos(heading) + north * np.sin(heading), north * np.cos(heading) - east * np.sin(heading)
     off = np.degrees(np.arctan2(across * np.sign(spin), along * np.sign(spin)))
-    if log.imu.attitude and log.imu.mounting_std_deg[2] > UNKNOWN_YAW and keep.any():
+    if log.imu.attitude and log.imu.mounting_std_deg[2] > FRAME_LIMITS.unknown_yaw and keep.any():
         # yaw counts from nowhere: only that the difference stays the same can be asked
         zero = np.degrees(np.angle(np.mean(np.exp(1j * np.radians(off[keep])))))
         off = (off - zero + 180.0) % 360.0 - 180.0
@@ -412,7 +418,7 @@ def _course(log: Log) -> list[Finding]:
     if keep.sum() < 5:
         return []
     off = off[keep]
-    if np.median(np.abs(off)) < COURSE_TOLERANCE:
+    if np.median(np.abs(off)) < FRAME_LIMITS.course_tolerance:
         return []
     return [
         _finding(

@@ -7,20 +7,30 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lunar_mjx.logs.checks.frames import ALIKE, FACTOR_TOLERANCE, UNLIKE, _finding, rate_agreement
+from lunar_mjx.logs.checks.frames import FRAME_LIMITS, _finding, rate_agreement
 from lunar_mjx.logs.findings import WARNING, Finding, is_bad
 from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.schema import CORNERS, SIDES
 from lunar_mjx.logs.series import agreement, at, continuous, edges, guess, means, sigma, span
 
-CROSSED = 3.0
-"""By how much two joints must fit each other's partner better than their own, before they count as swapped."""
 
-MANY = 5.0
-"""Factor between a command and what follows it that no controller leaves, but a unit does."""
+@dataclasses.dataclass(frozen=True)
+class MotorLimits:
+    """What the checks of motors tolerate."""
 
-LEAST_RESISTANCE = 0.02
-"""ohm, of any motor of a rover with its cables; less means that the current is in mA."""
+    crossed: float = 3.0
+    """By how much two joints must fit each other's partner better than their own, before they count as swapped."""
+    many: float = 5.0
+    """Factor between a command and what follows it that no controller leaves, but a unit does."""
+    least_resistance: float = 0.02
+    """ohm, of any motor of a rover with its cables; less means that the current is in mA."""
+    # Cosine between a motor's current and its wheel's speed below which the motor seems to brake all the way; deg of
+    # pitch beyond which it may.
+    against: float = -0.8
+    downhill: float = 2.0
+
+
+MOTOR_LIMITS = MotorLimits()
 
 
 def check_motors(log: Log) -> list[Finding]:
@@ -40,11 +50,6 @@ def _present(log: Log, pattern: str) -> dict[str, str]:
     return {c: n for c, n in names.items() if continuous(log, n) is not None}
 
 
-AGAINST, DOWNHILL = -0.8, 2.0
-"""Cosine between a motor's current and its wheel's speed below which the motor seems to brake all the way; deg of pitch
-beyond which it may."""
-
-
 def _against(log: Log) -> list[Finding]:
     """Currents with a sign: a driven rover takes power, so that current and speed have the same sign on average.
 
@@ -59,11 +64,11 @@ def _against(log: Log) -> list[Finding]:
         windows = edges(*limits)
         i, w = means(log, name, windows), means(log, speed[c], windows)
         pitch = means(log, "pitch_deg", windows) if span(log, ("pitch_deg",)) == limits else np.zeros(len(i))
-        keep = (np.abs(w) > 0.05) & (np.sign(w) * pitch < DOWNHILL)
+        keep = (np.abs(w) > 0.05) & (np.sign(w) * pitch < MOTOR_LIMITS.downhill)
         if keep.sum() < 8:
             continue
         cosine = float(i[keep] @ w[keep] / max(np.linalg.norm(i[keep]) * np.linalg.norm(w[keep]), 1e-12))
-        if cosine < AGAINST:
+        if cosine < MOTOR_LIMITS.against:
             text = f"is negative where {speed[c]} is positive (cosine {cosine:.2f}), as if the motor braked all the way"
             problem = _finding(log, name, "frame", f"{text}; correct its sign if it drove")
             found.append(dataclasses.replace(problem, severity=WARNING))
@@ -89,7 +94,9 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
         # one command tells neither sign nor unit: a controller may scale it down, or trade the sides' speeds for a turn
         if pair is None or mine is None or other is None or len(np.unique(mine[mine != 0.0])) < 2:
             continue
-        if pair.cosine > 0.95 and (pair.factor > MANY or 0.01 < pair.factor < 1.0 / (4.0 * MANY)):
+        if pair.cosine > 0.95 and (
+            pair.factor > MOTOR_LIMITS.many or 0.01 < pair.factor < 1.0 / (4.0 * MOTOR_LIMITS.many)
+        ):
             found.append(
                 _finding(
                     log,
@@ -98,7 +105,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
                     f"is {pair.factor:.3g} times its command{guess(pair.factor)}; correct its unit, or the command's",
                 )
             )
-        elif pair.cosine < -ALIKE and _together(mine, other) < -UNLIKE:
+        elif pair.cosine < -FRAME_LIMITS.alike and _together(mine, other) < -FRAME_LIMITS.unlike:
             found.append(
                 _finding(
                     log,
@@ -140,7 +147,11 @@ def _swapped(
             apart = float(np.sqrt(np.nanmean((wanted[a] - wanted[b]) ** 2)))
             noise = max(sigma(log, names[a]), sigma(log, names[b]), 1e-3)
             own, crossed = max(miss(a, a), 1e-12) + miss(b, b), miss(a, b) + miss(b, a)
-            if apart > 5.0 * noise and min(miss(a, a), miss(b, b)) > 0.5 * apart and own > CROSSED * crossed:
+            if (
+                apart > 5.0 * noise
+                and min(miss(a, a), miss(b, b)) > 0.5 * apart
+                and own > MOTOR_LIMITS.crossed * crossed
+            ):
                 found.append(
                     _finding(
                         log,
@@ -162,7 +173,7 @@ def _angles(log: Log, kind: str) -> list[Finding]:
         pair = rate_agreement(log, angle, speeds[c]) if c in speeds else None
         if pair is None or (kind != "drive" and pair.reference < 0.02):
             continue
-        if abs(pair.cosine) > ALIKE and abs(pair.factor - 1.0) > FACTOR_TOLERANCE:
+        if abs(pair.cosine) > FRAME_LIMITS.alike and abs(pair.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
             found.append(
                 _finding(
                     log,
@@ -172,7 +183,7 @@ def _angles(log: Log, kind: str) -> list[Finding]:
                     f"{guess(pair.factor)}; correct one of the two",
                 )
             )
-        elif pair.cosine < UNLIKE:
+        elif pair.cosine < FRAME_LIMITS.unlike:
             found.append(
                 _finding(
                     log,
@@ -239,7 +250,7 @@ def _electric(log: Log, kind: str) -> list[Finding]:
                     f"V s/rad): it is swapped with {current[c]}, or has the wrong sign",
                 )
             )
-        elif 0.0 < resistance < LEAST_RESISTANCE and resistance > 20.0 * error_r:
+        elif 0.0 < resistance < MOTOR_LIMITS.least_resistance and resistance > 20.0 * error_r:
             found.append(
                 _finding(
                     log,
@@ -279,7 +290,9 @@ def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, tuple[np.
         for b in corners[i + 1 :]:
             pairs = [(miss(a, a), miss(a, b)), (miss(b, b), miss(b, a))]
             apart = float(np.sqrt(np.mean((data[a][1] - data[b][1]) ** 2)))
-            if apart > 5.0 * sigma(log, names[a]) and all(own > CROSSED * crossed for own, crossed in pairs):
+            if apart > 5.0 * sigma(log, names[a]) and all(
+                own > MOTOR_LIMITS.crossed * crossed for own, crossed in pairs
+            ):
                 found.append(
                     _finding(
                         log,

@@ -2,42 +2,44 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
 from scipy import stats
 
-from lunar_mjx.logs.checks.values import CHANCE, quantum
+from lunar_mjx.logs.checks.values import VALUE_LIMITS, quantum
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, Noise
 from lunar_mjx.logs.schema import is_command, is_quantity
 
-FACTOR = 2.0
-"""A stated noise that is wrong by less than this does not mislead; the data sheets themselves are no better."""
 
-QUIETER = 3.5
-"""The same for noise smaller than stated, and only where the rest shows white noise: of noise that is nine tenths slow,
-spans of a few seconds show a third."""
+@dataclasses.dataclass(frozen=True)
+class NoiseLimits:
+    """How rest is found in a log, and by how much its noise may differ from what is stated."""
 
-SETTLE = 2.0
-"""Seconds after a command has changed in which a rover still rocks."""
+    factor: float = 2.0
+    """A stated noise that is wrong by less than this does not mislead; the data sheets themselves are no better."""
+    quieter: float = 3.5
+    """The same for noise smaller than stated, and only where the rest shows white noise: of noise that is nine tenths
+    slow, spans of a few seconds show a third."""
+    settle: float = 2.0
+    """Seconds after a command has changed in which a rover still rocks."""
+    still: float = 0.02
+    """rad/s: a wheel of 0.25 m that turns slower moves by less than 5 mm/s."""
+    longest: float = 8.0
+    """Seconds of rest taken together, over which a parabola follows whatever creeps or cools."""
+    white: float = 0.15
+    """Largest correlation of neighbouring samples that passes for white noise."""
+    shortest: float = 1.2
+    """s; shortest rest that is used: twice `margin`, and as much again for the noise itself."""
+    margin: float = 0.3
+    """Seconds at both ends of a rest in which filters and difference quotients still see the motion beside it."""
+    fewest: int = 20
+    """Samples of rest below which no noise is estimated: its standard deviation would be off by a sixth or more."""
 
-STILL = 0.02
-"""rad/s: a wheel of 0.25 m that turns slower moves by less than 5 mm/s."""
 
-LONGEST = 8.0
-"""Seconds of rest taken together, over which a parabola follows whatever creeps or cools."""
-
-WHITE = 0.15
-"""Largest correlation of neighbouring samples that passes for white noise."""
-
-SHORTEST = 1.2
-"""s; shortest rest that is used: twice `MARGIN`, and as much again for the noise itself."""
-MARGIN = 0.3
-"""Seconds at both ends of a rest in which filters and difference quotients still see the motion beside it."""
-
-FEWEST = 20
-"""Samples of rest below which no noise is estimated: its standard deviation would be off by a sixth or more."""
+NOISE_LIMITS = NoiseLimits()
 
 
 def rest_segments(log: Log) -> list[tuple[float, float]]:
@@ -53,11 +55,11 @@ def rest_segments(log: Log) -> list[tuple[float, float]]:
     for name in log.channel_names:
         if is_quantity(name, "joint_speed"):
             found = log.channel(name)
-            if found is None or len(found[0]) < FEWEST:
+            if found is None or len(found[0]) < NOISE_LIMITS.fewest:
                 continue
             noise = log.noise[name].std if name in log.noise else 0.0
             speed = np.interp(grid, found[0], np.abs(_medians(found[1])))
-            rest &= speed < max(STILL, noise)
+            rest &= speed < max(NOISE_LIMITS.still, noise)
     return _spans(grid, rest)
 
 
@@ -75,7 +77,7 @@ def _quiet_command(log: Log, name: str, grid: np.ndarray) -> np.ndarray:
     held = values[np.maximum(np.searchsorted(time, grid + 1e-6, side="right") - 1, 0)]
     quiet = np.ones(len(grid), bool) if is_quantity(name, "command_angle") else held == 0.0
     for when in time[1:][np.diff(values) != 0.0]:
-        quiet &= (grid < when) | (grid > when + SETTLE)
+        quiet &= (grid < when) | (grid > when + NOISE_LIMITS.settle)
     return quiet
 
 
@@ -85,10 +87,13 @@ def _spans(grid: np.ndarray, rest: np.ndarray) -> list[tuple[float, float]]:
     spans = []
     for first, last in zip(starts, ends, strict=True):
         low, high = float(grid[first]), float(grid[last - 1])
-        low, high = low + (SETTLE if first == 0 else MARGIN), high - MARGIN  # a log may begin in motion
-        pieces = max(1, int(np.ceil((high - low) / LONGEST)))
+        low, high = (
+            low + (NOISE_LIMITS.settle if first == 0 else NOISE_LIMITS.margin),
+            high - NOISE_LIMITS.margin,
+        )  # a log may begin in motion
+        pieces = max(1, int(np.ceil((high - low) / NOISE_LIMITS.longest)))
         cuts = np.linspace(low, high, pieces + 1)
-        spans += [(float(a), float(b)) for a, b in itertools.pairwise(cuts) if b - a >= SHORTEST]
+        spans += [(float(a), float(b)) for a, b in itertools.pairwise(cuts) if b - a >= NOISE_LIMITS.shortest]
     return spans
 
 
@@ -106,7 +111,7 @@ def rest_noise(log: Log, name: str, spans: list[tuple[float, float]]) -> tuple[f
     squares = products = count = freedom = pairs = 0.0
     for low, high in spans:
         keep = (time >= low) & (time <= high)
-        if keep.sum() < FEWEST:
+        if keep.sum() < NOISE_LIMITS.fewest:
             continue
         t = 2.0 * (time[keep] - low) / (high - low) - 1.0
         residual = values[keep] - np.polynomial.polynomial.polyval(
@@ -115,7 +120,7 @@ def rest_noise(log: Log, name: str, spans: list[tuple[float, float]]) -> tuple[f
         squares += float(residual @ residual)
         products += float(residual[1:] @ residual[:-1])
         count, freedom, pairs = count + len(t), freedom + len(t) - 3, pairs + len(t) - 1
-    if freedom < FEWEST - 3 or squares == 0.0:
+    if freedom < NOISE_LIMITS.fewest - 3 or squares == 0.0:
         return None
     correlation = float(np.clip(products / pairs / (squares / count), 0.0, 0.98))
     # variance of a variance under AR(1): as from n (1 - rho^2)/(1 + rho^2) independent samples
@@ -124,7 +129,7 @@ def rest_noise(log: Log, name: str, spans: list[tuple[float, float]]) -> tuple[f
 
 
 def check_noise(log: Log) -> list[Finding]:
-    """Channels whose noise at rest contradicts the stated one by more than `FACTOR`, beyond chance."""
+    """Channels whose noise at rest contradicts the stated one by more than `NOISE_LIMITS.factor`, beyond chance."""
     spans = rest_segments(log)
     if not spans:
         return []
@@ -150,13 +155,13 @@ def _contradiction(log: Log, name: str, noise: Noise, std: float, correlation: f
     if noise.correlation_time_s > 0.0 or correlation > 0.5:
         independent = min(independent, 10.0)  # spans of a few seconds hold few correlation times
     statistic, freedom = independent * ratio**2, independent
-    if ratio > FACTOR and stats.chi2.sf(statistic, freedom) < CHANCE:
+    if ratio > NOISE_LIMITS.factor and stats.chi2.sf(statistic, freedom) < VALUE_LIMITS.chance:
         side = "is noisier than stated"
     elif (
-        ratio < 1.0 / QUIETER
-        and correlation < WHITE
+        ratio < 1.0 / NOISE_LIMITS.quieter
+        and correlation < NOISE_LIMITS.white
         and step < noise.std
-        and stats.chi2.cdf(statistic, freedom) < CHANCE
+        and stats.chi2.cdf(statistic, freedom) < VALUE_LIMITS.chance
     ):
         side = "is quieter than stated"
     else:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from lunar_mjx.logs.checks.noise import FACTOR
-from lunar_mjx.logs.checks.values import CHANCE
+from lunar_mjx.logs.checks.noise import NOISE_LIMITS
+from lunar_mjx.logs.checks.values import VALUE_LIMITS
 from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import SteadyLog
 from lunar_mjx.logs.schema import STEADY_CHANNELS
@@ -41,7 +41,7 @@ def _copies(log: SteadyLog) -> list[Finding]:
     _, first, count = np.unique(measured, axis=0, return_index=True, return_counts=True)
     trivial = np.all(measured[first] == 0.0, axis=1)
     copies = int((count - 1)[~trivial].sum())
-    if not copies or stats.poisson.sf(copies - 1, _coincidences(log)) >= CHANCE:
+    if not copies or stats.poisson.sf(copies - 1, _coincidences(log)) >= VALUE_LIMITS.chance:
         return []
     original = int(first[np.argmax((count > 1) & ~trivial)])
     copy = int(np.flatnonzero((measured == measured[original]).all(axis=1))[1])
@@ -224,14 +224,19 @@ def _replicates(log: SteadyLog) -> list[Finding]:
         # a correction for unequal stated noise within a group would change this by less than the factor allows
         statistic = float(residual @ residual)
         ratio = float(np.sqrt(statistic / freedom))
-        high, low = stats.chi2.sf(statistic, freedom) < CHANCE, stats.chi2.cdf(statistic, freedom) < CHANCE
+        high, low = (
+            stats.chi2.sf(statistic, freedom) < VALUE_LIMITS.chance,
+            stats.chi2.cdf(statistic, freedom) < VALUE_LIMITS.chance,
+        )
         # A wrong statement is wrong at most points: where noise differs between points the median point tells.
         usual = _scatter_of_median_point(residual, group, count)
         several = count > 1
         squares = np.bincount(group, weights=(values - mean[group]) ** 2)[several]
         level = np.sqrt(np.bincount(group, weights=stated**2) / count)[several]
         honest = grows(squares, count[several] - 1, mean[several], level)
-        if (min(ratio, usual) > FACTOR and high and not honest) or (max(ratio, usual) < 1.0 / FACTOR and low):
+        if (min(ratio, usual) > NOISE_LIMITS.factor and high and not honest) or (
+            max(ratio, usual) < 1.0 / NOISE_LIMITS.factor and low
+        ):
             worst = int(np.argmax(np.abs(residual))) if ratio > 1.0 else None
             found.append(
                 _finding(

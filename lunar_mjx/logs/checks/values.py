@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 
 from lunar_mjx.logs.apply import environment_value
-from lunar_mjx.logs.checks.clock import LOST_SHARE
+from lunar_mjx.logs.checks.clock import CLOCK_LIMITS
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, LogTable
 from lunar_mjx.logs.schema import MIRROR, find_channel, is_command, is_quantity, limits
 from lunar_mjx.logs.series import sigma
 
-CHANCE = 1e-6
-"""Largest probability of a finding on a good channel."""
 
-SHORTEST_RUN = 20
-"""Equal samples in a row that may be chance, whatever the rest of the channel looks like."""
+@dataclasses.dataclass(frozen=True)
+class ValueLimits:
+    """What the checks of single values tolerate."""
 
-CLIPPED_SHARE = 0.02
-"""Share of samples exactly at the extreme value; with noise of two quanta or more a good channel has a few."""
+    chance: float = 1e-6
+    """Largest probability of a finding on a good channel."""
+    shortest_run: int = 20
+    """Equal samples in a row that may be chance, whatever the rest of the channel looks like."""
+    clipped_share: float = 0.02
+    """Share of samples exactly at the extreme value; with noise of two quanta or more a good channel has a few."""
+    far_from_ambient: float = 200.0
+    """K between a motor at the log's start and its surroundings: 273 is kelvin for Celsius, no motor is that hot."""
+    by_chance: float = 2.5
+    """Standard deviations by which a share of few cells may exceed `CLOCK_LIMITS.lost_share` by chance."""
+    evenly: float = 0.8
+    """Share of the distances between filled cells that must be one and the same for a column of a slower sensor."""
+    still: float = 0.02
+    """rad/s of a wheel that counts as standing: a wheel of 0.25 m then moves by less than 5 mm/s."""
 
-FAR_FROM_AMBIENT = 200.0
-"""K between a motor at the log's start and its surroundings: 273 is kelvin for Celsius, no motor is that hot."""
-_BY_CHANCE = 2.5
-"""Standard deviations by which a share of few cells may exceed `LOST_SHARE` by chance."""
+
+VALUE_LIMITS = ValueLimits()
 
 
 def check_values(log: Log) -> list[Finding]:
@@ -48,14 +58,14 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
     if not there.any():
         return finding(None, "dropout", "is empty; leave the column out")
     # a short table whose sensor loses fewer cells than that may still have lost more by chance
-    chance = _BY_CHANCE * np.sqrt(LOST_SHARE * (1.0 - LOST_SHARE) / len(there))
-    if (share := _lost(there)) > LOST_SHARE + chance:
+    chance = VALUE_LIMITS.by_chance * np.sqrt(CLOCK_LIMITS.lost_share * (1.0 - CLOCK_LIMITS.lost_share) / len(there))
+    if (share := _lost(there)) > CLOCK_LIMITS.lost_share + chance:
         return finding(
             int(np.argmin(there)),
             "dropout",
             f"is empty in {100 * share:.0f} % of its rows (at most "
-            f"{100 * (LOST_SHARE + chance):.0f} % may be); record it anew, leave the column out or, if its sensor only "
-            "reports now and then, give it a table of its own with on_change = true",
+            f"{100 * (CLOCK_LIMITS.lost_share + chance):.0f} % may be); record it anew, leave the column out or, if "
+            "its sensor only reports now and then, give it a table of its own with on_change = true",
         )
     low, high, why = limits(name)
     beyond = there & ((values < low) | (values > high))
@@ -101,13 +111,13 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
 def _kelvin(log: Log, values: np.ndarray) -> str:
     ambient = environment_value(log, "ambient_temperature_degC")
     start = float(np.median(values[:5]))
-    if ambient is not None and ambient < 150.0 and abs(start - ambient) > FAR_FROM_AMBIENT:
+    if ambient is not None and ambient < 150.0 and abs(start - ambient) > VALUE_LIMITS.far_from_ambient:
         hint = " (looks like kelvin)" if abs(start - 273.15 - ambient) < 100.0 else ""
         return (
             f"starts at {start:.4g} degC where the surroundings have {ambient:g} degC{hint}; give degrees Celsius, "
             "or call the column by its unit"
         )
-    if ambient is None and float(values.min()) > FAR_FROM_AMBIENT:
+    if ambient is None and float(values.min()) > VALUE_LIMITS.far_from_ambient:
         return f"never falls below {values.min():.4g} degC (looks like kelvin); give degrees Celsius"
     return ""
 
@@ -120,25 +130,18 @@ def quantum(values: np.ndarray) -> float:
     return float(steps.min()) if steps.size else 0.0
 
 
-EVENLY = 0.8
-"""Share of the distances between filled cells that must be one and the same for a column of a slower sensor."""
-
-
 def _lost(there: np.ndarray) -> float:
     """Share of a column's samples that are lost: of all rows, or of every k-th where a slower sensor fills these."""
     rows = np.flatnonzero(there)
     distances = np.diff(rows)
     every = int(np.median(distances)) if distances.size else 1
-    if every < 2 or float((distances == every).mean()) < EVENLY:
+    if every < 2 or float((distances == every).mean()) < VALUE_LIMITS.evenly:
         return float(1.0 - there.mean())
     return max(0.0, 1.0 - len(rows) * every / len(there))
 
 
 MOVED = ("position", "attitude", "velocity", "joint")
 """Families of channels that tell motion, and may stand still exactly where there is none."""
-
-STILL = 0.02
-"""rad/s of a wheel that counts as standing: a wheel of 0.25 m then moves by less than 5 mm/s."""
 
 
 def _judged(log: Log, table: LogTable, name: str, there: np.ndarray) -> np.ndarray:
@@ -160,7 +163,7 @@ def _judged(log: Log, table: LogTable, name: str, there: np.ndarray) -> np.ndarr
         after = np.searchsorted(time, table.common_time_s, side="left")
         last = len(time) - 1
         before, after = np.clip(after - 1, 0, last), np.clip(after, 0, last)
-        moving |= np.minimum(np.abs(speed[before]), np.abs(speed[after])) > STILL
+        moving |= np.minimum(np.abs(speed[before]), np.abs(speed[after])) > VALUE_LIMITS.still
     return moving
 
 
@@ -177,7 +180,7 @@ def _stuck(
 ) -> tuple[int, int, float] | None:
     """Start, length and value of a run that noise rules out, or that its siblings contradict."""
     first, length = longest_run(values, judged)
-    if length < SHORTEST_RUN:
+    if length < VALUE_LIMITS.shortest_run:
         return None
     noise = sigma(log, name)
     step = quantum(values) or _siblings_quantum(table, name)
@@ -195,7 +198,7 @@ def _possible_run(noise: float, step: float, count: int) -> float:
     """
     inside = math.erf(0.5 * step / (np.sqrt(0.1) * noise * np.sqrt(2.0)))
     same = min(inside**2 + 0.5 * (1.0 - inside) ** 2, 1.0 - 1e-12)
-    return max(SHORTEST_RUN, math.log(CHANCE / count) / math.log(max(same, 1e-3)))
+    return max(VALUE_LIMITS.shortest_run, math.log(VALUE_LIMITS.chance / count) / math.log(max(same, 1e-3)))
 
 
 def _siblings(table: LogTable, name: str) -> list[np.ndarray]:
@@ -230,6 +233,6 @@ def _clipped(log: Log, name: str, values: np.ndarray) -> float | None:
         count = int((values == extreme).sum())
         # slow noise stays at its extreme for a while too, but then its neighbours are as frequent
         beside = int((np.abs(values - extreme) < 1.5 * step).sum()) - count
-        if count >= max(10, CLIPPED_SHARE * len(values), 5 * beside):
+        if count >= max(10, VALUE_LIMITS.clipped_share * len(values), 5 * beside):
             return extreme
     return None

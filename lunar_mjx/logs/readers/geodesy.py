@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
-SEMI_MAJOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
-"""WGS84 ellipsoid (NIMA TR8350.2, 2000)."""
-_E2 = FLATTENING * (2.0 - FLATTENING)
-_UTM_SCALE, _UTM_FALSE_EASTING, _UTM_FALSE_NORTHING_SOUTH = 0.9996, 500000.0, 1e7
-"""1, m, m; scale on the central meridian and false origin of the UTM grid, by its definition."""
+
+@dataclasses.dataclass(frozen=True)
+class Ellipsoid:
+    """The ellipsoid WGS 84, and the numbers of its UTM projection."""
+
+    # WGS84 ellipsoid (NIMA TR8350.2, 2000).
+    semi_major_m: float = 6378137.0
+    flattening: float = 1.0 / 298.257223563
+    # 1, m, m; scale on the central meridian and false origin of the UTM grid, by its definition.
+    utm_scale: float = 0.9996
+    utm_false_easting: float = 500000.0
+    utm_false_northing_south: float = 10000000.0
+
+
+WGS84 = Ellipsoid()
+
+_E2 = WGS84.flattening * (2.0 - WGS84.flattening)
 
 
 def tangent_plane(
@@ -32,7 +46,7 @@ def tangent_plane(
 
 
 def _earth_centred(latitude: np.ndarray, longitude: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    normal = SEMI_MAJOR_M / np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
+    normal = WGS84.semi_major_m / np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
     return (
         normal * np.cos(latitude) * np.cos(longitude),
         normal * np.cos(latitude) * np.sin(longitude),
@@ -55,8 +69,8 @@ def utm(latitude_deg: np.ndarray, longitude_deg: np.ndarray, zone: int) -> tuple
       latitude_deg, longitude_deg: of any shape; northern and southern points get the false northing of their own.
       zone: 1 to 60.
     """
-    n = FLATTENING / (2.0 - FLATTENING)
-    radius = SEMI_MAJOR_M / (1.0 + n) * (1.0 + n**2 / 4.0 + n**4 / 64.0)
+    n = WGS84.flattening / (2.0 - WGS84.flattening)
+    radius = WGS84.semi_major_m / (1.0 + n) * (1.0 + n**2 / 4.0 + n**4 / 64.0)
     alpha = (n / 2.0 - 2.0 * n**2 / 3.0 + 5.0 * n**3 / 16.0, 13.0 * n**2 / 48.0 - 3.0 * n**3 / 5.0, 61.0 * n**3 / 240.0)
     phi = np.radians(latitude_deg)
     lam = np.radians(np.asarray(longitude_deg) - (6.0 * zone - 183.0))
@@ -68,6 +82,6 @@ def utm(latitude_deg: np.ndarray, longitude_deg: np.ndarray, zone: int) -> tuple
     eta0 = np.arcsinh(np.sin(lam) / np.hypot(conformal, np.cos(lam)))
     xi = xi0 + sum(a * np.sin(2 * k * xi0) * np.cosh(2 * k * eta0) for k, a in enumerate(alpha, 1))
     eta = eta0 + sum(a * np.cos(2 * k * xi0) * np.sinh(2 * k * eta0) for k, a in enumerate(alpha, 1))
-    easting = _UTM_FALSE_EASTING + _UTM_SCALE * radius * eta
-    south = np.where(np.asarray(latitude_deg) < 0.0, _UTM_FALSE_NORTHING_SOUTH, 0.0)
-    return easting, south + _UTM_SCALE * radius * xi
+    easting = WGS84.utm_false_easting + WGS84.utm_scale * radius * eta
+    south = np.where(np.asarray(latitude_deg) < 0.0, WGS84.utm_false_northing_south, 0.0)
+    return easting, south + WGS84.utm_scale * radius * xi

@@ -6,23 +6,35 @@ import dataclasses
 
 import numpy as np
 
-FEWEST_CHANGES = 6
-"""Renewals below which nothing is said: a channel that hardly ever changes may just be steady."""
-SLOWER = 1.5
-"""A channel is held only if its typical change comes later than this many rows."""
-REGULAR, ON_TIME = 0.15, 0.75
-"""Renewals are regular if `ON_TIME` of the time lies in intervals within `REGULAR` of whole multiples of one period, of
-at least `REGULAR_ROWS` rows: of intervals at random a third would."""
-REGULAR_ROWS = 3.0
-SPACED, SPACED_MOST, SPACED_SIGMA = 0.5, 5, 5.0
-"""Changes keep a distance if one is followed by another in the next row less than `SPACED` times as often as in one of
-the rows up to `SPACED_MOST` after it, by `SPACED_SIGMA` standard deviations: a slower sensor's readings do."""
-RAMP = 0.8
-"""A channel in few digits that rises or falls steadily changes at steady times, too: by one step, in one direction, in
-more than this share of its changes."""
-COARSE = 8.0
-"""Typical change in steps of the channel's resolution from which an exact repeat is no chance: below, a channel written
-in few digits repeats itself honestly."""
+
+@dataclasses.dataclass(frozen=True)
+class HeldReadings:
+    """How readings that a recorder repeats are told from readings of their own."""
+
+    fewest_changes: int = 6
+    """Renewals below which nothing is said: a channel that hardly ever changes may just be steady."""
+    slower: float = 1.5
+    """A channel is held only if its typical change comes later than this many rows."""
+    # Renewals are regular if `on_time` of the time lies in intervals within `regular` of whole multiples of one
+    # period, of at least `regular_rows` rows: of intervals at random a third would.
+    regular: float = 0.15
+    on_time: float = 0.75
+    regular_rows: float = 3.0
+    # Changes keep a distance if one is followed by another in the next row less than `spaced` times as often as in
+    # one of the rows up to `spaced_most` after it, by `spaced_sigma` standard deviations: a slower sensor's readings
+    # do.
+    spaced: float = 0.5
+    spaced_most: int = 5
+    spaced_sigma: float = 5.0
+    ramp: float = 0.8
+    """A channel in few digits that rises or falls steadily changes at steady times, too: by one step, in one direction,
+    in more than this share of its changes."""
+    coarse: float = 8.0
+    """Typical change in steps of the channel's resolution from which an exact repeat is no chance: below, a channel
+    written in few digits repeats itself honestly."""
+
+
+HELD_READINGS = HeldReadings()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,29 +66,29 @@ def held_samples(time: np.ndarray, values: np.ndarray, recurs: bool = True) -> H
     """
     there = np.isfinite(values).all(axis=1) & np.isfinite(time)
     rows = np.flatnonzero(there)
-    if len(rows) < 3 * FEWEST_CHANGES:
+    if len(rows) < 3 * HELD_READINGS.fewest_changes:
         return None
     t, v = time[rows], values[rows]
     step = float(np.median(np.diff(t)))
     changed = np.concatenate([[True], (np.diff(v, axis=0) != 0.0).any(axis=1)])
     at = np.flatnonzero(changed)
-    if len(at) < FEWEST_CHANGES + 1 or step <= 0.0:
+    if len(at) < HELD_READINGS.fewest_changes + 1 or step <= 0.0:
         return None
     intervals = np.diff(t[at])
     # while a rover stands its speeds are 0 and its fixes the same: those intervals tell nothing of the sensor
     moving = (v[at[:-1]] != 0.0).any(axis=1)
     intervals = intervals[moving & (intervals > 0.0)]
-    if len(intervals) < FEWEST_CHANGES or all(_is_ramp(column) for column in v.T):
+    if len(intervals) < HELD_READINGS.fewest_changes or all(_is_ramp(column) for column in v.T):
         return None
     middle = _weighted_median(intervals)
-    if middle < SLOWER * step:
+    if middle < HELD_READINGS.slower * step:
         return None
     # readings that happen to be equal make an interval twice as long: the shortest period that fits is the sensor's
     candidates = sorted([*np.quantile(intervals, (0.1, 0.25, 0.5)), middle])
     period = next((float(c) for c in candidates if _regular(intervals, float(c), step)), None)
     if period is None:
         period = float(np.median(intervals))
-        if period < SLOWER * step or not (_fine(v) or _spaced(changed)):
+        if period < HELD_READINGS.slower * step or not (_fine(v) or _spaced(changed)):
             return None
     else:
         period = float(np.median(intervals[np.round(intervals / period) == 1.0]))
@@ -99,23 +111,25 @@ def _weighted_median(intervals: np.ndarray) -> float:
 
 
 def _regular(intervals: np.ndarray, period: float, step: float) -> bool:
-    if period < REGULAR_ROWS * step:
+    if period < HELD_READINGS.regular_rows * step:
         return False
     multiple = intervals / period
-    near = np.abs(multiple - np.round(multiple)) < REGULAR * np.maximum(np.round(multiple), 1.0)
+    near = np.abs(multiple - np.round(multiple)) < HELD_READINGS.regular * np.maximum(np.round(multiple), 1.0)
     near &= np.round(multiple) >= 1.0
-    return int(near.sum()) >= FEWEST_CHANGES and float(intervals[near].sum()) > ON_TIME * float(intervals.sum())
+    return int(near.sum()) >= HELD_READINGS.fewest_changes and float(
+        intervals[near].sum()
+    ) > HELD_READINGS.on_time * float(intervals.sum())
 
 
 def _spaced(changed: np.ndarray) -> bool:
     """Whether changes keep a distance of two rows or more from each other."""
-    at = np.flatnonzero(changed[:-SPACED_MOST])
+    at = np.flatnonzero(changed[: -HELD_READINGS.spaced_most])
     if len(at) < 30:
         return False
-    after = np.array([changed[at + lag].mean() for lag in range(1, SPACED_MOST + 1)])
+    after = np.array([changed[at + lag].mean() for lag in range(1, HELD_READINGS.spaced_most + 1)])
     most = float(after.max())
     error = np.sqrt(most * (1.0 - most) / len(at)) + 1e-12
-    return after[0] < SPACED * most and most - after[0] > SPACED_SIGMA * error
+    return after[0] < HELD_READINGS.spaced * most and most - after[0] > HELD_READINGS.spaced_sigma * error
 
 
 def _is_ramp(column: np.ndarray) -> bool:
@@ -127,7 +141,7 @@ def _is_ramp(column: np.ndarray) -> bool:
     size = float(np.abs(jumps).min())
     single = np.abs(jumps) < 1.5 * size
     onwards = np.sign(jumps[1:]) == np.sign(jumps[:-1])
-    return float((single[1:] & single[:-1] & onwards).mean()) > RAMP
+    return float((single[1:] & single[:-1] & onwards).mean()) > HELD_READINGS.ramp
 
 
 def _fine(values: np.ndarray) -> bool:
@@ -140,5 +154,5 @@ def _fine(values: np.ndarray) -> bool:
         steps = steps[steps > 1e-9 * max(1e-12, float(np.abs(column).max()))]
         if jumps.size and steps.size:
             # the smallest of many differences of real numbers is far below any resolution: a low quantile is not
-            found.append(float(np.median(jumps)) > COARSE * float(np.quantile(steps, 0.05)))
+            found.append(float(np.median(jumps)) > HELD_READINGS.coarse * float(np.quantile(steps, 0.05)))
     return bool(found) and all(found)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input, require_finite
-from lunar_mjx.terrain.dem import HIGHEST, LARGEST, Dem, fill_holes, require_cell, require_size, undeclared_nodata
+from lunar_mjx.terrain.dem import DEM_LIMITS, Dem, fill_holes, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions
 
 
@@ -39,7 +39,15 @@ def grid(
     if options.fill:
         heights, filled = fill_holes(heights, source)
         notes = notes + filled
-    return Dem(heights[::-1], cell, x0, y0, source, notes=notes, highest=HIGHEST if options.heights else LARGEST)
+    return Dem(
+        heights[::-1],
+        cell,
+        x0,
+        y0,
+        source,
+        notes=notes,
+        highest=DEM_LIMITS.highest if options.heights else DEM_LIMITS.largest,
+    )
 
 
 def read_asc(path: Path, options: ReadOptions) -> Dem:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,16 +15,24 @@ from lunar_mjx.pytree import pytree
 from lunar_mjx.terrain.dem import Dem
 from lunar_mjx.terrain.heightfield import Points, Scalar, grid_index, take
 
-MOON_RADIUS = 1737.4e3
-"""m; distant ground sinks below a level plane by s^2/(2 R)."""
-BEARINGS = 120
-"""Directions of a horizon, 3 deg apart."""
-PLACES = 32
-"""Places along each side of a terrain for which a horizon is computed, at most."""
-EYE = 0.5
-"""Height above the ground from which it is seen, m: that of a small rover's panels."""
-_GROWTH = 1.02
-"""Ratio of neighbouring distances at which the ground is looked at."""
+
+@dataclasses.dataclass(frozen=True)
+class HorizonGrid:
+    """Where and how finely horizons are sampled."""
+
+    moon_radius: float = 1737.4e3
+    """m; distant ground sinks below a level plane by s^2/(2 R)."""
+    bearings: int = 120
+    """Directions of a horizon, 3 deg apart."""
+    places: int = 32
+    """Places along each side of a terrain for which a horizon is computed, at most."""
+    eye: float = 0.5
+    """Height above the ground from which it is seen, m: that of a small rover's panels."""
+    growth: float = 1.02
+    """Ratio of neighbouring distances at which the ground is looked at."""
+
+
+HORIZON_GRID = HorizonGrid()
 
 
 @pytree
@@ -72,9 +81,9 @@ def compute_horizon(
     ground: Dem,
     around: Sequence[Dem] = (),
     *,
-    places: int = PLACES,
-    bearings: int = BEARINGS,
-    eye: float = EYE,
+    places: int = HORIZON_GRID.places,
+    bearings: int = HORIZON_GRID.bearings,
+    eye: float = HORIZON_GRID.eye,
     dtype: np.dtype | type = np.float32,
 ) -> Horizon:
     """Horizon angles of a terrain: at each place the steepest way up to ground in each direction.
@@ -98,11 +107,13 @@ def compute_horizon(
     for dem in (ground, *around):
         w, s, e, n = dem.bounds
         far = np.hypot(max(e, east) - min(w, west), max(n, north) - min(s, south))
-        steps = dem.cell * _GROWTH ** np.arange(int(np.ceil(np.log(max(far / dem.cell, 2.0)) / np.log(_GROWTH))) + 1)
+        steps = dem.cell * HORIZON_GRID.growth ** np.arange(
+            int(np.ceil(np.log(max(far / dem.cell, 2.0)) / np.log(HORIZON_GRID.growth))) + 1
+        )
         for k, bearing in enumerate(np.arange(bearings) * (2.0 * np.pi / bearings)):
             at_x = x[:, None] + np.sin(bearing) * steps
             at_y = y[:, None] + np.cos(bearing) * steps
-            rise = _heights(dem, at_x, at_y) - stand[:, None] - steps**2 / (2.0 * MOON_RADIUS)
+            rise = _heights(dem, at_x, at_y) - stand[:, None] - steps**2 / (2.0 * HORIZON_GRID.moon_radius)
             here = (at_x >= w) & (at_x <= e) & (at_y >= s) & (at_y <= n)
             steepest = np.where(here, rise / steps, 0.0).max(axis=1)
             elevation[k] = np.maximum(elevation[k], np.arctan(steepest))

@@ -13,12 +13,22 @@ from lunar_mjx.wheel_bed.particles.settings import Numerics, Run
 
 MEASURED = ("drawbar_pull", "side_force", "driving_torque", "sinkage")
 """What a run measures: names as in `wheel_bed.table.QUANTITIES`, and in `Series`."""
-WINDOW = 0.5
-"""Share of the drive, its end, over which steady values are means."""
-_BLOCKS = 8
-"""Parts of the window from whose scatter the mean's standard error is taken."""
-LOAD_ERROR = 0.05
-"""Largest relative error of the mean vertical force with which a run counts: the wheel is not settled beyond."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SteadyPart:
+    """Which part of a run counts as steady."""
+
+    window: float = 0.5
+    """Share of the drive, its end, over which steady values are means."""
+    blocks: int = 8
+    """Parts of the window from whose scatter the mean's standard error is taken."""
+    load_error: float = 0.05
+    """Largest relative error of the mean vertical force with which a run counts: the wheel is not settled beyond."""
+
+
+STEADY_PART = SteadyPart()
+
 
 VARIANTS: Mapping[str, Mapping[str, float]] = {
     "voxel": {"voxel": 1.5},
@@ -64,20 +74,20 @@ def steady(run: Run, series: Series) -> dict[str, Any]:
       all is finite, the load is carried to 5 % and the hub is above the undisturbed surface.
     """
     begin = run.settle_time + run.ramp_time
-    window = series.time > begin + (1.0 - WINDOW) * (series.time[-1] - begin)
+    window = series.time > begin + (1.0 - STEADY_PART.window) * (series.time[-1] - begin)
     still = (series.time > 0.8 * run.settle_time) & (series.time <= run.settle_time)
     values, error, drift = {}, {}, {}
     for quantity in MEASURED:
         seen = getattr(series, quantity)[window]
         half = len(seen) // 2
-        blocks = np.array([block.mean() for block in np.array_split(seen, _BLOCKS)])
+        blocks = np.array([block.mean() for block in np.array_split(seen, STEADY_PART.blocks)])
         values[quantity] = float(seen.mean())
-        error[quantity] = float(blocks.std(ddof=1) / np.sqrt(_BLOCKS))
+        error[quantity] = float(blocks.std(ddof=1) / np.sqrt(STEADY_PART.blocks))
         drift[quantity] = float(seen[half:].mean() - seen[:half].mean())
     carried = float(series.vertical_force[window].mean())
     usable = bool(
         np.isfinite(list(values.values())).all()
-        and abs(carried / run.point.load - 1.0) < LOAD_ERROR
+        and abs(carried / run.point.load - 1.0) < STEADY_PART.load_error
         and values["sinkage"] < run.wheel.radius
     )
     return {

@@ -23,14 +23,22 @@ from lunar_mjx.wheel_bed.particles.settings import Layout, Run, Sand, layout
 EXTRA = "pip install 'lunar-mjx[particles]'"
 DEVICES = ("auto", "cpu", "cuda")
 
-_DAMPING = 1.0
-"""Of the wheel's vertical motion, over critical damping by a spring m g/R: what is asked for is the mean."""
-_JITTER = 0.8
-"""Range by which particles are moved off their lattice, in its spacings."""
-_FLOOR_FRICTION = 0.6
-"""Of the box's floor; its sides are smooth."""
-_LOOK_EVERY = 40
-"""Time steps between looks for numbers that are not finite."""
+
+@dataclasses.dataclass(frozen=True)
+class SandBoxNumbers:
+    """Numbers of the box of sand that no user sets."""
+
+    damping: float = 1.0
+    """Of the wheel's vertical motion, over critical damping by a spring m g/R: what is asked for is the mean."""
+    jitter: float = 0.8
+    """Range by which particles are moved off their lattice, in its spacings."""
+    floor_friction: float = 0.6
+    """Of the box's floor; its sides are smooth."""
+    look_every: int = 40
+    """Time steps between looks for numbers that are not finite."""
+
+
+SAND_BOX = SandBoxNumbers()
 
 
 @contextlib.contextmanager
@@ -109,7 +117,7 @@ class Series:
     particles: int
 
 
-def particle_places(box: Layout, seed: int, jitter: float = _JITTER) -> np.ndarray:
+def particle_places(box: Layout, seed: int, jitter: float = SAND_BOX.jitter) -> np.ndarray:
     """Places of the particles of one box, (n, 3) m, from its corner; off their lattice by random amounts."""
     spacing = box.voxel / box.per_edge
     axes = [(np.arange(n * box.per_edge) + 0.5) * spacing for n in box.cells]
@@ -143,7 +151,7 @@ def add_walls(builder: Any, box: Layout, boxes: int) -> None:
         builder.add_shape_box(-1, xform=middle, hx=hx, hy=hy, hz=hz, cfg=cfg)
 
     half = 0.5 * across + 2.0 * gap
-    wall(0.5 * length, 0.5 * across, -thick, 0.5 * length + 0.3, half, thick, _FLOOR_FRICTION)
+    wall(0.5 * length, 0.5 * across, -thick, 0.5 * length + 0.3, half, thick, SAND_BOX.floor_friction)
     for x in (-thick, length + thick):
         wall(x, 0.5 * across, high - 0.1, thick, half, high, 0.0)
     for y in (-gap, *(k * box.pitch + width for k in range(boxes))):
@@ -243,7 +251,7 @@ class SandBoxes:
     def _imposed(self, run: Run) -> list[float]:
         angle = math.radians(run.point.slip_angle)
         mass = run.point.load / run.gravity
-        damping = _DAMPING * 2.0 * mass * math.sqrt(run.gravity / run.wheel.radius)
+        damping = SAND_BOX.damping * 2.0 * mass * math.sqrt(run.gravity / run.wheel.radius)
         arrived = run.settle_time + run.ramp_time + run.drive_time
         travel, turn = run.speed * run.point.travel, run.speed * run.point.rim / run.wheel.radius
         # A wheel that slides to its left along x points to the right of x.
@@ -341,7 +349,7 @@ class SandBoxes:
         """
         for step in range(1, self.steps + 1):
             self.advance(step)
-            if step % _LOOK_EVERY == 0 and not np.isfinite(self.place.numpy()).all():
+            if step % SAND_BOX.look_every == 0 and not np.isfinite(self.place.numpy()).all():
                 raise FloatingPointError(f"a wheel's place is not finite after step {step}")
             if not going_on(step / self.steps):
                 return None

@@ -17,14 +17,21 @@ CONTACTS = ("S2", "pic8")
 """Where the wheel touches the sand: at nodes of the grid, which act from a quarter of a voxel outside the wheel, or at
 particles, which come closer. Their difference is part of the numerical error."""
 
-SLOWEST = 0.05
-"""Least travel speed over the larger of rim and travel speed: below it a wheel digs on the spot, and no steady state
-comes."""
 
-_FEWEST_VOXELS = 3.0
-"""Least voxels across the wheel's width and radius: fewer do not show a wheel."""
-_MARGIN = 1.6
-"""Sand beside, below, before and behind the wheel, in radii. Slip lines of dry sand reach about one radius."""
+@dataclasses.dataclass(frozen=True)
+class BoxSize:
+    """How large a box a wheel needs."""
+
+    slowest: float = 0.05
+    """Least travel speed over the larger of rim and travel speed: below it a wheel digs on the spot, and no steady
+    state comes."""
+    fewest_voxels: float = 3.0
+    """Least voxels across the wheel's width and radius: fewer do not show a wheel."""
+    margin: float = 1.6
+    """Sand beside, below, before and behind the wheel, in radii. Slip lines of dry sand reach about one radius."""
+
+
+BOX_SIZE = BoxSize()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,12 +101,12 @@ class Point:
     def __post_init__(self) -> None:
         require_within("point", "normal_load_N", self.load, 0.0, above=True)
         require_within("point", "slip_angle_deg", self.slip_angle, -90.0, 90.0)
-        if self.travel < SLOWEST:
+        if self.travel < BOX_SIZE.slowest:
             raise bad_input(
                 "point",
                 "slip_ratio",
                 self.slip_ratio,
-                f"leaves a travel speed below {SLOWEST:g} of the rim speed, and no steady state comes",
+                f"leaves a travel speed below {BOX_SIZE.slowest:g} of the rim speed, and no steady state comes",
                 "give less slip",
             )
 
@@ -245,13 +252,13 @@ def layout(runs: list[Run]) -> Layout:
     first = runs[0]
     wheel, voxel = first.wheel, first.numerics.voxel
     least = min(wheel.radius, wheel.width)
-    if least < _FEWEST_VOXELS * voxel:
+    if least < BOX_SIZE.fewest_voxels * voxel:
         raise bad_input(
             "numerics",
             "voxel",
             voxel,
             f"is too coarse for a wheel of radius {wheel.radius:g} m and width {wheel.width:g} m",
-            f"give {least / _FEWEST_VOXELS:.3g} m or less",
+            f"give {least / BOX_SIZE.fewest_voxels:.3g} m or less",
         )
     if 0.0 < wheel.grouser_height < voxel:
         raise bad_input(
@@ -263,10 +270,10 @@ def layout(runs: list[Run]) -> Layout:
         )
     outer = wheel.radius + wheel.grouser_height
     travel = max(r.speed * r.point.travel * (r.drive_time + 0.5 * r.ramp_time) for r in runs)
-    length = travel + 2.0 * _MARGIN * outer
-    width = wheel.width + 2.0 * _MARGIN * outer
-    cells = tuple(math.ceil(x / voxel - 1e-9) for x in (length, width, _MARGIN * outer))
-    return Layout((cells[0], cells[1], cells[2]), voxel, first.numerics.per_edge, _MARGIN * outer)
+    length = travel + 2.0 * BOX_SIZE.margin * outer
+    width = wheel.width + 2.0 * BOX_SIZE.margin * outer
+    cells = tuple(math.ceil(x / voxel - 1e-9) for x in (length, width, BOX_SIZE.margin * outer))
+    return Layout((cells[0], cells[1], cells[2]), voxel, first.numerics.per_edge, BOX_SIZE.margin * outer)
 
 
 def work(runs: list[Run]) -> float:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,14 +13,22 @@ import numpy as np
 from lunar_mjx.wheel_bed.particles.sand_box import add_sand, add_walls, open_device, particle_places, set_sand
 from lunar_mjx.wheel_bed.particles.settings import Layout, Sand
 
-_FREE_FALLS = 8.0
-"""Time computed, in sqrt(height/g): the flow of a low column ends after about three (Lajeunesse et al. 2005)."""
-_SETTLED = 3.0
-"""Time computed until sand has settled, in sqrt(depth/g)."""
-_STEP = 0.25
-"""Voxels that sand in free fall from the surface moves in a step."""
-_TRIM = 0.15
-"""Share of the height at the slope's foot and at its crest that is left out: both are round."""
+
+@dataclasses.dataclass(frozen=True)
+class Slump:
+    """How a heap is made and measured."""
+
+    free_falls: float = 8.0
+    """Time computed, in sqrt(height/g): the flow of a low column ends after about three (Lajeunesse et al. 2005)."""
+    settled: float = 3.0
+    """Time computed until sand has settled, in sqrt(depth/g)."""
+    step: float = 0.25
+    """Voxels that sand in free fall from the surface moves in a step."""
+    trim: float = 0.15
+    """Share of the height at the slope's foot and at its crest that is left out: both are round."""
+
+
+SLUMP = Slump()
 
 
 def settlement(
@@ -35,7 +44,7 @@ def settlement(
     """
     box = Layout((6, 6, depth), voxel, 2, 0.0)
     strewn = particle_places(box, 0)
-    after = _left_alone(strewn, box, sand, gravity, open_device(device), _SETTLED, time_step)
+    after = _left_alone(strewn, box, sand, gravity, open_device(device), SLUMP.settled, time_step)
     top = strewn[:, 2] > box.size[2] - voxel
     return float((strewn - after)[top, 2].mean())
 
@@ -53,8 +62,10 @@ def slump_angle(sand: Sand, gravity: float, voxel: float, height: int = 8, devic
     box = Layout((5 * height, 3, height), voxel, 2, 0.0)
     places = particle_places(box, 0)
     column = places[places[:, 0] < 1.5 * height * voxel]
-    time_step = _STEP * voxel / math.sqrt(2.0 * gravity * box.size[2])
-    return surface_angle(_left_alone(column, box, sand, gravity, open_device(device), _FREE_FALLS, time_step), voxel)
+    time_step = SLUMP.step * voxel / math.sqrt(2.0 * gravity * box.size[2])
+    return surface_angle(
+        _left_alone(column, box, sand, gravity, open_device(device), SLUMP.free_falls, time_step), voxel
+    )
 
 
 def _left_alone(
@@ -91,5 +102,5 @@ def surface_angle(places: np.ndarray, voxel: float) -> float:
     top = np.array([places[column == k, 2].max() if (column == k).any() else 0.0 for k in range(column.max() + 1)])
     middle = (np.arange(len(top)) + 0.5) * voxel
     crest = top.max()
-    slope = (top > _TRIM * crest) & (top < (1.0 - _TRIM) * crest)
+    slope = (top > SLUMP.trim * crest) & (top < (1.0 - SLUMP.trim) * crest)
     return float(np.degrees(np.arctan(-np.polyfit(middle[slope], top[slope], 1)[0])))
