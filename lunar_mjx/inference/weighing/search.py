@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -126,89 +126,206 @@ def search(
     Raises:
       EvidenceError: no form could be fitted. TimeUp: before the first one was.
     """
-    known: dict[tuple[str, Terms], Hypothesis] = {}
-    done: dict[tuple[str, frozenset[str]], Refit | None] = {}
-    failed: list[str] = []
-    reasons: list[str] = []
-    by_name = {form.name: form for form in forms}
-    over = False
+    under_way = _Search(forms, most_refits, most_terms, window, least_signal, unlisted_share, progress)
+    under_way.begin()
+    complete = False
+    while not complete and under_way.may_refit and not stop():
+        complete = not under_way.go_on(provisional)
+    return under_way.ranked(complete)
 
-    def refit(form: Form, effects: frozenset[str], near: Hypothesis | None, trial: str = "") -> None:
+
+@dataclasses.dataclass(eq=False)
+class _Search:
+    """A search under way: what is asked of it, and what it knows.
+
+    Attributes:
+      forms, most_refits, most_terms, window, least_signal, unlisted_share, progress: as for `search`.
+      known: the best evidence of each set of terms beside each form.
+      done: refits by form and effects; None where the solver failed.
+      reasons: "form with effects: reason" of each refit whose solver failed.
+      over: whether time was up within a refit.
+    """
+
+    forms: Sequence[Form]
+    most_refits: int
+    most_terms: int
+    window: float
+    least_signal: float
+    unlisted_share: float
+    progress: Callable[[str, float], None]
+    known: dict[tuple[str, Terms], Hypothesis] = dataclasses.field(default_factory=dict)
+    done: dict[tuple[str, frozenset[str]], Refit | None] = dataclasses.field(default_factory=dict)
+    reasons: list[str] = dataclasses.field(default_factory=list)
+    over: bool = False
+
+    @property
+    def may_refit(self) -> bool:
+        """Whether refits and time are left."""
+        return len(self.done) < self.most_refits and not self.over
+
+    def begin(self) -> None:
+        """Refits every form as it is, then with each effect that takes the place of a part of it.
+
+        Raises:
+          EvidenceError: no form could be fitted. TimeUp: before the first one was.
+        """
+        for form in self.forms:
+            self.refit(form, frozenset(), None)
+        if not self.known:
+            raise EvidenceError("; ".join(self.reasons))
+        for form in self.forms:
+            for effect in form.exchanged:
+                self.refit(form, frozenset({effect}), self.known.get((form.name, frozenset())))
+
+    def go_on(self, provisional: Callable[[ModelSearch], None]) -> bool:
+        """Makes the refit that promises most; false where none is left that could change the answer."""
+        by_name = {form.name: form for form in self.forms}
+        # Unlisted inputs are linear and need no refit; effects are not, and gain by theirs. What is unlisted closes the
+        # door on no effect before that has been refitted.
+        listed = [h for h in self.known.values() if not any(t.kind == UNLISTED for t in h.terms)]
+        best = max(listed, key=lambda h: h.log_posterior)
+        near = [h for h in listed if h.log_posterior > best.log_posterior - self.window]
+        open_ = [h for h in near if (h.form, h.effects) not in self.done]
+        # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
+        # order of what it promises there. Else one form's many neighbours would take the refits that tell which it is.
+        others = [f for f in self.forms if best.refitted and (f.name, best.effects) not in self.done]
+        others = [f for f in others if best.effects <= {t.name for t in f.terms}]
+        promise = {f.name: _carried_over(listed, best, f.name) for f in others}
+        others.sort(key=lambda f: -promise[f.name])
+        chosen = max(open_, key=lambda h: h.log_posterior, default=None)
+        if chosen is not None and not (others and promise[others[0].name] > chosen.log_posterior):
+            self.refit(by_name[chosen.form], chosen.effects, chosen)
+            provisional(self.ranked(False))
+            return True
+        if others:
+            self.refit(others[0], best.effects, None)
+            return True
+        # What leaving an effect out costs is told by a refit: where several do the work of one another, the linear
+        # estimate about the full set is much too high, and a set that grew around a wrong first step would stand.
+        unchallenged = [e for e in sorted(best.effects) if (best.form, best.effects - {e}) not in self.done]
+        if unchallenged:
+            self.refit(by_name[best.form], best.effects - {unchallenged[0]}, best)
+            return True
+        untried = self.untried(best)
+        if untried:
+            self.refit(by_name[best.form], best.effects | {untried[0]}, best, untried[0])
+        return bool(untried)
+
+    def refit(self, form: Form, effects: frozenset[str], near: Hypothesis | None, trial: str = "") -> None:
+        """Refits a form with a set of effects, and scores the hypotheses around it.
+
+        Args:
+          form, effects: what is refitted. near: hypothesis to begin at; the model as given if None.
+          trial: effect that begins where it acts, for one whose slope at its null says little.
+        """
         label = form.name + "".join(f" + {e}" for e in sorted(effects))
-        progress(f"refitting {label}", len(done) / most_refits)
+        self.progress(f"refitting {label}", len(self.done) / self.most_refits)
         start = None if near is None else _start(near, form)
         if trial and start is not None:
             start = form.trial(start, trial)
         try:
             made = form.refit(effects, near.refit if near else None, start)
         except TimeUp:
-            if not known:
+            if not self.known:
                 raise
-            nonlocal over
-            over = True
+            self.over = True
             return
         # A solver that fails says nothing against a hypothesis: it is recorded and the search goes on.
         except (EvidenceError, ValueError, np.linalg.LinAlgError) as error:
-            done[form.name, effects] = None
-            failed.append(label)
-            reasons.append(f"{label}: {error}")
+            self.done[form.name, effects] = None
+            self.reasons.append(f"{label}: {error}")
             return
-        done[form.name, effects] = made
+        self.done[form.name, effects] = made
         if made.failed:
-            failed.append(label)
-            reasons.append(f"{label}: {made.failed}")
-        _score_around(form, made, near, known, done, most_terms, window, least_signal)
+            self.reasons.append(f"{label}: {made.failed}")
+        self.score_around(form, made, near)
 
-    complete = False
-    for form in forms:
-        refit(form, frozenset(), None)
-    if not known:
-        raise EvidenceError("; ".join(reasons))
-    for form in forms:
-        for effect in form.exchanged:
-            refit(form, frozenset({effect}), known.get((form.name, frozenset())))
-
-    def ranked(complete: bool) -> ModelSearch:
+    def ranked(self, complete: bool) -> ModelSearch:
+        """What is known, most probable first."""
         # A set whose refit failed is no hypothesis.
-        alive = [h for h in known.values() if done.get((h.form, h.effects), h.refit) is not None]
+        alive = [h for h in self.known.values() if self.done.get((h.form, h.effects), h.refit) is not None]
         order = sorted(alive, key=lambda h: -h.log_posterior)
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
-        return ModelSearch(tuple(order), weight / weight.sum(), len(done), tuple(reasons), complete)
+        return ModelSearch(tuple(order), weight / weight.sum(), len(self.done), tuple(self.reasons), complete)
 
-    while len(done) < most_refits and not over and not stop():
-        # Unlisted inputs are linear and need no refit; effects are not, and gain by theirs. What is unlisted closes the
-        # door on no effect before that has been refitted.
-        listed = [h for h in known.values() if not any(t.kind == UNLISTED for t in h.terms)]
-        best = max(listed, key=lambda h: h.log_posterior)
-        near = [h for h in listed if h.log_posterior > best.log_posterior - window]
-        open_ = [h for h in near if (h.form, h.effects) not in done]
-        # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
-        # order of what it promises there. Else one form's many neighbours would take the refits that tell which it is.
-        others = [f for f in forms if best.refitted and (f.name, best.effects) not in done]
-        others = [f for f in others if best.effects <= {t.name for t in f.terms}]
-        promise = {f.name: _carried_over(listed, best, f.name) for f in others}
-        others.sort(key=lambda f: -promise[f.name])
-        chosen = max(open_, key=lambda h: h.log_posterior, default=None)
-        if chosen is not None and not (others and promise[others[0].name] > chosen.log_posterior):
-            refit(by_name[chosen.form], chosen.effects, chosen)
-            provisional(ranked(False))
-            continue
-        if others:
-            refit(others[0], best.effects, None)
-            continue
-        # What leaving an effect out costs is told by a refit: where several do the work of one another, the linear
-        # estimate about the full set is much too high, and a set that grew around a wrong first step would stand.
-        unchallenged = [e for e in sorted(best.effects) if (best.form, best.effects - {e}) not in done]
-        if unchallenged:
-            refit(by_name[best.form], best.effects - {unchallenged[0]}, best)
-            continue
-        untried = _untried(known.values(), best, by_name[best.form], done, least_signal, unlisted_share)
-        if not untried:
-            complete = True
-            break
-        refit(by_name[best.form], best.effects | {untried[0]}, best, untried[0])
-    return ranked(complete)
+    def untried(self, best: Hypothesis) -> list[str]:
+        """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.
+
+        Empty where something unlisted is less probable than its share: then what is listed explains the measurements.
+        """
+        scored = list(self.known.values())
+        top = max(h.log_posterior for h in scored)
+        weights = [(math.exp(h.log_posterior - top), any(t.kind == UNLISTED for t in h.terms)) for h in scored]
+        # refits of everything are dear: they are made only where something unlisted would else be believed
+        if sum(w for w, other in weights if other) < self.unlisted_share * sum(w for w, _ in weights):
+            return []
+        linear = {next(iter(h.effects - best.effects)): h.log_posterior for h in scored if _one_more(h, best)}
+        shows = best.refit.linear.shows()
+        names = [n for n in shows if n not in best.effects and shows[n] >= self.least_signal]
+        names = [n for n in names if (best.form, best.effects | {n}) not in self.done]
+        return sorted(names, key=lambda n: -linear.get(n, -math.inf))
+
+    def score_around(self, form: Form, made: Refit, near: Hypothesis | None) -> None:
+        """Scores the refitted set with every choice of terms that need no refit, and their neighbours by one effect."""
+        own = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in made.effects)
+        felt, shows = made.linear.felt(), made.linear.shows()
+        unfitted = [t for t in form.terms if t.kind != EFFECT]
+        unfitted = [t for t in unfitted if t.kind != UNLISTED or felt[t.name] >= self.least_signal]
+        effects = [t for t in form.terms if t.kind == EFFECT and shows[t.name] >= self.least_signal]
+        base = self.score(form, made, own, own, None if near is None else _sizes(near))
+        if base is None:
+            return
+
+        def scored(choices: Iterable[Terms], sizes: tuple[np.ndarray, np.ndarray]) -> list[Hypothesis]:
+            return [h for terms in choices if (h := self.score(form, made, own, terms, sizes))]
+
+        roots = [base]
+        # Terms without a refit: all single ones, then more beside the best of them.
+        level = scored((own | {t} for t in unfitted), _sizes(base))
+        best = max([base, *level], key=lambda h: h.log_posterior)
+        while level and best is not roots[-1] and len(best.terms) < self.most_terms:
+            roots.append(best)
+            level = scored((best.terms | {t} for t in unfitted if t not in best.terms), _sizes(best))
+            best = max([best, *level], key=lambda h: h.log_posterior)
+            # What a later term makes needless goes again.
+            fewer = scored((best.terms - {t} for t in best.terms - own), _sizes(best))
+            best = max([best, *fewer], key=lambda h: h.log_posterior)
+        top = max(h.log_posterior for h in self.known.values())
+        for root in roots:
+            # A neighbour of what is hopeless may still be the truth where nothing has been found yet.
+            if root is not base and root.log_posterior < top - self.window:
+                continue
+            scored((root.terms | {t} for t in effects if t not in own), _sizes(root))
+            scored((root.terms - {t} for t in own), _sizes(root))
+
+    def score(
+        self, form: Form, made: Refit, own: Terms, terms: Terms, sizes: tuple[np.ndarray, np.ndarray] | None
+    ) -> Hypothesis | None:
+        """The best that is known of a set of terms after it was scored around a refit; None if nothing is.
+
+        Args:
+          form, made: around which refit. own: its effects as terms. terms: of the set.
+          sizes: of discrepancy and noise to begin at.
+        """
+        refitted = terms.issuperset(own) and not any(t.kind == EFFECT for t in terms - own)
+        old = self.known.get((form.name, terms))
+        if len(terms) > self.most_terms or (old is not None and old.refitted):
+            return old
+        named = frozenset(t.name for t in terms if t.kind == EFFECT)
+        if not refitted and (form.name, named) in self.done:
+            return old
+        try:
+            value, found, places = made.linear.evidence(terms, sizes)
+        except (EvidenceError, np.linalg.LinAlgError):
+            return old
+        # terms are independent beforehand: each has its own odds, and a set the product of theirs
+        prior = form.log_prior + sum(t.log_prior for t in terms)
+        new = Hypothesis(form.name, terms, value + prior, made, refitted, found, places)
+        # Of two linear estimates of one set the one from nearer by counts: that of the more probable refit.
+        if old is None or refitted or new.log_posterior > old.log_posterior:
+            self.known[form.name, terms] = new
+        return self.known[form.name, terms]
 
 
 def _carried_over(listed: Sequence[Hypothesis], best: Hypothesis, form: str) -> float:
@@ -227,31 +344,6 @@ def _carried_over(listed: Sequence[Hypothesis], best: Hypothesis, form: str) -> 
     return found[form, shared] + best.log_posterior - found[best.form, shared]
 
 
-def _untried(
-    known: Iterable[Hypothesis],
-    best: Hypothesis,
-    form: Form,
-    done: Mapping[tuple[str, frozenset[str]], Refit | None],
-    least_signal: float,
-    unlisted_share: float,
-) -> list[str]:
-    """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.
-
-    Empty where something unlisted is less probable than its share: then what is listed explains the measurements.
-    """
-    scored = list(known)
-    top = max(h.log_posterior for h in scored)
-    weights = [(math.exp(h.log_posterior - top), any(t.kind == UNLISTED for t in h.terms)) for h in scored]
-    # refits of everything are dear: they are made only where something unlisted would else be believed
-    if sum(w for w, other in weights if other) < unlisted_share * sum(w for w, _ in weights):
-        return []
-    linear = {next(iter(h.effects - best.effects)): h.log_posterior for h in scored if _one_more(h, best)}
-    shows = best.refit.linear.shows()
-    names = [n for n in shows if n not in best.effects and shows[n] >= least_signal]
-    names = [n for n in names if (form.name, best.effects | {n}) not in done]
-    return sorted(names, key=lambda n: -linear.get(n, -math.inf))
-
-
 def _one_more(h: Hypothesis, best: Hypothesis) -> bool:
     """Whether a hypothesis is another with one effect more, and nothing else."""
     more = h.terms - best.terms
@@ -265,71 +357,6 @@ def _start(near: Hypothesis, form: Form) -> np.ndarray:
     own = near.places < len(u)
     u[near.places[own]] += near.evidence.mean[own]
     return u
-
-
-def _score_around(
-    form: Form,
-    made: Refit,
-    near: Hypothesis | None,
-    known: dict[tuple[str, Terms], Hypothesis],
-    done: dict[tuple[str, frozenset[str]], Refit | None],
-    most_terms: int,
-    window: float,
-    least_signal: float,
-) -> None:
-    """Scores the refitted set with every choice of terms that need no refit, and their neighbours by one effect."""
-    own = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in made.effects)
-    felt = made.linear.felt()
-    others = [t for t in form.terms if t.kind != EFFECT and (t.kind != UNLISTED or felt[t.name] >= least_signal)]
-    shows = made.linear.shows()
-    effects = [t for t in form.terms if t.kind == EFFECT and shows[t.name] >= least_signal]
-    start = None if near is None else (near.evidence.tau, near.evidence.noise)
-
-    def score(terms: Terms, begin: tuple[np.ndarray, np.ndarray] | None) -> Hypothesis | None:
-        refitted = terms.issuperset(own) and not any(t.kind == EFFECT for t in terms - own)
-        old = known.get((form.name, terms))
-        if len(terms) > most_terms or (old is not None and old.refitted):
-            return old
-        named = frozenset(t.name for t in terms if t.kind == EFFECT)
-        if not refitted and (form.name, named) in done:
-            return old
-        try:
-            value, found, places = made.linear.evidence(terms, begin)
-        except (EvidenceError, np.linalg.LinAlgError):
-            return old
-        # terms are independent beforehand: each has its own odds, and a set the product of theirs
-        prior = form.log_prior + sum(t.log_prior for t in terms)
-        new = Hypothesis(form.name, terms, value + prior, made, refitted, found, places)
-        # Of two linear estimates of one set the one from nearer by counts: that of the more probable refit.
-        if old is None or refitted or new.log_posterior > old.log_posterior:
-            known[form.name, terms] = new
-        return known[form.name, terms]
-
-    base = score(own, start)
-    if base is None:
-        return
-    sizes = (base.evidence.tau, base.evidence.noise)
-    roots = [base]
-    # Terms without a refit: all single ones, then more beside the best of them.
-    level = [h for t in others if (h := score(own | {t}, sizes))]
-    best = max([base, *level], key=lambda h: h.log_posterior)
-    while level and best is not roots[-1] and len(best.terms) < most_terms:
-        roots.append(best)
-        level = [h for t in others if t not in best.terms and (h := score(best.terms | {t}, _sizes(best)))]
-        best = max([best, *level], key=lambda h: h.log_posterior)
-        # What a later term makes needless goes again.
-        fewer = [h for t in best.terms - own if (h := score(best.terms - {t}, _sizes(best)))]
-        best = max([best, *fewer], key=lambda h: h.log_posterior)
-    top = max(h.log_posterior for h in known.values())
-    for root in roots:
-        # A neighbour of what is hopeless may still be the truth where nothing has been found yet.
-        if root is not base and root.log_posterior < top - window:
-            continue
-        for t in effects:
-            if t not in own:
-                score(root.terms | {t}, _sizes(root))
-        for t in own:
-            score(root.terms - {t}, _sizes(root))
 
 
 def _sizes(h: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
