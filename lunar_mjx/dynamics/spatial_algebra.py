@@ -134,7 +134,7 @@ class Body(NamedTuple):
     rest: Symmetric
 
     def at(self, origin: Vec3, frame: Frame) -> Inertia:
-        """Its spatial inertia when the link's frame stands at `origin` turned by `frame`."""
+        """The body's spatial inertia when the link's frame stands at `origin` turned by `frame`."""
         c = origin + frame.to_world(self.com)
         moments = self.rest.rotated(frame) + Symmetric.isotropic(self.spherical)
         return Inertia(self.mass, c * self.mass, moments + Symmetric.of_point(self.mass, c))

@@ -6,7 +6,7 @@ A series comes in steps (such as windows of two seconds). In step t a fitted mod
 
     r_t   (n_t,) measured less predicted, in units of the noise;  C_t  (n_t, k) what each amount changes of it
     x_t   (k,) amounts by which this series differs from the model: constant but for a slow walk w_t ~ N(0, walk^2)
-    s_t   scatter from step to step, N(0, scatter^2), and in rare outlying steps N(0, outlying^2) with `LOUDER` noise
+    s_t   scatter from step to step, N(0, scatter^2), and in rare outlying steps N(0, outlying^2), noise louder too
 
 A jump of kind p at step j adds N(0, size_p^2) to x_j for good. Each pair (j, p) is a Kalman filter beside that without
 a jump (Willsky & Jones 1976), with the probability ratio Lambda_{jp} of all that was measured since j. The alarm is
@@ -32,16 +32,27 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import optimize
 
-MEMORY = 20
-"""Steps for which a jump that may have begun is kept in mind; forgetting only lowers the statistic."""
-LOUDER = 3.0
-"""Factor of the noise in outlying steps."""
-POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
-"""Powers of probability ratios that are tried."""
-MOST_TRIALS = 100
-"""Trials of `learn` at most."""
-LOG_STD = 2.0
-"""Prior standard deviation of the logarithms of what `learn` learns: it may be off by a factor of seven."""
+
+@dataclasses.dataclass(frozen=True)
+class ChangeSettings:
+    """What is assumed of series that may change, and how it is learnt."""
+
+    memory: int = 20
+    """Steps for which a jump that may have begun is kept in mind; forgetting only lowers the statistic."""
+    louder: float = 3.0
+    """Factor of the noise in outlying steps."""
+    powers: tuple[float, ...] = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
+    """Powers of probability ratios that are tried."""
+    most_trials: int = 100
+    """Trials of `learn` at most."""
+    log_std: float = 2.0
+    """Prior standard deviation of the logarithms of what `learn` learns: it may be off by a factor of seven."""
+    bounds: tuple[tuple[float, float], ...] = ((1e-3, 3.0), (1e-3, 1.0), (0.2, 5.0), (1e-3, 0.3), (1e-2, 3.0))
+    """Least and most of each number of a `Restlessness`."""
+
+
+CHANGE = ChangeSettings()
+
 _LOG_2PI = math.log(2.0 * math.pi)
 
 Step = tuple[np.ndarray, np.ndarray]
@@ -138,7 +149,7 @@ class ChangeDetector:
         density, self._mean, self._cov = _update(self.usual, self._mean, self._cov, columns, residual)
         self._log_ratio += self.usual.power * (density[1:] - density[0])
         # The filter without a jump (first) always stays; of the others only those that began within memory.
-        keep = self._begun > self.count - MEMORY
+        keep = self._begun > self.count - CHANGE.memory
         there = np.append(True, keep)
         self._mean, self._cov = self._mean[there], self._cov[there]
         self._log_ratio, self._begun, self._kind = self._log_ratio[keep], self._begun[keep], self._kind[keep]
@@ -197,7 +208,7 @@ def _update(
     innovation = y - mean @ h.T
     crossed = cov @ h.T
     logs, means, covs = [], [], []
-    cases = ((1.0 - usual.rare, usual.scatter, usual.noise), (usual.rare, usual.outlying, LOUDER * usual.noise))
+    cases = ((1.0 - usual.rare, usual.scatter, usual.noise), (usual.rare, usual.outlying, CHANGE.louder * usual.noise))
     for chance, scatter, noise in cases:
         own = (h * scatter**2) @ h.T + noise**2 * np.eye(len(h))
         whole = h @ crossed + own
@@ -274,24 +285,20 @@ class Restlessness:
         return Undisturbed(start, walk, scatter, amounts.jump, self.rare, self.noise, self.power)
 
 
-BOUNDS = ((1e-3, 3.0), (1e-3, 1.0), (0.2, 5.0), (1e-3, 0.3), (1e-2, 3.0))
-"""Least and most of each number of a `Restlessness`."""
-
-
 def learn(series: Sequence[tuple[Amounts, Sequence[Step]]], usual: Restlessness = Restlessness()) -> Restlessness:
-    """How much undisturbed series move, most probably, where logarithms are normal about usual ones, `LOG_STD` wide.
+    """How much undisturbed series move, most probably, if logarithms are normal about usual ones.
 
     Args:
       series: undisturbed ones, each with what is known of its amounts. usual: the middle of the prior.
     """
-    centre = np.log(dataclasses.astuple(usual)[: len(BOUNDS)])
+    centre = np.log(dataclasses.astuple(usual)[: len(CHANGE.bounds)])
 
     def made(place: np.ndarray) -> Restlessness:
-        return Restlessness(*(float(np.clip(math.exp(v), *b)) for v, b in zip(place, BOUNDS, strict=True)))
+        return Restlessness(*(float(np.clip(math.exp(v), *b)) for v, b in zip(place, CHANGE.bounds, strict=True)))
 
     def cost(place: np.ndarray) -> float:
         found = made(place)
-        prior = 0.5 * float(np.sum(((place - centre) / LOG_STD) ** 2))
+        prior = 0.5 * float(np.sum(((place - centre) / CHANGE.log_std) ** 2))
         return prior - sum(log_density(found.of(amounts), steps) for amounts, steps in series)
 
     simplex = centre + np.vstack([np.zeros(5), np.diag([1.0, 1.0, 0.3, 0.7, 1.0])])
@@ -299,19 +306,19 @@ def learn(series: Sequence[tuple[Amounts, Sequence[Step]]], usual: Restlessness 
         cost,
         centre,
         method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.1, "maxfev": MOST_TRIALS},
+        options={"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.1, "maxfev": CHANGE.most_trials},
     )
     return _tempered(made(found.x), series)
 
 
 def _tempered(restless: Restlessness, series: Sequence[tuple[Amounts, Sequence[Step]]]) -> Restlessness:
-    """The same with the largest power with which these series raise no alarm at the threshold of their length."""
+    """A restlessness with the largest power at which these series raise no alarm at the threshold of their length."""
     length = float(sum(len(steps) for _, steps in series))
-    for power in POWERS[:-1]:
+    for power in CHANGE.powers[:-1]:
         found = dataclasses.replace(restless, power=power)
         if not any(_raises(found.of(amounts), amounts, steps, length) for amounts, steps in series):
             return found
-    return dataclasses.replace(restless, power=POWERS[-1])
+    return dataclasses.replace(restless, power=CHANGE.powers[-1])
 
 
 def _raises(usual: Undisturbed, amounts: Amounts, steps: Sequence[Step], between_alarms: float) -> bool:

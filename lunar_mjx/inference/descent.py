@@ -11,15 +11,24 @@ import numpy as np
 
 from lunar_mjx.inference.objective import Objective
 
-SMALL_PROMISE = 0.1
-"""Drop of chi-square promised by a Gauss-Newton step below which a descent has arrived."""
+
+@dataclasses.dataclass(frozen=True)
+class Damping:
+    """How a descent is damped, and when it has arrived."""
+
+    small_promise: float = 0.1
+    """Drop of chi-square promised by a Gauss-Newton step below which a descent has arrived."""
+    damping_growth: float = 1e2
+    """Factor on the damping of Levenberg-Marquardt after a step of no damping helped."""
+    iterations: int = 60
+    """Most steps: a descent that still moves then creeps along a curved valley, and another start does more."""
+
+
+DESCENT = Damping()
+
 _DAMPINGS = np.array([1e-4, 1e-2, 1e-1, 1.0, 1e2])
 """Factors on the damping that are tried at once: a batch of rollouts costs little more than one, and a wide spread
 finds in one iteration what a single damping would have to walk to."""
-DAMPING_GROWTH = 1e2
-"""Factor on the damping of Levenberg-Marquardt after a step of no damping helped."""
-_ITERATIONS = 60
-"""Most steps: a descent that still moves then creeps along a curved valley, and another start does more."""
 
 
 @dataclasses.dataclass
@@ -36,7 +45,7 @@ class Descent:
     chi2: float
 
 
-def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS) -> Descent:
+def descend(goal: Objective, start: np.ndarray, iterations: int = DESCENT.iterations) -> Descent:
     """Levenberg-Marquardt from one start, all dampings of an iteration in one batch.
 
     Args:
@@ -54,7 +63,7 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS) -
     for _ in range(iterations):
         downhill, hessian = goal.quadratic(here.u, here.residual, here.jacobian)
         promise = goal.promise(here.u, downhill, hessian)
-        if promise < SMALL_PROMISE:
+        if promise < DESCENT.small_promise:
             break
         dampings = damping * _DAMPINGS
         trials = goal.steps(here.u, downhill, hessian, dampings)
@@ -75,5 +84,5 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = _ITERATIONS) -
         elif damping > 1e8:
             break  # steps this short change nothing but rounding
         else:
-            damping, curved = damping * DAMPING_GROWTH, True
+            damping, curved = damping * DESCENT.damping_growth, True
     return here

@@ -40,12 +40,21 @@ import numpy as np
 from scipy import linalg, special
 
 _LOG_2PI = math.log(2.0 * math.pi)
-_MOST_STEPS = 60
-"""Newton steps of the sizes at most; from usual sizes 5 to 12 are needed."""
-_LONGEST = 2.0
-"""Longest Newton step of the logarithm of a size."""
-_SETTLED = 1e-6
-"""Gain of log density by a further Newton step below which sizes have settled."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SizeDescent:
+    """Newton's method on the sizes of discrepancy and noise."""
+
+    most_steps: int = 60
+    """Newton steps of the sizes at most; from usual sizes 5 to 12 are needed."""
+    longest: float = 2.0
+    """Longest Newton step of the logarithm of a size."""
+    settled: float = 1e-6
+    """Gain of log density by a further Newton step below which sizes have settled."""
+
+
+SIZE_DESCENT = SizeDescent()
 
 
 class EvidenceError(ArithmeticError):
@@ -252,13 +261,13 @@ def infer(
     x = np.log(np.concatenate([usual, np.ones(len(noises))] if start is None else [*start]))
     here = _density(x, gram, amplitudes, usual, noises)
     promised = np.inf
-    for _ in range(_MOST_STEPS):
+    for _ in range(SIZE_DESCENT.most_steps):
         step = _newton_step(here)
         promised = 0.5 * float(here.gradient @ step)
-        if promised < _SETTLED:
+        if promised < SIZE_DESCENT.settled:
             break
         # in the logarithms a long step leaves the region in which the density is near its quadratic
-        step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300))
+        step *= min(1.0, SIZE_DESCENT.longest / max(float(np.abs(step).max()), 1e-300))
         for _ in range(30):
             there = _density(x + step, gram, amplitudes, usual, noises)
             if there.value >= here.value:
@@ -268,7 +277,7 @@ def infer(
             break  # no step gains: rounding is reached
         gained = there.value - here.value
         x, here = x + step, there
-        if gained < _SETTLED:
+        if gained < SIZE_DESCENT.settled:
             break
     else:
         raise EvidenceError(f"sizes of discrepancy and noise did not settle: a step still promises {promised:.2g}")

@@ -11,18 +11,26 @@ from lunar_mjx.inference.fitting import Fit
 from lunar_mjx.inference.problem import Problem
 from lunar_mjx.inference.score import blocks
 
-AT_NOISE = 1.03
-"""Root mean square residual in sigma up to which a model counts as being at the noise, beyond sampling error."""
-CHANNEL_AT_NOISE = 1.05
-"""The same for the worst single channel."""
-_SAMPLING = 3.5
-"""Standard errors of the mean square that sampling may add: one in four thousand exceeds them."""
-_KNOWN = 1e-2
-"""Share of what is known about a direction from which the other manoeuvres count as knowing it."""
-ENOUGH = 4
-"""Fitted manoeuvres from which leaving one out in turn is a fair judge."""
-_PIECES = 4
-"""Pieces of a log that are left out in turn where there are too few manoeuvres."""
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut:
+    """When a residual counts as noise, and how manoeuvres are left out."""
+
+    at_noise: float = 1.03
+    """Root mean square residual in sigma up to which a model counts as being at the noise, beyond sampling error."""
+    channel_at_noise: float = 1.05
+    """Root mean square residual in sigma up to which the worst single channel counts as being at the noise."""
+    sampling: float = 3.5
+    """Standard errors of the mean square that sampling may add: one in four thousand exceeds them."""
+    known: float = 1e-2
+    """Share of what is known about a direction from which the other manoeuvres count as knowing it."""
+    enough: int = 4
+    """Fitted manoeuvres from which leaving one out in turn is a fair judge."""
+    pieces: int = 4
+    """Pieces of a log that are left out in turn where there are too few manoeuvres."""
+
+
+HELD_OUT = HeldOut()
 
 
 def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
@@ -46,7 +54,7 @@ def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
         mine = jb @ unit
         values, vectors = np.linalg.eigh(np.eye(mine.shape[1]) - mine.T @ mine)
         # A direction of which the other manoeuvres know next to nothing stays where the fit put it.
-        live = values > _KNOWN
+        live = values > HELD_OUT.known
         step = unit @ ((vectors[:, live] / values[live]) @ (vectors[:, live].T @ (mine.T @ rb)))
         out[part] = rb + jb @ step
     return out
@@ -58,7 +66,7 @@ def _left_out(problem: Problem, fit: Fit) -> list[np.ndarray]:
     if len(parts) >= 3:
         return parts
     number = blocks(observations, fit.residual, fit.fitted)
-    pieces = min(_PIECES * len(parts), number.max() + 1)
+    pieces = min(HELD_OUT.pieces * len(parts), number.max() + 1)
     group = np.where(number >= 0, number * pieces // (number.max() + 1), -1)
     return [np.flatnonzero(group == g) for g in range(pieces)]
 
@@ -81,14 +89,16 @@ def predictive_gain(
     new: np.ndarray,
     splits: tuple[str, ...] = ("fit", "select"),
 ) -> tuple[float, float]:
-    """As `gain`, from predictive residuals: for models that are not of one problem, but of the same measurements.
+    """Gain of the expected log density on manoeuvres left out, and its standard error, from predictive residuals.
+
+    For models that are not of one problem, but of one set of measurements; else see `gain`.
 
     Args:
       problem: whose measurements. before, after: the fits. old, new: (n,) their predictive residuals.
       splits: that judge.
     """
     keep = problem.observations.in_split(*splits)
-    few = len(np.unique(problem.observations.unit[before.fitted])) < ENOUGH
+    few = len(np.unique(problem.observations.unit[before.fitted])) < HELD_OUT.enough
     # Two manoeuvres hardly determine a model that has to predict a third.
     if few and problem.observations.in_split("select").any():
         # Leaving one of two or three groups out of a fit extrapolates too far; those never fitted judge alone.
@@ -142,14 +152,14 @@ def noise_test(problem: Problem, fit: Fit, splits: tuple[str, ...] = ("fit", "se
         row = np.array([squares[part].sum(), count, 0.5 * s.dependence * count + (count * s.level) ** 2])
         channels[s.channel] = channels.get(s.channel, np.zeros(3)) + row
     spread = float(sum(row[2] for row in channels.values()))
-    limit = AT_NOISE + _SAMPLING * np.sqrt(spread) / max(n, 1)
+    limit = HELD_OUT.at_noise + HELD_OUT.sampling * np.sqrt(spread) / max(n, 1)
     by_channel, worst, ratio = {}, "", 0.0
     for channel, (total, count, variance) in channels.items():
         if count < 1:
             continue
         value = float(np.sqrt(total / count * n / freedom))
         by_channel[channel] = value
-        share = value / (CHANNEL_AT_NOISE + _SAMPLING * np.sqrt(variance) / count)
+        share = value / (HELD_OUT.channel_at_noise + HELD_OUT.sampling * np.sqrt(variance) / count)
         if share > ratio:
             worst, ratio = channel, float(share)
     return NoiseTest(rms, float(limit), by_channel, worst, float(ratio), bool(rms <= limit and ratio <= 1.0))

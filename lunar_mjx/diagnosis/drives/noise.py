@@ -52,7 +52,7 @@ _EVIDENCE = 15.0
 """Twice the log-likelihood that a colour must gain over white noise: a chi-square of two degrees exceeds it once in
 1,800 times."""
 _OWN = 10.0
-"""The same for a kind of instrument that departs from the colour that all have in common."""
+"""Twice the log-likelihood that a kind of instrument must gain by a colour of its own over the one of all kinds."""
 _JITTER, _UNEVEN = 0.05, 40
 """Error of a segment's times, as a share of its length, that does not matter; sets of times that are looked at."""
 _SIZE = 1.2

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 SLIP_SPEED = 0.03
 """Speed of a wheel's rim below which a measured slip ratio is not compared, m/s."""
 SLIP_TIME = 0.25
-"""Nor within this time of such a speed, s: where a wheel reverses, the ratio jumps by hundreds of its noise with a
-millisecond."""
+"""Time around a rim speed below `SLIP_SPEED` in which no slip ratio is compared either, s: where a wheel reverses,
+the ratio jumps by hundreds of its noise with a millisecond."""
 
 
 def defined(log: Log, run: LogRun, channel: str, time: np.ndarray) -> np.ndarray:

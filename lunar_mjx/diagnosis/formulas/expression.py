@@ -39,7 +39,7 @@ class Quantity:
 
     @property
     def symbol(self) -> Symbol:
-        """Its SymPy symbol."""
+        """The quantity as a SymPy symbol."""
         return symbol(self.name, self.positive)
 
 

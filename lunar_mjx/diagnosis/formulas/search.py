@@ -16,7 +16,7 @@ from lunar_mjx.diagnosis.formulas.slots import Choice, Slots, features, library,
 from lunar_mjx.diagnosis.formulas.targets import known
 from lunar_mjx.inference.descent import descend
 from lunar_mjx.inference.fitting import Fit, Progress, fit, silent
-from lunar_mjx.inference.held_out import ENOUGH, noise_test, predictive_gain, predictive_residual
+from lunar_mjx.inference.held_out import HELD_OUT, noise_test, predictive_gain, predictive_residual
 from lunar_mjx.inference.objective import Objective
 from lunar_mjx.inference.score import leash, project
 
@@ -286,7 +286,7 @@ class _Search:
         # Where fitted groups are too few to be left out in turn, they count as they are: how well a formula does on two
         # groups alone decides nothing between neighbours.
         observations, fitted = slots.problem.observations, self.base.fitted
-        few = len(np.unique(observations.unit[fitted])) < ENOUGH
+        few = len(np.unique(observations.unit[fitted])) < HELD_OUT.enough
         old = np.where(fitted & few, self.base.residual, self.before)
         new = np.where(fitted & few, found.residual, after)
         change = (old**2 - new**2)[observations.in_split("fit", "select")]

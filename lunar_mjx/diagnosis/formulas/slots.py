@@ -67,7 +67,7 @@ class Choice:
 
     @functools.cached_property
     def term(self) -> Term:
-        """This choice of a formula as a `Term`."""
+        """The chosen formula, with its amount and null, as a `Term`."""
         of = features(self.port)
         return term(targets()[self.target], of[self.first] * of[self.second], self.linear)
 
@@ -173,7 +173,7 @@ class Slots:
         self.problem = self.empty.with_constants(self._numbers())
 
     def holding(self, held: Mapping[int, tuple[Choice, float]]) -> Slots:
-        """The same with other formulas."""
+        """This table's problem with other formulas in its slots; no program compiles anew."""
         other = object.__new__(Slots)
         other.empty, other.held = self.empty, dict(held)
         other.problem = self.empty.with_constants(other._numbers())

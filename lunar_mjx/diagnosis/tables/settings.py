@@ -48,7 +48,8 @@ class TableSettings(SearchSettings):
     stated_spread: float = 0.3
     """1; standard deviation of the logarithm of the noise's size where it is only stated."""
     replicate_spread: float = 0.15
-    """1; the same beside what the number of replicates allows: between points noise is not quite that between runs."""
+    """1; standard deviation of the logarithm of a noise's size that replicates tell, beside what their number allows:
+    between points noise is not quite that between runs."""
 
     length_size: float = 0.06
     """1; prior standard deviation of an amplitude in metres (height of grousers, error of the radius) over the wheel's
@@ -66,11 +67,11 @@ class TableSettings(SearchSettings):
     slip_length: float = 0.4
     """1; slip ratio over which a discrepancy changes."""
     angle_length: float = 30.0
-    """deg; the same of the slip angle."""
+    """deg; slip angle over which a discrepancy changes."""
     load_length: float = 0.7
-    """1; the same of the logarithm of the load: a factor of two."""
+    """1; logarithm of the load over which a discrepancy changes: a factor of two."""
     speed_length: float = 0.7
-    """1; the same of the logarithm of the speed."""
+    """1; logarithm of the speed over which a discrepancy changes: a factor of two."""
     shape_shares: tuple[float, float, float] = (0.3, 0.3, 0.4)
     """1; shares of a discrepancy's variance: constant, linear, curved."""
     mode_share: float = 0.985

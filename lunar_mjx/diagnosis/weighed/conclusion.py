@@ -116,7 +116,7 @@ def probabilities(found: ModelSearch) -> dict[str, float]:
 
 
 def _where(found: ModelSearch) -> tuple[str | None, str | None]:
-    """The port at which something unlisted most probably acts, the larger of two that are as sure; the same in full."""
+    """Port, and name of the term, at which something unlisted most probably acts; the larger of two as sure."""
     names = [t.name for t in found.inclusion() if t.kind == UNLISTED]
     if not names:
         return None, None

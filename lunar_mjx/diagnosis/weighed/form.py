@@ -32,7 +32,7 @@ class SearchSettings:
     """1; scale of the half-normal prior of each port's discrepancy: no contact law is exact (terramechanics models
     predict drawbar pull and sinkage to some 5 to 10 per cent, Wong 2008)."""
     unlisted_discrepancy: float = 0.3
-    """1; the same where something unlisted acts at a port."""
+    """1; scale of the half-normal prior of a discrepancy where something unlisted acts at its port."""
     effect_size: float = 1.0
     """1; prior standard deviation of an effect's amplitude, over its nominal size."""
     effect_odds: float = 0.01

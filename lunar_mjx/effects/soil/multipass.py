@@ -13,7 +13,7 @@ PLACES = 20
 shipped rovers roll (`ruts` remembers by place). 64 places took two thirds of the time of a step on one H100."""
 
 _FRESH = 3
-"""Its own latest places, which lie under or just behind it, are no earlier pass for a wheel."""
+"""Latest places of a wheel that lie under or just behind it, and so are no earlier pass."""
 _NOWHERE = 1e6
 """Where places lie that have not been visited yet, m from the origin."""
 _FAINT = 0.05

@@ -21,8 +21,8 @@ class NoiseLimits:
     factor: float = 2.0
     """A stated noise that is wrong by less than this does not mislead; the data sheets themselves are no better."""
     quieter: float = 3.5
-    """The same for noise smaller than stated, and only where the rest shows white noise: of noise that is nine tenths
-    slow, spans of a few seconds show a third."""
+    """A stated noise that is too large by less than this is borne, where the rest shows white noise: of noise that is
+    nine tenths slow, spans of a few seconds show a third."""
     settle: float = 2.0
     """Seconds after a command has changed in which a rover still rocks."""
     still: float = 0.02

@@ -186,7 +186,7 @@ _UNIT = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]])
 
 
 def with_forms(rocks: Rocks) -> Rocks:
-    """The same rocks, spheres as ellipsoids of three equal semi-axes."""
+    """Rocks with forms: spheres become ellipsoids of three equal semi-axes."""
     if rocks.forms is not None:
         return rocks
     squares = jnp.where(rocks.radii > 0.0, rocks.radii, 1.0) ** -2.0
@@ -194,7 +194,7 @@ def with_forms(rocks: Rocks) -> Rocks:
 
 
 def padded(rocks: Rocks, more: int) -> Rocks:
-    """The same rocks with `more` dummies behind."""
+    """Rocks with `more` dummies of radius zero behind them, so that fields of different number stack."""
     forms = rocks.forms
     if forms is not None:
         forms = jnp.concatenate([forms, jnp.broadcast_to(jnp.asarray(_UNIT, forms.dtype), (more, 6))])

@@ -42,7 +42,7 @@ from lunar_mjx.inference.weighing.search import Hypothesis
 SOFT = "soft_ground"
 """The suspect that takes the place of a hard surface: it has no null, and a program of its own."""
 INSTEAD = "instead"
-"""Its coordinate that tells whether it does: 0 or 1."""
+"""Name of the coordinate that tells whether soft ground takes the place of the hard surface: 0 or 1."""
 STEPS = 10
 """Gauss-Newton steps of a refit at most."""
 SETTLED = 0.1
