@@ -8,6 +8,8 @@ instruments read.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -20,16 +22,26 @@ from lunar_mjx.logs.schema import channel_name
 
 CLOCK, MOUNTING, USUAL = "clock ", "mounting ", "usual "
 """Names of these nuisances begin so, and go on with the table, the axis, or the kind of instrument and its error."""
-FARTHEST = 6.0
-"""Standard deviations at which they are bounded."""
-UNKNOWN_DEG = 60.0
-"""A mounting less well known than this is no small angle: its axis tells nothing, and has no nuisance."""
+
+
+@dataclasses.dataclass(frozen=True)
+class UsualErrors:
+    """What instruments usually get wrong, and by how much at most."""
+
+    farthest: float = 6.0
+    """Standard deviations at which they are bounded."""
+    unknown_deg: float = 60.0
+    """A mounting less well known than this is no small angle: its axis tells nothing, and has no nuisance."""
+    usual_clock_s: float = 0.005
+    """Usual error between the clocks of kinds of channels, s: a quarter of a sampling interval of 50 Hz."""
+    usual_scale: float = 0.01
+    """Usual error of the scale of inertial sensors, currents, voltages and torques."""
+
+
+USUAL_ERRORS = UsualErrors()
+
 USUAL_ZERO = {"gyro": 0.002, "accelerometer": 0.02}
 """Usual bias of an inertial sensor by the first word of its channels, rad/s and m/s2: a MEMS unit's over a day."""
-USUAL_CLOCK_S = 0.005
-"""Usual error between the clocks of kinds of channels, s: a quarter of a sampling interval of 50 Hz."""
-USUAL_SCALE = 0.01
-"""Usual error of the scale of inertial sensors, currents, voltages and torques."""
 _SCALED = ("gyro", "accelerometer", "motor")
 _VECTORS = {"gyro": "gyro_{}_rad_s", "accelerometer": "accelerometer_{}_m_s2"}
 
@@ -47,13 +59,13 @@ def instrument_nuisances(number: int, log: Log, observations: Observations) -> l
             found.append(_coordinate(CLOCK + name, table.clock_offset_std_s, "s", number))
     turned = [s for s in mine if s.channel.partition("_")[0] in _VECTORS or (log.imu.attitude and s.channel in EULER)]
     for axis, std in zip("xyz", log.imu.mounting_std_deg, strict=True):
-        if turned and 0.0 < std < UNKNOWN_DEG:
+        if turned and 0.0 < std < USUAL_ERRORS.unknown_deg:
             found.append(_coordinate(MOUNTING + axis, float(np.radians(std)), "rad", number))
     return found
 
 
 def _coordinate(name: str, std: float, unit: str, number: int) -> Coordinate:
-    far = FARTHEST * std
+    far = USUAL_ERRORS.farthest * std
     return Coordinate(NUISANCE, name, 0.0, std, -far, far, prior=1.0, physical=True, unit=unit, log_index=number)
 
 
@@ -106,7 +118,10 @@ def _turned(kind: str, one: Series, series: list[Series], log: Log, axis: int, p
 def usual_nuisances(observations: Observations) -> list[Coordinate]:
     """Coordinates of what instruments get wrong as much as is usual, in units of that, shared by all logs."""
     names = usual_errors(observations, observations.value)
-    return [Coordinate(NUISANCE, USUAL + name, 0.0, 1.0, -FARTHEST, FARTHEST, prior=1.0) for name in names]
+    return [
+        Coordinate(NUISANCE, USUAL + name, 0.0, 1.0, -USUAL_ERRORS.farthest, USUAL_ERRORS.farthest, prior=1.0)
+        for name in names
+    ]
 
 
 def usual_kind(c: Coordinate) -> str:
@@ -134,8 +149,8 @@ def usual_errors(observations: Observations, predicted: np.ndarray) -> dict[str,
             add(f"{word}: zero {s.channel}", part, USUAL_ZERO[word])
         if word in _SCALED:
             kind = word if word in USUAL_ZERO else f"{word} {s.channel.rpartition('_')[2]}"
-            add(f"{kind}: scale", part, USUAL_SCALE * predicted[part])
+            add(f"{kind}: scale", part, USUAL_ERRORS.usual_scale * predicted[part])
         if s.time is not None and s.stop - s.start > 2:
-            late = USUAL_CLOCK_S * np.gradient(predicted[part], np.asarray(s.time))
+            late = USUAL_ERRORS.usual_clock_s * np.gradient(predicted[part], np.asarray(s.time))
             add(f"clock {family(s.channel) or word}: late", part, late)
     return columns

@@ -40,28 +40,50 @@ DATASHEET = {
 """Standard deviation by the first word of a channel, in its unit, where a log states nothing: visual odometry of a few
 millimetres, a tactical MEMS IMU, 12-bit encoders, thermistors of 0.3 K."""
 _ELECTRICAL = {"A": 0.01, "V": 0.05, "Nm": 0.2}
-_SETTLING = 2.0
-"""s that the rover needs to come to rest."""
-_SHORTEST, _LONGEST = 8, 100
-"""Samples of a rest segment: shorter ones tell nothing beside their own trend, longer ones are cut."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NoiseColours:
+    """How the colour of noise is told from what channels show at rest."""
+
+    settling: float = 2.0
+    """s that the rover needs to come to rest."""
+    # Samples of a rest segment: shorter ones tell nothing beside their own trend, longer ones are cut.
+    shortest: int = 8
+    longest: int = 100
+    # What is tried: shares of the variance that are correlated; correlation times in sampling intervals, and the
+    # ratio of one to the next.
+    shortest_time: float = 0.7
+    longest_time: float = 40.0
+    times_apart: float = 1.6
+    evidence: float = 15.0
+    """Twice the log-likelihood that a colour must gain over white noise: a chi-square of two degrees exceeds it once in
+    1,800 times."""
+    own: float = 10.0
+    """Twice the log-likelihood that a kind of instrument must gain by a colour of its own over the one of all kinds."""
+    # Error of a segment's times, as a share of its length, that does not matter; sets of times that are looked at.
+    jitter: float = 0.05
+    uneven: int = 40
+    size: float = 1.2
+    """Factor by which the variance at rest may differ from what is stated: within a second, slow noise of any size
+    looks alike but for that."""
+    # Length of a residual's windows in correlation times; share of the stated variance beyond which one holds a
+    # misfit.
+    window: float = 3.0
+    loud: float = 2.0
+    quiet: float = 0.25
+    """Share of the stated variance below which a channel at rest does not show its noise (an encoder that stands)."""
+    quietest: float = 0.1
+    """Share of what its family's sensors have, below which no channel's noise is believed to lie: a simulated log
+    without noise would weigh millions of sigma."""
+    unknown_log_std: float = 0.7
+    """Standard deviation of the logarithm of a noise that nothing tells: what a family's sensors have, within a factor
+    of two."""
+
+
+NOISE_COLOURS = NoiseColours()
+
 _SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97])
-_SHORTEST_TIME, _LONGEST_TIME, _TIMES_APART = 0.7, 40.0, 1.6
-"""What is tried: shares of the variance that are correlated; correlation times in sampling intervals, and the ratio
-of one to the next."""
-_EVIDENCE = 15.0
-"""Twice the log-likelihood that a colour must gain over white noise: a chi-square of two degrees exceeds it once in
-1,800 times."""
-_OWN = 10.0
-"""Twice the log-likelihood that a kind of instrument must gain by a colour of its own over the one of all kinds."""
-_JITTER, _UNEVEN = 0.05, 40
-"""Error of a segment's times, as a share of its length, that does not matter; sets of times that are looked at."""
-_SIZE = 1.2
-"""Factor by which the variance at rest may differ from what is stated: within a second, slow noise of any size looks
-alike but for that."""
-_WINDOW, _LOUD = 3.0, 2.0
-"""Length of a residual's windows in correlation times; share of the stated variance beyond which one holds a misfit."""
-_QUIET = 0.25
-"""Share of the stated variance below which a channel at rest does not show its noise (an encoder that stands)."""
 
 
 def stated_or_typical(log: Log, channel: str) -> float:
@@ -79,14 +101,6 @@ def stated_or_typical(log: Log, channel: str) -> float:
     if channel.endswith("slip_ratio"):
         return 0.02
     return DATASHEET.get(word, 0.01)
-
-
-QUIETEST = 0.1
-"""Share of what its family's sensors have, below which no channel's noise is believed to lie: a simulated log without
-noise would weigh millions of sigma."""
-UNKNOWN_LOG_STD = 0.7
-"""Standard deviation of the logarithm of a noise that nothing tells: what a family's sensors have, within a factor of
-two."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +148,7 @@ class Noises:
         """White and coloured standard deviation in the channel's unit, and correlation time in s."""
         estimate = self.estimate(log, channel)
         if estimate is not None:
-            size = max(1.0, QUIETEST * stated_or_typical(log, channel) / estimate.std)
+            size = max(1.0, NOISE_COLOURS.quietest * stated_or_typical(log, channel) / estimate.std)
             return size * estimate.white, size * estimate.coloured, estimate.correlation_time_s
         std = stated_or_typical(log, channel)
         if self._stated(log, channel):
@@ -154,7 +168,7 @@ class Noises:
     def log_std(self, log: Log, channel: str) -> float:
         """Standard deviation of the logarithm of a channel's noise: how well its size is known."""
         found = noise_of(log, channel) if channel in log.noise else self.estimate(log, channel)
-        return UNKNOWN_LOG_STD if found is None else found.log_std
+        return NOISE_COLOURS.unknown_log_std if found is None else found.log_std
 
     def refined(self, observations: Observations, residual: np.ndarray) -> Observations:
         """The colours that rest has shown, taken anew from a residual, which is longer than any rest.
@@ -171,10 +185,14 @@ class Noises:
         for s in mine:
             key, time, values = _kind(self.logs[s.log], s.channel), np.asarray(s.time), residual[s.start : s.stop]
             step = float(np.median(np.diff(time)))
-            size = int(np.clip(_WINDOW * s.correlation_time / step, 2 * _SHORTEST, _LONGEST))
+            size = int(
+                np.clip(
+                    NOISE_COLOURS.window * s.correlation_time / step, 2 * NOISE_COLOURS.shortest, NOISE_COLOURS.longest
+                )
+            )
             for i in range(0, len(time) - size + 1 if step < s.correlation_time else 0, size):
                 t, v = time[i : i + size], values[i : i + size] / key[1]
-                if t[-1] - t[0] < 1.5 * step * size and _QUIET < _about_line(t, v) < _LOUD:
+                if t[-1] - t[0] < 1.5 * step * size and NOISE_COLOURS.quiet < _about_line(t, v) < NOISE_COLOURS.loud:
                     segments.setdefault(key, []).append((t, v))
         if segments:
             self.common, self.colours = colours(segments, near=self.common)
@@ -212,7 +230,7 @@ def _rests(log: Log) -> list[tuple[float, float]]:
     edges = np.diff(np.concatenate([[0], idle.astype(int), [0]]))
     spans = []
     for first, after in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        begin = time[first] + (_SETTLING if first > 0 else 0.0)
+        begin = time[first] + (NOISE_COLOURS.settling if first > 0 else 0.0)
         end = time[min(after, len(time) - 1)] if after < len(time) else time[-1] + 1e-9
         if begin < end:
             spans.append((float(begin), float(end)))
@@ -225,8 +243,11 @@ def _cut(
     """Pieces of a channel within a span; none where it is too short, or too quiet to be noise."""
     inside = (time >= begin) & (time < end)
     t, v = time[inside], values[inside]
-    pieces = [(t[i : i + _LONGEST], v[i : i + _LONGEST] / std) for i in range(0, len(t), _LONGEST)]
-    return [(t, v) for t, v in pieces if len(t) >= _SHORTEST and np.var(v) >= _QUIET]
+    pieces = [
+        (t[i : i + NOISE_COLOURS.longest], v[i : i + NOISE_COLOURS.longest] / std)
+        for i in range(0, len(t), NOISE_COLOURS.longest)
+    ]
+    return [(t, v) for t, v in pieces if len(t) >= NOISE_COLOURS.shortest and np.var(v) >= NOISE_COLOURS.quiet]
 
 
 def colours(
@@ -247,7 +268,7 @@ def colours(
     if not segments:
         return Colour(), {}
     tried = _around(near) if near is not None and near.share > 0.0 else _everywhere(segments)
-    size = 1.0 if near is not None else _SIZE
+    size = 1.0 if near is not None else NOISE_COLOURS.size
     likelihood = {}
     for kind, parts in segments.items():
         groups = _by_times(parts)
@@ -256,12 +277,12 @@ def colours(
     def most_likely(rows: Sequence[np.ndarray]) -> int:
         total = np.sum(rows, axis=0) if len(rows) else np.zeros(len(tried))
         k = int(np.argmax(total))
-        return k if 2.0 * (total[k] - total[0]) > _EVIDENCE else 0
+        return k if 2.0 * (total[k] - total[0]) > NOISE_COLOURS.evidence else 0
 
     common, alike = 0, list(likelihood)
     for _ in range(len(likelihood)):
         common = most_likely([likelihood[kind] for kind in alike])
-        kept = [kind for kind, row in likelihood.items() if 2.0 * (row.max() - row[common]) < _OWN]
+        kept = [kind for kind, row in likelihood.items() if 2.0 * (row.max() - row[common]) < NOISE_COLOURS.own]
         if kept == alike:
             break
         alike = kept
@@ -271,8 +292,8 @@ def colours(
 
 def _everywhere(segments: Mapping[K, Sequence[tuple[np.ndarray, np.ndarray]]]) -> list[Colour]:
     intervals = [float(np.median(np.diff(t))) for parts in segments.values() for t, _ in parts]
-    first, last = _SHORTEST_TIME * min(intervals), _LONGEST_TIME * max(intervals)
-    times = np.geomspace(first, last, 1 + int(np.ceil(np.log(last / first) / np.log(_TIMES_APART))))
+    first, last = NOISE_COLOURS.shortest_time * min(intervals), NOISE_COLOURS.longest_time * max(intervals)
+    times = np.geomspace(first, last, 1 + int(np.ceil(np.log(last / first) / np.log(NOISE_COLOURS.times_apart))))
     return [Colour(), *(Colour(float(share), float(tau)) for share in _SHARES for tau in times)]
 
 
@@ -291,9 +312,11 @@ def _by_times(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.n
     for t, v in parts:
         step = float(f"{np.median(np.diff(t)):.2g}")
         even = step * np.arange(len(t))
-        since = even if np.max(np.abs(t - t[0] - even)) < _JITTER * step * len(t) else np.round(t - t[0], 6)
+        since = (
+            even if np.max(np.abs(t - t[0] - even)) < NOISE_COLOURS.jitter * step * len(t) else np.round(t - t[0], 6)
+        )
         groups.setdefault(since.tobytes(), (since, []))[1].append(v)
-    found = sorted(groups.values(), key=lambda g: -len(g[1]))[:_UNEVEN]
+    found = sorted(groups.values(), key=lambda g: -len(g[1]))[: NOISE_COLOURS.uneven]
     return [(since, np.stack(values, axis=1)) for since, values in found]
 
 

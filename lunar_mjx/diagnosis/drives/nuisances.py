@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.instruments import is_instrument
-from lunar_mjx.diagnosis.drives.simulation.log_run import READS_BEFORE, SETTLE, STOOD
+from lunar_mjx.diagnosis.drives.simulation.log_run import LOG_START, READS_BEFORE, STOOD
 from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.logs.schema import is_quantity
@@ -22,14 +23,25 @@ _COUNTED = re.compile(r"position|angle|yaw")
 """What another pose at the start moves as a whole."""
 _START = {"x": (0.01, 1.0), "y": (0.01, 1.0), "yaw": (0.01, 0.6), "temperature": (1.0, 100.0)}
 """Scale and reach of what is measured with noise at the start, m, rad, K."""
-_STOOD_SCALE, _STOOD_MOST = 0.5, 6.0
-"""Of the time for which a rover had stood, s."""
-STANDING = (SETTLE, 3.0 * SETTLE)
+
+
+@dataclasses.dataclass(frozen=True)
+class StoodTime:
+    """The time for which a rover had stood when its log begins."""
+
+    # Of the time for which a rover had stood, s.
+    stood_scale: float = 0.5
+    stood_most: float = 6.0
+    shows: float = 500.0
+    """Squared difference between them, in sigma, from which the time is fitted. Where it matters less, its jumps
+    (wheels at rest that change the sign of their slip) cost descents more than it gives: four drives of VIPER on a
+    slope show thousands, six of LUVMI-X some fifty."""
+
+
+STOOD_TIME = StoodTime()
+
+STANDING = (LOG_START.settle, 3.0 * LOG_START.settle)
 """Times of standing that are compared, s."""
-_SHOWS = 500.0
-"""Squared difference between them, in sigma, from which the time is fitted. Where it matters less, its jumps (wheels at
-rest that change the sign of their slip) cost descents more than it gives: four drives of VIPER on a slope show
-thousands, six of LUVMI-X some fifty."""
 
 
 def is_encoder(series: Series) -> bool:
@@ -44,7 +56,7 @@ def standing_shows(change: np.ndarray, number: int, observations: Observations) 
         if s.log == number:
             own = change[s.start : s.stop] / sigma[s.start : s.stop]
             total += float(np.sum((own - own.mean() if _COUNTED.search(s.channel) else own) ** 2))
-    return total > _SHOWS
+    return total > STOOD_TIME.shows
 
 
 def step_error_share() -> Coordinate:
@@ -87,9 +99,9 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
                 NUISANCE,
                 STOOD,
                 run.start[STOOD],
-                _STOOD_SCALE,
-                SETTLE,
-                _STOOD_MOST,
+                STOOD_TIME.stood_scale,
+                LOG_START.settle,
+                STOOD_TIME.stood_most,
                 prior=10.0,
                 physical=True,
                 log_index=number,

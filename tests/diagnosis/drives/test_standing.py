@@ -11,7 +11,7 @@ import pytest
 
 from lunar_mjx.diagnosis.drives.nuisances import standing_shows
 from lunar_mjx.diagnosis.drives.problem import SIMULATED, DriveProblem
-from lunar_mjx.diagnosis.drives.simulation.log_run import SETTLE, STOOD
+from lunar_mjx.diagnosis.drives.simulation.log_run import LOG_START, STOOD
 from lunar_mjx.diagnosis.drives.simulation.program import PIECE, Program, _between
 from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench
 from lunar_mjx.logs import read_log, simulate_log, write_log
@@ -44,7 +44,7 @@ def test_standing_takes_as_many_pieces_as_the_rover_that_stood_longest():
         return {"time": state["time"] + PIECE}, None
 
     program._drive = drive  # type: ignore[assignment]
-    stood = np.array([SETTLE, 1.3, 2.0, 1.75])
+    stood = np.array([LOG_START.settle, 1.3, 2.0, 1.75])
     out = program._stand(None, {"time": jnp.zeros(4)}, np.zeros((4, 50, 3)), stood, True)  # type: ignore[arg-type]
     assert np.allclose(out["time"], stood)
     assert drives == [(4, 50, 3)] * 4
@@ -98,7 +98,7 @@ def test_a_log_on_a_slope_tells_how_long_its_rover_had_stood(tmp_path):
     problem = DriveProblem([log], make_model("viper", terrain=log.terrain), {})
     place = next(i for i, c in enumerate(problem.coordinates) if c.name == STOOD)
     c = problem.coordinates[place]
-    stood = np.array([SETTLE, 1.5, RECORDER_SETTLES, 3.0])
+    stood = np.array([LOG_START.settle, 1.5, RECORDER_SETTLES, 3.0])
     rows = np.repeat(problem.origin()[None], len(stood), axis=0)
     rows[:, place] = (stood - c.start) / c.scale
     currents = np.concatenate([np.r_[s.start : s.stop] for s in problem.observations.series if "current" in s.channel])

@@ -6,14 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.instruments import (
-    USUAL_CLOCK_S,
-    USUAL_SCALE,
-    USUAL_ZERO,
-    usual_errors,
-    usual_kind,
-    usual_nuisances,
-)
+from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS, USUAL_ZERO, usual_errors, usual_kind, usual_nuisances
 from tests.inference.toy_problem import manoeuvres
 
 
@@ -33,7 +26,9 @@ def test_each_kind_of_instrument_errs_in_its_own_way():
     zero, scale = found["gyro: zero gyro_z_rad_s"], found["gyro: scale"]
     assert not zero[50:].any() and not scale[50:].any()
     np.testing.assert_allclose(zero[:50], USUAL_ZERO["gyro"])
-    np.testing.assert_allclose(scale[:50], USUAL_SCALE * rise[:50])
+    np.testing.assert_allclose(scale[:50], USUAL_ERRORS.usual_scale * rise[:50])
     current = found["motor A: scale"]
-    np.testing.assert_allclose(current[50:150], USUAL_SCALE * rise[50:150])  # one scale of all motors
-    np.testing.assert_allclose(found["clock electrical: late"], USUAL_CLOCK_S * np.repeat([0.0, 2.0, 3.0, 0.0], 50))
+    np.testing.assert_allclose(current[50:150], USUAL_ERRORS.usual_scale * rise[50:150])  # one scale of all motors
+    np.testing.assert_allclose(
+        found["clock electrical: late"], USUAL_ERRORS.usual_clock_s * np.repeat([0.0, 2.0, 3.0, 0.0], 50)
+    )

@@ -17,14 +17,28 @@ from lunar_mjx.logs.series import sigma
 from lunar_mjx.model import ZERO_CELSIUS, Model
 from lunar_mjx.terrain.heightfield import slope
 
-SETTLE = 1.0
-"""Least time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
+
+@dataclasses.dataclass(frozen=True)
+class LogStart:
+    """How a simulation begins where its log does."""
+
+    settle: float = 1.0
+    """Least time for which a rover stands before a log begins, s: it sinks to rest, as the real one had before."""
+    finest: float = 0.01
+    """Shortest interval of telemetry, s."""
+    # s within which a first sample tells the start; noise that it must exceed to tell motion.
+    near_start: float = 0.5
+    sigmas: float = 5.0
+    starts_moving: float = 0.02
+    """m/s of a rover, or of its wheels' rims, from which a log begins in motion: below, noise of a rover at rest."""
+
+
+LOG_START = LogStart()
+
 READS_BEFORE = "reads_before"
 """Name of how far motors are read before a row's command takes effect: a share, which all logs have in common."""
 STOOD = "stood"
 """Name of the time for which a rover had stood before a log, s."""
-_FINEST = 0.01
-"""Shortest interval of telemetry, s."""
 _LEVEL = math.radians(1.0)
 """On a steeper slope a rover creeps for seconds, ever slower: how long it has stood may show in its currents."""
 
@@ -71,7 +85,7 @@ def log_run(log: Log, model: Model) -> LogRun:
     given, begin = log_commands(log, own)
     every = round(given.interval / own.timestep)
     values = given.values
-    finest = max(_FINEST, min(float(np.median(np.diff(t.time_s))) for t in log.tables.values() if len(t) > 2))
+    finest = max(LOG_START.finest, min(float(np.median(np.diff(t.time_s))) for t in log.tables.values() if len(t) > 2))
     split = next((k for k in range(1, every + 1) if every % k == 0 and given.interval / k <= 1.01 * finest), 1)
     values, every = np.repeat(values, split, axis=0), every // split
     if len(values) < 3:
@@ -85,7 +99,7 @@ def log_run(log: Log, model: Model) -> LogRun:
 
 def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
     """Pose, temperature and time of standing at the first samples, and which of them a fit must find."""
-    start = {"x": 0.0, "y": 0.0, "yaw": 0.0, "temperature": float(model.ambient[0]), STOOD: SETTLE}
+    start = {"x": 0.0, "y": 0.0, "yaw": 0.0, "temperature": float(model.ambient[0]), STOOD: LOG_START.settle}
     unknown = []
 
     def first(channel: str) -> float | None:
@@ -115,7 +129,7 @@ def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
         start["temperature"] = float(np.mean(known)) + ZERO_CELSIUS
         unknown.append("temperature")
     if float(slope(model.terrain.field, start["x"], start["y"])) > _LEVEL:
-        start[STOOD] = 2.0 * SETTLE
+        start[STOOD] = 2.0 * LOG_START.settle
         unknown.append(STOOD)
     return start, tuple(unknown)
 
@@ -128,12 +142,6 @@ def _stated_yaw(log: Log) -> float | None:
         return None
     w, x, y, z = log.initial["quaternion"]
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
-_NEAR_START, _SIGMAS = 0.5, 5.0
-"""s within which a first sample tells the start; noise that it must exceed to tell motion."""
-STARTS_MOVING = 0.02
-"""m/s of a rover, or of its wheels' rims, from which a log begins in motion: below, noise of a rover at rest."""
 
 
 def start_motion(log: Log, model: Model, begin: float, yaw: float) -> dict[str, np.ndarray]:
@@ -152,9 +160,9 @@ def start_motion(log: Log, model: Model, begin: float, yaw: float) -> dict[str, 
         """The first sample: a line through several would see a rover that starts at once as one that was moving."""
         for name in names:
             found = log.channel(name)
-            if found is not None and len(found[0]) and found[0][0] - begin < _NEAR_START:
+            if found is not None and len(found[0]) and found[0][0] - begin < LOG_START.near_start:
                 value = float(found[1][0])
-                return value if abs(value) > _SIGMAS * sigma(log, name) else 0.0
+                return value if abs(value) > LOG_START.sigmas * sigma(log, name) else 0.0
         return math.nan
 
     channels = joint_channels(model.rover)
@@ -171,7 +179,9 @@ def start_motion(log: Log, model: Model, begin: float, yaw: float) -> dict[str, 
         velocity = np.array([ahead * math.cos(yaw), ahead * math.sin(yaw)])
     # one of the two may be noise of a sensor that drifts; a rover in motion shows both where both are measured
     sizes = [float(np.hypot(*velocity)), *(abs(v) for v in rims if np.isfinite(v))]
-    moves = max(sizes) > STARTS_MOVING and (math.isnan(rolling) or max(np.abs(rims)) > STARTS_MOVING)
+    moves = max(sizes) > LOG_START.starts_moving and (
+        math.isnan(rolling) or max(np.abs(rims)) > LOG_START.starts_moving
+    )
     return {"moves": np.array(moves), "velocity": velocity, "yaw_rate": np.array(rate), "joint_speed": spin}
 
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.simulation.log_run import SETTLE, STOOD, ImuMounting, LogRun
+from lunar_mjx.diagnosis.drives.simulation.log_run import LOG_START, STOOD, ImuMounting, LogRun
 from lunar_mjx.dynamics import System, build
 from lunar_mjx.dynamics.signals import measure
 from lunar_mjx.dynamics.state import Params
@@ -139,9 +139,9 @@ class Program:
             return np.asarray(found if size >= len(log) else _first(found, size))
 
     def _stand(self, params: Params, state: Any, still: np.ndarray, stood: np.ndarray, shared: bool) -> Any:
-        """Rovers that have stood for their own times (rovers,), s, at least `SETTLE`."""
+        """Rovers that have stood for their own times (rovers,), s, at least `LOG_START.settle`."""
         pieces = stood / (self.segment * self.every * self.system.dt)
-        first = round(SETTLE / PIECE)
+        first = round(LOG_START.settle / PIECE)
         for _ in range(first):
             state, _ = self._drive(params, state, still, shared=shared)
         kept, now = state, state
