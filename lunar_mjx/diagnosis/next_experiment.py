@@ -31,7 +31,7 @@ NOTHING = "no further effect"
 
 
 @dataclasses.dataclass(frozen=True)
-class NextExperiment:
+class ExperimentChoice:
     """How experiments are chosen."""
 
     seconds: float = 30.0
@@ -42,7 +42,7 @@ class NextExperiment:
     """sigma; difference of two hypotheses from which a measurement tells them apart."""
 
 
-NEXT = NextExperiment()
+CHOICE = ExperimentChoice()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +78,7 @@ class NextExperiment:
 
 
 def next_experiment(
-    folder: str | Path | Run, between: Sequence[str] = (), seconds: float = NEXT.seconds, progress: Progress = silent
+    folder: str | Path | Run, between: Sequence[str] = (), seconds: float = CHOICE.seconds, progress: Progress = silent
 ) -> NextExperiment:
     """The manoeuvre (or sweep of a test bed) that best separates what the logs leave open; writes `next.json`.
 
@@ -137,15 +137,15 @@ def _hypotheses(verdict: dict[str, Any], between: Sequence[str], candidates: set
         return list(between) if len(between) > 1 else [*between, NOTHING]
     named = [e for e in verdict["effects"] if e in candidates]
     if verdict["verdict"] == "KNOWN_CLASS" and len(named) > 1:
-        return named[: NEXT.most]
+        return named[: CHOICE.most]
     if verdict["verdict"] == "NOISE_ONLY":
         # What these logs could not have shown, the most nearly visible first.
         hidden = sorted((e for e in evidence if e["status"] == "not tested"), key=lambda e: -e["separable_sigma"])
-        return [*(e["effect"] for e in hidden[: NEXT.most - 1]), NOTHING]
+        return [*(e["effect"] for e in hidden[: CHOICE.most - 1]), NOTHING]
     open_ = [e["effect"] for e in evidence if e["status"] in ("accepted", "confounded")]
     near = [e["nearest"][0] for e in evidence if e["effect"] in named and e["nearest"][0] in candidates]
     rest = [e["effect"] for e in sorted(evidence, key=lambda e: -(e["z"] or 0.0)) if e["effect"] in candidates]
-    return list(dict.fromkeys([*named[:2], *open_, *near, *rest]))[: max(2, min(NEXT.most, len(named) + 2))]
+    return list(dict.fromkeys([*named[:2], *open_, *near, *rest]))[: max(2, min(CHOICE.most, len(named) + 2))]
 
 
 class _Knowledge:
@@ -246,7 +246,7 @@ def _sentence(names: Sequence[str], plans: Sequence[Plan]) -> str:
         return f"No planned measurement could be simulated to tell {said} apart."
     best = plans[0]
     pair = f" (least for {best.pair[0]} against {best.pair[1]})" if len(names) > 2 else ""
-    if best.separation < NEXT.separable:
+    if best.separation < CHOICE.separable:
         return (
             f"No planned measurement tells {said} apart with these instruments: the best, {best.name}, would show a "
             f"difference of {best.separation:.2g} sigma{pair}; measure longer, or with less noise."

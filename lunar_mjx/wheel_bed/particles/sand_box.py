@@ -224,12 +224,13 @@ class SandBoxes:
             builder.add_shape_mesh(builder.add_body(mass=1.0), mesh=mesh, cfg=rough)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a wheel's inertia, which is imposed and never used, looks odd to Newton
-            self.model = builder.finalize(device=device)
+            # Newton declares arrays of a model as possibly missing: after `finalize` they are there
+            self.model: Any = builder.finalize(device=device)
         set_sand(self.model, first.sand, first.gravity)
         self.model.particle_q.assign(np.concatenate(places))
         self.model.particle_qd.zero_()
 
-        self.state = self.model.state()
+        self.state: Any = self.model.state()
         imposed = np.stack([self._imposed(r) for r in runs]).astype(np.float32)
         place = np.zeros((len(runs), PLACE), np.float32)
         place[:, 0] = self.box.start

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
@@ -79,13 +80,14 @@ def _left_alone(
     SolverImplicitMPM.register_custom_attributes(builder)
     add_sand(builder, box, sand, len(places))
     add_walls(builder, box, 1)
-    model = builder.finalize(device=name)
+    # Newton declares arrays of a model as possibly missing: after `finalize` they are there
+    model: Any = builder.finalize(device=name)
     set_sand(model, sand, gravity)
     model.particle_q.assign(places)
     state = model.state()
     config = SolverImplicitMPM.Config()
     config.voxel_size, config.max_iterations, config.tolerance = box.voxel, 100, 1e-5
-    solver = SolverImplicitMPM(model, config=config)
+    solver: Any = SolverImplicitMPM(model, config=config)
     for _ in range(math.ceil(duration * math.sqrt(box.size[2] / gravity) / dt)):
         solver.step(state, state, None, None, dt)
     return state.particle_q.numpy().astype(float)
