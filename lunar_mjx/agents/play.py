@@ -15,7 +15,7 @@ from scipy import ndimage
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.cameras.chase import Chase, wheel_tracks
 from lunar_mjx.cameras.ground_map import GroundMap
-from lunar_mjx.envs import NavigationEnv, make, make_agent, split_keys
+from lunar_mjx.envs import TASKS, NavigationEnv, make, make_agent, split_keys
 from lunar_mjx.envs.scripted import AGENTS, Agent
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.files import replacing, write_text
@@ -42,7 +42,7 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     """An agent with the environment that it was made for.
 
     Args:
-      name: path of a policy, name of a rover that ships one, or `zero`, `random`, `scripted`.
+      name: path of a policy, name of a rover that ships one, or of an agent that learns nothing (`AGENTS`).
       task: of agents without a policy.
       options: of the environment that differ from the policy's.
 
@@ -54,6 +54,8 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     """
     options = options or {}
     if name in AGENTS:
+        if name == "mapper" and task in TASKS and "observations" not in options:
+            options = {**options, "observations": (*TASKS[task].observations, "plan")}
         env = make("navigation", **{"task": task, **options})
         unseen = {"terrain": "world:heldout", "ranges": "unseen"} if task == "large" else {}
         if task.startswith("ladder/"):

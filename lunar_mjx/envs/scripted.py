@@ -1,5 +1,5 @@
 """Agents that learn nothing, to look at an environment and to beat: zero, random, straight for the goal, around what
-the height scan shows, and along the shortest way of one who knows the map."""
+the height scan shows, along the way on a map drawn while driving, and along that of one who knows the whole map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.envs.core import Environment, State
-from lunar_mjx.envs.ladder.follower import Follower
+from lunar_mjx.envs.ladder.follower import Follower, toward
 from lunar_mjx.envs.navigation.env import NavigationEnv, NavigationParams
 from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE
 from lunar_mjx.errors import bad_input
@@ -20,15 +20,15 @@ from lunar_mjx.errors import bad_input
 Agent = Callable[[State, Any], Any]
 """Function of the batch's state and a random key to actions (env, action)."""
 
-AGENTS = ("zero", "random", "scripted", "reactive", "planner")
+AGENTS = ("zero", "random", "scripted", "reactive", "mapper", "planner")
 
 
 def make_agent(name: str, env: Environment, params: Any = None) -> Agent:
     """An agent by name.
 
     `zero` does nothing, `random` draws uniformly, `scripted` drives straight for the goal, `reactive` steers around
-    what the height scan shows, `planner` follows the shortest way over the whole map of a ladder's worlds, which it
-    knows.
+    what the height scan shows. `mapper` follows the way on the map of what it has seen, `planner` the shortest way over
+    the whole map of a ladder's worlds, which it knows.
 
     Args:
       name: of the agent. env: to drive in. params: of the environment, whose map `planner` knows; `env.params` if None.
@@ -54,6 +54,8 @@ def make_agent(name: str, env: Environment, params: Any = None) -> Agent:
         raise bad_input("agent", name, env.config.action, "is no action mode that it can drive in", remedy)
     if name == "reactive":
         return reactive_rule(env)
+    if name == "mapper":
+        return _mapper(env)
     if name == "planner":
         return _planner(env, env.params if params is None else params)
     return _driver(env)
@@ -149,6 +151,22 @@ def reactive_rule(env: NavigationEnv, settings: Reactive | None = None) -> Agent
         back = (room < scale * r.near) | (waited > r.patience)
         steer = r.gain * heading / limit
         return _wheels(env, jnp.where(back, -0.7, 1.0), jnp.where(back, -steer, steer))
+
+    return act
+
+
+def _mapper(env: NavigationEnv) -> Agent:
+    """Aims where the block `plan` says, and backs off where it comes no farther."""
+    for block in ("plan", "waited"):
+        if block not in env.blocks:
+            raise bad_input("agent", "mapper", env.config.observations, f"lacks the block {block}", "add it")
+    limit = _steering_limit(env)
+
+    def act(state: State, key: Any) -> Any:
+        aim = state.obs[:, env.blocks["plan"]][:, :2]
+        waited = 10.0 * state.obs[:, env.blocks["waited"]][:, 0]
+        drive, steer = toward(jnp.arctan2(aim[:, 1], aim[:, 0]), waited)
+        return _wheels(env, drive, steer / limit)
 
     return act
 

@@ -218,7 +218,7 @@ def test_a_rung_keeps_the_contract_and_collisions_end_episodes():
 
 @pytest.mark.slow
 def test_the_reward_of_the_way_adds_up_and_the_trail_follows():
-    observations = ("goal_body", "height_scan", "far_scan", "trail", "border", "visited")
+    observations = ("goal_body", "height_scan", "far_scan", "trail", "border", "visited", "plan")
     env = make_navigation("ladder/3", worlds=1, decimation=25, observations=observations, weights={"way": 1.0})
     state = env.reset(env.params, split_keys(jax.random.PRNGKey(2), 3))
     first, begin, paid = state.inner.left, state.inner.origin[:, :2], 0.0
@@ -245,6 +245,14 @@ def test_the_reward_of_the_way_adds_up_and_the_trail_follows():
     been = np.asarray(state.obs[:, env.blocks["visited"]]).reshape(3, 5, 5)
     np.testing.assert_allclose(been[:, 2, 2], np.exp(-0.125 * gone**2), atol=0.05)
     assert (been.reshape(3, -1).argmax(1) == 12).all()
+    # the map is drawn from the first step on, and its way is no shorter than the straight line
+    seen, plan = np.asarray(state.inner.chart.seen), np.asarray(state.obs[:, env.blocks["plan"]])
+    assert (seen.sum((1, 2)) > 100).all() and not seen.all()
+    straight = np.hypot(*(state.inner.goal - here).T)
+    assert (50.0 * plan[:, -1] > straight - 1.0).all() and (np.hypot(plan[:, 0], plan[:, 1]) < 8.0).all()
+    # an episode that ends leaves no map to the next one
+    blank = env._restart(env.params, state.inner, dataclasses.replace(state, terminated=jnp.ones(3, bool))).inner.chart
+    assert not np.asarray(blank.seen).any() and np.isfinite(np.asarray(blank.cost)).all()
 
 
 @pytest.mark.slow

@@ -8,26 +8,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage
 
+from lunar_mjx.envs.ladder.chart import prices
 from lunar_mjx.envs.ladder.pool import Pool
 from lunar_mjx.envs.ladder.ways import distances
 
-WIDE = 1.6
-"""m from what is blocked at which a way costs no more than its length."""
-CLOSE = 3.0
-"""Price of a metre right beside what is blocked, over that of an open one. Shortest ways brush past boulders, and a
-rover that drifts a hand's breadth hangs on them."""
 AHEAD = 4
 """Nodes along the way that it aims at, at most; fewer where the straight line there is blocked."""
 PATIENCE = 3.0
 """s without progress after which it backs off, and after as long again drives on."""
-
-
-def prices(way: np.ndarray, cell: float) -> np.ndarray:
-    """Price of a metre at every node of a planning grid; infinite distances mark what is blocked."""
-    clear = cell * np.asarray(ndimage.distance_transform_edt(np.isfinite(way)))
-    return 1.0 + (CLOSE - 1.0) * np.clip(1.0 - (clear - cell) / WIDE, 0.0, 1.0)
 
 
 def costs(pool: Pool) -> Any:
@@ -41,9 +30,23 @@ def costs(pool: Pool) -> Any:
         way, price, row, column = args
         return distances(jnp.isfinite(way), row, column, cell, price)
 
-    price = jnp.asarray(np.stack([prices(way, cell) for way in ways]), jnp.float32)
+    price = jnp.asarray(np.stack([prices(np.isfinite(way), cell) for way in ways]), jnp.float32)
     rows, columns = (jnp.asarray(a) for a in np.array(goals).T)
     return jax.lax.map(one, (jnp.asarray(ways), price, rows, columns))
+
+
+def toward(turn: Any, waited: Any, leaving: Any = False) -> tuple[Any, Any]:
+    """Speed as a share of the top speed, and steering angle in rad, each (env,).
+
+    Args:
+      turn: to the place aimed at from the heading, rad. waited: s without progress.
+      leaving: whether to go on backwards.
+    """
+    phase = jnp.floor(waited / PATIENCE).astype(jnp.int32)
+    back = jnp.where(phase == 0, leaving | (jnp.abs(turn) > 1.9), phase % 2 == 1)
+    forward = jnp.where(jnp.abs(turn) > 0.6, 0.6, 1.0)
+    # backwards, the wheels turned away bring the nose round
+    return jnp.where(back, -0.7, forward), jnp.where(back, -1.5, 1.5) * jnp.clip(turn, -1.0, 1.0)
 
 
 class Follower:
@@ -95,9 +98,4 @@ class Follower:
         turn = jnp.arctan2(to[:, 1], to[:, 0]) - yaw
         turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
         # what it hangs on it must leave by more than the step that ends the waiting
-        leaving = beside & (inner.last_action[:, 0] < 0.0)
-        phase = jnp.floor(inner.waited / PATIENCE).astype(jnp.int32)
-        back = jnp.where(phase == 0, leaving | (jnp.abs(turn) > 1.9), phase % 2 == 1)
-        forward = jnp.where(jnp.abs(turn) > 0.6, 0.6, 1.0)
-        # backwards, the wheels turned away bring the nose round
-        return jnp.where(back, -0.7, forward), jnp.where(back, -1.5, 1.5) * jnp.clip(turn, -1.0, 1.0)
+        return toward(turn, inner.waited, beside & (inner.last_action[:, 0] < 0.0))

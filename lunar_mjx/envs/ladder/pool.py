@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lunar_mjx.envs.ladder.chart import coarse_prices
 from lunar_mjx.envs.ladder.ground import World, make_world
 from lunar_mjx.envs.ladder.rungs import Rung
 from lunar_mjx.envs.ladder.ways import draw_goal, passable
@@ -24,6 +25,8 @@ from lunar_mjx.terrain.rocks import CELL
 
 GOALS, STARTS = 4, 16
 """Goals of a world, and starts of a goal."""
+BATCH = 4
+"""Worlds that are made at once."""
 
 
 @pytree
@@ -54,6 +57,7 @@ class Pool:
       ways: (goal, row, column) distance to each goal over the planning grid of its world, m.
       middles: (world, 2) of the worlds on the map, m.
       size: side of a world, m.
+      prices: (world, row, column) price of a metre on the grid of the rovers' charts, infinite where blocked.
     """
 
     terrain: Any
@@ -61,6 +65,7 @@ class Pool:
     ways: Any
     middles: Any
     size: Any
+    prices: Any
 
 
 def way_left(pool: Pool, place: Any, position: Any) -> tuple[Any, Any]:
@@ -99,7 +104,7 @@ def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: f
       UserError: no world has a pair of places as the rung asks.
     """
     made = _worlds(rung, worlds, half_width)(jax.random.PRNGKey(seed), jnp.float32(hardness))
-    world, goals = made
+    world, goals, free = made
     valid = np.asarray(goals["valid"])
     if not valid.any():
         raise bad_input("ladder", "worlds", worlds, "have no such places", "raise it, or lower the hardness")
@@ -111,21 +116,25 @@ def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: f
         goals["way"].reshape(-1, *goals["way"].shape[2:]),
         jnp.asarray(middles, jnp.float32),
         jnp.float32(rung.size),
+        jnp.asarray(np.stack([coarse_prices(f, rung.plan_cell) for f in np.asarray(free)]), jnp.float32),
     )
 
 
 @functools.cache
 def _worlds(rung: Rung, worlds: int, half_width: float) -> Any:
-    """The compiled maker: key and hardness to worlds and their goals, world by world."""
+    """The compiled maker: key and hardness to worlds, their goals and their free nodes, some worlds at a time."""
 
     def one(key: Any, hardness: Any) -> Any:
         k_world, k_goals = jax.random.split(key)
         world = make_world(rung, k_world, hardness)
         free, roomy = passable(rung, world, half_width)
         keys = jax.random.split(k_goals, GOALS)
-        return world, jax.vmap(lambda k: draw_goal(rung, free, roomy, k, STARTS))(keys)
+        return world, jax.vmap(lambda k: draw_goal(rung, free, roomy, k, STARTS))(keys), free
 
-    return jax.jit(lambda key, hardness: jax.lax.map(lambda k: one(k, hardness), jax.random.split(key, worlds)))
+    def all_of(key: Any, hardness: Any) -> Any:
+        return jax.lax.map(lambda k: one(k, hardness), jax.random.split(key, worlds), batch_size=BATCH)
+
+    return jax.jit(all_of)
 
 
 def _middles(worlds: int, across: int, size: float) -> np.ndarray:

@@ -182,8 +182,9 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", name, value, "is not a whole number of at least 0", "give one")
     if c.rung:
         get_rung(c.rung)
-    if "arrival" in c.observations and not c.rung:
-        raise bad_input("navigation", "observations", "arrival", "is only told on the ladder", "leave it out")
+    for name in ("arrival", "plan"):
+        if name in c.observations and not c.rung:
+            raise bad_input("navigation", "observations", name, "is only told on the ladder", "leave it out")
 
 
 EGOCENTRIC = (

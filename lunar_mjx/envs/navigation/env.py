@@ -19,6 +19,7 @@ from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.effects.power.supply import charge_of
 from lunar_mjx.effects.presets import DEFAULT_PRESET
 from lunar_mjx.envs.core import State, side_by_side, where
+from lunar_mjx.envs.ladder import chart
 from lunar_mjx.envs.ladder.pool import Pool, make_pool, way_left
 from lunar_mjx.envs.ladder.rungs import get_rung
 from lunar_mjx.envs.navigation import kalman, randomise, rewards, tally
@@ -90,7 +91,7 @@ class Ready:
     """The beginning of each rover's next episode, prepared; leading axis `env`.
 
     Attributes:
-      obs, privileged, info: as in `State`. inner: with neither `ready` nor `used` of its own.
+      obs, privileged, info: as in `State`. inner: with neither `ready` nor `used` nor `chart` of its own.
     """
 
     obs: Any
@@ -116,6 +117,7 @@ class Inner:
       place: number of the pair of start and goal. tally: of the episode. left: length of the shortest way to the
         goal from where the rover last stood on free ground, m. trail: (3, 2) means of past positions, m.
         visited: (place, 2) where it was, newest first, m. All None unless the task needs them.
+      chart: what the rover knows of its world; None unless it is observed, and in a prepared beginning.
       ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
     """
 
@@ -137,6 +139,7 @@ class Inner:
     left: Any = None
     trail: Any = None
     visited: Any = None
+    chart: chart.Chart | None = None
     ready: Ready | None = None
     used: Any = None
 
@@ -310,7 +313,7 @@ class NavigationEnv:
         told = tally.METRICS if self.config.tally else ()
         names = ("episode_return", "episode_length", "success", *self._ends_told[1:], *told, *terms)
         metrics = dict.fromkeys(names, zero)
-        inner = dataclasses.replace(inner, ready=ready, used=no)
+        inner = dataclasses.replace(inner, ready=ready, used=no, chart=self._blank(params, inner))
         return State(obs, privileged, zero, no, no, obs, privileged, metrics, first.info, inner)
 
     def step(self, params: NavigationParams, state: State, action: Any) -> State:
@@ -389,7 +392,7 @@ class NavigationEnv:
         """
         done, kept = state.done, side_by_side((inner.ready, inner.used))
         # the prepared episode lies inside the state that it replaces, so that it is taken out before the selection
-        alone = dataclasses.replace(inner, ready=None, used=None)
+        alone = dataclasses.replace(inner, ready=None, used=None, chart=None)
 
         def prepare(carry: Any) -> Any:
             _, (_, used) = carry
@@ -400,7 +403,11 @@ class NavigationEnv:
         _, (ready, used) = jax.lax.while_loop(lambda carry: carry[0], prepare, (short, kept))
         here = side_by_side((state.obs, state.privileged, state.info, alone))
         obs, privileged, info, alone = where(done, (ready.obs, ready.privileged, ready.info, ready.inner), here)
-        inner = dataclasses.replace(alone, ready=ready, used=used | done)
+        known = inner.chart
+        if known is not None:
+            # a blank chart is cheaper made than kept
+            known = where(done, self._blank(params, alone), known)
+        inner = dataclasses.replace(alone, ready=ready, used=used | done, chart=known)
         return dataclasses.replace(state, obs=obs, privileged=privileged, info=info, inner=inner)
 
     def _begin(self, params: NavigationParams, keys: Any) -> Ready:
@@ -469,6 +476,11 @@ class NavigationEnv:
             # towards its other side pays nothing
             left, known = way_left(params.pool, inner.place, position[:, :2])
             inner = dataclasses.replace(inner, left=jnp.where(known, left, inner.left))
+        if inner.chart is not None:
+            assert params.pool is not None
+            place, yaw = self._on_chart(params, inner), self._reader.pose(physics)["yaw"]
+            price, world, here, goal, cell = place
+            inner = dataclasses.replace(inner, chart=chart.look(inner.chart, price, world, here, yaw, goal, cell))
         view = self._view(params, inner)
         if inner.tally is not None and self._outline is not None:
             touching = self._outline.touches(params.system.terrain, view)
@@ -567,6 +579,33 @@ class NavigationEnv:
             high = low + params.side
         return jnp.stack([low + self.config.edge, high - self.config.edge], axis=1)
 
+    def _on_chart(self, params: NavigationParams, inner: Inner) -> tuple[Any, ...]:
+        """What the functions of `ladder.chart` take: prices, world, position and goal in it, and the nodes' spacing."""
+        assert params.pool is not None
+        pool = params.pool
+        world = pool.places.world[inner.place]
+        corner = pool.middles[world] - 0.5 * pool.size
+        here = inner.physics.qpos[:, :2] - corner
+        return pool.prices, world, here, inner.goal - corner, pool.size / pool.prices.shape[-1]
+
+    def _blank(self, params: NavigationParams, inner: Inner) -> chart.Chart | None:
+        """The charts of rovers that have seen nothing; None unless they are observed."""
+        if "plan" not in self.config.observations:
+            return None
+        price, _, _, goal, cell = self._on_chart(params, inner)
+        return chart.begin(price.shape[-1], goal, cell)
+
+    def _plan(self, params: NavigationParams, inner: Inner) -> Any:
+        """The field `plan` of `View`; of who has seen nothing yet, straight for the goal."""
+        if "plan" not in self.config.observations:
+            return None
+        price, world, here, goal, cell = self._on_chart(params, inner)
+        if inner.chart is None:
+            aim, nodes, left = chart.straight(here, goal, cell)
+        else:
+            aim, nodes, left = chart.way(inner.chart, price, world, here, goal, cell)
+        return jnp.concatenate([aim, nodes.reshape(aim.shape[0], -1), left[:, None]], axis=-1)
+
     def _charge(self, params: NavigationParams, inner: Inner) -> Any:
         """Charge of the battery above its cut-off, 0 to 1, (env,); None without one."""
         if not self._battery:
@@ -591,6 +630,7 @@ class NavigationEnv:
             visited=inner.visited,
             corners=self._corners(params, inner),
             trail=inner.trail,
+            plan=self._plan(params, inner),
         )
 
     def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:

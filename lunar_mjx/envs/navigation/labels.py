@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from lunar_mjx.envs.ladder.chart import STEPS
 from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.envs.navigation.view import FAR_SCAN, SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE, TRAIL, VISITED_GRID
 
@@ -49,6 +50,8 @@ def _scan(env: NavigationEnv, wider: float = 1.0) -> list[Label]:
     ]
 
 
+_PLACES = ("aim", *(f"node {k + 1} of the way" for k in range(STEPS)))
+
 LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
     "position": _axes("m"),
     "euler": _axes("rad", "roll pitch yaw"),
@@ -70,6 +73,10 @@ LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
     "border": lambda env: [Label(side, "10 m") for side in ("ahead", "to the left", "behind", "to the right")],
     "visited": lambda env: [
         Label(f"{a:g} m ahead, {b:g} m to the left", "1") for a in VISITED_GRID for b in VISITED_GRID
+    ],
+    "plan": lambda env: [
+        *(Label(f"{place}, {side}", "m") for place in _PLACES for side in ("ahead", "to the left")),
+        Label("cost of the way", "50 m"),
     ],
     "power": lambda env: [
         Label("charge above the cut-off", "%"),

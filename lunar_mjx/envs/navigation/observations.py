@@ -170,6 +170,17 @@ def visited(v: View, s: Scene) -> Any:
     return jnp.einsum("epi,epj->eij", fore, side).reshape(v.yaw.shape[0], -1)
 
 
+def plan(v: View, s: Scene) -> Any:
+    """The way to the goal on the map that the rover has drawn of what it has seen (`ladder.chart`): where to aim, then
+    the next nodes of the way, m, all in the body frame as along and across pairs, and the way's cost in units of 50 m
+    of open ground."""
+    assert v.plan is not None, "the environment keeps the chart that this block asks for"
+    cos, sin = jnp.cos(v.yaw)[:, None], jnp.sin(v.yaw)[:, None]
+    x, y = v.plan[:, :-1:2], v.plan[:, 1:-1:2]
+    turned = jnp.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+    return jnp.concatenate([turned.reshape(v.yaw.shape[0], -1), v.plan[:, -1:] / 50.0], axis=-1)
+
+
 def power(v: View, s: Scene) -> Any:
     """The battery's charge above its cut-off, %; sunlight as a share of that in free space, which falls in shadow; and
     cosine and sine of the Sun's bearing from the heading, as a Sun sensor or the panels' currents tell them. For models
@@ -252,6 +263,7 @@ BLOCKS: dict[str, Block] = {
         trail,
         border,
         visited,
+        plan,
         power,
         drawn,
     )

@@ -56,6 +56,8 @@ class View:
         they are observed.
       charge: of the battery above that at which it cuts the motors off, 0 to 1; None without one.
       trail: where the rover was, averaged over the `TRAIL` times, m; None unless it is observed.
+      plan: where to aim and the next nodes of the way on the rover's own map, x and y from the rover along the world's
+        axes, m, and the cost of that way, m; (env, 2 + 2 * node + 1), None unless it is observed.
     """
 
     position: Float[Array, "env 3"]
@@ -84,6 +86,7 @@ class View:
     visited: Any = None
     charge: Any = None
     trail: Any = None
+    plan: Any = None
 
 
 def rotation(quaternion: Float[Array, "env 4"]) -> Float[Array, "env 3 3"]:
