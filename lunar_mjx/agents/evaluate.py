@@ -52,6 +52,7 @@ class Score:
 def wilson(successes: float, count: int) -> tuple[float, float]:
     """95 % interval of a share (Wilson 1927)."""
     share, z2 = successes / count, _Z * _Z
+    # Wilson's interval stays within 0 and 1 and has a width for 0 of n, where the normal approximation has none.
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
     half = _Z / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
     return max(0.0, middle - half), min(1.0, middle + half)
@@ -145,6 +146,7 @@ def score(result: dict[str, np.ndarray], interval: float) -> Score:
 
 def _costs(result: dict[str, np.ndarray]) -> dict[str, float]:
     travelled, shortest = (np.asarray(result[k], float) for k in ("travelled", "shortest"))
+    # A way shorter than the shortest (by the grid that it was planned on) counts as the shortest.
     direct = shortest / np.maximum(np.maximum(shortest, travelled), 1e-9)
     km = max(float(travelled.sum()) / 1000.0, 1e-9)
     return {

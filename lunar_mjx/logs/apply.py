@@ -124,10 +124,12 @@ def hold(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 def _interval(tables: list[Any], timestep: float) -> float:
     """The commands' own interval where it is a whole number of steps; else a quarter of it at most, in whole steps."""
+    # The fastest table decides: a slower command is held over several of its intervals.
     step = min(float(np.median(np.diff(t.time_s[np.isfinite(t.time_s)]))) if len(t) > 1 else 0.05 for t in tables)
     whole = round(step / timestep)
     if whole >= 1 and abs(whole * timestep - step) <= 1e-3 * step:
         return whole * timestep
+    # A quarter: then a command acts late by an eighth of its interval on average.
     return max(1, int(step / (4.0 * timestep))) * timestep
 
 
@@ -154,6 +156,7 @@ def log_model(log: Log, base: Model) -> Model:
     ambient = environment_value(log, "ambient_temperature_degC")
     if ambient is not None:
         kelvin = ambient + ZERO_CELSIUS
+        # Noon and night alike: one measured temperature tells no lunar day.
         changes["ambient"] = (kelvin, kelvin, 0.0, base.ambient[3])
     model = base.replace(**changes)
     if any(log.terrain_origin_m):

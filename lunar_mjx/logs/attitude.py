@@ -34,6 +34,7 @@ def body_attitude(tables: Mapping[str, LogTable], imu: Imu) -> dict[str, LogTabl
             if imu.attitude:
                 size = np.sqrt(sum(channels[q][there] ** 2 for q in QUATERNION))
                 channels |= _filled(QUATERNION, (turned.as_quat(scalar_first=True) * size[:, None]).T, there)
+            # Angles that were logged beside the quaternion stay as logged: they are measurements of their own.
             if not any(e in known for e in EULER):
                 channels |= _filled(EULER, turned.as_euler("ZYX", degrees=True).T[::-1], there)
         if imu.attitude and all(e in table.channels for e in EULER[:2]):
@@ -76,6 +77,7 @@ def with_angles(noise: Mapping[str, Noise], channels: Sequence[str]) -> dict[str
     parts = [noise[q] for q in QUATERNION if q in noise]
     if parts and all(q in channels for q in QUATERNION):
         largest = max(parts, key=lambda n: n.std)
+        # The largest of the four: which component tells a turn depends on the attitude.
         angle = dataclasses.replace(largest, std=float(np.degrees(2.0 * largest.std)))
         for name in EULER:
             if name in channels:

@@ -12,6 +12,7 @@ import numpy as np
 from lunar_mjx.effects import catalogue, presets
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.joint.motor import MODES, WINDINGS
+from lunar_mjx.effects.soil.ground import least_stiffness
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.model.ambient import SYNODIC_DAY
 from lunar_mjx.model.sun import SunSettings
@@ -100,6 +101,7 @@ class Model:
                 )
         replaced = [i for i, e in enumerate(self.effects) if e.name in found.replaces]
         kept = [e for e in self.effects if e.name not in found.replaces]
+        # In the place of the first that it replaces: order within a port may matter.
         kept.insert(replaced[0] if replaced else len(kept), found)
         parameters = {k: v for k, v in self.parameters.items() if k not in found.replaces}
         parameters[found.name] = found.nominal()
@@ -133,6 +135,7 @@ class Model:
         for key, value in values.items():
             if isinstance(value, Mapping):
                 value = self._by_group(effect, key, value, source)
+            # NumPy and JAX numbers become Python's, so that what is saved is what was set.
             elif hasattr(value, "tolist"):
                 value = value.tolist()
             _check_flat(effect, key, value, source)
@@ -243,9 +246,8 @@ def _check_moduli(model: Model, source: str | Path) -> None:
     layers = {} if model.terrain.grids is None else model.terrain.grids.layers
     if "soil" not in model.effect_names or not {"k_c", "k_phi"} & set(layers):
         return
-    k_c, k_phi = (np.asarray(layers.get(k, model.parameters["soil"][k]), float) for k in ("k_c", "k_phi"))
-    width = min(wheel.width for wheel in model.rover.wheels)
-    least = float((k_c / width + k_phi).min())
+    k_c, k_phi = (layers.get(k, model.parameters["soil"][k]) for k in ("k_c", "k_phi"))
+    width, least = least_stiffness(k_c, k_phi, [wheel.width for wheel in model.rover.wheels])
     if least <= 0.0:
         raise bad_input(
             source,
@@ -434,6 +436,7 @@ def _gains_of_gear(model: Model, rover: Rover) -> dict[str, tuple[float, float]]
         ratio = ratios[rover.joints.index(group.joints[0])]
         inertia = float(compiled.dof_M0[compiled.joint(group.joints[0]).dofadr[0]])
         rotor = group.rotor_inertia / rover.wheels_per_motor(group.joints[0])
+        # The compiled inertia holds the rotor through the rover's own gear already; only the difference is added.
         reflected = rotor * (ratio**2 - group.gear_ratio**2)
         scale = (inertia + reflected) / inertia
         gains[group.name] = (group.position_gain * scale, group.velocity_gain * scale)

@@ -53,6 +53,8 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
             raise bad_input(urdf.path, where, joint.mimic.leader, "is no other moving joint", "correct the name")
         if written[joint.mimic.leader].mimic is not None:
             raise bad_input(urdf.path, where, joint.mimic.leader, "follows a joint itself", "follow that joint")
+        # The converter turns axes so that positive drives forward; a ratio written for the URDF's axes changes its sign
+        # with each.
         own, other = sense(joint.name), sense(joint.mimic.leader)
         multiplier, offset = own * other * joint.mimic.multiplier, own * joint.mimic.offset
         found.append(Coupling(joint.name, joint.mimic.leader, multiplier, offset))

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -36,7 +35,7 @@ class GainRules:
 GAIN_RULES = GainRules()
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Gains:
     """Position gain N m/rad and velocity gain N m s/rad of one joint group."""
 
@@ -73,6 +72,7 @@ def holding_torques(model: mujoco.MjModel, roles: Roles) -> dict[str, float]:
             rows = data.efc_J.reshape(data.nefc, model.nv)
         columns.extend(rows)
     matrix = np.array(columns).T
+    # Loads of four wheels on flat ground are one too many to be determined: the smallest loads are the symmetric ones.
     solution, *_ = np.linalg.lstsq(matrix, data.qfrc_bias, rcond=1e-9)
     start = len(roles.wheels)
     return {joint: float(solution[start + i]) for i, joint in enumerate(joints)}

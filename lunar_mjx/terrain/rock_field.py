@@ -146,6 +146,7 @@ def place_rocks(
                 break
     places, kept = places[:n], kept[:n]
     height = np.asarray(ground(places[:, 0], places[:, 1])) if n else np.zeros(0)
+    # Sunk by the buried share: at burial 0.5 the centre lies at the ground.
     centers = np.column_stack([places, height - share * population.height * kept])
     options: Any = {"cell": population.cell, "reach": REACH, "dtype": dtype}
     if population.width == population.height == 1.0:

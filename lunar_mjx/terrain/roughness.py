@@ -77,6 +77,7 @@ def fractal(
         twice[-1] = 1.0
     squared = (gain**2 * twice * 2 * (1 - np.cos(2 * np.pi * fx * lag))).sum() / (high * wide)
     gain *= wanted / np.sqrt(squared)
+    # Waves that the DEM holds already: adding them again would double the relief.
     gain[k * longest < cell] = 0.0
     noise = rng.standard_normal((high, wide), dtype=dtype)
     shaped: Any = fft.irfft2(fft.rfft2(noise, workers=2) * gain.astype(dtype), s=(high, wide), workers=2)

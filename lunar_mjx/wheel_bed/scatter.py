@@ -27,6 +27,7 @@ def point_scatter(squares: np.ndarray, freedom: np.ndarray, reading: np.ndarray)
     whole = np.sum(squares / shape, axis=1)
     total = float(freedom.sum())
     log_p = -0.5 * np.log(shape) @ freedom - 0.5 * total * np.log(np.maximum(whole, 1e-300))
+    # Half of the prior for constant noise, the other half spread over all ratios: growth has to be seen to be believed.
     log_p[0] += np.log(_CONSTANT)
     log_p[1:] += np.log((1.0 - _CONSTANT) / (len(_RATIOS) - 1))
     p = np.exp(log_p - log_p.max())

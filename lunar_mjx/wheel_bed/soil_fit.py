@@ -127,6 +127,7 @@ def _solve(
     """Least squares from every start; arguments as for `fit`. Best first."""
     with jax.enable_x64(True):
         evaluate, jacobian = _functions(bed, table, free)
+        # Starts spread evenly over the box: residuals of a sinkage exponent have several minima.
         points = qmc.Sobol(len(free), rng=np.random.default_rng(seed)).random(starts)
         solutions = []
         for i, start in enumerate(points):

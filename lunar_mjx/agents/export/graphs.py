@@ -61,6 +61,7 @@ def to_onnx(policy: Policy) -> bytes:
     if policy.mean is not None and policy.deviation is not None:
         hidden = add("Sub", [hidden, weight("mean", policy.mean)], "centred")
         hidden = add("Div", [hidden, weight("deviation", policy.deviation)], "scaled")
+        # Clipped as in training: an observation far outside must not reach the network as something it has never seen.
         bounds = [weight("least", -MOST_DEVIATIONS), weight("most", MOST_DEVIATIONS)]
         hidden = add("Clip", [hidden, *bounds], "normalised")
     layers, inner = policy.network["layers"], policy.params["params"]
@@ -101,6 +102,7 @@ def to_stablehlo(policy: Policy) -> bytes:
     """
     (batch,) = symbolic_shape("batch")
     shape = jax.ShapeDtypeStruct((batch, policy.network["obs"]), jnp.float32)
+    # On GPUs that round products to TF32 the exported policy would not be the one that was scored.
     with jax.default_matmul_precision("highest"):
         exported = export(jax.jit(policy.act), platforms=("cpu", "cuda"))(shape)
     try:

@@ -164,6 +164,7 @@ class Driver:
             self.action = np.zeros_like(self.action)
         else:
             action = self.policy.act(self.observe())
+            # A policy that was fed something not finite answers likewise: motors stand rather than run away.
             self.action = np.clip(action, -1.0, 1.0) if np.isfinite(action).all() else np.zeros_like(self.action)
         return self.targets(self.action)
 
@@ -179,6 +180,7 @@ class Driver:
         odometry, joints, goal = (self.inputs[k][0] for k in TOLD)
         pose, twist = odometry.pose.pose, odometry.twist.twist
         self.position = vector(pose.position)
+        # ROS has w last, the package has it first.
         q = pose.orientation
         self.matrix = rotation(q.x, q.y, q.z, q.w)
         self.body_velocity, self.body_rates = vector(twist.linear), vector(twist.angular)

@@ -44,6 +44,7 @@ def export_policy(path: Path, folder: Path, only: Sequence[str] = tuple(GRAPHS))
         # names and units do not depend on how many worlds are made
         options["worlds"] = 1
     env = make(made_in["name"], **options)
+    # The environment may have changed since the training; a contract of other observations would be worse than none.
     sizes = (env.observation_size, env.action_size)
     if sizes != (policy.network["obs"], policy.network["actions"]):
         raise bad_input(

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from lunar_mjx.effects.base import Parameter, Refusal, effect
 from lunar_mjx.terrain import rock_fraction, soil_parameters
@@ -15,10 +16,15 @@ from lunar_mjx.terrain.soil.named import BOUNDS
 _SOURCEBOOK = "Heiken et al. 1991, Lunar Sourcebook, ch. 9"
 
 
+def least_stiffness(k_c: Any, k_phi: Any, wheel_widths: Sequence[float]) -> tuple[float, float]:
+    """Width of the narrowest wheel, m, and the least k_c/b + k_phi under it, N/m^(n+2), of one soil or of a grid."""
+    narrowest = min(wheel_widths)
+    return narrowest, float(np.min(np.asarray(k_c, float) / narrowest + np.asarray(k_phi, float)))
+
+
 def _positive_stiffness(values: Mapping[str, Any], wheel_widths: Sequence[float]) -> Refusal | None:
     """Refuses a soil that would pull a wheel down: k_c/b + k_phi must be positive for every width b of a wheel."""
-    narrowest = min(wheel_widths)
-    stiffness = values["k_c"] / narrowest + values["k_phi"]
+    narrowest, stiffness = least_stiffness(values["k_c"], values["k_phi"], wheel_widths)
     if stiffness > 0.0:
         return None
     return Refusal(

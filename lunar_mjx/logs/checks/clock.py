@@ -51,6 +51,7 @@ def _check_table(log: Log, table: LogTable) -> list[Finding]:
     if missing.size:
         row = int(missing[0])
         return [_finding(log, table, row, "clock", f"is empty in {missing.size} rows; every row needs its time")]
+    # Order first: every later check divides by steps or sorts by time.
     steps = np.diff(time)
     back = np.flatnonzero(steps <= 0.0)
     if back.size:
@@ -116,6 +117,7 @@ def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
     """Lost samples beyond the tolerable, and gaps in which a moving rover did not move: there the clock jumped."""
     base = float(np.median(steps))
     lost = float(np.sum(np.maximum(np.round(steps / base) - 1.0, 0.0)))
+    # Three steps: one or two lost samples are common, and too short to tell a jump from noise.
     for row in np.flatnonzero(steps > 3.0 * base):
         for integral, rate in _pairs(table):
             moved, expected, still = _over_gap(table, int(row), integral, rate, base)

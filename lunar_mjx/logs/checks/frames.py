@@ -66,6 +66,7 @@ def _quaternion(log: Log) -> list[Finding]:
     tables = [t for t in log.tables.values() if all(q in t.channels for q in QUATERNION)]
     if not tables:
         return []
+    # The first table with a quaternion: a second one would be another estimate of one attitude.
     norm = np.sqrt(sum(tables[0].channels[q] ** 2 for q in QUATERNION))
     tolerance = max(FRAME_LIMITS.norm_tolerance, 6.0 * max(sigma(log, q) for q in QUATERNION))
     wrong = np.isfinite(norm) & (np.abs(norm - 1.0) > tolerance)
@@ -151,6 +152,7 @@ def _gravity(log: Log) -> list[Finding]:
     measured = measured @ _rotation(w, x, y, z)[0].T
     turn = attitude(log, time)
     up = np.tile([0.0, 0.0, 1.0], (len(time), 1)) if turn is None else turn[:, 2, :]
+    # Medians, because a drive over boulders has jolts of many g.
     force, expected = np.median(measured, axis=0), np.median(up, axis=0)
     size, g = float(np.linalg.norm(force)), log.gravity_m_s2
     angle = float(np.degrees(np.arccos(np.clip(force @ expected / max(size, 1e-12) / np.linalg.norm(expected), -1, 1))))
@@ -236,6 +238,7 @@ def _ground_speed(log: Log) -> list[Finding]:
     limits = span(log, names)
     if limits is None:
         return []
+    # Long windows: over a few seconds positions of a receiver err more than a rover moves.
     windows = edges(*limits, count=10, shortest=4.0)
     way = np.hypot(*(increments(log, n, windows) for n in names[:2]))
     driven = np.abs(integrals(log, names[2], windows))

@@ -64,6 +64,7 @@ def _against(log: Log) -> list[Finding]:
         windows = edges(*limits)
         i, w = means(log, name, windows), means(log, speed[c], windows)
         pitch = means(log, "pitch_deg", windows) if span(log, ("pitch_deg",)) == limits else np.zeros(len(i))
+        # Downhill a motor brakes, and its current has the other sign by right.
         keep = (np.abs(w) > 0.05) & (np.sign(w) * pitch < MOTOR_LIMITS.downhill)
         if keep.sum() < 8:
             continue
@@ -264,6 +265,7 @@ def _electric(log: Log, kind: str) -> list[Finding]:
 
 def _circuit(voltage: np.ndarray, current: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Resistance and back-EMF constant with standard errors; None where current and speed do not tell them apart."""
+    # Least squares of V = R I + k omega; where the columns are nearly parallel (a steady drive) nothing can be told.
     design = np.stack([current, speed], 1)
     size = np.sqrt(np.mean(design**2, axis=0))
     if not (size > 0.0).all():
