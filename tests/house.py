@@ -168,6 +168,10 @@ class House:
                 if len(owners) == 1:
                     yield owners[0]
 
+    def has(self, entries: Sequence[str]) -> bool:
+        """Whether all entries are functions or classes of the checkout."""
+        return all((e.split(":")[0], e.split(":")[1]) in self.definitions for e in entries)
+
     def files_from(self, entries: Sequence[str], steps: int = 10_000) -> set[str]:
         """Modules that hold what the code of some entries reaches in so many steps.
 
@@ -357,18 +361,51 @@ def measure(root: Path = HERE) -> dict:
         "files_to_open": {
             way: {"all": len(house.files_from(entries)), "within_3": len(house.files_from(entries, 3))}
             for way, entries in ENTRIES.items()
+            if house.has(entries)
         },
         "rooms": dict(sorted(rooms.items(), key=lambda kv: -kv[1]["lines"])),
     }
+
+
+def markdown(before: dict, now: dict) -> str:
+    """Two checkouts' counts as the tables of docs/architecture.md."""
+    names = {
+        "lines": "lines of `lunar_mjx`",
+        "files": "files",
+        "largest_folder": "files of the largest folder",
+        "circles": "circles of imports",
+        "documented_percent": "public functions with a docstring, %",
+        "annotated_percent": "their parameters with a type, %",
+        "comment_percent": "lines with a comment, %",
+        "noted_percent": "lines of strings below constants and fields, which say why, %",
+        "numeric_constants": "numeric constants of modules",
+        "vague_names_percent": "vague names of variables, %",
+        "one_word_percent": "functions and classes named by one word, %",
+        "formatter_exceptions": "exceptions from the formatter",
+        "tests_over_source": "lines of tests over lines of source",
+    }
+    rows = [f"| {label} | {before[key]} | {now[key]} |" for key, label in names.items()]
+    for way, count in now["files_to_open"].items():
+        old = before["files_to_open"].get(way)
+        cells = "" if old is None else f"{old['within_3']}, {old['all']}"
+        rows.append(
+            f"| files that the code of {way} reaches in three steps, in all | {cells} | {count['within_3']}, {count['all']} |"
+        )
+    rooms = [f"| `{room}` | {n['files']} | {n['lines']:,} |" for room, n in now["rooms"].items() if n["files"] > 1]
+    head = ["| | before | now |", "|---|---|---|"]
+    return "\n".join([*head, *rows, "", "| room | files | lines |", "|---|---|---|", *rooms])
 
 
 def main() -> None:
     """Prints the counts as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, default=HERE, help="checkout to measure")
+    parser.add_argument("--before", type=Path, help="checkout to compare with: prints tables of both")
     parser.add_argument("--names", action="store_true", help="list numeric constants and vague names instead")
     options = parser.parse_args()
-    if options.names:
+    if options.before is not None:
+        print(markdown(measure(options.before), measure(options.root)))
+    elif options.names:
         house = House(options.root)
         print("\n".join(house.numeric_constants()))
         print(house.vague())
