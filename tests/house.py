@@ -388,9 +388,8 @@ def markdown(before: dict, now: dict) -> str:
     for way, count in now["files_to_open"].items():
         old = before["files_to_open"].get(way)
         cells = "" if old is None else f"{old['within_3']}, {old['all']}"
-        rows.append(
-            f"| files that the code of {way} reaches in three steps, in all | {cells} | {count['within_3']}, {count['all']} |"
-        )
+        reached = f"{count['within_3']}, {count['all']}"
+        rows.append(f"| files that {way} reaches in three steps, in all | {cells} | {reached} |")
     rooms = [f"| `{room}` | {n['files']} | {n['lines']:,} |" for room, n in now["rooms"].items() if n["files"] > 1]
     head = ["| | before | now |", "|---|---|---|"]
     return "\n".join([*head, *rows, "", "| room | files | lines |", "|---|---|---|", *rooms])

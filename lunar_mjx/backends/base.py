@@ -103,6 +103,7 @@ class Backend(abc.ABC):
 
     def stages(self, control: Any) -> dict[str, Observation]:
         """Every stage of the step that `control` would make from the present state, which stays as it is."""
+        # The step is made and taken back: engines have no other way to tell its stages.
         before = self.state()
         self.step(control)
         seen = self.observe()

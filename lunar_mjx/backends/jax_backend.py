@@ -128,6 +128,7 @@ class JaxBackend(Backend):
                 jnp.asarray(k - REFERENCE_TEMPERATURE, float)
                 for k in (state.winding_temperature, state.housing_temperature)
             ]
+            # What Kahan's sums had lost is not part of a state that another engine can give.
             zero = jnp.zeros_like(offsets[0])
             effects = {
                 e: {k: jnp.asarray(state.effects[e][k], float) for k in own} for e, own in self._state.effects.items()

@@ -60,6 +60,7 @@ class NativeBackend(NumpyBackend):
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._xfrc, self._qfrc = self._batch.bind("xfrc_applied"), self._batch.bind("qfrc_applied")
         self._seen = {name: self._batch.bind(name) for name in _DERIVED}
+        # Wheels whose centre of mass is their centre need no moment for the shift, the usual case.
         self._at_rim = not m.body_ipos[self._wheels].any()
         self._carried = np.zeros((rovers, 7))
         self._fields: dict[str, np.ndarray] = {}
@@ -121,6 +122,7 @@ class NativeBackend(NumpyBackend):
         if not (g["payload_mass"].any() or g["com_offset"].any() or self._carried.any()):
             return
         carried = np.concatenate([g["payload_mass"][:, None], g["payload_position"], g["com_offset"]], axis=1)
+        # Payloads change seldom; setting inertias row by row is slow.
         if np.array_equal(carried, self._carried):
             return
         if not self._fields:
@@ -194,6 +196,7 @@ def _combined(drawn: tuple[float, np.ndarray, np.ndarray], row: np.ndarray):
     for part, point in ((mass, shifted), (payload, place)):
         d = point - middle
         inertia = inertia + part * (d @ d * np.eye(3) - np.outer(d, d))
+    # MuJoCo holds an inertia as principal moments and their frame.
     moments, axes = np.linalg.eigh(inertia)
     axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
     quaternion = np.empty(4)

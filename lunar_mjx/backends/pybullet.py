@@ -360,8 +360,10 @@ class _World:
         qpos, qvel = self.coordinates()
         angle, speed = qpos[self._qadr], qvel[self._dadr]
         passive = -self._spring * (angle - self._rest) - self._damping * speed
+        # The trial step: its accelerations are those of a rover without rotors and dampers.
         self._drive(torque + passive, loads)
         without = (self.coordinates()[1][self._dadr] - speed) / self._dt
+        # Taken back: the world must begin the real step where the trial began.
         self.place(qpos, qvel)
         response = self._response(self._sign * angle)
         rotors = np.linalg.solve(np.eye(len(angle)) + response * self._inertia, without)
@@ -393,6 +395,8 @@ class _World:
                 )
                 rows.append(one - two)
             loops = np.concatenate(rows)
+            # Motions that would open a loop are projected out; a planar pin holds two directions, hence the pseudo-
+            # inverse.
             inverse = inverse - inverse @ loops.T @ np.linalg.pinv(loops @ inverse @ loops.T, 1e-9) @ loops @ inverse
         return self._sign[:, None] * inverse[6:, 6:] * self._sign
 
@@ -430,6 +434,7 @@ def _quaternion(matrix: np.ndarray) -> list[float]:
             1 + m[0, 0] + m[1, 1] + m[2, 2],
         ]
     )
+    # The largest component is divided by: any other may be zero for some rotation.
     k = int(np.argmax(squares))
     if k == 3:
         q = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]]

@@ -51,6 +51,7 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
       UserError: a file is missing or broken, or the URDF lacks what a rover needs; nothing is written then.
     """
     source = read_urdf(urdf)
+    # Roles first, then loops and couplings: these are told in the bodies' final axes, which roles may reverse.
     told = _describe(source, description)
     name = _file_name(source, name or told.name or source.name)
     bodies = bodies_of(source)
@@ -71,6 +72,7 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
             level_springs(spec, model, roles, told)
             model = _compile(source, spec)
             xml = to_xml(spec)
+            # What is compared with the URDF is the text as anyone will read it, not the model in memory.
             again = mujoco.MjModel.from_xml_string(xml)
             _assert_nothing_lost(source, roles, loops, ties(driven) + len(couplings), again)
             record = _record(source, name, roles, loops, told, model, height, height_notes, driven)
@@ -131,6 +133,7 @@ def _standing_height(roles: Roles) -> tuple[float, list[str]]:
     notes = []
     if np.ptp(bottoms) > _LEVEL:
         notes.append(f"the wheels' lowest points differ by {1e3 * np.ptp(bottoms):.1f} mm at zero angles")
+    # Rounded to a nanometre, so that a file does not differ between machines in its last digit.
     return round(float(-bottoms.min()), 9), notes
 
 
@@ -285,6 +288,7 @@ def _chassis_points(base: Body, roles: Roles) -> tuple[np.ndarray, list[str]]:
         high[2] = low[2] + max(w.radius for w in roles.wheels) * 2
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         notes.append("the chassis has no primitive shape: its contact points are the box between the wheel centres")
+    # Shapes share corners; equal ones would spend the few points that are kept.
     corners = np.unique(np.round(corners, 6), axis=0)
     # A flat chassis has no hull of volume; all its corners are on the outside then.
     with contextlib.suppress(QhullError):

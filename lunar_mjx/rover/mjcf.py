@@ -40,6 +40,7 @@ def build_spec(
     """
     spec = mujoco.MjSpec()
     spec.modelname = name
+    # Radians throughout: no number of the file is in another unit than the code's.
     spec.compiler.degree = False
     spec.compiler.autolimits = False
     option = spec.option
@@ -47,6 +48,7 @@ def build_spec(
     option.gravity = [0.0, 0.0, -description.gravity]
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # Equalities alone make a quadratic problem, which one Newton step solves.
     option.iterations, option.ls_iterations = 1, 1
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
     parents: dict[str | None, mujoco.MjsBody] = {None: spec.worldbody}
@@ -74,6 +76,7 @@ def _add_body(
 ) -> mujoco.MjsBody:
     position = np.array([0.0, 0.0, standing_height]) if body.parent is None else body.pose.position
     added = parent.add_body(name=body.name, pos=position, quat=quaternion(body.pose.rotation))
+    # From the URDF, never from the shapes, whose density MuJoCo would invent.
     added.explicitinertial = True
     added.mass, added.ipos = body.mass, body.com
     i = body.inertia

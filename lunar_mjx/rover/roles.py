@@ -110,6 +110,7 @@ def _rim(body: Body) -> tuple[Geometry, float, float] | None:
     assert body.joint is not None
     found = []
     for shape in body.geometry:
+        # A cylinder across the axle is a hub or a motor, not a rim.
         if shape.kind == "cylinder" and abs(shape.pose.rotation[:, 2] @ body.joint.axis) > 0.98:
             found.append((shape, shape.size[0], shape.size[1]))
         elif shape.kind == "sphere":
@@ -131,6 +132,8 @@ def _candidates(bodies: tuple[Body, ...], poses: dict[str, Pose]) -> list[Body]:
         found.append(body)
         bottoms[body.name] = (poses[body.name] @ rim[0].pose).position[2] - rim[1]
     lowest = min(bottoms.values(), default=0.0)
+    # Half a radius above the lowest: wheels of a suspension may differ by that, a reel on the deck does not come so
+    # low.
     return [b for b in found if bottoms[b.name] - lowest < 0.5 * _rim(b)[1]]  # type: ignore[index]
 
 
@@ -200,6 +203,7 @@ def _name_corners(urdf: Urdf, wheels: list[WheelRole], description: Description)
     rows: list[list[WheelRole]] = []
     spread = max(w.center[0] for w in wheels) - min(w.center[0] for w in wheels)
     for wheel in sorted(wheels, key=lambda w: -w.center[0]):
+        # A tenth of the wheel base: drawn wheels of one axle are not exactly in line.
         if rows and rows[-1][0].center[0] - wheel.center[0] < max(_SAME_PLACE, 0.1 * spread):
             rows[-1].append(wheel)
         else:
@@ -254,6 +258,8 @@ def _mend_signs(
             reverse[wheel.steer] = "steers to the left"
         if wheel.suspension is not None:
             body = by_joint[wheel.suspension]
+            # How the wheel's height changes when the joint turns: the sign tells the axis's sense, zero that it is no
+            # suspension.
             lift = np.cross(_world_axis(body, poses), wheel.center - poses[body.name].position)[2]
             if abs(lift) < 1e-9:
                 raise UserError(

@@ -142,6 +142,7 @@ def _base_frame(urdf: Urdf, root: str, frames: dict[str, Pose]) -> tuple[str, di
     offset = frames[name]
     if not np.array_equal(offset.rotation, np.eye(3)):
         return name, frames
+    # Moved but not turned: the base's axes are the rover's forward, left and up.
     return name, {link: Pose(pose.position - offset.position, pose.rotation) for link, pose in frames.items()}
 
 
@@ -159,6 +160,7 @@ def _fuse(urdf: Urdf, name: str, parent: str | None, pose: Pose, joint: Joint | 
         if link.mass > 0 and (len(links) == 1 or np.abs(link.inertia).max() > 0):
             check_inertia(urdf.path, link.name, link.inertia)
     com = sum((link.mass * frame.apply(link.com) for link, frame in links), np.zeros(3)) / mass
+    # About the common centre of mass, by the parallel-axis theorem.
     inertia = np.zeros((3, 3))
     for link, frame in links:
         arm = frame.apply(link.com) - com

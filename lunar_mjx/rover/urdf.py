@@ -138,6 +138,7 @@ def read_urdf(path: str | Path) -> Urdf:
     colours = {m.get("name", ""): reader.colour(m) for m in robot.findall("material") if m.find("color") is not None}
     links = [reader.link(element, colours) for element in robot.findall("link")]
     joints = [reader.joint(element) for element in robot.findall("joint")]
+    # XML does not forbid two of a name, and the second would silently take the place of the first.
     for what, names in (("link", [x.name for x in links]), ("joint", [x.name for x in joints])):
         for name in names:
             if names.count(name) > 1:
@@ -341,6 +342,7 @@ def check_inertia(path: Path, name: str, inertia: np.ndarray) -> None:
         raise bad_input(path, where, shown, "are zero", "give the inertia in kg m2; a moving link needs it")
     if moments[0] <= 0:
         raise bad_input(path, where, shown, "are not all positive", "give a positive definite inertia in kg m2")
+    # No body has a moment larger than the sum of the other two; tensors typed in by hand often do.
     if moments[0] + moments[1] < moments[2] * (1 - _INERTIA_TOLERANCE):
         raise bad_input(
             path, where, shown, "break the triangle inequality I1 + I2 >= I3", "compute the inertia from the geometry"

@@ -67,6 +67,7 @@ def _least_on_disc(m: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarr
     """Where p' m p/2 - b' p is least within |p| <= radius, by halving Lagrange's multiplier among eigenvectors."""
     values, vectors = np.linalg.eigh(m)
     b = np.einsum("...ji,...j->...i", vectors, b)
+    # At the upper end the point lies within the disc for certain, since every eigenvalue is positive.
     low, high = np.zeros(b.shape[:-1]), np.sqrt(dot(b, b)) / radius
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)

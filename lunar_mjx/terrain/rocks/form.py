@@ -67,6 +67,7 @@ def principal_axes(forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Semi-axes (n, 3), m, longest first, and the rotations (n, 3, 3) whose columns they lie along; see `forms_of`."""
     xx, yy, zz, yz, xz, xy = np.asarray(forms, float).T
     matrix = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
+    # Eigenvalues of the form are inverse squares of the semi-axes, so that the smallest belongs to the longest.
     values, turns = np.linalg.eigh(matrix)
     turns[:, :, 2] *= np.linalg.det(turns)[:, None]  # right-handed
     return values**-0.5, turns

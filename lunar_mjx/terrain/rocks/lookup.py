@@ -67,6 +67,7 @@ def nearest_rock(
     if rocks is None:
         zero = jnp.zeros_like(x)
         return zero, zero, zero, zero
+    # One gather finds the number, the others read that rock: no loop over rocks, however many there are.
     k = _number(rocks, x, y)
     flat = rocks.centers.reshape(-1)
     return take(flat, 3 * k), take(flat, 3 * k + 1), take(flat, 3 * k + 2), take(rocks.radii, k)
@@ -216,6 +217,7 @@ def _nearest_index(
     centers: np.ndarray, radii: np.ndarray, west: float, south: float, rows: int, cols: int, cell: float, reach: float
 ) -> np.ndarray:
     """Rasterises "whose surface is nearest" rock by rock; cells farther than `reach` from any keep the dummy."""
+    # The number behind the last rock is the dummy: "none" needs no branch.
     index = np.full((rows, cols), len(radii), np.int32)
     best = np.full((rows, cols), reach)
     for k, ((x, y, _), radius) in enumerate(zip(centers, radii, strict=True)):
@@ -239,6 +241,7 @@ def smallest_gap(centers: np.ndarray, radii: np.ndarray) -> float:
         return float("inf")
     tree = KDTree(centers[:, :2])
     gap = np.inf
+    # Ten metres more than the radii: gaps wider than that matter to nobody.
     for k, near in enumerate(tree.query_ball_point(centers[:, :2], radii + radii.max() + 10.0)):
         others = np.array([n for n in near if n != k], int)
         if len(others):

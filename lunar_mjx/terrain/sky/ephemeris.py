@@ -81,6 +81,7 @@ def sun_over(date: str, seconds: Any, latitude_deg: float, longitude_deg: float)
         sun, moon = (
             get_body_barycentric(b, times, ephemeris="builtin").xyz.to_value(units.au) for b in ("sun", "moon")
         )
+    # Days since J2000, from which the IAU's series count.
     towards = _body_fixed(sun - moon, times.jd - 2451545.0)
     distance = np.linalg.norm(towards, axis=0)
     phi, lam = np.radians(latitude_deg), np.radians(longitude_deg)

@@ -107,6 +107,7 @@ def compute_horizon(
     for dem in (ground, *around):
         w, s, e, n = dem.bounds
         far = np.hypot(max(e, east) - min(w, west), max(n, north) - min(s, south))
+        # In proportion to the distance: what is far away has to be high to be seen, and then it is wide.
         steps = dem.cell * HORIZON_GRID.growth ** np.arange(
             int(np.ceil(np.log(max(far / dem.cell, 2.0)) / np.log(HORIZON_GRID.growth))) + 1
         )
@@ -116,6 +117,7 @@ def compute_horizon(
             rise = _heights(dem, at_x, at_y) - stand[:, None] - steps**2 / (2.0 * HORIZON_GRID.moon_radius)
             here = (at_x >= w) & (at_x <= e) & (at_y >= s) & (at_y <= n)
             steepest = np.where(here, rise / steps, 0.0).max(axis=1)
+            # The highest of all DEMs: where two overlap, the coarser one may miss a ridge but invents none.
             elevation[k] = np.maximum(elevation[k], np.arctan(steepest))
     return Horizon(
         jnp.asarray(elevation.reshape(bearings, rows, cols), dtype),

@@ -82,6 +82,7 @@ def share_above(height: Any) -> Any:
     Returns:
       1/2 + (u sqrt(1 - u^2) + asin u)/pi with u = height over the radius, a segment of a circle: from 0 to 1.
     """
+    # Kept off the edges, where the root's derivative is infinite.
     u = jnp.clip(height / SUN_RADIUS, -1.0 + _EDGE, 1.0 - _EDGE)
     segment = 0.5 + (u * jnp.sqrt(1.0 - u * u) + jnp.arcsin(u)) / jnp.pi
     return jnp.where(height >= SUN_RADIUS, 1.0, jnp.where(height <= -SUN_RADIUS, 0.0, segment))
