@@ -14,7 +14,7 @@ import numpy as np
 from lunar_mjx.envs.core import Environment, State
 from lunar_mjx.envs.ladder.follower import Follower, toward
 from lunar_mjx.envs.navigation.env import NavigationEnv, NavigationParams
-from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE
+from lunar_mjx.envs.navigation.view import SCAN_SCALE, VIEW
 from lunar_mjx.errors import bad_input
 
 Agent = Callable[[State, Any], Any]
@@ -128,7 +128,7 @@ def reactive_rule(env: NavigationEnv, settings: Reactive | None = None) -> Agent
             raise bad_input("agent", "reactive", env.config.observations, f"lacks the block {block}", "add it")
     r, limit = settings or Reactive(), _steering_limit(env)
     scale = SCAN_SCALE.get(env.model.rover.name, 1.0)
-    ahead, aside = (scale * a.ravel() for a in np.meshgrid(SCAN_AHEAD, SCAN_ASIDE, indexing="ij"))
+    ahead, aside = (scale * a.ravel() for a in np.meshgrid(VIEW.scan_ahead, VIEW.scan_aside, indexing="ij"))
     headings = np.radians(np.arange(-75.0, 76.0, 15.0))
     along = ahead * np.cos(headings)[:, None] + aside * np.sin(headings)[:, None]
     across = np.abs(aside * np.cos(headings)[:, None] - ahead * np.sin(headings)[:, None])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from lunar_mjx.effects.context import Geometry
 from lunar_mjx.effects.ports import Pipeline, nominal_geometry, wheel_contact, wheel_ports
-from lunar_mjx.effects.soil.ruts import SIDE
+from lunar_mjx.effects.soil.ruts import PATCH
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import HeightField
 from tests.effects.effects_harness import bare_context, effects_named, parameters, rover_info
@@ -54,5 +54,5 @@ class Wheels:
 
 def fresh_patch() -> dict[str, Any]:
     """The memory of a patch that no wheel has touched."""
-    cells = jnp.zeros(SIDE * SIDE)
+    cells = jnp.zeros(PATCH.side * PATCH.side)
     return {"moved": cells, "pressed": cells, "tile": cells - 1e7}

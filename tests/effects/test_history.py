@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.context import Geometry
-from lunar_mjx.effects.soil.multipass import PLACES
+from lunar_mjx.effects.soil.multipass import TRACK
 from lunar_mjx.spatial import Vec3
 
 WHEELS = 2
@@ -59,8 +59,8 @@ def _ground(x):
 
 
 def test_a_wheel_finds_the_rut_of_another_but_not_its_own_under_it():
-    nowhere = np.full((PLACES, WHEELS), 1e6)
-    state = {"place_x": nowhere.copy(), "place_y": nowhere.copy(), "depth": np.zeros((PLACES, WHEELS))}
+    nowhere = np.full((TRACK.places, WHEELS), 1e6)
+    state = {"place_x": nowhere.copy(), "place_y": nowhere.copy(), "depth": np.zeros((TRACK.places, WHEELS))}
     state["place_x"][0, 0], state["place_y"][0, 0], state["depth"][0, 0] = 1.0, 0.0, 0.02
     with jax.enable_x64(True):
         soil, _ = _call("multipass", "soil", _ground([1.0, 1.0]), {"plastic": 0.5}, state, _soil())
@@ -72,8 +72,8 @@ def test_a_wheel_finds_the_rut_of_another_but_not_its_own_under_it():
 
 
 def test_a_wheel_remembers_a_place_once_it_has_left_the_last_one():
-    nowhere = np.full((PLACES, WHEELS), 1e6)
-    state = {"place_x": nowhere, "place_y": nowhere, "depth": np.zeros((PLACES, WHEELS))}
+    nowhere = np.full((TRACK.places, WHEELS), 1e6)
+    state = {"place_x": nowhere, "place_y": nowhere, "depth": np.zeros((TRACK.places, WHEELS))}
     with jax.enable_x64(True):
         _, new = _call("multipass", "soil", _ground([1.0, 2.0]), {}, state, _soil())
         assert np.allclose(new["place_x"][0], [1.0, 2.0]) and np.allclose(new["depth"][0], [0.02, 0.01])
@@ -84,8 +84,8 @@ def test_a_wheel_remembers_a_place_once_it_has_left_the_last_one():
 
 def test_the_latest_place_deepens_with_the_wheel():
     """Wheels touch their first place before they sink in: a place of no depth would be firm and no rut."""
-    nowhere = np.full((PLACES, WHEELS), 1e6)
-    state = {"place_x": nowhere, "place_y": nowhere, "depth": np.zeros((PLACES, WHEELS))}
+    nowhere = np.full((TRACK.places, WHEELS), 1e6)
+    state = {"place_x": nowhere, "place_y": nowhere, "depth": np.zeros((TRACK.places, WHEELS))}
     touching = _ground([1.0, 2.0])
     touching.contact.sinkage = np.array([1e-7, 0.0])
     with jax.enable_x64(True):
@@ -135,8 +135,8 @@ def _passes(slip, field=True, compacted_depth=1.5, count=4):
         deep = rut + z
         out.append((deep, _pull(z, slip, soil, field)[1] / LOAD))
         # as if the wheel had left many places here: it stands fully in the rut
-        state = {k: np.zeros((PLACES, WHEELS)) for k in ("place_x", "place_y")} | {
-            "depth": np.full((PLACES, WHEELS), deep)
+        state = {k: np.zeros((TRACK.places, WHEELS)) for k in ("place_x", "place_y")} | {
+            "depth": np.full((TRACK.places, WHEELS), deep)
         }
         virgin = fresh | {"n": 1.0 + slip * field}
         before = _soil_of({k: np.full(WHEELS, v) for k, v in virgin.items()})

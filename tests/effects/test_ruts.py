@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.effects.soil.ruts import SIDE
+from lunar_mjx.effects.soil.ruts import PATCH
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import flat
 from tests.effects.ruts_harness import DT, GRAVITY, MASS, RADIUS, WIDTH, Wheels, fresh_patch
@@ -90,7 +90,7 @@ def test_a_standing_wheel_changes_nothing() -> None:
 def test_cells_one_patch_on_are_new() -> None:
     """What lies 64 cells away has the same address and is not taken for it."""
     end, _ = _drive(_start(), 0.03, 0.0375)
-    _, again = _drive(end, 0.03, 0.0375, at=SIDE * CELL)
+    _, again = _drive(end, 0.03, 0.0375, at=PATCH.side * CELL)
     assert np.abs(again["rut"][500:2000]).max() < 1e-3
     _, back = _drive(end, 0.03, 0.0375)
     assert back["rut"][500:2000].min() > 0.01

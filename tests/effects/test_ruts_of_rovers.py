@@ -17,7 +17,7 @@ from lunar_mjx.backends.physics.ground import Grid
 from lunar_mjx.backends.physics.ruts import relief_of, ruts, untouched
 from lunar_mjx.backends.physics.soil import uniform_soil
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.effects.soil.ruts import SIDE
+from lunar_mjx.effects.soil.ruts import PATCH
 from lunar_mjx.model import make_model
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import flat
@@ -98,7 +98,7 @@ def test_native_mujoco_drives_with_ruts():
     for _ in range(200):
         backend.step(command)
     patch = backend.state().effects["ruts"]
-    assert patch["pressed"].shape == (2, SIDE * SIDE)
+    assert patch["pressed"].shape == (2, PATCH.side * PATCH.side)
     assert (patch["pressed"].max(axis=1) > 1e-3).all() and np.isfinite(patch["moved"]).all()
     np.testing.assert_array_equal(patch["pressed"][0], patch["pressed"][1])
     assert backend.reset().effects["ruts"]["pressed"].max() == 0.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.dynamics import build
-from lunar_mjx.effects.soil.ruts import SIDE, cell_numbers, tile_of
+from lunar_mjx.effects.soil.ruts import PATCH, cell_numbers, tile_of
 from lunar_mjx.effects.soil.shared_ruts import SharedGround, exchange, shared_ground
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
@@ -126,11 +126,11 @@ def test_a_whole_rover_that_follows_meets_the_ruts_of_the_one_ahead() -> None:
 def test_every_slot_holds_the_cell_nearest_to_the_rover() -> None:
     u, v = np.random.default_rng(0).uniform(-1000.0, 1000.0, (2, 50)).astype(np.float32)
     i, j = (np.asarray(n) for n in cell_numbers(tile_of(jnp.asarray(u), jnp.asarray(v))))
-    assert i.shape == (50, SIDE * SIDE)
-    assert np.abs(i + 0.5 - u[:, None]).max() <= 0.5 * SIDE + 1e-3
-    assert np.abs(j + 0.5 - v[:, None]).max() <= 0.5 * SIDE + 1e-3
-    slots = np.mod(i, SIDE) + SIDE * np.mod(j, SIDE)
-    np.testing.assert_array_equal(slots, np.broadcast_to(np.arange(SIDE * SIDE), slots.shape))
+    assert i.shape == (50, PATCH.side * PATCH.side)
+    assert np.abs(i + 0.5 - u[:, None]).max() <= 0.5 * PATCH.side + 1e-3
+    assert np.abs(j + 0.5 - v[:, None]).max() <= 0.5 * PATCH.side + 1e-3
+    slots = np.mod(i, PATCH.side) + PATCH.side * np.mod(j, PATCH.side)
+    np.testing.assert_array_equal(slots, np.broadcast_to(np.arange(PATCH.side * PATCH.side), slots.shape))
 
 
 def test_beyond_the_shared_ground_ruts_stay_with_the_rover() -> None:
@@ -138,9 +138,13 @@ def test_beyond_the_shared_ground_ruts_stay_with_the_rover() -> None:
     ground = shared_ground(state[4], jnp.zeros(1, int), (0.0, 0.0), (1.0, 1.0), CELL)
     assert isinstance(ground, SharedGround)
     here = tile_of(jnp.asarray([-10.0]), jnp.asarray([0.0]))
-    ruts = {"moved": jnp.ones((1, SIDE * SIDE)), "pressed": jnp.ones((1, SIDE * SIDE)), "tile": here}
+    ruts = {
+        "moved": jnp.ones((1, PATCH.side * PATCH.side)),
+        "pressed": jnp.ones((1, PATCH.side * PATCH.side)),
+        "tile": here,
+    }
     ground, new = exchange(ground, ruts, jnp.asarray([-10.0 * CELL]), jnp.asarray([0.0]))
-    assert 0 < np.asarray(ground.moved).sum() < SIDE * SIDE  # of the patch a part lies on it
+    assert 0 < np.asarray(ground.moved).sum() < PATCH.side * PATCH.side  # of the patch a part lies on it
     np.testing.assert_array_equal(new["moved"], ruts["moved"])
 
 

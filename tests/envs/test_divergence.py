@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.envs import make_navigation, split_keys
-from lunar_mjx.envs.navigation.env import MOST_VALUE, bounded, plausible
+from lunar_mjx.envs.navigation.env import PLAUSIBLE, bounded, plausible
 
 ABSURD = {
     "at rest": (None, 0.0, True),
@@ -39,7 +39,7 @@ def test_what_no_rover_can_do_is_not_plausible(name):
 
 def test_values_are_bounded():
     found = bounded(jnp.array([1.0, -1e30, 1e30, np.nan, np.inf, -np.inf]))
-    np.testing.assert_array_equal(found, [1.0, -MOST_VALUE, MOST_VALUE, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(found, [1.0, -PLAUSIBLE.most_value, PLAUSIBLE.most_value, 0.0, 0.0, 0.0])
 
 
 @pytest.mark.slow
@@ -58,4 +58,4 @@ def test_absurd_states_end_the_episode_within_bounds():
     after = jax.jit(env.step)(env.params, dataclasses.replace(state, inner=inner), action)
     assert np.asarray(after.metrics["diverged"]).tolist() == [1.0] * len(cases) + [0.0]
     for values in (after.reward, after.obs, after.final_obs, after.privileged):
-        assert np.isfinite(values).all() and np.abs(values).max() <= MOST_VALUE
+        assert np.isfinite(values).all() and np.abs(values).max() <= PLAUSIBLE.most_value

@@ -22,7 +22,7 @@ from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
 from lunar_mjx.envs.navigation.places import draw_places
 from lunar_mjx.envs.navigation.randomise import Range, check_ranges
-from lunar_mjx.envs.navigation.view import SCAN_AHEAD, SCAN_ASIDE, SCAN_REACH
+from lunar_mjx.envs.navigation.view import VIEW
 from lunar_mjx.envs.navigation.worlds import WORLDS, world
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
@@ -169,15 +169,17 @@ def test_shipped_policies_fit_their_task_and_hold_what_they_scored(rover):
 def test_the_height_scan_misses_no_rock():
     """Wherever the smallest rock lies among the near places of the scan, some place shows it."""
     radius = 0.125
-    ahead, aside = np.meshgrid(SCAN_AHEAD, SCAN_ASIDE, indexing="ij")
+    ahead, aside = np.meshgrid(VIEW.scan_ahead, VIEW.scan_aside, indexing="ij")
     for at in np.random.default_rng(0).uniform([-1.0, -0.75], [1.6, 0.75], (20, 2)):
         rocks = build_rocks(np.array([[*at, 0.0]]), np.array([radius]), (-4.0, -4.0, 4.0, 4.0))
         ground = load_terrain("flat")
         ground = dataclasses.replace(ground, rocks=rocks)
-        seen = np.asarray(surface(ground, jnp.asarray(ahead, jnp.float32), jnp.asarray(aside, jnp.float32), SCAN_REACH))
+        seen = np.asarray(
+            surface(ground, jnp.asarray(ahead, jnp.float32), jnp.asarray(aside, jnp.float32), VIEW.scan_reach)
+        )
         assert seen.max() > 0.02, at
         bare = np.hypot(ahead - at[0], aside - at[1]) - radius
-        assert (seen[bare > SCAN_REACH] == 0.0).all() and (seen[bare < 0.0] > 0.0).all()
+        assert (seen[bare > VIEW.scan_reach] == 0.0).all() and (seen[bare < 0.0] > 0.0).all()
 
 
 def test_worlds_share_one_shape_and_padding_adds_no_rock():

@@ -27,12 +27,22 @@ from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Refit, Term
 
 OWN_FORM = "the model"
-_SHARES = (1.0, 0.5, 0.2, 0.05)
-"""Shares of a step that are simulated side by side, as far as they fit into one batch."""
-_TOGETHER = 8
-"""Candidates whose signatures one program simulates: fewer are faster per rover, more are fewer programs to make."""
-_MOST_AT_ONCE = 4
-"""Such programs that are made and run side by side at most: each holds some hundred rovers in memory."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveRefit:
+    """How refits of drives are tried."""
+
+    shares: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)
+    """Shares of a step that are simulated side by side, as far as they fit into one batch."""
+    together: int = 8
+    """Candidates whose signatures one program simulates: fewer are faster per rover, more are fewer programs to
+    make."""
+    most_at_once: int = 4
+    """Such programs that are made and run side by side at most: each holds some hundred rovers in memory."""
+
+
+DRIVE_REFIT = DriveRefit()
 
 
 class DriveForm(MeasuredForm):
@@ -91,7 +101,7 @@ class DriveForm(MeasuredForm):
     def parts(self) -> list[list[str]]:
         """Candidates whose signatures are simulated by one program each."""
         names = list(self.candidates)
-        return [names[at : at + _TOGETHER] for at in range(0, len(names), _TOGETHER)]
+        return [names[at : at + DRIVE_REFIT.together] for at in range(0, len(names), DRIVE_REFIT.together)]
 
     # --- predictions and derivatives ---------------------------------------------------------------------------------
 
@@ -136,7 +146,7 @@ class DriveForm(MeasuredForm):
             return ()
 
         # one program is made while another runs: the first takes Python's lock, and the second a core
-        with concurrent.futures.ThreadPoolExecutor(min(cores(), _MOST_AT_ONCE)) as pool:
+        with concurrent.futures.ThreadPoolExecutor(min(cores(), DRIVE_REFIT.most_at_once)) as pool:
             self.skipped = tuple(name for late in pool.map(take, parts) for name in late)
         self._seen = seen
 
@@ -375,7 +385,7 @@ class DriveForm(MeasuredForm):
         residual = white(self.observations.value - value)
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
-        many = min(len(_SHARES), self.drives.together)
+        many = min(len(DRIVE_REFIT.shares), self.drives.together)
         here = chi2(residual, u[free])
         for _ in range(settings.most_jacobians):
             jacobian, first = white(slopes), here
@@ -388,7 +398,7 @@ class DriveForm(MeasuredForm):
                     break
                 step *= min(1.0, settings.longest_step / float(np.abs(step).max()))
                 rows = np.repeat(u[None], many, axis=0)
-                rows[:, free] = np.clip(u[free] + np.outer(_SHARES[:many], step), low, high)
+                rows[:, free] = np.clip(u[free] + np.outer(DRIVE_REFIT.shares[:many], step), low, high)
                 try:
                     values = self.drives.predict(self._whole(rows))
                 except TimeUp:

@@ -8,40 +8,45 @@ import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Parameter, StateVariable, effect
 
-PLACES = 20
-"""Places that every wheel remembers; with the nominal spacing a track of 2 m, in which the following wheels of all
-shipped rovers roll (`ruts` remembers by place). 64 places took two thirds of the time of a step on one H100."""
 
-_FRESH = 3
-"""Latest places of a wheel that lie under or just behind it, and so are no earlier pass."""
-_NOWHERE = 1e6
-"""Where places lie that have not been visited yet, m from the origin."""
-_FAINT = 0.05
-"""Nearness, 1 on the place itself, at which the rut is half as deep as in the middle of the track."""
+@dataclasses.dataclass(frozen=True)
+class TrackMemory:
+    """What is remembered of tracks, and how pressed soil differs."""
 
-FRICTION_POWER, COHESION_POWER, SHEAR_POWER = 2.7, 11.0, -1.0
-"""Powers of the density with which tan(phi), the cohesion and the shear moduli go.
+    places: int = 20
+    """Places that every wheel remembers; with the nominal spacing a track of 2 m, in which the following wheels of all
+    shipped rovers roll (`ruts` remembers by place). 64 places took two thirds of the time of a step on one H100."""
+    fresh: int = 3
+    """Latest places of a wheel that lie under or just behind it, and so are no earlier pass."""
+    nowhere: float = 1e6
+    """Where places lie that have not been visited yet, m from the origin."""
+    faint: float = 0.05
+    """Nearness, 1 on the place itself, at which the rut is half as deep as in the middle of the track."""
+    # Powers of the density with which tan(phi), the cohesion and the shear moduli go. The first two through the four
+    # layers of the Lunar Sourcebook's table of lunar soil (Carrier et al. 1991, ch. 9: 1.50, 1.58, 1.66, 1.74 g/cm3;
+    # 42, 46, 49, 54 deg; 0.52, 0.90, 1.6, 3.0 kPa), the last as Senatore & Sandu 2011 read Holm's passes: the modulus
+    # falls by the share by which the density rises.
+    friction_power: float = 2.7
+    cohesion_power: float = 11.0
+    shear_power: float = -1.0
+    most_pressed: float = 0.14
+    """Share of its thickness by which soil can be pressed: from 1.50 to 1.74 g/cm3, the ends of that table."""
 
-The first two through the four layers of the Lunar Sourcebook's table of lunar soil (Carrier et al. 1991, ch. 9: 1.50,
-1.58, 1.66, 1.74 g/cm3; 42, 46, 49, 54 deg; 0.52, 0.90, 1.6, 3.0 kPa), the last as Senatore & Sandu 2011 read Holm's
-passes: the modulus falls by the share by which the density rises."""
+
+TRACK = TrackMemory()
 
 
 def compacted(soil, pressed, thickness):
     """The soil whose upper layer of `thickness`, m, has been pressed together by `pressed`, m: denser, so stronger."""
-    denser = thickness / (thickness - jnp.minimum(pressed, _MOST_PRESSED * thickness))
-    modulus = denser**SHEAR_POWER
+    denser = thickness / (thickness - jnp.minimum(pressed, TRACK.most_pressed * thickness))
+    modulus = denser**TRACK.shear_power
     return dataclasses.replace(
         soil,
-        cohesion=soil.cohesion * denser**COHESION_POWER,
-        tan_phi=soil.tan_phi * denser**FRICTION_POWER,
+        cohesion=soil.cohesion * denser**TRACK.cohesion_power,
+        tan_phi=soil.tan_phi * denser**TRACK.friction_power,
         shear_modulus_x=soil.shear_modulus_x * modulus,
         shear_modulus_y=soil.shear_modulus_y * modulus,
     )
-
-
-_MOST_PRESSED = 0.14
-"""Share of its thickness by which soil can be pressed: from 1.50 to 1.74 g/cm3, the ends of that table."""
 
 
 def rut_under(ctx, p, x):
@@ -60,10 +65,10 @@ def rut_under(ctx, p, x):
     near = near * near
     places, wheels = x.depth.shape
     # A wheel stands in the soil that it is pressing now; its own latest places are that soil and no earlier pass.
-    own = jnp.eye(wheels, dtype=bool)[None] & (jnp.arange(places) < _FRESH)[:, None, None]
+    own = jnp.eye(wheels, dtype=bool)[None] & (jnp.arange(places) < TRACK.fresh)[:, None, None]
     near = jnp.where(own, 0.0, near)
     total = jnp.sum(near, axis=(0, 1))
-    return jnp.sum(near * x.depth[:, :, None], axis=(0, 1)) / (total + _FAINT), total / (total + _FAINT)
+    return jnp.sum(near * x.depth[:, :, None], axis=(0, 1)) / (total + TRACK.faint), total / (total + TRACK.faint)
 
 
 def _remember(ctx, ground, p, x):
@@ -85,7 +90,7 @@ def _remember(ctx, ground, p, x):
 
 
 def _place(axis: str) -> StateVariable:
-    return StateVariable(_NOWHERE, "m", f"{axis} of the places that the wheel has visited", slots=PLACES)
+    return StateVariable(TRACK.nowhere, "m", f"{axis} of the places that the wheel has visited", slots=TRACK.places)
 
 
 @effect(
@@ -95,7 +100,7 @@ def _place(axis: str) -> StateVariable:
     state={
         "place_x": _place("x"),
         "place_y": _place("y"),
-        "depth": StateVariable(0.0, "m", "sinkage of the wheel at those places", slots=PLACES),
+        "depth": StateVariable(0.0, "m", "sinkage of the wheel at those places", slots=TRACK.places),
     },
     plastic=Parameter(
         0.8,

@@ -13,21 +13,30 @@ from lunar_mjx.effects.soil.multipass import compacted
 from lunar_mjx.effects.wheel.closed_form import entrance_angle
 from lunar_mjx.pytree import pytree
 
-SIDE = 64
-"""Cells along each side of the patch; the patch repeats, so that a cell is forgotten where the rover comes to the next
-one of the same address, 64 cells on."""
-_TILES = 1024.0
-"""Tiles per row of their numbers: patches within 512 of the origin keep numbers of their own, exact in float32."""
-_NOWHERE = -1e7
-"""Tile of a cell that no wheel has touched."""
+
+@dataclasses.dataclass(frozen=True)
+class RutPatch:
+    """The patch of ground that ruts are kept in, and where wheels act on it."""
+
+    side: int = 64
+    """Cells along each side of the patch; the patch repeats, so that a cell is forgotten where the rover comes to the
+    next one of the same address, 64 cells on."""
+    tiles: float = 1024.0
+    """Tiles per row of their numbers: patches within 512 of the origin keep numbers of their own, exact in float32."""
+    nowhere: float = -1e7
+    """Tile of a cell that no wheel has touched."""
+    dug: tuple[float, ...] = (-0.5, 0.0, 0.5, 1.0)
+    """Where along the rim soil is taken, in lengths of the contact ahead of the axle."""
+    behind: tuple[float, float] = (0.8, 1.0)
+    """Distances at which it comes to lie behind the axle, in radii: just beyond the rim of a sunken wheel."""
+    faint: float = 1e-3
+    """Depth of a rut, in radii, at which its soil is half as firm as pressed soil is."""
+
+
+PATCH = RutPatch()
+
 _ACROSS = tuple(np.linspace(-0.4, 0.4, 5).tolist())
 """Where a wheel presses and digs, in its widths beside its middle."""
-_DUG = (-0.5, 0.0, 0.5, 1.0)
-"""Where along the rim soil is taken, in lengths of the contact ahead of the axle."""
-_BEHIND = (0.8, 1.0)
-"""Distances at which it comes to lie behind the axle, in radii: just beyond the rim of a sunken wheel."""
-_FAINT = 1e-3
-"""Depth of a rut, in radii, at which its soil is half as firm as pressed soil is."""
 
 
 @pytree
@@ -62,26 +71,27 @@ class Relief:
 
 def _address(i: Any, j: Any) -> tuple[Any, Any]:
     """Place of the cells i, j in the patch, and the number of their tile."""
-    tile_i, tile_j = jnp.floor(i / SIDE), jnp.floor(j / SIDE)
-    slot = (i - SIDE * tile_i) + SIDE * (j - SIDE * tile_j)
+    tile_i, tile_j = jnp.floor(i / PATCH.side), jnp.floor(j / PATCH.side)
+    slot = (i - PATCH.side * tile_i) + PATCH.side * (j - PATCH.side * tile_j)
     # a position of NaN may become any whole number
-    return jnp.clip(slot.astype(jnp.int32), 0, SIDE * SIDE - 1), tile_i + _TILES * tile_j
+    return jnp.clip(slot.astype(jnp.int32), 0, PATCH.side * PATCH.side - 1), tile_i + PATCH.tiles * tile_j
 
 
 def cell_numbers(tile: Any) -> tuple[Any, Any]:
     """Numbers, east and north, of the cells that the slots of a patch (last axis) hold, from their tiles; whole."""
-    slot = jnp.arange(SIDE * SIDE)
-    tile_j = jnp.round(tile / _TILES)
-    return slot % SIDE + SIDE * (tile - _TILES * tile_j), slot // SIDE + SIDE * tile_j
+    slot = jnp.arange(PATCH.side * PATCH.side)
+    tile_j = jnp.round(tile / PATCH.tiles)
+    return slot % PATCH.side + PATCH.side * (tile - PATCH.tiles * tile_j), slot // PATCH.side + PATCH.side * tile_j
 
 
 def tile_of(u: Any, v: Any) -> Any:
     """Tiles of all slots (last axis) in the patch whose middle lies nearest to a place, in cells."""
-    slot = jnp.arange(SIDE * SIDE)
+    slot = jnp.arange(PATCH.side * PATCH.side)
     tile_i, tile_j = (
-        jnp.round((middle[..., None] - 0.5 - number) / SIDE) for middle, number in ((u, slot % SIDE), (v, slot // SIDE))
+        jnp.round((middle[..., None] - 0.5 - number) / PATCH.side)
+        for middle, number in ((u, slot % PATCH.side), (v, slot // PATCH.side))
     )
-    return tile_i + _TILES * tile_j
+    return tile_i + PATCH.tiles * tile_j
 
 
 def _relief(ctx: Any, p: Any, x: Any, geometry: Any) -> Relief:
@@ -114,7 +124,7 @@ def _soil(ctx, p, x, ground):
     lead_x, lead_y = here.x + 0.5 * way * reach * ahead.x, here.y + 0.5 * way * reach * ahead.y
     _, rut = relief.at(lead_x, lead_y)
     rut = jnp.where(ground.rock > 0.5, 0.0, rut)
-    firm = 1.0 + rut / (rut + _FAINT * radius) * (jnp.power(1.0 - p.plastic, -ground.n) - 1.0)
+    firm = 1.0 + rut / (rut + PATCH.faint * radius) * (jnp.power(1.0 - p.plastic, -ground.n) - 1.0)
     soil = dataclasses.replace(
         ground,
         k_c=ground.k_c * firm,
@@ -134,14 +144,14 @@ def _soil(ctx, p, x, ground):
         """Points across the wheel at distances ahead of its axle."""
         return (jnp.concatenate([s + d * a for d in off]) for s, a in ((side_x, ahead.x), (side_y, ahead.y)))
 
-    dug_x, dug_y = along(*(toward * f * reach for f in _DUG))
-    back_x, back_y = along(*(-toward * f * radius for f in _BEHIND))
+    dug_x, dug_y = along(*(toward * f * reach for f in PATCH.dug))
+    back_x, back_y = along(*(-toward * f * radius for f in PATCH.behind))
     trail_x, trail_y = along(-way * relief.cell)
 
     heap = jnp.mean(relief.at(back_x, back_y)[0], axis=0)
     hole = jnp.mean(relief.at(dug_x, dug_y)[0], axis=0)
     # soil heaped steeper than it stands runs back to where it came from
-    room = 1.0 - (heap - hole) / (_BEHIND[0] * radius * ground.tan_phi)
+    room = 1.0 - (heap - hole) / (PATCH.behind[0] * radius * ground.tan_phi)
     deep = jnp.minimum(jnp.maximum(contact.sinkage - rut, 0.0), radius)
     volume = ctx.dt * p.carried * deep * jnp.abs(slide) * jnp.clip(room, 0.0, 1.0) * width
     # A volume spread over cells: what is taken from some is brought to others, so that soil is conserved.
@@ -159,7 +169,7 @@ def _soil(ctx, p, x, ground):
 
 
 def _cells(initial: float, unit: str, meaning: str) -> StateVariable:
-    return StateVariable(initial, unit, meaning, axis="rover", slots=SIDE * SIDE)
+    return StateVariable(initial, unit, meaning, axis="rover", slots=PATCH.side * PATCH.side)
 
 
 ruts = Effect(
@@ -210,7 +220,7 @@ ruts = Effect(
     state={
         "moved": _cells(0.0, "m", "soil brought to a cell or taken from it"),
         "pressed": _cells(0.0, "m", "depth by which the soil of a cell was pressed together"),
-        "tile": _cells(_NOWHERE, "1", "which patch a cell belongs to"),
+        "tile": _cells(PATCH.nowhere, "1", "which patch a cell belongs to"),
     },
     replaces=("multipass",),
     order=20,

@@ -14,12 +14,25 @@ import jax.numpy as jnp
 from lunar_mjx.effects.base import Parameter, StateVariable, effect
 from lunar_mjx.spatial import Vec3
 
-_MIN_SINKAGE = 1e-9
-"""Least sinkage over radius: a root has no finite derivative at zero."""
-_TINY = 1e-24
-"""Added below a root of two squares, far below the squared displacements over moduli that move soil."""
-_MAX_SINKAGE_RATIO = 1.5
-"""The contact arc is followed up to an entrance angle of 120 deg; a wheel buried deeper keeps the force of that arc."""
+
+@dataclasses.dataclass(frozen=True)
+class ContactLimits:
+    """Between which depths the closed form is followed."""
+
+    min_sinkage: float = 1e-9
+    """Least sinkage over radius: a root has no finite derivative at zero."""
+    tiny: float = 1e-24
+    """Added below a root of two squares, far below the squared displacements over moduli that move soil."""
+    max_sinkage_ratio: float = 1.5
+    """The contact arc is followed up to an entrance angle of 120 deg; a wheel buried deeper keeps the force of that
+    arc."""
+    shortest: float = 0.05
+    """Least contact length that remembers its shear, in radii; it is reached half a hundredth of a radius deep. Less of
+    it would lean fully within the first step of a touchdown, and whether that step began a micrometre above the ground
+    or below it would show in how a rover stands for seconds."""
+
+
+CONTACT = ContactLimits()
 
 
 STANDSTILL_SPEED: Annotated[float, "m/s"] = 1e-3
@@ -29,7 +42,7 @@ STANDSTILL_SPEED: Annotated[float, "m/s"] = 1e-3
 def entrance_angle(sinkage, radius):
     """theta_1 = arccos((r - z)/r), written as 2 arcsin sqrt(z/2r), which keeps its digits at small sinkage; rad."""
     # Clipped below, since the root has no finite derivative at zero, where every wheel touches down.
-    ratio = jnp.clip(sinkage / radius, _MIN_SINKAGE, _MAX_SINKAGE_RATIO)
+    ratio = jnp.clip(sinkage / radius, CONTACT.min_sinkage, CONTACT.max_sinkage_ratio)
     return 2.0 * jnp.arcsin(jnp.sqrt(0.5 * ratio))
 
 
@@ -50,7 +63,7 @@ def first_axis(values, like):
 
 def max_normal_stress(soil, width, radius, theta_m, theta_1):
     """sigma_m = (k_c/b + k_phi) [r (cos theta_m - cos theta_1)]^n, Pa."""
-    depth = jnp.maximum(radius * cos_difference(theta_m, theta_1), _MIN_SINKAGE * radius)
+    depth = jnp.maximum(radius * cos_difference(theta_m, theta_1), CONTACT.min_sinkage * radius)
     return (soil.k_c / width + soil.k_phi) * depth**soil.n
 
 
@@ -138,12 +151,6 @@ def mean_decay(q):
     return jnp.where(small, series, -jnp.expm1(-safe) / safe)
 
 
-_SHORTEST = 0.05
-"""Least contact length that remembers its shear, in radii; it is reached half a hundredth of a radius deep. Less of it
-would lean fully within the first step of a touchdown, and whether that step began a micrometre above the ground or
-below it would show in how a rover stands for seconds."""
-
-
 def contact_length(ctx, normal):
     """Length of soil sheared between the entrance and the angle of maximum stress, m."""
     return ctx.geometry.radius * sin_difference(normal.entrance, normal.theta_m)
@@ -195,7 +202,7 @@ def shear_state(ctx, p, x, wheel):
     """
     contact = ctx.contact
     rock = ctx.soil.rock > 0.5
-    length = jnp.maximum(contact_length(ctx, ctx.normal), _SHORTEST * ctx.geometry.radius)
+    length = jnp.maximum(contact_length(ctx, ctx.normal), CONTACT.shortest * ctx.geometry.radius)
     length = jnp.where(rock, p.rock_length, length)
     # eq. 8 divides by the faster of rim and hub
     roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
@@ -242,7 +249,7 @@ def shear_stress(wheel, soil, strength, j_x, j_y):
         return tau_x, tau_y
     # Displacements in units of their moduli: an ellipse in metres becomes the circle of the law.
     q_x, q_y = j_x / soil.shear_modulus_x, j_y / soil.shear_modulus_y
-    common = strength * mean_decay(jnp.sqrt(q_x * q_x + q_y * q_y + _TINY))
+    common = strength * mean_decay(jnp.sqrt(q_x * q_x + q_y * q_y + CONTACT.tiny))
     return tau_x + wheel.circle * (common * q_x - tau_x), tau_y + wheel.circle * (common * q_y - tau_y)
 
 

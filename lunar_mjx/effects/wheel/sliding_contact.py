@@ -14,10 +14,27 @@ from lunar_mjx.spatial import Vec3
 
 _STILL: Annotated[float, "m/s"] = 2e-3
 """m/s; below it a wheel counts as standing, as for the slip ratio."""
-_FLAT = 1e-3
-"""Slip below which the root of two squares is rounded off."""
-_LONGEST = 0.9
-"""Share of the true contact time of a braked wheel, which has no limit for a locked one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SlidingLimits:
+    """Where the laws of sliding are rounded off."""
+
+    flat: float = 1e-3
+    """Slip below which the root of two squares is rounded off."""
+    longest: float = 0.9
+    """Share of the true contact time of a braked wheel, which has no limit for a locked one."""
+    shortest_turn: float = 0.01
+    """Least 1 + s: beyond a skid of 99 % the displacement is 100 times that of eq. 9 and more, tens of moduli K."""
+    shortest_arc: float = 0.05
+    """Least mean cosine over the front of the arc: wheels sunk to the axle, where the front stands upright."""
+    spread: float = 0.3
+    """Spread of the speed of the soil along the flank, over the lateral speed: friction turns over it, not at a
+    point."""
+
+
+SLIDING = SlidingLimits()
+
 _ACROSS, _ACROSS_WEIGHTS = (a.tolist() for a in np.polynomial.legendre.leggauss(3))
 _ALONG, _ALONG_WEIGHTS = (a.tolist() for a in np.polynomial.legendre.leggauss(6))
 
@@ -76,7 +93,7 @@ def slide_softening(ctx, p, x, ground):
     # eq. 8 has the larger of rim and forward speed below
     along = c.soil_slip * jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + _STILL**2)) / fastest
     across = c.v_y / fastest
-    sliding = jnp.sqrt(along**2 + across**2 + _FLAT**2) - _FLAT
+    sliding = jnp.sqrt(along**2 + across**2 + SLIDING.flat**2) - SLIDING.flat
     factor = 1.0 / (1.0 + p.softening * sliding)
     return dataclasses.replace(ground, k_c=ground.k_c * factor, k_phi=ground.k_phi * factor)
 
@@ -143,9 +160,9 @@ def shear_softening(ctx, p, x, normal):
     """
     contact, soil, r = contact_with_soil(ctx), ctx.soil, ctx.geometry.radius
     slip = contact.soil_slip
-    slip_x = slip / (1.0 + _LONGEST * jnp.minimum(slip, 0.0))
+    slip_x = slip / (1.0 + SLIDING.longest * jnp.minimum(slip, 0.0))
     rim, travel = jnp.abs(contact.rim_speed), jnp.abs(contact.v_x)
-    pace = rim + (1.0 - _LONGEST) * jnp.maximum(travel - rim, 0.0)
+    pace = rim + (1.0 - SLIDING.longest) * jnp.maximum(travel - rim, 0.0)
     slip_y = contact.v_y / jnp.sqrt(pace**2 + _STILL**2)
 
     def factor(theta):
@@ -192,13 +209,13 @@ def _angle_of_reversal(ctx, p, x, normal):
 
 def _own_turning(ctx, p, x, wheel):
     skid = jnp.clip(-jnp.sign(wheel.direction) * wheel.slip_x, 0.0, 1.0)
-    stretch = 1.0 / jnp.maximum(1.0 - p.share * skid, _SHORTEST_TURN)
+    stretch = 1.0 / jnp.maximum(1.0 - p.share * skid, SLIDING.shortest_turn)
     slip_x = wheel.slip_x * stretch
     theta_1 = ctx.normal.entrance
     theta_0 = jnp.minimum(ctx.normal.reversal, theta_1)
     # (theta_1 - theta_0)/(sin theta_1 - sin theta_0), by half angles
     half = 0.5 * (theta_1 - theta_0)
-    upright = jnp.maximum(jnp.cos(0.5 * (theta_1 + theta_0)), _SHORTEST_ARC)
+    upright = jnp.maximum(jnp.cos(0.5 * (theta_1 + theta_0)), SLIDING.shortest_arc)
     undone = 1.0 / (upright * jnp.sinc(half / jnp.pi))
     kept = jnp.maximum(1.0 - undone - wheel.direction * slip_x, 0.0)
     return dataclasses.replace(
@@ -235,11 +252,6 @@ skid_shear = Effect(
     theta_0 it is not dragged back, j_x(theta_0) >= 0, and behind it the shear begins anew (Wong & Reece 1967, part II:
     towed wheels, whose shear turns about there). Driving, theta_0 = 0 and nothing changes.""",
 )
-
-_SHORTEST_TURN = 0.01
-"""Least 1 + s: beyond a skid of 99 % the displacement is 100 times that of eq. 9 and more, tens of moduli K."""
-_SHORTEST_ARC = 0.05
-"""Least mean cosine over the front of the arc: wheels sunk to the axle, where the front stands upright."""
 
 
 def wall_bearing(tan_phi, tan_delta):
@@ -313,7 +325,7 @@ def side_wall(ctx, p, x, wheel):
     arm, place = axle + 2.0 / 3.0 * h, ahead * along
     rise = jnp.abs(contact.v_y) / (soil.tan_phi + jnp.sqrt(1.0 + soil.tan_phi**2))
     u_x, u_z = contact.v_x - turning * arm, -turning * place - rise
-    speed = jnp.sqrt(u_x**2 + u_z**2 + (_SPREAD * contact.v_y) ** 2 + p.speed_scale**2)
+    speed = jnp.sqrt(u_x**2 + u_z**2 + (SLIDING.spread * contact.v_y) ** 2 + p.speed_scale**2)
     tan_delta = p.friction * soil.tan_phi
     bearing = wall_bearing(soil.tan_phi, -tan_delta * u_z / speed)
     wall = h * (0.5 * bearing * weight * h + 2.0 * soil.cohesion * jnp.sqrt(bearing))
@@ -332,7 +344,3 @@ def _tangent_of_travel(contact, wheel, still):
     fastest = jnp.maximum(jnp.abs(contact.rim_speed), jnp.abs(contact.v_x))
     braking = jnp.clip(-jnp.sign(wheel.direction) * wheel.slip_x, 0.0, 1.0)
     return wheel.slip_y / (1.0 + braking) * jnp.sqrt((fastest**2 + still**2) / (contact.v_x**2 + still**2))
-
-
-_SPREAD = 0.3
-"""Spread of the speed of the soil along the flank, over the lateral speed: friction turns over it, not at a point."""

@@ -3,6 +3,7 @@ through."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -13,10 +14,18 @@ from lunar_mjx.envs.ladder.chart import prices
 from lunar_mjx.envs.ladder.pool import Pool
 from lunar_mjx.envs.ladder.ways import distances
 
-AHEAD = 4
-"""Nodes along the way that it aims at, at most; fewer where the straight line there is blocked."""
-PATIENCE = 3.0
-"""s without progress after which it backs off, and after as long again drives on."""
+
+@dataclasses.dataclass(frozen=True)
+class Following:
+    """How the follower keeps to its way."""
+
+    ahead: int = 4
+    """Nodes along the way that it aims at, at most; fewer where the straight line there is blocked."""
+    patience: float = 3.0
+    """s without progress after which it backs off, and after as long again drives on."""
+
+
+FOLLOWING = Following()
 
 
 def costs(pool: Pool) -> Any:
@@ -42,7 +51,7 @@ def toward(turn: Any, waited: Any, leaving: Any = False) -> tuple[Any, Any]:
       turn: to the place aimed at from the heading, rad. waited: s without progress.
       leaving: whether to go on backwards.
     """
-    phase = jnp.floor(waited / PATIENCE).astype(jnp.int32)
+    phase = jnp.floor(waited / FOLLOWING.patience).astype(jnp.int32)
     back = jnp.where(phase == 0, leaving | (jnp.abs(turn) > 1.9), phase % 2 == 1)
     forward = jnp.where(jnp.abs(turn) > 0.6, 0.6, 1.0)
     # backwards, the wheels turned away bring the nose round
@@ -77,8 +86,8 @@ class Follower:
         steps = jnp.asarray([(i, j) for j in (-1, 0, 1) for i in (-1, 0, 1)])
         aim = node + 0.5
         seen = jnp.ones(node.shape[0], bool)
-        share = jnp.linspace(0.0, 1.0, 2 * AHEAD + 1)[1:, None, None]
-        for k in range(AHEAD):
+        share = jnp.linspace(0.0, 1.0, 2 * FOLLOWING.ahead + 1)[1:, None, None]
+        for k in range(FOLLOWING.ahead):
             # off the free nodes every node of the neighbourhood is tried, two cells wide
             near = jnp.clip(node + (2 if k == 0 else 1) * steps[:, None, :], 0, count - 1)
             best = jnp.argmin(self.costs[way, near[..., 1], near[..., 0]], axis=0)

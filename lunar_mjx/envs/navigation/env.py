@@ -27,17 +27,7 @@ from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
 from lunar_mjx.envs.navigation.observations import CAMERA, Scene, observe
 from lunar_mjx.envs.navigation.places import draw_places
-from lunar_mjx.envs.navigation.view import (
-    NOWHERE,
-    SCAN_SCALE,
-    TRAIL,
-    VISITED_APART,
-    VISITED_KEPT,
-    Reader,
-    View,
-    goal_in_body,
-    read,
-)
+from lunar_mjx.envs.navigation.view import SCAN_SCALE, VIEW, Reader, View, goal_in_body, read
 from lunar_mjx.envs.navigation.worlds import PREFIX, world
 from lunar_mjx.errors import bad_input
 from lunar_mjx.model import Model, make_model
@@ -144,14 +134,22 @@ class Inner:
     used: Any = None
 
 
-MOST_SPEED = 30.0
-"""m/s of the chassis: ten times the fastest rover that has driven on the Moon (LRV, 18 km/h), and a fall from 280 m."""
-MOST_TURN = 100.0
-"""rad/s of the chassis and of every joint: a wheel of 0.1 m rim radius at 10 m/s."""
-MOST_HEIGHT = 50.0
-"""m above the highest and below the lowest ground."""
-MOST_VALUE = 1e4
-"""Largest observation and reward that a replay buffer and the normaliser are given."""
+@dataclasses.dataclass(frozen=True)
+class Plausible:
+    """Beyond these values a rover's state is taken for diverged."""
+
+    most_speed: float = 30.0
+    """m/s of the chassis: ten times the fastest rover that has driven on the Moon (LRV, 18 km/h), and a fall from 280
+    m."""
+    most_turn: float = 100.0
+    """rad/s of the chassis and of every joint: a wheel of 0.1 m rim radius at 10 m/s."""
+    most_height: float = 50.0
+    """m above the highest and below the lowest ground."""
+    most_value: float = 1e4
+    """Largest observation and reward that a replay buffer and the normaliser are given."""
+
+
+PLAUSIBLE = Plausible()
 
 
 def plausible(qpos: Any, qvel: Any, ground: Any) -> Any:
@@ -160,15 +158,15 @@ def plausible(qpos: Any, qvel: Any, ground: Any) -> Any:
     Args:
       qpos: (env, nq), qvel: (env, nv), of a free body and its joints. ground: lowest and highest ground, m.
     """
-    low, high = ground[0] - MOST_HEIGHT, ground[1] + MOST_HEIGHT
-    there = (qpos[:, 2] > low) & (qpos[:, 2] < high) & (jnp.abs(qpos[:, 7:]) < MOST_VALUE).all(-1)
-    slow = (jnp.abs(qvel[:, :3]) < MOST_SPEED).all(-1) & (jnp.abs(qvel[:, 3:]) < MOST_TURN).all(-1)
+    low, high = ground[0] - PLAUSIBLE.most_height, ground[1] + PLAUSIBLE.most_height
+    there = (qpos[:, 2] > low) & (qpos[:, 2] < high) & (jnp.abs(qpos[:, 7:]) < PLAUSIBLE.most_value).all(-1)
+    slow = (jnp.abs(qvel[:, :3]) < PLAUSIBLE.most_speed).all(-1) & (jnp.abs(qvel[:, 3:]) < PLAUSIBLE.most_turn).all(-1)
     return there & slow
 
 
 def bounded(a: Any) -> Any:
-    """Values within `MOST_VALUE`; 0 for what is not finite."""
-    return jnp.clip(jnp.nan_to_num(a, nan=0.0, posinf=0.0, neginf=0.0), -MOST_VALUE, MOST_VALUE)
+    """Values within `PLAUSIBLE.most_value`; 0 for what is not finite."""
+    return jnp.clip(jnp.nan_to_num(a, nan=0.0, posinf=0.0, neginf=0.0), -PLAUSIBLE.most_value, PLAUSIBLE.most_value)
 
 
 class NavigationEnv:
@@ -463,12 +461,12 @@ class NavigationEnv:
             waited=waited,
         )
         if inner.trail is not None:
-            fade = jnp.exp(-self.control_interval / jnp.asarray(TRAIL, position.dtype))[:, None]
+            fade = jnp.exp(-self.control_interval / jnp.asarray(VIEW.trail, position.dtype))[:, None]
             # Exponential means over three times: a memory of fixed size of where the rover has been.
             trail = position[:, None, :2] + fade * (inner.trail - position[:, None, :2])
             inner = dataclasses.replace(inner, trail=trail)
         if inner.visited is not None:
-            far = rewards.length(position[:, :2] - inner.visited[:, 0]) > VISITED_APART
+            far = rewards.length(position[:, :2] - inner.visited[:, 0]) > VIEW.visited_apart
             more = jnp.concatenate([position[:, None, :2], inner.visited[:, :-1]], axis=1)
             inner = dataclasses.replace(inner, visited=jnp.where(far[:, None, None], more, inner.visited))
         if inner.left is not None and params.pool is not None:
@@ -557,8 +555,8 @@ class NavigationEnv:
             place=pick if params.shortest is not None or params.arrivals is not None else None,
             tally=tally.start(count, position.dtype) if c.tally else None,
             left=params.pool.places.shortest[pick] if "way" in c.weights and params.pool is not None else None,
-            trail=jnp.repeat(position[:, None, :2], len(TRAIL), axis=1) if "trail" in c.observations else None,
-            visited=jnp.full((count, VISITED_KEPT, 2), NOWHERE, position.dtype)
+            trail=jnp.repeat(position[:, None, :2], len(VIEW.trail), axis=1) if "trail" in c.observations else None,
+            visited=jnp.full((count, VIEW.visited_kept, 2), VIEW.nowhere, position.dtype)
             if "visited" in c.observations
             else None,
         )

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from lunar_mjx.envs.ladder.chart import STEPS
 from lunar_mjx.envs.navigation.env import NavigationEnv
-from lunar_mjx.envs.navigation.view import FAR_SCAN, SCAN_AHEAD, SCAN_ASIDE, SCAN_SCALE, TRAIL, VISITED_GRID
+from lunar_mjx.envs.navigation.view import SCAN_SCALE, VIEW
 
 
 class Label(NamedTuple):
@@ -46,7 +46,9 @@ def _per_wheel(unit: str) -> Callable[[NavigationEnv], list[Label]]:
 def _scan(env: NavigationEnv, wider: float = 1.0) -> list[Label]:
     scale = wider * SCAN_SCALE.get(env.model.rover.name, 1.0)
     return [
-        Label(f"{scale * a:.4g} m ahead, {scale * b:.4g} m to the left", "m") for a in SCAN_AHEAD for b in SCAN_ASIDE
+        Label(f"{scale * a:.4g} m ahead, {scale * b:.4g} m to the left", "m")
+        for a in VIEW.scan_ahead
+        for b in VIEW.scan_aside
     ]
 
 
@@ -72,7 +74,7 @@ LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
     "arrival": lambda env: [Label("cosine", "1"), Label("sine", "1")],
     "border": lambda env: [Label(side, "10 m") for side in ("ahead", "to the left", "behind", "to the right")],
     "visited": lambda env: [
-        Label(f"{a:g} m ahead, {b:g} m to the left", "1") for a in VISITED_GRID for b in VISITED_GRID
+        Label(f"{a:g} m ahead, {b:g} m to the left", "1") for a in VIEW.visited_grid for b in VIEW.visited_grid
     ],
     "plan": lambda env: [
         *(Label(f"{place}, {side}", "m") for place in _PLACES for side in ("ahead", "to the left")),
@@ -85,8 +87,10 @@ LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
         Label("sine of the Sun's bearing", "1"),
     ],
     "height_scan": _scan,
-    "far_scan": lambda env: _scan(env, FAR_SCAN),
-    "trail": lambda env: [Label(f"{axis}, {time:g} s", "m") for axis in ("ahead", "to the left") for time in TRAIL],
+    "far_scan": lambda env: _scan(env, VIEW.far_scan),
+    "trail": lambda env: [
+        Label(f"{axis}, {time:g} s", "m") for axis in ("ahead", "to the left") for time in VIEW.trail
+    ],
 }
 """Blocks whose numbers have names of their own. Pictures and what was drawn are counted through."""
 

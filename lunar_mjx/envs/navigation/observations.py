@@ -8,16 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from lunar_mjx.cameras.batch import Pictures
-from lunar_mjx.envs.navigation.view import (
-    FAR_SCAN,
-    SCAN_AHEAD,
-    SCAN_ASIDE,
-    VISITED_APART,
-    VISITED_GRID,
-    View,
-    goal_in_body,
-    height_scan,
-)
+from lunar_mjx.envs.navigation.view import VIEW, View, goal_in_body, height_scan
 from lunar_mjx.errors import bad_input
 from lunar_mjx.pytree import pytree, static
 from lunar_mjx.terrain import Terrain
@@ -132,7 +123,7 @@ def scan(v: View, s: Scene) -> Any:
 def far_scan(v: View, s: Scene) -> Any:
     """The height scan over a wider and coarser pattern, m, within 2 m of the standing plane. Nothing hides what lies
     behind a boulder from it."""
-    return jnp.clip(height_scan(s.terrain, v, FAR_SCAN * s.scan_scale, s.ride), -2.0, 2.0)
+    return jnp.clip(height_scan(s.terrain, v, VIEW.far_scan * s.scan_scale, s.ride), -2.0, 2.0)
 
 
 def trail(v: View, s: Scene) -> Any:
@@ -164,9 +155,9 @@ def visited(v: View, s: Scene) -> Any:
     away = v.visited - v.position[:, None, :2]
     cos, sin = jnp.cos(v.yaw)[:, None], jnp.sin(v.yaw)[:, None]
     ahead, aside = cos * away[..., 0] + sin * away[..., 1], cos * away[..., 1] - sin * away[..., 0]
-    grid = jnp.asarray(VISITED_GRID)
+    grid = jnp.asarray(VIEW.visited_grid)
     # the bell of a place is the product of one along and one across
-    fore, side = (jnp.exp(-0.5 * ((a[..., None] - grid) / VISITED_APART) ** 2) for a in (ahead, aside))
+    fore, side = (jnp.exp(-0.5 * ((a[..., None] - grid) / VIEW.visited_apart) ** 2) for a in (ahead, aside))
     return jnp.einsum("epi,epj->eij", fore, side).reshape(v.yaw.shape[0], -1)
 
 
@@ -273,7 +264,7 @@ BLOCKS: dict[str, Block] = {
 CAMERA = "camera/"
 """What the names of blocks begin with that are pictures."""
 
-SCAN_POINTS = len(SCAN_AHEAD) * len(SCAN_ASIDE)
+SCAN_POINTS = len(VIEW.scan_ahead) * len(VIEW.scan_aside)
 
 
 def check_blocks(names: Sequence[str], field: str) -> None:

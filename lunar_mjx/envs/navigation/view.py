@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,22 +13,33 @@ from lunar_mjx.envs.navigation.kalman import KalmanState
 from lunar_mjx.pytree import pytree
 from lunar_mjx.terrain import Terrain, surface
 
-SCAN_AHEAD = (-1.0, -0.7, -0.35, 0.0, 0.35, 0.65, 0.95, 1.25, 1.6, 2.0, 2.5, 3.1, 3.8)
-SCAN_ASIDE = (-1.6, -1.1, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.1, 1.6)
-"""Places of the height scan relative to the rover, m, along and across its heading; times `SCAN_SCALE`."""
-FAR_SCAN = 2.5
-"""What the far scan's pattern is larger by: places 9.5 m ahead and 4 m aside."""
-SCAN_REACH = 0.2
-"""Radius of the cell about each place, m, times `SCAN_SCALE`: the scan keeps the highest rock within it, as elevation
-maps do. Without it the smallest rocks, 0.25 m wide, slip between the places and end up under the chassis."""
-TRAIL = (4.0, 15.0, 60.0)
-"""Time constants of the means of past positions, s: a few metres, a yard, and the way into it."""
-VISITED_APART, VISITED_KEPT = 2.0, 32
-"""m between the places that a rover remembers to have been at, and how many it remembers."""
-VISITED_GRID = (-8.0, -4.0, 0.0, 4.0, 8.0)
-"""m along and across the heading at which the memory is looked up."""
-NOWHERE = 1e4
-"""m; coordinates of places not yet visited."""
+
+@dataclasses.dataclass(frozen=True)
+class ViewSizes:
+    """What a rover sees and remembers of its surroundings."""
+
+    scan_ahead: tuple[float, ...] = (-1.0, -0.7, -0.35, 0.0, 0.35, 0.65, 0.95, 1.25, 1.6, 2.0, 2.5, 3.1, 3.8)
+    scan_aside: tuple[float, ...] = (-1.6, -1.1, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.1, 1.6)
+    """Places of the height scan relative to the rover, m, along and across its heading; times `SCAN_SCALE`."""
+    far_scan: float = 2.5
+    """What the far scan's pattern is larger by: places 9.5 m ahead and 4 m aside."""
+    scan_reach: float = 0.2
+    """Radius of the cell about each place, m, times `SCAN_SCALE`: the scan keeps the highest rock within it, as
+    elevation maps do. Without it the smallest rocks, 0.25 m wide, slip between the places and end up under the
+    chassis."""
+    trail: tuple[float, float, float] = (4.0, 15.0, 60.0)
+    """Time constants of the means of past positions, s: a few metres, a yard, and the way into it."""
+    # m between the places that a rover remembers to have been at, and how many it remembers.
+    visited_apart: float = 2.0
+    visited_kept: int = 32
+    visited_grid: tuple[float, ...] = (-8.0, -4.0, 0.0, 4.0, 8.0)
+    """m along and across the heading at which the memory is looked up."""
+    nowhere: float = 1e4
+    """m; coordinates of places not yet visited."""
+
+
+VIEW = ViewSizes()
+
 SCAN_SCALE = {"viper": 1.6}
 """Larger rovers look farther."""
 
@@ -55,7 +67,7 @@ class View:
       visited: places where it has been, newest first, (env, place, 2) m, far away where there is none yet; None unless
         they are observed.
       charge: of the battery above that at which it cuts the motors off, 0 to 1; None without one.
-      trail: where the rover was, averaged over the `TRAIL` times, m; None unless it is observed.
+      trail: where the rover was, averaged over the `VIEW.trail` times, m; None unless it is observed.
       plan: where to aim and the next nodes of the way on the rover's own map, x and y from the rover along the world's
         axes, m, and the cost of that way, m; (env, 2 + 2 * node + 1), None unless it is observed.
     """
@@ -140,20 +152,20 @@ def _turn(matrix: Any, vector: Any) -> Any:
 def height_scan(terrain: Terrain, view: View, scale: float, ride: float) -> Float[Array, "env point"]:
     """Height of the surface around the rover over the plane its wheels would stand on if it were level, m.
 
-    Rocks count with their highest point within `SCAN_REACH` of each place.
+    Rocks count with their highest point within `VIEW.scan_reach` of each place.
 
     Args:
       terrain: one for all.
       view: the rovers.
-      scale: of the pattern `SCAN_AHEAD` x `SCAN_ASIDE`.
+      scale: of the pattern `VIEW.scan_ahead` x `VIEW.scan_aside`.
       ride: height of the chassis frame over the ground when standing, m.
     """
-    ahead, aside = jnp.meshgrid(jnp.asarray(SCAN_AHEAD), jnp.asarray(SCAN_ASIDE), indexing="ij")
+    ahead, aside = jnp.meshgrid(jnp.asarray(VIEW.scan_ahead), jnp.asarray(VIEW.scan_aside), indexing="ij")
     ahead, aside = scale * ahead.reshape(-1), scale * aside.reshape(-1)
     cos, sin = jnp.cos(view.yaw)[:, None], jnp.sin(view.yaw)[:, None]
     x = view.position[:, 0, None] + cos * ahead - sin * aside
     y = view.position[:, 1, None] + sin * ahead + cos * aside
-    return surface(terrain, x, y, scale * SCAN_REACH) - (view.position[:, 2, None] - ride)
+    return surface(terrain, x, y, scale * VIEW.scan_reach) - (view.position[:, 2, None] - ride)
 
 
 def goal_in_body(view: View) -> Float[Array, "env 2"]:

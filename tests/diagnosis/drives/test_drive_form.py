@@ -155,7 +155,7 @@ class Hurried(Toy):
 
 
 def test_candidates_without_time_are_skipped_and_told(monkeypatch):
-    monkeypatch.setattr(module, "_TOGETHER", 1)
+    monkeypatch.setattr(module, "DRIVE_REFIT", dataclasses.replace(module.DRIVE_REFIT, together=1))
     toy = Hurried({"a": 0.5, "drag": 0.9})
     toy.late = "lag"
     form, _, said = asked(toy)
