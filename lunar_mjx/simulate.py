@@ -164,17 +164,17 @@ def simulate(
             "is not finite",
             "give a finite number",
         )
-    every = round(commands.interval / model.timestep)
-    if every < 1 or abs(every * model.timestep - commands.interval) > 1e-3 * commands.interval:
+    steps_per_command = round(commands.interval / model.timestep)
+    if steps_per_command < 1 or abs(steps_per_command * model.timestep - commands.interval) > 1e-3 * commands.interval:
         raise bad_input(
             "simulate",
             "interval",
             f"{commands.interval:g} s",
             f"is no whole number of time steps of {model.timestep:g} s",
-            f"set timestep_s = {commands.interval / max(every, 1):.6g}, or resample the commands",
+            f"set timestep_s = {commands.interval / max(steps_per_command, 1):.6g}, or resample the commands",
         )
     state = system.reset(system.params, x, y, yaw)
-    run = jax.jit(lambda p, s, c: system.rollout(p, s, c, every=every))
+    run = jax.jit(lambda p, s, c: system.rollout(p, s, c, every=steps_per_command))
     count = len(commands.values)
     values = jnp.asarray(np.pad(commands.values, ((0, -count % SIMULATE.piece), (0, 0)), mode="edge"))
     try:
@@ -197,11 +197,11 @@ def check_finite(telemetry: Telemetry) -> None:
     for leaf in jax.tree.leaves(telemetry):
         finite &= np.isfinite(leaf.reshape(len(finite), -1)).all(axis=1)
     if not finite.all():
-        when = float(telemetry.time[np.argmin(finite)])
+        time_s = float(telemetry.time[np.argmin(finite)])
         raise bad_input(
             "simulate",
             "time",
-            f"{when:g} s",
+            f"{time_s:g} s",
             "is where the simulation diverged",
             "use a smaller timestep_s, softer gains or smaller commands",
         )

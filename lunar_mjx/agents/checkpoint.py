@@ -46,9 +46,9 @@ class Checkpoints:
           UserError: it cannot be written; the one before it stays.
         """
         notes = {**notes, "settings": self.settings}
-        what = ocp.args.Composite(state=ocp.args.StandardSave(_flat(state)), notes=ocp.args.JsonSave(notes))
+        items_to_save = ocp.args.Composite(state=ocp.args.StandardSave(_flat(state)), notes=ocp.args.JsonSave(notes))
         try:
-            self._manager.save(step, args=what)
+            self._manager.save(step, args=items_to_save)
             self._manager.wait_until_finished()
         except Exception as error:  # orbax raises what the writer of each part raises
             raise UserError(
@@ -97,8 +97,8 @@ class Checkpoints:
         notes = self._manager.restore(step, args=ocp.args.Composite(notes=ocp.args.JsonRestore()))["notes"]
         # Settings first: arrays of another network would fail later, with a message that names a shape.
         self._compare(notes.get("settings"))
-        what = ocp.args.Composite(state=ocp.args.StandardRestore(_flat(like)))
-        found = self._manager.restore(step, args=what)["state"]
+        items_to_restore = ocp.args.Composite(state=ocp.args.StandardRestore(_flat(like)))
+        found = self._manager.restore(step, args=items_to_restore)["state"]
         leaves = [
             # an empty array, too, must lie as the compiled step expects it
             found[jax.tree_util.keystr(path)]
@@ -111,12 +111,12 @@ class Checkpoints:
     def _compare(self, kept: Mapping[str, Any] | None) -> None:
         if self.settings is None or kept is None:
             return
-        now, then = _by_name(self.settings), _by_name(kept)
-        for name in sorted(now.keys() | then.keys()):
-            if now.get(name) != then.get(name):
-                problem = f"is not {then.get(name)}, with which the training there began"
+        current, saved = _by_name(self.settings), _by_name(kept)
+        for name in sorted(current.keys() | saved.keys()):
+            if current.get(name) != saved.get(name):
+                problem = f"is not {saved.get(name)}, with which the training there began"
                 remedy = "give the same, add --restart to begin anew, or train into another folder"
-                raise _OtherSettings(str(bad_input(self.folder, name, now.get(name), problem, remedy)))
+                raise _OtherSettings(str(bad_input(self.folder, name, current.get(name), problem, remedy)))
 
     def close(self) -> None:
         self._manager.close()

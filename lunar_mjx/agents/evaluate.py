@@ -125,8 +125,8 @@ def score(result: dict[str, np.ndarray], interval: float) -> Score:
     success, returns = result["success"], result["episode_return"]
     count = len(success)
     low, high = wilson(float(success.sum()), count)
-    others = {"episode_return", "episode_length", "success", *METRICS}
-    ends = {k: float(v.mean()) for k, v in result.items() if k not in others}
+    no_goal_metrics = {"episode_return", "episode_length", "success", *METRICS}
+    ends = {k: float(v.mean()) for k, v in result.items() if k not in no_goal_metrics}
     return Score(
         episodes=count,
         success=float(success.mean()),

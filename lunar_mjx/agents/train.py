@@ -227,9 +227,9 @@ class _Loop:
                 f"train: environment {number} gave a value that is not finite; train into a folder to keep its state."
             )
         path = self.folder / "not_finite.npz"
-        number, when = guard.dump(seen, path if self.lead else None, envs)
+        number, step = guard.dump(seen, path if self.lead else None, envs)
         raise guard.DivergenceError(
-            f"train: environment {number} gave a value that is not finite in step {when}; its state before that step "
+            f"train: environment {number} gave a value that is not finite in step {step}; its state before that step "
             f"is in {path}: take the step again with lunar_mjx.agents.guard.replay, and mend the model or time step."
         )
 

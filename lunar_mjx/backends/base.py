@@ -123,13 +123,13 @@ class Backend(abc.ABC):
         Raises:
           UserError: an interval that is no whole number of time steps, or a run that diverged.
         """
-        every = whole_steps(commands, self.model.timestep)
+        steps_per_command = whole_steps(commands, self.model.timestep)
         values = np.asarray(commands.values, float)
         rows = []
         with np.errstate(all="ignore"):  # a run that diverges is told below, not by a warning
             for k in range(values.shape[-2]):
                 control = self.controls(values[..., k, :])
-                for i in range(every):
+                for i in range(steps_per_command):
                     self.step(control)
                     if i == 0:
                         rows.append(self.observe())
@@ -139,11 +139,11 @@ class Backend(abc.ABC):
     def _check_finite(self, seen: Observation) -> None:
         fine = np.isfinite(seen["position"]).all() and np.isfinite(seen["velocity"]).all()
         if not (fine and np.isfinite(seen["joint_speed"]).all()):
-            when = round(float(seen["time"].flat[0]), 6)
+            time_s = round(float(seen["time"].flat[0]), 6)
             raise bad_input(
                 self.name,
                 "time, s",
-                when,
+                time_s,
                 "is where the simulation diverged",
                 "use a smaller timestep_s, softer gains or smaller commands",
             )
@@ -155,9 +155,9 @@ class Backend(abc.ABC):
 
 def whole_steps(commands: Commands, timestep: float) -> int:
     """Time steps for which each command is held."""
-    every = round(commands.interval / timestep)
-    if every < 1 or abs(every * timestep - commands.interval) > 1e-3 * commands.interval:
-        better = commands.interval / max(every, 1)
+    steps_per_command = round(commands.interval / timestep)
+    if steps_per_command < 1 or abs(steps_per_command * timestep - commands.interval) > 1e-3 * commands.interval:
+        better = commands.interval / max(steps_per_command, 1)
         raise bad_input(
             "run",
             "interval",
@@ -165,7 +165,7 @@ def whole_steps(commands: Commands, timestep: float) -> int:
             f"is no whole number of time steps of {timestep:g} s",
             f"set timestep_s = {better:.6g}, or resample the commands",
         )
-    return every
+    return steps_per_command
 
 
 VECTORS = (

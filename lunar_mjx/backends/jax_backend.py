@@ -104,10 +104,10 @@ class JaxBackend(Backend):
             self._seen = self._go(control, 1)
 
     def run(self, commands: Commands) -> Telemetry:
-        every = whole_steps(commands, self.model.timestep)
+        steps_per_command = whole_steps(commands, self.model.timestep)
         values = np.asarray(commands.values, float)
         with self._precision():
-            rows = [jax.device_get(self._go(values[..., k, :], every)) for k in range(values.shape[-2])]
+            rows = [jax.device_get(self._go(values[..., k, :], steps_per_command)) for k in range(values.shape[-2])]
         return jax.tree.map(lambda *a: np.stack(a, axis=1), *rows)
 
     def state(self) -> BackendState:

@@ -122,8 +122,8 @@ class PyBulletBackend(NumpyBackend):
             world.place(q, v)
 
     def _coordinates(self) -> tuple[np.ndarray, np.ndarray]:
-        both = [world.coordinates() for world in self._worlds]
-        return np.stack([b[0] for b in both]), np.stack([b[1] for b in both])
+        per_world = [world.coordinates() for world in self._worlds]
+        return np.stack([b[0] for b in per_world]), np.stack([b[1] for b in per_world])
 
     def _look(self, c: Context) -> None:
         rows = [world.look(self._wheel_links, self._axles) for world in self._worlds]
@@ -362,11 +362,11 @@ class _World:
         passive = -self._spring * (angle - self._rest) - self._damping * speed
         # The trial step: its accelerations are those of a rover without rotors and dampers.
         self._drive(torque + passive, loads)
-        without = (self.coordinates()[1][self._dadr] - speed) / self._dt
+        free_acceleration = (self.coordinates()[1][self._dadr] - speed) / self._dt
         # Taken back: the world must begin the real step where the trial began.
         self.place(qpos, qvel)
         response = self._response(self._sign * angle)
-        rotors = np.linalg.solve(np.eye(len(angle)) + response * self._inertia, without)
+        rotors = np.linalg.solve(np.eye(len(angle)) + response * self._inertia, free_acceleration)
         self._drive(torque + passive - self._inertia * rotors, loads)
 
     def _drive(self, torque: np.ndarray, loads: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]) -> None:
@@ -388,10 +388,10 @@ class _World:
         if self._pins:
             still = [0.0] * len(q)
             rows = []
-            for first, second, here, there in self._pins:
+            for first, second, on_first, on_second in self._pins:
                 one, two = (
                     np.array(p.calculateJacobian(self._body, link, at.tolist(), q, still, still, **self._id)[0])
-                    for link, at in ((first, here), (second, there))
+                    for link, at in ((first, on_first), (second, on_second))
                 )
                 rows.append(one - two)
             loops = np.concatenate(rows)

@@ -108,24 +108,24 @@ def picture(
     direction = jnp.sum(turn * rays[..., None, :], axis=-1)
     depth = march(terrain, position, direction, far, steps)
     label = jnp.where(jnp.isfinite(depth), GROUND, SKY)
-    which = jnp.zeros(depth.shape, jnp.int32)
+    surface = jnp.zeros(depth.shape, jnp.int32)
     if rovers is not None:
-        near, which = hit(rovers, position, direction)
+        near, surface = hit(rovers, position, direction)
         on_rover = (near < depth) & (near > camera.near)
         depth, label = jnp.where(on_rover, near, depth), jnp.where(on_rover, ROVER, label)
     # Pixels of the sky are shaded like the others and blanked at the end: any finite distance will do.
-    there = jnp.where(jnp.isfinite(depth), depth, 1.0)
-    point = position + there[..., None] * direction
+    finite_depth = jnp.where(jnp.isfinite(depth), depth, 1.0)
+    point = position + finite_depth[..., None] * direction
     face, on_rock = _surface_normal(terrain, point)
     label = jnp.where((label == GROUND) & on_rock, ROCK, label)
     if rovers is not None:
-        face = jnp.where((label == ROVER)[..., None], normal(rovers, which, point), face)
+        face = jnp.where((label == ROVER)[..., None], normal(rovers, surface, point), face)
     to_eye = -direction / jnp.sqrt(jnp.sum(direction**2, axis=-1, keepdims=True))
     # Lifted off its own surface, which would otherwise shade itself where the march's bilinear patch lies above it.
     lit = _sunlit(terrain, point + _SKIN * face, to_sun, rovers, shadow_steps)
     bright = _brightness(terrain, light, label, face, to_eye, to_sun, lit, point, paint)
     if rovers is not None:
-        colour = rovers.colour[which]
+        colour = rovers.colour[surface]
         bright = jnp.where((label == ROVER)[..., None], bright * colour, bright * jnp.asarray(TINT, dtype))
     else:
         bright = bright * jnp.asarray(TINT, dtype)
@@ -157,10 +157,10 @@ def pictures(
       more: `far`, `steps`, `shadow_steps`, `paint` of `picture`.
     """
     shapes, optics = rover_shapes(rover, detail), camera or Pinhole(64, 48)
-    where = mount or front_mount(rover)
+    camera_mount = mount or front_mount(rover)
 
     def one(given: tuple) -> Pictures:
-        position, turn = mounted(where, given[0])
+        position, turn = mounted(camera_mount, given[0])
         seen = placed(shapes, rover, given[0])
         if others is not None:
             seen = together(seen, *(placed(shapes, rover, given[1][i]) for i in range(others.shape[1])))

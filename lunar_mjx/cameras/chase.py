@@ -31,8 +31,8 @@ def wheel_places(rover: Rover, qpos: np.ndarray) -> np.ndarray:
     data = mujoco.MjData(model)
     bodies = [model.body(w.body).id for w in rover.wheels]
     out = np.empty((len(qpos), len(bodies), 3))
-    for row, here in enumerate(qpos):
-        data.qpos[:] = here
+    for row, row_qpos in enumerate(qpos):
+        data.qpos[:] = row_qpos
         mujoco.mj_kinematics(model, data)
         out[row] = data.xpos[bodies]
     return out

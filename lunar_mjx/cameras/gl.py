@@ -30,10 +30,10 @@ def wanted_backends() -> tuple[str, ...]:
     Raises:
       UserError: it turns OpenGL off.
     """
-    said = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if said in OFF:
-        raise UserError(f"cameras: MUJOCO_GL={said} turns OpenGL off; unset it, or set it to egl or osmesa.")
-    return (said,) if said in BACKENDS else BACKENDS
+    environment = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if environment in OFF:
+        raise UserError(f"cameras: MUJOCO_GL={environment} turns OpenGL off; unset it, or set it to egl or osmesa.")
+    return (environment,) if environment in BACKENDS else BACKENDS
 
 
 def context_class(backends: Sequence[str] | None = None) -> Any:

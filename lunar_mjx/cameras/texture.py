@@ -112,10 +112,10 @@ class TrackPainter:
         middle, way = place(at), place(at + 0.5 * pitch) - place(at - 0.5 * pitch)
         way *= 0.12 * pitch / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
         # a little after the rut beneath it, which would else be painted over it
-        when = np.searchsorted(length, np.minimum(at + 0.03, length[-1]))
+        print_index = np.searchsorted(length, np.minimum(at + 0.03, length[-1]))
         return [
             (int(w) + 1, self._bar(m - d, m + d, 0.94 * track.width), SOIL_TEXTURE.print)
-            for w, m, d in zip(when, middle, way, strict=True)
+            for w, m, d in zip(print_index, middle, way, strict=True)
         ]
 
     def _bar(self, a: np.ndarray, b: np.ndarray, width: float) -> list[tuple[float, float]]:

@@ -205,8 +205,8 @@ def _tell(outcome: Any, folder: Path, points: int) -> None:
             "impulse"
         )
     for quantity, parts in numerical_error(outcome.results).items():
-        told = ", ".join(f"{k} {v:.2g}" for k, v in parts.items())
-        if told:
-            print(f"numerical error of {QUANTITIES[quantity][0]}: {told}")
+        amounts = ", ".join(f"{k} {v:.2g}" for k, v in parts.items())
+        if amounts:
+            print(f"numerical error of {QUANTITIES[quantity][0]}: {amounts}")
     if outcome.stopped:
         print(f"stopped: {outcome.stopped}; {outcome.left} runs are left, the same command goes on with them")

@@ -57,9 +57,9 @@ def _plain_number(parameter: Any, process: Callable[[Any, Any], Any], kind: type
 
 def _problem(message: str) -> str:
     for words, problem in _PROBLEMS:
-        _, found, rest = message.partition(words)
+        _, found, after = message.partition(words)
         if found:
-            return problem.format(rest)
+            return problem.format(after)
     return f"is not accepted: {_clause(message)}"
 
 

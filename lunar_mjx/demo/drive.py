@@ -127,11 +127,11 @@ def drive(
     system = build(model)
     rng = np.random.default_rng([seed, *rover.encode()])
     starts = _starts(terrain, count, rng, shift * DEMO_DRIVE.spacing)
-    hold = round(1.0 / DEMO_DRIVE.records_per_second / system.dt)
+    steps_per_record = round(1.0 / DEMO_DRIVE.records_per_second / system.dt)
     controls, speed = _controls(system, count, seconds, rng)
     state = jax.jit(jax.vmap(system.reset, in_axes=(None, 0, 0, 0)))(system.params, *map(jnp.asarray, starts))
 
-    run = jax.jit(lambda params, state, controls: system.rollout_batch(params, state, controls, hold))
+    run = jax.jit(lambda params, state, controls: system.rollout_batch(params, state, controls, steps_per_record))
     records: list[Telemetry] = []
     chunk = max(1, round(DEMO_DRIVE.chunk_seconds * DEMO_DRIVE.records_per_second))
     for first in range(0, controls.shape[1], chunk):

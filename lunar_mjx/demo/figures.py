@@ -287,7 +287,7 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
         column_titles=[f"{a:g}°<br>{_split_of(a)}" for a in angles],
     )
     for column, angle in enumerate(angles, 1):
-        here = np.abs(table.test["slip_angle_deg"] - angle) < 0.01
+        at_angle = np.abs(table.test["slip_angle_deg"] - angle) < 0.01
         for row, (quantity, _, scale) in enumerate(rows, 1):
             place, legend = {"row": row, "col": column}, row == 1 and column == 1
             for case, curve in zip(cases, curves, strict=True):
@@ -304,11 +304,11 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
                     **place,
                 )
             figure.add_scatter(
-                x=table.test["slip_ratio"][here].round(3),
-                y=(scale * table.measured[quantity][here]).round(3),
+                x=table.test["slip_ratio"][at_angle].round(3),
+                y=(scale * table.measured[quantity][at_angle]).round(3),
                 error_y={
                     "type": "data",
-                    "array": (scale * scatter[quantity][here]).round(3),
+                    "array": (scale * scatter[quantity][at_angle]).round(3),
                     "thickness": 1.2,
                     "width": 3,
                 },

@@ -53,13 +53,15 @@ def husky_case(seed: int = 0, progress: Callable[[float], None] | None = None) -
     """
     tell = progress or (lambda done: None)
     with tempfile.TemporaryDirectory() as folder:
-        here = Path(folder)
-        import_drives(copy_example(here / "recordings"), here / "logs", MAP)
-        floor = compare([here / "logs" / FLOOR], hard_floor("husky"), here / FLOOR, seed=seed)
+        log_folder = Path(folder)
+        import_drives(copy_example(log_folder / "recordings"), log_folder / "logs", MAP)
+        floor = compare([log_folder / "logs" / FLOOR], hard_floor("husky"), log_folder / FLOOR, seed=seed)
         tell(0.5)
-        sand = compare([here / "logs" / SAND], load_model(floor.folder / "fitted.toml"), here / SAND, seed=seed)
+        sand = compare(
+            [log_folder / "logs" / SAND], load_model(floor.folder / "fitted.toml"), log_folder / SAND, seed=seed
+        )
         tell(0.7)
-        grown = add(sand.folder, "soft_ground", here / "grown")
+        grown = add(sand.folder, "soft_ground", log_folder / "grown")
         tell(1.0)
         time, measured, before = _series(sand.folder / "series.npz", "as given")
         after = _series(grown.folder / "series.npz", "refitted")[2]

@@ -67,9 +67,9 @@ def run_demo(
         terrain = load_terrain(DEFAULT_TERRAIN)
         drives, done = [], 0.02
         for i, (name, share) in enumerate(_SHARES.items()):
-            what = f"driving {rovers} {ROVERS[name][0]}s"
-            report(f"{what} (compiling)", done)
-            tell = _part(report, what, done + 0.85 * share, 0.15 * share)
+            activity = f"driving {rovers} {ROVERS[name][0]}s"
+            report(f"{activity} (compiling)", done)
+            tell = _part(report, activity, done + 0.85 * share, 0.15 * share)
             drives.append(drive(name, rovers, seconds, seed, terrain, tell, shift=0.5 * i))
             done += share
         share = 0.5 * (0.95 - done)

@@ -83,9 +83,9 @@ def husky_section(case: HuskyCase) -> Section:
         "The current of a Husky's left motor on sandy loam. The wheels turn as measured; the model was fitted on a "
         "hard floor, and then soft ground took the floor's place. Gaps lie between windows of two seconds."
     )
-    told = {"fit": "fitted windows", "held_out": "held-out windows"}
+    split_words = {"fit": "fitted windows", "held_out": "held-out windows"}
     steps = (case.error_before, case.error_refitted, case.error_after)
-    rows = [[told[k], *(f"{s[k]:.2f}" for s in steps)] for k in told if k in case.error_before]
+    rows = [[split_words[k], *(f"{s[k]:.2f}" for s in steps)] for k in split_words if k in case.error_before]
     header = ["", "as fitted on the floor", "refitted", "with soft ground"]
     table = Table("Error in standard deviations of the noise, all channels", header, rows)
     credit = "; ".join(case.source[k] for k in ("who", "citation", "licence") if k in case.source)

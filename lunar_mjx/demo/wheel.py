@@ -78,8 +78,8 @@ def wheel_cases(starts: int = 8, seed: int = 0, progress: Callable[[float], None
             seed,
             lambda done, i=i: tell(0.2 + 0.4 * (i + done / starts)),
         )
-        what = "soil and contact" if len(free) > len(SOIL) else "soil"
-        cases.append(Case(found.name, f"{what} {REFITTED}", found.comparison, found))
+        freed = "soil and contact" if len(free) > len(SOIL) else "soil"
+        cases.append(Case(found.name, f"{freed} {REFITTED}", found.comparison, found))
     return cases
 
 
@@ -92,8 +92,8 @@ def dense_curves(bed: WheelBed, table: SteadyStateTable, angles_deg: Sequence[fl
     slip = np.linspace(-1.0, 0.92, _CURVE_POINTS)
     loads = []
     for angle in angles_deg:
-        here = table.at_angles((angle,)).test
-        loads.append(np.interp(slip, here["slip_ratio"], here["normal_load_N"]))
+        of_angle = table.at_angles((angle,)).test
+        loads.append(np.interp(slip, of_angle["slip_ratio"], of_angle["normal_load_N"]))
     with jax.enable_x64(True):
         angles = np.radians(np.asarray(angles_deg))[:, None]
         test = wheel_test(slip[None, :], angles, np.stack(loads), table.radius, table.width, "travel_speed")

@@ -153,12 +153,12 @@ def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, se
             "effects": [],
             "outcome": _outcome(truth, Verdict.BAD_FIT, ()),
         }
-    said = conclude(found, settings.sure)
+    conclusion = conclude(found, settings.sure)
     return {
         **case,
-        "verdict": said.verdict.label,
-        "effects": list(said.effects),
-        "outcome": _outcome(truth, said.verdict, said.effects),
+        "verdict": conclusion.verdict.label,
+        "effects": list(conclusion.effects),
+        "outcome": _outcome(truth, conclusion.verdict, conclusion.effects),
     }
 
 

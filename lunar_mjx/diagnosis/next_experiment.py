@@ -144,8 +144,8 @@ def _hypotheses(verdict: dict[str, Any], between: Sequence[str], candidates: set
         return [*(e["effect"] for e in hidden[: CHOICE.most - 1]), NOTHING]
     open_ = [e["effect"] for e in evidence if e["status"] in ("accepted", "confounded")]
     near = [e["nearest"][0] for e in evidence if e["effect"] in named and e["nearest"][0] in candidates]
-    rest = [e["effect"] for e in sorted(evidence, key=lambda e: -(e["z"] or 0.0)) if e["effect"] in candidates]
-    return list(dict.fromkeys([*named[:2], *open_, *near, *rest]))[: max(2, min(CHOICE.most, len(named) + 2))]
+    by_z = [e["effect"] for e in sorted(evidence, key=lambda e: -(e["z"] or 0.0)) if e["effect"] in candidates]
+    return list(dict.fromkeys([*named[:2], *open_, *near, *by_z]))[: max(2, min(CHOICE.most, len(named) + 2))]
 
 
 class _Knowledge:
@@ -226,8 +226,8 @@ def _left(
     hypothesis: str,
 ) -> float:
     """Squared length of a difference after the hypothesis has been refitted to it, the earlier logs counted in."""
-    others = np.concatenate([[-1], *(problem.candidates[e] for e in effects if e != hypothesis)])
-    mine = ~np.isin(free, others)
+    other_columns = np.concatenate([[-1], *(problem.candidates[e] for e in effects if e != hypothesis)])
+    mine = ~np.isin(free, other_columns)
     columns, places = jacobian[:, mine], free[mine]
     precision = np.diag([1.0 / problem.coordinates[i].prior ** 2 for i in places])
     index = {key: k for k, key in enumerate(known.keys)}
@@ -241,17 +241,17 @@ def _left(
 
 
 def _sentence(names: Sequence[str], plans: Sequence[Plan]) -> str:
-    said = " and ".join(names) if len(names) == 2 else ", ".join(names)
+    listed = " and ".join(names) if len(names) == 2 else ", ".join(names)
     if not plans:
-        return f"No planned measurement could be simulated to tell {said} apart."
+        return f"No planned measurement could be simulated to tell {listed} apart."
     best = plans[0]
     pair = f" (least for {best.pair[0]} against {best.pair[1]})" if len(names) > 2 else ""
     if best.separation < CHOICE.separable:
         return (
-            f"No planned measurement tells {said} apart with these instruments: the best, {best.name}, would show a "
+            f"No planned measurement tells {listed} apart with these instruments: the best, {best.name}, would show a "
             f"difference of {best.separation:.2g} sigma{pair}; measure longer, or with less noise."
         )
-    rest = "; ".join(f"{p.name} {p.separation:.3g}" for p in plans[1:4])
-    return f"Measure next: {best.name}. It would show {said} apart by {best.separation:.3g} sigma{pair}." + (
-        f" Next best: {rest} sigma." if rest else ""
+    runners_up = "; ".join(f"{p.name} {p.separation:.3g}" for p in plans[1:4])
+    return f"Measure next: {best.name}. It would show {listed} apart by {best.separation:.3g} sigma{pair}." + (
+        f" Next best: {runners_up} sigma." if runners_up else ""
     )

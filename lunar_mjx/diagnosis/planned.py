@@ -65,8 +65,8 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
             count = int(time[-1] * table.rate_hz) + 1
             if channels and count > 1:
                 fill = {c: np.full(count, _first(c, plan.start, kelvin)) for c in channels}
-                when = np.arange(count) / table.rate_hz
-                tables[table.name] = LogTable(table.name, Path(name), when, fill, table.rate_hz)
+                sample_times = np.arange(count) / table.rate_hz
+                tables[table.name] = LogTable(table.name, Path(name), sample_times, fill, table.rate_hz)
         payload = {"payload_kg": plan.payload_share * model.rover.mass, "payload_position_m": (0.0, 0.0, 0.2)}
         found.append(
             (
@@ -128,12 +128,12 @@ def planned_sweeps(logs: Sequence[SteadyLog]) -> list[tuple[str, str, SteadyLog]
         names = " and ".join(QUANTITIES[q][2] for q in missing)
         for angle in (0.0, 30.0):
             name = f"slip sweep at {angle:g} deg slip angle, {load:.3g} N, measuring {names} too"
-            every = {**typical, **sigma}
+            conditions = {**typical, **sigma}
             found.append(
                 (
                     name,
                     "twelve slip ratios from -0.3 to 0.8, three runs each",
-                    _sweep(template, name, angle, load, every),
+                    _sweep(template, name, angle, load, conditions),
                 )
             )
     return found

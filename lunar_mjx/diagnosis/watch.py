@@ -67,12 +67,12 @@ class Alarm:
     def sentence(self) -> str:
         """The alarm, and what began if that is known, in a line."""
         difference, chance = next(iter(self.differences.items()))
-        told = (
+        cause = (
             f"{self.raised_s:.1f} s: alarm {self.number}: something began at {self.onset_s:.1f} s (between "
             f"{self.first_s:.1f} and {self.last_s:.1f} s), most probably at {difference} ({chance:.2f}): {self.size}."
         )
         if self.diagnosis is None:
-            return told
+            return cause
         names = ", ".join(self.diagnosis.effects) or self.diagnosis.port or "nothing by name"
         return f"alarm {self.number}, began at {self.onset_s:.1f} s: {self.diagnosis.verdict.label} {names}. " + (
             self.diagnosis.sentence

@@ -39,9 +39,9 @@ def step_heat(
             housing_temperature=ctx.housing_temperature + ctx.dt * heat.housing / heat.housing_capacity,
         )
         # the states that effects return here are those of a trial step, and are dropped
-        then, _ = heat_flow(pipeline, ahead, effects)
+        flow_ahead, _ = heat_flow(pipeline, ahead, effects)
         heat = dataclasses.replace(
-            heat, winding=0.5 * (heat.winding + then.winding), housing=0.5 * (heat.housing + then.housing)
+            heat, winding=0.5 * (heat.winding + flow_ahead.winding), housing=0.5 * (heat.housing + flow_ahead.housing)
         )
     # a step warms a winding by microkelvins, which float32 would drop beside 300 K
     winding = compensated_add(

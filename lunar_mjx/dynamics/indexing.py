@@ -46,8 +46,8 @@ def assemble(pieces: list[Any], at: list[np.ndarray]) -> Any:
         starts = starts[size:]
     else:
         return runs[0] if len(runs) == 1 else jnp.concatenate(runs)
-    where = {int(a): (k, i) for k, places in enumerate(at) for i, a in enumerate(places)}
-    return jnp.concatenate([jax.lax.slice(pieces[k], (i,), (i + 1,)) for _, (k, i) in sorted(where.items())])
+    source_of = {int(a): (k, i) for k, places in enumerate(at) for i, a in enumerate(places)}
+    return jnp.concatenate([jax.lax.slice(pieces[k], (i,), (i + 1,)) for _, (k, i) in sorted(source_of.items())])
 
 
 def _interleaved(starts: list[int], at: list[np.ndarray]) -> list[int] | None:

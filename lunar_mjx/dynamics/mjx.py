@@ -199,10 +199,10 @@ class _Pins:
 
 def _anchor(model: mujoco.MjModel, pin: Any, end: int) -> tuple[int, np.ndarray]:
     """Body of one end of a `connect`, and the anchor in its frame (3,), m."""
-    thing = (model.eq_obj1id, model.eq_obj2id)[end][pin]
+    object_ids = (model.eq_obj1id, model.eq_obj2id)[end][pin]
     if model.eq_objtype[pin] == mujoco.mjtObj.mjOBJ_SITE:
-        return int(model.site_bodyid[thing]), np.array(model.site_pos[thing])
-    return int(thing), np.array(model.eq_data[pin, 3 * end : 3 * end + 3])
+        return int(model.site_bodyid[object_ids]), np.array(model.site_pos[object_ids])
+    return int(object_ids), np.array(model.eq_data[pin, 3 * end : 3 * end + 3])
 
 
 def _hold_equalities(m: mjx.Model, d: mjx.Data, pins: _Pins) -> mjx.Data:

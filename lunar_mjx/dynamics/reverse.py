@@ -51,10 +51,10 @@ def reversible(function: Callable[..., Any]) -> Callable[..., Any]:
             return jax.vjp(of_real, *(leaves[i] for i in real))[1](given)
 
         found = computed_once(pull)(leaves, [g for g in jax.tree.leaves(given) if g.dtype != jax.dtypes.float0])
-        back: list[Any] = [None] * len(leaves)
+        cotangents: list[Any] = [None] * len(leaves)
         for i, value in zip(real, found, strict=True):
-            back[i] = value
-        return jax.tree.unflatten(tree, back)
+            cotangents[i] = value
+        return jax.tree.unflatten(tree, cotangents)
 
     run.defvjp(forward, backward)
     return run

@@ -129,14 +129,14 @@ def observe(
     if seen.supply is not None:
         supply = seen.supply
         kelvin = supply.chassis_temperature
-        rest = {
+        other_channels = {
             "bus_load_W": supply.load,
             "bus_solar_W": supply.solar,
             "battery_charge_ratio": supply.charge,
             "bus_voltage_V": supply.voltage,
             "chassis_temperature_degC": None if kelvin is None else kelvin - _ZERO_CELSIUS,
         }
-        out |= {name: value for name, value in rest.items() if value is not None}
+        out |= {name: value for name, value in other_channels.items() if value is not None}
     return Signals(jnp.asarray(seen.time), {k: jnp.asarray(v) for k, v in out.items()})
 
 

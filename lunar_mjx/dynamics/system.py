@@ -360,14 +360,14 @@ def _bus_voltage(params: Params, state: State) -> Any:
 def _supply(ctx: Context, effects: EffectState) -> Supply | None:
     """Power of the step, and charge and temperature at its beginning; None for a model that has none of them."""
     power, parameters = ctx.power, ctx.parameters
-    told: dict[str, Any] = {} if power is None else {"load": power.load, "solar": power.solar}
+    supplied: dict[str, Any] = {} if power is None else {"load": power.load, "solar": power.solar}
     if "battery" in effects:
-        told["charge"] = charge_of(parameters["battery"], effects["battery"]["used"])
-        told["voltage"] = ctx.bus_voltage
+        supplied["charge"] = charge_of(parameters["battery"], effects["battery"]["used"])
+        supplied["voltage"] = ctx.bus_voltage
     if "chassis_node" in effects:
         node = SimpleNamespace(**effects["chassis_node"])
-        told["chassis_temperature"] = chassis_temperature(parameters["chassis_node"], node)
-    return Supply(**told) if told else None
+        supplied["chassis_temperature"] = chassis_temperature(parameters["chassis_node"], node)
+    return Supply(**supplied) if supplied else None
 
 
 def _quaternion(roll: Any, pitch: Any, yaw: Any) -> Any:

@@ -164,8 +164,8 @@ def _requirements(effect: Effect) -> Check:
     act, s = _subject(watched, 4, 1, 0)
     jax.eval_shape(jax.vmap(functools.partial(act, _numbers(effect.nominal()))), s)
     missing = sorted(read - {effect.name, *effect.requires})
-    told = f"reads the parameters of {', '.join(missing)}: say requires={tuple(missing)}" if missing else ""
-    return Check("requirements", not missing, told or f"reads of others: {', '.join(effect.requires) or 'nothing'}")
+    remedy = f"reads the parameters of {', '.join(missing)}: say requires={tuple(missing)}" if missing else ""
+    return Check("requirements", not missing, remedy or f"reads of others: {', '.join(effect.requires) or 'nothing'}")
 
 
 def _numbers(values: Mapping[str, float]) -> dict[str, Any]:
@@ -176,14 +176,14 @@ def _null(effect: Effect, runs: Sequence[tuple[_Act, Any]]) -> Check:
     name = "vanishes at null"
     if not any(p.null is not None for p in effect.parameters.values()):
         return Check(name, None, "no parameter has a null value: the effect cannot be switched off")
-    worst, where = 0.0, ""
+    worst, worst_quantity = 0.0, ""
     for act, s in runs:
         with_it = jax.vmap(functools.partial(act, _numbers(effect.null())))(s)
-        without = jax.vmap(functools.partial(act, None))(s)
-        for key, ulp in _ulps(jax.device_get(with_it), jax.device_get(without)).items():
+        forces_without = jax.vmap(functools.partial(act, None))(s)
+        for key, ulp in _ulps(jax.device_get(with_it), jax.device_get(forces_without)).items():
             if not ulp <= worst:
-                worst, where = ulp, key
-    detail = f"{worst:.2g} ulp" + (f" in {where}" if worst else "")
+                worst, worst_quantity = ulp, key
+    detail = f"{worst:.2g} ulp" + (f" in {worst_quantity}" if worst else "")
     if not worst <= TOLERANCES.ulp:
         detail += "; give a null value only to parameters that switch the effect off, and see that they do"
     return Check(name, bool(worst <= TOLERANCES.ulp), detail)
@@ -224,8 +224,8 @@ def _derivatives(effect: Effect, runs: Sequence[tuple[_Act, Any]], seed: int) ->
             for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
                 wrong = ~np.isfinite(np.asarray(leaf)).reshape(len(leaf), -1).all(axis=1)
                 if wrong.any():
-                    which = jax.tree_util.keystr(path).strip("[]'")
-                    bad.append(f"by {kind}{which} at {label} values (rover {int(np.argmax(wrong))})")
+                    parameter = jax.tree_util.keystr(path).strip("[]'")
+                    bad.append(f"by {kind}{parameter} at {label} values (rover {int(np.argmax(wrong))})")
         if not all(np.isfinite(np.asarray(v)).all() for v in forward.values()):
             bad.append(f"forward mode at {label} values")
         if label == "null":
@@ -233,10 +233,10 @@ def _derivatives(effect: Effect, runs: Sequence[tuple[_Act, Any]], seed: int) ->
     looked = f"by every parameter and input of {len(jax.tree.leaves(s)[0])} rovers, at null and nominal values"
     finite = Check("finite derivatives", not bad, "not finite " + ", ".join(bad[:4]) if bad else looked)
     zero = [k for k, p in effect.parameters.items() if p.null is not None and by_parameter[k] == 0.0]
-    told = "every parameter with a null value can be tested there"
+    note = "every parameter with a null value can be tested there"
     if zero:
-        told = f"none by {', '.join(zero)}: no score test at the null can see it; linear amplitudes can be seen"
-    return [finite, Check("derivatives at null", None if zero else True, told)]
+        note = f"none by {', '.join(zero)}: no score test at the null can see it; linear amplitudes can be seen"
+    return [finite, Check("derivatives at null", None if zero else True, note)]
 
 
 def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
@@ -266,11 +266,11 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
             worst[label][port] = max(worst[label].get(port, 0.0), relative)
     guilty = [(base, port, w) for base in BASES for port, w in worst[base].items() if not w <= TOLERANCES.homogeneity]
     if guilty:
-        told = ", ".join(f"of {BASES[base]} (port {port}, {w:.0e})" for base, port, w in guilty)
+        broken = ", ".join(f"of {BASES[base]} (port {port}, {w:.0e})" for base, port, w in guilty)
         return Check(
             "units",
             False,
-            f"the result depends on the unit {told}: a number in the function stands for a "
+            f"the result depends on the unit {broken}: a number in the function stands for a "
             "quantity; make it a parameter or an Annotated constant with that unit, or mend the unit of a parameter",
         )
     largest = max([w for ports in worst.values() for w in ports.values()], default=0.0)
@@ -325,9 +325,9 @@ def _differences(got: Any, want: Any, scale: Any) -> tuple[list[Any], list[Any]]
 
 
 def _cost(cost: float, noise: float) -> Check:
-    told = f"{100 * cost:+.1f} % of the effects of a step, repeats differ by {100 * noise:.1f} %"
+    measured = f"{100 * cost:+.1f} % of the effects of a step, repeats differ by {100 * noise:.1f} %"
     if cost <= TOLERANCES.overhead:
-        return Check("cost", True, told)
+        return Check("cost", True, measured)
     if cost - noise <= TOLERANCES.overhead:
-        return Check("cost", None, told + ": too near the limit of 5 % for a verdict on this machine")
-    return Check("cost", False, told + "; the limit is 5 %")
+        return Check("cost", None, measured + ": too near the limit of 5 % for a verdict on this machine")
+    return Check("cost", False, measured + "; the limit is 5 %")

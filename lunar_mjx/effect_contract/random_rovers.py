@@ -98,8 +98,8 @@ def states(count: int, wheels: int, seed: int = 0) -> dict[str, np.ndarray]:
     def normal(*shape: int, scale: float = 1.0) -> np.ndarray:
         return scale * rng.normal(size=(count, moments, *shape))
 
-    here = np.array([[0.5 - i // 2 * (2.0 / wheels), 0.5 - i % 2] for i in range(wheels)])
-    lane = np.stack([np.roll(here, moment, axis=0) for moment in range(moments)])
+    wheel_places = np.array([[0.5 - i // 2 * (2.0 / wheels), 0.5 - i % 2] for i in range(wheels)])
+    lane = np.stack([np.roll(wheel_places, moment, axis=0) for moment in range(moments)])
     airborne = rng.uniform(size=(count, moments, wheels)) < 0.2
     s = {
         "sinkage": np.where(airborne, -0.05, rng.uniform(0.001, 0.1, (count, moments, wheels))),

@@ -66,8 +66,8 @@ def _check_ends(state: State) -> None:
     assert not bool((state.terminated & state.truncated).any()), "an episode both terminated and was truncated"
     going = ~np.asarray(state.done)
     for a, b in (("obs", "final_obs"), ("privileged", "final_privileged")):
-        here, there = np.asarray(getattr(state, a)), np.asarray(getattr(state, b))
-        assert (here[going] == there[going]).all(), f"{a} and {b} differ although the episode goes on"
+        alone, batched = np.asarray(getattr(state, a)), np.asarray(getattr(state, b))
+        assert (alone[going] == batched[going]).all(), f"{a} and {b} differ although the episode goes on"
 
 
 def _same(a: Any, b: Any, complaint: str) -> None:

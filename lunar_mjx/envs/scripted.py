@@ -84,8 +84,8 @@ def _driver(env: NavigationEnv) -> Agent:
             drive = jnp.clip(2.0 * (0.5 - speed), -1.0, 1.0)
         else:
             steer, drive = wanted / limit, jnp.ones_like(bearing)
-        rest = jnp.zeros((goal.shape[0], env.action_size - 2), goal.dtype)
-        return jnp.concatenate([jnp.stack([drive, jnp.clip(steer, -1.0, 1.0)], axis=-1), rest], axis=-1)
+        other_actions = jnp.zeros((goal.shape[0], env.action_size - 2), goal.dtype)
+        return jnp.concatenate([jnp.stack([drive, jnp.clip(steer, -1.0, 1.0)], axis=-1), other_actions], axis=-1)
 
     return act
 
@@ -148,9 +148,9 @@ def reactive_rule(env: NavigationEnv, settings: Reactive | None = None) -> Agent
         best = jnp.argmax(free - r.turn_price * off, axis=-1)
         heading = jnp.asarray(headings)[best]
         room = horizon * jnp.take_along_axis(free, best[:, None], axis=-1)[:, 0]
-        back = (room < scale * r.near) | (waited > r.patience)
+        backing = (room < scale * r.near) | (waited > r.patience)
         steer = r.gain * heading / limit
-        return _wheels(env, jnp.where(back, -0.7, 1.0), jnp.where(back, -steer, steer))
+        return _wheels(env, jnp.where(backing, -0.7, 1.0), jnp.where(backing, -steer, steer))
 
     return act
 

@@ -40,7 +40,7 @@ def minimise(
     """
     x = np.clip(start, low, high)
     residual, slope = at(x)
-    here, damping, growth = float(residual @ residual), DAMPING, 2.0
+    present_cost, damping, growth = float(residual @ residual), DAMPING, 2.0
     evaluations = 1
     while True:
         # The undamped step decides: a damped one is short by construction and always promises little.
@@ -54,16 +54,16 @@ def minimise(
             trial, trial_slope = at(there)
             evaluations += 1
             reached = float(trial @ trial) if np.isfinite(trial).all() and np.isfinite(trial_slope).all() else np.inf
-            if reached < here:
+            if reached < present_cost:
                 break
             # Nielsen's rule: failures double the growth of the damping, so that a hopeless region is left in a few
             # trials.
             damping, growth = damping * growth, 2.0 * growth
         # Share of the promised fall that the step kept: near 1 the model is linear here and the damping may fall to a
         # third.
-        kept = (here - reached) / max(_promise(residual, slope, step), 1e-300)
+        kept = (present_cost - reached) / max(_promise(residual, slope, step), 1e-300)
         damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * kept - 1.0) ** 3), 2.0
-        x, residual, slope, here = there, trial, trial_slope, reached
+        x, residual, slope, present_cost = there, trial, trial_slope, reached
 
 
 def _step(residual: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray, damping: float) -> np.ndarray:
@@ -72,14 +72,14 @@ def _step(residual: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.nda
     size = 1.0 / np.maximum(np.linalg.norm(slope, axis=0), 1e-12)
     # a triangle in place of all rows: the same sum of squares but for a constant
     triangle = np.asarray(np.linalg.qr(np.column_stack([slope * size, residual]), mode="r"))
-    matrix, rest = triangle[:, :-1], -triangle[:, -1]
+    matrix, right_side = triangle[:, :-1], -triangle[:, -1]
     if damping:
         matrix = np.vstack([matrix, np.sqrt(damping) * np.eye(len(size))])
-        rest = np.concatenate([rest, np.zeros(len(size))])
-    step = np.linalg.lstsq(matrix, rest, rcond=None)[0]
+        right_side = np.concatenate([right_side, np.zeros(len(size))])
+    step = np.linalg.lstsq(matrix, right_side, rcond=None)[0]
     room = 1e-12
     if np.any(step * size < low) or np.any(step * size > high):
-        step = optimize.lsq_linear(matrix, rest, ((low - room) / size, (high + room) / size), "bvls").x
+        step = optimize.lsq_linear(matrix, right_side, ((low - room) / size, (high + room) / size), "bvls").x
     return np.clip(step * size, low, high)
 
 

@@ -150,8 +150,8 @@ class ChangeDetector:
         self._log_ratio += self.usual.power * (density[1:] - density[0])
         # The filter without a jump (first) always stays; of the others only those that began within memory.
         keep = self._begun > self.count - CHANGE.memory
-        there = np.append(True, keep)
-        self._mean, self._cov = self._mean[there], self._cov[there]
+        kept_columns = np.append(True, keep)
+        self._mean, self._cov = self._mean[kept_columns], self._cov[kept_columns]
         self._log_ratio, self._begun, self._kind = self._log_ratio[keep], self._begun[keep], self._kind[keep]
         # Shiryaev and Roberts: the sum over beginnings of likelihood ratios, each against the filter without a jump
         self.log_statistic = float(np.logaddexp.reduce(self._log_ratio)) - math.log(kinds)
@@ -193,8 +193,8 @@ def _compressed(columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
     # the rest is orthogonal to all columns: it tells of the noise alone, and goes in as one number
     orthogonal, upper = np.linalg.qr(columns)
     inside = orthogonal.T @ residual
-    rest = max(float(residual @ residual - inside @ inside), 0.0)
-    return upper, inside, rest, len(residual) - len(inside)
+    outside = max(float(residual @ residual - inside @ inside), 0.0)
+    return upper, inside, outside, len(residual) - len(inside)
 
 
 def _update(
@@ -204,7 +204,7 @@ def _update(
 
     A step is usual or outlying; the two are merged by their moments.
     """
-    h, y, rest, free = _compressed(columns, residual)
+    h, y, outside, free = _compressed(columns, residual)
     innovation = y - mean @ h.T
     crossed = cov @ h.T
     logs, means, covs = [], [], []
@@ -216,7 +216,7 @@ def _update(
         white = np.linalg.solve(factor, innovation[..., None])[..., 0]
         gain = np.swapaxes(np.linalg.solve(whole, np.swapaxes(crossed, 1, 2)), 1, 2)
         log_size = 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-        quiet = rest / noise**2 + free * 2.0 * math.log(noise) + len(residual) * _LOG_2PI
+        quiet = outside / noise**2 + free * 2.0 * math.log(noise) + len(residual) * _LOG_2PI
         logs.append(math.log(chance) - 0.5 * (np.sum(white**2, axis=1) + log_size + quiet))
         means.append(mean + np.einsum("bkm,bm->bk", gain, innovation))
         covs.append(cov - gain @ np.swapaxes(crossed, 1, 2))

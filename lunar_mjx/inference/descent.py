@@ -58,31 +58,31 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = DESCENT.iterat
     if not np.isfinite(chi2s[0]):
         # a simulation that diverged has no slope to follow: the caller's other starts go on
         return Descent(u, residuals[0], np.zeros((residuals.shape[1], len(goal.free))), float(chi2s[0]))
-    here = Descent(u, residuals[0], goal.jacobian(u), float(chi2s[0]))
+    present = Descent(u, residuals[0], goal.jacobian(u), float(chi2s[0]))
     damping, curved = 1e-2, False
     for _ in range(iterations):
-        downhill, hessian = goal.quadratic(here.u, here.residual, here.jacobian)
-        promise = goal.promise(here.u, downhill, hessian)
+        downhill, hessian = goal.quadratic(present.u, present.residual, present.jacobian)
+        promise = goal.promise(present.u, downhill, hessian)
         if promise < DESCENT.small_promise:
             break
         dampings = damping * _DAMPINGS
-        trials = goal.steps(here.u, downhill, hessian, dampings)
+        trials = goal.steps(present.u, downhill, hessian, dampings)
         rows = trials
         if curved:
-            bent, probes, _ = goal.bent(here.u, here.residual, here.jacobian, hessian, trials, dampings)
+            bent, probes, _ = goal.bent(present.u, present.residual, present.jacobian, hessian, trials, dampings)
             rows = np.concatenate([trials, bent, probes])
         residuals, chi2s = goal.residuals(rows)
         # All trials are simulated anyhow, so the best one is taken and not the first that helps.
         k = int(np.argmin(chi2s))
-        if chi2s[k] < here.chi2:
+        if chi2s[k] < present.chi2:
             # a step that keeps less than half of its promise went round a bend: the next one is bent, too, at the
             # price of one more batch
-            curved = not here.chi2 - chi2s[k] > 0.5 * promise
-            here = Descent(rows[k], residuals[k], goal.jacobian(rows[k]), float(chi2s[k]))
+            curved = not present.chi2 - chi2s[k] > 0.5 * promise
+            present = Descent(rows[k], residuals[k], goal.jacobian(rows[k]), float(chi2s[k]))
             # trials, bent ones and probes lie in blocks of the same dampings
             damping = float(np.clip(dampings[k % len(dampings)], 1e-4, 1e6))
         elif damping > 1e8:
             break  # steps this short change nothing but rounding
         else:
             damping, curved = damping * DESCENT.damping_growth, True
-    return here
+    return present

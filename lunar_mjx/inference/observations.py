@@ -29,9 +29,9 @@ class Chain:
         out = along.copy()
         at = np.flatnonzero(self.follows)
         out[at] = (along[at] - self.correlation * along[at - 1]) / self.innovation
-        back = np.empty_like(out)
-        back[self.order] = out
-        return back
+        lagged = np.empty_like(out)
+        lagged[self.order] = out
+        return lagged
 
 
 @dataclasses.dataclass(frozen=True)

@@ -54,8 +54,8 @@ def _table_blocks(observations: Observations, mine: list, keep: np.ndarray, numb
         first = observations.place[part, 0] if observations.place is not None else np.arange(len(part))
         at = count
         for unit in np.unique(observations.unit[part]):
-            here = part[observations.unit[part] == unit]
-            order = here[np.argsort(first[observations.unit[part] == unit], kind="stable")]
+            unit_rows = part[observations.unit[part] == unit]
+            order = unit_rows[np.argsort(first[observations.unit[part] == unit], kind="stable")]
             number[order] = at + np.arange(len(order)) // 3
             at += (len(order) + 2) // 3
         most = max(most, at)

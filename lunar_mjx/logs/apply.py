@@ -218,12 +218,12 @@ def _with_payload(model: Model, mass: float, position: Any, source: str) -> Mode
     """The payload added to one that the model carries already, as one point mass at their common centre."""
     if "payload" in model.effect_names:
         old = model.parameters["payload"]
-        both = float(old["mass"]) + mass  # type: ignore[arg-type]
+        total_mass = float(old["mass"]) + mass  # type: ignore[arg-type]
         position = [
-            (float(old[k]) * float(old["mass"]) + p * mass) / both  # type: ignore[arg-type]
+            (float(old[k]) * float(old["mass"]) + p * mass) / total_mass  # type: ignore[arg-type]
             for k, p in zip("xyz", position, strict=True)
         ]
-        mass = both
+        mass = total_mass
     return _set(model, "payload", source, mass=mass, **dict(zip("xyz", position, strict=True)))
 
 

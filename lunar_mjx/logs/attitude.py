@@ -47,16 +47,16 @@ def body_attitude(tables: Mapping[str, LogTable], imu: Imu) -> dict[str, LogTabl
 
 def _of_quaternion(channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation]:
     parts = np.stack([channels[q] for q in QUATERNION], axis=1)
-    there = np.isfinite(parts).all(axis=1) & (np.linalg.norm(np.nan_to_num(parts), axis=1) > 1e-6)
-    return there, Rotation.from_quat(parts[there], scalar_first=True)
+    known = np.isfinite(parts).all(axis=1) & (np.linalg.norm(np.nan_to_num(parts), axis=1) > 1e-6)
+    return known, Rotation.from_quat(parts[known], scalar_first=True)
 
 
 def _of_angles(channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation]:
     roll, pitch = (channels[e] for e in EULER[:2])
     yaw = channels.get(EULER[2], np.zeros(len(roll)))
-    there = np.isfinite(roll) & np.isfinite(pitch) & np.isfinite(yaw)
-    angles = np.stack([yaw, pitch, roll], axis=1)[there]
-    return there, Rotation.from_euler("ZYX", angles, degrees=True)
+    known = np.isfinite(roll) & np.isfinite(pitch) & np.isfinite(yaw)
+    angles = np.stack([yaw, pitch, roll], axis=1)[known]
+    return known, Rotation.from_euler("ZYX", angles, degrees=True)
 
 
 def _mounting(imu: Imu) -> Rotation:

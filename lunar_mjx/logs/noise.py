@@ -151,12 +151,12 @@ def noise_table(logs: Sequence[Log]) -> dict[str, dict[str, ChannelNoise]]:
         found: dict[str, list[ChannelNoise]] = {}
         for log in mine:
             stated = log.noise.get(name)
-            both: Mapping[str, ChannelNoise | None] = {
+            by_channel: Mapping[str, ChannelNoise | None] = {
                 "stated": noise_of(log, name) if stated is not None and stated.std > 0.0 else None,
                 "drive": estimated_noise(log, name, moving=True),
                 "rest": estimated_noise(log, name, moving=False),
             }
-            for kind, one in both.items():
+            for kind, one in by_channel.items():
                 if one is not None:
                     found.setdefault(kind, []).append(one)
         if found:

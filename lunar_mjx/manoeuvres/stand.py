@@ -36,7 +36,7 @@ def _memory(unit: str, meaning: str) -> StateVariable:
 def stand(ctx, p, x, wrench):
     """Holds the chassis as a damped spring, level and `lift` above where it stood, raised at 0.2 m/s."""
     caught = x.caught > 0.5
-    at = Vec3(*(jnp.where(caught, old, now) for old, now in zip((x.x, x.y, x.z), ctx.position, strict=True)))
+    at = Vec3(*(jnp.where(caught, old, present) for old, present in zip((x.x, x.y, x.z), ctx.position, strict=True)))
     ahead = ctx.frame.forward
     held_x, held_y = jnp.where(caught, x.ahead_x, ahead.x), jnp.where(caught, x.ahead_y, ahead.y)
     height = jnp.minimum(x.height + 0.2 * ctx.dt, p.lift)

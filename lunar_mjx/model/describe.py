@@ -49,12 +49,12 @@ def origins(model: Model, effect: Effect, key: str) -> tuple[str, ...]:
         made = [(f"{MARKER} of {model.rover.name}", rover_motors(start))]
         made.append((f"preset {model.preset}", preset_values(made[0][1])))
         layers = [(label, layer.parameters[effect.name][key]) for label, layer in made] + layers
-    for label, now in layers:
-        now = now if isinstance(now, tuple) else (now,) * len(values)
-        if len(now) != len(values):  # one value for all where the preset has several
-            now = (now[0] if len(set(now)) == 1 else float("nan"),) * len(values)
-        found = [label if new != old else known for known, new, old in zip(found, now, before, strict=True)]
-        before = now
+    for label, layer_values in layers:
+        layer_values = layer_values if isinstance(layer_values, tuple) else (layer_values,) * len(values)
+        if len(layer_values) != len(values):  # one value for all where the preset has several
+            layer_values = (layer_values[0] if len(set(layer_values)) == 1 else float("nan"),) * len(values)
+        found = [label if new != old else known for known, new, old in zip(found, layer_values, before, strict=True)]
+        before = layer_values
     return tuple(found)
 
 
@@ -94,27 +94,27 @@ def print_preset(model: Model, console: Console) -> None:
             ("undefined in print: what is done there", REGULARISATIONS),
         ):
             table = make_table("what", "choice", title=title)
-            for what, choice in rows.items():
-                table.add_row(what, choice)
+            for row_name, choice in rows.items():
+                table.add_row(row_name, choice)
             console.print(table)
     console.print("\nwhat the paper has wrong, and consistent right")
     for flaw in FLAWS:
-        told = (("paper", flaw.paper), ("consistent", flaw.consistent), ("effect", flaw.mended_by))
-        _print_difference(f"{flaw.number} {flaw.where}", told, console)
+        flaw_lines = (("paper", flaw.paper), ("consistent", flaw.consistent), ("effect", flaw.mended_by))
+        _print_difference(f"{flaw.number} {flaw.where}", flaw_lines, console)
     if model.preset == "paper":  # how the paper differs from `field` follows from the two lists
         return
     console.print("\nwhat consistent leaves out, and field has")
     for change in FIELD_CHANGES:
-        told = (("consistent", change.consistent), ("field", change.field), ("effect", change.mended_by))
-        _print_difference(change.where, told, console)
+        flaw_lines = (("consistent", change.consistent), ("field", change.field), ("effect", change.mended_by))
+        _print_difference(change.where, flaw_lines, console)
 
 
 def _print_difference(title: str, told: Sequence[tuple[str, str]], console: Console) -> None:
     """A heading, and below it what each preset does."""
     table = make_table("", "", names=1)
     table.show_header = False
-    for what, text in told:
-        table.add_row(f"  {what}", text)
+    for heading, text in told:
+        table.add_row(f"  {heading}", text)
     console.print(title)
     console.print(table)
 

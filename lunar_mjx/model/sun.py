@@ -85,8 +85,8 @@ def read_sun(path: Path, table: Mapping[str, Any]) -> SunSettings:
         if kind is float and (isinstance(value, bool) or not isinstance(value, int | float)):
             raise bad_input(path, f"sun.{key}", value, "is not a number", "give a number")
         if kind is not float and not isinstance(value, kind):
-            what = "a text in quotes" if kind is str else "true or false"
-            raise bad_input(path, f"sun.{key}", value, f"is not {what}", f"give {what}")
+            wanted = "a text in quotes" if kind is str else "true or false"
+            raise bad_input(path, f"sun.{key}", value, f"is not {wanted}", f"give {wanted}")
         values[key] = kind(value)
     if "horizon_dem" in values:
         values["horizon_dem"] = str(path.parent.resolve() / values["horizon_dem"])

@@ -53,9 +53,9 @@ def hot_motor(preset: str, duration: float = 14.0, rover: str = "luvmi_x") -> Ho
     system = build(model)
     drives = len(model.rover.wheels)
     control = jnp.zeros(len(system.joint_names)).at[:drives].set(DESIRED_TORQUE)
-    every = 10
-    samples = round(duration / (every * model.timestep))
-    run = jax.jit(lambda p, s: system.rollout(p, s, jnp.tile(control, (samples, 1)), every=every)[1])
+    steps_per_record = 10
+    samples = round(duration / (steps_per_record * model.timestep))
+    run = jax.jit(lambda p, s: system.rollout(p, s, jnp.tile(control, (samples, 1)), every=steps_per_record)[1])
     seen = jax.device_get(run(system.params, system.reset(system.params)))
     winding = np.asarray(seen.winding_temperature)[:, 0] - 273.15
     off = np.flatnonzero(np.asarray(seen.joint_torque)[:, 0] == 0.0)

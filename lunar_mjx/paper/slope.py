@@ -55,15 +55,15 @@ def slope_runs(
     terrain = stack([inclined(np.deg2rad(s)) for s in slopes_deg])
     terrain = jax.tree.map(jnp.asarray, terrain)
     control = jnp.zeros(len(system.joint_names)).at[: len(model.rover.wheels)].set(rim_speed / radius)
-    every = 50
-    samples = round(duration / (every * model.timestep))
+    steps_per_record = 50
+    samples = round(duration / (steps_per_record * model.timestep))
 
     def run(ground):
         params = dataclasses.replace(system.params, terrain=ground)
-        return system.rollout(params, system.reset(params), jnp.tile(control, (samples, 1)), every=every)[1]
+        return system.rollout(params, system.reset(params), jnp.tile(control, (samples, 1)), every=steps_per_record)[1]
 
     seen = jax.device_get(jax.jit(jax.vmap(run))(terrain))
-    last = slice(samples - round(average / (every * model.timestep)), None)
+    last = slice(samples - round(average / (steps_per_record * model.timestep)), None)
 
     def mean(values: jax.Array) -> np.ndarray:
         return np.asarray(values)[:, last].mean(axis=1)

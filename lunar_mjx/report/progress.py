@@ -49,12 +49,12 @@ def _lines(console: Console) -> Reporter:
 
     def report(what: str, done: float) -> None:
         nonlocal last, stage
-        now = time.monotonic() - start
-        if what == stage and now - last < _LINE_EVERY:
+        elapsed_s = time.monotonic() - start
+        if what == stage and elapsed_s - last < _LINE_EVERY:
             return
-        last, stage = now, what
-        left = f", about {now * (1.0 - done) / done:.0f} s left" if done > 0.02 else ""
+        last, stage = elapsed_s, what
+        left = f", about {elapsed_s * (1.0 - done) / done:.0f} s left" if done > 0.02 else ""
         share = f"{100 * done:3.0f} %" if math.isfinite(done) else "  ..."
-        console.print(f"{share}  {what} ({now:.0f} s{left})", highlight=False, markup=False)
+        console.print(f"{share}  {what} ({elapsed_s:.0f} s{left})", highlight=False, markup=False)
 
     return report

@@ -52,16 +52,16 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
     """
     source = read_urdf(urdf)
     # Roles first, then loops and couplings: these are told in the bodies' final axes, which roles may reverse.
-    told = _describe(source, description)
-    name = _file_name(source, name or told.name or source.name)
+    described = _describe(source, description)
+    name = _file_name(source, name or described.name or source.name)
     bodies = bodies_of(source)
-    roles = without_followers(source, assign_roles(source, bodies, told))
-    loops = place_loops(source, roles.bodies, told)
-    driven = place_drive_groups(source, roles, told)
-    couplings = place_couplings(source, roles.bodies, told)
+    roles = without_followers(source, assign_roles(source, bodies, described))
+    loops = place_loops(source, roles.bodies, described)
+    driven = place_drive_groups(source, roles, described)
+    couplings = place_couplings(source, roles.bodies, described)
     height, height_notes = _standing_height(roles)
     try:
-        spec = build_spec(name, roles, loops, told, height, driven, couplings)
+        spec = build_spec(name, roles, loops, described, height, driven, couplings)
     except ValueError as error:
         raise _uncompilable(source, error) from None
     try:
@@ -69,13 +69,13 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
             # MuJoCo warns of inertia that is next to singular; numbers computed from it would be noise
             warnings.simplefilter("error")
             model = _compile(source, spec)
-            level_springs(spec, model, roles, told)
+            level_springs(spec, model, roles, described)
             model = _compile(source, spec)
             xml = to_xml(spec)
             # What is compared with the URDF is the text as anyone will read it, not the model in memory.
             again = mujoco.MjModel.from_xml_string(xml)
             _assert_nothing_lost(source, roles, loops, ties(driven) + len(couplings), again)
-            record = _record(source, name, roles, loops, told, model, height, height_notes, driven)
+            record = _record(source, name, roles, loops, described, model, height, height_notes, driven)
     except Warning as error:
         raise _uncompilable(source, error) from None
     out = Path(out)
@@ -190,24 +190,24 @@ def _record(
     for group in GROUPS:
         if not roles.group(group):
             continue
-        told, gain = description.groups[group], gains(model, roles, description, group)
+        group_fields, gain = description.groups[group], gains(model, roles, description, group)
         groups[group] = {
             "joints": list(roles.group(group)),
-            "mode": told.mode,
+            "mode": group_fields.mode,
             "position_gain": gain.position,
             "velocity_gain": gain.velocity,
-            "gear_ratio": told.gear_ratio,
-            "gear_efficiency": told.gear_efficiency,
-            "rotor_inertia": told.rotor_inertia_kg_m2,
-            "winding": told.winding,
+            "gear_ratio": group_fields.gear_ratio,
+            "gear_efficiency": group_fields.gear_efficiency,
+            "rotor_inertia": group_fields.rotor_inertia_kg_m2,
+            "winding": group_fields.winding,
         }
-        motor = ("torque_constant", told.torque_constant_Nm_A), ("resistance", told.resistance_ohm)
-        stated = {k: v for k, v in (*motor, ("current_limit", told.current_limit_A)) if v is not None}
+        motor = ("torque_constant", group_fields.torque_constant_Nm_A), ("resistance", group_fields.resistance_ohm)
+        stated = {k: v for k, v in (*motor, ("current_limit", group_fields.current_limit_A)) if v is not None}
         groups[group].update(stated)
         if group not in description.stated:
             notes.append(
-                f"{group}: assumed the motor maxon ECX TORQUE 22 XL, {told.winding} V, behind a gear of "
-                f"{told.gear_ratio:g}; state the real one in [joints.{group}] of the description"
+                f"{group}: assumed the motor maxon ECX TORQUE 22 XL, {group_fields.winding} V, behind a gear of "
+                f"{group_fields.gear_ratio:g}; state the real one in [joints.{group}] of the description"
             )
     return {
         "format": FORMAT,
@@ -242,12 +242,12 @@ def place_drive_groups(urdf: Urdf, roles: Roles, description: Description) -> tu
       UserError: a corner that no wheel has, or that is in two groups.
     """
     joints = {w.corner: w.drive for w in roles.wheels}
-    taken: list[str] = []
+    placed: list[str] = []
     found = []
     for i, group in enumerate(description.drive_groups):
         for corner in group.wheels:
-            if corner not in joints or corner in taken:
-                reason = "is in two groups" if corner in taken else "is no wheel of the rover"
+            if corner not in joints or corner in placed:
+                reason = "is in two groups" if corner in placed else "is no wheel of the rover"
                 raise bad_input(
                     description.path or urdf.path,
                     f"drive_groups[{i}].wheels",
@@ -255,7 +255,7 @@ def place_drive_groups(urdf: Urdf, roles: Roles, description: Description) -> tu
                     reason,
                     f"use {', '.join(joints)}, each once",
                 )
-            taken.append(corner)
+            placed.append(corner)
         found.append(DriveGroup(group.name, tuple(joints[c] for c in group.wheels)))
     return tuple(found)
 
@@ -269,12 +269,12 @@ def _passive_notes(roles: Roles, loops: tuple[PlacedLoop, ...]) -> list[str]:
             guided.add(name)
             name = parents[name]
     moved = {joint for group in GROUPS for joint in roles.group(group)}
-    told = " ".join(roles.notes)
+    notes = " ".join(roles.notes)
     free = [b.joint.name for b in roles.bodies if b.joint is not None and b.name not in guided]
     return [
         f"joint '{joint}' drives, steers or suspends no wheel: it has no motor and moves freely beyond its limits"
         for joint in free
-        if joint not in moved and f"'{joint}'" not in told
+        if joint not in moved and f"'{joint}'" not in notes
     ]
 
 
@@ -312,9 +312,9 @@ def _box_corners(shape: Geometry) -> list[np.ndarray]:
 def _farthest(points: np.ndarray, count: int) -> np.ndarray:
     """`count` of the points, each the farthest from those taken before, in the order given."""
     distance = np.round(np.linalg.norm(points - points.mean(axis=0), axis=1), 9)
-    taken: list[int] = []
+    chosen: list[int] = []
     for _ in range(count):
-        taken.append(int(np.argmax(distance)))
-        step = np.round(np.linalg.norm(points - points[taken[-1]], axis=1), 9)
-        distance = step if len(taken) == 1 else np.minimum(distance, step)
-    return points[np.sort(taken)]
+        chosen.append(int(np.argmax(distance)))
+        step = np.round(np.linalg.norm(points - points[chosen[-1]], axis=1), 9)
+        distance = step if len(chosen) == 1 else np.minimum(distance, step)
+    return points[np.sort(chosen)]

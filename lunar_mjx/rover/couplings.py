@@ -48,11 +48,11 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
     for joint in urdf.joints:
         if joint.mimic is None:
             continue
-        where = f"joint '{joint.name}' mimic joint"
+        field = f"joint '{joint.name}' mimic joint"
         if joint.mimic.leader not in moving or joint.mimic.leader == joint.name:
-            raise bad_input(urdf.path, where, joint.mimic.leader, "is no other moving joint", "correct the name")
+            raise bad_input(urdf.path, field, joint.mimic.leader, "is no other moving joint", "correct the name")
         if written[joint.mimic.leader].mimic is not None:
-            raise bad_input(urdf.path, where, joint.mimic.leader, "follows a joint itself", "follow that joint")
+            raise bad_input(urdf.path, field, joint.mimic.leader, "follows a joint itself", "follow that joint")
         # The converter turns axes so that positive drives forward; a ratio written for the URDF's axes changes its sign
         # with each.
         own, other = sense(joint.name), sense(joint.mimic.leader)

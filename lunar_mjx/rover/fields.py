@@ -88,10 +88,10 @@ def check_sizes(path: Path, model: mujoco.MjModel, wheels: Sequence[Wheel], stan
         field = f"wheels[{i}].radius"
         centre = float(data.xpos[model.body(wheel.body).id][2]) - chassis + standing_height
         shape = _shape_radius(model, model.body(wheel.body).id)
-        for size, what in ((shape, "the shape of its MJCF"), (centre, "the height at which the rover stands")):
+        for size, size_name in ((shape, "the shape of its MJCF"), (centre, "the height at which the rover stands")):
             if size is not None and not (1 - RADIUS_TOLERANCE) * size <= wheel.radius <= (1 + RADIUS_TOLERANCE) * size:
                 raise bad_input(
-                    path, field, wheel.radius, f"is not the {size:.3g} m of {what}", "correct it, or convert again"
+                    path, field, wheel.radius, f"is not the {size:.3g} m of {size_name}", "correct it, or convert again"
                 )
 
 

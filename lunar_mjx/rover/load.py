@@ -162,24 +162,24 @@ def _groups(path: Path, data: Any, model: mujoco.MjModel) -> tuple[JointGroup, .
     actuators = [model.actuator(i).name for i in range(model.nu)]
     groups = []
     for name in (g for g in GROUPS if g in data):
-        table, where = data[name], f"groups.{name}"
-        toml.check_keys(path, where, table, _GROUP_KEYS, _GROUP_KEYS - set(_MOTOR_KEYS))
-        motor = {k: toml.at_least(path, f"{where}.{k}", table[k], 0.0, strict=True) for k in _MOTOR_KEYS if k in table}
+        table, field = data[name], f"groups.{name}"
+        toml.check_keys(path, field, table, _GROUP_KEYS, _GROUP_KEYS - set(_MOTOR_KEYS))
+        motor = {k: toml.at_least(path, f"{field}.{k}", table[k], 0.0, strict=True) for k in _MOTOR_KEYS if k in table}
         groups.append(
             JointGroup(
                 name=name,
                 joints=tuple(
-                    _known(path, f"{where}.joints", j, set(actuators), "motor") for j in _list(path, "joints", table)
+                    _known(path, f"{field}.joints", j, set(actuators), "motor") for j in _list(path, "joints", table)
                 ),
-                mode=toml.one_of(path, f"{where}.mode", table["mode"], MODES),
-                position_gain=toml.at_least(path, f"{where}.position_gain", table["position_gain"], 0.0, strict=False),
-                velocity_gain=toml.at_least(path, f"{where}.velocity_gain", table["velocity_gain"], 0.0, strict=False),
-                gear_ratio=toml.at_least(path, f"{where}.gear_ratio", table["gear_ratio"], 0.0, strict=True),
+                mode=toml.one_of(path, f"{field}.mode", table["mode"], MODES),
+                position_gain=toml.at_least(path, f"{field}.position_gain", table["position_gain"], 0.0, strict=False),
+                velocity_gain=toml.at_least(path, f"{field}.velocity_gain", table["velocity_gain"], 0.0, strict=False),
+                gear_ratio=toml.at_least(path, f"{field}.gear_ratio", table["gear_ratio"], 0.0, strict=True),
                 gear_efficiency=toml.at_least(
-                    path, f"{where}.gear_efficiency", table["gear_efficiency"], 0.0, strict=True
+                    path, f"{field}.gear_efficiency", table["gear_efficiency"], 0.0, strict=True
                 ),
-                rotor_inertia=toml.at_least(path, f"{where}.rotor_inertia", table["rotor_inertia"], 0.0, strict=False),
-                winding=toml.one_of(path, f"{where}.winding", table["winding"], WINDINGS),
+                rotor_inertia=toml.at_least(path, f"{field}.rotor_inertia", table["rotor_inertia"], 0.0, strict=False),
+                winding=toml.one_of(path, f"{field}.winding", table["winding"], WINDINGS),
                 **motor,
             )
         )

@@ -85,15 +85,15 @@ def flip_axis(body: Body) -> Body:
 def reframe(body: Body, frame: Pose) -> Body:
     """The same body described in another frame, given in the present one; only for a body without children."""
     assert body.joint is not None
-    back = Pose(-frame.rotation.T @ frame.position, frame.rotation.T)
+    inverse = Pose(-frame.rotation.T @ frame.position, frame.rotation.T)
     return replace(
         body,
         pose=body.pose @ frame,
-        joint=replace(body.joint, axis=back.rotation @ body.joint.axis),
-        com=back.apply(body.com),
-        inertia=back.rotation @ body.inertia @ frame.rotation,
-        geometry=tuple(replace(g, pose=back @ g.pose) for g in body.geometry),
-        frames={link: back @ pose for link, pose in body.frames.items()},
+        joint=replace(body.joint, axis=inverse.rotation @ body.joint.axis),
+        com=inverse.apply(body.com),
+        inertia=inverse.rotation @ body.inertia @ frame.rotation,
+        geometry=tuple(replace(g, pose=inverse @ g.pose) for g in body.geometry),
+        frames={link: inverse @ pose for link, pose in body.frames.items()},
     )
 
 

@@ -139,10 +139,10 @@ def read_urdf(path: str | Path) -> Urdf:
     links = [reader.link(element, colours) for element in robot.findall("link")]
     joints = [reader.joint(element) for element in robot.findall("joint")]
     # XML does not forbid two of a name, and the second would silently take the place of the first.
-    for what, names in (("link", [x.name for x in links]), ("joint", [x.name for x in joints])):
+    for kind, names in (("link", [x.name for x in links]), ("joint", [x.name for x in joints])):
         for name in names:
             if names.count(name) > 1:
-                raise bad_input(path, f"{what} name", name, "appears more than once", f"give each {what} its own name")
+                raise bad_input(path, f"{kind} name", name, "appears more than once", f"give each {kind} its own name")
     by_name = {link.name: link for link in links}
     root = _check_tree(path, by_name, joints)
     return Urdf(path, robot.get("name", path.stem), by_name, tuple(joints), root, tuple(reader.notes))
@@ -192,7 +192,7 @@ class _Reader:
 
     def link(self, element: ET.Element, colours: dict[str, tuple[float, float, float, float]]) -> Link:
         name = self.name_of(element, "link")
-        where = f"link '{name}'"
+        field = f"link '{name}'"
         rgba = (0.7, 0.7, 0.7, 1.0)
         material = element.find("visual/material")
         if material is not None:
@@ -203,25 +203,25 @@ class _Reader:
         geometry: tuple[Geometry, ...] = ()
         for tag in ("collision", "visual"):
             if not geometry:
-                shapes = (self.geometry(s, where, rgba) for s in element.findall(tag))
+                shapes = (self.geometry(s, field, rgba) for s in element.findall(tag))
                 geometry = tuple(g for g in shapes if g is not None)
         inertial = element.find("inertial")
         if inertial is None:
             return Link(name, 0.0, np.zeros(3), np.zeros((3, 3)), geometry)
-        mass = self.number(inertial.find("mass"), "value", f"{where} mass")
+        mass = self.number(inertial.find("mass"), "value", f"{field} mass")
         if mass <= 0:
             raise bad_input(
                 self.path,
-                f"{where} mass",
+                f"{field} mass",
                 mass,
                 "is not positive",
                 "give the mass in kg, or leave out <inertial> of a link that is only a frame",
             )
         tensor = inertial.find("inertia")
         xx, xy, xz, yy, yz, zz = (
-            self.number(tensor, key, f"{where} inertia") for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+            self.number(tensor, key, f"{field} inertia") for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
-        pose = self.pose(inertial, f"{where} inertial")
+        pose = self.pose(inertial, f"{field} inertial")
         inertia = pose.rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ pose.rotation.T
         return Link(name, mass, pose.position, inertia, geometry)
 
@@ -244,32 +244,32 @@ class _Reader:
 
     def joint(self, element: ET.Element) -> Joint:
         name = self.name_of(element, "joint")
-        where = f"joint '{name}'"
+        field = f"joint '{name}'"
         kind = element.get("type", "")
         if kind not in JOINT_TYPES:
-            raise bad_input(self.path, f"{where} type", kind, "is not supported", f"use {', '.join(JOINT_TYPES)}")
+            raise bad_input(self.path, f"{field} type", kind, "is not supported", f"use {', '.join(JOINT_TYPES)}")
         ends = []
         for end in ("parent", "child"):
             tag = element.find(end)
             link = "" if tag is None else tag.get("link", "")
             if not link:
-                raise bad_input(self.path, f"{where} {end}", "", "is missing", f"name the {end} link")
+                raise bad_input(self.path, f"{field} {end}", "", "is missing", f"name the {end} link")
             ends.append(link)
-        axis = self.numbers(element.find("axis"), "xyz", "1 0 0", f"{where} axis")
+        axis = self.numbers(element.find("axis"), "xyz", "1 0 0", f"{field} axis")
         length = float(np.linalg.norm(axis))
         if length < 1e-9 and kind not in ("fixed", "floating"):
-            raise bad_input(self.path, f"{where} axis", axis, "has no length", "give a direction")
+            raise bad_input(self.path, f"{field} axis", axis, "has no length", "give a direction")
         limits = (-np.inf, np.inf)
         limit = element.find("limit")
         if kind in ("revolute", "prismatic"):
             if limit is None:
-                raise bad_input(self.path, f"{where} limit", "", "is missing", "give it, or use 'continuous'")
-            lower, upper = (float(self.numbers(limit, k, "0", f"{where} limit", 1)[0]) for k in ("lower", "upper"))
+                raise bad_input(self.path, f"{field} limit", "", "is missing", "give it, or use 'continuous'")
+            lower, upper = (float(self.numbers(limit, k, "0", f"{field} limit", 1)[0]) for k in ("lower", "upper"))
             if lower > upper:
-                raise bad_input(self.path, f"{where} limit lower", lower, f"is above upper = {upper}", "swap the two")
+                raise bad_input(self.path, f"{field} limit lower", lower, f"is above upper = {upper}", "swap the two")
             limits = (lower, upper)
-        mimic = self.mimic(element.find("mimic"), where)
-        return Joint(name, kind, ends[0], ends[1], self.pose(element, where), axis / max(length, 1e-9), limits, mimic)
+        mimic = self.mimic(element.find("mimic"), field)
+        return Joint(name, kind, ends[0], ends[1], self.pose(element, field), axis / max(length, 1e-9), limits, mimic)
 
     def mimic(self, element: ET.Element | None, where: str) -> Mimic | None:
         if element is None:
@@ -337,13 +337,13 @@ def check_inertia(path: Path, name: str, inertia: np.ndarray) -> None:
     """
     moments = np.sort(np.linalg.eigvalsh(inertia))
     shown = np.array2string(moments, precision=6)
-    where = f"link '{name}' principal moments of inertia"
+    field = f"link '{name}' principal moments of inertia"
     if np.abs(inertia).max() == 0:
-        raise bad_input(path, where, shown, "are zero", "give the inertia in kg m2; a moving link needs it")
+        raise bad_input(path, field, shown, "are zero", "give the inertia in kg m2; a moving link needs it")
     if moments[0] <= 0:
-        raise bad_input(path, where, shown, "are not all positive", "give a positive definite inertia in kg m2")
+        raise bad_input(path, field, shown, "are not all positive", "give a positive definite inertia in kg m2")
     # No body has a moment larger than the sum of the other two; tensors typed in by hand often do.
     if moments[0] + moments[1] < moments[2] * (1 - _INERTIA_TOLERANCE):
         raise bad_input(
-            path, where, shown, "break the triangle inequality I1 + I2 >= I3", "compute the inertia from the geometry"
+            path, field, shown, "break the triangle inequality I1 + I2 >= I3", "compute the inertia from the geometry"
         )

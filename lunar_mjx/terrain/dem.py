@@ -262,9 +262,9 @@ def _across(heights: np.ndarray, hole: np.ndarray) -> np.ndarray:
             missing, after = missing[inside], after[inside]
             left, right = known[after - 1], known[after]
             share = (missing - left) / (right - left)
-            where = at[i, missing]
-            value[where] += ((1.0 - share) * line[i, left] + share * line[i, right]) / (right - left)
-            weight[where] += 1.0 / (right - left)
+            missing_at = at[i, missing]
+            value[missing_at] += ((1.0 - share) * line[i, left] + share * line[i, right]) / (right - left)
+            weight[missing_at] += 1.0 / (right - left)
     enclosed = weight > 0.0
     value[enclosed] /= weight[enclosed]
     if not enclosed.all():
@@ -286,13 +286,15 @@ def undeclared_nodata(raw: np.ndarray, source: str) -> tuple[np.ndarray, tuple[s
     notes: tuple[str, ...] = ()
     usual = np.isin(raw, DEM_LIMITS.usual_nodata)
     if usual.any():
-        rest = raw[~usual & np.isfinite(raw)]
+        valid = raw[~usual & np.isfinite(raw)]
         for mark in DEM_LIMITS.usual_nodata:
-            here = raw == mark
+            marked = raw == mark
             # A number amid the real heights may be a height; one far from all of them is a mark.
-            alone = rest.size == 0 or not rest.min() - DEM_LIMITS.nodata_gap < mark < rest.max() + DEM_LIMITS.nodata_gap
-            if alone and here.any():
-                raw = np.where(here, np.nan, raw)
-                told = f"taken for nodata, which {Path(source).name} does not declare"
-                notes += (f"{int(here.sum())} cells of {mark:g} {told}",)
+            alone = (
+                valid.size == 0 or not valid.min() - DEM_LIMITS.nodata_gap < mark < valid.max() + DEM_LIMITS.nodata_gap
+            )
+            if alone and marked.any():
+                raw = np.where(marked, np.nan, raw)
+                note = f"taken for nodata, which {Path(source).name} does not declare"
+                notes += (f"{int(marked.sum())} cells of {mark:g} {note}",)
     return raw, notes

@@ -133,16 +133,18 @@ def _without_means(detail: np.ndarray, ratio: int, coarse: tuple[int, int]) -> n
     """Takes the smooth surface off that carries the means over the coarse cells."""
     rows, cols = detail.shape
     carrier = np.zeros(coarse)
-    wanted = rest = cell_means(detail, ratio)
+    wanted = residual = cell_means(detail, ratio)
     # The means of a spline through the means are not quite the means: correct by what is left, until little is.
     for _ in range(_ROUNDS):
-        taken = spline(carrier, rows, cols, 1 / ratio)
-        rest = wanted - cell_means(taken, ratio)
-        if np.abs(rest).max() < TOLERANCE / 2:
-            return detail - taken
+        smooth_part = spline(carrier, rows, cols, 1 / ratio)
+        residual = wanted - cell_means(smooth_part, ratio)
+        if np.abs(residual).max() < TOLERANCE / 2:
+            return detail - smooth_part
         # Over-relaxed: a spline through the means falls short of them in the same way in every round.
-        carrier += 1.3 * rest
-    raise bad_input("detail", "mean of a cell", f"{np.abs(rest).max():.2g} m", "does not vanish", "use another seed")
+        carrier += 1.3 * residual
+    raise bad_input(
+        "detail", "mean of a cell", f"{np.abs(residual).max():.2g} m", "does not vanish", "use another seed"
+    )
 
 
 def make_soil_patches(

@@ -129,7 +129,7 @@ def place_rocks(
     places, kept = np.zeros((len(radii), 2)), np.zeros(len(radii))
     # Rocks nearer than the gap lie in this square or the eight around it.
     side = population.gap + 2 * radii[0] if len(radii) else 1.0
-    taken: dict[tuple[int, int], list[int]] = {}
+    rocks_in_bin: dict[tuple[int, int], list[int]] = {}
     n = 0
     for radius in radii:
         for _ in range(_TRIES):
@@ -137,11 +137,11 @@ def place_rocks(
             if np.hypot(*(place - middle)) < population.clear + radius:
                 continue
             i, j = int((place[0] - west) // side), int((place[1] - south) // side)
-            near = [k for a in (i - 1, i, i + 1) for b in (j - 1, j, j + 1) for k in taken.get((a, b), ())]
+            near = [k for a in (i - 1, i, i + 1) for b in (j - 1, j, j + 1) for k in rocks_in_bin.get((a, b), ())]
             distance = np.hypot(*(places[near] - place).T) - kept[near] - radius
             if not near or distance.min() >= population.gap:
                 places[n], kept[n] = place, radius
-                taken.setdefault((i, j), []).append(n)
+                rocks_in_bin.setdefault((i, j), []).append(n)
                 n += 1
                 break
     places, kept = places[:n], kept[:n]

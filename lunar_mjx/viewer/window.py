@@ -127,18 +127,21 @@ def _show(window: Any, model: mujoco.MjModel, data: mujoco.MjData, drive: LiveDr
 
 def captions(drive: LiveDrive) -> tuple[str, str]:
     """Names and values of the readings, line by line."""
-    now = drive.readings()
+    readings = drive.readings()
     rows = [
-        ("arrows, space, backspace", f"asked {now['asked_m_s']:.2f} m/s, steering {100 * now['asked_turn']:.0f} %"),
-        ("speed", f"{now['speed_m_s']:.2f} m/s"),
-        ("driven", f"{now['path_m']:.1f} m in {now['time_s']:.0f} s"),
-        ("nose up, left side up", f"{-now['pitch_deg']:.1f}, {now['roll_deg']:.1f} deg"),
-        ("power", f"{now['power_W']:.0f} W"),
-        ("hottest winding", f"{now['hottest']} {now['hottest_degC']:.1f} degC"),
+        (
+            "arrows, space, backspace",
+            f"asked {readings['asked_m_s']:.2f} m/s, steering {100 * readings['asked_turn']:.0f} %",
+        ),
+        ("speed", f"{readings['speed_m_s']:.2f} m/s"),
+        ("driven", f"{readings['path_m']:.1f} m in {readings['time_s']:.0f} s"),
+        ("nose up, left side up", f"{-readings['pitch_deg']:.1f}, {readings['roll_deg']:.1f} deg"),
+        ("power", f"{readings['power_W']:.0f} W"),
+        ("hottest winding", f"{readings['hottest']} {readings['hottest_degC']:.1f} degC"),
     ]
-    for wheel, slip, sinkage in zip(drive.model.rover.wheels, now["slip"], now["sinkage_mm"], strict=True):
+    for wheel, slip, sinkage in zip(drive.model.rover.wheels, readings["slip"], readings["sinkage_mm"], strict=True):
         shown = "at rest" if slip is None else f"{slip:5.2f}"
         rows.append((f"{wheel.corner} slip, sinkage", f"{shown}, {sinkage:.1f} mm"))
-    if now["note"]:
-        rows.append(("", now["note"]))
+    if readings["note"]:
+        rows.append(("", readings["note"]))
     return "\n".join(name for name, _ in rows), "\n".join(value for _, value in rows)

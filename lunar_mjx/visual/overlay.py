@@ -90,11 +90,11 @@ class Overlay:
         glass = Image.new("RGBA", (round(widest) + 2 * pad, len(lines) * self._line + 2 * pad), COLOURS.glass)
         draw = ImageDraw.Draw(glass)
         for i, line in enumerate(lines):
-            name, rest = (line, "") if i == 0 else (line[:10].strip(), line[10:])
+            name, value_text = (line, "") if i == 0 else (line[:10].strip(), line[10:])
             y = pad + i * self._line
             draw.text((pad, y), name, font=self._font, fill=COLOURS.text if i == 0 else COLOURS.faint)
-            if rest:
-                draw.text((pad + 4.6 * self._line, y), rest.strip(), font=self._font, fill=COLOURS.text)
+            if value_text:
+                draw.text((pad + 4.6 * self._line, y), value_text.strip(), font=self._font, fill=COLOURS.text)
         image.alpha_composite(glass, (8, 8))
 
     def _draw_strip(self) -> tuple[Image.Image, list[tuple[float, float, float, float]]]:

@@ -289,13 +289,13 @@ class WheelBed:
         start = (jnp.zeros_like(deepest), deepest, jnp.asarray(False))
         low, high, reached = jax.lax.fori_loop(0, BED_SEARCH.scan + BED_SEARCH.bisections, probe, start)
         root = jnp.where(reached, 0.5 * (low + high), deepest)
-        here, slope = jax.jvp(loads, (root,), (jnp.ones_like(root),))
+        load_at_root, slope = jax.jvp(loads, (root,), (jnp.ones_like(root),))
         slope = jax.lax.stop_gradient(slope)
         # A root of zero slope has no derivative; it is left where the bisection put it.
         firm = reached & (jnp.abs(slope.vertical) > 0.0)
-        change = jnp.where(firm, (test.normal_load - here.vertical) / jnp.where(firm, slope.vertical, 1.0), 0.0)
-        settled = jax.tree.map(lambda value, rate: value + rate * change, here, slope)
-        return WheelResult(settled.drawbar, settled.side, settled.torque, root + change, here.vertical, reached)
+        change = jnp.where(firm, (test.normal_load - load_at_root.vertical) / jnp.where(firm, slope.vertical, 1.0), 0.0)
+        settled = jax.tree.map(lambda value, rate: value + rate * change, load_at_root, slope)
+        return WheelResult(settled.drawbar, settled.side, settled.torque, root + change, load_at_root.vertical, reached)
 
     def _loads(self, parameters: Parameters, test: WheelTest, terrain: Terrain, sinkage: Any) -> _Loads:
         ctx = _bed_context(parameters, test, terrain, sinkage, self.gravity)

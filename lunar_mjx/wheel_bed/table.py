@@ -152,9 +152,9 @@ def _check_columns(file: Path, frame: pd.DataFrame) -> None:
     stems = {re.sub(r"_(N|Nm|m|deg|m_s)$", "", column): column for column in _COLUMNS}
     for column in map(str, frame.columns):
         for stem, wanted in stems.items():
-            rest = column.removeprefix(stem + "_")
+            suffix = column.removeprefix(stem + "_")
             if column not in _COLUMNS and (
-                column == stem or (rest != column and "std" not in rest and "_" not in rest)
+                column == stem or (suffix != column and "std" not in suffix and "_" not in suffix)
             ):
                 raise bad_input(
                     file, "column", column, "does not have the unit of the schema", f"convert it and call it {wanted}"

@@ -300,12 +300,12 @@ def main(args: Any = None) -> None:
         listen(kind, name, name)
     for name in driver.foreign:
         listen(array, name, "blocks/" + name)
-    told: list[str] = []
+    warnings: list[str] = []
 
     def tick() -> None:
         stale = driver.stale(seconds())
-        if stale != told:
-            told[:] = stale
+        if stale != warnings:
+            warnings[:] = stale
             node.get_logger().info("waiting for " + ", ".join(stale) if stale else "driving")
         publisher.publish(joint_state(state(), driver.tick(seconds())))
 

@@ -236,10 +236,10 @@ def judge(
     stages = [(1, stage, q, samples.stages, other[0]) for stage, names in STAGES.items() for q in names]
     steps = [(2, "step", q, samples.after, other[1]) for q in STEP_QUANTITIES]
     for level, stage, quantity, a, b in stages + steps:
-        error, difference, where, size = compare(
+        error, difference, worst_place, size = compare(
             a[quantity][rows], b[quantity][rows], quantity, tolerance[quantity], model
         )
-        out.append(Result(case.name, level, stage, quantity, error, difference, size, where))
+        out.append(Result(case.name, level, stage, quantity, error, difference, size, worst_place))
     return out
 
 
@@ -254,8 +254,10 @@ def judge_drive(
         apart = np.max([gap(exact[quantity], n[quantity], quantity) for n in perturbed], axis=0)
         # what has been perturbed stays perturbed, where it is an integral of the motion
         floor = _around(apart) if quantity in MOMENTARY else np.maximum.accumulate(apart, axis=0)
-        error, difference, where, size = compare(a[quantity], b[quantity], quantity, tolerance[quantity], model, floor)
-        out.append(Result(case.name, 3, "drive", quantity, error, difference, size, where, float(np.max(apart))))
+        error, difference, worst_place, size = compare(
+            a[quantity], b[quantity], quantity, tolerance[quantity], model, floor
+        )
+        out.append(Result(case.name, 3, "drive", quantity, error, difference, size, worst_place, float(np.max(apart))))
     return out
 
 

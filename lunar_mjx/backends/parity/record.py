@@ -109,11 +109,11 @@ def record(model: Model, case: Case, commands: Commands, count: int) -> tuple[Sa
     kept = np.unique(np.linspace(min(1, len(commands.values) - 1), len(commands.values) - 1, count).astype(int))
     states: list[BackendState] = []
     seen: list[Observation] = []
-    every = round(commands.interval / model.timestep)
+    steps_per_command = round(commands.interval / model.timestep)
     for k, control in enumerate(commands.values):
         if k in kept:
             states.append(backend.state())
-        for i in range(every):
+        for i in range(steps_per_command):
             backend.step(backend.controls(control))
             if i == 0:
                 seen.append(backend.observe())

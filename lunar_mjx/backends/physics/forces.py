@@ -245,11 +245,11 @@ class ForceModel:
         dt, flow = c.dt, first
         rate_w, rate_h = flow["winding"] / flow["winding_capacity"], flow["housing"] / flow["housing_capacity"]
         if self.numbers.integrator == "heun":
-            then = self._heat_at(c, c.winding_temperature + dt * rate_w, c.housing_temperature + dt * rate_h)
+            heat_ahead = self._heat_at(c, c.winding_temperature + dt * rate_w, c.housing_temperature + dt * rate_h)
             flow = {
                 **first,
-                "winding": 0.5 * (first["winding"] + then["winding"]),
-                "housing": 0.5 * (first["housing"] + then["housing"]),
+                "winding": 0.5 * (first["winding"] + heat_ahead["winding"]),
+                "housing": 0.5 * (first["housing"] + heat_ahead["housing"]),
             }
             rate_w, rate_h = flow["winding"] / flow["winding_capacity"], flow["housing"] / flow["housing_capacity"]
         c.heat = flow

@@ -46,10 +46,10 @@ def rock_shear(c: Context, p: SimpleNamespace) -> None:
     k = np.sqrt(k_x * k_x + k_y * k_y + 1e-12)
     share = -p.mu * load * np.expm1(-k / p.slip_scale) / k
     along, side = share * k_x, -p.side * share * k_y
-    where = rock[..., None]
+    on_rock = rock[..., None]
     force, moment = np.stack([along, side, load], -1), np.stack([r * side, -r * along, 0.0 * r], -1)
-    c.wheel["force"] = np.where(where, force, c.wheel["force"])
-    c.wheel["moment"] = np.where(where, moment, c.wheel["moment"])
+    c.wheel["force"] = np.where(on_rock, force, c.wheel["force"])
+    c.wheel["moment"] = np.where(on_rock, moment, c.wheel["moment"])
 
 
 def _pushed(depth: np.ndarray, rate: np.ndarray, p: SimpleNamespace) -> np.ndarray:
@@ -144,8 +144,8 @@ def _chassis_boulders(c: Context, p: SimpleNamespace) -> None:
     if not radius.any():
         return
     # quarters that found the same boulder share its push
-    same = (rock[..., :, None, :2] == rock[..., None, :, :2]).all(-1)
-    share = 1.0 / same.sum(-1)
+    same_boulder = (rock[..., :, None, :2] == rock[..., None, :, :2]).all(-1)
+    share = 1.0 / same_boulder.sum(-1)
     gap = np.einsum("...ji,...j->...i", rotation, rock - c.position[:, None, None]) - center
     nearest = clamp(gap, -half, half)
     apart = gap - nearest
@@ -184,6 +184,6 @@ def parking_brake(c: Context, p: SimpleNamespace, state: Values) -> Values:
     """Holds every drive joint by a damped spring at the angle where the brake caught it."""
     held = (c.numbers.group == 0) & (p.engaged > 0.5)
     angle = np.where(held, state["angle"], c.joint_angle)
-    hold = p.stiffness * (angle - c.joint_angle) - p.damping * c.joint_speed
-    c.body["joint_torque"] = c.body["joint_torque"] + np.where(held, hold, 0.0)
+    holding_torque = p.stiffness * (angle - c.joint_angle) - p.damping * c.joint_speed
+    c.body["joint_torque"] = c.body["joint_torque"] + np.where(held, holding_torque, 0.0)
     return {"angle": angle}

@@ -34,8 +34,8 @@ class Differences:
         for k, i in enumerate(self._shared):
             rows[1 + k, i] += self._step(u, i)
         for k, kind in enumerate(self._kinds):
-            same = [i for i in self._own if self._coordinates[i].name == kind]
-            rows[1 + len(self._shared) + k, same] += [self._step(u, i) for i in same]
+            same_kind = [i for i in self._own if self._coordinates[i].name == kind]
+            rows[1 + len(self._shared) + k, same_kind] += [self._step(u, i) for i in same_kind]
         return rows
 
     def _step(self, u: np.ndarray, i: int) -> float:

@@ -385,10 +385,10 @@ class DriveForm(MeasuredForm):
         residual = white(self.observations.value - value)
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
-        many = min(len(DRIVE_REFIT.shares), self.drives.together)
-        here = chi2(residual, u[free])
+        trial_count = min(len(DRIVE_REFIT.shares), self.drives.together)
+        present_chi2 = chi2(residual, u[free])
         for _ in range(settings.most_jacobians):
-            jacobian, first = white(slopes), here
+            jacobian, first = white(slopes), present_chi2
             normal = inner(jacobian, jacobian) + np.diag(std**-2)
             while True:
                 downhill = inner(jacobian, residual) - (u[free] - centre) / std**2
@@ -397,8 +397,8 @@ class DriveForm(MeasuredForm):
                 if promised < settings.settled:
                     break
                 step *= min(1.0, settings.longest_step / float(np.abs(step).max()))
-                rows = np.repeat(u[None], many, axis=0)
-                rows[:, free] = np.clip(u[free] + np.outer(DRIVE_REFIT.shares[:many], step), low, high)
+                rows = np.repeat(u[None], trial_count, axis=0)
+                rows[:, free] = np.clip(u[free] + np.outer(DRIVE_REFIT.shares[:trial_count], step), low, high)
                 try:
                     values = self.drives.predict(self._whole(rows))
                 except TimeUp:
@@ -408,13 +408,13 @@ class DriveForm(MeasuredForm):
                 residuals = [white(self.observations.value - v) for v in values]
                 reached = [chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
                 best = int(np.argmin(reached))
-                gained = here - reached[best]
+                gained = present_chi2 - reached[best]
                 if not gained > 0.0:
                     break
-                u, residual, here = rows[best], residuals[best], reached[best]
+                u, residual, present_chi2 = rows[best], residuals[best], reached[best]
                 if gained < 0.3 * promised:
                     break
-            if not guessed and (promised < settings.settled or first - here < settings.settled):
+            if not guessed and (promised < settings.settled or first - present_chi2 < settings.settled):
                 break
             try:
                 slopes, guessed = self.jacobian(u, free)[1], False

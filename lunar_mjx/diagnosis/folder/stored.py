@@ -103,8 +103,8 @@ def _told(error: Exception) -> str:
     """A validation's first problem in a few words."""
     if isinstance(error, ValidationError):
         first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"])) or "the whole"
-        return f"{where}: {first['msg'].lower()}"
+        field = ".".join(map(str, first["loc"])) or "the whole"
+        return f"{field}: {first['msg'].lower()}"
     return " ".join(str(error).split())[:150] or type(error).__name__
 
 

@@ -137,10 +137,10 @@ class Discovery:
             )
         if self.files:
             runs = ["RUN", *(f"run{k + 2}" for k in range(len(self.files)))]
-            then = ", then ".join(
+            sequence = ", then ".join(
                 f"lunar-mjx add {a} {file} -o {b}" for a, file, b in zip(runs, self.files, runs[1:], strict=False)
             )
-            lines.append(f"Effect file: {', '.join(self.files)}; look at it, then: {then}")
+            lines.append(f"Effect file: {', '.join(self.files)}; look at it, then: {sequence}")
         else:
             lines.append("No formula pays on manoeuvres left out; none is written.")
         return "\n".join(lines)
@@ -166,8 +166,8 @@ def discover(
     if port is None:
         raise UserError(f"{run.folder}: no port shows anything unknown; run lunar-mjx why first, or give --port.")
     if port not in FORMULA_PORTS:
-        what = "has no formulas" if port in PORTS else "does not exist"
-        raise bad_input("unknown", "port", port, what, f"use one of {', '.join(FORMULA_PORTS)}")
+        problem = "has no formulas" if port in PORTS else "does not exist"
+        raise bad_input("unknown", "port", port, problem, f"use one of {', '.join(FORMULA_PORTS)}")
     if out is not None and Path(out).exists() and not Path(out).read_text(encoding="utf-8").startswith(SUGGESTED):
         raise bad_input("unknown", "--out", str(out), "exists, and is none of these suggestions", "name another file")
     logs = run.campaign()

@@ -154,9 +154,9 @@ def search_formulas(
         if best is None:
             break
         progress("refitting formulas", (k + 1) / (FORMULA_SEARCH.rounds + 2))
-        (only,) = best.slots.held
-        again = search.scores(best.slots, best.fit, choices, only)
-        new = search.refit(best.slots, best.fit, again, FORMULA_SEARCH.next, FORMULA_SEARCH.alike[1], only)
+        (held_slot,) = best.slots.held
+        again = search.scores(best.slots, best.fit, choices, held_slot)
+        new = search.refit(best.slots, best.fit, again, FORMULA_SEARCH.next, FORMULA_SEARCH.alike[1], held_slot)
         trials += new
         if not any(t.merit > best.merit for t in new):
             break
@@ -262,8 +262,8 @@ class _Search:
         for i in chosen:
             choice, amount = scores.choices[i], scores.amount[i]
             grown = slots.holding({**held, number: (choice, targets()[choice.target].size * scores.scale[i])})
-            rest = (residual - scores.column[:, i] * amount)[at.fitted]
-            step = np.linalg.lstsq(rows, np.concatenate([rest, np.zeros(len(prior))]), rcond=1e-8)[0]
+            unexplained = (residual - scores.column[:, i] * amount)[at.fitted]
+            step = np.linalg.lstsq(rows, np.concatenate([unexplained, np.zeros(len(prior))]), rcond=1e-8)[0]
             start = np.zeros_like(at.u)
             start[left] = at.u[left] + step
             start[grown.place(number)] = amount

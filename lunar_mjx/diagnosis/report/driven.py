@@ -84,8 +84,8 @@ def _course(label: str, traces: Traces, log: int, row: int | None) -> Course:
     y = np.interp(time, *_values(traces, across, row))
     heading = _series(traces, log, "yaw_deg")
     if heading is not None:
-        when, degrees = _values(traces, heading, row)
-        yaw = np.interp(time, when, np.unwrap(np.radians(degrees)))
+        heading_time, degrees = _values(traces, heading, row)
+        yaw = np.interp(time, heading_time, np.unwrap(np.radians(degrees)))
     else:
         yaw = _direction(x, y)
     return Course(label, time, x, y, yaw)

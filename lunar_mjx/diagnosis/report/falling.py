@@ -141,29 +141,33 @@ def _picture(
         x, at = x[order], at[order]
         measured = traces.observations.value[at]
         predicted = (1.0 - share) * steps[low].predicted[at] + share * steps[high].predicted[at]
-        every = np.concatenate([measured, *(s.predicted[at] for s in steps)])
-        margin = 0.06 * max(float(np.nanmax(every) - np.nanmin(every)), 1e-12)
-        axes.set_ylim(float(np.nanmin(every)) - margin, float(np.nanmax(every)) + margin)
-        many = len(x) > FILM.many_points
+        all_values = np.concatenate([measured, *(s.predicted[at] for s in steps)])
+        margin = 0.06 * max(float(np.nanmax(all_values) - np.nanmin(all_values)), 1e-12)
+        axes.set_ylim(float(np.nanmin(all_values)) - margin, float(np.nanmax(all_values)) + margin)
+        as_density = len(x) > FILM.many_points
         axes.plot(
             *_broken(x, predicted),
             color=SKY if dark else BLUE,
-            marker="" if many else "s",
+            marker="" if as_density else "s",
             markersize=5,
             linewidth=2,
             label="model",
         )
-        axes.plot(x, measured, color=ink, marker="o", markersize=2 if many else 4.5, linestyle="none", label="measured")
+        axes.plot(
+            x, measured, color=ink, marker="o", markersize=2 if as_density else 4.5, linestyle="none", label="measured"
+        )
         axes.set_title(f"{channel_label(channel)}\n{manoeuvre.replace('_', ' ')[:34]}", fontsize=9)
         axes.set_xlabel("slip ratio" if traces.is_table else "time, s", fontsize=8)
     marks, words = figure.axes[0].get_legend_handles_labels()
     figure.legend(marks, words, loc="upper right", ncols=2, fontsize=9, bbox_to_anchor=(0.99, 1.01))
     bar = figure.add_subplot(grid[1, :])
-    now = (1.0 - share) * errors[low] + share * errors[high]
-    bar.barh([0], [now], color=ORANGE, height=0.6)
+    shown_error = (1.0 - share) * errors[low] + share * errors[high]
+    bar.barh([0], [shown_error], color=ORANGE, height=0.6)
     bar.axvline(1.0, color=ink, linestyle="--", linewidth=1.5)
     bar.set(xlim=(0.0, 1.25 * max(errors)), ylim=(-0.5, 0.5), yticks=[])
-    bar.text(now + 0.012 * max(errors), 0, f"{shown(now)} sigma", va="center", fontsize=12, weight="bold")
+    bar.text(
+        shown_error + 0.012 * max(errors), 0, f"{shown(shown_error)} sigma", va="center", fontsize=12, weight="bold"
+    )
     name = steps[low if share < 0.5 else high].label
     title = f"{name}: error on {measure} points (dashed: the noise)"
     bar.set_title(textwrap.fill(title, FILM.title_width))

@@ -81,23 +81,23 @@ def _interval(errors: Sequence[Error]) -> dict:
 
 def bars(values: Mapping[str, float | None], title: str, named: str = "") -> go.Figure:
     """Horizontal bars, largest first; the one of a name stands out."""
-    items = sorted(((k, v or 0.0) for k, v in values.items()), key=lambda item: item[1])
+    ascending = sorted(((k, v or 0.0) for k, v in values.items()), key=lambda item: item[1])
     figure = go.Figure(
         go.Bar(
-            x=[v for _, v in items],
-            y=[plot_text(port_label(k)) for k, _ in items],
+            x=[v for _, v in ascending],
+            y=[plot_text(port_label(k)) for k, _ in ascending],
             orientation="h",
-            text=[shown(v) for _, v in items],
+            text=[shown(v) for _, v in ascending],
             textposition="outside",
             cliponaxis=False,
             marker={
-                "color": [BLUE if k == named else faded(BLUE, 0.35) for k, _ in items],
+                "color": [BLUE if k == named else faded(BLUE, 0.35) for k, _ in ascending],
                 "line": {"color": INK, "width": 1},
             },
             hovertemplate="%{y}: %{x:.4g}<extra></extra>",
         )
     )
-    finish(figure, 90 + 26 * max(len(items), 2), margin={"l": 270, "r": 70, "t": 20, "b": 52}, showlegend=False)
+    finish(figure, 90 + 26 * max(len(ascending), 2), margin={"l": 270, "r": 70, "t": 20, "b": 52}, showlegend=False)
     figure.update_xaxes(title_text=title)
     return figure
 

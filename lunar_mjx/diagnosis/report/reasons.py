@@ -29,17 +29,21 @@ def reason(
     if status == "not tested":
         seen = "leaves no trace" if not shows else f"stands out by {shown(shows, 2)} sigma only"
         return f"These measurements cannot tell: at its usual size it {seen} once the model has been refitted."
-    said = []
+    sentences = []
     probability = _number(evidence.get("probability"))
     if name in named:
-        said.append("This is what the measurements ask for.")
+        sentences.append("This is what the measurements ask for.")
         own = errors.get("" if len(named) > 1 else name, errors.get(name))
         if own is not None and before is not None:
-            together = f" together with {and_list([_plain(n) for n in named if n != name])}" if len(named) > 1 else ""
-            said.append(f"With it{together} the {measure} error falls from {shown(before)} to {shown(own)} sigma.")
-        return " ".join([*said, *_probable(probability)])
+            with_others = (
+                f" together with {and_list([_plain(n) for n in named if n != name])}" if len(named) > 1 else ""
+            )
+            sentences.append(
+                f"With it{with_others} the {measure} error falls from {shown(before)} to {shown(own)} sigma."
+            )
+        return " ".join([*sentences, *_probable(probability)])
     if shows:
-        said.append(f"At its usual size it would stand out by {shown(shows, 2)} sigma.")
+        sentences.append(f"At its usual size it would stand out by {shown(shows, 2)} sigma.")
     if name in errors and before is not None:
         left = errors[name]
         falls = left < 0.98 * before
@@ -47,7 +51,7 @@ def reason(
         best = errors.get("") if "" in errors else errors.get(named[0]) if named else None
         if best is not None and best < left:
             tail += f", where {and_list([_plain(n) for n in named])} leaves {shown(best)}"
-        said.append(f"Adding it alone {tail} ({measure} error).")
+        sentences.append(f"Adding it alone {tail} ({measure} error).")
     near, cosine = _nearest(evidence)
     if near and cosine >= ALIKE:
         more = (
@@ -57,11 +61,11 @@ def reason(
             if named
             else "so either may stand for both"
         )
-        said.append(f"Its trace looks like that of {_plain(near)} (alike to {cosine:.2f} of 1), {more}.")
+        sentences.append(f"Its trace looks like that of {_plain(near)} (alike to {cosine:.2f} of 1), {more}.")
     note = str(evidence.get("reason") or "")
     if probability is None and note:
-        said.append(f"The diagnosis notes: {note[:200]}.")
-    return " ".join([*said, *_probable(probability)])
+        sentences.append(f"The diagnosis notes: {note[:200]}.")
+    return " ".join([*sentences, *_probable(probability)])
 
 
 def _probable(probability: float | None) -> list[str]:

@@ -245,20 +245,20 @@ def _map(traces: Traces, models: Sequence[_Model]) -> dict[str, Any] | None:
     """
     o = traces.observations
     if o.place is not None:
-        where, titles = np.column_stack([o.place[:, 0], o.place[:, 1]]), ("slip ratio", "slip angle, deg")
+        slip_and_angle, titles = np.column_stack([o.place[:, 0], o.place[:, 1]]), ("slip ratio", "slip angle, deg")
     else:
         parts = [covariate_along(o, f"position_{axis}_m", "") for axis in "xy"]
-        where, titles = np.column_stack(parts), ("east x, m", "north y, m")
-    known = np.isfinite(where).all(axis=1)
+        slip_and_angle, titles = np.column_stack(parts), ("east x, m", "north y, m")
+    known = np.isfinite(slip_and_angle).all(axis=1)
     if not known.any():
         return None
-    cell = 0.02 * max(float(np.ptp(where[known], axis=0).max()), 1e-9)
-    grid = np.round(where[known] / (cell if o.place is None else 1e-9)).astype(np.int64)
+    cell = 0.02 * max(float(np.ptp(slip_and_angle[known], axis=0).max()), 1e-9)
+    grid = np.round(slip_and_angle[known] / (cell if o.place is None else 1e-9)).astype(np.int64)
     _, first, number = np.unique(np.column_stack([grid, o.unit[known]]), axis=0, return_index=True, return_inverse=True)
     number = np.ravel(number)
     units = sorted(set(o.unit.tolist()))
     keep = np.arange(len(first))[:: max(1, int(np.ceil(len(first) / STUDIO_SIZES.most_map)))]
-    here = where[known][first][keep]
+    shown_points = slip_and_angle[known][first][keep]
 
     def errors(residual: np.ndarray) -> list[float | None]:
         fine = np.isfinite(residual)
@@ -268,8 +268,8 @@ def _map(traces: Traces, models: Sequence[_Model]) -> dict[str, Any] | None:
             return _list(np.sqrt(squares / count)[keep])
 
     return {
-        "x": _list(here[:, 0]),
-        "y": _list(here[:, 1]),
+        "x": _list(shown_points[:, 0]),
+        "y": _list(shown_points[:, 1]),
         "unit": [units.index(int(u)) for u in o.unit[known][first][keep]],
         "x_title": titles[0],
         "y_title": titles[1],

@@ -27,9 +27,11 @@ def plus_minus(value: Any, std: Any, unit: str = "") -> str:
 def error_rows(steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[Error | None], measure: str) -> Table:
     """The numbers of the waterfall."""
     rows = []
-    for i, (step, now, fit) in enumerate(zip(steps, judged, fitted, strict=True)):
-        change = "" if i == 0 else f"{100.0 * (now.value / judged[i - 1].value - 1.0):+.0f} %"
-        rows.append([step.label, step.run, _with_interval(now), change, _with_interval(fit), str(now.blocks)])
+    for i, (step, step_error, fit) in enumerate(zip(steps, judged, fitted, strict=True)):
+        change = "" if i == 0 else f"{100.0 * (step_error.value / judged[i - 1].value - 1.0):+.0f} %"
+        rows.append(
+            [step.label, step.run, _with_interval(step_error), change, _with_interval(fit), str(step_error.blocks)]
+        )
     note = (
         "95 % intervals by a bootstrap over blocks of at least five correlation times (of neighbouring points in "
         "tables); the last column counts the blocks."
@@ -185,9 +187,9 @@ def parameters(first: Result, last: Result) -> list[Block]:
             unit = (found.get("unit") or {}).get(name, "")
             given = (old.get("given") or {}).get(name)
             strength = shown(abs(a - b) / sa, 2) if a is not None and b is not None and a != b and sa else "-"
-            for label, own, now in _sizes(first, last, effect, name, unit):
+            for label, own, last_size in _sizes(first, last, effect, name, unit):
                 # values before are in units of the first run's model, values after in those of the last one's
-                (g, a_, sa_), (b_, sb_) = _scaled(own, given, a, sa), _scaled(now, b, sb)
+                (g, a_, sa_), (b_, sb_) = _scaled(own, given, a, sa), _scaled(last_size, b, sb)
                 bias = "-"
                 if a_ is not None and b_ is not None and a != b:
                     bias = shown(a_ - b_) + (f" ({100.0 * (a_ / b_ - 1.0):+.0f} %)" if b_ else "")
@@ -317,8 +319,8 @@ def _who_split(result: Result, units: Sequence[str]) -> str:
     stated = (result.comparison or {}).get("log_splits") or {}
     parts = []
     if stated:
-        said = ", ".join(f"{log} ({SPLIT_NAMES.get(split, split)})" for log, split in stated.items())
-        parts.append(f"Stated by the logs themselves: {said}.")
+        listed = ", ".join(f"{log} ({SPLIT_NAMES.get(split, split)})" for log, split in stated.items())
+        parts.append(f"Stated by the logs themselves: {listed}.")
     if own:
         parts.append(f"Chosen by the user with --split: {', '.join(own)}.")
     if not stated and not own:

@@ -81,18 +81,18 @@ def _audit_line(result: Result) -> str:
 
 def _error_section(steps: Sequence[Step], results: Sequence[Result]) -> Section:
     splits, measure = judged(steps)
-    now = [e for s in steps if (e := error(s, splits)) is not None]
+    errors = [e for s in steps if (e := error(s, splits)) is not None]
     fitted = [error(s, ("fit",)) for s in steps]
     blocks: list[Block] = []
     if not comparable(steps):
         blocks.append(Text(["The runs were not made on the same measurements, so their errors do not compare."]))
-    if len(now) == len(steps):
+    if len(errors) == len(steps):
         caption = (
             f"Root mean square residual over {measure} manoeuvres in sigma of the noise. 1 sigma is the noise floor: a "
             "true model cannot go below it but by chance."
         )
-        blocks.append(Figure(figures.waterfall(steps, now, fitted, measure), caption))
-        blocks.append(tables.error_rows(steps, now, fitted, measure))
+        blocks.append(Figure(figures.waterfall(steps, errors, fitted, measure), caption))
+        blocks.append(tables.error_rows(steps, errors, fitted, measure))
     return Section("The error, step by step", blocks)
 
 

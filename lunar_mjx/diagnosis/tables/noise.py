@@ -88,10 +88,10 @@ def sweeps(table: SteadyStateTable, key: np.ndarray) -> tuple[np.ndarray, np.nda
     keys = np.column_stack([key, np.round(table.test["slip_angle_deg"], 2), _levels(table)])
     sweep = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
     order = np.lexsort([slip, sweep])
-    same = np.diff(sweep[order]) == 0
+    same_sweep = np.diff(sweep[order]) == 0
     gap = np.diff(slip[order])
-    near = gap <= _GAP * np.median(gap[same]) if same.any() else same
-    return order, np.concatenate([[False], same & near])
+    near = gap <= _GAP * np.median(gap[same_sweep]) if same_sweep.any() else same_sweep
+    return order, np.concatenate([[False], same_sweep & near])
 
 
 def _levels(table: SteadyStateTable) -> np.ndarray:

@@ -111,9 +111,9 @@ def table_data(
     std: dict[int, float] = {}
     for log in logs:
         for name, own in scatter(log).items():
-            told = np.hypot(settings.replicate_spread, own.level) if own.level else settings.stated_spread
+            noise_spread = np.hypot(settings.replicate_spread, own.level) if own.level else settings.stated_spread
             i = _NAMES.index(name)
-            std[i] = max(std.get(i, 0.0), float(told))
+            std[i] = max(std.get(i, 0.0), float(noise_spread))
     return TableData(
         observations, imposed, point, quantity, _modes(usual, settings), following, dict(sorted(std.items()))
     )
@@ -216,11 +216,13 @@ class WheelForm(MeasuredForm):
         unlisted, followed = self._following(gains)
         columns = np.column_stack([own, whiten(errors), fields, added, unlisted])
         calibrated = count + np.arange(errors.shape[1])
-        rest = count + errors.shape[1] + np.arange(fields.shape[1])
+        field_columns = count + errors.shape[1] + np.arange(fields.shape[1])
         last = columns.shape[1] - unlisted.shape[1]
         more = last - added.shape[1]
         sizes = np.full(unlisted.shape[1], settings.following_discrepancy)
-        std = np.concatenate([[c.prior for c in self.coordinates], error_std, np.ones(last - more + len(rest)), sizes])
+        std = np.concatenate(
+            [[c.prior for c in self.coordinates], error_std, np.ones(last - more + len(field_columns)), sizes]
+        )
         for places in self.candidates.values():
             amplitude = [i for i in places if self.coordinates[i].amplitude]
             std[amplitude] = [self.effect_size(self.coordinates[i]) for i in amplitude]
@@ -254,7 +256,7 @@ class WheelForm(MeasuredForm):
             amplitudes=Amplitudes(std, field, mean),
             low=low,
             high=high,
-            always=np.concatenate([self.baseline, calibrated, rest]).astype(int),
+            always=np.concatenate([self.baseline, calibrated, field_columns]).astype(int),
             effects=self.candidates,
             at=at,
             calibration={name: calibrated[places] for name, places in instruments.items()},

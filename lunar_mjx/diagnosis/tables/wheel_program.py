@@ -139,8 +139,8 @@ def _compiled(key: Any, bed: WheelBed, layout: Sequence[tuple[str, str]]) -> Any
 
         def values(z: Any, scales: Any, parameters: Any, gravity: Any, imposed: Imposed) -> tuple[Any, Any]:
             # Gravity is a number like others: a table from another laboratory shares the program.
-            here = copy.copy(bed)
-            here.gravity = gravity
+            traced_bed = copy.copy(bed)
+            traced_bed.gravity = gravity
             own = {e: dict(v) for e, v in parameters.items()}
             count = len(layout)
             start, change = scales[:, 0], scales[:, 1] * z[:count]
@@ -151,7 +151,7 @@ def _compiled(key: Any, bed: WheelBed, layout: Sequence[tuple[str, str]]) -> Any
                 own[effect][name] = moved[i]
             for i in range(len(GAINS)):
                 own[EFFECT][f"gain_{i}"] = z[count + i]
-            result = here(own, _off(imposed, z[count + len(GAINS) :]))
+            result = traced_bed(own, _off(imposed, z[count + len(GAINS) :]))
             found = jnp.stack([getattr(result, q) for q in QUANTITIES])
             return found, found
 

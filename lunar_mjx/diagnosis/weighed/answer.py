@@ -207,7 +207,7 @@ def _discrepancy(
 ) -> dict[str, dict[str, Any]]:
     """Size of every field of which the data can tell something."""
     found = {}
-    for (field, said), size, spread in zip(form.words.items(), tau, log_std, strict=True):
+    for (field, words), size, spread in zip(form.words.items(), tau, log_std, strict=True):
         if felt[field] < least_signal:
             continue  # its size would be the prior's, told as if it had been measured
         size = size * form.shares.get(field, 1.0)
@@ -216,7 +216,7 @@ def _discrepancy(
             "size": float(size),
             "low": float(low),
             "high": float(high),
-            "text": f"{said} good to {_percent(size)}",
+            "text": f"{words} good to {_percent(size)}",
         }
     return found
 
@@ -269,11 +269,11 @@ def save_series(
 
 def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagnosis:
     settings = problem.settings
-    said = conclude(found, settings.sure, settings.largest_class)
+    conclusion = conclude(found, settings.sure, settings.largest_class)
     forms = found.forms()
     own = problem.own.name
     remains = _averaged(problem.own, found, settings.least_signal)
-    sentence = said.sentence
+    sentence = conclusion.sentence
     better = max(forms, key=lambda n: forms[n])
     if forms[better] >= settings.sure and better != own:
         sentence += f" The contact law {better} explains these data better than {own}: add it."
@@ -287,31 +287,31 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         sentence += " The search ended by its time or its number of refits: what it did not refit is an estimate."
     skipped = problem.own.skipped
     if skipped:
-        said, sentence = _without(said, sentence, skipped)
+        conclusion, sentence = _without(conclusion, sentence, skipped)
     elif not found.complete:
-        said, sentence = _unrefitted(said, sentence, [h.effects for h in found.hypotheses if h.refitted])
+        conclusion, sentence = _unrefitted(conclusion, sentence, [h.effects for h in found.hypotheses if h.refitted])
     gain, se, units = _held_out(found, best, own)
     inclusion = found.inclusion()
-    evidence, undecidable = _evidence(problem, found, said.effects)
+    evidence, undecidable = _evidence(problem, found, conclusion.effects)
     return Diagnosis(
-        verdict=said.verdict,
-        effects=said.effects,
+        verdict=conclusion.verdict,
+        effects=conclusion.effects,
         sentence=sentence,
         evidence=evidence,
-        port=said.port,
+        port=conclusion.port,
         ports={t.name: p for t, p in inclusion.items() if t.kind == UNLISTED and p >= 1e-4},
         isolability=_cosines(found.base(best.form).refit, settings.least_signal),
         undecidable=undecidable,
-        probability=said.probability,
+        probability=conclusion.probability,
         probabilities=probabilities(found),
         inclusion={label(t): p for t, p in inclusion.items()},
         forms=forms,
-        unlisted=said.unlisted,
-        further=said.further,
+        unlisted=conclusion.unlisted,
+        further=conclusion.further,
         discrepancy=remains,
         details={
             "best": {"form": best.form, "hypothesis": title(best), "log_posterior": best.log_posterior},
-            "place": said.place,
+            "place": conclusion.place,
             "held_out": {"gain": gain, "se": se, "manoeuvres": units},
             "noise": {n.name: float(s) for n, s in zip(best.refit.linear.noises, best.evidence.noise, strict=True)},
             "search": {
@@ -333,11 +333,11 @@ def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[C
     That nothing is missing stands, for it has been held against unknown inputs at all ports. That something is missing
     stands, too, but not what: a candidate that was not looked at may be that.
     """
-    rest = f" Not looked at in the time given: {', '.join(skipped)}; give more --seconds."
+    skipped_sentence = f" Not looked at in the time given: {', '.join(skipped)}; give more --seconds."
     if said.verdict is Verdict.NOISE_ONLY:
-        return said, sentence + rest
+        return said, sentence + skipped_sentence
     said = dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=())
-    return said, "Of what was looked at: " + sentence + rest
+    return said, "Of what was looked at: " + sentence + skipped_sentence
 
 
 def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]]) -> tuple[Conclusion, str]:
@@ -390,10 +390,10 @@ def _evidence(
     for name, length in shows.items():
         p = inclusion.get(name, 0.0)
         holding = next((h for h in found.hypotheses if name in h.effects), None)
-        without = next(h for h in found.hypotheses if name not in h.effects)
+        best_without = next(h for h in found.hypotheses if name not in h.effects)
         values, std, log_ratio = {}, {}, float("-inf")
         if holding is not None:
-            log_ratio = holding.log_posterior - without.log_posterior
+            log_ratio = holding.log_posterior - best_without.log_posterior
             form = problem.form(holding.form)
             moved = holding.evidence.mean
             for k, i in enumerate(holding.places):
@@ -403,8 +403,8 @@ def _evidence(
                     std[c.name] = c.std(
                         holding.refit.u[i], math.sqrt(max(float(holding.evidence.covariance[k, k]), 0.0))
                     )
-        others = {e: v for e, v in cosines.get(name, {}).items() if e != name}
-        nearest = max(others.items(), key=lambda item: item[1]) if others else ("", 0.0)
+        similar_effects = {e: v for e, v in cosines.get(name, {}).items() if e != name}
+        nearest = max(similar_effects.items(), key=lambda item: item[1]) if similar_effects else ("", 0.0)
         if name in problem.own.skipped:
             status, reason = "not tested", "the time did not suffice to look at it"
         elif length < problem.settings.least_signal:
@@ -444,10 +444,12 @@ def _cosines(refit: Refit, least_signal: float) -> dict[str, dict[str, float]]:
     own = np.setdiff1d(linear.always[linear.amplitudes.field[linear.always] < 0], calibrated)
     scale = linear.amplitudes.std
     inner = np.eye(len(own)) + scale[own, None] * whole[np.ix_(own, own)] * scale[own]
-    every = np.concatenate([*linear.effects.values(), np.zeros(0)]).astype(int)
-    across = scale[own, None] * whole[np.ix_(own, every)] * scale[every]
-    left = scale[every, None] * whole[np.ix_(every, every)] * scale[every] - across.T @ np.linalg.solve(inner, across)
-    index = {i: k for k, i in enumerate(every)}
+    effect_columns = np.concatenate([*linear.effects.values(), np.zeros(0)]).astype(int)
+    across = scale[own, None] * whole[np.ix_(own, effect_columns)] * scale[effect_columns]
+    left = scale[effect_columns, None] * whole[np.ix_(effect_columns, effect_columns)] * scale[
+        effect_columns
+    ] - across.T @ np.linalg.solve(inner, across)
+    index = {i: k for k, i in enumerate(effect_columns)}
     shows = linear.shows()
     names = [n for n in linear.effects if shows[n] >= least_signal]
     found: dict[str, dict[str, float]] = {}

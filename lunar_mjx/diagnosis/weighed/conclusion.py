@@ -61,24 +61,24 @@ def conclude(found: ModelSearch, sure: float, largest_class: int = LARGEST_CLASS
         # each is sure by itself, and all of them together less so: this is the probability that is told
         p = found.probability_of(lambda h: set(named) <= h.terms)
         names = tuple(map(label, named))
-        rest = [t for t in inclusion if t not in named]
-        further, _ = _smallest(found, rest, sure, named, largest_class)
-        many = len(names) > 1
-        said = f"{_list(names)} {'are' if many else 'is'} missing"
+        unnamed = [t for t in inclusion if t not in named]
+        further, _ = _smallest(found, unnamed, sure, named, largest_class)
+        plural = len(names) > 1
+        said = f"{_list(names)} {'are' if plural else 'is'} missing"
         if all(t.kind == CALIBRATION for t in named):
             said = f"{_list(names)}: out of order beyond what is usual"
-        verdict = Verdict.MULTIPLE if many else Verdict.KNOWN
+        verdict = Verdict.MULTIPLE if plural else Verdict.KNOWN
         other = _UNLISTED in further
         where = (port, place) if other else (None, None)
         more = tuple(m for m in further if m != _UNLISTED)
         sentence = _with(said, p)
         if further:
-            sentence += f" Beside {'them' if many else 'it'}, {_one_of(further, place)} acts, too."
+            sentence += f" Beside {'them' if plural else 'it'}, {_one_of(further, place)} acts, too."
         return Conclusion(verdict, names, other, where[0], p, sentence, where[1], more)
-    nothing = found.probability_of(lambda h: not any(t.kind in (EFFECT, UNLISTED) for t in h.terms))
-    if nothing >= sure:
+    no_term = found.probability_of(lambda h: not any(t.kind in (EFFECT, UNLISTED) for t in h.terms))
+    if no_term >= sure:
         said = "Nothing is missing beyond usual errors of model, sensors and noise"
-        return Conclusion(Verdict.NOISE_ONLY, (), False, None, nothing, _with(said, nothing))
+        return Conclusion(Verdict.NOISE_ONLY, (), False, None, no_term, _with(said, no_term))
     members, p = _smallest(found, list(inclusion), sure, (), largest_class)
     effects = tuple(m for m in members if m != _UNLISTED)
     if members:
@@ -86,7 +86,7 @@ def conclude(found: ModelSearch, sure: float, largest_class: int = LARGEST_CLASS
         said = f"{_one_of(members, place)} acts".capitalize() if other else f"One of {_list(effects)} is missing"
         where = (port, place) if other else (None, None)
         return Conclusion(Verdict.KNOWN_CLASS, effects, other, where[0], p, _with(said, p), where[1])
-    said = f"These data do not settle whether anything is missing (nothing: {_percent(nothing)})"
+    said = f"These data do not settle whether anything is missing (nothing: {_percent(no_term)})"
     return Conclusion(Verdict.UNDECIDABLE, (), False, None, 0.0, said + ".")
 
 
@@ -110,9 +110,9 @@ def probabilities(found: ModelSearch) -> dict[str, float]:
     for h, p in zip(found.hypotheses, found.probability, strict=True):
         total[title(h)] = total.get(title(h), 0.0) + float(p)
     ranked = sorted(total.items(), key=lambda item: -item[1])
-    told = dict(ranked[:_TOLD])
-    rest = sum(p for _, p in ranked[_TOLD:])
-    return {**told, "others": rest} if rest > 0.0 else told
+    most_probable = dict(ranked[:_TOLD])
+    remainder = sum(p for _, p in ranked[_TOLD:])
+    return {**most_probable, "others": remainder} if remainder > 0.0 else most_probable
 
 
 def _where(found: ModelSearch) -> tuple[str | None, str | None]:

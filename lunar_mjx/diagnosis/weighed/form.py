@@ -86,8 +86,8 @@ class SearchSettings:
 def _like(usual: Any, value: Any) -> Any:
     """A value in the kind of the usual one; lists may be text with commas."""
     if isinstance(usual, tuple):
-        items = [v.strip() for v in value.split(",")] if isinstance(value, str) else list(value)
-        return tuple(type(usual[0])(v) for v in items if v != "")
+        texts = [v.strip() for v in value.split(",")] if isinstance(value, str) else list(value)
+        return tuple(type(usual[0])(v) for v in texts if v != "")
     found = float(value)
     if not math.isfinite(found) or (isinstance(usual, int) and found != int(found)):
         raise ValueError(value)

@@ -40,7 +40,7 @@ def batch_last(function: Callable[..., Any], in_axes: tuple[Any, ...]) -> Callab
     def batched(*args: Any) -> Any:
         leaves, treedef = jax.tree.flatten(args)
         axes = [_spread(a, arg) for a, arg in zip(in_axes, args, strict=True)]
-        flat_axes = [a for some in axes for a in some]
+        flat_axes = [a for tree_axes in axes for a in tree_axes]
         single = [
             leaf if a is None else jax.ShapeDtypeStruct(_without(leaf.shape, a), leaf.dtype)
             for leaf, a in zip(leaves, flat_axes, strict=True)

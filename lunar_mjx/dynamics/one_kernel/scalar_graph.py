@@ -213,9 +213,9 @@ def _frozen(params: dict[str, Any]) -> Any:
 def _reduce(primitive: Any) -> Callable[[Graph, Any, list[Any]], Any]:
     def rule(graph: Graph, eqn: Any, operands: list[Any]) -> Any:
         x, axes, aval = operands[0], eqn.params["axes"], eqn.outvars[0].aval
-        rest = [i for i in range(x.ndim) if i not in axes]
+        kept_axes = [i for i in range(x.ndim) if i not in axes]
         out = np.empty(aval.shape, object)
-        flat = x.transpose(*rest, *axes).reshape(*aval.shape, -1)
+        flat = x.transpose(*kept_axes, *axes).reshape(*aval.shape, -1)
         for at in np.ndindex(*aval.shape):
             total = flat[at][0]
             for value in flat[at][1:]:
@@ -276,8 +276,8 @@ def _gather(graph: Graph, eqn: Any, operands: list[Any]) -> Any:
     for at in np.ndindex(*aval.shape):
         chosen = values[0]
         for k in range(1, len(values)):
-            same = graph.operate(lax.eq_p, {}, [index[at], np.int32(k)], bool)
-            chosen = graph.operate(lax.select_n_p, {}, [same, chosen, values[k]], aval.dtype)
+            hit = graph.operate(lax.eq_p, {}, [index[at], np.int32(k)], bool)
+            chosen = graph.operate(lax.select_n_p, {}, [hit, chosen, values[k]], aval.dtype)
         out[at] = chosen
     return out
 

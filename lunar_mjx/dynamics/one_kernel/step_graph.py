@@ -41,9 +41,9 @@ def step_graph(system: Any, params: Params, kinds: list[str], state: State, cont
       params: one rover's, tables of every rover's own with their first axis. kinds: of its leaves, see `traced`.
       state, control: one rover's, the state in pieces.
     """
-    rest = ["input"] * (len(jax.tree.leaves((state, control))))
+    input_roles = ["input"] * (len(jax.tree.leaves((state, control))))
     graph, results, _, entries = traced(
-        lambda x: system.step(x[0], x[1], x[2])[0], (params, state, control), kinds + rest
+        lambda x: system.step(x[0], x[1], x[2])[0], (params, state, control), kinds + input_roles
     )
     first = len(kinds)
     count = len(jax.tree.leaves(state))
@@ -51,7 +51,7 @@ def step_graph(system: Any, params: Params, kinds: list[str], state: State, cont
     def numbers(some: list[Any]) -> tuple[int, ...]:
         return tuple(n.params for e in some if e is not None and e.dtype == object for n in e.reshape(-1))
 
-    inputs = [e for e, kind in zip(entries, kinds + rest, strict=True) if kind == "input"]
+    inputs = [e for e, kind in zip(entries, kinds + input_roles, strict=True) if kind == "input"]
     dtypes = tuple(n.dtype for e in inputs for n in e.reshape(-1))
     new = tuple(x for r in results for x in np.asarray(r).reshape(-1))
     of_params = numbers([e for e, k in zip(entries[:first], kinds, strict=True) if k == "input"])

@@ -97,8 +97,8 @@ class FourBar:
         along = tuple(
             sub(add(mul(r[0][k], squares[0]), mul(r[1][k], squares[1])), mul(r[2][k], squares[2])) for k in (0, 1)
         )
-        rest = (neg(along[1]), along[0])
-        bias = mul(neg(_cross(rest, q)), determinant), mul(neg(_cross(p, rest)), determinant)
+        perpendicular = (neg(along[1]), along[0])
+        bias = mul(neg(_cross(perpendicular, q)), determinant), mul(neg(_cross(p, perpendicular)), determinant)
         senses = [s for i, s in enumerate(n.senses) if i != self.given]
         return (
             tuple(mul(mul(s, own), g) for s, g in zip(senses, gain, strict=True)),  # type: ignore[return-value]

@@ -101,9 +101,14 @@ def _bodies(model: mujoco.MjModel) -> list[str]:
 
 def _others(model: mujoco.MjModel) -> list[str]:
     problems = []
-    for count, what in (("ntendon", "tendons"), ("nflex", "flexes"), ("nplugin", "plugins"), ("na", "actuator states")):
+    for count, plural in (
+        ("ntendon", "tendons"),
+        ("nflex", "flexes"),
+        ("nplugin", "plugins"),
+        ("na", "actuator states"),
+    ):
         if getattr(model, count):
-            problems.append(what)
+            problems.append(plural)
     for i in range(model.neq):
         if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT:
             multiplier = model.eq_data[i, 1]

@@ -150,11 +150,11 @@ def read_structure(
         # one leg.
         patterns.setdefault(leg.pattern, []).append(leg)
     groups, members = [], []
-    for same in patterns.values():
+    for alike in patterns.values():
         # In the order of the rover's wheels, so that results are slices and not gathers.
-        same.sort(key=lambda leg: [w[0] for w in leg.wheels] or [leg.links[0].joint])
-        groups.append(_group(model, same, order, name))
-        members.append(same)
+        alike.sort(key=lambda leg: [w[0] for w in leg.wheels] or [leg.links[0].joint])
+        groups.append(_group(model, alike, order, name))
+        members.append(alike)
     free = int(model.body_jntadr[chassis])
     return Structure(
         base=_body([base_masses], [np.eye(3)]),
@@ -412,13 +412,13 @@ def _body(masses: list[list[tuple[float, np.ndarray, np.ndarray]]], aligns: list
     best = min(
         (entries[k] for k in range(3)), key=lambda s: sum(np.abs(entries[k] - s).max() > 1e-13 * size for k in range(3))
     )
-    rest = entries - best * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
-    rest[np.abs(rest) < 1e-13 * size] = 0.0
+    anisotropic = entries - best * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
+    anisotropic[np.abs(anisotropic) < 1e-13 * size] = 0.0
     return Body(
         uniform([m for m, _, _ in fused], 0.0),
         _vector(coms),
         uniform(best, 0.0),
-        Symmetric(*(uniform(e, 0.0) for e in rest)),
+        Symmetric(*(uniform(e, 0.0) for e in anisotropic)),
     )
 
 

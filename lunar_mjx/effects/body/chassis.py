@@ -110,8 +110,8 @@ def parking_brake(ctx, p, x, wrench):
     held = (ctx.rover.joint_group == 0) & (p.engaged > 0.5)
     # While released the state follows the joint, so that the brake catches the wheel where it is.
     angle = jnp.where(held, x.angle, ctx.joint_angle)
-    hold = p.stiffness * (angle - ctx.joint_angle) - p.damping * ctx.joint_speed
-    torque = wrench.joint_torque + jnp.where(held, hold, 0.0)
+    holding_torque = p.stiffness * (angle - ctx.joint_angle) - p.damping * ctx.joint_speed
+    torque = wrench.joint_torque + jnp.where(held, holding_torque, 0.0)
     return dataclasses.replace(wrench, joint_torque=torque), {"angle": angle}
 
 

@@ -34,9 +34,9 @@ def motor_power(ctx, p, x, power):
     motor = ctx.parameters["motor"]
     current = ctx.command.current
     back_emf = constant_at(ctx.parameters, ctx.winding_temperature) * motor.gear_ratio * ctx.joint_speed
-    each = current * (winding_resistance(motor, ctx.winding_temperature) * current + back_emf)
+    per_motor = current * (winding_resistance(motor, ctx.winding_temperature) * current + back_emf)
     # motor by motor: on one rover some drive while others brake, and only a driving one pays the amplifier's loss
-    drawn, braking = jnp.sum(jnp.maximum(each, 0.0)), jnp.sum(jnp.minimum(each, 0.0))
+    drawn, braking = jnp.sum(jnp.maximum(per_motor, 0.0)), jnp.sum(jnp.minimum(per_motor, 0.0))
     load = drawn / p.efficiency + p.returned * braking
     return dataclasses.replace(power, load=power.load + load, loss=power.loss + load - drawn - braking)
 

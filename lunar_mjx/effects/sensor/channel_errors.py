@@ -137,11 +137,11 @@ def encoder_quantisation(ctx, p, x, signals):
     changed = {}
     for quantity, pattern in _STEPPED.items():
         step = jax.lax.stop_gradient(jnp.asarray(getattr(p, quantity)))
-        some = step > 0.0
-        safe = jnp.where(some, step, 1.0)
+        has_step = step > 0.0
+        safe = jnp.where(has_step, step, 1.0)
         for name in _matching(signals, pattern):
             value = jnp.asarray(signals.channels[name])
-            error = jnp.where(some, safe * jnp.round(value / safe) - value, 0.0)
+            error = jnp.where(has_step, safe * jnp.round(value / safe) - value, 0.0)
             changed[name] = value + jax.lax.stop_gradient(error)
     return signals.with_channels(changed)
 
@@ -192,8 +192,8 @@ def _length(dx: Any, dy: Any) -> Any:
     square = dx * dx + dy * dy
     # The inner `where` keeps the root's infinite derivative at zero out of the gradient, which NaN times 0 would
     # poison.
-    some = square > 0.0
-    return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+    nonzero = square > 0.0
+    return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1.0)), 0.0)
 
 
 def _running_sum(increments: Any) -> Any:

@@ -233,10 +233,10 @@ def lag(time: Any, values: Any, constant: Any) -> Any:
     if values.shape[-1] < 2:
         return values
     step = jnp.diff(time, axis=-1)
-    some = constant > 0.0
-    safe = jnp.where(some, constant, 1.0)
+    has_lag = constant > 0.0
+    safe = jnp.where(has_lag, constant, 1.0)
     # At tau = 0 the output is the input: no memory, and a finite derivative.
-    decay = jnp.where(some, jnp.exp(-step / safe), 0.0)
+    decay = jnp.where(has_lag, jnp.exp(-step / safe), 0.0)
     behind = constant * jnp.diff(values, axis=-1) / step
     # e = u - y obeys e_k = decay e_(k-1) + behind (1 - decay)
     decay, source = jnp.broadcast_arrays(decay, behind * (1.0 - decay))

@@ -85,13 +85,13 @@ def surface_type(ctx, p, x, ground):
     A parameter that no map holds stays as the effect `soil` has it; without maps all is soft and the same everywhere.
     The wheel's foot counts, one radius below its centre along the normal of the ground (for rock, its centre).
     """
-    terrain, here = ctx.terrain, ctx.wheel_position
+    terrain, wheel_at = ctx.terrain, ctx.wheel_position
     if terrain.grids is not None:
-        foot = here - ctx.contact.normal * ctx.geometry.radius
+        foot = wheel_at - ctx.contact.normal * ctx.geometry.radius
         ground = dataclasses.replace(ground, **soil_parameters(terrain.grids, foot.x, foot.y))
     if terrain.soil is None:
         return ground
-    fraction = rock_fraction(terrain.soil, here.x, here.y)
+    fraction = rock_fraction(terrain.soil, wheel_at.x, wheel_at.y)
     # Half and half counts as soil: laws of rock and soil do not mix under one wheel.
     return dataclasses.replace(ground, rock=jnp.where(fraction > 0.5, 1.0, 0.0) * jnp.ones_like(ground.rock))
 

@@ -76,8 +76,8 @@ def _remember(ctx, ground, p, x):
 
     The latest place deepens with the wheel: a wheel that is set down touches its first place before it sinks in.
     """
-    here, depth = ctx.wheel_position, ctx.contact.sinkage
-    gone = (here.x - x.place_x[0]) ** 2 + (here.y - x.place_y[0]) ** 2
+    wheel_at, depth = ctx.wheel_position, ctx.contact.sinkage
+    gone = (wheel_at.x - x.place_x[0]) ** 2 + (wheel_at.y - x.place_y[0]) ** 2
     drop = (gone > p.spacing**2) & (depth > 0.0) & (ground.rock < 0.5)
 
     def push(old, new):
@@ -85,7 +85,7 @@ def _remember(ctx, ground, p, x):
 
     deep = push(x.depth, depth)
     latest = jnp.maximum(deep[:1], jnp.where(ground.rock < 0.5, depth, 0.0)[None])
-    places = {"place_x": push(x.place_x, here.x), "place_y": push(x.place_y, here.y)}
+    places = {"place_x": push(x.place_x, wheel_at.x), "place_y": push(x.place_y, wheel_at.y)}
     return places | {"depth": jnp.concatenate([latest, deep[1:]])}
 
 

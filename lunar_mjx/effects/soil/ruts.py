@@ -117,11 +117,11 @@ def _soil(ctx, p, x, ground):
     geometry, contact = ctx.geometry, ctx.contact
     relief = _relief(ctx, p, x, geometry)
     radius, width = geometry.radius, geometry.width
-    here, ahead, beside = ctx.wheel_position, contact.forward, contact.left
+    wheel_at, ahead, beside = ctx.wheel_position, contact.forward, contact.left
     # Which way the wheel rolls, without a jump at rest.
     way = jnp.clip(contact.rim_speed / p.turning, -1.0, 1.0)
     reach = radius * jnp.sin(entrance_angle(contact.sinkage, radius))
-    lead_x, lead_y = here.x + 0.5 * way * reach * ahead.x, here.y + 0.5 * way * reach * ahead.y
+    lead_x, lead_y = wheel_at.x + 0.5 * way * reach * ahead.x, wheel_at.y + 0.5 * way * reach * ahead.y
     _, rut = relief.at(lead_x, lead_y)
     rut = jnp.where(ground.rock > 0.5, 0.0, rut)
     firm = 1.0 + rut / (rut + PATCH.faint * radius) * (jnp.power(1.0 - p.plastic, -ground.n) - 1.0)
@@ -134,8 +134,8 @@ def _soil(ctx, p, x, ground):
     soil = compacted(soil, rut, p.compacted_depth * width)
 
     working = (contact.sinkage > 0.0) & (ground.rock < 0.5) & (jnp.abs(way) > 0.5)
-    share = jnp.reshape(jnp.asarray(_ACROSS, here.x.dtype), (-1, 1))
-    side_x, side_y = here.x + share * width * beside.x, here.y + share * width * beside.y
+    share = jnp.reshape(jnp.asarray(_ACROSS, wheel_at.x.dtype), (-1, 1))
+    side_x, side_y = wheel_at.x + share * width * beside.x, wheel_at.y + share * width * beside.y
     slide = contact.rim_speed - contact.v_x
     # A spinning wheel throws soil back, a braked one shoves it ahead.
     toward = jnp.sign(slide)

@@ -84,7 +84,7 @@ def exchange(
       one counts.
     """
     moved, pressed, tile = ruts["moved"], ruts["pressed"], ruts["tile"]
-    told, told_tile = ground.told
+    moved_soil, told_tile = ground.told
     _, rows, cols = ground.moved.shape
     world = jnp.broadcast_to(ground.world[:, None], moved.shape)
 
@@ -96,20 +96,20 @@ def exchange(
         return jnp.where(inside, col, cols).astype(jnp.int32), jnp.where(inside, row, rows).astype(jnp.int32), inside
 
     # a cell that was given up for the next tile on keeps in the grid what it had been told
-    done = moved - jnp.where(tile == told_tile, told, 0.0)
+    done = moved - jnp.where(tile == told_tile, moved_soil, 0.0)
     col, row, _ = places(tile)
     # Scatters of all rovers at once: soil adds up, whoever moved it, and what lies beyond the grid is dropped.
     total = ground.moved.at[world, row, col].add(done, mode="drop")
     deepest = ground.pressed.at[world, row, col].max(pressed, mode="drop")
 
     # Every patch is laid anew about where its rover is now, whatever it held before.
-    here = tile_of(x / ground.cell, y / ground.cell)
-    col, row, inside = places(here)
+    own_tile = tile_of(x / ground.cell, y / ground.cell)
+    col, row, inside = places(own_tile)
     at = world, row, col
-    own = tile == here
+    own = tile == own_tile
     new = {
         "moved": jnp.where(inside, total.at[at].get(mode="fill", fill_value=0.0), jnp.where(own, moved, 0.0)),
         "pressed": jnp.where(inside, deepest.at[at].get(mode="fill", fill_value=0.0), jnp.where(own, pressed, 0.0)),
-        "tile": here,
+        "tile": own_tile,
     }
     return dataclasses.replace(ground, moved=total, pressed=deepest, told=(new["moved"], new["tile"])), new

@@ -85,14 +85,14 @@ def slope_stiffness(ctx, p, x, ground):
     up = ctx.contact.normal
     # tan^2 of the slope from the normal, without an angle: smooth on level ground.
     grade = (up.x * up.x + up.y * up.y) / (up.z * up.z)
-    taken = grade / jnp.maximum(ground.tan_phi, 0.05) ** 2
+    strength_used = grade / jnp.maximum(ground.tan_phi, 0.05) ** 2
     # Beyond twice its strength no slope stands; there the soil grows no softer.
-    soft = jnp.exp(-p.stiffness * jnp.minimum(taken, 2.0))
+    soft = jnp.exp(-p.stiffness * jnp.minimum(strength_used, 2.0))
     return dataclasses.replace(
         ground,
         k_c=ground.k_c * soft,
         k_phi=ground.k_phi * soft,
-        tan_phi=ground.tan_phi * jnp.exp(-p.friction * jnp.minimum(taken, 2.0)),
+        tan_phi=ground.tan_phi * jnp.exp(-p.friction * jnp.minimum(strength_used, 2.0)),
     )
 
 
@@ -113,9 +113,11 @@ def _patch_parameters() -> dict[str, Parameter]:
             "choice: half as stiff at place 2",
         )
     for i in range(PATCHES):
-        where = f"of place {i}; see `places_along` for those of a track"
-        parameters[f"x_{i}"] = Parameter(1.5 * i, None, (-1e6, 1e6), "m", "x " + where, "choice: every 1.5 m along x")
-        parameters[f"y_{i}"] = Parameter(0.0, None, (-1e6, 1e6), "m", "y " + where, "choice: along x")
+        patch_words = f"of place {i}; see `places_along` for those of a track"
+        parameters[f"x_{i}"] = Parameter(
+            1.5 * i, None, (-1e6, 1e6), "m", "x " + patch_words, "choice: every 1.5 m along x"
+        )
+        parameters[f"y_{i}"] = Parameter(0.0, None, (-1e6, 1e6), "m", "y " + patch_words, "choice: along x")
     parameters["width"] = Parameter(1.0, None, (0.01, 1e4), "m", "standard deviation of a patch", "choice")
     parameters["cohesive"] = Parameter(
         0.5, None, (-2.0, 2.0), "1", "exponent by which cohesion follows the stiffness", "choice"

@@ -270,8 +270,8 @@ def chassis_contact(ctx, p, x, wrench):
     force = normal * load + _sliding_friction(velocity, normal, p.mu, load, p.speed_scale)
     total, moment = force.sum(), arm.cross(force).sum()
     if ctx.terrain.rocks is not None and ctx.rover.box_center is not None:
-        for push, where in _boulders_under_chassis(ctx, p):
-            total, moment = total + push.sum(), moment + where.cross(push).sum()
+        for push, touching_at in _boulders_under_chassis(ctx, p):
+            total, moment = total + push.sum(), moment + touching_at.cross(push).sum()
     return dataclasses.replace(wrench, force=wrench.force + total, moment=wrench.moment + moment)
 
 

@@ -127,13 +127,13 @@ def side_entry(ctx, p, x, normal):
 
     def factor(theta):
         place = r * jnp.sin(theta)
-        now = jnp.maximum(r * (jnp.cos(theta) - jnp.cos(theta_1)), 1e-9 * r)
+        depth_at = jnp.maximum(r * (jnp.cos(theta) - jnp.cos(theta_1)), 1e-9 * r)
         node, weight = first_axis(_ACROSS, place), first_axis(_ACROSS_WEIGHTS, place)
         enters = place + 0.5 * (1.0 + node) * reach
         beside = enters < entrance * (1.0 - 1e-6)
         height = jnp.sqrt(jnp.where(beside, r * r - jnp.where(beside, enters, 0.0) ** 2, r * r))
         depth = jnp.where(beside, jnp.maximum(height - r * jnp.cos(theta_1), 0.0), 0.0)
-        left = 1.0 - (1.0 - p.kept) * depth / now
+        left = 1.0 - (1.0 - p.kept) * depth / depth_at
         return 1.0 + jnp.sum(0.5 * weight * (jnp.maximum(left, 1e-9) ** soil.n - 1.0), axis=0)
 
     return scaled_stress(ctx, normal, factor)

@@ -100,8 +100,8 @@ def look(chart: Chart, price: Any, world: Any, position: Any, yaw: Any, goal: An
     """
     count = price.shape[-1]
     row, column = _nodes(count)
-    here = position / cell
-    dx, dy = column + 0.5 - here[:, 0, None, None], row + 0.5 - here[:, 1, None, None]
+    cell_position = position / cell
+    dx, dy = column + 0.5 - cell_position[:, 0, None, None], row + 0.5 - cell_position[:, 1, None, None]
     far = jnp.sqrt(dx * dx + dy * dy)
     cos, sin = jnp.cos(yaw)[:, None, None], jnp.sin(yaw)[:, None, None]
     ahead = dx * cos + dy * sin > far * math.cos(HALF_VIEW)
@@ -137,7 +137,7 @@ def way(chart: Chart, price: Any, world: Any, position: Any, goal: Any, cell: An
       nodes of the way, both m from the rover; and (env,) the cost of the way, m of open ground.
     """
     count = price.shape[-1]
-    env, here = jnp.arange(position.shape[0]), position / cell
+    env, cell_position = jnp.arange(position.shape[0]), position / cell
     steps = jnp.asarray([(i, j) for j in (-1, 0, 1) for i in (-1, 0, 1)])
     stride = cell * jnp.sqrt(jnp.sum(steps * steps, axis=-1).astype(position.dtype))
     share = jnp.linspace(0.0, 1.0, 2 * STEPS + 1)[1:, None, None]
@@ -146,7 +146,7 @@ def way(chart: Chart, price: Any, world: Any, position: Any, goal: Any, cell: An
         at = jnp.clip(points.astype(jnp.int32), 0, count - 1)
         return chart.seen[env, at[..., 1], at[..., 0]] & jnp.isinf(price[world, at[..., 1], at[..., 0]])
 
-    node = jnp.clip(here.astype(jnp.int32), 0, count - 1)
+    node = jnp.clip(cell_position.astype(jnp.int32), 0, count - 1)
     aim, straight, nodes = node + 0.5, jnp.ones(node.shape[0], bool), []
     left: Any = None
     for k in range(STEPS):
@@ -159,7 +159,7 @@ def way(chart: Chart, price: Any, world: Any, position: Any, goal: Any, cell: An
         if left is None:
             left = jnp.min(total, axis=0)
         node = jnp.take_along_axis(near, best[None, :, None], axis=0)[0]
-        straight = straight & (~blocked(here + share * (node + 0.5 - here)).any(axis=0) | (k == 0))
+        straight = straight & (~blocked(cell_position + share * (node + 0.5 - cell_position)).any(axis=0) | (k == 0))
         aim = jnp.where(straight[:, None], node + 0.5, aim)
         nodes.append((node + 0.5) * cell)
     close = jnp.sum((goal - position) ** 2, axis=-1) < (2.0 * cell) ** 2

@@ -52,10 +52,10 @@ def toward(turn: Any, waited: Any, leaving: Any = False) -> tuple[Any, Any]:
       leaving: whether to go on backwards.
     """
     phase = jnp.floor(waited / FOLLOWING.patience).astype(jnp.int32)
-    back = jnp.where(phase == 0, leaving | (jnp.abs(turn) > 1.9), phase % 2 == 1)
+    backing = jnp.where(phase == 0, leaving | (jnp.abs(turn) > 1.9), phase % 2 == 1)
     forward = jnp.where(jnp.abs(turn) > 0.6, 0.6, 1.0)
     # backwards, the wheels turned away bring the nose round
-    return jnp.where(back, -0.7, forward), jnp.where(back, -1.5, 1.5) * jnp.clip(turn, -1.0, 1.0)
+    return jnp.where(backing, -0.7, forward), jnp.where(backing, -1.5, 1.5) * jnp.clip(turn, -1.0, 1.0)
 
 
 class Follower:
@@ -81,8 +81,8 @@ class Follower:
         way, world = pool.places.way[inner.place], pool.places.world[inner.place]
         position = inner.physics.qpos[:, :2]
         corner = pool.middles[world] - 0.5 * pool.size
-        here = (position - corner) / self.cell
-        node = jnp.clip(here.astype(jnp.int32), 0, count - 1)
+        cell_position = (position - corner) / self.cell
+        node = jnp.clip(cell_position.astype(jnp.int32), 0, count - 1)
         steps = jnp.asarray([(i, j) for j in (-1, 0, 1) for i in (-1, 0, 1)])
         aim = node + 0.5
         seen = jnp.ones(node.shape[0], bool)
@@ -92,12 +92,12 @@ class Follower:
             near = jnp.clip(node + (2 if k == 0 else 1) * steps[:, None, :], 0, count - 1)
             best = jnp.argmin(self.costs[way, near[..., 1], near[..., 0]], axis=0)
             node = jnp.take_along_axis(near, best[None, :, None], axis=0)[0]
-            clear = self._free(way, here + share * (node + 0.5 - here)).all(axis=0)
+            clear = self._free(way, cell_position + share * (node + 0.5 - cell_position)).all(axis=0)
             seen = seen & (clear | (k == 0))
             aim = jnp.where(seen[:, None], node + 0.5, aim)
         target = aim * self.cell + corner
         close = jnp.sum((inner.goal - position) ** 2, axis=-1) < (2.0 * self.cell) ** 2
-        return jnp.where(close[:, None], inner.goal, target) - position, ~self._free(way, here)
+        return jnp.where(close[:, None], inner.goal, target) - position, ~self._free(way, cell_position)
 
     def command(self, inner: Any) -> tuple[Any, Any]:
         """Speed as a share of the top speed, and steering angle in rad, each (env,)."""

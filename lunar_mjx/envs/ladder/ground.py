@@ -107,7 +107,7 @@ def add_craters(rung: Rung, heights: Any, key: Any, hardness: Any) -> Any:
         mean = population.number(small) * rung.size**2
         most = math.ceil(mean + 3.0 * math.sqrt(mean)) + 1
         draws = jax.random.uniform(jax.random.fold_in(key, i), (4, most))
-        here = jnp.arange(most) < jax.random.poisson(jax.random.fold_in(key, 100 + i), mean)
+        present = jnp.arange(most) < jax.random.poisson(jax.random.fold_in(key, 100 + i), mean)
         diameter = (small**-2 - draws[0] * (small**-2 - large**-2)) ** -0.5
         ratio = 0.02 * (rung.deepest / 0.02) ** draws[1] * hardness
         place = (draws[2:] - 0.5) * rung.size
@@ -125,7 +125,7 @@ def add_craters(rung: Rung, heights: Any, key: Any, hardness: Any) -> Any:
             old = jax.lax.dynamic_slice(ground, (row, column), (patch, patch))
             return jax.lax.dynamic_update_slice(ground, old + bowl, (row, column)), None
 
-        depth = jnp.where(here, ratio * diameter, 1e-9)
+        depth = jnp.where(present, ratio * diameter, 1e-9)
         heights, _ = jax.lax.scan(stamp, heights, (place[0], place[1], diameter, depth))
     return heights
 
@@ -141,10 +141,10 @@ def boulders(rung: Rung, heights: Any, key: Any, hardness: Any) -> tuple[Any, An
     # fields of boulders: where a smooth field is high they lie twice as dense as on average, elsewhere hardly any
     dense = jax.image.resize(jax.random.normal(k_field, (max(2, count // 5),) * 2), (count, count), "cubic")
     share = 2.0 * jax.nn.sigmoid(2.0 * dense)
-    there = jax.random.uniform(k_there, (count, count)) < rung.presence * hardness * share
+    present = jax.random.uniform(k_there, (count, count)) < rung.presence * hardness * share
     at = nodes(rung.size, side)
     free = jnp.abs(at) < 0.5 * rung.size - RIM
-    there = (there | ridge) & free[:, None] & free[None, :]
+    present = (present | ridge) & free[:, None] & free[None, :]
     room = 0.5 * (side - diameter)[..., None] * jnp.where(ridge, 0.3, 0.9)[..., None]
     shift = room * jax.random.uniform(k_place, (count, count, 2), minval=-1.0, maxval=1.0)
     x, y = at[None, :] + shift[..., 0], at[:, None] + shift[..., 1]
@@ -153,7 +153,7 @@ def boulders(rung: Rung, heights: Any, key: Any, hardness: Any) -> tuple[Any, An
     row, column = (jnp.clip(((c + 0.5 * rung.size) / rung.cell).astype(jnp.int32), 0, cells - 1) for c in (y, x))
     z = heights[row, column] + (1.0 - 2.0 * BURIAL) * radius
     centers = jnp.stack([x, y, z], axis=-1).reshape(-1, 3)
-    return centers, jnp.where(there, radius, 0.0).reshape(-1)
+    return centers, jnp.where(present, radius, 0.0).reshape(-1)
 
 
 def ridges(rung: Rung, key: Any, hardness: Any) -> Any:

@@ -70,8 +70,8 @@ class Planner:
         if not near.any():
             return np.full(x.shape, np.inf)
         centers, radii = centers[near], radii[near]
-        apart, which = KDTree(centers).query(np.column_stack([x.ravel(), y.ravel()]), k=min(16, len(radii)))
-        gaps = apart.reshape(x.size, -1) - radii[which.reshape(x.size, -1)]
+        apart, nearest = KDTree(centers).query(np.column_stack([x.ravel(), y.ravel()]), k=min(16, len(radii)))
+        gaps = apart.reshape(x.size, -1) - radii[nearest.reshape(x.size, -1)]
         return gaps.min(axis=1).reshape(x.shape)
 
     def _edges(self, cost: np.ndarray) -> Any:
@@ -80,10 +80,10 @@ class Planner:
         for j, i in _STEPS:
             one = np.s_[: n - j, max(0, -i) : n - max(0, i)]
             other = np.s_[j:, max(0, i) : n - max(0, -i)]
-            both = self.free[one] & self.free[other]
-            begins.append(number[one][both])
-            ends.append(number[other][both])
-            lengths.append((0.5 * (cost[one] + cost[other]) * math.hypot(i, j) * self.cell)[both])
+            both_free = self.free[one] & self.free[other]
+            begins.append(number[one][both_free])
+            ends.append(number[other][both_free])
+            lengths.append((0.5 * (cost[one] + cost[other]) * math.hypot(i, j) * self.cell)[both_free])
         begin, end, length = (np.concatenate(a) for a in (begins, ends, lengths))
         return coo_array((length, (begin, end)), shape=(n * n, n * n)).tocsr()
 

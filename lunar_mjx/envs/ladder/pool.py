@@ -145,7 +145,7 @@ def _middles(worlds: int, across: int, size: float) -> np.ndarray:
 
 def _atlas(rung: Rung, world: World, middles: np.ndarray, across: int) -> Terrain:
     """The worlds' grids side by side, and their boulders in one list; what is left over of the map is level."""
-    count, each = world.radii.shape
+    count, rocks_each = world.radii.shape
     rows = math.ceil(count / across)
 
     def tiled(grids: Any, fill: Any) -> Any:
@@ -154,8 +154,8 @@ def _atlas(rung: Rung, world: World, middles: np.ndarray, across: int) -> Terrai
         high, wide = grids.shape[1:]
         return full.reshape(rows, across, high, wide).swapaxes(1, 2).reshape(rows * high, across * wide)
 
-    number = world.index + each * jnp.arange(count)[:, None, None]
-    index = jnp.where(world.index == each, count * each, number)
+    number = world.index + rocks_each * jnp.arange(count)[:, None, None]
+    index = jnp.where(world.index == rocks_each, count * rocks_each, number)
     shift = jnp.pad(jnp.asarray(middles, jnp.float32), ((0, 0), (0, 1)))
     centers = (world.centers + shift[:, None]).reshape(-1, 3)
     west, south = (-0.5 * n * rung.size for n in (across, rows))
@@ -166,7 +166,7 @@ def _atlas(rung: Rung, world: World, middles: np.ndarray, across: int) -> Terrai
     rocks = Rocks(
         jnp.pad(centers, ((0, 1), (0, 0))),
         jnp.pad(world.radii.reshape(-1), (0, 1)),
-        tiled(index, count * each),
+        tiled(index, count * rocks_each),
         *(jnp.float32(v) for v in (west, south, CELL)),
     )
     return Terrain(field, rocks, None, jnp.zeros(3), "ladder")
@@ -177,13 +177,13 @@ def _places(goals: dict[str, Any], valid: np.ndarray, middles: np.ndarray, seed:
     starts, shortest = (np.asarray(goals[k]) for k in ("starts", "shortest"))
     good = np.flatnonzero(valid.reshape(-1))
     way = np.repeat(np.resize(good, valid.size), starts.shape[2])
-    which = np.tile(np.arange(starts.shape[2]), valid.size)
+    world_number = np.tile(np.arange(starts.shape[2]), valid.size)
     world = way // valid.shape[1]
-    start = starts.reshape(-1, starts.shape[2], 2)[way, which] + middles[world]
+    start = starts.reshape(-1, starts.shape[2], 2)[way, world_number] + middles[world]
     goal = np.asarray(goals["goal"]).reshape(-1, 2)[way] + middles[world]
     bearing = np.arctan2(*(goal - start).T[::-1])
     # from any side but the far one: a rover need not drive around its goal
     arrival = bearing + np.random.default_rng([seed, 17]).uniform(-0.5 * np.pi, 0.5 * np.pi, len(way))
-    shortest = shortest.reshape(-1, starts.shape[2])[way, which]
+    shortest = shortest.reshape(-1, starts.shape[2])[way, world_number]
     start, goal, arrival, shortest = (jnp.asarray(a, jnp.float32) for a in (start, goal, arrival, shortest))
     return Places(start, goal, arrival, shortest, jnp.asarray(way), jnp.asarray(world))

@@ -88,8 +88,8 @@ class Rung:
         """Share of the lattice's squares beside ridges that hold a scattered boulder."""
         mean_area = float(np.mean(np.pi / 4.0 * self.diameters() ** 2))
         in_ridges = self.on_edges * np.pi / 4.0 * self.ridge_diameter**2 / self.lattice**2
-        rest = (self.coverage - in_ridges) * self.lattice**2 / mean_area
-        return rest / (1.0 - self.on_edges)
+        outside_ridges = (self.coverage - in_ridges) * self.lattice**2 / mean_area
+        return outside_ridges / (1.0 - self.on_edges)
 
     def diameters(self, count: int = 256) -> np.ndarray:
         """Quantiles of the diameters: dN ~ D^-2 exp(-q D) dD between the bounds, q = 1.79 (Golombek & Rapp 1997)."""

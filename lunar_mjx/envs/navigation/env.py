@@ -159,9 +159,9 @@ def plausible(qpos: Any, qvel: Any, ground: Any) -> Any:
       qpos: (env, nq), qvel: (env, nv), of a free body and its joints. ground: lowest and highest ground, m.
     """
     low, high = ground[0] - PLAUSIBLE.most_height, ground[1] + PLAUSIBLE.most_height
-    there = (qpos[:, 2] > low) & (qpos[:, 2] < high) & (jnp.abs(qpos[:, 7:]) < PLAUSIBLE.most_value).all(-1)
+    in_range = (qpos[:, 2] > low) & (qpos[:, 2] < high) & (jnp.abs(qpos[:, 7:]) < PLAUSIBLE.most_value).all(-1)
     slow = (jnp.abs(qvel[:, :3]) < PLAUSIBLE.most_speed).all(-1) & (jnp.abs(qvel[:, 3:]) < PLAUSIBLE.most_turn).all(-1)
-    return there & slow
+    return in_range & slow
 
 
 def bounded(a: Any) -> Any:
@@ -301,15 +301,15 @@ class NavigationEnv:
     def reset(self, params: NavigationParams, keys: Any) -> State:
         """Begins an episode in every environment; `keys` (env, 2) raw random keys."""
         # the first episode and the prepared one in one batch: half the program to compile
-        both = self._begin(params, jnp.concatenate([keys, _split(keys)[:, 0]]))
+        begun = self._begin(params, jnp.concatenate([keys, _split(keys)[:, 0]]))
         first, ready = (
-            jax.tree.map(lambda a, p=part: a[p], both) for part in (slice(keys.shape[0]), slice(keys.shape[0], None))
+            jax.tree.map(lambda a, p=part: a[p], begun) for part in (slice(keys.shape[0]), slice(keys.shape[0], None))
         )
         obs, privileged, inner = first.obs, first.privileged, first.inner
         zero, no = jnp.zeros(keys.shape[0], obs.dtype), jnp.zeros(keys.shape[0], bool)
         terms = (f"reward_{n}" for n in self.config.weights)
-        told = tally.METRICS if self.config.tally else ()
-        names = ("episode_return", "episode_length", "success", *self._ends_told[1:], *told, *terms)
+        metric_names = tally.METRICS if self.config.tally else ()
+        names = ("episode_return", "episode_length", "success", *self._ends_told[1:], *metric_names, *terms)
         metrics = dict.fromkeys(names, zero)
         inner = dataclasses.replace(inner, ready=ready, used=no, chart=self._blank(params, inner))
         return State(obs, privileged, zero, no, no, obs, privileged, metrics, first.info, inner)
@@ -399,8 +399,8 @@ class NavigationEnv:
         short = (done & inner.used).any() | (inner.used.mean(dtype=jnp.float32) > _USED)
         # a loop of no or one turn: unlike a conditional, it leaves what it does not change where it is
         _, (ready, used) = jax.lax.while_loop(lambda carry: carry[0], prepare, (short, kept))
-        here = side_by_side((state.obs, state.privileged, state.info, alone))
-        obs, privileged, info, alone = where(done, (ready.obs, ready.privileged, ready.info, ready.inner), here)
+        per_rover = side_by_side((state.obs, state.privileged, state.info, alone))
+        obs, privileged, info, alone = where(done, (ready.obs, ready.privileged, ready.info, ready.inner), per_rover)
         known = inner.chart
         if known is not None:
             # a blank chart is cheaper made than kept
@@ -477,8 +477,10 @@ class NavigationEnv:
         if inner.chart is not None:
             assert params.pool is not None
             place, yaw = self._on_chart(params, inner), self._reader.pose(physics)["yaw"]
-            price, world, here, goal, cell = place
-            inner = dataclasses.replace(inner, chart=chart.look(inner.chart, price, world, here, yaw, goal, cell))
+            price, world, map_position, goal, cell = place
+            inner = dataclasses.replace(
+                inner, chart=chart.look(inner.chart, price, world, map_position, yaw, goal, cell)
+            )
         view = self._view(params, inner)
         if inner.tally is not None and self._outline is not None:
             touching = self._outline.touches(params.system.terrain, view)
@@ -498,8 +500,8 @@ class NavigationEnv:
             diverged = ~(fine & plausible(physics.qpos, physics.qvel, ground))
         else:
             diverged = jnp.zeros_like(fine)
-        here = view.position[:, :2]
-        inside = ((here > view.corners[:, 0]) & (here < view.corners[:, 1])).all(-1)
+        position_xy = view.position[:, :2]
+        inside = ((position_xy > view.corners[:, 0]) & (position_xy < view.corners[:, 1])).all(-1)
         reached = rewards.reached(to_goal, c.goal_radius)
         if c.arrive_within < np.pi and view.arrival is not None:
             reached = reached & (jnp.cos(view.arrival - view.yaw) > np.cos(c.arrive_within))
@@ -515,10 +517,10 @@ class NavigationEnv:
         if self._battery:
             found["drained"] = physics.effects["battery"]["flat"] > 0.5
         # Exclusive, so that the shares of all ends add up to one.
-        taken = jnp.zeros_like(fine)
+        no_reward = jnp.zeros_like(fine)
         for name, happened in found.items():
-            found[name] = happened & ~taken
-            taken = taken | happened
+            found[name] = happened & ~no_reward
+            no_reward = no_reward | happened
         return found
 
     def _fresh(self, params: NavigationParams, keys: Any) -> Inner:
@@ -583,8 +585,8 @@ class NavigationEnv:
         pool = params.pool
         world = pool.places.world[inner.place]
         corner = pool.middles[world] - 0.5 * pool.size
-        here = inner.physics.qpos[:, :2] - corner
-        return pool.prices, world, here, inner.goal - corner, pool.size / pool.prices.shape[-1]
+        on_map = inner.physics.qpos[:, :2] - corner
+        return pool.prices, world, on_map, inner.goal - corner, pool.size / pool.prices.shape[-1]
 
     def _blank(self, params: NavigationParams, inner: Inner) -> chart.Chart | None:
         """The charts of rovers that have seen nothing; None unless they are observed."""
@@ -597,11 +599,11 @@ class NavigationEnv:
         """The field `plan` of `View`; of who has seen nothing yet, straight for the goal."""
         if "plan" not in self.config.observations:
             return None
-        price, world, here, goal, cell = self._on_chart(params, inner)
+        price, world, map_position, goal, cell = self._on_chart(params, inner)
         if inner.chart is None:
-            aim, nodes, left = chart.straight(here, goal, cell)
+            aim, nodes, left = chart.straight(map_position, goal, cell)
         else:
-            aim, nodes, left = chart.way(inner.chart, price, world, here, goal, cell)
+            aim, nodes, left = chart.way(inner.chart, price, world, map_position, goal, cell)
         return jnp.concatenate([aim, nodes.reshape(aim.shape[0], -1), left[:, None]], axis=-1)
 
     def _charge(self, params: NavigationParams, inner: Inner) -> Any:

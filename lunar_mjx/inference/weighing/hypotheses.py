@@ -94,12 +94,12 @@ class Linear:
         places = np.concatenate([self.always, *own]).astype(int)
         # An effect of the refit that is no term of this hypothesis goes back to its null.
         gone = [p for name, p in self.effects.items() if name not in named and np.any(self.at[p] != 0.0)]
-        gram, back = self.gram, np.zeros(self.gram.width)
+        gram, discrepancy_back = self.gram, np.zeros(self.gram.width)
         for p in gone:
             # From where the refit stands to zero amplitude, by the linear model.
-            back[p] = -self.at[p]
+            discrepancy_back[p] = -self.at[p]
         if gone:
-            gram = shifted(gram, back)
+            gram = shifted(gram, discrepancy_back)
         std = self.amplitudes.std.copy()
         for t in terms:
             if t.kind == CALIBRATION:
@@ -110,7 +110,7 @@ class Linear:
         found = infer(gram.select(places), prior, fields, self.noises, start)
         value = found.log_evidence + found.log_inside(self.low[places], self.high[places])
         if self.judged is not None:
-            held = self.judged if not gone else shifted(self.judged, back)
+            held = self.judged if not gone else shifted(self.judged, discrepancy_back)
             value += found.log_score(held.select(places))
         return value, found, places
 

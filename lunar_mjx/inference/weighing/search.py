@@ -188,17 +188,17 @@ class _Search:
         open_ = [h for h in near if (h.form, h.effects) not in self.done]
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
         # order of what it promises there. Else one form's many neighbours would take the refits that tell which it is.
-        others = [f for f in self.forms if best.refitted and (f.name, best.effects) not in self.done]
-        others = [f for f in others if best.effects <= {t.name for t in f.terms}]
-        promise = {f.name: _carried_over(listed, best, f.name) for f in others}
-        others.sort(key=lambda f: -promise[f.name])
+        other_forms = [f for f in self.forms if best.refitted and (f.name, best.effects) not in self.done]
+        other_forms = [f for f in other_forms if best.effects <= {t.name for t in f.terms}]
+        promise = {f.name: _carried_over(listed, best, f.name) for f in other_forms}
+        other_forms.sort(key=lambda f: -promise[f.name])
         chosen = max(open_, key=lambda h: h.log_posterior, default=None)
-        if chosen is not None and not (others and promise[others[0].name] > chosen.log_posterior):
+        if chosen is not None and not (other_forms and promise[other_forms[0].name] > chosen.log_posterior):
             self.refit(by_name[chosen.form], chosen.effects, chosen)
             provisional(self.ranked(False))
             return True
-        if others:
-            self.refit(others[0], best.effects, None)
+        if other_forms:
+            self.refit(other_forms[0], best.effects, None)
             return True
         # What leaving an effect out costs is told by a refit: where several do the work of one another, the linear
         # estimate about the full set is much too high, and a set that grew around a wrong first step would stand.

@@ -53,18 +53,18 @@ def _check_table(log: Log, table: LogTable) -> list[Finding]:
         return [_finding(log, table, row, "clock", f"is empty in {missing.size} rows; every row needs its time")]
     # Order first: every later check divides by steps or sorts by time.
     steps = np.diff(time)
-    back = np.flatnonzero(steps <= 0.0)
-    if back.size:
-        row = int(back[0]) + 1
-        what = "repeats" if steps[row - 1] == 0.0 else "goes back"
+    backward = np.flatnonzero(steps <= 0.0)
+    if backward.size:
+        row = int(backward[0]) + 1
+        event = "repeats" if steps[row - 1] == 0.0 else "goes back"
         return [
             _finding(
                 log,
                 table,
                 row,
                 "clock",
-                f"{what}: {time[row]:.6g} s after {time[row - 1]:.6g} s, and so in "
-                f"{back.size} rows; sort the rows and drop copies",
+                f"{event}: {time[row]:.6g} s after {time[row - 1]:.6g} s, and so in "
+                f"{backward.size} rows; sort the rows and drop copies",
             )
         ]
     found = [] if table.on_change else _check_rate(log, table, steps)

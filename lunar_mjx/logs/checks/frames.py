@@ -219,14 +219,18 @@ def _velocities(log: Log) -> list[Finding]:
         x, y = (at(log, f"{frame}_velocity_{a}_m_s", time) for a in "xy")
         speed[frame] = np.hypot(x, y)  # type: ignore[arg-type]
     noise = max(sigma(log, f"{k}_velocity_x_m_s") for k in ("world", "body"))
-    both = agreement(speed["body"], speed["world"], noise)
-    if both is not None and both.cosine > FRAME_LIMITS.alike and abs(both.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
+    shared = agreement(speed["body"], speed["world"], noise)
+    if (
+        shared is not None
+        and shared.cosine > FRAME_LIMITS.alike
+        and abs(shared.factor - 1.0) > FRAME_LIMITS.factor_tolerance
+    ):
         return [
             _finding(
                 log,
                 "body_velocity_x_m_s",
                 "unit",
-                f"is {both.factor:.3g} times the world velocity in size{guess(both.factor)}; correct its unit",
+                f"is {shared.factor:.3g} times the world velocity in size{guess(shared.factor)}; correct its unit",
             )
         ]
     return []
@@ -265,8 +269,8 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
     found = []
     for key, (integral, rate) in pairs.items():
         own = rate_agreement(log, integral, rate, scale)
-        others = [p[1] for k, p in pairs.items() if k != key]
-        twin = next((o for o in others if _alike(rate_agreement(log, integral, o, scale))), None)
+        other_pairs = [p[1] for k, p in pairs.items() if k != key]
+        twin = next((o for o in other_pairs if _alike(rate_agreement(log, integral, o, scale))), None)
         cosine = 0.0 if own is None else own.cosine
         if twin is not None and abs(cosine) < FRAME_LIMITS.unlike and span(log, (rate,)) is not None:
             text = f"has nothing in common with {what} {integral} (cosine {cosine:.2f}), which {twin} follows"

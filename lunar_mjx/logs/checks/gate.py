@@ -31,11 +31,11 @@ def check(logs: Log | SteadyLog | Sequence[Log | SteadyLog], slowest_s: Slowest 
     Returns:
       Findings in the order of the logs; those of severity `BAD_DATA` make a log unusable. Empty for a good log.
     """
-    several = [logs] if isinstance(logs, Log | SteadyLog) else list(logs)
+    log_list = [logs] if isinstance(logs, Log | SteadyLog) else list(logs)
     findings: list[Finding] = []
-    for log in several:
+    for log in log_list:
         findings += list(log.problems) + (check_steady(log) if isinstance(log, SteadyLog) else _check_drive(log))
-    return findings + _check_length(several, slowest_s or {})
+    return findings + _check_length(log_list, slowest_s or {})
 
 
 def _check_drive(log: Log) -> list[Finding]:

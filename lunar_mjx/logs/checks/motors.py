@@ -127,8 +127,8 @@ def _together(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _held(log: Log, name: str, time: np.ndarray) -> np.ndarray:
-    when, values = log.channel(name)  # type: ignore[misc]
-    return values[np.maximum(np.searchsorted(when, time + 1e-6, side="right") - 1, 0)]
+    command_times, values = log.channel(name)  # type: ignore[misc]
+    return values[np.maximum(np.searchsorted(command_times, time + 1e-6, side="right") - 1, 0)]
 
 
 def _swapped(
@@ -211,9 +211,9 @@ def _crossed_speeds(log: Log, kind: str, angles: dict[str, str], speeds: dict[st
         return np.diff(at(log, name, time)) / length  # type: ignore[arg-type]
 
     def mean(name: str) -> np.ndarray:
-        when, values = continuous(log, name)  # type: ignore[misc]
-        total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(when))])
-        return np.diff(np.interp(time, when, total)) / length
+        sample_times, values = continuous(log, name)  # type: ignore[misc]
+        total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(sample_times))])
+        return np.diff(np.interp(time, sample_times, total)) / length
 
     return _swapped(
         log,

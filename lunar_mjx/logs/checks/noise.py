@@ -49,9 +49,9 @@ def rest_segments(log: Log) -> list[tuple[float, float]]:
         return []
     start, end = log.span_s
     grid = np.arange(start, end, 0.05)
-    rest = np.ones(len(grid), bool)
+    at_rest = np.ones(len(grid), bool)
     for name in commands:
-        rest &= _quiet_command(log, name, grid)
+        at_rest &= _quiet_command(log, name, grid)
     for name in log.channel_names:
         if is_quantity(name, "joint_speed"):
             found = log.channel(name)
@@ -59,8 +59,8 @@ def rest_segments(log: Log) -> list[tuple[float, float]]:
                 continue
             noise = log.noise[name].std if name in log.noise else 0.0
             speed = np.interp(grid, found[0], np.abs(_medians(found[1])))
-            rest &= speed < max(NOISE_LIMITS.still, noise)
-    return _spans(grid, rest)
+            at_rest &= speed < max(NOISE_LIMITS.still, noise)
+    return _spans(grid, at_rest)
 
 
 def _medians(values: np.ndarray) -> np.ndarray:
@@ -76,8 +76,8 @@ def _quiet_command(log: Log, name: str, grid: np.ndarray) -> np.ndarray:
     time, values = found
     held = values[np.maximum(np.searchsorted(time, grid + 1e-6, side="right") - 1, 0)]
     quiet = np.ones(len(grid), bool) if is_quantity(name, "command_angle") else held == 0.0
-    for when in time[1:][np.diff(values) != 0.0]:
-        quiet &= (grid < when) | (grid > when + NOISE_LIMITS.settle)
+    for change_time in time[1:][np.diff(values) != 0.0]:
+        quiet &= (grid < change_time) | (grid > change_time + NOISE_LIMITS.settle)
     return quiet
 
 

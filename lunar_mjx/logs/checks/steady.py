@@ -182,8 +182,8 @@ def _clipped(log: SteadyLog) -> list[Finding]:
     for quantity, values in log.table.measured.items():
         count = np.unique(values, return_counts=True)[1]
         for at, extreme in ((-1, values.max()), (0, values.min())):
-            others = np.delete(count, at)
-            often = max(8.0, _AT_LIMIT * len(values), 4.0 * float(others.max(initial=1)))
+            other_counts = np.delete(count, at)
+            often = max(8.0, _AT_LIMIT * len(values), 4.0 * float(other_counts.max(initial=1)))
             if len(count) > 2 and extreme != 0.0 and count[at] >= often:
                 row = int(np.argmax(values == extreme))
                 message = f"stays at {extreme:.5g} in {count[at]} of {len(values)} rows; leave out what was cut off"
@@ -193,11 +193,11 @@ def _clipped(log: SteadyLog) -> list[Finding]:
 
 def _noiseless(log: SteadyLog) -> list[Finding]:
     """Quantities whose noise neither the log nor replicates tell: nothing could be counted in sigma."""
-    told = average(log.table).sigma
+    stated_sigma = average(log.table).sigma
     found = []
     for quantity in log.table.measured:
         column = QUANTITIES[quantity][0]
-        if not told.get(quantity, 0.0) > 0.0 and column not in log.noise:
+        if not stated_sigma.get(quantity, 0.0) > 0.0 and column not in log.noise:
             message = (
                 f"nothing tells its noise; state [noise.{column}] std in log.toml, give replicates, or leave it out"
             )
@@ -230,10 +230,10 @@ def _replicates(log: SteadyLog) -> list[Finding]:
         )
         # A wrong statement is wrong at most points: where noise differs between points the median point tells.
         usual = _scatter_of_median_point(residual, group, count)
-        several = count > 1
-        squares = np.bincount(group, weights=(values - mean[group]) ** 2)[several]
-        level = np.sqrt(np.bincount(group, weights=stated**2) / count)[several]
-        honest = grows(squares, count[several] - 1, mean[several], level)
+        repeated = count > 1
+        squares = np.bincount(group, weights=(values - mean[group]) ** 2)[repeated]
+        level = np.sqrt(np.bincount(group, weights=stated**2) / count)[repeated]
+        honest = grows(squares, count[repeated] - 1, mean[repeated], level)
         if (min(ratio, usual) > NOISE_LIMITS.factor and high and not honest) or (
             max(ratio, usual) < 1.0 / NOISE_LIMITS.factor and low
         ):
@@ -270,6 +270,6 @@ def _scatter_of_median_point(residual: np.ndarray, group: np.ndarray, count: np.
       residual: (row,) from the mean of its point, in stated sigma. group: (row,) number of its point. count: (point,)
         rows of each.
     """
-    several = count > 1
-    squares = np.bincount(group, weights=residual**2)[several]
-    return float(np.sqrt(np.median(squares / stats.chi2.median(count[several] - 1))))
+    repeated = count > 1
+    squares = np.bincount(group, weights=residual**2)[repeated]
+    return float(np.sqrt(np.median(squares / stats.chi2.median(count[repeated] - 1))))

@@ -54,21 +54,21 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
         return [Finding(log.name, table.name, row, column, kind, message)]
 
     values = table.channels[name]
-    there = np.isfinite(values)
-    if not there.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return finding(None, "dropout", "is empty; leave the column out")
     # a short table whose sensor loses fewer cells than that may still have lost more by chance
-    chance = VALUE_LIMITS.by_chance * np.sqrt(CLOCK_LIMITS.lost_share * (1.0 - CLOCK_LIMITS.lost_share) / len(there))
-    if (share := _lost(there)) > CLOCK_LIMITS.lost_share + chance:
+    chance = VALUE_LIMITS.by_chance * np.sqrt(CLOCK_LIMITS.lost_share * (1.0 - CLOCK_LIMITS.lost_share) / len(finite))
+    if (share := _lost(finite)) > CLOCK_LIMITS.lost_share + chance:
         return finding(
-            int(np.argmin(there)),
+            int(np.argmin(finite)),
             "dropout",
             f"is empty in {100 * share:.0f} % of its rows (at most "
             f"{100 * (CLOCK_LIMITS.lost_share + chance):.0f} % may be); record it anew, leave the column out or, if "
             "its sensor only reports now and then, give it a table of its own with on_change = true",
         )
     low, high, why = limits(name)
-    beyond = there & ((values < low) | (values > high))
+    beyond = finite & ((values < low) | (values > high))
     if beyond.any():
         row = int(np.argmax(beyond))
         return finding(
@@ -77,17 +77,17 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
             f"is {values[row]:.6g}, outside [{low:g}, {high:g}] ({why}), and so in "
             f"{int(beyond.sum())} rows; check its unit, or leave these cells empty",
         )
-    if name.endswith("_temperature_degC") and (text := _kelvin(log, values[there])):
-        return finding(int(np.argmax(there)), "unit", text)
+    if name.endswith("_temperature_degC") and (text := _kelvin(log, values[finite])):
+        return finding(int(np.argmax(finite)), "unit", text)
     if is_command(name):
         return []
     # a receiver that holds its fix at rest, and an encoder that stands, are not broken
-    judged = _judged(log, table, name, there)
-    stuck = _stuck(log, table, name, values[there], judged[there])
+    judged = _judged(log, table, name, finite)
+    stuck = _stuck(log, table, name, values[finite], judged[finite])
     if stuck is not None:
         first, length, value = stuck
-        row = int(np.flatnonzero(there)[first])
-        extreme = value in (values[there].min(), values[there].max()) and np.ptp(values[there]) > 0.0
+        row = int(np.flatnonzero(finite)[first])
+        extreme = value in (values[finite].min(), values[finite].max()) and np.ptp(values[finite]) > 0.0
         what, kind = ("lies at its extreme", "saturated") if extreme else ("is stuck at", "stuck")
         return finding(
             row,
@@ -95,14 +95,14 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
             f"{what} {value:.6g} for {length} samples in a row, which its noise rules out; "
             "leave these cells empty or the column out",
         )
-    clipped = _clipped(log, name, values[there & judged])
+    clipped = _clipped(log, name, values[finite & judged])
     if clipped is not None:
-        row = int(np.flatnonzero(there & (values == clipped))[0])
+        row = int(np.flatnonzero(finite & (values == clipped))[0])
         count = int((values[judged] == clipped).sum())
         return finding(
             row,
             "saturated",
-            f"is exactly {clipped:.6g}, its extreme, in {count} of {int(there.sum())} "
+            f"is exactly {clipped:.6g}, its extreme, in {count} of {int(finite.sum())} "
             "samples: the sensor is clipped; leave these cells empty",
         )
     return []
@@ -134,10 +134,10 @@ def _lost(there: np.ndarray) -> float:
     """Share of a column's samples that are lost: of all rows, or of every k-th where a slower sensor fills these."""
     rows = np.flatnonzero(there)
     distances = np.diff(rows)
-    every = int(np.median(distances)) if distances.size else 1
-    if every < 2 or float((distances == every).mean()) < VALUE_LIMITS.evenly:
+    spacing = int(np.median(distances)) if distances.size else 1
+    if spacing < 2 or float((distances == spacing).mean()) < VALUE_LIMITS.evenly:
         return float(1.0 - there.mean())
-    return max(0.0, 1.0 - len(rows) * every / len(there))
+    return max(0.0, 1.0 - len(rows) * spacing / len(there))
 
 
 MOVED = ("position", "attitude", "velocity", "joint")
@@ -197,8 +197,8 @@ def _possible_run(noise: float, step: float, count: int) -> float:
     At least a tenth of the variance is taken to be white, the rest to stand still in the middle of a quantum.
     """
     inside = math.erf(0.5 * step / (np.sqrt(0.1) * noise * np.sqrt(2.0)))
-    same = min(inside**2 + 0.5 * (1.0 - inside) ** 2, 1.0 - 1e-12)
-    return max(VALUE_LIMITS.shortest_run, math.log(VALUE_LIMITS.chance / count) / math.log(max(same, 1e-3)))
+    repeat_chance = min(inside**2 + 0.5 * (1.0 - inside) ** 2, 1.0 - 1e-12)
+    return max(VALUE_LIMITS.shortest_run, math.log(VALUE_LIMITS.chance / count) / math.log(max(repeat_chance, 1e-3)))
 
 
 def _siblings(table: LogTable, name: str) -> list[np.ndarray]:
@@ -207,8 +207,10 @@ def _siblings(table: LogTable, name: str) -> list[np.ndarray]:
     corner = found[1].groupdict().get("corner") if found else None
     if corner is None:
         return []
-    others = (name.replace(f"_{corner}_", f"_{c}_") for c in MIRROR if c != corner)
-    return [v[np.isfinite(v)] for o in others if (v := table.channels.get(o)) is not None and np.isfinite(v).any()]
+    sibling_names = (name.replace(f"_{corner}_", f"_{c}_") for c in MIRROR if c != corner)
+    return [
+        v[np.isfinite(v)] for o in sibling_names if (v := table.channels.get(o)) is not None and np.isfinite(v).any()
+    ]
 
 
 def _siblings_quantum(table: LogTable, name: str) -> float | None:

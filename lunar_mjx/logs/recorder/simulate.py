@@ -182,8 +182,12 @@ def _drive(
     model: Model, moves: Commands, start: tuple[float, float, float], engine: str
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Stands, then drives: time from 0, and what perfect instruments with the model's sensor effects would write."""
-    every = round(moves.interval / model.timestep)
-    split = next(k for k in range(1, every + 1) if (every % k == 0 and moves.interval / k <= _FINEST) or k == every)
+    steps_per_command = round(moves.interval / model.timestep)
+    split = next(
+        k
+        for k in range(1, steps_per_command + 1)
+        if (steps_per_command % k == 0 and moves.interval / k <= _FINEST) or k == steps_per_command
+    )
     fine = np.repeat(moves.values, split, axis=0)
     interval = moves.interval / split
     settle = round(SETTLE / interval)
@@ -206,5 +210,5 @@ def _drive(
 def _after(seen: Any, first: int, origin: float) -> Any:
     import jax
 
-    rest = jax.tree.map(lambda a: np.asarray(a)[first:], seen)
-    return dataclasses.replace(rest, time=rest.time - origin)
+    later = jax.tree.map(lambda a: np.asarray(a)[first:], seen)
+    return dataclasses.replace(later, time=later.time - origin)

@@ -243,8 +243,8 @@ def smallest_gap(centers: np.ndarray, radii: np.ndarray) -> float:
     gap = np.inf
     # Ten metres more than the radii: gaps wider than that matter to nobody.
     for k, near in enumerate(tree.query_ball_point(centers[:, :2], radii + radii.max() + 10.0)):
-        others = np.array([n for n in near if n != k], int)
-        if len(others):
-            distance = np.hypot(*(centers[others, :2] - centers[k, :2]).T) - radii[others] - radii[k]
+        neighbours = np.array([n for n in near if n != k], int)
+        if len(neighbours):
+            distance = np.hypot(*(centers[neighbours, :2] - centers[k, :2]).T) - radii[neighbours] - radii[k]
             gap = min(gap, float(distance.min()))
     return gap

@@ -115,8 +115,8 @@ def compute_horizon(
             at_x = x[:, None] + np.sin(bearing) * steps
             at_y = y[:, None] + np.cos(bearing) * steps
             rise = _heights(dem, at_x, at_y) - stand[:, None] - steps**2 / (2.0 * HORIZON_GRID.moon_radius)
-            here = (at_x >= w) & (at_x <= e) & (at_y >= s) & (at_y <= n)
-            steepest = np.where(here, rise / steps, 0.0).max(axis=1)
+            inside = (at_x >= w) & (at_x <= e) & (at_y >= s) & (at_y <= n)
+            steepest = np.where(inside, rise / steps, 0.0).max(axis=1)
             # The highest of all DEMs: where two overlap, the coarser one may miss a ridge but invents none.
             elevation[k] = np.maximum(elevation[k], np.arctan(steepest))
     return Horizon(

@@ -167,8 +167,8 @@ def _array(path: Path, name: str, values: np.ndarray, place: Place) -> Dem:
             path, "cell", None, "leaves the arrays without a scale", "give it in the file or the table, in m"
         )
     if values.dtype.kind not in "iuf" or values.ndim != 2 or min(values.shape) < 2:
-        told = f"{values.dtype} of shape {values.shape}"
-        raise bad_input(path, name, told, "is no grid of at least 2 x 2 real numbers", "save rows x columns")
+        shape_words = f"{values.dtype} of shape {values.shape}"
+        raise bad_input(path, name, shape_words, "is no grid of at least 2 x 2 real numbers", "save rows x columns")
     if not np.isfinite(values).all():
         raise bad_input(path, name, f"{int((~np.isfinite(values)).sum())} nodes", "are not finite", "fill the holes")
     # as in all readers, the first row is the north

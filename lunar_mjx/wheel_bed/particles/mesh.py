@@ -37,14 +37,14 @@ def wheel_mesh(wheel: ParticleWheel) -> tuple[np.ndarray, np.ndarray]:
     right = np.concatenate([outline[:, :1], -side, outline[:, 1:]], axis=1)
     left = np.concatenate([outline[:, :1], side, outline[:, 1:]], axis=1)
     hubs = np.array([[0.0, -0.5 * wheel.width, 0.0], [0.0, 0.5 * wheel.width, 0.0]])
-    here = np.arange(n)
-    there = (here + 1) % n
+    rim_index = np.arange(n)
+    next_index = (rim_index + 1) % n
     faces = np.concatenate(
         [
-            np.stack([here, n + here, there], axis=1),
-            np.stack([there, n + here, n + there], axis=1),
-            np.stack([np.full(n, 2 * n), here, there], axis=1),
-            np.stack([np.full(n, 2 * n + 1), n + there, n + here], axis=1),
+            np.stack([rim_index, n + rim_index, next_index], axis=1),
+            np.stack([next_index, n + rim_index, n + next_index], axis=1),
+            np.stack([np.full(n, 2 * n), rim_index, next_index], axis=1),
+            np.stack([np.full(n, 2 * n + 1), n + next_index, n + rim_index], axis=1),
         ]
     )
     corners = np.concatenate([right, left, hubs]).astype(np.float32)

@@ -79,8 +79,8 @@ def open_device(device: str) -> str:
         raise UserError(
             f"particles: newton {newton.__version__} is here, but 1.8 is needed; install the extra: {EXTRA}."
         )
-    here = wp.is_cuda_available()
-    if device == "cuda" and not here:
+    has_cuda = wp.is_cuda_available()
+    if device == "cuda" and not has_cuda:
         raise bad_input(
             "particles",
             "--device",
@@ -88,7 +88,7 @@ def open_device(device: str) -> str:
             "is not here: Warp sees no NVIDIA GPU",
             "use --device cpu and larger voxels",
         )
-    return "cuda:0" if here and device != "cpu" else "cpu"
+    return "cuda:0" if has_cuda and device != "cpu" else "cpu"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -83,18 +83,25 @@ def log_run(log: Log, model: Model) -> LogRun:
     """
     own = log_model(log, model)
     given, begin = log_commands(log, own)
-    every = round(given.interval / own.timestep)
+    steps_per_command = round(given.interval / own.timestep)
     values = given.values
     finest = max(LOG_START.finest, min(float(np.median(np.diff(t.time_s))) for t in log.tables.values() if len(t) > 2))
-    split = next((k for k in range(1, every + 1) if every % k == 0 and given.interval / k <= 1.01 * finest), 1)
-    values, every = np.repeat(values, split, axis=0), every // split
+    split = next(
+        (
+            k
+            for k in range(1, steps_per_command + 1)
+            if steps_per_command % k == 0 and given.interval / k <= 1.01 * finest
+        ),
+        1,
+    )
+    values, steps_per_command = np.repeat(values, split, axis=0), steps_per_command // split
     if len(values) < 3:
         raise UserError(f"{log.folder}: is too short to simulate ({len(values)} commands); record a longer drive.")
-    end = begin + (len(values) - 1) * every * own.timestep
+    end = begin + (len(values) - 1) * steps_per_command * own.timestep
     start, unknown = _start(log, own)
     motion = start_motion(log, own, begin, start["yaw"])
     imu = ImuMounting(log.imu.position_m, log.imu.quaternion)
-    return LogRun(own, values, every, begin, end, start, unknown, motion, imu)
+    return LogRun(own, values, steps_per_command, begin, end, start, unknown, motion, imu)
 
 
 def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
@@ -114,9 +121,9 @@ def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
         if value is not None:
             start[axis] = value
             unknown.append(axis)
-    yaw, said = first("yaw_deg"), _stated_yaw(log)
-    if said is not None:
-        start["yaw"] = said
+    yaw, stated_yaw = first("yaw_deg"), _stated_yaw(log)
+    if stated_yaw is not None:
+        start["yaw"] = stated_yaw
     if yaw is not None:
         start["yaw"] = float(np.deg2rad(yaw))
         unknown.append("yaw")
