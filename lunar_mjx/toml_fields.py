@@ -21,7 +21,7 @@ def read_toml(path: Path) -> dict[str, Any]:
       UserError: it is no text, or not TOML.
     """
     try:
-        found = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError:
         raise UserError(f"{path}: is not a text file in UTF-8; give a TOML file.") from None
     except RecursionError:
@@ -30,8 +30,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         reason = str(error)
         shown = reason if len(reason) <= 200 else f"{reason[:100]} ... {reason[-60:]}"
         raise UserError(f"{path}: is not valid TOML ({shown}); mend that line.") from None
-    _short_keys(path, found)
-    return found
+    _short_keys(path, document)
+    return document
 
 
 def _short_keys(path: Path, value: Any) -> None:

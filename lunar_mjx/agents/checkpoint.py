@@ -72,7 +72,7 @@ class Checkpoints:
         # Newest first: a kill may have damaged the last one, and the one before it is only an interval older.
         for step in sorted(self._manager.all_steps(), reverse=True):
             try:
-                found = self.restore(step, like)
+                restored = self.restore(step, like)
             except _OtherSettings:
                 raise
             except Exception as error:  # orbax raises what the reader of each part raises
@@ -84,7 +84,7 @@ class Checkpoints:
                     file=sys.stderr,
                 )
                 self._manager.delete(damaged)
-            return found
+            return restored
         if failed:
             raise UserError(
                 f"{self.folder}: no checkpoint fits these settings ({_first_line(failed[0][1])}); train with the "
@@ -98,10 +98,10 @@ class Checkpoints:
         # Settings first: arrays of another network would fail later, with a message that names a shape.
         self._compare(notes.get("settings"))
         items_to_restore = ocp.args.Composite(state=ocp.args.StandardRestore(_flat(like)))
-        found = self._manager.restore(step, args=items_to_restore)["state"]
+        restored_state = self._manager.restore(step, args=items_to_restore)["state"]
         leaves = [
             # an empty array, too, must lie as the compiled step expects it
-            found[jax.tree_util.keystr(path)]
+            restored_state[jax.tree_util.keystr(path)]
             if leaf.size
             else jnp.zeros(leaf.shape, leaf.dtype, device=getattr(leaf, "sharding", None))
             for path, leaf in jax.tree_util.tree_leaves_with_path(like)
@@ -128,10 +128,10 @@ class _OtherSettings(UserError):
 
 def _by_name(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     """Settings by dotted names."""
-    found: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
     for name, value in settings.items():
-        found |= _by_name(value, f"{before}{name}.") if isinstance(value, Mapping) else {before + name: value}
-    return found
+        by_name |= _by_name(value, f"{before}{name}.") if isinstance(value, Mapping) else {before + name: value}
+    return by_name
 
 
 def _first_line(error: Exception) -> str:

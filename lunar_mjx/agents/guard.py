@@ -95,7 +95,7 @@ def replay(env: Environment, path: Path) -> State:
     """
     with require_file(path, "the guard's dump").open("rb") as file, np.load(file, allow_pickle=False) as data:
         shapes = jax.eval_shape(env.reset, env.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
-        found = []
+        stored_leaves = []
         for place, leaf in jax.tree_util.tree_leaves_with_path(shapes):
             name = jax.tree_util.keystr(place)
             if name not in data or data[name].shape != leaf.shape:
@@ -106,6 +106,6 @@ def replay(env: Environment, path: Path) -> State:
                     "is not the state of this environment",
                     "make the environment with the settings of the training",
                 )
-            found.append(jnp.asarray(data[name]))
-        state = jax.tree.unflatten(jax.tree.structure(shapes), found)
+            stored_leaves.append(jnp.asarray(data[name]))
+        state = jax.tree.unflatten(jax.tree.structure(shapes), stored_leaves)
         return jax.jit(env.step)(env.params, state, jnp.asarray(data["action"]))

@@ -133,13 +133,13 @@ class _Loop:
         self.checkpoints = _checkpoints(folder / "checkpoints", settings) if folder else None
         self.episodes: dict[str, list[float]] = {name: [] for name in (*EPISODE, "step")}
         self.epochs, self.elapsed, rows = 0, 0.0, []
-        found = None
+        restored = None
         if self.checkpoints and run.resume:
-            found = self.checkpoints.newest(learner.abstract())
+            restored = self.checkpoints.newest(learner.abstract())
         elif self.checkpoints:
             self.checkpoints.clear()
-        if found is not None:
-            self.state, notes = found
+        if restored is not None:
+            self.state, notes = restored
             self.epochs, self.elapsed, rows = notes["epochs"], notes["elapsed"], notes["rows"]
             self.episodes = notes["episodes"]
         else:
@@ -194,12 +194,12 @@ class _Loop:
     def _episodes(self, episodes: Any, first: int) -> None:
         if not episodes or jax.process_count() > 1:
             return
-        found = jax.device_get(episodes)
-        env, step = np.nonzero(found["done"])
+        on_host = jax.device_get(episodes)
+        env, step = np.nonzero(on_host["done"])
         order = np.lexsort((env, step))
         env, step = env[order], step[order]
         for name in EPISODE:
-            self.episodes[name] += found[name][env, step].astype(float).tolist()
+            self.episodes[name] += on_host[name][env, step].astype(float).tolist()
         self.episodes["step"] += (first + (step + 1) * self.learner.config.envs).tolist()
 
     def _keep(self, row: dict[str, Any]) -> None:

@@ -57,8 +57,8 @@ def _first(names: tuple[str, ...]) -> Any:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of OpenGL libraries that find no device
-                found = importlib.import_module(f"mujoco.{name}").GLContext
-                context = found(64, 64)
+                context_class = importlib.import_module(f"mujoco.{name}").GLContext
+                context = context_class(64, 64)
                 context.make_current()
                 context.free()
         except Exception:
@@ -66,7 +66,7 @@ def _first(names: tuple[str, ...]) -> Any:
             if kept is None:
                 os.environ.pop("PYOPENGL_PLATFORM", None)
             continue
-        return found
+        return context_class
     raise UserError(
         f"cameras: no OpenGL works here (tried {', '.join(names)}); install EGL (Debian and Ubuntu: apt install "
         "libegl1 libgl1-mesa-dri) or OSMesa (apt install libosmesa6)."

@@ -180,14 +180,14 @@ def hit(placed: Placed, origin: Any, direction: Any) -> tuple[Any, Any]:
     Returns:
       Multiple of `direction` at the entry, infinite where nothing is hit; and which shape it is.
     """
-    found, first = [], 0
+    distances, first = [], 0
     for kind in range(4):
         count = int(np.sum(placed.kind == kind))
         if count:
             part = slice(first, first + count)
-            found.append(_ENTRY[kind](placed.size[part], *_local(placed, part, origin, direction)))
+            distances.append(_ENTRY[kind](placed.size[part], *_local(placed, part, origin, direction)))
         first += count
-    t = jnp.concatenate(found)
+    t = jnp.concatenate(distances)
     which = jnp.argmin(t, axis=0)
     near = jnp.min(t, axis=0)
     return jnp.where(near < _FAR, near, jnp.inf), which

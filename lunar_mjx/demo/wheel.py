@@ -69,7 +69,7 @@ def wheel_cases(starts: int = 8, seed: int = 0, progress: Callable[[float], None
         cases.append(Case(name, soil, compare(beds[name], table, name), None))
         tell(0.1 * (i + 1))
     for i, (name, free) in enumerate((("paper", SOIL + PAPER_CONTACT), ("consistent", SOIL))):
-        found = fit(
+        fitted = fit(
             beds[name],
             table,
             free,
@@ -79,7 +79,7 @@ def wheel_cases(starts: int = 8, seed: int = 0, progress: Callable[[float], None
             lambda done, i=i: tell(0.2 + 0.4 * (i + done / starts)),
         )
         freed = "soil and contact" if len(free) > len(SOIL) else "soil"
-        cases.append(Case(found.name, f"{freed} {REFITTED}", found.comparison, found))
+        cases.append(Case(fitted.name, f"{freed} {REFITTED}", fitted.comparison, fitted))
     return cases
 
 

@@ -102,8 +102,8 @@ def audit(folder: str | Path | Run, seconds: float, progress: Progress = silent)
         done += 1
         progress(f"auditing, case {len(cases) + 1}", min(1.0, (time.monotonic() - begun) / max(end - begun, 1e-9)))
         cases.append(one(len(cases)))
-        found = _summary(cases)
-        run.save(AUDIT_FILE, {"key": key, "version": __version__, **found.to_dict()})
+        summary = _summary(cases)
+        run.save(AUDIT_FILE, {"key": key, "version": __version__, **summary.to_dict()})
     return _summary(cases)
 
 
@@ -145,7 +145,7 @@ def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, se
     drawn = form.measuring(clean + draw_noise(form.drives.observations, rng), base.u)
     settings = form.settings
     try:
-        found = search([drawn], settings.most_refits, settings.most_terms, settings.window)
+        model_search = search([drawn], settings.most_refits, settings.most_terms, settings.window)
     except EvidenceError:
         return {
             **case,
@@ -153,7 +153,7 @@ def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, se
             "effects": [],
             "outcome": _outcome(truth, Verdict.BAD_FIT, ()),
         }
-    conclusion = conclude(found, settings.sure)
+    conclusion = conclude(model_search, settings.sure)
     return {
         **case,
         "verdict": conclusion.verdict.label,

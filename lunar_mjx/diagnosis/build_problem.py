@@ -45,11 +45,11 @@ that integrates the stress, can tell them from these; elsewhere they would only 
 
 def candidate_effects(run: Run) -> dict[str, Effect]:
     """Every effect that may be proposed: the catalogue's, and the user's own."""
-    found = {n: e for n, e in catalogue.CATALOGUE.items() if n not in NO_CANDIDATE}
+    candidates = {n: e for n, e in catalogue.CATALOGUE.items() if n not in NO_CANDIDATE}
     for spec in run.candidates:
         effect = catalogue.get(spec)
-        found[effect.name] = effect
-    return found
+        candidates[effect.name] = effect
+    return candidates
 
 
 def require_splits(splits: Mapping[str, str], logs: Sequence[Any]) -> None:

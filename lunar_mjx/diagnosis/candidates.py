@@ -17,7 +17,7 @@ def usable(
       effects: of the model. candidates: by name. unfit: why a candidate is none for such measurements, or "".
     """
     present = {e.name for e in effects}
-    found, refused = {}, []
+    tested, refused = {}, []
     for name, effect in candidates.items():
         if name in present:
             continue
@@ -30,5 +30,5 @@ def usable(
         if reason:
             refused.append(NotTested(name, reason))
         else:
-            found[name] = effect
-    return found, tuple(refused)
+            tested[name] = effect
+    return tested, tuple(refused)

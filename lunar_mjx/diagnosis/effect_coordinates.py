@@ -16,16 +16,16 @@ def of_candidate(effect: Effect, values: Mapping[str, float] | None = None) -> t
     the bounds hold them. Parameters without one are shapes: they start at the nominal value and keep a prior of a
     third of it, because they mean nothing while the amplitudes are zero.
     """
-    found = []
+    coordinates = []
     for name, p in effect.parameters.items():
         start = (values or {}).get(name)
         if p.null is not None:
-            found.append(_amplitude(effect.name, name, p))
+            coordinates.append(_amplitude(effect.name, name, p))
         elif p.nominal > 0.0 and p.bounds[0] >= 0.0:
-            found.append(
+            coordinates.append(
                 Coordinate(effect.name, name, start or p.nominal, 0.3, *p.bounds, log=True, prior=1.0, unit=p.unit)
             )
-    return tuple(found)
+    return tuple(coordinates)
 
 
 def _amplitude(effect: str, name: str, p: Parameter) -> Coordinate:

@@ -107,9 +107,9 @@ def next_experiment(
             raise UserError(f"{run.folder}: no two hypotheses are left to tell apart; name effects with --between.")
         sweeps = rank_sweeps(run, logs, verdict, usable, NOTHING, progress)  # type: ignore[arg-type]
         ranked = [Plan(*sweep) for sweep in sweeps]
-        found = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
-        run.save(NEXT_FILE, found.to_dict())
-        return found
+        experiment = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
+        run.save(NEXT_FILE, experiment.to_dict())
+        return experiment
     form = build_drives(run, logs, effects, progress).own  # type: ignore[arg-type]
     assert isinstance(form, DriveForm)
     usable = [n for n in names if n == NOTHING or n in form.candidates]
@@ -122,9 +122,9 @@ def next_experiment(
     effects_by_name = {n: form.drives.effects[n] for n in usable if n != NOTHING}
     new = DriveProblem([p[2] for p in plans], run.model, effects_by_name, progress=progress)  # type: ignore[arg-type]
     ranked = _rank(new, known, usable, [(name, text) for name, text, _ in plans])
-    found = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
-    run.save(NEXT_FILE, found.to_dict())
-    return found
+    experiment = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
+    run.save(NEXT_FILE, experiment.to_dict())
+    return experiment
 
 
 def _hypotheses(verdict: dict[str, Any], between: Sequence[str], candidates: set[str]) -> list[str]:
@@ -198,7 +198,7 @@ def _rank(
     base = problem.origin()
     base[problem.baseline] = np.mean(rows[:, problem.baseline], axis=0)
     jacobian = problem.observations.whiten(problem.jacobian(base, free)[1])
-    found = []
+    ranked = []
     for number, (name, text) in enumerate(plans):
         keep = problem.observations.unit == -1
         for s in problem.observations.series:
@@ -212,8 +212,8 @@ def _rank(
             for (i, a), (k, b) in itertools.combinations(enumerate(names), 2)
         }
         worst = min(pairs, key=lambda p: pairs[p])
-        found.append(Plan(name, text, float(np.sqrt(max(pairs[worst], 0.0))), worst))
-    return sorted(found, key=lambda p: -p.separation)
+        ranked.append(Plan(name, text, float(np.sqrt(max(pairs[worst], 0.0))), worst))
+    return sorted(ranked, key=lambda p: -p.separation)
 
 
 def _left(

@@ -44,7 +44,7 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
     Returns:
       Name, description and log of each manoeuvre that the rover can drive.
     """
-    found = []
+    drives = []
     for name in MANOEUVRES:
         plan = load_manoeuvre(name)
         own = model.replace(modes={"drive": plan.drive_mode})
@@ -68,7 +68,7 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
                 sample_times = np.arange(count) / table.rate_hz
                 tables[table.name] = LogTable(table.name, Path(name), sample_times, fill, table.rate_hz)
         payload = {"payload_kg": plan.payload_share * model.rover.mass, "payload_position_m": (0.0, 0.0, 0.2)}
-        found.append(
+        drives.append(
             (
                 name,
                 plan.description,
@@ -90,7 +90,7 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
                 ),
             )
         )
-    return found
+    return drives
 
 
 def _first(channel: str, start: tuple[float, float, float], celsius: float) -> float:
@@ -112,11 +112,11 @@ def planned_sweeps(logs: Sequence[SteadyLog]) -> list[tuple[str, str, SteadyLog]
         "driving_torque": reference * table.radius,
         "sinkage": 5e-4,
     }
-    found = []
+    sweeps = []
     for share in PLANNED.loads:
         for angle in PLANNED.angles:
             name = f"slip sweep at {angle:g} deg slip angle, {share * load:.3g} N"
-            found.append(
+            sweeps.append(
                 (
                     name,
                     "twelve slip ratios from -0.3 to 0.8, three runs each",
@@ -129,14 +129,14 @@ def planned_sweeps(logs: Sequence[SteadyLog]) -> list[tuple[str, str, SteadyLog]
         for angle in (0.0, 30.0):
             name = f"slip sweep at {angle:g} deg slip angle, {load:.3g} N, measuring {names} too"
             conditions = {**typical, **sigma}
-            found.append(
+            sweeps.append(
                 (
                     name,
                     "twelve slip ratios from -0.3 to 0.8, three runs each",
                     _sweep(template, name, angle, load, conditions),
                 )
             )
-    return found
+    return sweeps
 
 
 def _sigma(log: SteadyLog, table: SteadyStateTable, quantity: str) -> float:

@@ -165,11 +165,11 @@ def log_folders(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     paths = without_answers(paths)
     if not paths:
         raise UserError("compare: no log is given; give at least one log folder.")
-    found = tuple(Path(p).resolve() for p in paths)
-    for path in found:
+    folders = tuple(Path(p).resolve() for p in paths)
+    for path in folders:
         if not path.exists():
             raise bad_input("compare", "log", str(path), "does not exist", "give a log folder")
-    return found
+    return folders
 
 
 def folder_hash(path: Path) -> str:

@@ -168,11 +168,11 @@ def why(
         return windows.why(run, campaign, only, windows.SECONDS if seconds is None else seconds, progress)
     problem = _problem(run, campaign, only, progress)
     left = math.inf if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
-    diagnosis, found = answer.diagnose(run, problem, progress, left)
-    if found is not None:
+    diagnosis, model_search = answer.diagnose(run, problem, progress, left)
+    if model_search is not None:
         own = problem.own
-        rows = {"refitted": found.base(own.name).refit.u}
-        best = next(h for h in found.hypotheses if h.refitted)
+        rows = {"refitted": model_search.base(own.name).refit.u}
+        best = next(h for h in model_search.hypotheses if h.refitted)
         if best.form == own.name:
             rows[", ".join(sorted(best.effects)) or "refitted"] = best.refit.u
         if not isinstance(campaign[0], SteadyLog):  # those of tables are made by `studio`, a second each
@@ -180,7 +180,7 @@ def why(
                 run.folder,
                 {
                     tuple(sorted(h.effects)): (own.residual(h.refit.u), own.predicted(h.refit.u))
-                    for h in found.hypotheses
+                    for h in model_search.hypotheses
                     if h.refitted and h.effects
                 },
             )
@@ -195,8 +195,8 @@ def explain(diagnosis: Diagnosis, effect: str) -> Diagnosis:
     Raises:
       UserError: the diagnosis says nothing about it.
     """
-    found = next((e for e in diagnosis.evidence if e.effect == effect), None)
-    if found is None:
+    evidence = next((e for e in diagnosis.evidence if e.effect == effect), None)
+    if evidence is None:
         refused = {n["effect"]: n["reason"] for n in diagnosis.details.get("not_tested", [])}
         if effect in refused:
             sentence = f"{effect} cannot be tested here: it {refused[effect]}."
@@ -206,19 +206,21 @@ def explain(diagnosis: Diagnosis, effect: str) -> Diagnosis:
             f"{', '.join(e.effect for e in diagnosis.evidence)}."
         )
     nearest = (
-        f"; its nearest confounder is {found.nearest[0]} (|cos| {found.nearest[1]:.2f})" if found.nearest[0] else ""
+        f"; its nearest confounder is {evidence.nearest[0]} (|cos| {evidence.nearest[1]:.2f})"
+        if evidence.nearest[0]
+        else ""
     )
-    if found.status == "not tested":
+    if evidence.status == "not tested":
         return dataclasses.replace(
             diagnosis,
             verdict=Verdict.UNDECIDABLE,
             effects=(effect,),
-            sentence=f"{effect} leaves no separable signal in these logs: {found.reason}{nearest}.",
+            sentence=f"{effect} leaves no separable signal in these logs: {evidence.reason}{nearest}.",
         )
-    values = ", ".join(f"{k} {v:.3g} +- {found.std.get(k, 0.0):.1g}" for k, v in found.values.items())
+    values = ", ".join(f"{k} {v:.3g} +- {evidence.std.get(k, 0.0):.1g}" for k, v in evidence.values.items())
     sentence = (
-        f"{effect} is missing with probability {found.probability:.3f}; it would show with "
-        f"{found.separable_sigma:.1f} sigma at its usual size, its best fit is {values or 'none'}{nearest}."
+        f"{effect} is missing with probability {evidence.probability:.3f}; it would show with "
+        f"{evidence.separable_sigma:.1f} sigma at its usual size, its best fit is {values or 'none'}{nearest}."
     )
     return dataclasses.replace(diagnosis, sentence=sentence)
 

@@ -80,11 +80,11 @@ class Alarm:
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers and names only."""
-        found = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "diagnosis"}
-        found["event"] = "alarm" if self.diagnosis is None else "named"
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "diagnosis"}
+        fields["event"] = "alarm" if self.diagnosis is None else "named"
         if self.diagnosis is not None:
-            found["diagnosis"] = self.diagnosis.to_dict()
-        return plain({**found, "sentence": self.sentence})
+            fields["diagnosis"] = self.diagnosis.to_dict()
+        return plain({**fields, "sentence": self.sentence})
 
 
 def watch(
@@ -177,7 +177,7 @@ class _Watch:
                     bad = next(f for f in findings if f.severity == "bad_data")
                     raise UserError(f"{bad.where}: {bad.message}; mend the log before it is watched.")
                 end = log.span_s[1]
-                found = self.follower.windows(log)
+                windows = self.follower.windows(log)
             except (UserError, ValueError, IndexError):
                 # a line that is being written, or a drive that is too short as yet
                 if once or waited >= idle_s:
@@ -185,9 +185,9 @@ class _Watch:
             else:
                 waited = 0.0 if end > last_end else waited
                 last_end = max(last_end, end)
-                yield from self._follow(log, found, end if once else end - LEVELLING_S, once)
+                yield from self._follow(log, windows, end if once else end - LEVELLING_S, once)
                 if once or waited >= idle_s:
-                    yield from self._name(log, found, True)
+                    yield from self._name(log, windows, True)
                     return
             sleep(WATCHING.every_s)
             waited += WATCHING.every_s

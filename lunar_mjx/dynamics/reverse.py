@@ -50,9 +50,9 @@ def reversible(function: Callable[..., Any]) -> Callable[..., Any]:
 
             return jax.vjp(of_real, *(leaves[i] for i in real))[1](given)
 
-        found = computed_once(pull)(leaves, [g for g in jax.tree.leaves(given) if g.dtype != jax.dtypes.float0])
+        gradients = computed_once(pull)(leaves, [g for g in jax.tree.leaves(given) if g.dtype != jax.dtypes.float0])
         cotangents: list[Any] = [None] * len(leaves)
-        for i, value in zip(real, found, strict=True):
+        for i, value in zip(real, gradients, strict=True):
             cotangents[i] = value
         return jax.tree.unflatten(tree, cotangents)
 

@@ -190,8 +190,8 @@ _SUFFIX = {
 
 def channel_unit(name: str) -> str:
     """SI unit of a log channel by the end of its name; temperatures count from the offset of degrees Celsius."""
-    found = [suffix for suffix in _SUFFIX if name.endswith(suffix)]
-    return _SUFFIX[max(found, key=len)] if found else "1"
+    suffixes = [suffix for suffix in _SUFFIX if name.endswith(suffix)]
+    return _SUFFIX[max(suffixes, key=len)] if suffixes else "1"
 
 
 def check_unit(unit: str) -> None:
@@ -210,14 +210,14 @@ def constants(modules: Sequence[ModuleType]) -> list[tuple[str, float, str]]:
     Raises:
       ValueError: what is wrong with a unit.
     """
-    found = []
+    numbers = []
     for module in modules:
         for name, hint in get_type_hints(module, include_extras=True).items():
             if get_origin(hint) is Annotated and get_args(hint)[0] is float:
                 unit = get_args(hint)[1]
                 check_unit(unit)
-                found.append((name, getattr(module, name), unit))
-    return found
+                numbers.append((name, getattr(module, name), unit))
+    return numbers
 
 
 class Rescaling:

@@ -247,14 +247,14 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
     scales = {label: Rescaling(factors, effects) for label, factors in settings.items()}
 
     def errors(s: Any) -> list[tuple[str, str, Any, Any]]:
-        found: list[tuple[str, str, Any, Any]] = []
-        watched = _watched(effect, scales, found)
+        differences: list[tuple[str, str, Any, Any]] = []
+        watched = _watched(effect, scales, differences)
         if on_sensors:
             act_on_channels(watched, _numbers(effect.nominal()), s)
         else:
             probe.act([watched if e is effect else e for e in effects], probe.terrain(), {}, s)
-        names[:] = [(label, port) for label, port, _, _ in found]
-        return [(error, size) for _, _, error, size in found]  # type: ignore[misc]
+        names[:] = [(label, port) for label, port, _, _ in differences]
+        return [(error, size) for _, _, error, size in differences]  # type: ignore[misc]
 
     names: list[tuple[str, str]] = []
     runs = channel_states(rovers, seed) if on_sensors else probe.states(rovers, 4, seed)

@@ -160,12 +160,12 @@ class ChangeDetector:
             # The walk between this step and the next.
             self._cov = self._cov + np.diag(self.usual.walk**2)
             return None
-        found = self._alarm()
+        alarm = self._alarm()
         best = 1 + int(np.argmax(self._log_ratio))
         # From here on the most probable jump is taken for granted, and the next one is looked for beside it.
         self._mean[0], self._cov[0] = self._mean[best], self._cov[best] + np.diag(self.usual.walk**2)
         self._forget()
-        return found
+        return alarm
 
     def _alarm(self) -> Change:
         chance = np.exp(self._log_ratio - np.logaddexp.reduce(self._log_ratio))
@@ -297,27 +297,27 @@ def learn(series: Sequence[tuple[Amounts, Sequence[Step]]], usual: Restlessness 
         return Restlessness(*(float(np.clip(math.exp(v), *b)) for v, b in zip(place, CHANGE.bounds, strict=True)))
 
     def cost(place: np.ndarray) -> float:
-        found = made(place)
+        law = made(place)
         prior = 0.5 * float(np.sum(((place - centre) / CHANGE.log_std) ** 2))
-        return prior - sum(log_density(found.of(amounts), steps) for amounts, steps in series)
+        return prior - sum(log_density(law.of(amounts), steps) for amounts, steps in series)
 
     simplex = centre + np.vstack([np.zeros(5), np.diag([1.0, 1.0, 0.3, 0.7, 1.0])])
-    found = optimize.minimize(
+    optimum = optimize.minimize(
         cost,
         centre,
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.1, "maxfev": CHANGE.most_trials},
     )
-    return _tempered(made(found.x), series)
+    return _tempered(made(optimum.x), series)
 
 
 def _tempered(restless: Restlessness, series: Sequence[tuple[Amounts, Sequence[Step]]]) -> Restlessness:
     """A restlessness with the largest power at which these series raise no alarm at the threshold of their length."""
     length = float(sum(len(steps) for _, steps in series))
     for power in CHANGE.powers[:-1]:
-        found = dataclasses.replace(restless, power=power)
-        if not any(_raises(found.of(amounts), amounts, steps, length) for amounts, steps in series):
-            return found
+        tempered = dataclasses.replace(restless, power=power)
+        if not any(_raises(tempered.of(amounts), amounts, steps, length) for amounts, steps in series):
+            return tempered
     return dataclasses.replace(restless, power=CHANGE.powers[-1])
 
 

@@ -73,12 +73,12 @@ def fit(
     fitted = problem.observations.in_split(*splits)
     goal = Objective(problem, free, fitted)
     origin = problem.origin() if start is None else np.asarray(start, float)
-    found = []
+    fits = []
     for i, place in enumerate([origin, *_other_starts(problem, free, origin, starts - 1, seed, spread, goal)]):
         progress("fitting", i / starts)
-        found.append(descend(goal, place))
+        fits.append(descend(goal, place))
     # Descents that ended elsewhere are local minima: only the lowest counts.
-    best = min(found, key=lambda d: d.chi2)
+    best = min(fits, key=lambda d: d.chi2)
     return Fit(best.u, np.asarray(free), best.chi2, best.residual, best.jacobian, fitted)
 
 

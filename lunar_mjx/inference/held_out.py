@@ -167,12 +167,12 @@ def noise_test(problem: Problem, fit: Fit, splits: tuple[str, ...] = ("fit", "se
 
 def errors(problem: Problem, fit: Fit) -> dict[str, float]:
     """Root mean square residual in sigma by split, where the split holds observations."""
-    found = {}
+    by_split = {}
     for split in ("fit", "select", "test", "apart"):
         keep = problem.observations.in_split(split)
         if keep.any():
-            found[split] = fit.rms(keep)
+            by_split[split] = fit.rms(keep)
     held = problem.observations.in_split("select", "test")
     if held.any():
-        found["held_out"] = fit.rms(held)
-    return found
+        by_split["held_out"] = fit.rms(held)
+    return by_split

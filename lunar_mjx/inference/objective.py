@@ -116,5 +116,5 @@ def _within(hessian: np.ndarray, downhill: np.ndarray, low: np.ndarray, high: np
     root = np.sqrt(np.maximum(values, 1e-14 * max(float(values[-1]), 1e-30)))
     # a square root of the matrix as rows: the quadratic model becomes a least-squares problem, which takes bounds
     rows = root[:, None] * axes.T
-    found = lsq_linear(rows, (axes.T @ (size * downhill)) / root, (low / size - _ROOM, high / size + _ROOM), "bvls")
-    return found.x * size
+    solution = lsq_linear(rows, (axes.T @ (size * downhill)) / root, (low / size - _ROOM, high / size + _ROOM), "bvls")
+    return solution.x * size

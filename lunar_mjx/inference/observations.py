@@ -90,10 +90,10 @@ class Observations:
     @functools.cached_property
     def of_log(self) -> Mapping[int, slice]:
         """Where each log's observations lie."""
-        found: dict[int, slice] = {}
+        rows_of_log: dict[int, slice] = {}
         for s in self.series:
-            found[s.log] = slice(found[s.log].start if s.log in found else s.start, s.stop)
-        return found
+            rows_of_log[s.log] = slice(rows_of_log[s.log].start if s.log in rows_of_log else s.start, s.stop)
+        return rows_of_log
 
     def in_split(self, *splits: str) -> np.ndarray:
         """(n,) which observations belong to one of the splits."""

@@ -27,9 +27,9 @@ def log_modes(log: Log, model: Model) -> dict[str, str]:
     names = set(log.channel_names)
     channels = _channels_by_joint(model)
     for group in model.rover.groups:
-        found = [m for m in MODES if any(_command(c, m) in names for j in group.joints for c in channels[j])]
-        if len(found) > 1:
-            shown = ", ".join(f"command_*_{_KIND[group.name]}_{COMMAND_UNITS[m]}" for m in found)
+        stated_modes = [m for m in MODES if any(_command(c, m) in names for j in group.joints for c in channels[j])]
+        if len(stated_modes) > 1:
+            shown = ", ".join(f"command_*_{_KIND[group.name]}_{COMMAND_UNITS[m]}" for m in stated_modes)
             raise bad_input(
                 log.folder,
                 "commands",
@@ -37,8 +37,8 @@ def log_modes(log: Log, model: Model) -> dict[str, str]:
                 f"command the {group.name} joints in several modes",
                 "command all joints of a group in one unit",
             )
-        if found:
-            modes[group.name] = found[0]
+        if stated_modes:
+            modes[group.name] = stated_modes[0]
     return modes
 
 
@@ -99,9 +99,9 @@ def commands(log: Log, model: Model) -> tuple[Commands, float]:
     grid = start + interval * np.arange(max(1, int(np.floor((end - start) / interval + 1e-6)) + 1))
     values = np.zeros((len(grid), len(names)))
     for column, name in enumerate(names):
-        found = log.channel(name)
-        if found is not None and found[0].size:
-            values[:, column] = hold(found[0], found[1], grid)
+        samples = log.channel(name)
+        if samples is not None and samples[0].size:
+            values[:, column] = hold(samples[0], samples[1], grid)
     return Commands(values, interval), start
 
 
@@ -176,8 +176,8 @@ def environment_value(log: Log, key: str) -> float | None:
     """A constant of the environment, or the mean of the channel that holds it; None if the log does not say."""
     value = log.environment.get(key)
     if isinstance(value, str):
-        found = log.channel(value)
-        return float(found[1].mean()) if found is not None and found[1].size else None
+        samples = log.channel(value)
+        return float(samples[1].mean()) if samples is not None and samples[1].size else None
     return value
 
 

@@ -116,10 +116,10 @@ def estimated_noise(log: Log, channel: str, moving: bool) -> ChannelNoise | None
     Args:
       log: of a drive. channel: that it holds; commands have no noise. moving: which part of the drive.
     """
-    found = log.channel(channel)
-    if found is None or is_command(channel):
+    samples = log.channel(channel)
+    if samples is None or is_command(channel):
         return None
-    time, values = found
+    time, values = samples
     step, windows = _windows(time, values, _moving(log, time, channel), moving)
     if windows.shape[1] < NOISE_ESTIMATE.fewest_windows:
         return None
@@ -148,7 +148,7 @@ def noise_table(logs: Sequence[Log]) -> dict[str, dict[str, ChannelNoise]]:
     names = dict.fromkeys(c for log in logs for c in log.channel_names if not is_command(c))
     for name in names:
         mine = [log for log in logs if name in log.channel_names]
-        found: dict[str, list[ChannelNoise]] = {}
+        noises: dict[str, list[ChannelNoise]] = {}
         for log in mine:
             stated = log.noise.get(name)
             by_channel: Mapping[str, ChannelNoise | None] = {
@@ -158,9 +158,9 @@ def noise_table(logs: Sequence[Log]) -> dict[str, dict[str, ChannelNoise]]:
             }
             for kind, one in by_channel.items():
                 if one is not None:
-                    found.setdefault(kind, []).append(one)
-        if found:
-            out[name] = {k: sorted(v, key=lambda n: n.std)[len(v) // 2] for k, v in found.items()}
+                    noises.setdefault(kind, []).append(one)
+        if noises:
+            out[name] = {k: sorted(v, key=lambda n: n.std)[len(v) // 2] for k, v in noises.items()}
     return out
 
 

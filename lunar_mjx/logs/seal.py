@@ -122,14 +122,14 @@ def unseal(answer: str | Path, log: str | Path, verdict: str | Path | None = Non
     Raises:
       UserError: the log is not sealed, or neither with this answer nor with these data.
     """
-    given, found = read_answer(answer), read_log(log)
+    given, sealed = read_answer(answer), read_log(log)
     path = Path(log) / LOG_FILE
     committed = Fields.read(path).text("commitment", "")
     if not committed:
         raise UserError(f"{path}: commitment is missing; this log was not sealed.")
     if committed != given.commitment():
         raise UserError(f"{answer}: is not the answer that {log} was sealed with; ask its sender for the right file.")
-    if not isinstance(found, Log) or log_hash(found) != given.data_sha256:
+    if not isinstance(sealed, Log) or log_hash(sealed) != given.data_sha256:
         raise UserError(f"{log}: its tables were changed after it was sealed; ask its sender for the log.")
     result: dict[str, Any] = {"sealed": True, "hidden": list(given.hidden), "effects": [dict(e) for e in given.effects]}
     if verdict is not None:

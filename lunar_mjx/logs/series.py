@@ -15,10 +15,10 @@ PERIODS = {"yaw_deg": 360.0, "roll_deg": 360.0}
 
 def continuous(log: Log, name: str) -> tuple[np.ndarray, np.ndarray] | None:
     """A channel without gaps and without the jumps of an angle that wraps; None if fewer than 8 samples are left."""
-    found = log.channel(name)
-    if found is None or len(found[0]) < 8:
+    samples = log.channel(name)
+    if samples is None or len(samples[0]) < 8:
         return None
-    time, values = found
+    time, values = samples
     period = PERIODS.get(name)
     if period is None and is_quantity(name, "joint_angle") and np.ptp(values) <= 6.5:
         period = 2.0 * np.pi
@@ -32,8 +32,8 @@ def sigma(log: Log, name: str) -> float:
 
 def at(log: Log, name: str, time: np.ndarray) -> np.ndarray | None:
     """A channel at other times, by straight lines; NaN outside its span."""
-    found = continuous(log, name)
-    return None if found is None else np.interp(time, found[0], found[1], left=np.nan, right=np.nan)
+    samples = continuous(log, name)
+    return None if samples is None else np.interp(time, samples[0], samples[1], left=np.nan, right=np.nan)
 
 
 def span(log: Log, names: Sequence[str]) -> tuple[float, float] | None:

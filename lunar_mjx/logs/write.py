@@ -153,9 +153,9 @@ def _check_frame(name: str, frame: pd.DataFrame) -> None:
     if "time_s" not in frame.columns:
         raise bad_input("write_log", f"tables.{name}", list(frame.columns)[:4], "lacks time_s", "add the time in s")
     for column in map(str, frame.columns):
-        found = parse_column(column, "write_log") if column != "time_s" else None
-        if found is not None and found.problem:
-            raise bad_input("write_log", f"tables.{name}", column, found.problem, "rename the column")
+        parsed = parse_column(column, "write_log") if column != "time_s" else None
+        if parsed is not None and parsed.problem:
+            raise bad_input("write_log", f"tables.{name}", column, parsed.problem, "rename the column")
 
 
 def _rate(frame: pd.DataFrame) -> float:

@@ -40,7 +40,7 @@ def origins(model: Model, effect: Effect, key: str) -> tuple[str, ...]:
     value = model.parameters[effect.name][key]
     values = value if isinstance(value, tuple) else (value,)
     parameter = effect.parameters[key]
-    found, before = [parameter.source] * len(values), (parameter.nominal,) * len(values)
+    sources, before = [parameter.source] * len(values), (parameter.nominal,) * len(values)
     layers: list[tuple[str, Value]] = [("set in this model", value)]
     names = PRESETS[model.preset]
     if effect.name in names:
@@ -53,9 +53,11 @@ def origins(model: Model, effect: Effect, key: str) -> tuple[str, ...]:
         layer_values = layer_values if isinstance(layer_values, tuple) else (layer_values,) * len(values)
         if len(layer_values) != len(values):  # one value for all where the preset has several
             layer_values = (layer_values[0] if len(set(layer_values)) == 1 else float("nan"),) * len(values)
-        found = [label if new != old else known for known, new, old in zip(found, layer_values, before, strict=True)]
+        sources = [
+            label if new != old else known for known, new, old in zip(sources, layer_values, before, strict=True)
+        ]
         before = layer_values
-    return tuple(found)
+    return tuple(sources)
 
 
 def by_group(entries: Sequence[Entry], model: Model) -> list[tuple[str, Entry]]:
@@ -68,7 +70,7 @@ def by_group(entries: Sequence[Entry], model: Model) -> list[tuple[str, Entry]]:
     alike: dict[Entry, list[str]] = {}
     for name, entry in dict.fromkeys(zip(names, entries, strict=True)):
         alike.setdefault(entry, []).append(name)
-    return [(", ".join(found), entry) for entry, found in alike.items()]
+    return [(", ".join(names_of_group), entry) for entry, names_of_group in alike.items()]
 
 
 def print_preset(model: Model, console: Console) -> None:

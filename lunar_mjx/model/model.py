@@ -87,29 +87,29 @@ class Model:
             of bounds.
         """
         written = settled_effect(effect) if isinstance(effect, str) else effect.name
-        found = catalogue.get(written) if isinstance(effect, str) else effect
-        if found.name in self.effect_names:
-            raise bad_input(source, "effect", found.name, "is already in the model", "set its parameters instead")
+        added = catalogue.get(written) if isinstance(effect, str) else effect
+        if added.name in self.effect_names:
+            raise bad_input(source, "effect", added.name, "is already in the model", "set its parameters instead")
         for other in self.effects:
-            if found.name in other.replaces and other.name not in found.replaces:
+            if added.name in other.replaces and other.name not in added.replaces:
                 raise bad_input(
                     source,
                     "effect",
-                    found.name,
+                    added.name,
                     f"is replaced by {other.name}, which is in the model",
                     f"remove {other.name} first",
                 )
-        replaced = [i for i, e in enumerate(self.effects) if e.name in found.replaces]
-        kept = [e for e in self.effects if e.name not in found.replaces]
+        replaced = [i for i, e in enumerate(self.effects) if e.name in added.replaces]
+        kept = [e for e in self.effects if e.name not in added.replaces]
         # In the place of the first that it replaces: order within a port may matter.
-        kept.insert(replaced[0] if replaced else len(kept), found)
-        parameters = {k: v for k, v in self.parameters.items() if k not in found.replaces}
-        parameters[found.name] = found.nominal()
-        files = {k: v for k, v in self.effect_files.items() if k not in found.replaces}
+        kept.insert(replaced[0] if replaced else len(kept), added)
+        parameters = {k: v for k, v in self.parameters.items() if k not in added.replaces}
+        parameters[added.name] = added.nominal()
+        files = {k: v for k, v in self.effect_files.items() if k not in added.replaces}
         model = dataclasses.replace(
-            self, effects=tuple(kept), parameters=parameters, effect_files={**files, found.name: written}
+            self, effects=tuple(kept), parameters=parameters, effect_files={**files, added.name: written}
         )
-        return model.set(found.name, source, **values)
+        return model.set(added.name, source, **values)
 
     def remove(self, name: str) -> Model:
         """A model without the effect `name`."""

@@ -40,7 +40,7 @@ def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]
         raise UserError(
             "figures: Fig. 6 needs trainings; make one with lunar-mjx train, and give its folder with --training."
         )
-    found: dict[str, list[dict[str, Any]]] = {}
+    trainings: dict[str, list[dict[str, Any]]] = {}
     for path in map(Path, paths):
         file = path / CURVE if path.is_dir() else path
         try:
@@ -65,8 +65,8 @@ def read_trainings(paths: Sequence[str | Path]) -> dict[str, list[dict[str, Any]
                 "give a folder that lunar-mjx train wrote",
             ) from None
         for name, record in named:
-            found.setdefault(name, []).append(record)
-    return found
+            trainings.setdefault(name, []).append(record)
+    return trainings
 
 
 def _is_training(record: dict[str, Any]) -> bool:

@@ -153,9 +153,9 @@ def _assert_nothing_lost(
         )
     joints = {b.joint.name: b.joint for b in roles.bodies if b.joint is not None}
     moving = {j.name for j in urdf.joints if j.kind not in ("fixed", "floating")}
-    found = {model.joint(i).name for i in range(model.njnt)} - {"free"}
-    if found != moving or set(joints) != moving:
-        raise bad_input(urdf.path, "joints", sorted(moving ^ found), "were lost or invented", "report this")
+    compiled_joints = {model.joint(i).name for i in range(model.njnt)} - {"free"}
+    if compiled_joints != moving or set(joints) != moving:
+        raise bad_input(urdf.path, "joints", sorted(moving ^ compiled_joints), "were lost or invented", "report this")
     for joint in joints.values():
         limits = joint.limits if np.isfinite(joint.limits).all() else (0.0, 0.0)
         if not np.allclose(model.joint(joint.name).range, limits, rtol=0, atol=1e-9):
@@ -243,7 +243,7 @@ def place_drive_groups(urdf: Urdf, roles: Roles, description: Description) -> tu
     """
     joints = {w.corner: w.drive for w in roles.wheels}
     placed: list[str] = []
-    found = []
+    groups = []
     for i, group in enumerate(description.drive_groups):
         for corner in group.wheels:
             if corner not in joints or corner in placed:
@@ -256,8 +256,8 @@ def place_drive_groups(urdf: Urdf, roles: Roles, description: Description) -> tu
                     f"use {', '.join(joints)}, each once",
                 )
             placed.append(corner)
-        found.append(DriveGroup(group.name, tuple(joints[c] for c in group.wheels)))
-    return tuple(found)
+        groups.append(DriveGroup(group.name, tuple(joints[c] for c in group.wheels)))
+    return tuple(groups)
 
 
 def _passive_notes(roles: Roles, loops: tuple[PlacedLoop, ...]) -> list[str]:

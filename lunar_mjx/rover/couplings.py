@@ -36,7 +36,7 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
     """
     moving = {b.joint.name: b for b in bodies if b.joint is not None}
     written = {j.name: j for j in urdf.joints}
-    found: list[Coupling] = []
+    couplings: list[Coupling] = []
 
     def sense(joint: str) -> float:
         """-1 where the conversion has reversed the joint's axis, which also turns frames; told by the limits' axis."""
@@ -57,7 +57,7 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
         # with each.
         own, other = sense(joint.name), sense(joint.mimic.leader)
         multiplier, offset = own * other * joint.mimic.multiplier, own * joint.mimic.offset
-        found.append(Coupling(joint.name, joint.mimic.leader, multiplier, offset))
+        couplings.append(Coupling(joint.name, joint.mimic.leader, multiplier, offset))
     path = description.path or urdf.path
     for i, pair in enumerate(description.differentials):
         for key in ("joint1", "joint2"):
@@ -75,12 +75,12 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
             raise bad_input(
                 path, f"differentials[{i}].joint2", pair.joint2, "is not parallel to joint1", "name the rockers' pivots"
             )
-        found.append(Coupling(pair.joint2, pair.joint1, -1.0 if cosine > 0.0 else 1.0, 0.0))
-    followers = [c.follower for c in found]
+        couplings.append(Coupling(pair.joint2, pair.joint1, -1.0 if cosine > 0.0 else 1.0, 0.0))
+    followers = [c.follower for c in couplings]
     for name in followers:
         if followers.count(name) > 1:
             raise bad_input(path, "joint", name, "follows two joints", "leave one of them out")
-    return tuple(found)
+    return tuple(couplings)
 
 
 def _drawn_axis(urdf: Urdf, joint: str) -> np.ndarray:

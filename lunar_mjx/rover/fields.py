@@ -98,7 +98,7 @@ def check_sizes(path: Path, model: mujoco.MjModel, wheels: Sequence[Wheel], stan
 def _shape_radius(model: mujoco.MjModel, body: int) -> float | None:
     """Largest radius of the cylinders and spheres of a wheel's body, m; None without any."""
     round_ = (int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_SPHERE))
-    found = [
+    radii = [
         float(model.geom_size[g, 0]) for g in np.flatnonzero(model.geom_bodyid == body) if model.geom_type[g] in round_
     ]
-    return max(found, default=None)
+    return max(radii, default=None)

@@ -129,11 +129,11 @@ def _colours(path: Path, table: Any) -> dict[str, tuple[float, ...]]:
     """Colours as shown on a screen, 0 to 1, by name."""
     if not isinstance(table, dict):
         raise bad_input(path, "colours", table, "is not a table", "write grey = [0.5, 0.5, 0.5]")
-    found = {name: tuple(numbers(path, f"colours.{name}", value, 3)) for name, value in table.items()}
-    for name, value in found.items():
+    colours = {name: tuple(numbers(path, f"colours.{name}", value, 3)) for name, value in table.items()}
+    for name, value in colours.items():
         if not all(0.0 <= v <= 1.0 for v in value):
             raise bad_input(path, f"colours.{name}", list(value), "is outside 0 to 1", "give red, green and blue")
-    return found
+    return colours
 
 
 def _turn(angles: np.ndarray) -> np.ndarray:

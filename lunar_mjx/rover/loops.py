@@ -34,15 +34,15 @@ def place_loops(urdf: Urdf, bodies: tuple[Body, ...], description: Description) 
     poses = world_poses(bodies)
     placed = []
     for i, loop in enumerate(description.loops):
-        found: list[tuple[str, np.ndarray]] = []
+        loops: list[tuple[str, np.ndarray]] = []
         for key, link, anchor in (("link1", loop.link1, loop.anchor1), ("link2", loop.link2, loop.anchor2)):
             place = locate(bodies, link)
             if place is None:
                 raise bad_input(
                     path, f"loops[{i}].{key}", link, f"is not a link of {urdf.path.name}", "correct the name"
                 )
-            found.append((place[0].name, place[1].apply(np.array(anchor))))
-        (body1, anchor1), (body2, anchor2) = found
+            loops.append((place[0].name, place[1].apply(np.array(anchor))))
+        (body1, anchor1), (body2, anchor2) = loops
         if body1 == body2:
             raise bad_input(
                 path, f"loops[{i}].link2", loop.link2, "belongs to the body of link1", "tie two bodies that move"

@@ -59,11 +59,11 @@ def assign_roles(urdf: Urdf, bodies: tuple[Body, ...], description: Description)
     else:
         wheels = [_role(urdf, bodies, poses, b, WheelDescription(b.name)) for b in _candidates(bodies, poses)]
     if len(wheels) < MINIMUM_WHEELS:
-        found = ", ".join(w.body for w in wheels) or "none"
+        wheel_names = ", ".join(w.body for w in wheels) or "none"
         raise bad_input(
             urdf.path,
             "wheels",
-            found,
+            wheel_names,
             f"are fewer than {MINIMUM_WHEELS}",
             "give each wheel a continuous joint with an axis along y at zero angles and a cylinder, "
             "or name the wheels in the description beside the URDF ([[wheels]])",
@@ -108,33 +108,33 @@ def _world_axis(body: Body, poses: dict[str, Pose]) -> np.ndarray:
 def _rim(body: Body) -> tuple[Geometry, float, float] | None:
     """The body's largest round primitive about its joint axis, with radius and width."""
     assert body.joint is not None
-    found = []
+    rims = []
     for shape in body.geometry:
         # A cylinder across the axle is a hub or a motor, not a rim.
         if shape.kind == "cylinder" and abs(shape.pose.rotation[:, 2] @ body.joint.axis) > 0.98:
-            found.append((shape, shape.size[0], shape.size[1]))
+            rims.append((shape, shape.size[0], shape.size[1]))
         elif shape.kind == "sphere":
-            found.append((shape, shape.size[0], shape.size[0]))
-    return max(found, key=lambda f: f[1], default=None)
+            rims.append((shape, shape.size[0], shape.size[0]))
+    return max(rims, key=lambda f: f[1], default=None)
 
 
 def _candidates(bodies: tuple[Body, ...], poses: dict[str, Pose]) -> list[Body]:
     """Bodies at the end of a chain that turn about y and carry a round shape, unless they hang above the others."""
     parents = {b.parent for b in bodies}
     bottoms: dict[str, float] = {}
-    found = []
+    candidates = []
     for body in bodies:
         if body.joint is None or body.joint.kind not in _HINGES or body.name in parents:
             continue
         rim = _rim(body)
         if rim is None or abs(_world_axis(body, poses)[1]) < 0.9:
             continue
-        found.append(body)
+        candidates.append(body)
         bottoms[body.name] = (poses[body.name] @ rim[0].pose).position[2] - rim[1]
     lowest = min(bottoms.values(), default=0.0)
     # Half a radius above the lowest: wheels of a suspension may differ by that, a reel on the deck does not come so
     # low.
-    return [b for b in found if bottoms[b.name] - lowest < 0.5 * _rim(b)[1]]  # type: ignore[index]
+    return [b for b in candidates if bottoms[b.name] - lowest < 0.5 * _rim(b)[1]]  # type: ignore[index]
 
 
 def _described(

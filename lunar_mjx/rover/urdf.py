@@ -229,11 +229,11 @@ class _Reader:
         shape = element.find("geometry")
         pose = self.pose(element, f"{where} {element.tag}")
         for kind, keys in (("box", ()), ("cylinder", ("radius", "length")), ("sphere", ("radius",))):
-            found = None if shape is None else shape.find(kind)
-            if found is None:
+            shape_element = None if shape is None else shape.find(kind)
+            if shape_element is None:
                 continue
-            size = [self.number(found, k, f"{where} {kind}") for k in keys] or [
-                float(v) for v in self.numbers(found, "size", "", f"{where} box")
+            size = [self.number(shape_element, k, f"{where} {kind}") for k in keys] or [
+                float(v) for v in self.numbers(shape_element, "size", "", f"{where} box")
             ]
             if min(size) <= 0:
                 raise bad_input(self.path, f"{where} {kind} size", size, "is not positive", "give the size in metres")

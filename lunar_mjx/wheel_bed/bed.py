@@ -158,8 +158,8 @@ class WheelBed:
     def __init__(
         self, effects: Sequence[Effect | str], parameters: Parameters | None = None, gravity: float = EARTH_GRAVITY
     ):
-        found = [catalogue.get(e) if isinstance(e, str) else e for e in effects]
-        self.effects = tuple(e for e in found if not e.transient and any(port in PORTS for port in e.ports))
+        effect_list = [catalogue.get(e) if isinstance(e, str) else e for e in effects]
+        self.effects = tuple(e for e in effect_list if not e.transient and any(port in PORTS for port in e.ports))
         given = parameters or {}
         self.parameters = {e.name: {**e.nominal(), **given.get(e.name, {})} for e in self.effects}
         for name, values in self.parameters.items():
@@ -275,15 +275,15 @@ class WheelBed:
 
         # One loop for scan and bisection: the forces are then compiled once.
         def probe(i: Any, bracket: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-            low, high, found = bracket
+            low, high, is_found = bracket
             scanning = i < BED_SEARCH.scan
             at = jnp.where(scanning, grid[jnp.minimum(i, BED_SEARCH.scan - 1)], 0.5 * (low + high))
             enough = self._loads(still_parameters, still_test, terrain, at).vertical >= still_test.normal_load
-            live = jnp.logical_not(scanning & found)
+            live = jnp.logical_not(scanning & is_found)
             return (
                 jnp.where(live & jnp.logical_not(enough), at, low),
                 jnp.where(live & enough, at, high),
-                found | (scanning & enough),
+                is_found | (scanning & enough),
             )
 
         start = (jnp.zeros_like(deepest), deepest, jnp.asarray(False))

@@ -133,14 +133,14 @@ def _solve(
         for i, start in enumerate(points):
             # The middle of the range keeps starts away from its edges, where an exponent of 2.5 carries no load.
             x0 = 0.1 + 0.8 * start
-            found = optimize.least_squares(
+            solution = optimize.least_squares(
                 evaluate,
                 x0,
                 jac=jacobian,  # pyright: ignore[reportArgumentType]
                 bounds=(0.0, 1.0),
                 x_scale=0.1,
             )
-            solutions.append(found)
+            solutions.append(solution)
             if progress is not None:
                 progress(i + 1)
     return sorted(solutions, key=lambda s: s.cost)

@@ -197,13 +197,13 @@ def _blocks(env: NavigationEnv) -> list[Block]:
 
 
 def _joints(env: NavigationEnv) -> list[Joint]:
-    rover, found = env.model.rover, []
+    rover, joints = env.model.rover, []
     for name, source, scale, mode in zip(
         rover.joints, env.actions.source, env.actions.scale, env.actions.mode, strict=True
     ):
         word, unit = MODES[int(mode)]
         low, high = (value if math.isfinite(value) else None for value in map(float, rover.joint_limits[name]))
-        found.append(
+        joints.append(
             Joint(name=name, mode=word, unit=unit, action=int(source), scale=float(scale), low=low, high=high)  # type: ignore[arg-type]
         )
-    return found
+    return joints

@@ -170,10 +170,10 @@ class Driver:
 
     def targets(self, action: Any) -> dict[str, dict[str, float]]:
         """Targets of all joints for actions (action,)."""
-        found: dict[str, dict[str, float]] = {"position": {}, "velocity": {}, "effort": {}}
+        by_mode: dict[str, dict[str, float]] = {"position": {}, "velocity": {}, "effort": {}}
         for joint in self.contract["joints"]:
-            found[FIELD[joint["mode"]]][joint["name"]] = float(joint["scale"] * action[joint["action"]])
-        return found
+            by_mode[FIELD[joint["mode"]]][joint["name"]] = float(joint["scale"] * action[joint["action"]])
+        return by_mode
 
     def look(self) -> None:
         """Reads pose and joints of the newest messages, and counts what the observations count."""

@@ -59,18 +59,18 @@ def unfit(name: str, effect: Effect) -> str:
 
 def baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[Coordinate]:
     """Baseline parameters; one that differs between wheels or joints moves by a common factor."""
-    found = []
+    coordinates = []
     for effect in model.effects:
         for name, (relative, prior) in baseline.get(effect.name, {}).items():
             value = np.atleast_1d(np.asarray(model.parameters[effect.name][name], float))
             p = effect.parameters[name]
             if np.all(value > 0.0):
                 low, high = max(p.bounds[0] / value.min(), 1e-3), min(p.bounds[1] / value.max(), 1e3)
-                found.append(Coordinate(effect.name, name, 1.0, relative, low, high, True, prior, factor=True))
+                coordinates.append(Coordinate(effect.name, name, 1.0, relative, low, high, True, prior, factor=True))
         # Effects beyond the preset were added to explain measurements; they are refitted with the rest.
         if effect.name not in PRESETS.get(model.preset, ()) and effect.name not in NOT_MISSING:
             for name, p in effect.parameters.items():
                 value = np.asarray(model.parameters[effect.name][name], float)
                 if p.null is not None and value.ndim == 0:
-                    found.append(default_coordinate(effect, name, float(value), 0.3, 10.0))
-    return found
+                    coordinates.append(default_coordinate(effect, name, float(value), 0.3, 10.0))
+    return coordinates

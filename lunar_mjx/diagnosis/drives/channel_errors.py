@@ -53,9 +53,11 @@ def chosen_errors(
 
     def value(levels: np.ndarray) -> float:
         gram = Gram(grams[0].count, np.stack([grams[level].matrix[g] for g, level in enumerate(levels)]))
-        found = infer(gram, amplitudes, (), noises)
+        inferred = infer(gram, amplitudes, (), noises)
         return (
-            found.log_evidence - sum(log_det[level][g] for g, level in enumerate(levels)) + float(prior[levels].sum())
+            inferred.log_evidence
+            - sum(log_det[level][g] for g, level in enumerate(levels))
+            + float(prior[levels].sum())
         )
 
     levels = np.zeros(kinds, int)
@@ -84,11 +86,11 @@ def with_errors(observations: Observations, sizes: Mapping[str, float], share: f
 
 def spread(observations: Observations) -> dict[str, float]:
     """Root mean square of what a channel does, about its first value, by channel, over all logs, its axes together."""
-    found: dict[str, list[float]] = {}
+    by_kind: dict[str, list[float]] = {}
     for s in observations.series:
         v = observations.value[s.start : s.stop]
-        found.setdefault(_kind(s.channel), []).append(float(np.mean((v - v[0]) ** 2)))
-    return {s.channel: float(np.sqrt(np.mean(found[_kind(s.channel)]))) for s in observations.series}
+        by_kind.setdefault(_kind(s.channel), []).append(float(np.mean((v - v[0]) ** 2)))
+    return {s.channel: float(np.sqrt(np.mean(by_kind[_kind(s.channel)]))) for s in observations.series}
 
 
 def _kind(channel: str) -> str:

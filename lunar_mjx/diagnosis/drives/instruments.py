@@ -53,15 +53,15 @@ def instrument_nuisances(number: int, log: Log, observations: Observations) -> l
       number: of the log. log: itself. observations: of the campaign.
     """
     mine = [s for s in observations.series if s.log == number]
-    found = []
+    coordinates = []
     for name, table in log.tables.items():
         if table.clock_offset_std_s > 0.0 and any(s.channel in table.channels for s in mine):
-            found.append(_coordinate(CLOCK + name, table.clock_offset_std_s, "s", number))
+            coordinates.append(_coordinate(CLOCK + name, table.clock_offset_std_s, "s", number))
     turned = [s for s in mine if s.channel.partition("_")[0] in _VECTORS or (log.imu.attitude and s.channel in EULER)]
     for axis, std in zip("xyz", log.imu.mounting_std_deg, strict=True):
         if turned and 0.0 < std < USUAL_ERRORS.unknown_deg:
-            found.append(_coordinate(MOUNTING + axis, float(np.radians(std)), "rad", number))
-    return found
+            coordinates.append(_coordinate(MOUNTING + axis, float(np.radians(std)), "rad", number))
+    return coordinates
 
 
 def _coordinate(name: str, std: float, unit: str, number: int) -> Coordinate:

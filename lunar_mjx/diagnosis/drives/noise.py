@@ -126,13 +126,13 @@ class Noises:
         for log in logs:
             rests = _rests(log)
             for channel in log.channel_names:
-                found = log.channel(channel)
+                samples = log.channel(channel)
                 # a slip ratio at rest is noise over zero
-                if is_command(channel) or channel.endswith("slip_ratio") or found is None:
+                if is_command(channel) or channel.endswith("slip_ratio") or samples is None:
                     continue
                 key = _kind(log, channel)
                 for begin, end in rests:
-                    segments.setdefault(key, []).extend(_cut(*found, begin, end, key[1]))
+                    segments.setdefault(key, []).extend(_cut(*samples, begin, end, key[1]))
         self.common, self.colours = colours({key: parts for key, parts in segments.items() if parts})
 
     @staticmethod
@@ -153,8 +153,8 @@ class Noises:
         std = stated_or_typical(log, channel)
         if self._stated(log, channel):
             return 0.1 * std, std, log.noise[channel].correlation_time_s
-        found = self.colours.get(_kind(log, channel), self.common)
-        return std * np.sqrt(1.0 - found.share), std * np.sqrt(found.share), found.correlation_time
+        colour = self.colours.get(_kind(log, channel), self.common)
+        return std * np.sqrt(1.0 - colour.share), std * np.sqrt(colour.share), colour.correlation_time
 
     def estimate(self, log: Log, channel: str) -> ChannelNoise | None:
         """Noise that the log does not state, as the drive itself shows it; None where that is stated or too short."""
@@ -167,8 +167,8 @@ class Noises:
 
     def log_std(self, log: Log, channel: str) -> float:
         """Standard deviation of the logarithm of a channel's noise: how well its size is known."""
-        found = noise_of(log, channel) if channel in log.noise else self.estimate(log, channel)
-        return NOISE_COLOURS.unknown_log_std if found is None else found.log_std
+        channel_noise = noise_of(log, channel) if channel in log.noise else self.estimate(log, channel)
+        return NOISE_COLOURS.unknown_log_std if channel_noise is None else channel_noise.log_std
 
     def refined(self, observations: Observations, residual: np.ndarray) -> Observations:
         """The colours that rest has shown, taken anew from a residual, which is longer than any rest.
@@ -219,7 +219,7 @@ def _kind(log: Log, channel: str) -> tuple[str, float]:
 
 def _rests(log: Log) -> list[tuple[float, float]]:
     """Spans in which all commands are zero, without what the rover needs to come to rest."""
-    commands = [found for c in log.channel_names if is_command(c) and (found := log.channel(c)) is not None]
+    commands = [samples for c in log.channel_names if is_command(c) and (samples := log.channel(c)) is not None]
     if not commands:
         return []
     # A command stays until the next one.
@@ -316,8 +316,8 @@ def _by_times(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.n
             even if np.max(np.abs(t - t[0] - even)) < NOISE_COLOURS.jitter * step * len(t) else np.round(t - t[0], 6)
         )
         groups.setdefault(since.tobytes(), (since, []))[1].append(v)
-    found = sorted(groups.values(), key=lambda g: -len(g[1]))[: NOISE_COLOURS.uneven]
-    return [(since, np.stack(values, axis=1)) for since, values in found]
+    largest = sorted(groups.values(), key=lambda g: -len(g[1]))[: NOISE_COLOURS.uneven]
+    return [(since, np.stack(values, axis=1)) for since, values in largest]
 
 
 def _likelihood(groups: Sequence[tuple[np.ndarray, np.ndarray]], c: Colour, most: float) -> float:

@@ -79,7 +79,7 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
 
     `stood` tells whether the time for which the rover had stood is one.
     """
-    found = [
+    coordinates = [
         Coordinate(
             NUISANCE,
             name,
@@ -94,7 +94,7 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
         if name in _START
     ]
     if stood:
-        found.append(
+        coordinates.append(
             Coordinate(
                 NUISANCE,
                 STOOD,
@@ -111,7 +111,7 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
         if s.log == number and is_encoder(s):
             first = float(np.mean(observations.value[s.start : s.stop][:5]))
             scale = 3.0 * float(observations.sigma()[s.start])
-            found.append(
+            coordinates.append(
                 Coordinate(
                     NUISANCE,
                     s.channel,
@@ -123,7 +123,7 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
                     log_index=number,
                 )
             )
-    return found
+    return coordinates
 
 
 def is_linear(c: Coordinate) -> bool:

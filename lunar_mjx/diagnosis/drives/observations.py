@@ -38,10 +38,10 @@ def observations_of(
         for channel in bench.channels(number):
             if channels is not None and channel not in channels:
                 continue
-            found = log.channel(channel)
-            if found is None:
+            samples = log.channel(channel)
+            if samples is None:
                 continue
-            time, measured = found
+            time, measured = samples
             inside = (time >= run.begin - 1e-9) & (time <= run.end + 1e-9) & defined(log, run, channel, time)
             time, measured = time[inside], measured[inside]
             if len(time) < 2:

@@ -101,30 +101,30 @@ class DriveProblem:
         self.effects, self.not_tested = usable(model.effects, candidates, unfit)
         self.bench = Bench(model, self.logs, chunk, engine)
         self._stamped: tuple[Observations | None, bytes] = None, b""
-        found = baseline_coordinates(model, baseline)
+        coordinates = baseline_coordinates(model, baseline)
         self._noises = Noises(self.logs)
         self._noise_alone = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
         self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
         self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self._noise_alone.series)
         shows = self._standing_shows()
-        found.append(step_error_share())
+        coordinates.append(step_error_share())
         if any(at_once(s.channel) for s in self.observations.series):
-            found.append(reads_before_share())
+            coordinates.append(reads_before_share())
         for number, run in enumerate(self.bench.runs):
-            found += nuisances(number, run, self.observations, number in shows)
-            found += instrument_nuisances(number, self.logs[number], self.observations)
-        found += usual_nuisances(self.observations)
-        self.baseline = np.arange(len(found))
+            coordinates += nuisances(number, run, self.observations, number in shows)
+            coordinates += instrument_nuisances(number, self.logs[number], self.observations)
+        coordinates += usual_nuisances(self.observations)
+        self.baseline = np.arange(len(coordinates))
         self.candidates: dict[str, np.ndarray] = {}
         for name, effect in self.effects.items():
             mine = of_candidate(effect)
-            self.candidates[name] = np.arange(len(found), len(found) + len(mine))
-            found += mine
+            self.candidates[name] = np.arange(len(coordinates), len(coordinates) + len(mine))
+            coordinates += mine
         smooth = smooth_inputs(frozenset(port for e in model.effects for port in e.ports))
-        own = {c.name: len(found) + k for k, c in enumerate(of_candidate(smooth))}
+        own = {c.name: len(coordinates) + k for k, c in enumerate(of_candidate(smooth))}
         amplitudes = {label: [amplitude(label, q) for q in quantities] for label, quantities in FOLLOWS.items()}
         self.inputs = {k: np.array([own[n] for n in names]) for k, names in amplitudes.items() if names[0] in own}
-        self.coordinates = (*found, *of_candidate(smooth))
+        self.coordinates = (*coordinates, *of_candidate(smooth))
         self._additions = {**self.effects, SMOOTH: smooth}
         self._wider: dict[frozenset[str], Bench] = {}
         self._step_error: np.ndarray | None = None
@@ -213,10 +213,10 @@ class DriveProblem:
         if c.key not in self._instruments:
             predicted = self._simulations(self.bench, self.origin()[None], silent)[0]
             if c.name.startswith(USUAL):
-                found = usual_errors(self.observations, predicted)[c.name.removeprefix(USUAL)]
+                direction = usual_errors(self.observations, predicted)[c.name.removeprefix(USUAL)]
             else:
-                found = instrument_direction(c, self.logs[c.log_index], self.observations, predicted)
-            self._instruments[c.key] = np.where(np.isfinite(found), found, 0.0)
+                direction = instrument_direction(c, self.logs[c.log_index], self.observations, predicted)
+            self._instruments[c.key] = np.where(np.isfinite(direction), direction, 0.0)
         return self._instruments[c.key]
 
     @property
@@ -229,22 +229,22 @@ class DriveProblem:
         if self._step_error is None:
             origin = self.origin()[None]
             coarse, fine = (self._simulations(b, origin, silent)[0] for b in (self.bench, self.bench.halved()))
-            found = 2.0 * (fine - coarse)
-            self._step_error = np.where(np.isfinite(found), found, 0.0)
+            two_step_error = 2.0 * (fine - coarse)
+            self._step_error = np.where(np.isfinite(two_step_error), two_step_error, 0.0)
         return self._step_error
 
     def _simulations(self, bench: Bench, rows: np.ndarray, progress: Progress) -> np.ndarray:
         """(k, n) what a bench predicts for rows of coordinates, without linear nuisances, kept or simulated."""
         keys = self._keys(bench, rows)
-        found = {k: row for k in dict.fromkeys(keys) if (row := SIMULATED.get(k)) is not None}
-        new = {k: n for n, k in enumerate(keys) if k not in found}
+        known_rows = {k: row for k in dict.fromkeys(keys) if (row := SIMULATED.get(k)) is not None}
+        new = {k: n for n, k in enumerate(keys) if k not in known_rows}
         if new:
             wanted = rows[list(new.values())]
             simulated = from_first(self._run(bench, len(wanted), self._values(wanted), progress), self.observations)
             for k, row in zip(new, simulated, strict=True):
                 SIMULATED.keep(k, row)
-                found[k] = row
-        return np.stack([found[k] for k in keys])
+                known_rows[k] = row
+        return np.stack([known_rows[k] for k in keys])
 
     def _run(self, bench: Bench, rows: int, values: Rows, progress: Progress) -> np.ndarray:
         """(rows, n) what a bench simulates."""

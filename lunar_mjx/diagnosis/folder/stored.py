@@ -118,7 +118,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         return {}
     try:
         # NumPy leaves a file open that is no archive
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
-            return {name: found[name] for name in found.files}
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
     except Exception as error:  # zip archives, their compression and NumPy's headers raise a dozen kinds
         raise UserError(f"{path}: is damaged ({_told(error)}); make it anew with lunar-mjx compare or why.") from None

@@ -174,19 +174,19 @@ def discover(
     if isinstance(logs[0], SteadyLog):
         if asked is not None and asked not in WHEEL_PORTS:
             raise bad_input("unknown", "port", asked, "is none of a wheel bed", f"use one of {', '.join(WHEEL_PORTS)}")
-        before, found, scored, number = _in_tables(run, logs, [asked] if asked else WHEEL_PORTS, progress)
+        before, suggested, scored, number = _in_tables(run, logs, [asked] if asked else WHEEL_PORTS, progress)
     else:
-        before, found, scored = _in_drives(run, logs, port, progress)
+        before, suggested, scored = _in_drives(run, logs, port, progress)
         number = len(scored)
     files: list[str] = []
-    best = next((row for row in found if row[0].pays(Settings().chi2)), None)
+    best = next((row for row in suggested if row[0].pays(Settings().chi2)), None)
     if best is not None:
         provenance = f"lunar-mjx unknown on {', '.join(p.name for p in run.logs)}"
         for k, (part, term) in enumerate(zip(best[0].parts, best[1], strict=True)):
             values = {c: v for c, (v, _) in part.constants.items()}
             text = functools.partial(with_amount, term, part.amount, provenance=provenance, constants=values)
             files.append(str(_write(run, Path(out) if out else None, part.port, k, text)))
-    result = Discovery(port, tuple(s for s, _ in found), tuple(scored[:LISTED]), tuple(files), before, number)
+    result = Discovery(port, tuple(s for s, _ in suggested), tuple(scored[:LISTED]), tuple(files), before, number)
     run.save(UNKNOWN_FILE, result.to_dict())
     return result
 
@@ -239,7 +239,7 @@ def _in_drives(
     }
     order = sorted(gains, key=lambda n: -(2.0 * gains[n] - FORMULA_SEARCH.penalty * library[n].length))
     scored = [(f"{library[n].target}: {library[n].formula}", max(2.0 * gains[n], 0.0)) for n in order]
-    found: list[Row] = []
+    rows: list[Row] = []
     for i, name in enumerate(order[:REFITS]):
         progress("refitting formulas", i / REFITS)
         try:
@@ -262,9 +262,9 @@ def _in_drives(
         residual = form.residual(refit.u)
         quiet = bool(np.max(posterior.noise) < 1.0 + DriveSettings().stated_spread)
         suggestion = _suggestion([part], 2.0 * (after - before), gained, answer.errors(form, residual), quiet, t.length)
-        found.append((suggestion, (t,)))
-    found.sort(key=lambda row: -(row[0].chi2 - FORMULA_SEARCH.penalty * row[0].length))
-    return answer.errors(form, form.residual(base.u)), found, scored
+        rows.append((suggestion, (t,)))
+    rows.sort(key=lambda row: -(row[0].chi2 - FORMULA_SEARCH.penalty * row[0].length))
+    return answer.errors(form, form.residual(base.u)), rows, scored
 
 
 def _of_trial(trial: Trial, base: Fit) -> Row:

@@ -236,12 +236,12 @@ def matching(unit: tuple[int, int], quantities: Sequence[tuple[Quantity, tuple[i
     Args:
       unit: powers of N and m. quantities: with theirs. arm: the length.
     """
-    found = []
+    matches = []
     for q, (newton, metre) in quantities:
         if newton == unit[0] and newton:
             power = unit[1] - metre
             shown = q.name if q.positive else f"Abs({q.name})"
-            found.append(
+            matches.append(
                 shown if not power else f"{shown}*{arm.name}" if power == 1 else f"{shown}*{arm.name}**{power}"
             )
-    return found
+    return matches

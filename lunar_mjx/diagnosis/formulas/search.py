@@ -277,8 +277,8 @@ class _Search:
         down = descend(goal, start, iterations=FORMULA_SEARCH.steps)
         if not np.isfinite(down.chi2):
             return None
-        found = Fit(down.u, slots.free, down.chi2, down.residual, down.jacobian, self.base.fitted)
-        return self._judged(choices, slots, found)
+        descended = Fit(down.u, slots.free, down.chi2, down.residual, down.jacobian, self.base.fitted)
+        return self._judged(choices, slots, descended)
 
     def _judged(self, choices: tuple[Choice, ...], slots: Slots, found: Fit) -> Trial:
         after = predictive_residual(slots.problem, found)
@@ -308,8 +308,8 @@ class _Search:
         ordered = sorted(trials, key=lambda t: -t.merit)
         done = []
         for t in ordered[: FORMULA_SEARCH.finished]:
-            found = fit(t.slots.problem, t.slots.free, t.fit.u, starts=1)
-            done.append(self._judged(t.choices, t.slots, found) if found.chi2 <= t.fit.chi2 else t)
+            refitted = fit(t.slots.problem, t.slots.free, t.fit.u, starts=1)
+            done.append(self._judged(t.choices, t.slots, refitted) if refitted.chi2 <= t.fit.chi2 else t)
         return done + ordered[FORMULA_SEARCH.finished :]
 
     def pairs(self, trials: Sequence[Trial], choices: Sequence[Choice]) -> list[Trial]:

@@ -75,7 +75,7 @@ class Choice:
 @functools.cache
 def library(ports: tuple[str, ...]) -> tuple[Choice, ...]:
     """All formulas at some ports; two constants to be refined are one too many."""
-    found = []
+    functions = []
     for k, target in enumerate(targets()):
         if target.port not in ports:
             continue
@@ -83,8 +83,8 @@ def library(ports: tuple[str, ...]) -> tuple[Choice, ...]:
         for i, j in _pairs(target.port):
             one = plain == 1 and (i, j) == (0, 0)
             if not (shapes[i] and shapes[j]) and not (one and target.port == "soil"):
-                found.append(Choice(k, i, j))
-    return tuple(found)
+                functions.append(Choice(k, i, j))
+    return tuple(functions)
 
 
 @functools.cache
@@ -213,11 +213,11 @@ class Slots:
         Args:
           u: (coordinates,) where. which: numbers of targets.
         """
-        found, number = {}, self.spare
+        probe_rows, number = {}, self.spare
         for k in which:
             other = self.holding({**self.held, number: (Choice(k, 0, 0), targets()[k].size)})
-            found[k] = other.problem.jacobian(u, np.array([other.place(number)]))[:, 0]
-        return found
+            probe_rows[k] = other.problem.jacobian(u, np.array([other.place(number)]))[:, 0]
+        return probe_rows
 
     def factors(self, u: np.ndarray, port: str) -> np.ndarray:
         """(n, features) what every feature of a port is at the observed points of the bed at a place."""
@@ -271,8 +271,8 @@ def _settled(bed: Any) -> Any:
 
 @functools.cache
 def _functions(port: str) -> tuple[tuple[list[str], Any], ...]:
-    found = []
+    functions = []
     for e in features(port):
         symbols = sorted(e.free_symbols, key=str)
-        found.append(([str(s) for s in symbols], f.function(e, symbols)))
-    return tuple(found)
+        functions.append(([str(s) for s in symbols], f.function(e, symbols)))
+    return tuple(functions)

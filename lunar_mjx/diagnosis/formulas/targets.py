@@ -205,8 +205,8 @@ def wheel_targets(port: str) -> tuple[Target, ...]:
         (named[n], unit)
         for n, unit in (("W", (1, 0)), ("R", (1, 0)), ("F_x", (1, 0)), ("F_y", (1, 0)), ("M_y", (1, 1)))
     ]
-    found = [GRIP, dataclasses.replace(GRIP, words="friction", carrier="q"), SHEAR]
+    targets = [GRIP, dataclasses.replace(GRIP, words="friction", carrier="q"), SHEAR]
     for base, unit in ((ALONG, (1, 0)), (LEFT, (1, 0)), (AGAINST, (1, 0)), (DRIVE, (1, 1))):
         own = "" if base.carrier == "1" else f"{base.carrier}*"
-        found += [base, *(carried(base, own + c, {}) for c in matching(unit, forces, named["r"]))]
-    return tuple(found)
+        targets += [base, *(carried(base, own + c, {}) for c in matching(unit, forces, named["r"]))]
+    return tuple(targets)

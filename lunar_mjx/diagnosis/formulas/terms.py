@@ -87,16 +87,16 @@ def with_amount(
     """The term's effect file with its fitted amount and constants, another name and where it came from."""
     text = term.source.replace(f"def {term.name}(", f"def {name}(")
     for key, value in {"amount": amount, **(constants or {})}.items():
-        found = re.search(rf"\b{key}=Parameter\(([^,]+), ([^,]+), \(([^,]+), ([^)]+)\)", text)
-        if found is None:
+        declared = re.search(rf"\b{key}=Parameter\(([^,]+), ([^,]+), \(([^,]+), ([^)]+)\)", text)
+        if declared is None:
             continue
         # a search may end beyond the bounds that a term is given at first
         low, high = (
-            b(float(found[n]), value * s)
+            b(float(declared[n]), value * s)
             for b, n, s in ((min, 3, 0.1 if value > 0.0 else 10.0), (max, 4, 10.0 if value > 0.0 else 0.1))
         )
-        low, high = (min(low, -high), max(high, -low)) if found[2] == "0.0" else (low, high)
-        text = text.replace(found[0], f"{key}=Parameter({value:.6g}, {found[2]}, ({low!r}, {high!r})", 1)
+        low, high = (min(low, -high), max(high, -low)) if declared[2] == "0.0" else (low, high)
+        text = text.replace(declared[0], f"{key}=Parameter({value:.6g}, {declared[2]}, ({low!r}, {high!r})", 1)
     return text.replace('source="suggested"', f"source={provenance!r}")
 
 
@@ -326,10 +326,10 @@ def _sensor(kinds: Sequence[str]) -> Iterator[Term]:
         ):
             made = Term("sensor", kind, f"y += {shown}", per, size, "", f"y += {shown}", len(shown), shown)
             changed = f"changed = {{name: value.channels[name] + p.amount * {code} for name in chosen}}"
-            found = _file(made, [*pick, changed], "value.with_channels(changed)")
+            draft = _file(made, [*pick, changed], "value.with_channels(changed)")
             yield dataclasses.replace(
-                found,
-                source=found.source.replace(
+                draft,
+                source=draft.source.replace(
                     "from lunar_mjx.effects import Parameter, effect",
                     "from lunar_mjx.effects import Parameter, effect\n"
                     "from lunar_mjx.effects.sensor.channels import slope",

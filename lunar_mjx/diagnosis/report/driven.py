@@ -93,13 +93,13 @@ def _course(label: str, traces: Traces, log: int, row: int | None) -> Course:
 
 def _direction(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Heading of the way, rad: that of the last place that was far enough away, as if it drove forward."""
-    yaw, last, found = np.zeros(len(x)), 0, False
+    yaw, last, has_direction = np.zeros(len(x)), 0, False
     for i in range(1, len(x)):
         yaw[i] = yaw[i - 1]
         if np.hypot(x[i] - x[last], y[i] - y[last]) >= _LEAST_STEP:
             yaw[i], last = np.arctan2(y[i] - y[last], x[i] - x[last]), i
-            if not found:
-                yaw[:i], found = yaw[i], True
+            if not has_direction:
+                yaw[:i], has_direction = yaw[i], True
     return np.unwrap(yaw)
 
 

@@ -58,12 +58,15 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     height = 24 * len(channels)
     gap = 34 / (height * len(rms) + 34 * (len(rms) - 1))
     figure = make_subplots(len(rms), 1, shared_xaxes=True, subplot_titles=titles, vertical_spacing=gap)
-    for n, found in enumerate(rms, 1):
+    for n, channel_rms in enumerate(rms, 1):
         figure.add_heatmap(
             x=[_unit_label(o, u) for u in units],
             y=[plot_text(channel_label(c)) for c in channels],
-            z=[[_depth(found.get((c, u))) for u in units] for c in channels],
-            text=[[shown(found[c, u]) if found.get((c, u)) is not None else "" for u in units] for c in channels],
+            z=[[_depth(channel_rms.get((c, u))) for u in units] for c in channels],
+            text=[
+                [shown(channel_rms[c, u]) if channel_rms.get((c, u)) is not None else "" for u in units]
+                for c in channels
+            ],
             texttemplate="%{text}",
             customdata=[[_key(c, u) for u in units] for c in channels],
             colorscale=SHADES,
@@ -83,14 +86,14 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     thin = max(1, int(np.ceil(len(o) * 5 / EXPLORE.most_values)))
     worst = sorted(places, key=lambda key: -(rms[0][key] or 0.0))
     models = _compared(steps)
-    found = {_key(*key): _panel(models, *key, places[key][::thin]) for key in worst}
+    channel_rms = {_key(*key): _panel(models, *key, places[key][::thin]) for key in worst}
     left = f" {len(steps) - EXPLORE.maps} models in between are left out." if len(steps) > EXPLORE.maps else ""
     caption = (
         "Root mean square residual in sigma, 1 is the noise: one map for each model of the chain, in one scale of "
         f"shades.{left} What is held out was never fitted. Click a field, or choose from the list, to see what was "
         "measured, what the models say, and what they leave."
     )
-    return [Explorer(figure, _detail(models), found, caption)]
+    return [Explorer(figure, _detail(models), channel_rms, caption)]
 
 
 def _number(steps: Sequence[Step], step: Step) -> int:
@@ -180,7 +183,7 @@ def gallery(result: Result) -> list[Block]:
             shapes[e["effect"]] = np.zeros(len(o))
             shapes[e["effect"]][fitted] = signature
     chosen = sorted(shapes, key=lambda e: -float(np.linalg.norm(shapes[e])))[: EXPLORE.shapes]
-    drawn = {e: found for e in chosen if (found := _largest(o, shapes[e])) is not None}
+    drawn = {e: largest for e in chosen if (largest := _largest(o, shapes[e])) is not None}
     if not drawn:
         return []
     columns = min(2, len(drawn))
@@ -236,12 +239,12 @@ def _baseline(traces: Traces) -> int:
 
 def cells(o: Observations) -> Iterator[tuple[str, int, np.ndarray]]:
     """Channel, manoeuvre, and places of its observations."""
-    found: dict[tuple[str, int], list[np.ndarray]] = {}
+    rows_of: dict[tuple[str, int], list[np.ndarray]] = {}
     for s in o.series:
         part = np.arange(s.start, s.stop)
         for unit in np.unique(o.unit[part]):
-            found.setdefault((s.channel, int(unit)), []).append(part[o.unit[part] == unit])
-    for (channel, unit), parts in found.items():
+            rows_of.setdefault((s.channel, int(unit)), []).append(part[o.unit[part] == unit])
+    for (channel, unit), parts in rows_of.items():
         yield channel, unit, np.concatenate(parts)
 
 

@@ -98,9 +98,9 @@ def _worst(steps: Sequence[Step], splits: Sequence[str]) -> list[tuple[str, str,
     """Channel, manoeuvre and observations where the first model is worst, one of each channel, of the judged splits."""
     o, residual = steps[0].observations, steps[0].residual
     judges = o.in_split(*splits)
-    found = [(channel, unit, at[judges[at] & np.isfinite(residual[at])]) for channel, unit, at in cells(o)]
+    judged = [(channel, unit, at[judges[at] & np.isfinite(residual[at])]) for channel, unit, at in cells(o)]
     ranked = sorted(
-        (c for c in found if len(c[2]) >= FILM.least_points),
+        (c for c in judged if len(c[2]) >= FILM.least_points),
         key=lambda c: -float(np.sqrt(np.mean(residual[c[2]] ** 2))),
     )
     worst: dict[str, tuple[str, str, np.ndarray]] = {}

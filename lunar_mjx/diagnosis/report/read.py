@@ -120,40 +120,40 @@ def read_result(folder: Path) -> Result:
 
 
 def _signatures(path: Path) -> dict[str, np.ndarray]:
-    found = read_arrays(path)
-    if not found:
+    arrays = read_arrays(path)
+    if not arrays:
         return {}
     try:
-        return dict(zip(map(str, found["names"]), found["signatures"], strict=True))
+        return dict(zip(map(str, arrays["names"]), arrays["signatures"], strict=True))
     except (KeyError, ValueError, TypeError) as error:
         raise UserError(f"{path}: is damaged ({error}); make it anew with lunar-mjx why.") from None
 
 
 def _traces(path: Path) -> Traces | None:
-    found = read_arrays(path)
-    if not found:
+    arrays = read_arrays(path)
+    if not arrays:
         return None
     try:
-        _check_shapes(found)
-        starts = [*found["series_start"].tolist(), len(found["measured"])]
-        independent = np.isnan(found["time"])
+        _check_shapes(arrays)
+        starts = [*arrays["series_start"].tolist(), len(arrays["measured"])]
+        independent = np.isnan(arrays["time"])
         series = []
-        for i, (channel, log) in enumerate(zip(found["series_channel"], found["series_log"], strict=True)):
+        for i, (channel, log) in enumerate(zip(arrays["series_channel"], arrays["series_log"], strict=True)):
             a, b = starts[i], starts[i + 1]
-            time = None if b > a and independent[a] else found["time"][a:b]
-            series.append(Series(int(log), str(channel), a, b, time, found["sigma"][a:b]))
+            time = None if b > a and independent[a] else arrays["time"][a:b]
+            series.append(Series(int(log), str(channel), a, b, time, arrays["sigma"][a:b]))
         observations = Observations(
-            value=found["measured"],
+            value=arrays["measured"],
             series=tuple(series),
-            logs=tuple(map(str, found["logs"])),
+            logs=tuple(map(str, arrays["logs"])),
             split=(),
-            unit=found["unit"],
-            unit_split=tuple(map(str, found["split"])),
-            unit_names=tuple(map(str, found["unit_names"])),
-            place=found["place"] if len(found["place"]) else None,
+            unit=arrays["unit"],
+            unit_split=tuple(map(str, arrays["split"])),
+            unit_names=tuple(map(str, arrays["unit_names"])),
+            place=arrays["place"] if len(arrays["place"]) else None,
         )
-        labels = tuple(map(str, found["labels"]))
-        return Traces(observations, labels, found["predicted"], found["residual"], found["time"])
+        labels = tuple(map(str, arrays["labels"]))
+        return Traces(observations, labels, arrays["predicted"], arrays["residual"], arrays["time"])
     except KeyError as error:
         raise UserError(f"{path}: lacks {error}; make it anew with lunar-mjx compare.") from None
     except (ValueError, TypeError, IndexError) as error:

@@ -122,15 +122,15 @@ def _digest(script: str) -> str:
 def _page_data(result: Result, traces: Traces) -> dict[str, Any]:
     o = traces.observations
     models = _models(result, traces)
-    found = {(c, u): at for c, u, at in cells(o) if np.isfinite(models[0].residual[at]).any()}
-    channels = list(dict.fromkeys(c for c, _ in found))
-    units = sorted({u for _, u in found})
+    shown_cells = {(c, u): at for c, u, at in cells(o) if np.isfinite(models[0].residual[at]).any()}
+    channels = list(dict.fromkeys(c for c, _ in shown_cells))
+    units = sorted({u for _, u in shown_cells})
     thin = max(1, int(np.ceil(len(o) * (2 + 2 * len(models)) / STUDIO_SIZES.most_values)))
     held = o.in_split("select", "test")
     fitted = o.in_split("fit")
     verdict = result.verdict or {}
     base = next((i for i, m in enumerate(models) if m.kind == "refit"), 0)
-    grid = [[found.get((c, u)) for u in units] for c in channels]
+    grid = [[shown_cells.get((c, u)) for u in units] for c in channels]
     remains = [(k, d) for k, d in (verdict.get("discrepancy") or {}).items() if isinstance(d, Mapping)]
     return {
         "table": traces.is_table,
@@ -167,14 +167,14 @@ def _unit(name: str, split: str) -> dict[str, str]:
 def _models(result: Result, traces: Traces) -> list[_Model]:
     """As given, refitted, and with every effect of which the folder tells something, best first within each kind."""
     o = traces.observations
-    found = []
+    models = []
     for row, label in enumerate(traces.labels):
         effects = () if label in ("as given", "refitted") else tuple(re.split(r", | \+ ", label.removeprefix("with ")))
         words = {"as given": "the model as given", "refitted": "the model, refitted"}.get(label, "+ " + _words(effects))
         kind = "given" if label == "as given" else "refit"
-        found.append(_Model(words, effects, kind, traces.residual[row], traces.predicted[row]))
-    base = next((m for m in found if m.kind == "refit"), found[-1])
-    known = {frozenset(m.effects) for m in found}
+        models.append(_Model(words, effects, kind, traces.residual[row], traces.predicted[row]))
+    base = next((m for m in models if m.kind == "refit"), models[-1])
+    known = {frozenset(m.effects) for m in models}
     refits = read_refits(result.folder, len(o)) if result.folder is not None else {}
     more = [
         _Model("+ " + _words(names), names, "refit", left.residual, left.predicted)
@@ -189,7 +189,7 @@ def _models(result: Result, traces: Traces) -> list[_Model]:
             residual[fitted] = left
             more.append(_Model("+ " + _words((name,)), (name,), "estimate", residual, None))
     more.sort(key=lambda m: (m.kind != "refit", _rms(m.residual[fitted]) or np.inf))
-    return [*found, *more][: STUDIO_SIZES.most_models]
+    return [*models, *more][: STUDIO_SIZES.most_models]
 
 
 def _estimate(residual: np.ndarray, signature: np.ndarray) -> np.ndarray | None:

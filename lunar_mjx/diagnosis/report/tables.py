@@ -179,12 +179,12 @@ def parameters(first: Result, last: Result) -> list[Block]:
     proposed = ((last.verdict or {}).get("details") or {}).get("parameters")
     after = proposed or (last.comparison or {}).get("parameters") or {}
     rows = []
-    for effect, found in {**before, **after}.items():
+    for effect, parameters_of in {**before, **after}.items():
         old, new = before.get(effect) or {}, after.get(effect) or {}
-        for name in found.get("value") or {}:
+        for name in parameters_of.get("value") or {}:
             a, b = ((t.get("value") or {}).get(name) for t in (old, new))
             sa, sb = ((t.get("std") or {}).get(name) for t in (old, new))
-            unit = (found.get("unit") or {}).get(name, "")
+            unit = (parameters_of.get("unit") or {}).get(name, "")
             given = (old.get("given") or {}).get(name)
             strength = shown(abs(a - b) / sa, 2) if a is not None and b is not None and a != b and sa else "-"
             for label, own, last_size in _sizes(first, last, effect, name, unit):

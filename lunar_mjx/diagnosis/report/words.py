@@ -39,10 +39,10 @@ def channel_label(channel: str) -> str:
         unit = STEADY_CHANNELS[channel][0]
         stem = channel.removesuffix("_" + unit.replace("/", "_").replace(" ", "")) if unit != "1" else channel
         return f"{stem.replace('_', ' ')}, {unit}"
-    found = find_channel(channel)
-    if found is None:
+    channel_entry = find_channel(channel)
+    if channel_entry is None:
         return channel.replace("_", " ")
-    kind, match = found
+    kind, match = channel_entry
     return f"{match[0].replace('_', ' ')}, {kind.unit}"
 
 

@@ -123,11 +123,11 @@ def contact_laws(model: Model, rivals: Sequence[str]) -> dict[str, Model]:
             raise bad_input("settings", "laws", name, "is not known", f"use some of {', '.join(LAWS)}")
     present = set(model.effect_names)
     own = next((name for name, parts in LAWS.items() if set(parts) <= present), OWN_FORM)
-    found = {own: model}
+    laws = {own: model}
     for name in rivals:
         if name != own:
-            found[name] = with_law(model, name)
-    return found
+            laws[name] = with_law(model, name)
+    return laws
 
 
 def with_law(model: Model, law: str) -> Model:

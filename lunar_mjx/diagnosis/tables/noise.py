@@ -51,8 +51,8 @@ def scatter(log: SteadyLog) -> dict[str, Scatter]:
             out[quantity] = Scatter()
             continue
         mean = np.bincount(group, weights=values) / np.bincount(group)
-        found = Scatter(0.0, *_neighbours(log, values - mean[group]))
-        out[quantity] = dataclasses.replace(found, level=float(np.sqrt(0.5 * found.dependence / freedom)))
+        estimate = Scatter(0.0, *_neighbours(log, values - mean[group]))
+        out[quantity] = dataclasses.replace(estimate, level=float(np.sqrt(0.5 * estimate.dependence / freedom)))
     return out
 
 

@@ -248,16 +248,16 @@ def _coordinates(
     baseline: Mapping[str, Mapping[str, tuple[float, float, float, float]]],
     values: Mapping[str, Mapping[str, float]],
 ) -> tuple[tuple[Coordinate, ...], np.ndarray, dict[str, np.ndarray]]:
-    found: list[Coordinate] = []
+    coordinates: list[Coordinate] = []
     for effect in bed.effects:
         for name, (relative, prior, low, high) in baseline.get(effect.name, {}).items():
             p, at = effect.parameters[name], float(bed.parameters[effect.name][name])
             if low > 0.0:
                 at = min(max(at, low), high)
-                found.append(Coordinate(effect.name, name, at, relative, low, high, True, prior, unit=p.unit))
+                coordinates.append(Coordinate(effect.name, name, at, relative, low, high, True, prior, unit=p.unit))
             else:
                 scale = relative * (at or 0.1 * min(high, 1e4))
-                found.append(Coordinate(effect.name, name, at, scale, low, high, False, prior, True, p.unit))
+                coordinates.append(Coordinate(effect.name, name, at, scale, low, high, False, prior, True, p.unit))
         # Effects added earlier are refitted with the rest, their shapes within a third, as those of candidates are.
         amplitudes = [p for p in effect.parameters.values() if p.null is not None]
         if effect.name not in baseline and amplitudes and not _unfit(effect.name, effect):
@@ -266,15 +266,17 @@ def _coordinates(
                 if p.null is not None:
                     scale = 0.3 * (abs(at) or abs(p.nominal) or 1.0)
                     physical = p.null in p.bounds
-                    found.append(Coordinate(effect.name, name, at, scale, *p.bounds, False, WIDE, physical, p.unit))
+                    coordinates.append(
+                        Coordinate(effect.name, name, at, scale, *p.bounds, False, WIDE, physical, p.unit)
+                    )
                 elif at > 0.0 and p.bounds[0] >= 0.0:
-                    found.append(Coordinate(effect.name, name, at, 0.3, *p.bounds, True, 1.0, unit=p.unit))
-    count, places = len(found), {}
+                    coordinates.append(Coordinate(effect.name, name, at, 0.3, *p.bounds, True, 1.0, unit=p.unit))
+    count, places = len(coordinates), {}
     for name, effect in effects.items():
         mine = of_candidate(effect, values.get(name))
-        places[name] = np.arange(len(found), len(found) + len(mine))
-        found += mine
-    return tuple(found), np.arange(count), places
+        places[name] = np.arange(len(coordinates), len(coordinates) + len(mine))
+        coordinates += mine
+    return tuple(coordinates), np.arange(count), places
 
 
 def _observations(

@@ -27,7 +27,7 @@ def refit_each(run: Run, logs: Sequence[SteadyLog], sets: Sequence[Sequence[str]
     problem = build_tables(run, logs, rivals=False)
     form = problem.own
     known = run.load(HYPOTHESES_FILE) or {}
-    found = {}
+    refits = {}
     with threadpool_limits(1, "blas"):
         base = form.refit(frozenset(), None, None)
         for number, wanted in enumerate(sets):
@@ -42,5 +42,5 @@ def refit_each(run: Run, logs: Sequence[SteadyLog], sets: Sequence[Sequence[str]
             except EvidenceError:
                 continue
             alone = form.alone(refit)
-            found[tuple(sorted(names))] = (form.residual(alone), form.predicted(alone))
-    write_refits(run.folder, found)
+            refits[tuple(sorted(names))] = (form.residual(alone), form.predicted(alone))
+    write_refits(run.folder, refits)

@@ -83,5 +83,5 @@ class SimulatedTables:
             forms.append(other)
         settings = self._problem.settings
         with threadpool_limits(1, "blas"):
-            found = search(forms, settings.most_refits, settings.most_terms, settings.window)
-        return truth, amount, conclude(found, settings.sure, settings.largest_class)
+            model_search = search(forms, settings.most_refits, settings.most_terms, settings.window)
+        return truth, amount, conclude(model_search, settings.sure, settings.largest_class)

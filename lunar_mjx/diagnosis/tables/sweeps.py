@@ -72,9 +72,9 @@ def rank_sweeps(
             refit = base if effects == base.effects else form.refit(effects, base, form.trial(base.u, name))
             linear, columns, residual = form.linearise(refit.u)
             terms = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in effects)
-            _, found, places = linear.evidence(terms)
+            _, inferred, places = linear.evidence(terms)
             white = form.data.observations.whiten(form.data.observations.value) - residual
-            expected[name] = _Expected(white, columns[:, places], found.covariance)
+            expected[name] = _Expected(white, columns[:, places], inferred.covariance)
     observations = form.data.observations
     ranked = []
     for k, (name, text, _) in enumerate(plans):

@@ -369,15 +369,15 @@ class WheelForm(MeasuredForm):
         u[free] = np.clip(u[free], *(self._bounds(free) + np.array([[1e-9], [-1e-9]])))
         terms = frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
         linear, columns, _ = self.linearise(u)
-        value, found, _ = linear.evidence(terms)
+        value, inferred, _ = linear.evidence(terms)
         best = None
         for _ in range(settings.most_rounds):
-            scale = linear.amplitudes.std * np.append(found.tau, 1.0)[linear.amplitudes.field]
+            scale = linear.amplitudes.std * np.append(inferred.tau, 1.0)[linear.amplitudes.field]
             shared = linear.always[linear.always >= len(u)]  # calibration and fields of usual size
-            spread = columns[self._fit][:, shared] * scale[shared], found.noise[self.noise_group()[self._fit]]
+            spread = columns[self._fit][:, shared] * scale[shared], inferred.noise[self.noise_group()[self._fit]]
             u = self._descend(u, free, linear, spread)
             linear, columns, _ = self.linearise(u)
-            value, found, _ = linear.evidence(terms, (found.tau, found.noise))
+            value, inferred, _ = linear.evidence(terms, (inferred.tau, inferred.noise))
             gained = np.inf if best is None else value - best[0]
             if gained > 0.0:
                 best = value, Refit(self.name, effects, u, linear)

@@ -119,15 +119,15 @@ class WheelProgram:
         """Places of the points of each chunk, and its gravity and what is imposed there."""
         gravities = np.asarray(imposed.gravity, float)
         whole = jax.tree.map(lambda a: np.asarray(a, float), imposed)
-        found = []
+        chunks = []
         for gravity in np.unique(gravities):
             mine = np.flatnonzero(gravities == gravity)
             for at in range(0, len(mine), CHUNK):
                 rows = mine[at : at + CHUNK]
                 filled = np.pad(rows, (0, CHUNK - len(rows)), mode="edge")
                 chunk = jax.tree.map(lambda a, filled=filled: jnp.asarray(a[filled]), whole)
-                found.append((rows, (jnp.asarray(gravity), chunk)))
-        return found
+                chunks.append((rows, (jnp.asarray(gravity), chunk)))
+        return chunks
 
 
 _PROGRAMS: dict[Any, tuple[WheelBed, Any]] = {}
@@ -152,8 +152,8 @@ def _compiled(key: Any, bed: WheelBed, layout: Sequence[tuple[str, str]]) -> Any
             for i in range(len(GAINS)):
                 own[EFFECT][f"gain_{i}"] = z[count + i]
             result = traced_bed(own, _off(imposed, z[count + len(GAINS) :]))
-            found = jnp.stack([getattr(result, q) for q in QUANTITIES])
-            return found, found
+            loads = jnp.stack([getattr(result, q) for q in QUANTITIES])
+            return loads, loads
 
         while len(_PROGRAMS) >= _MOST_PROGRAMS:
             _PROGRAMS.pop(next(iter(_PROGRAMS)))

@@ -161,10 +161,10 @@ def _inner_axis(leaf: Any) -> int:
 
 
 def _check(leaves: list[Any], per_rover: list[bool], varying: Any, batch: int) -> None:
-    found = {leaf.shape[0] if leaf.ndim else None for leaf, own in zip(leaves, per_rover, strict=True) if own}
-    found |= {leaf.shape[0] for leaf in jax.tree.leaves(varying)}
-    if found - {batch}:
+    batch_sizes = {leaf.shape[0] if leaf.ndim else None for leaf, own in zip(leaves, per_rover, strict=True) if own}
+    batch_sizes |= {leaf.shape[0] for leaf in jax.tree.leaves(varying)}
+    if batch_sizes - {batch}:
         raise UserError(
-            f"step_batch: the leading axes {sorted(map(str, found))} do not agree with the {batch} rovers; "
+            f"step_batch: the leading axes {sorted(map(str, batch_sizes))} do not agree with the {batch} rovers; "
             "give one entry per rover, or leave shared parameters out of params_axes."
         )

@@ -176,10 +176,10 @@ class Graph:
     def _node(self, op: str, args: tuple[Any, ...], params: Any, dtype: np.dtype) -> Node:
         # the bits of a number tell 0 from -0
         key = (op, params, dtype, *(id(a) if isinstance(a, Node) else (a.dtype.str, a.tobytes()) for a in args))
-        found = self._made.get(key)
-        if found is None:
-            found = self._made[key] = Node(op, args, params, dtype)
-        return found
+        node = self._made.get(key)
+        if node is None:
+            node = self._made[key] = Node(op, args, params, dtype)
+        return node
 
 
 def needed(outputs: list[Any]) -> list[Node]:

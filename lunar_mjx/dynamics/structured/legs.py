@@ -189,7 +189,7 @@ def leg_block(n: LegGroup, leg: LegState, up: Vec3, forces: Forces, frame: Frame
 
 def _wheel_forces(n: LegGroup, leg: LegState, forces: Forces, frame: Frame) -> dict[int, Force]:
     """Forces of the ground about the chassis frame's origin, by link."""
-    found: dict[int, Force] = {}
+    wheel_forces: dict[int, Force] = {}
     for slot in n.wheels:
         link = leg.links[slot.link]
         push = frame.from_world(Vec3(*(select(c, slot.index) for c in forces.wheel_force)))
@@ -197,8 +197,8 @@ def _wheel_forces(n: LegGroup, leg: LegState, forces: Forces, frame: Frame) -> d
         at = link.origin + link.frame.to_world(slot.numbers.center)
         force = Force(moment + at.cross(push), push)
         # Several wheels may hang on one link, as on a bogie whose axle is rigid.
-        found[slot.link] = found[slot.link] + force if slot.link in found else force
-    return found
+        wheel_forces[slot.link] = wheel_forces[slot.link] + force if slot.link in wheel_forces else force
+    return wheel_forces
 
 
 def _joint_torque(n: LegGroup, leg: LegState, k: int, forces: Forces) -> Any:

@@ -187,15 +187,15 @@ def _couplings(
         sign = np.broadcast_to(np.asarray(group.links[k].numbers.sign), group.count)[i]
         return End(g, group.free.index(k), np.arange(group.count) == i, float(sign))
 
-    found = []
+    couplings = []
     for e in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
         ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
         # Taken care of already: tied legs are one joint.
         if any(groups[place[j][0]].ties for j in ends):
             continue
         follower, leader = (end(j, model.eq(e).name) for j in ends)
-        found.append(Coupling(follower, leader, float(model.eq_data[e, 1])))
-    return tuple(found)
+        couplings.append(Coupling(follower, leader, float(model.eq_data[e, 1])))
+    return tuple(couplings)
 
 
 def _matrix(quaternion: np.ndarray) -> np.ndarray:
@@ -292,7 +292,7 @@ def _leg(
     local = {g: i for i, g in enumerate(members)}
     own = [links[g] for g in members]
     parents = tuple(local.get(link.parent, CHASSIS) for link in own)
-    found = [
+    leg_links = [
         (i, local[p.owner], p.shift, p.turn @ axles[i])
         for i, p in enumerate(places[w] for w in wheels)
         if p.owner in local
@@ -301,10 +301,10 @@ def _leg(
     pattern = (
         parents,
         tuple(link.joint in actuated for link in own),
-        tuple(slot for _, slot, _, _ in found),
+        tuple(slot for _, slot, _, _ in leg_links),
         tuple(p.links for p in tied),
     )
-    return _Leg(own, parents, found, tied, pattern)
+    return _Leg(own, parents, leg_links, tied, pattern)
 
 
 def _group(model: mujoco.MjModel, legs: list[_Leg], actuated: dict[int, int], name: str) -> LegGroup:

@@ -94,18 +94,18 @@ class Planner:
     def ways(self, goal: Any, starts: np.ndarray) -> list[np.ndarray | None]:
         """The cheapest way from every start to a goal as points (point, 2), m; None where there is none."""
         cost, before = dijkstra(self._graph, directed=False, indices=self._node(goal), return_predecessors=True)
-        found: list[np.ndarray | None] = []
+        cells_of_ways: list[np.ndarray | None] = []
         for start in starts:
             node = self._node(start)
             if not np.isfinite(cost[node]):
-                found.append(None)
+                cells_of_ways.append(None)
                 continue
             nodes = [node]
             while before[nodes[-1]] >= 0:
                 nodes.append(int(before[nodes[-1]]))
             row, column = np.divmod(nodes, self.count)
-            found.append(self.corner + (np.column_stack([column, row]) + 0.5) * self.cell)
-        return found
+            cells_of_ways.append(self.corner + (np.column_stack([column, row]) + 0.5) * self.cell)
+        return cells_of_ways
 
 
 def length(way: np.ndarray) -> float:

@@ -505,7 +505,7 @@ class NavigationEnv:
         reached = rewards.reached(to_goal, c.goal_radius)
         if c.arrive_within < np.pi and view.arrival is not None:
             reached = reached & (jnp.cos(view.arrival - view.yaw) > np.cos(c.arrive_within))
-        found = {
+        end_flags = {
             "diverged": diverged,
             "reached": reached,
             "rolled_over": rewards.rolled_over(view.up[:, 2], c.most_tilt),
@@ -513,15 +513,15 @@ class NavigationEnv:
             "off_terrain": ~inside & fine,
         }
         if c.collisions == "end" and inner.tally is not None:
-            found["collided"] = inner.tally.struck > 0.0
+            end_flags["collided"] = inner.tally.struck > 0.0
         if self._battery:
-            found["drained"] = physics.effects["battery"]["flat"] > 0.5
+            end_flags["drained"] = physics.effects["battery"]["flat"] > 0.5
         # Exclusive, so that the shares of all ends add up to one.
         no_reward = jnp.zeros_like(fine)
-        for name, happened in found.items():
-            found[name] = happened & ~no_reward
+        for name, happened in end_flags.items():
+            end_flags[name] = happened & ~no_reward
             no_reward = no_reward | happened
-        return found
+        return end_flags
 
     def _fresh(self, params: NavigationParams, keys: Any) -> Inner:
         """New episodes, all at their beginning."""

@@ -64,14 +64,14 @@ def check_ranges(model: Model, ranges: Sequence[Range], source: str = "navigatio
                 raise bad_input(source, f"randomise.{r.parameter}", r.low, "is not positive", "give a positive value")
             continue
         effect, _, name = r.parameter.partition(".")
-        found = next((e for e in model.effects if e.name == effect), None)
-        if found is None or name not in found.parameters:
+        owner = next((e for e in model.effects if e.name == effect), None)
+        if owner is None or name not in owner.parameters:
             known = ", ".join(f"{e.name}.{k}" for e in model.effects for k in e.parameters)
             raise bad_input(source, "randomise", r.parameter, "is no parameter of the model", f"use one of {known}")
         value = np.asarray(model.parameters[effect][name], float)
         for bound in (r.low, r.high):
             for number in np.ravel(value * bound if r.relative else bound):
-                found.check(name, float(number), f"{source}, randomise")
+                owner.check(name, float(number), f"{source}, randomise")
 
 
 def draw(

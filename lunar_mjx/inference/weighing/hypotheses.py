@@ -107,12 +107,12 @@ class Linear:
         # an instrument that errs more than usual has the columns of every hypothesis, with a wider prior
         prior = Amplitudes(std, self.amplitudes.field, self.amplitudes.mean).select(places)
         fields = tuple(Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields)
-        found = infer(gram.select(places), prior, fields, self.noises, start)
-        value = found.log_evidence + found.log_inside(self.low[places], self.high[places])
+        inferred = infer(gram.select(places), prior, fields, self.noises, start)
+        value = inferred.log_evidence + inferred.log_inside(self.low[places], self.high[places])
         if self.judged is not None:
             held = self.judged if not gone else shifted(self.judged, discrepancy_back)
-            value += found.log_score(held.select(places))
-        return value, found, places
+            value += inferred.log_score(held.select(places))
+        return value, inferred, places
 
     def shows(self) -> dict[str, float]:
         """Length in sigma of each effect's signature at its prior size that the form's own parameters cannot absorb.
@@ -126,25 +126,25 @@ class Linear:
         own = np.setdiff1d(own, np.concatenate([*self.calibration.values(), np.zeros(0)]).astype(int))
         scale = self.amplitudes.std
         inner = np.eye(len(own)) + scale[own, None] * whole[np.ix_(own, own)] * scale[own]
-        found = {}
+        shown_sigma = {}
         for name, places in self.effects.items():
             across = scale[own, None] * whole[np.ix_(own, places)] * scale[places]
             length = scale[places] ** 2 * np.diag(whole)[places]
             length = length - np.einsum("ij,ij->j", across, np.linalg.solve(inner, across))
-            found[name] = float(np.sqrt(max(length.max(), 0.0))) if len(places) else 0.0
-        return found
+            shown_sigma[name] = float(np.sqrt(max(length.max(), 0.0))) if len(places) else 0.0
+        return shown_sigma
 
     def felt(self) -> dict[str, float]:
         """Length in sigma of each field's strongest direction at the size of something unlisted; 0 for none."""
         whole = np.diag(self.gram.matrix.sum(axis=0))[:-1]
-        found = {}
+        felt_sizes = {}
         for number, field in enumerate(self.fields):
             own = np.flatnonzero(self.amplitudes.field == number)
             length = self.wide * self.amplitudes.std[own] * np.sqrt(whole[own])
-            found[field.name] = float(length.max(initial=0.0))
+            felt_sizes[field.name] = float(length.max(initial=0.0))
         for name, places in self.following.items():
-            found[name] = float((self.amplitudes.std[places] * np.sqrt(whole[places])).max(initial=0.0))
-        return found
+            felt_sizes[name] = float((self.amplitudes.std[places] * np.sqrt(whole[places])).max(initial=0.0))
+        return felt_sizes
 
 
 def shifted(gram: Gram, amounts: np.ndarray) -> Gram:

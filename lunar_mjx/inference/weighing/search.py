@@ -82,11 +82,11 @@ class ModelSearch:
 
     def inclusion(self) -> dict[Term, float]:
         """Probability that a term belongs to the truth, by term."""
-        found: dict[Term, float] = {}
+        by_term: dict[Term, float] = {}
         for h, p in zip(self.hypotheses, self.probability, strict=True):
             for t in h.terms:
-                found[t] = found.get(t, 0.0) + float(p)
-        return dict(sorted(found.items(), key=lambda item: -item[1]))
+                by_term[t] = by_term.get(t, 0.0) + float(p)
+        return dict(sorted(by_term.items(), key=lambda item: -item[1]))
 
     def probability_of(self, holds: Callable[[Hypothesis], bool]) -> float:
         """Probability of a statement about the hypotheses."""
@@ -316,12 +316,12 @@ class _Search:
         if not refitted and (form.name, named) in self.done:
             return old
         try:
-            value, found, places = made.linear.evidence(terms, sizes)
+            value, inferred, places = made.linear.evidence(terms, sizes)
         except (EvidenceError, np.linalg.LinAlgError):
             return old
         # terms are independent beforehand: each has its own odds, and a set the product of theirs
         prior = form.log_prior + sum(t.log_prior for t in terms)
-        new = Hypothesis(form.name, terms, value + prior, made, refitted, found, places)
+        new = Hypothesis(form.name, terms, value + prior, made, refitted, inferred, places)
         # Of two linear estimates of one set the one from nearer by counts: that of the more probable refit.
         if old is None or refitted or new.log_posterior > old.log_posterior:
             self.known[form.name, terms] = new
@@ -333,15 +333,15 @@ def _carried_over(listed: Sequence[Hypothesis], best: Hypothesis, form: str) -> 
 
     The gain is counted from the largest set of its effects that was refitted beside both forms.
     """
-    found: dict[tuple[str, frozenset[str]], float] = {}
+    best_of: dict[tuple[str, frozenset[str]], float] = {}
     for h in listed:
         if h.refitted and h.effects <= best.effects:
-            found[h.form, h.effects] = max(h.log_posterior, found.get((h.form, h.effects), -math.inf))
-    common = [e for name, e in found if name == form and (best.form, e) in found]
+            best_of[h.form, h.effects] = max(h.log_posterior, best_of.get((h.form, h.effects), -math.inf))
+    common = [e for name, e in best_of if name == form and (best.form, e) in best_of]
     if not common:
         return -math.inf
     shared = max(common, key=len)
-    return found[form, shared] + best.log_posterior - found[best.form, shared]
+    return best_of[form, shared] + best.log_posterior - best_of[best.form, shared]
 
 
 def _one_more(h: Hypothesis, best: Hypothesis) -> bool:

@@ -33,10 +33,10 @@ _RATES = (("joint_{}_angle_rad", "joint_{}_speed_rad_s"), ("position_{}_m", "wor
 
 def check_clock(log: Log) -> list[Finding]:
     """Time of every table, and that the tables share an origin."""
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for table in log.tables.values():
-        found += _check_table(log, table)
-    return found or _check_overlap(log)
+        findings += _check_table(log, table)
+    return findings or _check_overlap(log)
 
 
 def _finding(log: Log, table: LogTable, row: int | None, kind: str, message: str) -> Finding:
@@ -67,8 +67,8 @@ def _check_table(log: Log, table: LogTable) -> list[Finding]:
                 f"{backward.size} rows; sort the rows and drop copies",
             )
         ]
-    found = [] if table.on_change else _check_rate(log, table, steps)
-    return found or _check_jumps(log, table, steps)
+    findings = [] if table.on_change else _check_rate(log, table, steps)
+    return findings or _check_jumps(log, table, steps)
 
 
 def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:

@@ -43,11 +43,11 @@ FRAME_LIMITS = FrameLimits()
 
 def check_frames(log: Log) -> list[Finding]:
     """Attitude, gravity, velocities against positions, turning against wheels."""
-    found = _quaternion(log)
-    if not found:
-        found += _euler(log) + _gravity(log)
-    found += _velocities(log) + _turning(log)
-    return found or _course(log) + _left_right(log)
+    findings = _quaternion(log)
+    if not findings:
+        findings += _euler(log) + _gravity(log)
+    findings += _velocities(log) + _turning(log)
+    return findings or _course(log) + _left_right(log)
 
 
 def _finding(log: Log, channel: str, kind: str, message: str, row: int | None = None) -> Finding:
@@ -209,10 +209,10 @@ def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Ag
 def _velocities(log: Log) -> list[Finding]:
     """Velocities against positions: unit, sign, swapped axes."""
     pairs = {a: (f"position_{a}_m", f"world_velocity_{a}_m_s") for a in "xyz"}
-    found = _paired(log, pairs, "the change of") or _ground_speed(log)
+    findings = _paired(log, pairs, "the change of") or _ground_speed(log)
     limits = span(log, [f"{k}_velocity_{a}_m_s" for k in ("world", "body") for a in "xy"])
-    if found or limits is None:
-        return found
+    if findings or limits is None:
+        return findings
     time = np.linspace(*limits, 300)
     speed = {}
     for frame in ("world", "body"):
@@ -266,7 +266,7 @@ def _turning(log: Log) -> list[Finding]:
 
 def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float = 1.0) -> list[Finding]:
     """Each channel against its rate: a wrong factor, or a rate that is another channel's."""
-    found = []
+    findings = []
     for key, (integral, rate) in pairs.items():
         own = rate_agreement(log, integral, rate, scale)
         other_pairs = [p[1] for k, p in pairs.items() if k != key]
@@ -274,12 +274,12 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
         cosine = 0.0 if own is None else own.cosine
         if twin is not None and abs(cosine) < FRAME_LIMITS.unlike and span(log, (rate,)) is not None:
             text = f"has nothing in common with {what} {integral} (cosine {cosine:.2f}), which {twin} follows"
-            found.append(_finding(log, rate, "swap", f"{text}; these two are swapped"))
+            findings.append(_finding(log, rate, "swap", f"{text}; these two are swapped"))
         elif own is None:
             continue
         elif abs(own.cosine) > FRAME_LIMITS.alike and abs(own.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
             kind = "frame" if own.factor < 0.0 else "unit"
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     rate,
@@ -290,7 +290,7 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
                 )
             )
         elif abs(own.cosine) < FRAME_LIMITS.unlike and own.series < 0.2 * own.reference:
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     integral,
@@ -299,7 +299,7 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
                     f"lets expect {own.reference:.3g}; leave the broken one out",
                 )
             )
-    return found
+    return findings
 
 
 def _alike(pair: Agreement | None) -> bool:

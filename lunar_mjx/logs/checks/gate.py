@@ -39,15 +39,15 @@ def check(logs: Log | SteadyLog | Sequence[Log | SteadyLog], slowest_s: Slowest 
 
 
 def _check_drive(log: Log) -> list[Finding]:
-    found = check_clock(log)
-    if is_bad(found):
-        return found  # everything below reads channels by their time
-    found = check_values(log)
-    bad = {f.column for f in found if f.severity == "bad_data"}
+    findings = check_clock(log)
+    if is_bad(findings):
+        return findings  # everything below reads channels by their time
+    findings = check_values(log)
+    bad = {f.column for f in findings if f.severity == "bad_data"}
     for part in (check_frames, check_motors, check_noise):
         # A column that is broken already would fail every comparison with others; one finding is enough.
-        found += [f for f in part(log) if f.column not in bad]
-    return found
+        findings += [f for f in part(log) if f.column not in bad]
+    return findings
 
 
 def _check_length(logs: Sequence[Log | SteadyLog], slowest_s: Slowest) -> list[Finding]:

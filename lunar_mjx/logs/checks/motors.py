@@ -35,13 +35,13 @@ MOTOR_LIMITS = MotorLimits()
 
 def check_motors(log: Log) -> list[Finding]:
     """Every joint, and every pair of corners."""
-    found = _against(log)
+    findings = _against(log)
     for kind in ("drive", "steer", "sus"):
         for quantity in ("speed_rad_s", "angle_rad"):
-            found += _follows(log, kind, quantity)
-        if not is_bad(found):
-            found += _angles(log, kind) + _electric(log, kind) + _heat(log, kind)
-    return found
+            findings += _follows(log, kind, quantity)
+        if not is_bad(findings):
+            findings += _angles(log, kind) + _electric(log, kind) + _heat(log, kind)
+    return findings
 
 
 def _present(log: Log, pattern: str) -> dict[str, str]:
@@ -56,7 +56,7 @@ def _against(log: Log) -> list[Finding]:
     A warning only: a motor may brake all the way down a slope that no channel tells.
     """
     current, speed = _present(log, "motor_{}_drive_current_A"), _present(log, "joint_{}_drive_speed_rad_s")
-    found = []
+    findings = []
     for c, name in current.items():
         limits = span(log, (name, speed[c])) if c in speed and name not in log.magnitudes else None
         if limits is None:
@@ -72,8 +72,8 @@ def _against(log: Log) -> list[Finding]:
         if cosine < MOTOR_LIMITS.against:
             text = f"is negative where {speed[c]} is positive (cosine {cosine:.2f}), as if the motor braked all the way"
             problem = _finding(log, name, "frame", f"{text}; correct its sign if it drove")
-            found.append(dataclasses.replace(problem, severity=WARNING))
-    return found
+            findings.append(dataclasses.replace(problem, severity=WARNING))
+    return findings
 
 
 def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
@@ -87,7 +87,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
     time = np.linspace(*limits, 500)
     seen = {c: at(log, measured[c], time) for c in corners}
     wanted = {c: _held(log, commanded[c], time) for c in corners}
-    found = []
+    findings = []
     for a in corners:
         noise = max(sigma(log, measured[a]), 1e-3)
         mine, other = wanted[a], seen[a]
@@ -98,7 +98,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
         if pair.cosine > 0.95 and (
             pair.factor > MOTOR_LIMITS.many or 0.01 < pair.factor < 1.0 / (4.0 * MOTOR_LIMITS.many)
         ):
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     measured[a],
@@ -107,7 +107,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
                 )
             )
         elif pair.cosine < -FRAME_LIMITS.alike and _together(mine, other) < -FRAME_LIMITS.unlike:
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     measured[a],
@@ -116,7 +116,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
                     "positive drives forward, steers left, raises the chassis",
                 )
             )
-    return found or _swapped(log, {c: measured[c] for c in corners}, seen, wanted, "command")  # type: ignore[arg-type]
+    return findings or _swapped(log, {c: measured[c] for c in corners}, seen, wanted, "command")  # type: ignore[arg-type]
 
 
 def _together(one: np.ndarray, other: np.ndarray) -> float:
@@ -141,7 +141,7 @@ def _swapped(
         gaps = [float(np.nanmean((np.roll(wanted[b], k) - seen[a])[5:] ** 2)) for k in range(5)]
         return np.sqrt(min(gaps))
 
-    found = []
+    findings = []
     corners = list(names)
     for i, a in enumerate(corners):
         for b in corners[i + 1 :]:
@@ -153,7 +153,7 @@ def _swapped(
                 and min(miss(a, a), miss(b, b)) > 0.5 * apart
                 and own > MOTOR_LIMITS.crossed * crossed
             ):
-                found.append(
+                findings.append(
                     _finding(
                         log,
                         names[a],
@@ -163,19 +163,19 @@ def _swapped(
                         f"{own:.3g} as they are, {crossed:.3g} crossed); exchange the two columns",
                     )
                 )
-    return found
+    return findings
 
 
 def _angles(log: Log, kind: str) -> list[Finding]:
     """Angles against speeds."""
     angles, speeds = _present(log, f"joint_{{}}_{kind}_angle_rad"), _present(log, f"joint_{{}}_{kind}_speed_rad_s")
-    found = []
+    findings = []
     for c, angle in angles.items():
         pair = rate_agreement(log, angle, speeds[c]) if c in speeds else None
         if pair is None or (kind != "drive" and pair.reference < 0.02):
             continue
         if abs(pair.cosine) > FRAME_LIMITS.alike and abs(pair.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     angle,
@@ -185,7 +185,7 @@ def _angles(log: Log, kind: str) -> list[Finding]:
                 )
             )
         elif pair.cosine < FRAME_LIMITS.unlike:
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     angle,
@@ -195,7 +195,7 @@ def _angles(log: Log, kind: str) -> list[Finding]:
                     "one of them is another joint's, or broken",
                 )
             )
-    return found or _crossed_speeds(log, kind, angles, speeds)
+    return findings or _crossed_speeds(log, kind, angles, speeds)
 
 
 def _crossed_speeds(log: Log, kind: str, angles: dict[str, str], speeds: dict[str, str]) -> list[Finding]:
@@ -234,14 +234,14 @@ def _electric(log: Log, kind: str) -> list[Finding]:
         return []
     time = np.linspace(*limits, 500)
     data = {c: tuple(at(log, d[c], time) for d in (voltage, current, speed)) for c in corners}
-    found = []
+    findings = []
     for c in corners:
         fit = _circuit(*data[c])  # type: ignore[arg-type]
         if fit is None:
             continue
         (resistance, back_emf), (error_r, error_k) = fit
         if back_emf < -20.0 * error_k:
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     voltage[c],
@@ -252,7 +252,7 @@ def _electric(log: Log, kind: str) -> list[Finding]:
                 )
             )
         elif 0.0 < resistance < MOTOR_LIMITS.least_resistance and resistance > 20.0 * error_r:
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     current[c],
@@ -260,7 +260,7 @@ def _electric(log: Log, kind: str) -> list[Finding]:
                     f"gives a motor of {resistance:.3g} ohm with {voltage[c]} (looks like mA for A); correct its unit",
                 )
             )
-    return found or _crossed_currents(log, current, data)  # type: ignore[arg-type]
+    return findings or _crossed_currents(log, current, data)  # type: ignore[arg-type]
 
 
 def _circuit(voltage: np.ndarray, current: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -273,12 +273,12 @@ def _circuit(voltage: np.ndarray, current: np.ndarray, speed: np.ndarray) -> tup
     scaled = design / size
     if np.linalg.cond(scaled) > 100.0:
         return None
-    found, *_ = np.linalg.lstsq(scaled, voltage, rcond=None)
-    residual = voltage - scaled @ found
+    coefficients, *_ = np.linalg.lstsq(scaled, voltage, rcond=None)
+    residual = voltage - scaled @ coefficients
     if residual @ residual > 0.1 * (voltage @ voltage):
         return None  # another circuit than a motor's; no statement
     variance = residual @ residual / max(1, len(voltage) - 2) * np.diag(np.linalg.inv(scaled.T @ scaled))
-    return found / size, np.sqrt(variance) / size
+    return coefficients / size, np.sqrt(variance) / size
 
 
 def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, tuple[np.ndarray, ...]]) -> list[Finding]:
@@ -286,7 +286,7 @@ def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, tuple[np.
         design = np.stack([data[b][1], data[a][2]], 1)
         return float(np.linalg.norm(data[a][0] - design @ np.linalg.lstsq(design, data[a][0], rcond=None)[0]))
 
-    found = []
+    findings = []
     corners = list(data)
     for i, a in enumerate(corners):
         for b in corners[i + 1 :]:
@@ -295,7 +295,7 @@ def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, tuple[np.
             if apart > 5.0 * sigma(log, names[a]) and all(
                 own > MOTOR_LIMITS.crossed * crossed for own, crossed in pairs
             ):
-                found.append(
+                findings.append(
                     _finding(
                         log,
                         names[a],
@@ -303,7 +303,7 @@ def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, tuple[np.
                         f"fits the voltage of {b} and {names[b]} that of {a}; exchange the two columns",
                     )
                 )
-    return found
+    return findings
 
 
 def _heat(log: Log, kind: str) -> list[Finding]:
@@ -311,7 +311,7 @@ def _heat(log: Log, kind: str) -> list[Finding]:
     winding = _present(log, f"winding_{{}}_{kind}_temperature_degC")
     housing = _present(log, f"housing_{{}}_{kind}_temperature_degC")
     current = _present(log, f"motor_{{}}_{kind}_current_A")
-    found = []
+    findings = []
     for c in [c for c in winding if c in housing and c in current]:
         limits = span(log, (winding[c], housing[c], current[c]))
         if limits is None:
@@ -323,7 +323,7 @@ def _heat(log: Log, kind: str) -> list[Finding]:
             continue
         rise, cosine = _slope(power, apart)
         if cosine < -0.8 and abs(rise) * np.ptp(power) > max(5.0, 8.0 * sigma(log, winding[c])):
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     winding[c],
@@ -331,7 +331,7 @@ def _heat(log: Log, kind: str) -> list[Finding]:
                     f"falls against {housing[c]} as current flows (correlation {cosine:.2f}): the two are swapped",
                 )
             )
-    return found
+    return findings
 
 
 def _average(current: np.ndarray, share: float) -> np.ndarray:

@@ -54,11 +54,11 @@ def rest_segments(log: Log) -> list[tuple[float, float]]:
         at_rest &= _quiet_command(log, name, grid)
     for name in log.channel_names:
         if is_quantity(name, "joint_speed"):
-            found = log.channel(name)
-            if found is None or len(found[0]) < NOISE_LIMITS.fewest:
+            samples = log.channel(name)
+            if samples is None or len(samples[0]) < NOISE_LIMITS.fewest:
                 continue
             noise = log.noise[name].std if name in log.noise else 0.0
-            speed = np.interp(grid, found[0], np.abs(_medians(found[1])))
+            speed = np.interp(grid, samples[0], np.abs(_medians(samples[1])))
             at_rest &= speed < max(NOISE_LIMITS.still, noise)
     return _spans(grid, at_rest)
 
@@ -70,10 +70,10 @@ def _medians(values: np.ndarray) -> np.ndarray:
 
 
 def _quiet_command(log: Log, name: str, grid: np.ndarray) -> np.ndarray:
-    found = log.channel(name)
-    if found is None or not found[0].size:
+    samples = log.channel(name)
+    if samples is None or not samples[0].size:
         return np.ones(len(grid), bool)
-    time, values = found
+    time, values = samples
     held = values[np.maximum(np.searchsorted(time, grid + 1e-6, side="right") - 1, 0)]
     quiet = np.ones(len(grid), bool) if is_quantity(name, "command_angle") else held == 0.0
     for change_time in time[1:][np.diff(values) != 0.0]:
@@ -104,10 +104,10 @@ def rest_noise(log: Log, name: str, spans: list[tuple[float, float]]) -> tuple[f
       Standard deviation, correlation of neighbouring samples, and the number of independent samples behind it; None if
       there are too few.
     """
-    found = log.channel(name)
-    if found is None:
+    samples = log.channel(name)
+    if samples is None:
         return None
-    time, values = found
+    time, values = samples
     squares = products = count = freedom = pairs = 0.0
     for low, high in spans:
         keep = (time >= low) & (time <= high)
@@ -133,7 +133,7 @@ def check_noise(log: Log) -> list[Finding]:
     spans = rest_segments(log)
     if not spans:
         return []
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for name, noise in log.noise.items():
         estimate = rest_noise(log, name, spans) if noise.std > 0.0 and not is_command(name) else None
         if estimate is None:
@@ -141,10 +141,10 @@ def check_noise(log: Log) -> list[Finding]:
         text = _contradiction(log, name, noise, *estimate)
         table = log.table_of(name)
         if text and table is not None:
-            found.append(
+            findings.append(
                 Finding(log.name, table.name, _row(log, name, spans), table.columns.get(name, name), "noise", text)
             )
-    return found
+    return findings
 
 
 def _contradiction(log: Log, name: str, noise: Noise, std: float, correlation: float, independent: float) -> str:

@@ -18,8 +18,8 @@ def check_steady(log: SteadyLog) -> list[Finding]:
     """Findings beyond what reading found."""
     if len(log.table) == 0:
         return [Finding(log.name, "", None, "", "dropout", "holds no usable row; see the other findings, or fill it")]
-    found = _copies(log) + _ranges(log) + _signs(log) + _swapped(log) + _clipped(log) + _noiseless(log)
-    return found + (_replicates(log) if not found else [])
+    findings = _copies(log) + _ranges(log) + _signs(log) + _swapped(log) + _clipped(log) + _noiseless(log)
+    return findings + (_replicates(log) if not findings else [])
 
 
 def _finding(
@@ -80,13 +80,13 @@ def _agree(values: np.ndarray, group: np.ndarray) -> float:
 
 
 def _ranges(log: SteadyLog) -> list[Finding]:
-    found = []
+    findings = []
     for column, values in _columns(log).items():
         _, low, high = STEADY_CHANNELS[column]
         beyond = (values < low) | (values > high)
         if beyond.any():
             row = int(np.argmax(beyond))
-            found.append(
+            findings.append(
                 _finding(
                     log, row, column, "range", f"is {values[row]:.5g}, outside [{low:g}, {high:g}]; check its unit"
                 )
@@ -95,7 +95,7 @@ def _ranges(log: SteadyLog) -> list[Finding]:
     for quantity in ("drawbar_pull", "side_force"):
         values = log.table.measured.get(quantity)
         if values is not None and np.median(np.abs(values)) > 3.0 * np.median(load):
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     None,
@@ -109,7 +109,7 @@ def _ranges(log: SteadyLog) -> list[Finding]:
             )
     sinkage = log.table.measured.get("sinkage")
     if sinkage is not None and np.median(sinkage) > 2.0 * log.table.radius:
-        found.append(
+        findings.append(
             _finding(
                 log,
                 None,
@@ -118,12 +118,12 @@ def _ranges(log: SteadyLog) -> list[Finding]:
                 f"is {np.median(sinkage):.3g} m at the median, more than the wheel's diameter; check its unit",
             )
         )
-    return found
+    return findings
 
 
 def _signs(log: SteadyLog) -> list[Finding]:
     """Pull and torque grow with slip; a wheel sinks downwards; both by rank over the whole table."""
-    found = []
+    findings = []
     slip = log.table.test["slip_ratio"]
     for quantity in ("drawbar_pull", "driving_torque"):
         values = log.table.measured.get(quantity)
@@ -132,7 +132,7 @@ def _signs(log: SteadyLog) -> list[Finding]:
         rank = float(np.asarray(stats.spearmanr(slip, values))[0])
         noise = log.table.sigma.get(quantity, 0.0)
         if rank < -0.7 and np.ptp(values) > 10.0 * noise:
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     None,
@@ -145,7 +145,7 @@ def _signs(log: SteadyLog) -> list[Finding]:
             )
     sinkage = log.table.measured.get("sinkage")
     if sinkage is not None and np.median(sinkage) < -5.0 * log.table.sigma.get("sinkage", 1e-4):
-        found.append(
+        findings.append(
             _finding(
                 log,
                 None,
@@ -154,7 +154,7 @@ def _signs(log: SteadyLog) -> list[Finding]:
                 f"is {np.median(sinkage):.3g} m at the median; sinkage counts downwards",
             )
         )
-    return found
+    return findings
 
 
 def _swapped(log: SteadyLog) -> list[Finding]:
@@ -178,7 +178,7 @@ _AT_LIMIT = 0.05
 
 def _clipped(log: SteadyLog) -> list[Finding]:
     """An extreme value that many rows share, where other values do not repeat so often: the instrument's limit."""
-    found = []
+    findings = []
     for quantity, values in log.table.measured.items():
         count = np.unique(values, return_counts=True)[1]
         for at, extreme in ((-1, values.max()), (0, values.min())):
@@ -187,22 +187,22 @@ def _clipped(log: SteadyLog) -> list[Finding]:
             if len(count) > 2 and extreme != 0.0 and count[at] >= often:
                 row = int(np.argmax(values == extreme))
                 message = f"stays at {extreme:.5g} in {count[at]} of {len(values)} rows; leave out what was cut off"
-                found.append(_finding(log, row, QUANTITIES[quantity][0], "saturation", message))
-    return found
+                findings.append(_finding(log, row, QUANTITIES[quantity][0], "saturation", message))
+    return findings
 
 
 def _noiseless(log: SteadyLog) -> list[Finding]:
     """Quantities whose noise neither the log nor replicates tell: nothing could be counted in sigma."""
     stated_sigma = average(log.table).sigma
-    found = []
+    findings = []
     for quantity in log.table.measured:
         column = QUANTITIES[quantity][0]
         if not stated_sigma.get(quantity, 0.0) > 0.0 and column not in log.noise:
             message = (
                 f"nothing tells its noise; state [noise.{column}] std in log.toml, give replicates, or leave it out"
             )
-            found.append(_finding(log, None, column, "noise", message))
-    return found
+            findings.append(_finding(log, None, column, "noise", message))
+    return findings
 
 
 def _replicates(log: SteadyLog) -> list[Finding]:
@@ -210,9 +210,9 @@ def _replicates(log: SteadyLog) -> list[Finding]:
     group = replicate_groups(log.table)
     count = np.bincount(group)
     freedom = int((count - 1).sum())
-    found: list[Finding] = []
+    findings: list[Finding] = []
     if freedom < 3:
-        return found
+        return findings
     for quantity, values in log.table.measured.items():
         column = QUANTITIES[quantity][0]
         row_std = log.row_std.get(column)
@@ -238,7 +238,7 @@ def _replicates(log: SteadyLog) -> list[Finding]:
             max(ratio, usual) < 1.0 / NOISE_LIMITS.factor and low
         ):
             worst = int(np.argmax(np.abs(residual))) if ratio > 1.0 else None
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     worst,
@@ -250,7 +250,7 @@ def _replicates(log: SteadyLog) -> list[Finding]:
                 )
             )
         elif high and ratio > 1.3:
-            found.append(
+            findings.append(
                 _finding(
                     log,
                     None,
@@ -260,7 +260,7 @@ def _replicates(log: SteadyLog) -> list[Finding]:
                     WARNING,
                 )
             )
-    return found
+    return findings
 
 
 def _scatter_of_median_point(residual: np.ndarray, group: np.ndarray, count: np.ndarray) -> float:

@@ -40,11 +40,11 @@ VALUE_LIMITS = ValueLimits()
 
 def check_values(log: Log) -> list[Finding]:
     """Every channel by itself, and by its stated noise."""
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for table in log.tables.values():
         for name in table.channels:
-            found += _check_channel(log, table, name)
-    return found
+            findings += _check_channel(log, table, name)
+    return findings
 
 
 def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
@@ -149,8 +149,8 @@ def _judged(log: Log, table: LogTable, name: str, there: np.ndarray) -> np.ndarr
 
     A wheel's own speed is no witness of its rest, but the other wheels' are.
     """
-    found = find_channel(name)
-    if found is None or found[0].family not in MOVED:
+    channel_entry = find_channel(name)
+    if channel_entry is None or channel_entry[0].family not in MOVED:
         return np.ones(len(there), bool)
     speeds = [c for c in log.channel_names if is_quantity(c, "joint_speed", "drive") and c != name]
     speeds = speeds or [c for c in log.channel_names if is_quantity(c, "command_speed", "drive")]
@@ -203,8 +203,8 @@ def _possible_run(noise: float, step: float, count: int) -> float:
 
 def _siblings(table: LogTable, name: str) -> list[np.ndarray]:
     """Values of a channel at the other corners of the rover, such as the other wheels' currents."""
-    found = find_channel(name)
-    corner = found[1].groupdict().get("corner") if found else None
+    channel_entry = find_channel(name)
+    corner = channel_entry[1].groupdict().get("corner") if channel_entry else None
     if corner is None:
         return []
     sibling_names = (name.replace(f"_{corner}_", f"_{c}_") for c in MIRROR if c != corner)

@@ -120,10 +120,12 @@ def read_classes(path: Path, soils: Mapping[str, Any], place: Place, ground: Dem
     """
     grid = read_plain(path, cell=place.cell, fill=False)
     table = {_number(path, key): _soil(path, key, value) for key, value in soils.items()}
-    for found in np.unique(grid.heights):
-        if found not in table:
+    for class_number in np.unique(grid.heights):
+        if class_number not in table:
             have = ", ".join(f"{k:g}" for k in table) or "none"
-            raise bad_input(path, "class", f"{found:g}", f"is not in soil.classes.soils ({have})", "add its soil there")
+            raise bad_input(
+                path, "class", f"{class_number:g}", f"is not in soil.classes.soils ({have})", "add its soil there"
+            )
     rock = np.isin(grid.heights, [k for k, soil in table.items() if soil is None])
     number = grid.heights
     if rock.any() and not rock.all():

@@ -110,8 +110,8 @@ def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
     unknown = []
 
     def first(channel: str) -> float | None:
-        found = log.channel(channel)
-        return None if found is None or not len(found[1]) else float(np.mean(found[1][:5]))
+        samples = log.channel(channel)
+        return None if samples is None or not len(samples[1]) else float(np.mean(samples[1][:5]))
 
     stated = log.initial.get("position_m")
     for i, axis in enumerate("xy"):
@@ -166,9 +166,9 @@ def start_motion(log: Log, model: Model, begin: float, yaw: float) -> dict[str, 
     def measured(*names: str) -> float:
         """The first sample: a line through several would see a rover that starts at once as one that was moving."""
         for name in names:
-            found = log.channel(name)
-            if found is not None and len(found[0]) and found[0][0] - begin < LOG_START.near_start:
-                value = float(found[1][0])
+            samples = log.channel(name)
+            if samples is not None and len(samples[0]) and samples[0][0] - begin < LOG_START.near_start:
+                value = float(samples[1][0])
                 return value if abs(value) > LOG_START.sigmas * sigma(log, name) else 0.0
         return math.nan
 

@@ -90,8 +90,8 @@ class Program:
         def channels(params: Params, seen: Any) -> Any:
             position = self.imu.position if any(self.imu.position) else None
             turn = self.imu.quaternion if any(self.imu.quaternion[1:]) else None
-            found = measure(self.system, seen, params, position, turn).channels
-            return jnp.stack([found[c] for c in self.channels])
+            measured = measure(self.system, seen, params, position, turn).channels
+            return jnp.stack([measured[c] for c in self.channels])
 
         return jax.vmap(channels, (self._axes(params, shared), 0))(params, seen)
 
@@ -134,9 +134,9 @@ class Program:
                 seen.append(telemetry)
                 if first and not at:
                     _compiling.seconds = time.monotonic() - began
-            found = self._measure(full, seen, shared=shared)
+            measured = self._measure(full, seen, shared=shared)
             size = max(_FEWEST, 1 << (count - 1).bit_length())
-            return np.asarray(found if size >= len(log) else _first(found, size))
+            return np.asarray(measured if size >= len(log) else _first(measured, size))
 
     def _stand(self, params: Params, state: Any, still: np.ndarray, stood: np.ndarray, shared: bool) -> Any:
         """Rovers that have stood for their own times (rovers,), s, at least `LOG_START.settle`."""

@@ -190,20 +190,20 @@ class _Place:
 
 def _places(runs: Sequence[LogRun], observations: Observations) -> list[list[_Place]]:
     """By log, where its observations lie among the simulated samples."""
-    found: list[dict[tuple[bytes, bool, bool], _Place]] = [{} for _ in runs]
+    by_run: list[dict[tuple[bytes, bool, bool], _Place]] = [{} for _ in runs]
     begin: dict[int, int] = {}
     for s in observations.series:
         assert s.time is not None
         run, key = runs[s.log], (s.time.tobytes(), s.channel in EULER, at_once(s.channel))
         begin.setdefault(s.log, s.start)
-        if key not in found[s.log]:
+        if key not in by_run[s.log]:
             # a logger's clock that ticks with the simulation's, but for rounding, meets samples and nothing between
             place = np.round((s.time - run.begin) / (run.every * run.model.timestep), 9)
             low = np.clip(np.floor(place).astype(int), 0, len(run.commands) - 1)
-            found[s.log][key] = _Place([], key[1], key[2], low, place - low, begin[s.log], [])
-        found[s.log][key].channels.append(s.channel)
-        found[s.log][key].parts.append((s.start, s.stop))
-    return [list(groups.values()) for groups in found]
+            by_run[s.log][key] = _Place([], key[1], key[2], low, place - low, begin[s.log], [])
+        by_run[s.log][key].channels.append(s.channel)
+        by_run[s.log][key].parts.append((s.start, s.stop))
+    return [list(groups.values()) for groups in by_run]
 
 
 def _sample(

@@ -44,10 +44,10 @@ class Simulated:
     def get(self, key: Key) -> np.ndarray | None:
         """(n,) the row, or None."""
         with self._lock:
-            found = self._rows.get(key)
-            if found is not None:
+            row = self._rows.get(key)
+            if row is not None:
                 self._rows.move_to_end(key)
-            return found
+            return row
 
     def keep(self, key: Key, row: np.ndarray) -> None:
         """Remembers a copy of a row (n,)."""
