@@ -113,6 +113,7 @@ class Episode:
 
     @property
     def sentence(self) -> str:
+        """One sentence of how the episode ended, its time, way and return."""
         length = float(np.hypot(*np.diff(self.qpos[:, :2], axis=0).T).sum())
         time = len(self.reward) * self.env.control_interval
         return f"{self.end} after {time:.1f} s and {length:.1f} m, return {self.reward.sum():.1f}"

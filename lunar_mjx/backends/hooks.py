@@ -70,6 +70,7 @@ class Hooks:
         self.reset()
 
     def reset(self) -> None:
+        """Puts the state of every hook back to its beginning."""
         self.states = [copy.deepcopy(dict(hook.initial)) for hook in self.hooks]
 
     def __contains__(self, point: str) -> bool:

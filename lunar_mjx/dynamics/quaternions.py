@@ -10,6 +10,7 @@ from lunar_mjx.spatial import Frame, Vec3
 
 
 def normalized(q: list[Any]) -> list[Any]:
+    """A quaternion of length one in the direction of `q`."""
     scale = 1.0 / jnp.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return [c * scale for c in q]
 

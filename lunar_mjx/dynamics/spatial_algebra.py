@@ -37,6 +37,7 @@ class Symmetric(NamedTuple):
         return Symmetric(*(mul(a, scale) for a in self))
 
     def apply(self, v: Vec3) -> Vec3:
+        """Product of the matrix and a vector."""
         return Vec3(
             total(mul(self.xx, v.x), mul(self.xy, v.y), mul(self.xz, v.z)),
             total(mul(self.xy, v.x), mul(self.yy, v.y), mul(self.yz, v.z)),
@@ -55,6 +56,7 @@ class Symmetric(NamedTuple):
 
     @classmethod
     def isotropic(cls, value: Any) -> Symmetric:
+        """`value` times the identity matrix."""
         return cls(value, value, value, 0.0, 0.0, 0.0)
 
     @classmethod

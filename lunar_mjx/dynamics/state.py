@@ -29,10 +29,12 @@ class Temperature:
 
     @property
     def winding_kelvin(self) -> Any:
+        """Temperature of the windings, K; the state holds differences from the reference."""
         return self.winding + REFERENCE_TEMPERATURE
 
     @property
     def housing_kelvin(self) -> Any:
+        """Temperature of the housings, K; the state holds differences from the reference."""
         return self.housing + REFERENCE_TEMPERATURE
 
 

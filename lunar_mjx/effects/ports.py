@@ -95,6 +95,7 @@ class Pipeline:
 
 
 def nominal_geometry(rover: RoverInfo) -> Geometry:
+    """Wheels as the rover states them, without any offset."""
     zero = jnp.zeros_like(rover.wheel_radius)
     nil = jnp.zeros_like(rover.wheel_radius[..., 0])
     none = Vec3(nil, nil, nil)
@@ -166,11 +167,13 @@ def _ground_below(ctx: Context, geometry: Geometry) -> tuple[Any, Any, Any]:
 
 
 def initial_soil(like: Any) -> Soil:
+    """Soil before any effect has set it: zeros, and ones where effects divide by the value."""
     zero, one = jnp.zeros_like(like), jnp.ones_like(like)
     return Soil(zero, one, one, zero, zero, one, one, zero)
 
 
 def initial_normal(like: Any) -> Normal:
+    """Normal forces of wheels in the air."""
     zero = jnp.zeros_like(like)
     # Angles of an airborne wheel: an empty arc, but not one of length zero, through which effects divide.
     tiny = zero + 1e-4

@@ -97,6 +97,7 @@ class Agreement:
 
     @property
     def excited(self) -> bool:
+        """Whether the compared signal moved at all."""
         return self.reference > 0.0
 
 

@@ -72,6 +72,7 @@ class Model:
 
     @property
     def effect_names(self) -> tuple[str, ...]:
+        """Names of the model's effects, in the order in which they act."""
         return tuple(e.name for e in self.effects)
 
     def add(self, effect: Effect | str, source: str = "Model.add", /, **values: Any) -> Model:

@@ -149,6 +149,7 @@ class Viewer(ThreadingHTTPServer):
             self.drive.reset()
 
     def ground(self, x: float, y: float) -> str:
+        """Heights around (x, y) as JSON of the page's scene."""
         return json.dumps(ground_scene(self.terrain, x, y))
 
     def next_picture(self, after: int) -> tuple[int, str]:

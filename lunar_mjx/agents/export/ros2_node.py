@@ -218,25 +218,32 @@ class Driver:
     # The blocks that odometry, joints and goal give, as the contract describes them.
 
     def block_position(self) -> Any:
+        """Position from where the episode began, world axes, m."""
         return self.position - self.origin
 
     def block_euler(self) -> Any:
+        """Roll, pitch and yaw, rad (pitch is positive with the nose down)."""
         m = self.matrix
         return [math.atan2(m[2, 1], m[2, 2]), math.asin(min(1.0, max(-1.0, -m[2, 0]))), heading(m)]
 
     def block_velocity(self) -> Any:
+        """Velocity of the chassis, world axes, m/s."""
         return self.velocity
 
     def block_angular_velocity(self) -> Any:
+        """Angular velocity of the chassis, world axes, rad/s."""
         return self.matrix @ self.body_rates
 
     def block_acceleration(self) -> Any:
+        """Acceleration of the chassis, m/s2."""
         return self.acceleration
 
     def block_goal(self) -> Any:
+        """Goal from where the episode began, world axes, m."""
         return self.goal - self.origin[:2]
 
     def block_goal_body(self) -> Any:
+        """Distance of the goal, m, its squashed value in 0 to 1, and its direction ahead and to the left."""
         yaw, to = heading(self.matrix), self.goal - self.position[:2]
         ahead = math.cos(yaw) * to[0] + math.sin(yaw) * to[1]
         aside = math.cos(yaw) * to[1] - math.sin(yaw) * to[0]
@@ -245,24 +252,31 @@ class Driver:
         return [distance, 1.0 - math.exp(-distance / 3.0), ahead / least, aside / least]
 
     def block_up(self) -> Any:
+        """Direction of world up in axes of the chassis."""
         return self.matrix[2]
 
     def block_body_velocity(self) -> Any:
+        """Velocity in axes of the chassis, m/s."""
         return self.body_velocity
 
     def block_body_rates(self) -> Any:
+        """Angular velocity in axes of the chassis, rad/s."""
         return self.body_rates
 
     def block_joints(self) -> Any:
+        """Sines of the joints' angles, then their speeds, rad/s."""
         return np.concatenate([np.sin(self.angles), self.speeds])
 
     def block_last_action(self) -> Any:
+        """The action that was last sent."""
         return self.action
 
     def block_waited(self) -> Any:
+        """Time without progress, in tens of seconds."""
         return [self.waited / 10.0]
 
     def block_arrival(self) -> Any:
+        """Cosine and sine of the turn that is left to the wanted direction of arrival."""
         turn = self.direction - heading(self.matrix)
         return [math.cos(turn), math.sin(turn)]
 

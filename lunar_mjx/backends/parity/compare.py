@@ -91,6 +91,7 @@ class Result:
 
     @property
     def passed(self) -> bool:
+        """Whether the worst error keeps its tolerance."""
         return bool(self.error <= 1.0)
 
 

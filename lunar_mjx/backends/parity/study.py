@@ -50,6 +50,7 @@ class Pair:
 
     @property
     def failed(self) -> list[Result]:
+        """Results above their tolerance; none where the pair of backends is shown and not judged."""
         return [r for r in self.results if not r.passed] if self.judged else []
 
 

@@ -31,6 +31,7 @@ class Step:
 
     @property
     def observations(self) -> Observations:
+        """Measurements with their residuals; the step must have been traced."""
         assert self.result.traces is not None
         return self.result.traces.observations
 

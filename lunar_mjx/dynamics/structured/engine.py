@@ -56,6 +56,7 @@ class Pieces:
 
     @property
     def dtype(self) -> Any:
+        """Float type of the whole step."""
         return self.base[0].dtype
 
 

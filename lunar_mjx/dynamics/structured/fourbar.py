@@ -56,10 +56,12 @@ class FourBar:
 
     @property
     def independent(self) -> int:
+        """Number of the link whose angle gives the other two."""
         return self.links[self.given]
 
     @property
     def dependent(self) -> tuple[int, int]:
+        """Numbers of the two links whose angles follow."""
         first, second = (link for i, link in enumerate(self.links) if i != self.given)
         return first, second
 

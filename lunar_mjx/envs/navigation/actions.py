@@ -42,6 +42,7 @@ class ActionMap:
 
     @property
     def size(self) -> int:
+        """Number of actions."""
         return len(self.names)
 
     def controls(self, action: Float[Array, "env action"]) -> Float[Array, "env joint"]:

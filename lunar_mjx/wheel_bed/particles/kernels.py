@@ -20,6 +20,7 @@ its axle (to its left) N m, height of its centre m, place along the travel m, co
 
 @wp.func
 def rise(t: float, begin: float, duration: float):
+    """Share of a load or speed at time `t`: 0 before `begin`, straight up, 1 after `duration`."""
     return wp.clamp((t - begin) / wp.max(duration, 1.0e-9), 0.0, 1.0)
 
 
