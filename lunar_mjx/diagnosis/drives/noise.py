@@ -277,6 +277,7 @@ def colours(
     def most_likely(rows: Sequence[np.ndarray]) -> int:
         total = np.sum(rows, axis=0) if len(rows) else np.zeros(len(tried))
         k = int(np.argmax(total))
+        # the first that was tried is white noise: a colour must earn its two parameters
         return k if 2.0 * (total[k] - total[0]) > NOISE_COLOURS.evidence else 0
 
     common, alike = 0, list(likelihood)
@@ -340,6 +341,7 @@ def _about_a_line(times: bytes, c: Colour) -> tuple[np.ndarray, float]:
     """
     since = np.frombuffer(times)
     line = np.stack([np.ones_like(since), since - since.mean()], axis=1)
+    # white noise and an Ornstein-Uhlenbeck process, of variance one together
     correlation = (1.0 - c.share) * np.eye(len(since))
     if c.share > 0.0:
         correlation += c.share * np.exp(-np.abs(since[:, None] - since) / c.correlation_time)

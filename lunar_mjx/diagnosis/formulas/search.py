@@ -155,11 +155,13 @@ def search_formulas(
             break
         progress("refitting formulas", (k + 1) / (FORMULA_SEARCH.rounds + 2))
         (held_slot,) = best.slots.held
+        # with the held formula taken out: the next one replaces it, and is scored where the better model stands
         again = search.scores(best.slots, best.fit, choices, held_slot)
         new = search.refit(best.slots, best.fit, again, FORMULA_SEARCH.next, FORMULA_SEARCH.alike[1], held_slot)
         trials += new
         if not any(t.merit > best.merit for t in new):
             break
+    # 1 + x differs from exp x for large x alone, so that only the best are tried in both ways
     trials += search.linear(trials)
     trials = search.finished(trials)
     progress("refitting pairs of formulas", FORMULA_SEARCH.rounds / (FORMULA_SEARCH.rounds + 2))
@@ -206,6 +208,7 @@ class _Search:
             mine = [c for c in choices if c.target == k]
             seen = slots.factors(at.u, targets()[k].port)
             product = seen[:, [c.first for c in mine]] * seen[:, [c.second for c in mine]]
+            # over its own root mean square, so that one amount means the same for formulas in N, m or rad/s
             size = np.sqrt(np.mean(product[keep] ** 2, axis=0))
             scale = 1.0 / np.where(size > 0.0, size, 1.0)
             column = observations.whiten(np.nan_to_num(probes[k])[:, None] * product * scale)
@@ -214,6 +217,7 @@ class _Search:
         signature = np.concatenate([o[1] for o in out], axis=1)
         power = np.sum(signature**2, axis=0)
         amount = signature.T @ residual[keep] / np.where(power > 1e-6, power, np.inf)
+        # least squares in one unknown beside the refitted baseline, for thousands of formulas in one product
         chi2 = np.where(np.abs(amount) < FORMULA_SEARCH.far, amount**2 * power, 0.0)
         return _Scores(
             [c for o in out for c in o[0]],
@@ -253,6 +257,7 @@ class _Search:
             new = kept | {scores.choices[i]}
             if scores.chi2[i] < self.settings.chi2 or len(new) == len(kept) or new in self.tried:
                 continue
+            # the best of each family alone: a hundred spellings of one law would fill all refits
             if not chosen or np.max(np.abs(unit[:, chosen].T @ unit[:, i])) < alike:
                 chosen.append(int(i))
         left, number = self._left(slots, at, dropped), slots.spare
@@ -263,6 +268,7 @@ class _Search:
             choice, amount = scores.choices[i], scores.amount[i]
             grown = slots.holding({**held, number: (choice, targets()[choice.target].size * scores.scale[i])})
             unexplained = (residual - scores.column[:, i] * amount)[at.fitted]
+            # the others give way to the new formula before the descent, which then has less to do
             step = np.linalg.lstsq(rows, np.concatenate([unexplained, np.zeros(len(prior))]), rcond=1e-8)[0]
             start = np.zeros_like(at.u)
             start[left] = at.u[left] + step
@@ -316,6 +322,7 @@ class _Search:
         """The best singles with a second formula, where they leave a rest."""
         out: list[Trial] = []
         for t in sorted(trials, key=lambda t: -t.merit)[: FORMULA_SEARCH.seeds]:
+            # where a single formula left noise alone, a second could only explain noise
             if not t.at_noise:
                 more = self.scores(t.slots, t.fit, choices)
                 out += self.refit(t.slots, t.fit, more, FORMULA_SEARCH.seconds, FORMULA_SEARCH.alike[0])

@@ -97,6 +97,7 @@ def build_tables(
         for effect in effects.values():
             union = union.with_effect(effect, **effect.null())
         coordinates, baseline, places = tables._coordinates(bed, effects, tables.BASELINE, {})
+        # prior probability: the model's own law has half of it, its rivals share the other half
         share = 1.0 if len(laws) == 1 else 0.5 if number == 0 else 0.5 / (len(laws) - 1)
         forms.append(WheelForm(name, data, union, coordinates, baseline, places, settings, math.log(share)))
         beds[name] = bed
@@ -151,6 +152,7 @@ def better_law(forms: Mapping[str, float], model: Model, sure: float = TableSett
 
 def _single(values: Mapping[str, Any]) -> dict[str, float]:
     """One value per parameter: the first where a model has one per wheel or joint."""
+    # a bed holds one wheel
     return {k: float(v[0]) if isinstance(v, tuple | list) else v for k, v in values.items()}
 
 
@@ -177,6 +179,7 @@ def grown_model(
     new = frozenset(catalogue.get(n).name for n in effects) & set(problem.own.candidates)
     progress("refitting with " + ", ".join(sorted(new) or [problem.own.name]), 0.0)
     form = problem.own
+    # where the search of `why` ended: the refit is then a few steps, and ends in the minimum that was judged
     kept = (run.load(HYPOTHESES_FILE) or {}).get(" + ".join([form.name, *sorted(new)]), {}).get("u")
     start = None if kept is None else np.array([kept.get(c.key, 0.0) for c in form.coordinates])
     with threadpool_limits(1, "blas"):

@@ -13,9 +13,11 @@ if TYPE_CHECKING:
     from lunar_mjx.logs import SteadyLog
 
 _MOST = 0.95
+"""Largest correlation that is believed: at 1 no point would add anything to its neighbour."""
 _SURE = 2.5
 """Standard errors from which a correlation counts."""
 _FEWEST = 8
+"""Pairs of neighbours from which a correlation is estimated."""
 _GAP = 1.5
 """Median steps of slip beyond which two points of a sweep are no neighbours."""
 
@@ -50,6 +52,7 @@ def scatter(log: SteadyLog) -> dict[str, Scatter]:
         if freedom < 1:
             out[quantity] = Scatter()
             continue
+        # around each group's own mean: replicates tell the noise whatever the law of the wheel is
         mean = np.bincount(group, weights=values) / np.bincount(group)
         estimate = Scatter(0.0, *_neighbours(log, values - mean[group]))
         out[quantity] = dataclasses.replace(estimate, level=float(np.sqrt(0.5 * estimate.dependence / freedom)))
@@ -67,6 +70,7 @@ def _neighbours(log: SteadyLog, residual: np.ndarray) -> tuple[float, float]:
     if len(first) < _FEWEST or size <= 0.0:
         return 0.0, 1.0
     correlation = float(first @ second) / size
+    # 1/sqrt(n) is the standard error of a correlation that is none; a negative one is no memory of the bed
     if correlation <= _SURE / np.sqrt(len(first)):
         return 0.0, 1.0
     correlation = min(correlation, _MOST)
@@ -90,6 +94,7 @@ def sweeps(table: SteadyStateTable, key: np.ndarray) -> tuple[np.ndarray, np.nda
     order = np.lexsort([slip, sweep])
     same_sweep = np.diff(sweep[order]) == 0
     gap = np.diff(slip[order])
+    # a gap in a sweep is a point that was left out or measured elsewhere: noise need not go on across it
     near = gap <= _GAP * np.median(gap[same_sweep]) if same_sweep.any() else same_sweep
     return order, np.concatenate([[False], same_sweep & near])
 
@@ -99,5 +104,6 @@ def _levels(table: SteadyStateTable) -> np.ndarray:
     load = table.test["normal_load_N"]
     order = np.argsort(load, kind="stable")
     level = np.zeros(len(load), int)
+    # measured loads scatter around what was set: a new level begins where the sorted loads jump
     level[order[1:]] = np.cumsum(np.diff(load[order]) > SAME_LOAD * load[order[:-1]])
     return level

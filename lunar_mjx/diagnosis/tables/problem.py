@@ -61,6 +61,7 @@ def points(log: SteadyLog) -> tuple[SteadyStateTable, dict[str, np.ndarray]]:
         column = QUANTITIES[quantity][0]
         mean = table.measured[quantity]
         squares = np.bincount(group, weights=(values - mean[group]) ** 2)
+        # replicates first: they hold what a stated noise forgets (preparation of the bed, refilling)
         if squares.any():
             noise[quantity] = point_scatter(squares, count - 1, mean) / np.sqrt(count)
             continue
@@ -253,6 +254,8 @@ def _coordinates(
         for name, (relative, prior, low, high) in baseline.get(effect.name, {}).items():
             p, at = effect.parameters[name], float(bed.parameters[effect.name][name])
             if low > 0.0:
+                # a parameter without prior knowledge moves by its logarithm, and a logarithm needs a start inside its
+                # bounds
                 at = min(max(at, low), high)
                 coordinates.append(Coordinate(effect.name, name, at, relative, low, high, True, prior, unit=p.unit))
             else:

@@ -90,6 +90,7 @@ def table_data(
         np.full(len(np.atleast_1d(t.slip_angle)), log.gravity_m_s2 or EARTH_GRAVITY)
         for log, t in zip(logs, tests, strict=True)
     ]
+    # an error of the load's zero is a share of the mean load, the same for all points of a load cell
     imposed = Imposed(stacked, slip, lever, np.full(first, load.mean()), np.concatenate(gravity))
     speed = np.concatenate([_speed(log) for log in logs])
     features = np.column_stack(
@@ -128,6 +129,7 @@ def _speed(log: SteadyLog) -> np.ndarray:
 
 def _modes(features: np.ndarray, settings: TableSettings) -> np.ndarray:
     """(points, modes): a constant, a plane and a smooth remainder, of given shares of the variance."""
+    # once a place: replicates share their discrepancy, and the eigenproblem stays small
     unique, inverse = np.unique(np.round(features, 6), axis=0, return_inverse=True)
     centred = unique - unique.mean(axis=0)
     plane = centred @ centred.T / max(float(np.mean(np.sum(centred**2, axis=1))), 1e-12)
@@ -219,6 +221,7 @@ class WheelForm(MeasuredForm):
         field_columns = count + errors.shape[1] + np.arange(fields.shape[1])
         last = columns.shape[1] - unlisted.shape[1]
         more = last - added.shape[1]
+        # no field's size is inferred for these (field -1): what follows speed or load is asked for, and never usual
         sizes = np.full(unlisted.shape[1], settings.following_discrepancy)
         std = np.concatenate(
             [[c.prior for c in self.coordinates], error_std, np.ones(last - more + len(field_columns)), sizes]
@@ -238,6 +241,7 @@ class WheelForm(MeasuredForm):
                     low[i], high[i] = self.coordinates[i].bounds()
         low[:count] -= u
         high[:count] -= u
+        # where each amplitude stands, so that hypotheses without the effect are told at its null
         at = np.zeros(len(std))
         for places in self.candidates.values():
             at[places] = u[places]
@@ -301,6 +305,7 @@ class WheelForm(MeasuredForm):
             if not parts or (added and usually > 0.0):
                 continue
             white = self.data.observations.whiten(np.column_stack([slope[:, [i]] * x * modes for i, x in parts]))
+            # turned to principal directions: those that even a large discrepancy keeps below the noise only cost time
             left, size, _ = np.linalg.svd(white, full_matrices=False)
             keep = size * self.settings.unlisted_discrepancy > self.settings.least_length
             columns.append(left[:, keep] * size[keep])
@@ -334,8 +339,11 @@ class WheelForm(MeasuredForm):
         for q in data.measured:
             name = QUANTITIES[_NAMES[q]][0]
             mine = data.quantity == q
+            # a sensor's zero is stated as a share of its full scale; the table's own range stands for it, without its
+            # outliers
             top = float(np.quantile(np.abs(observations.value[mine]), 0.95))
             errors = [(value, settings.sensor_scale), (np.full(len(value), top), settings.sensor_zero)]
+            # a balance of several axes reads a share of the load and of the other horizontal force
             if _NAMES[q] in ("drawbar_pull", "side_force"):
                 other = 1 - q
                 errors.append((load, settings.cross_talk))
@@ -366,6 +374,7 @@ class WheelForm(MeasuredForm):
             u[free] = start[free]
         elif near is not None:
             u[free] = near.u[free]
+        # strictly inside: at a bound, a bounded step has no direction to begin with
         u[free] = np.clip(u[free], *(self._bounds(free) + np.array([[1e-9], [-1e-9]])))
         terms = frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
         linear, columns, _ = self.linearise(u)
@@ -381,6 +390,7 @@ class WheelForm(MeasuredForm):
             gained = np.inf if best is None else value - best[0]
             if gained > 0.0:
                 best = value, Refit(self.name, effects, u, linear)
+            # the sizes were inferred at the last place: a round that gains little would change them little, too
             if gained < settings.settled:
                 break
         assert best is not None
@@ -411,6 +421,7 @@ class WheelForm(MeasuredForm):
         """
         fit = self._fit
         columns, noise = spread or (np.zeros((int(fit.sum()), 0)), np.ones(int(fit.sum())))
+        # what is shared between points is marginalised in closed form, in place of thousands of further coordinates
         covariance = columns @ columns.T
         covariance[np.diag_indices(len(noise))] += noise**2
         factor = linalg.cholesky(covariance, lower=True, check_finite=False)

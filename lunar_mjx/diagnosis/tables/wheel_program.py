@@ -104,6 +104,7 @@ class WheelProgram:
             if self._held is None or self._held[0] is not imposed:
                 self._held = imposed, self._constants(), self._chunks(imposed)
             _, constants, chunks = self._held
+            # gains and errors of abscissae are differentiated at zero: they enter hypotheses to first order alone
             z = jnp.asarray(np.concatenate([u[self._order], np.zeros(self.width - len(u))]))
             parts = [(rows, self._run(z, *constants, *chunk)) for rows, chunk in chunks]
             for rows, (slope, value) in parts:
@@ -124,6 +125,8 @@ class WheelProgram:
             mine = np.flatnonzero(gravities == gravity)
             for at in range(0, len(mine), CHUNK):
                 rows = mine[at : at + CHUNK]
+                # repeats the last point: zeros would be a wheel without a load or a radius, and its derivatives not
+                # finite
                 filled = np.pad(rows, (0, CHUNK - len(rows)), mode="edge")
                 chunk = jax.tree.map(lambda a, filled=filled: jnp.asarray(a[filled]), whole)
                 chunks.append((rows, (jnp.asarray(gravity), chunk)))
@@ -132,6 +135,7 @@ class WheelProgram:
 
 _PROGRAMS: dict[Any, tuple[WheelBed, Any]] = {}
 _MOST_PROGRAMS = 24
+"""Compiled programs that are kept; the oldest goes first."""
 
 
 def _compiled(key: Any, bed: WheelBed, layout: Sequence[tuple[str, str]]) -> Any:

@@ -16,9 +16,11 @@ SOURCE = "unknown input of a localisation"
 SMOOTH = "smooth_inputs"
 """Name of the effect that holds all inputs which follow quantities of their ports."""
 _ORDER = 1000
+"""After all effects at a port: an unknown input adds to what they made of its value."""
 
 
 def _torque(ctx, a, value):
+    # group 0 drives wheels; steering and suspension joints are left as they are
     return value + jnp.where(ctx.rover.joint_group == 0, a, 0.0)
 
 
@@ -43,6 +45,7 @@ def _load(ctx, a, value):
 
 
 def _resistance(ctx, a, value):
+    # in loads of the wheel, so that a size means the same on every rover
     return dataclasses.replace(value, resistance=value.resistance + a * value.load)
 
 
@@ -185,6 +188,7 @@ def smooth_inputs(ports: frozenset[str]) -> Effect:
         mine = [label for label in labels if PROBES[label][0] == port]
 
         def function(ctx, p, x, value):
+            # all follow what came in: otherwise the order of the inputs would matter
             given = value
             for label in mine:
                 amount = sum(getattr(p, amplitude(label, q)) * _quantity(q, ctx, given) for q in FOLLOWS[label])

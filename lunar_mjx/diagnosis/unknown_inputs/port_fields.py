@@ -83,6 +83,7 @@ class Usual:
             "load": self.load,
             "travel speed": self.speed * self.radius,
         }
+        # inputs are made for one size of rover; here their quantity is one at this rover's own usual value
         follows = QUANTITY_SIZES[quantity] / usual[quantity] if quantity in usual else 1.0
         return SHARES.get(label, 1.0) * amounts.get(label, 1.0) * follows
 
@@ -90,4 +91,5 @@ class Usual:
 def rotated(columns: np.ndarray, least: float) -> np.ndarray:
     """Columns (n, m) turned so that few (n, k) are left: those at least `least` long."""
     values, vectors = np.linalg.eigh(columns.T @ columns)
+    # squared lengths along principal axes; an axis shorter than that cannot be told from noise
     return columns @ vectors[:, values > least**2]

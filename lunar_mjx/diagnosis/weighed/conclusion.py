@@ -53,6 +53,7 @@ def conclude(found: ModelSearch, sure: float, largest_class: int = LARGEST_CLASS
     if unlisted >= sure:
         names = tuple(map(label, named))
         said = _with(f"Something that no listed effect explains acts at {place}", unlisted)
+        # an effect beside something unlisted is said to help: how much of it is real, no hypothesis tells
         if names:
             said += f" Beside it {_list(names)} {'help' if len(names) > 1 else 'helps'}."
         effects = tuple(dict.fromkeys([*names, *_helpful(found)]))
@@ -65,6 +66,7 @@ def conclude(found: ModelSearch, sure: float, largest_class: int = LARGEST_CLASS
         further, _ = _smallest(found, unnamed, sure, named, largest_class)
         plural = len(names) > 1
         said = f"{_list(names)} {'are' if plural else 'is'} missing"
+        # an instrument is there and wrong, not missing
         if all(t.kind == CALIBRATION for t in named):
             said = f"{_list(names)}: out of order beyond what is usual"
         verdict = Verdict.MULTIPLE if plural else Verdict.KNOWN
@@ -125,6 +127,7 @@ def _where(found: ModelSearch) -> tuple[str | None, str | None]:
 
     def sure(holds: Callable[[str], bool]) -> float:
         p = found.probability_of(lambda h: any(t.kind == UNLISTED and holds(t.name) for t in h.terms))
+        # probabilities that differ by less than a per cent are taken for equal; then the larger one is told
         return round(p, 2)
 
     def size(name: str) -> float:
@@ -173,6 +176,7 @@ def _smallest(
         # jointly, not from the terms' own probabilities: hypotheses that hold both must not count twice
         gains = {t: found.probability_of(holds([*members, t])) for t in by_label if t not in members}
         best = max(gains, key=lambda t: gains[t], default=None)
+        # nothing more helps: the rest of the probability lies with hypotheses without any of these
         if best is None or gains[best] <= p:
             break
         members.append(best)

@@ -37,6 +37,7 @@ _PROGRAMS: dict[Any, Program] = {}
 """Programs take every number as an argument, so that campaigns of one rover share them; a program keeps its model, so
 that no other effect takes the identity of one of its own."""
 _MOST_PROGRAMS = 32
+"""Compiled programs that are kept; the oldest goes first."""
 
 
 class Bench:
@@ -156,10 +157,12 @@ class Bench:
         """
 
         def one(part: np.ndarray) -> np.ndarray:
+            # filled up with copies: another number of rovers would be another program to compile
             full = np.concatenate([part, np.repeat(part[-1:], self.chunk - len(part), axis=0)])
             return logs.program(logs, full[:, 0], full[:, 1], values, len(part), self.deadline)
 
         workers = cores() if jax.default_backend() == "cpu" else 1
+        # the first part compiles alone, or every thread would compile the same program
         if workers < 2 or len(parts) < 2 or not logs.program.compiled:
             yield one(parts[0])
             parts = parts[1:]
@@ -220,6 +223,7 @@ def _sample(
         for channel, (start, stop) in zip(p.channels, p.parts, strict=True):
             one = signals[:, names.index(channel)]
             if p.euler:
+                # a mean of 179 and -179 degrees would be 0: samples are interpolated without jumps
                 one = np.rad2deg(np.unwrap(np.deg2rad(one), axis=1))
             one = one[:, at] * (1.0 - p.share) + one[:, after] * p.share if np.any(p.share) else one[:, at]
             if p.at_once and np.any(before):
@@ -227,6 +231,7 @@ def _sample(
                 earlier = signals[:, names.index(channel)][:, np.maximum(p.low - (p.share == 0.0), 0)]
                 one = one + before[:, None] * (earlier - one)
             if p.euler:
+                # whichever turn is nearest to what was measured, so that no residual is near 360 degrees
                 one = measured[start:stop] + (one - measured[start:stop] + 180.0) % 360.0 - 180.0
             out[:, start - p.begin : stop - p.begin] = one
     return out
