@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import integrate, special, stats
 
 from lunar_mjx.inference import evidence
-from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize, infer
+from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize, infer, log_box
 
 N, OWN, EACH = 60, 3, 8
 FIELDS = (Field("a", 0.5), Field("b", 0.2))
@@ -179,3 +179,43 @@ def test_one_right_parameter_beats_a_field_of_many():
 def test_values_that_are_not_finite_are_refused():
     with pytest.raises(EvidenceError, match="not finite"):
         Gram.of(np.array([[np.nan]]), np.zeros(1))
+
+
+def _by_conditioning(mean: np.ndarray, covariance: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+    """Log probability of a box in two dimensions, by quadrature over the first coordinate."""
+    std = math.sqrt(covariance[0, 0])
+    share = covariance[0, 1] / covariance[0, 0]
+    rest = math.sqrt(covariance[1, 1] - share * covariance[0, 1])
+    x = np.linspace(max(low[0], mean[0] - 12.0 * std), min(high[0], mean[0] + 12.0 * std), 200_001)
+    inner = mean[1] + share * (x - mean[0])
+    logs = stats.norm.logpdf(x, mean[0], std)
+    logs = logs + np.log(stats.norm.sf((low[1] - inner) / rest) - stats.norm.sf((high[1] - inner) / rest))
+    return float(special.logsumexp(logs) + math.log(x[1] - x[0]))
+
+
+@pytest.mark.parametrize("correlation", (-0.9, 0.0, 0.6, 0.95))
+@pytest.mark.parametrize("far", (0.5, 3.0))
+def test_bounds_that_bind_together_are_taken_together(correlation: float, far: float):
+    mean = np.array([-far, 0.3 - far])
+    covariance = np.array([[1.0, 1.4 * correlation], [1.4 * correlation, 1.96]])
+    low, high = np.zeros(2), np.array([5.0, 6.0])
+    wanted = _by_conditioning(mean, covariance, low, high)
+    assert log_box(mean, covariance, low, high) == pytest.approx(wanted, abs=0.02 + 0.02 * abs(wanted))
+
+
+def test_a_box_of_independent_coordinates_is_the_product_of_its_sides():
+    mean, std = np.array([0.4, -2.0, 1.0]), np.array([1.0, 0.5, 3.0])
+    low, high = np.array([0.0, 0.0, -np.inf]), np.array([1.0, np.inf, 2.0])
+    sides = stats.norm.cdf((high - mean) / std) - stats.norm.cdf((low - mean) / std)
+    assert log_box(mean, np.diag(std**2), low, high) == pytest.approx(float(np.log(sides).sum()), abs=1e-6)
+
+
+def test_many_bounds_agree_with_samples():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(5, 5))
+    covariance = root @ root.T + 0.1 * np.eye(5)
+    mean = rng.normal(size=5)
+    low, high = np.zeros(5), np.full(5, np.inf)
+    drawn = rng.multivariate_normal(mean, covariance, 1_000_000)
+    wanted = math.log(np.mean(np.all(drawn > low, axis=1)))
+    assert log_box(mean, covariance, low, high) == pytest.approx(wanted, abs=0.15)
