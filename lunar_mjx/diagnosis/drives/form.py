@@ -24,6 +24,7 @@ from lunar_mjx.effects.sensor.channels import family
 from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
 from lunar_mjx.inference.fitting import Progress, silent
+from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Refit, Term
 
 OWN_FORM = "the model"
@@ -211,10 +212,8 @@ class DriveForm(MeasuredForm):
                     low[i], high[i] = np.array(self.coordinates[i].bounds()) - u[i]
         kinds, fit, observations = len(self.noise_names), self._fit, self.observations
         held = {}
-        for number, split in enumerate(observations.unit_split):
-            if split in ("select", "test"):
-                rows = observations.unit == number
-                held[observations.unit_names[number]] = Gram.of(columns[rows], residual[rows], self._group[rows], kinds)
+        for name, rows in held_out_pieces(observations, settings.held_out_piece).items():
+            held[name] = Gram.of(columns[rows], residual[rows], self._group[rows], kinds)
         return Linear(
             gram=Gram.of(columns[fit], residual[fit], self._group[fit], kinds),
             held_out=held,
@@ -423,6 +422,30 @@ class DriveForm(MeasuredForm):
                     raise
                 return u, slopes
         return u, slopes
+
+
+def held_out_pieces(observations: Observations, seconds: float) -> dict[str, np.ndarray]:
+    """Places of the observations of each piece of held-out drives, by a name such as "climb from 2 s".
+
+    A campaign holds out one drive or two: too few to tell what a name gains there from chance.
+
+    Args:
+      observations: of drives. seconds: length of a piece.
+    """
+    found: dict[str, list[np.ndarray]] = {}
+    for s in observations.series:
+        assert s.time is not None
+        rows = np.arange(s.start, s.stop)
+        number = observations.unit[rows]
+        since = s.time - s.time[0]
+        # what is left over belongs to the last piece: a sample or two are no witness
+        last = max(round(float(since[-1]) / seconds), 1) - 1
+        piece = np.minimum(np.floor(since / seconds + 1e-9), last)
+        for unit, at in np.unique(np.stack([number, piece]), axis=1).T:
+            if observations.unit_split[int(unit)] in ("select", "test"):
+                name = f"{observations.unit_names[int(unit)]} from {at * seconds:g} s"
+                found.setdefault(name, []).append(rows[(number == unit) & (piece == at)])
+    return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
 def _bounded_step(

@@ -23,6 +23,7 @@ from lunar_mjx.diagnosis.runs import (
 from lunar_mjx.diagnosis.verdict import Diagnosis, EffectEvidence, Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, label, probabilities, title
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm, Problem
+from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, account, gains_on_held_out
 from lunar_mjx.files import replacing
 from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
@@ -290,7 +291,8 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         conclusion, sentence = _without(conclusion, sentence, skipped)
     elif not found.complete:
         conclusion, sentence = _unrefitted(conclusion, sentence, [h.effects for h in found.hypotheses if h.refitted])
-    gain, se, units = _held_out(found, best, own)
+    held = account(_held_out(found, best, own))
+    conclusion, sentence, accounted = _held_to_account(conclusion, sentence, found, settings.held_out_sure)
     inclusion = found.inclusion()
     evidence, undecidable = _evidence(problem, found, conclusion.effects)
     return Diagnosis(
@@ -312,7 +314,8 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         details={
             "best": {"form": best.form, "hypothesis": title(best), "log_posterior": best.log_posterior},
             "place": conclusion.place,
-            "held_out": {"gain": gain, "se": se, "manoeuvres": units},
+            "held_out": held.to_dict("manoeuvres"),
+            **accounted,
             "noise": {n.name: float(s) for n, s in zip(best.refit.linear.noises, best.evidence.noise, strict=True)},
             "search": {
                 "refits": found.refits,
@@ -364,19 +367,40 @@ def _averaged(form: MeasuredForm, found: ModelSearch, least_signal: float) -> di
     return _discrepancy(form, np.asarray(tau), np.asarray(spread), found.best.refit.linear.felt(), least_signal)
 
 
-def _held_out(found: ModelSearch, best: Hypothesis, own: str) -> tuple[float, float, int]:
-    """Gain of log predictive density on manoeuvres that chose nothing: the best hypothesis over the model as it is."""
+def _held_to_account(
+    said: Conclusion, sentence: str, found: ModelSearch, sure: float
+) -> tuple[Conclusion, str, dict[str, Any]]:
+    """A conclusion and its sentence where what it names does not help what was held out, and what that was measured by.
+
+    Drives that chose a name have bent it to whatever else is wrong there. One that says nothing of other drives is not
+    known to be missing, nor is it known that it is not.
+    """
+    if not sure or said.verdict not in NAMING:
+        return said, sentence, {}
+    held = account(gains_on_held_out(found))
+    details = {"held_out_of_usual": held.to_dict("units")}
+    if held.units < FEWEST:
+        return said, sentence + " No drive was held out that could bear it out.", details
+    if held.helps(sure):
+        return said, sentence, details
+    names = ", ".join([*said.effects, *(["something unlisted"] if said.unlisted else [])])
+    sentence = (
+        f"By the fitted drives alone: {sentence} Those that were held out do not bear it out (log density "
+        f"{held.gain:+.1f} +- {held.se:.1f} over {held.units} pieces), so {names} is not named; drive more, and "
+        "otherwise."
+    )
+    said = dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=(), unlisted=False, port=None)
+    return said, sentence, details
+
+
+def _held_out(found: ModelSearch, best: Hypothesis, own: str) -> np.ndarray:
+    """(unit,) gain of log predictive density on what chose nothing: the best hypothesis over the model as it is."""
     base = found.base(own)
-    names = list(best.refit.linear.held_out)
-    if not names:
-        return float("nan"), float("nan"), 0
 
     def score(h: Hypothesis, name: str) -> float:
         return h.evidence.log_score(h.refit.linear.held_out[name].select(h.places))
 
-    gains = np.array([score(best, n) - score(base, n) for n in names])
-    se = float(np.sqrt(len(gains) * np.var(gains, ddof=1))) if len(gains) > 1 else float("nan")
-    return float(gains.sum()), se, len(names)
+    return np.array([score(best, n) - score(base, n) for n in best.refit.linear.held_out])
 
 
 def _evidence(

@@ -54,6 +54,8 @@ class SearchSettings:
     Brier score 0.048 to 0.032)."""
     largest_class: int = LARGEST_CLASS
     """1; names of a class at most: "one of six" is no help to its reader."""
+    held_out_sure: float = 0.0
+    """1; probability that a name helps what was held out, below which it is taken back; 0: never."""
 
     @classmethod
     def of(cls: type[SettingsKind], changed: Mapping[str, Any]) -> SettingsKind:

@@ -39,7 +39,7 @@ class Linear:
 
     Attributes:
       gram: of fitted measurements, over all columns: parameters of the form, of every effect, calibration, fields.
-      held_out: the same of measurements that choose nothing, by manoeuvre.
+      held_out: the same of measurements that choose nothing, by manoeuvre or piece of one.
       amplitudes: prior of all columns, relative to the refit. low, high: (k,) bounds relative to the refit; infinite
         where the prior is not truncated.
       always: columns of every hypothesis: the form's own parameters, calibration, and fields of usual size.

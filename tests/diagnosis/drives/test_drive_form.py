@@ -13,7 +13,7 @@ from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotated
 from lunar_mjx.diagnosis.verdict import Verdict
-from lunar_mjx.diagnosis.weighed.answer import _unrefitted, _without
+from lunar_mjx.diagnosis.weighed.answer import _held_to_account, _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.inference.deadline import Deadline, TimeUp
 from lunar_mjx.inference.weighing.search import search
@@ -95,8 +95,25 @@ def test_an_effect_is_named_and_sized(effect, amount):
     form, found, said = asked(Toy({"a": 0.5, effect: amount}))
     assert (said.verdict, said.effects) == (Verdict.KNOWN, (effect,)), said.sentence
     assert found.best.refit.u[form.candidates[effect][0]] == pytest.approx(amount, abs=0.2)
-    assert set(found.best.refit.linear.held_out) == {"log4", "log5"}
+    assert set(found.best.refit.linear.held_out) == {f"{log} from {k} s" for log in ("log4", "log5") for k in range(8)}
     assert "idle" not in {t.name for t in found.inclusion()}, "what cannot show is not weighed"
+
+
+@pytest.mark.parametrize(("everywhere", "verdict"), [(True, Verdict.KNOWN), (False, Verdict.UNDECIDABLE)])
+def test_a_name_has_to_help_drives_that_chose_nothing(everywhere: bool, verdict: Verdict):
+    """An effect of all drives is named; one that only the fitted ones show is taken back."""
+    toy = Toy({"drag": 0.9})
+    if not everywhere:
+        held = toy.observations.in_split("select")
+        without = Toy({}).observations.value
+        toy.observations = dataclasses.replace(toy.observations, value=np.where(held, without, toy.observations.value))
+    _, found, said = asked(toy)
+    assert (said.verdict, said.effects) == (Verdict.KNOWN, ("drag",)), said.sentence
+    after, sentence, details = _held_to_account(said, said.sentence, found, 0.95)
+    assert after.verdict is verdict
+    assert details["held_out_of_usual"]["units"] == 16
+    assert (after.effects, "not named" in sentence) == ((("drag",), False) if everywhere else ((), True))
+    assert _held_to_account(said, said.sentence, found, 0.0) == (said, said.sentence, {})
 
 
 def test_what_no_effect_does_is_unlisted_at_its_port():

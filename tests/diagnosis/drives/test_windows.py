@@ -371,14 +371,14 @@ def test_a_name_that_does_not_help_what_was_held_out_is_taken_back(monkeypatch):
     """Three windows of mixed gain refuse a name and keep its port; eight that all gain keep it."""
     named = Diagnosis(Verdict.KNOWN, ("soft_ground",), "soft_ground is missing.")
     families = {"soft_ground": "ground"}
-    monkeypatch.setattr(verbs, "_gains", lambda found: np.array([3.0, -2.0, 1.0]))
+    monkeypatch.setattr(verbs, "gains_on_held_out", lambda found: np.array([3.0, -2.0, 1.0]))
     said = verbs._held_to_account(named, None, families)
     assert said.verdict is Verdict.UNKNOWN
     assert (said.effects, said.port) == ((), "wheel_normal")
     assert "wheel_normal" in said.sentence
-    monkeypatch.setattr(verbs, "_gains", lambda found: np.linspace(1.0, 3.0, 8))
+    monkeypatch.setattr(verbs, "gains_on_held_out", lambda found: np.linspace(1.0, 3.0, 8))
     assert verbs._held_to_account(named, None, families).verdict is Verdict.KNOWN
-    monkeypatch.setattr(verbs, "_gains", lambda found: np.zeros(0))
+    monkeypatch.setattr(verbs, "gains_on_held_out", lambda found: np.zeros(0))
     assert verbs._held_to_account(named, None, families) is named
 
 

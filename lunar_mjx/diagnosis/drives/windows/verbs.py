@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from lunar_mjx.diagnosis.drives.windows.bench import WINDOWS_FILE, Bench
@@ -23,6 +22,7 @@ from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE, Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.diagnosis.weighed.form import Problem
+from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, account, gains_on_held_out
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress, silent
@@ -283,28 +283,24 @@ PORTS = {
     "sensor": "sensor",
 }
 """The port at which a family of suspects acts."""
-NAMING = (Verdict.KNOWN, Verdict.KNOWN_CLASS, Verdict.MULTIPLE)
 
 
 def _held_to_account(diagnosis: Diagnosis, found: ModelSearch, families: Mapping[str, str]) -> Diagnosis:
     """The diagnosis, or UNKNOWN where what it names does not help held-out windows with 95 % (Student's t).
 
-    Windows of one drive share what no law here has, such as the shape of friction's rise with slip; what fits some of
-    them alone is no explanation. Where fewer than two windows were held out, nothing is refused.
+    Where fewer than two windows were held out, nothing is refused.
     """
-    gains = _gains(found)
-    count = len(gains)
-    if diagnosis.verdict not in NAMING or count < 2:
+    held = account(gains_on_held_out(found))
+    if diagnosis.verdict not in NAMING or held.units < FEWEST:
         return diagnosis
-    gain, se = float(gains.sum()), float(math.sqrt(count) * np.std(gains, ddof=1))
-    held = {"gain": gain, "se": se, "windows": count}
-    diagnosis = dataclasses.replace(diagnosis, details={**diagnosis.details, "held_out_of_usual": held})
-    if gain > float(stats.t.ppf(SURE, count - 1.0)) * se:
+    details = {**diagnosis.details, "held_out_of_usual": held.to_dict("windows")}
+    diagnosis = dataclasses.replace(diagnosis, details=details)
+    if held.helps(SURE):
         return diagnosis
     names = ", ".join([*diagnosis.effects, *(["something unlisted"] if diagnosis.unlisted else [])])
     sentence = (
         f"Something acts that is not explained: {names} would explain the fitted windows, and does not help those that "
-        f"were held out (gain of log density {gain:.1f} +- {se:.1f} over {count:.0f} windows)."
+        f"were held out (gain of log density {held.gain:.1f} +- {held.se:.1f} over {held.units} windows)."
     )
     acts = [PORTS[families[n]] for n in diagnosis.effects if n in families]
     if acts:
@@ -312,23 +308,6 @@ def _held_to_account(diagnosis: Diagnosis, found: ModelSearch, families: Mapping
         sentence += f" It acts at {acts[0]}" + "".join(f"; {d['text']} beside it" for d in fields.values()) + "."
         diagnosis = dataclasses.replace(diagnosis, port=acts[0])
     return dataclasses.replace(diagnosis, verdict=Verdict.UNKNOWN, effects=(), further=(), sentence=sentence)
-
-
-def _gains(found: ModelSearch) -> np.ndarray:
-    """(held-out window,) gain of log predictive density of the best explanation over nothing beyond the usual.
-
-    The model as it is has differences of usual size here: those that the fitted windows asked for may hold the very
-    thing that is to be named.
-    """
-    best = next(h for h in found.hypotheses if h.refitted)
-    base = found.base(best.form)
-    usual = np.array([f.usual for f in base.refit.linear.fields])
-    plain = dataclasses.replace(base.evidence, tau=usual)
-    out = []
-    for name, gram in best.refit.linear.held_out.items():
-        own = base.refit.linear.held_out[name]
-        out.append(best.evidence.log_score(gram.select(best.places)) - plain.log_score(own.select(base.places)))
-    return np.array(out)
 
 
 SURE = 0.95
