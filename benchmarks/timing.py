@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 import platform
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -43,6 +45,24 @@ def commit() -> str:
     head = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
     changed = subprocess.run(["git", "diff", "--quiet", "HEAD"], cwd=root).returncode
     return head.stdout.strip() + ("+" if changed else "")
+
+
+def tree() -> str:
+    """Git's hash of the package as it lies there: `git rev-parse COMMIT:lunar_mjx` gives it where nothing differs.
+
+    A machine to which only files are copied may stand at another commit.
+    """
+    root = Path(__file__).parents[1]
+    with tempfile.TemporaryDirectory() as folder:
+        about = {
+            "cwd": root,
+            "env": {**os.environ, "GIT_INDEX_FILE": f"{folder}/index", "GIT_OBJECT_DIRECTORY": folder},
+            "check": True,
+        }
+        subprocess.run(["git", "add", "lunar_mjx"], **about)
+        return subprocess.run(
+            ["git", "write-tree", "--prefix=lunar_mjx/"], **about, capture_output=True, text=True
+        ).stdout.strip()
 
 
 def cpu_name() -> str:

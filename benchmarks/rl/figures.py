@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import tables as more
-from harness import percent
+from harness import digits, percent
 
 from lunar_mjx.agents.curves import mean_interval, new_figure
 from lunar_mjx.agents.policy import load_policy
@@ -61,17 +61,12 @@ ROWS = ("steps", "elapsed_s", "steps_per_s", "episode_return", "success")
 
 
 def rounded(value: Any) -> Any:
-    """What is kept of a record: numbers with five digits, which is more than one seed tells, and rows' `ROWS`."""
+    """What is kept of a record: its numbers as of `digits`, of a training's rows `ROWS` alone."""
     if isinstance(value, dict):
-        rows = (
-            {"rows": [{k: r[k] for k in ROWS if k in r} for r in value["rows"]]}
-            if "seed" in value and "rows" in value
-            else {}
-        )
-        return {k: rounded(v) for k, v in {**value, **rows}.items()}
-    if isinstance(value, list):
-        return [rounded(v) for v in value]
-    return float(f"{value:.5g}") if isinstance(value, float) else value
+        if "seed" in value and "rows" in value:
+            value = {**value, "rows": [{k: r[k] for k in ROWS if k in r} for r in value["rows"]]}
+        return {k: rounded(v) for k, v in value.items()}
+    return [rounded(v) for v in value] if isinstance(value, list) else digits(value)
 
 
 def plot_large(record: dict[str, Any], path: Path) -> None:

@@ -61,6 +61,15 @@ def save(out: Path, name: str, record: Mapping[str, Any]) -> None:
     write(out / f"{name}.json", plain({"about": about, **record}))
 
 
+def digits(value: Any) -> Any:
+    """A record's numbers with five digits, which is more than one seed tells."""
+    if isinstance(value, dict):
+        return {k: digits(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [digits(v) for v in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
 def say(text: str) -> None:
     print(text, flush=True)
 

@@ -1,13 +1,18 @@
 """Trains on a rung of the ladder and scores the policy beside those that learn nothing, on the same unseen episodes.
 
     python benchmarks/rl/rung.py ladder-3 --seconds 500 --out runs/rung                # one GPU
+    python benchmarks/rl/rung.py ladder-3 --seeds 1 2 3 4 --steps 60e6 --every inf --out runs/rung
     python benchmarks/rl/rung.py ladder-3 --tiny --seconds 400 --out runs/tiny         # the same code on two CPU cores
+    python benchmarks/rl/rung.py --keep runs/rung/ladder-3.json                        # its seeds join the kept record
+    python benchmarks/rl/rung.py --ship runs/rung/ladder-3_seed0.npz                   # to models/, with a card
 
 Rows: the policy, the policy with all that comes from its scans blanked, straight ahead, the reactive rule as it was
 tuned (`benchmarks/rl/ladder.json`), and `mapper`, which follows the way on the rover's own map if the policy is told
-it. All rows are of one program, compiled beside the training's. Each score writes `NAME.json`, `NAME.npz` (best on
-the unseen worlds so far) and `NAME_last.npz`, so that a run that is cut off leaves what it had. The last score is of
-other episodes than those by which the best was chosen.
+it. All rows are of one program, compiled beside the training's; all seeds use the same two. Each score writes
+`NAME.json`, `NAME_seedN.npz` (best on the unseen worlds so far) and `NAME_seedN_last.npz`, so that a run that is cut
+off leaves what it had. The final score is of other episodes than those by which the best was chosen; with
+`--every inf` nothing is chosen. The documentation's tables of rungs are made from the kept records,
+`benchmarks/rl/ladder-N.json`.
 """
 
 from __future__ import annotations
@@ -15,6 +20,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
+import shutil
 import sys
 import time
 from collections.abc import Mapping
@@ -26,16 +33,18 @@ import jax.numpy as jnp
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from benchmarks.rl.harness import DURING, FINAL, Clock, in_threads, percent, save, say
-from benchmarks.timing import commit
+from benchmarks.rl.harness import DURING, FINAL, Clock, digits, in_threads, percent, save, say, write
+from benchmarks.timing import commit, tree
 from lunar_mjx.agents.configs import get_training, override
 from lunar_mjx.agents.evaluate import score
 from lunar_mjx.agents.learner import Learner, normalised
-from lunar_mjx.agents.policy import policy_of, save_policy
+from lunar_mjx.agents.policy import load_policy, policy_of, save_policy
 from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.agents.train import RunConfig, train
 from lunar_mjx.envs import make, make_agent, split_keys
+from lunar_mjx.envs.ladder.rungs import get_rung
 from lunar_mjx.envs.scripted import Reactive, reactive_rule
+from lunar_mjx.resources import shipped
 
 SEES = ("height_scan", "far_scan", "plan")
 """Blocks that come from what the rover sees ahead."""
@@ -43,6 +52,8 @@ PIECE = 25
 """Control steps between looks at whether all episodes are over."""
 TINY = {"envs": 16, "epoch_steps": 24, "minibatches": 2, "passes": 1}
 """What --tiny changes of the training."""
+KEPT = ("steps", "elapsed_s", "steps_per_s", "success", "stuck")
+"""Numbers of an epoch that the kept records hold."""
 
 
 def tuned_rule(rung: int) -> Reactive:
@@ -134,19 +145,24 @@ def options() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("training", help="a shipped training of the ladder, or a file like it")
-    add("--out", type=Path, required=True)
+    add("training", nargs="?", default="ladder-3", help="a shipped training of the ladder, or a file like it")
+    add("--out", type=Path, default=Path("runs/rung"))
     add("--name", help="of the files; the training's unless told")
     add("--learner", help="another algorithm than the file's")
     add("--seconds", type=float, default=500.0, help="for everything, compiling and the last score among it")
     add("--last", type=float, default=70.0, help="of them kept for the last two scores")
+    add("--steps", type=float, help="of the environment, of each seed; the training's own unless told")
     add("--target", type=float, help="success of the policy at which the training stops")
-    add("--every", type=float, default=90.0, help="s of training between scores")
+    add("--every", type=float, default=90.0, help="s of training between scores; inf: the final one alone")
     add("--episodes", type=int, default=256, help="of each row")
-    add("--seed", type=int, default=0)
+    add("--seeds", type=int, nargs="+", default=[0], help="one after another, as many as there is time for")
     add("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
     add("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment, as JSON")
     add("--tiny", action="store_true", help="small enough for two CPU cores")
+    add("--keep", type=Path, nargs="+", metavar="JSON", help="train nothing; add the seeds of these to the kept record")
+    add(
+        "--ship", type=Path, metavar="NPZ", help="train nothing; a policy of the kept record goes to its rover's folder"
+    )
     return parser.parse_args()
 
 
@@ -159,84 +175,229 @@ def told(value: str) -> Any:
     return tuple(found) if isinstance(found, list) else found
 
 
+def keep(paths: list[Path], home: Path = Path(__file__).parent) -> Path:
+    """The kept record of a training, with the finished seeds of further runs in it; a seed told twice is the later's.
+
+    Raises:
+      ValueError: runs of different trainings, environments or settings.
+    """
+    records = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    home = home / f"{records[0]['training']}.json"
+    if home.is_file():
+        records.insert(0, json.loads(home.read_text(encoding="utf-8")))
+    first, seeds = records[0], {}
+    for record in records:
+        for same in ("training", "environment", "train"):
+            if record[same] != first[same]:
+                raise ValueError(f"{home.name}: {same} is not the same in all runs: {first[same]}; {record[same]}")
+        about = {k: record[k] for k in ("commit", "tree", "worlds_s", "compile_s") if k in record}
+        for run in record["seeds"]:
+            if "final" in run:
+                epochs = [{k: row[k] for k in KEPT if k in row} for row in run["epochs"]]
+                seeds[run["seed"]] = {"device": record["about"]["device"], **about, **run, "epochs": epochs}
+    kept = {k: first[k] for k in ("about", "training", "environment", "train", "learner")}
+    write(home, digits({**kept, "seeds": [seeds[n] for n in sorted(seeds)]}))
+    return home
+
+
+CARD = """# Policy of {rover} for rung {rung} of the ladder
+
+`{training}.npz` ({size:.2f} MB): weights, observation statistics and the environment's options, without pickles.
+
+    lunar-mjx play {rover}/{training}
+    lunar-mjx evaluate {rover}/{training}
+
+**Task.** `ladder/{rung}`: {note}; goals {near:.0f} to {far:.0f} m away. Options: `{options}`.
+
+**Training.** {learner}, {envs:,} rovers in {worlds} worlds, seed {seed}: {steps:.0f} M environment steps in
+{elapsed_s:.0f} s on one {device}, after {worlds_s:.0f} s for the worlds and {compile_s:.0f} s of compiling.
+Commit {commit}. Script: `benchmarks/rl/rung.py {training}`; record: `benchmarks/rl/{training}.json`.
+
+**Score** in worlds and soil never trained on (`{unseen}`), {episodes} episodes, 95 % Wilson interval:
+
+| agent | success | weighted by path length | collisions/km | W h/km | mean slip |
+|---|---|---|---|---|---|
+{rows}
+
+Ends of this policy's episodes: {ends}.
+
+**Limits.** It is told `plan`: the way on a map that the rover draws while it drives, from the true ground within its
+view, at its exact pose. It learns to drive along that way, not to map: the rule `mapper`, which learns nothing, arrives
+about as often. Trained in simulation only. It has driven no real rover.
+"""
+
+
+def ship(path: Path) -> Path:
+    """Copies a policy of the kept record into its rover's folder and writes its card; returns the copy."""
+    policy = load_policy(path)
+    seed, options = policy.notes["seed"], policy.environment["options"]
+    training = path.stem.partition("_")[0]
+    record = json.loads((Path(__file__).parent / f"{training}.json").read_text(encoding="utf-8"))
+    run = next(r for r in record["seeds"] if r["seed"] == seed)
+    assert run["final"]["steps"] == policy.notes["steps"], f"{path}: not the policy that the kept record scores"
+    rows = run["final"]["rows"]
+    rover = options.get("rover", "luvmi_x")
+    number = int(options["task"].rpartition("/")[2])
+    home = shipped("models") / rover / f"{training}.npz"
+    shutil.copyfile(path, home)
+    lines = [
+        f"| {name} | {percent(r)} | {r['spl']:.2f} | {r['collisions_per_km']:.0f} | {r['wh_per_km']:.0f} "
+        f"| {r['slip']:.2f} |"
+        for name, r in {"this policy": rows["policy"], **rows}.items()
+        if name != "policy"
+    ]
+    text = CARD.format(
+        rover=rover,
+        training=training,
+        rung=number,
+        note=get_rung(number).note,
+        near=get_rung(number).goal_distance[0],
+        far=get_rung(number).goal_distance[1],
+        size=home.stat().st_size / 1e6,
+        options=json.dumps(options),
+        learner=record["learner"].removesuffix("Config"),
+        envs=record["train"]["envs"],
+        worlds=record["environment"]["options"]["worlds"],
+        seed=seed,
+        steps=run["final"]["steps"] / 1e6,
+        elapsed_s=run["final"]["elapsed_s"],
+        device=run["device"],
+        worlds_s=run["worlds_s"],
+        compile_s=max(run["compile_s"]),
+        commit=run["commit"],
+        unseen=json.dumps(record["environment"]["unseen"]),
+        episodes=rows["policy"]["episodes"],
+        rows="\n".join(lines),
+        ends=json.dumps({k: round(v, 4) for k, v in rows["policy"]["ends"].items()}),
+    )
+    home.with_suffix(".md").write_text(text, encoding="utf-8")
+    return home
+
+
+class Trials:
+    """Trainings from several seeds with the same two programs.
+
+    Args:
+      args: the command line. training: what to train.
+    """
+
+    def __init__(self, args: argparse.Namespace, training: Any):
+        self.args, self.clock = args, Clock(args.seconds)
+        files = {"commit": commit(), "tree": tree()}
+        more: Mapping[str, Any] = {k: told(v) for k, v in (pair.split("=", 1) for pair in args.env)}
+        if args.tiny:
+            names = {f.name for c in (training.train, training.train.algorithm) for f in dataclasses.fields(c)}
+            training = override(training, **{k: v for k, v in TINY.items() if k in names})
+            more, args.episodes = {"worlds": 2, "episode_time": 20.0, **more}, min(args.episodes, 2)
+        settings = {**training.options, **more}
+        self.steps = int(args.steps or training.steps)
+        self.name = args.name or Path(args.training).stem
+        args.out.mkdir(parents=True, exist_ok=True)
+        env = make(training.environment, **settings)
+        worlds_s = self.clock.spent
+        self.learner = learner = Learner(env, training.train)
+
+        def prepare() -> None:
+            self.rows = Rows(env, learner, unseen_params(env, training.unseen), args.episodes)
+            self.rows.compile(jax.eval_shape(learner.policy, learner.abstract()))
+
+        self.rows: Rows
+        compile_s = in_threads(learner.compile, prepare)
+        say(f"worlds {worlds_s:.0f} s, compiled after {compile_s}, {self.clock.left:.0f} s left")
+        self.environment = {"name": training.environment, "options": settings, "unseen": dict(training.unseen)}
+        self.record: dict[str, Any] = {
+            **files,
+            "training": self.name,
+            "environment": self.environment,
+            "train": dataclasses.asdict(training.train),
+            "learner": type(training.train.algorithm).__name__,
+            "worlds_s": worlds_s,
+            "compile_s": compile_s,
+            "seeds": [],
+        }
+
+    def store(self, seed: int, state: Any, row: Mapping[str, Any], score: Any, word: str = "") -> None:
+        """Writes the policy of a state; `word` ends the file's name."""
+        # whoever drives the policy makes as many worlds as the rung has, not all that it was trained in
+        options = {k: v for k, v in self.environment["options"].items() if k != "worlds"}
+        notes = {"score": score, "seed": seed, "commit": self.record["commit"], "tree": self.record["tree"]}
+        notes |= {k: row[k] for k in ("steps", "elapsed_s")}
+        policy = policy_of(self.learner, state, {**self.environment, "options": options}, notes)
+        save_policy(policy, self.args.out / f"{self.name}_seed{seed}{word}.npz")
+
+    def __call__(self, seed: int) -> None:
+        """Trains and scores one seed."""
+        args, learner = self.args, self.learner
+        run: dict[str, Any] = {"seed": seed, "scores": [], "epochs": []}
+        self.record["seeds"].append(run)
+        best, due = {"success": -1.0}, [args.every]
+        chosen: list[Any] = []
+
+        def look(state: Any, row: Mapping[str, Any]) -> None:
+            begin = time.monotonic()
+            policy = jax.device_get(learner.policy(state))
+            found = self.rows(policy, DURING)
+            run["scores"].append({"steps": row["steps"], "elapsed_s": row["elapsed_s"], "seed": DURING, "rows": found})
+            self.store(seed, state, row, found["policy"], "_last")
+            if found["policy"]["success"] > best["success"]:
+                best["success"] = found["policy"]["success"]
+                chosen[:] = [policy, row]
+                self.store(seed, state, row, found["policy"])
+            save(args.out, self.name, self.record)
+            say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s: scored in {time.monotonic() - begin:.0f} s")
+            shown(found, "    ")
+
+        def after_epoch(_: Learner, state: Any, row: dict[str, Any]) -> dict[str, Any]:
+            run["epochs"].append({k: row[k] for k in row if not k.startswith("reward_")})
+            if row["elapsed_s"] >= due[0]:
+                look(state, row)
+                due[0] = row["elapsed_s"] + args.every
+            there = args.target is not None and best["success"] >= args.target
+            return {"stop": there or self.clock.left < args.last}
+
+        result = train(learner, RunConfig(self.steps, seed, quiet=True), None, self.environment, after_epoch)
+        last = result.rows[-1]
+        if math.isinf(args.every):
+            chosen = [jax.device_get(learner.policy(result.state)), last]
+        elif not run["scores"] or run["scores"][-1]["steps"] < last["steps"]:
+            look(result.state, last)
+        policy, row = chosen
+        found = self.rows(policy, FINAL)
+        run["final"] = {"steps": row["steps"], "elapsed_s": row["elapsed_s"], "seed": FINAL, "rows": found}
+        if math.isinf(args.every):
+            self.store(seed, result.state, row, found["policy"])
+        save(args.out, self.name, self.record)
+        shown(found, f"seed {seed} final ")
+        say(f"done after {self.clock.spent:.0f} s, {last['steps']:.3g} steps, {last['steps_per_s']:.3g} steps/s")
+
+
+def shown(rows: Mapping[str, Any], before: str) -> None:
+    """Prints the rows of a score."""
+    for agent, one in rows.items():
+        ends = {k: round(v, 3) for k, v in one["ends"].items() if v}
+        say(f"{before}{agent}: {percent(one)}, SPL {one['spl']:.2f}, {one['collisions_per_km']:.0f}/km, {ends}")
+
+
 def main() -> None:
     """Trains, scores and writes."""
     args = options()
-    clock = Clock(args.seconds)
+    if args.keep:
+        say(str(keep(args.keep)))
+    if args.ship:
+        say(str(ship(args.ship)))
+    if args.keep or args.ship:
+        return
     training = get_training(args.training, args.learner)
-    training = override(training, **dict(pair.split("=", 1) for pair in args.set))
-    more: Mapping[str, Any] = {k: told(v) for k, v in (pair.split("=", 1) for pair in args.env)}
-    if args.tiny:
-        names = {f.name for c in (training.train, training.train.algorithm) for f in dataclasses.fields(c)}
-        training = override(training, **{k: v for k, v in TINY.items() if k in names})
-        more, args.episodes = {"worlds": 2, "episode_time": 20.0, **more}, min(args.episodes, 2)
-    settings = {**training.options, **more}
-    name = args.name or Path(args.training).stem
-    args.out.mkdir(parents=True, exist_ok=True)
-    env = make(training.environment, **settings)
-    unseen = unseen_params(env, training.unseen)
-    worlds_s = clock.spent
-    learner = Learner(env, training.train)
-    rows = Rows(env, learner, unseen, args.episodes)
-    shapes = jax.eval_shape(learner.policy, learner.abstract())
-    compile_s = in_threads(learner.compile, lambda: rows.compile(shapes))
-    say(f"worlds {worlds_s:.0f} s, compiled after {compile_s}, {clock.left:.0f} s left")
-    environment = {"name": training.environment, "options": settings, "unseen": dict(training.unseen)}
-    # whoever drives the policy makes as many worlds as the rung has, not all that it was trained in
-    driven = {**environment, "options": {k: v for k, v in settings.items() if k != "worlds"}}
-    record: dict[str, Any] = {
-        "commit": commit(),
-        "training": name,
-        "environment": environment,
-        "train": dataclasses.asdict(training.train),
-        "learner": type(training.train.algorithm).__name__,
-        "seed": args.seed,
-        "worlds_s": worlds_s,
-        "compile_s": compile_s,
-        "scores": [],
-        "epochs": [],
-    }
-    best = {"success": -1.0}
-    chosen: list[Any] = []
-
-    def look(state: Any, row: Mapping[str, Any], seed: int) -> None:
-        begin = time.monotonic()
-        policy = jax.device_get(learner.policy(state))
-        found = rows(policy, seed)
-        record["scores"].append({"steps": row["steps"], "elapsed_s": row["elapsed_s"], "seed": seed, "rows": found})
-        notes = {"score": found["policy"], "steps": row["steps"], "elapsed_s": row["elapsed_s"], "commit": commit()}
-        told_policy = policy_of(learner, state, driven, notes)
-        save_policy(told_policy, args.out / f"{name}_last.npz")
-        if found["policy"]["success"] > best["success"]:
-            best["success"] = found["policy"]["success"]
-            chosen[:] = [policy, row]
-            save_policy(told_policy, args.out / f"{name}.npz")
-        save(args.out, name, record)
-        say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s: scored in {time.monotonic() - begin:.0f} s")
-        for agent, one in found.items():
-            ends = {k: round(v, 3) for k, v in one["ends"].items() if v}
-            say(f"    {agent}: {percent(one)}, SPL {one['spl']:.2f}, {one['collisions_per_km']:.0f}/km, {ends}")
-
-    due = [args.every]
-
-    def after_epoch(_: Learner, state: Any, row: dict[str, Any]) -> dict[str, Any]:
-        record["epochs"].append({k: row[k] for k in row if not k.startswith("reward_")})
-        if row["elapsed_s"] >= due[0]:
-            look(state, row, DURING)
-            due[0] = row["elapsed_s"] + args.every
-        there = args.target is not None and best["success"] >= args.target
-        return {"stop": there or clock.left < args.last}
-
-    result = train(learner, RunConfig(training.steps, args.seed, quiet=True), None, environment, after_epoch)
-    last = result.rows[-1]
-    if not record["scores"] or record["scores"][-1]["steps"] < last["steps"]:
-        look(result.state, last, DURING)
-    policy, row = chosen
-    record["final"] = {"steps": row["steps"], "elapsed_s": row["elapsed_s"], "seed": FINAL, "rows": rows(policy, FINAL)}
-    save(args.out, name, record)
-    for agent, one in record["final"]["rows"].items():
-        say(f"final {agent}: {percent(one)}, SPL {one['spl']:.2f}, {one['collisions_per_km']:.0f}/km, {one['ends']}")
-    say(f"done in {clock.spent:.0f} s, {last['steps']:.3g} steps, {last['steps_per_s']:.3g} steps/s")
+    trials = Trials(args, override(training, **dict(pair.split("=", 1) for pair in args.set)))
+    longest = 0.0
+    for seed in args.seeds:
+        # a seed that would be cut short is no equal of the others
+        if trials.clock.left < longest:
+            say(f"no time for seed {seed}: {trials.clock.left:.0f} s left")
+            break
+        begin = trials.clock.spent
+        trials(seed)
+        longest = max(longest, trials.clock.spent - begin)
 
 
 if __name__ == "__main__":

@@ -112,6 +112,48 @@ def field_measured() -> str:
     return table([f"at {kept['commit']}", *columns], rows)
 
 
+def _rung(number: int) -> dict[str, Any]:
+    """The kept record of trainings on a rung of the ladder (`benchmarks/rl/rung.py --keep`)."""
+    path = Path(__file__).parents[2] / "benchmarks" / "rl" / f"ladder-{number}.json"
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _share(score: dict[str, Any]) -> str:
+    return f"{100 * score['success']:.1f} % ({100 * score['low']:.1f} to {100 * score['high']:.1f})"
+
+
+def ladder_3() -> str:
+    """Who arrives on rung 3: each trained policy, and those that learn nothing, on the same unseen episodes."""
+    kept = _rung(3)["seeds"]
+    finals = {run["seed"]: run["final"]["rows"] for run in kept}
+    rows = [(f"trained, seed {seed}", rows["policy"]) for seed, rows in finals.items()]
+    rows += [(f"seed {seed}, its scans blanked", rows["policy, scans blanked"]) for seed, rows in finals.items()]
+    rules = {"mapper": "`mapper`", "reactive, tuned": "reactive, tuned", "scripted": "straight ahead"}
+    rows += [(text, next(iter(finals.values()))[name]) for name, text in rules.items()]
+    numbers = {"spl": "{:.2f}", "collisions_per_km": "{:.0f}", "wh_per_km": "{:.0f}", "slip": "{:.2f}"}
+    header = [f"{rows[0][1]['episodes']} episodes", "success", "SPL", "collisions/km", "W h/km", "mean slip"]
+    return table(header, [[n, _share(r), *(text.format(r[k]) for k, text in numbers.items())] for n, r in rows])
+
+
+def ladder_3_trainings() -> str:
+    """What the trainings on rung 3 took."""
+    header = ["seed", "device", "commit", "worlds made in", "compiled in", "steps", "training", "steps/s"]
+    rows = [
+        [
+            str(run["seed"]),
+            cell(run["device"]),
+            run["commit"],
+            f"{run['worlds_s']:.0f} s",
+            f"{max(run['compile_s']):.0f} s",
+            f"{run['final']['steps'] / 1e6:.0f} M",
+            f"{run['final']['elapsed_s']:.0f} s",
+            f"{run['final']['steps'] / run['final']['elapsed_s'] / 1e6:.2f} M",
+        ]
+        for run in _rung(3)["seeds"]
+    ]
+    return table(header, rows)
+
+
 def unsaid() -> str:
     """What the paper leaves unsaid, and where it needs regularising."""
     rows = [[cell(k), cell(str(v)), "unsaid"] for k, v in UNSAID.items()]
@@ -137,6 +179,8 @@ TABLES = {
     "flaws": flaws,
     "field": field,
     "field_measured": field_measured,
+    "ladder_3": ladder_3,
+    "ladder_3_trainings": ladder_3_trainings,
     "unsaid": unsaid,
     "soils": soils,
     "windings": windings,

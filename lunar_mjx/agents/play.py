@@ -32,9 +32,10 @@ _FRAMES = 300
 """Most frames of a video."""
 
 
-def shipped_policy(rover: str) -> Path | None:
-    """The trained policy that ships with a rover, or None."""
-    path = shipped("models") / rover / "policy.npz"
+def shipped_policy(name: str) -> Path | None:
+    """The trained policy that ships with a rover (`luvmi_x`), or of another training (`luvmi_x/ladder-3`), or None."""
+    rover, _, training = name.partition("/")
+    path = shipped("models") / rover / f"{training or 'policy'}.npz"
     return path if path.is_file() else None
 
 
@@ -42,7 +43,7 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     """An agent with the environment that it was made for.
 
     Args:
-      name: path of a policy, name of a rover that ships one, or of an agent that learns nothing (`AGENTS`).
+      name: path of a policy, name of one that ships (`shipped_policy`), or of an agent that learns nothing (`AGENTS`).
       task: of agents without a policy.
       options: of the environment that differ from the policy's.
 
@@ -68,7 +69,7 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
             "agent",
             name,
             "is no rover with a trained policy",
-            f"give a policy.npz, or one of {', '.join(AGENTS)}",
+            f"give a policy.npz, a rover that ships one, luvmi_x/ladder-3, or one of {', '.join(AGENTS)}",
         )
     policy = load_policy(path)
     made_in = policy.environment

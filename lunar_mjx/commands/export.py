@@ -11,7 +11,9 @@ from lunar_mjx.errors import bad_input
 
 
 def policy(
-    agent: Annotated[str, typer.Argument(help="policy.npz, or the rover of a shipped policy.")] = "luvmi_x",
+    agent: Annotated[
+        str, typer.Argument(help="policy.npz, or a shipped policy: luvmi_x, viper, luvmi_x/ladder-3.")
+    ] = "luvmi_x",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("runs/export"),
     only: Annotated[list[str] | None, typer.Option(help="onnx or stablehlo; both if left out.")] = None,
 ) -> None:

@@ -121,7 +121,10 @@ def train(
 
 AgentArgument = Annotated[
     str,
-    typer.Argument(help="policy.npz, a shipped policy's rover, or zero, random, scripted, reactive, mapper, planner."),
+    typer.Argument(
+        help="policy.npz, a shipped policy (luvmi_x, viper, luvmi_x/ladder-3), or zero, random, scripted, reactive, "
+        "mapper, planner."
+    ),
 ]
 AgentOption = Annotated[str | None, typer.Option("--agent", help="The same as an option, for agents without a policy.")]
 TaskOption = Annotated[

@@ -83,3 +83,88 @@ def test_the_plainer_model_has_neither_heat_nor_soil():
     assert not set(THERMAL) & set(model.effect_names)
     assert model.parameters["hard_surface"]["fraction"] == 1.0
     assert model.parameters["motor"]["alpha"] == model.parameters["motor"]["beta"] == 0.0
+
+
+def test_rung_3_tells_those_apart_that_the_page_says_it_does():
+    finals = [run["final"]["rows"] for run in record("ladder-3")["seeds"]]
+    assert np.mean([rows["policy"]["success"] for rows in finals]) >= 0.9
+    for rows in finals:
+        policy, mapper = rows["policy"], rows["mapper"]
+        assert rows["scripted"]["success"] <= 0.05 and rows["reactive, tuned"]["success"] <= 0.4
+        assert rows["policy, scans blanked"]["success"] <= 0.1
+        # the rule on the same map arrives about as often, and drives worse
+        assert abs(policy["success"] - mapper["success"]) < 0.1
+        assert all(policy[k] < mapper[k] for k in ("collisions_per_km", "wh_per_km", "slip"))
+
+
+def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypatch):
+    import rung
+
+    from lunar_mjx.agents.policy import load_policy
+
+    scored, compiled = [], []
+
+    class Rows:
+        """Scores every policy as arriving, in no time."""
+
+        def __init__(self, *_):
+            pass
+
+        def compile(self, _):
+            compiled.append(1)
+
+        def __call__(self, policy, seed):
+            scored.append(seed)
+            one = {
+                "success": 1.0,
+                "low": 0.9,
+                "high": 1.0,
+                "spl": 1.0,
+                "collisions_per_km": 0.0,
+                "ends": {"success": 1.0},
+            }
+            return {"policy": one}
+
+    monkeypatch.setattr(rung, "Rows", Rows)
+    words = ["rung.py", "point", "--seeds", "3", "4", "--steps", "300", "--every", "inf", "--out", str(tmp_path)]
+    settings = ["--set", "envs=4", "epoch_steps=8", "batch=8", "buffer_steps=64", "random_steps=4", "updates=1"]
+    monkeypatch.setattr(sys, "argv", [*words, *settings])
+    rung.main()
+    told = json.loads((tmp_path / "point.json").read_text())
+    assert [run["seed"] for run in told["seeds"]] == [3, 4] and len(compiled) == 1
+    assert scored == [rung.FINAL, rung.FINAL], "with no scores before the last nothing is chosen"
+    for run in told["seeds"]:
+        assert run["final"]["steps"] == run["epochs"][-1]["steps"] == 320 and run["scores"] == []
+    first, second = (load_policy(tmp_path / f"point_seed{n}.npz") for n in (3, 4))
+    assert (first.notes["seed"], second.notes["seed"]) == (3, 4)
+    assert any((np.asarray(a) != np.asarray(b)).any() for a, b in zip(*map(_leaves, (first, second)), strict=True))
+
+
+def _leaves(policy):
+    import jax
+
+    return jax.tree.leaves(policy.params)
+
+
+def test_seeds_of_further_runs_join_the_kept_record_unless_settings_differ(tmp_path):
+    from rung import keep
+
+    def run(folder, seeds, steps, rate=1.0, **more):
+        found = [{"seed": n, "epochs": [{"steps": 1, "kl": 2.0}], "final": {"steps": steps}} for n in seeds]
+        about = {"about": {"device": "GPU"}, "commit": folder, "worlds_s": 1.0, "compile_s": [2.0]}
+        told = {**about, "training": "mine", "environment": {}, "learner": "PPOConfig", "train": {"rate": rate}}
+        (tmp_path / folder).mkdir()
+        path = tmp_path / folder / "mine.json"
+        path.write_text(json.dumps({**told, "seeds": [*found, *more.get("cut", [])]}))
+        return path
+
+    keep([run("a", [0, 1], 10)], tmp_path)
+    kept = json.loads(keep([run("b", [3, 1], 20, cut=[{"seed": 4, "epochs": []}])], tmp_path).read_text())
+    assert [(s["seed"], s["commit"], s["final"]["steps"]) for s in kept["seeds"]] == [
+        (0, "a", 10),
+        (1, "b", 20),
+        (3, "b", 20),
+    ]
+    assert kept["seeds"][0]["epochs"] == [{"steps": 1}] and kept["seeds"][0]["device"] == "GPU"
+    with pytest.raises(ValueError, match="train is not the same"):
+        keep([run("c", [5], 20, rate=2.0)], tmp_path)

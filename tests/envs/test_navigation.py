@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from lunar_mjx.agents.configs import get_training
 from lunar_mjx.agents.evaluate import Evaluator
 from lunar_mjx.agents.play import shipped_policy
 from lunar_mjx.agents.policy import load_policy
@@ -164,6 +165,16 @@ def test_shipped_policies_fit_their_task_and_hold_what_they_scored(rover):
     assert policy.notes["train_score"]["success"] > 0.95
     action = policy.act(jnp.asarray(policy.mean)[None])
     assert action.shape == (1, 6) and (abs(action) <= 1.0).all()
+
+
+def test_a_policy_of_another_training_ships_by_its_name():
+    policy = load_policy(shipped_policy("luvmi_x/ladder-3"))
+    trained, options = get_training("ladder-3"), policy.environment["options"]
+    assert tuple(options["observations"]) == tuple(trained.options["observations"]) and options["task"] == "ladder/3"
+    assert policy.environment["unseen"] == dict(trained.unseen) and policy.notes["score"]["success"] > 0.9
+    action = policy.act(jnp.asarray(policy.mean)[None])
+    assert action.shape == (1, 6) and (abs(action) <= 1.0).all()
+    assert shipped_policy("viper/ladder-3") is None and shipped_policy("luvmi_x/policy") == shipped_policy("luvmi_x")
 
 
 def test_the_height_scan_misses_no_rock():
