@@ -284,10 +284,12 @@ def rows_of(rover: str, options: argparse.Namespace, rows: list[dict[str, Any]],
         add("structured", batch, timed(rollout(full, steps, chunk), state, steps, batch))
         single = rows[-1]["steps_per_s"]
         for count in options.devices[1:]:
-            run, split = sharded(rollout(full, steps, chunk), starts(full, count * batch), jax.devices()[:count])
-            own = timed(run, split, steps, count * batch)
-            share = own["steps_per_s"] / (count * single)
-            add(f"structured, {count} devices", count * batch, own | {"efficiency": share})
+            # weak scaling (a batch for each) and strong scaling (one batch for all)
+            for whole in (count * batch, batch):
+                run, split = sharded(rollout(full, steps, chunk), starts(full, whole), jax.devices()[:count])
+                own = timed(run, split, steps, whole)
+                share = own["steps_per_s"] / (count * single)
+                add(f"structured, {count} devices", whole, own | {"efficiency": share})
         if not options.only_full and batch in (options.batches[-1], options.main):
             own = starts(integral, batch)
             add(
@@ -335,7 +337,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--mjx-steps", type=int, default=10)
     parser.add_argument("--chunk", type=int, default=0, help="rovers per chunk; 0: the library's choice")
-    parser.add_argument("--devices", type=numbers, default=[1], help="such as 1,2,4: with several, each takes a batch")
+    parser.add_argument(
+        "--devices", type=numbers, default=[1], help="such as 1,2,4; several take a batch each, then share one"
+    )
     parser.add_argument("--lock", type=Path, help="file that is locked while a row is timed; see backends.py")
     parser.add_argument("--threads", type=int, default=0, help="threads of native MuJoCo; 0: leave it out")
     parser.add_argument("--processes", type=int, default=0, help="processes side by side, besides the one; 0: none")

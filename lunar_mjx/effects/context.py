@@ -123,11 +123,15 @@ class Arc:
 
 @pytree
 class Stress:
-    """Normal stress at quadrature nodes over the contact arc, one tuple entry per node."""
+    """Normal stress at quadrature nodes over the contact arc.
 
-    theta: tuple[Any, ...]
-    weight: tuple[Any, ...]
-    sigma: tuple[Any, ...]
+    Attributes:
+      theta: angles, rad. weight: of the nodes, rad. sigma: stress, Pa.
+    """
+
+    theta: Float[Array, "node wheel"]
+    weight: Float[Array, "node wheel"]
+    sigma: Float[Array, "node wheel"]
 
 
 @pytree

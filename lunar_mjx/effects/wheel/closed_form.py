@@ -56,6 +56,11 @@ def sin_difference(a, b):
     return 2.0 * jnp.cos(0.5 * (a + b)) * jnp.sin(0.5 * (a - b))
 
 
+def half_angle(theta):
+    """sin(theta/2) and cos(theta/2), of which sines, cosines and their differences are products that keep digits."""
+    return jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
+
+
 def first_axis(values, like):
     """Numbers along a new first axis, in front of those of `like`: node by node they would compile for minutes."""
     return jnp.reshape(jnp.asarray(values, jnp.result_type(like)), (-1,) + (1,) * jnp.ndim(like))
@@ -69,10 +74,10 @@ def max_normal_stress(soil, width, radius, theta_m, theta_1):
 
 def janosi(displacement, modulus):
     """(1 - exp(-|j|/K)) sign(j): share of the shear strength that a displacement mobilises (Janosi & Hanamoto)."""
-    # the two signs apart: |j| has no derivative at 0, where a wheel at rest is
-    forward = jnp.where(displacement >= 0.0, displacement, 0.0)
-    backward = jnp.where(displacement >= 0.0, 0.0, displacement)
-    return -jnp.expm1(-forward / modulus) + jnp.expm1(backward / modulus)
+    ahead, q = displacement >= 0.0, displacement / modulus
+    # not |q|, which has no derivative at 0, where a wheel at rest is
+    short = jnp.expm1(jnp.where(ahead, -q, q))
+    return jnp.where(ahead, -short, short)
 
 
 def geometry_factors(theta_m):
@@ -253,17 +258,25 @@ def shear_stress(wheel, soil, strength, j_x, j_y):
     return tau_x + wheel.circle * (common * q_x - tau_x), tau_y + wheel.circle * (common * q_y - tau_y)
 
 
-def shear_along(wheel, normal, theta, r_s, r):
+def shear_along(wheel, normal, theta, r_s, r, half=None):
     """Displacement of the rim over its soil at theta, m: r_s (theta_1 - theta) - r (1 - s)(sin theta_1 - sin theta).
 
-    In front of the angle of reversal, where there is one, with the slip that the soil has there.
+    In front of the angle of reversal, where there is one, with the slip that the soil has there. `half` is the sine and
+    cosine of theta/2 where they are known.
     """
     theta_1 = normal.entrance
-    arc = sin_difference(theta_1, theta)
+    first, here = half_angle(theta_1), half_angle(theta) if half is None else half
+
+    def arc_to(sine, cosine):
+        # sin theta_1 - sin theta = 2 cos((theta_1 + theta)/2) sin((theta_1 - theta)/2), both expanded
+        return 2.0 * (first[1] * cosine - first[0] * sine) * (first[0] * cosine - first[1] * sine)
+
+    arc = arc_to(*here)
     j = wheel.direction * (r_s * (theta_1 - theta) - r * arc) + r * wheel.slip_x * arc
     if wheel.slip_ahead is None:
         return j
-    ahead = sin_difference(theta_1, jnp.maximum(theta, jnp.minimum(normal.reversal, theta_1)))
+    turn = jnp.minimum(normal.reversal, theta_1)
+    ahead = jnp.where(theta > turn, arc, arc_to(*half_angle(turn)))
     return j + r * (wheel.slip_ahead - wheel.slip_x) * ahead
 
 

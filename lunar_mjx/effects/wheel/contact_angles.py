@@ -103,7 +103,7 @@ def dynamic_sinkage(ctx, p, x, normal):
     factor = jnp.maximum(1.0 + p.rate * ctx.contact.sinkage_rate, 0.0)
     stress = normal.stress
     if stress is not None:
-        stress = dataclasses.replace(stress, sigma=tuple(s * factor for s in stress.sigma))
+        stress = dataclasses.replace(stress, sigma=stress.sigma * factor)
     return dataclasses.replace(
         normal,
         sigma_m=normal.sigma_m * factor,

@@ -112,14 +112,14 @@ def _normal(ctx, p, x, normal):
         load=load,
         resistance=resistance,
         damping=grounded(contact, damping),
-        stress=Stress(theta=tuple(theta), weight=tuple(weight), sigma=tuple(sigma)),
+        stress=Stress(theta=theta, weight=weight, sigma=sigma),
     )
 
 
 def _shear(ctx, p, x, wheel):
     geometry, normal, soil = ctx.geometry, ctx.normal, ctx.soil
     r, b, r_s = geometry.radius, geometry.width, shearing_radius(p, geometry, wheel)
-    theta, weight, sigma = (jnp.stack(v) for v in (normal.stress.theta, normal.stress.weight, normal.stress.sigma))
+    theta, weight, sigma = normal.stress.theta, normal.stress.weight, normal.stress.sigma
     way, (along, across, rim) = _travel(ctx.contact)
     pressure, forward, aside = traction(theta, along, across, rim * r_s / r)
     size = jnp.sqrt(forward**2 + aside**2 + _TINY)

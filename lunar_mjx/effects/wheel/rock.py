@@ -27,7 +27,7 @@ def _rock_normal(ctx, p, x, normal):
     zero = jnp.zeros_like(load)
     stress = normal.stress
     if stress is not None:
-        stress = dataclasses.replace(stress, sigma=tuple(jnp.where(rock, 0.0, s) for s in stress.sigma))
+        stress = dataclasses.replace(stress, sigma=jnp.where(rock, 0.0, stress.sigma))
     return dataclasses.replace(
         normal,
         entrance=jnp.where(rock, theta_1, normal.entrance),

@@ -51,11 +51,7 @@ def scaled_stress(ctx, normal, factor):
         return dataclasses.replace(
             normal, sigma_m=normal.sigma_m * f, load=normal.load * f, resistance=normal.resistance * f
         )
-    # Nodes along a first axis: written out one by one they take minutes to compile.
-    theta, weight, old = (
-        jnp.stack([v + 0.0 * normal.load for v in values])
-        for values in (normal.stress.theta, normal.stress.weight, normal.stress.sigma)
-    )
+    theta, weight, old = normal.stress.theta, normal.stress.weight, normal.stress.sigma
     f = factor(theta)
     change = ctx.geometry.radius * ctx.geometry.width * weight * old * (f - 1.0)
     # What changes is added, so that nothing is rounded where nothing changes.
@@ -64,7 +60,7 @@ def scaled_stress(ctx, normal, factor):
         sigma_m=normal.sigma_m * factor(normal.theta_m),
         load=normal.load + jnp.sum(change * jnp.cos(theta), axis=0),
         resistance=normal.resistance + jnp.sum(change * jnp.sin(theta), axis=0),
-        stress=dataclasses.replace(normal.stress, sigma=tuple(old * f)),
+        stress=dataclasses.replace(normal.stress, sigma=old * f),
     )
 
 

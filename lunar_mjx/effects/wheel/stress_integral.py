@@ -13,10 +13,10 @@ from lunar_mjx.effects.context import Stress
 from lunar_mjx.effects.wheel.closed_form import (
     _DAMPING,
     contact_with_soil,
-    cos_difference,
     entrance_angle,
     first_axis,
     grounded,
+    half_angle,
     max_normal_stress,
     normal_damping_force,
     shear_along,
@@ -49,13 +49,17 @@ def integrate(ctx, contact, theta_1, theta_m, theta_2, reversal=None):
     weight = jnp.concatenate([half * (high - low) for low, high in parts])
     # The rear stress at theta is the front stress at the angle that lies as far, in proportion, from theta_m.
     mirror = theta_1 - (theta - theta_2) / (theta_m - theta_2) * (theta_1 - theta_m)
-    # depth^n with n < 1 has an infinite derivative at 0, where the arc begins
-    depth = jnp.maximum(r * cos_difference(jnp.where(theta < theta_m, mirror, theta), theta_1), 1e-12 * r)
-    sigma = grounded(contact, modulus * depth**ctx.soil.n)
+    (sine_1, _), (sine, cosine) = half_angle(theta_1), half_angle(theta)
+    front = jnp.where(theta < theta_m, half_angle(mirror)[0], sine)
+    # cos(theta) - cos(theta_1); depth^n with n < 1 has an infinite derivative at 0, where the arc begins
+    depth = jnp.maximum(2.0 * r * (sine_1 - front) * (sine_1 + front), 1e-12 * r)
+    # depth^n by its logarithm: XLA's power also handles negative numbers, at twice the time
+    sigma = grounded(contact, modulus * jnp.exp(ctx.soil.n * jnp.log(depth)))
     area = r * b
-    load = area * jnp.sum(weight * sigma * jnp.cos(theta), axis=0)
-    resistance = area * jnp.sum(weight * sigma * jnp.sin(theta), axis=0)
-    return load, resistance, Stress(theta=tuple(theta), weight=tuple(weight), sigma=tuple(sigma))
+    pressed = weight * sigma
+    load = area * jnp.sum(pressed * (1.0 - 2.0 * sine * sine), axis=0)
+    resistance = area * jnp.sum(2.0 * pressed * sine * cosine, axis=0)
+    return load, resistance, Stress(theta=theta, weight=weight, sigma=sigma)
 
 
 def _normal(ctx, p, x, normal):
@@ -82,13 +86,12 @@ def _shear(ctx, p, x, wheel):
     geometry, normal, soil = ctx.geometry, ctx.normal, ctx.soil
     r, b, r_s = geometry.radius, geometry.width, shearing_radius(p, geometry, wheel)
     theta_1, stress = normal.entrance, normal.stress
-    theta, weight, sigma = (
-        jnp.stack([v + 0.0 * theta_1 for v in values]) for values in (stress.theta, stress.weight, stress.sigma)
-    )
-    strength = grounded(ctx.contact, soil.cohesion + sigma * soil.tan_phi)
-    j_x = shear_along(wheel, normal, theta, r_s, r)
-    tau, tau_y = shear_stress(wheel, soil, weight * strength, j_x, r * (theta_1 - theta) * wheel.slip_y)
-    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    theta = stress.theta
+    strength = grounded(ctx.contact, soil.cohesion + stress.sigma * soil.tan_phi)
+    sine, cosine = half_angle(theta)
+    j_x = shear_along(wheel, normal, theta, r_s, r, (sine, cosine))
+    tau, tau_y = shear_stress(wheel, soil, stress.weight * strength, j_x, r * (theta_1 - theta) * wheel.slip_y)
+    cos, sin = 1.0 - 2.0 * sine * sine, 2.0 * sine * cosine
     along, lift, turn = jnp.sum(tau * cos, axis=0), jnp.sum(tau * sin, axis=0), jnp.sum(tau, axis=0)
     across, roll, yaw = jnp.sum(tau_y, axis=0), jnp.sum(tau_y * cos, axis=0), jnp.sum(tau_y * sin, axis=0)
     area = r * b
