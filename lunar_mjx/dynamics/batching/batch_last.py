@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
-ELEMENTWISE = {
+_ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp",
     "convert_element_type", "copy", "copy_p", "cos", "cosh", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp",
     "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt",
@@ -114,7 +114,7 @@ def _apply(eqn: Any, operands: list[_Value]) -> list[_Value]:
         x = operands[0].array
         return [_Value(jnp.reshape(x, (x.shape[0], *eqn.params["new_sizes"])), 0)]
     # A rule may decline (None), as for gathers of a form that it does not know; then vmap does it.
-    rule = _elementwise if name in ELEMENTWISE else _RULES.get(name)
+    rule = _elementwise if name in _ELEMENTWISE else _RULES.get(name)
     if rule is not None and all(o.axis in (None, -1) for o in operands):
         done = rule(eqn, operands)
         if done is not None:
