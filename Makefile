@@ -1,4 +1,5 @@
 # make demo: run the main job. make test: lint, type-check and test; make test-all: the slow tests, too. make docs: the pages.
+# make busy-test: the fast tests where other processes take the processors, three times.
 # make proofs: slow tests in turn, 40 minutes of them, those with a record first; make all-proofs: all of them,
 # with the table of when each last passed.
 # Each installs all that it needs into .venv.
@@ -19,7 +20,7 @@ export PIP_NO_COMPILE ?= 1
 FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$(XLA_FLAGS) --xla_cpu_use_fusion_emitters=false"
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test fast-tests test-all proofs all-proofs lint docs foreign-tune foreign-report hashes clean
+.PHONY: demo test fast-tests busy-test test-all for-proofs proofs all-proofs lint docs foreign-tune foreign-report hashes clean
 
 demo: $(VENV)/run.stamp
 	$(BIN)/lunar-mjx demo -o runs/demo
@@ -30,16 +31,25 @@ test: $(VENV)/dev.stamp
 fast-tests: $(VENV)/dev.stamp
 	$(FAST_COMPILE) $(PYTEST) -m "not slow"
 
+# Three times beside eight busy processes on each pair of processors, each time in another random order.
+busy-test: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.busy
+
 test-all: lint
 	$(PYTEST)
 
 # The build of torch without CUDA (190 MB for 3 GB), where an index has it; SB3's proof is skipped elsewhere.
 SB3 := stable-baselines3==2.9.2 torch==2.13.0+cpu
-proofs: $(VENV)/dev.stamp
+PARTICLES := newton==1.8.0 warp-lang==1.19.0
+for-proofs: $(VENV)/dev.stamp
 	@timeout 180 $(PIP) install --quiet -c requirements-dev.txt $(SB3) || echo "no CPU build of torch at hand: SB3's proof is skipped"
+	@timeout 180 $(PIP) install --quiet -c requirements-dev.txt $(PARTICLES) || echo "no Newton at hand: the proof on particles is skipped"
+	@timeout 180 $(PIP) install --quiet -c requirements-dev.txt -r requirements-docs.txt || echo "no MkDocs at hand: the proof on the site is skipped"
+
+proofs: for-proofs
 	$(BIN)/python -m tests.proofs --minutes 40
 
-all-proofs: $(VENV)/dev.stamp
+all-proofs: for-proofs
 	$(BIN)/python -m tests.proofs --all --record
 
 lint: $(VENV)/dev.stamp
