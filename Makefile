@@ -1,6 +1,6 @@
 # make demo: run the main job. make test: lint, type-check and test; make test-all: the slow tests, too. make docs: the pages.
 # make busy-test: the fast tests where other processes take the processors, three times.
-# make proofs: slow tests in turn, 40 minutes of them, those with a record first; make all-proofs: all of them,
+# make proofs: slow tests in turn, 50 minutes of them, those with a record first; make all-proofs: all of them,
 # with the table of when each last passed.
 # Each installs all that it needs into .venv.
 
@@ -47,7 +47,7 @@ for-proofs: $(VENV)/dev.stamp
 	@timeout 180 $(PIP) install --quiet -c requirements-dev.txt -r requirements-docs.txt || echo "no MkDocs at hand: the proof on the site is skipped"
 
 proofs: for-proofs
-	$(BIN)/python -m tests.proofs --minutes 40
+	$(BIN)/python -m tests.proofs --minutes 50
 
 all-proofs: for-proofs
 	$(BIN)/python -m tests.proofs --all --record

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -97,11 +98,13 @@ class Fields:
         """A finite number, which must be there if there is no default."""
         return self._finite(self.field(key), self.values.get(key, default))
 
-    def positive(self, key: str, default: float | None = None) -> float:
-        """A positive finite number."""
+    def positive(self, key: str, default: float | None = None, most: float = math.inf) -> float:
+        """A positive finite number, `most` at most."""
         value = self.number(key, default)
         if value <= 0.0:
             raise bad_input(self.path, self.field(key), value, "is not positive", "give a positive number")
+        if value > most:
+            raise bad_input(self.path, self.field(key), value, f"is above {most:g}", "check its unit")
         return value
 
     def vector(self, key: str, count: int, default: Sequence[float] | None = None) -> tuple[float, ...]:

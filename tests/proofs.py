@@ -1,6 +1,6 @@
 """Runs slow proofs file by file, in an order that the commit turns, until the time is spent; keeps when each passed.
 
-    python -m tests.proofs [--minutes 40] [--jobs 2] [--all] [--record] [--only FILE ...]
+    python -m tests.proofs [--minutes 50] [--jobs 2] [--all] [--record] [--only FILE ...]
 
 Files with a record come first: they are promises. Then come files that never passed yet; what of these fails is told,
 and breaks no promise. A file whose recorded time exceeds what is left waits for another commit; what still runs a
@@ -38,7 +38,7 @@ OVERRUN = 1.25
 """Times the minutes asked for, after which what still runs is stopped: recorded times are of another machine."""
 HEAD = """# Proofs
 
-Acceptance proofs that take longer than `make test` may: `make proofs` runs as many as fit into 40 minutes on two cores,
+Acceptance proofs that take longer than `make test` may: `make proofs` runs as many as fit into 50 minutes on two cores,
 in an order that each commit turns, so that all have their turn. Those that were never recorded come last, and are no
 promise yet: what of them fails is told and does not end the run with an error.
 `make all-proofs` runs all and records them, `python -m tests.proofs --record --only FILE` one. Times are of a shared
@@ -226,7 +226,7 @@ def recorded(record: Mapping[str, Entry], found: Mapping[str, Entry], files: Seq
 def main() -> int:
     """See the module's docstring."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--minutes", type=float, default=40.0)
+    parser.add_argument("--minutes", type=float, default=50.0)
     parser.add_argument("--jobs", type=int, default=2, help="files at a time")
     parser.add_argument("--all", action="store_true")
     parser.add_argument("--record", action="store_true")

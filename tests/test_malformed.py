@@ -6,10 +6,12 @@ names of another kind, other encodings, deep nesting.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 import re
 import shutil
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +38,8 @@ from lunar_mjx.terrain import load_terrain, read_dem
 DATA = Path(__file__).parent / "rover" / "data"
 LONGEST = 1500
 """Characters of a refusal."""
+LONGEST_S, LARGEST = 5.0, 2 * 10**9
+"""Seconds of the processor for one file, and bytes for any."""
 NUMBER = re.compile(rb"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.])")
 WORD = re.compile(rb"[A-Za-z_]{3,}")
 NUMBERS = [
@@ -266,6 +270,20 @@ def test_there_are_more_than_800():
     assert sum(kind[3] for kind in KINDS.values()) > 800
 
 
+def _peak(name: str) -> int:
+    """Bytes that this process holds (VmRSS), or has held since `_fresh_peak` (VmHWM); 0 where no kernel tells."""
+    status = Path("/proc/self/status")
+    found = re.search(rf"{name}:\s+(\d+) kB", status.read_text()) if status.is_file() else None
+    return 1024 * int(found[1]) if found else 0
+
+
+def _fresh_peak() -> int:
+    """Forgets the largest memory so far, where the kernel does so; returns what is held now, bytes."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return _peak("VmRSS")
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_broken_files_are_refused_or_load_to_finite_numbers(kind, tmp_path, capfd):
     name, make, read, count = KINDS[kind]
@@ -273,9 +291,11 @@ def test_broken_files_are_refused_or_load_to_finite_numbers(kind, tmp_path, capf
     path.write_bytes(good)
     read(path)
     refused, failed = 0, []
+    before = _fresh_peak()
     for number in range(count):
         bad = torn(good, rng)
         path.write_bytes(bad)
+        began = time.process_time()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
@@ -287,8 +307,11 @@ def test_broken_files_are_refused_or_load_to_finite_numbers(kind, tmp_path, capf
                 failed.append((number, f"unclear: {text[:300]!r}"))
         except BaseException as error:
             failed.append((number, f"{type(error).__name__}: {str(error)[:200]}"))
+        if (took := time.process_time() - began) > LONGEST_S:
+            failed.append((number, f"took {took:.1f} s of the processor"))
     assert not failed, f"{len(failed)} of {count}, such as {failed[:6]}"
     assert refused > count // 10
+    assert _peak("VmHWM") - before < LARGEST
 
 
 def _record(changes: dict) -> dict:

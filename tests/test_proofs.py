@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -74,6 +75,21 @@ def test_what_never_ends_is_stopped_and_is_neither_passed_nor_failed(tmp_path, m
     found = prove_all(Turn(FILES, {}, 2400.0, clock), 1, "abc", _spend(clock, 1e9))
     assert clock.now == 3000.0 and [entry["ok"] for entry in found.values()] == [None]
     assert recorded({}, found, FILES) == {}
+
+
+def test_every_recorded_proof_has_its_turn_in_at_least_a_quarter_of_the_runs():
+    """With the times that are recorded, two files at a time, whatever file the commit begins with."""
+    record = json.loads(proofs.RECORD.read_text(encoding="utf-8"))
+    files, runs = sorted(record), dict.fromkeys(record, 0)
+    for start in range(len(files)):
+        clock = _Clock()
+        turn, ends = Turn(turned(files, f"{start:010x}"), record, 60.0 * 50.0, clock), [0.0, 0.0]
+        while (file := turn.next()) is not None:
+            runs[file] += 1
+            ends.remove(clock.now)
+            ends.append(clock.now + record[file]["seconds"])
+            clock.now = min(ends)
+    assert min(runs.values()) >= len(files) / 4, min(runs, key=lambda f: runs[f])
 
 
 def test_all_have_no_limit():

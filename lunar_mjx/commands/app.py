@@ -6,6 +6,7 @@ import errno
 import math
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,7 +38,7 @@ from lunar_mjx.commands.options import (
     open_terrain,
     select_device,
 )
-from lunar_mjx.errors import EXIT_STATUS, UserError, bad_input
+from lunar_mjx.errors import EXIT_STATUS, UserError, bad_input, require_within
 from lunar_mjx.files import replacing
 from lunar_mjx.trust import trusting
 
@@ -152,10 +153,10 @@ def simulate(
     from lunar_mjx.manoeuvres.cmd_vel import cmd_vel_commands
     from lunar_mjx.model import make_model
     from lunar_mjx.model.file import load_model, save_model
-    from lunar_mjx.simulate import channels, constant_commands, front_steering, read_commands
+    from lunar_mjx.simulate import channels, command_channels, constant_commands, front_steering, read_commands
     from lunar_mjx.simulate import simulate as run
 
-    built = load_model(model) if model else make_model(rover, terrain, preset or DEFAULT_PRESET)
+    built = load_model(model) if model else make_model(rover, terrain, DEFAULT_PRESET if preset is None else preset)
     if gravity is not None:
         if not 0.0 < gravity < 30.0:
             raise bad_input("simulate", "--gravity", gravity, "is no gravity that a rover meets", "give 0 to 30 m/s2")
@@ -170,6 +171,7 @@ def simulate(
         wanted = cmd_vel_commands(built, cmd_vel, duration)
     else:
         wanted = front_steering(built, constant_commands(built, duration, drive=drive), steer)
+    _require_possible(wanted, command_channels(built), yaw_deg)
     keep_compiled()
     if sys.stderr.isatty():
         print("compiling and driving; the first time can take a minute", file=sys.stderr)
@@ -184,6 +186,20 @@ def simulate(
     way = math.hypot(last.position_x_m - first.position_x_m, last.position_y_m - first.position_y_m)
     print(f"{built.rover.name} drove {way:.3f} m in {last.time_s:.1f} s")
     print(path)
+
+
+def _require_possible(commands: Any, names: Sequence[str], yaw_deg: float) -> None:
+    """Raises `UserError` for a command or heading that no rover takes: what a log's channel of it may hold."""
+    from lunar_mjx.logs.schema import limits
+
+    low, high, _ = limits("yaw_deg")
+    require_within("simulate", "--yaw-deg", yaw_deg, low, high)
+    for name, values in zip(names, commands.values.T, strict=True):
+        low, high, why = limits(name)
+        beyond = (values < low) | (values > high)
+        if beyond.any():
+            remedy = f"give {low:.4g} to {high:.4g}"
+            raise bad_input("simulate", name, float(values[beyond.argmax()]), f"is out of range ({why})", remedy)
 
 
 @app.command()
@@ -294,7 +310,10 @@ def main() -> None:
         _fail(str(error), EXIT_STATUS)
     except OSError as error:  # unreadable, unwritable, disk full
         if error.filename is not None:
-            _fail(f"{error.filename}: {error.strerror or error}; check the path and its permissions.", EXIT_STATUS)
+            _fail(
+                f"{str(error.filename)[:200]}: {error.strerror or error}; check the path and its permissions.",
+                EXIT_STATUS,
+            )
         if error.errno not in NO_ROOM:
             raise
         _fail(f"{error.strerror}; free some room where it writes, and run it again.", EXIT_STATUS)
@@ -305,6 +324,9 @@ def main() -> None:
 
 
 def _fail(sentence: str, status: int) -> None:
-    line = " ".join(sentence.splitlines()).removeprefix("lunar-mjx: ").removeprefix("lunar-mjx ")
+    line = " ".join(sentence.splitlines())
+    # what no terminal shows as it is: bytes of another encoding, marks that turn the text around, colours
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in line)
+    line = line.removeprefix("lunar-mjx: ").removeprefix("lunar-mjx ")
     print(f"lunar-mjx: {line}", file=sys.stderr)
     sys.exit(status)

@@ -97,6 +97,8 @@ def compare(
     from lunar_mjx.diagnosis import verbs
     from lunar_mjx.report.progress import console_progress
 
+    _require_imposed("--prior", prior, logs)
+    _require_imposed("--fix", fix, logs)
     keep_compiled()
     try:
         with console_progress() as progress:
@@ -122,7 +124,7 @@ def why(
     explain: Annotated[str | None, typer.Option(help="Evidence for and against one effect.")] = None,
     only: Annotated[list[str] | None, typer.Option(help="Consider only these effects.")] = None,
     audit: Annotated[
-        float, typer.Option(help="Minutes to spend on simulated logs like these: how often is it wrong?")
+        float, typer.Option(help="Minutes to spend on simulated logs like these: how often is it wrong?", min=0.0)
     ] = 0,
     seconds: Annotated[
         float | None, typer.Option(help="Answer after this many seconds with what is known by then.", min=1.0)
@@ -330,7 +332,16 @@ def _model(path: Path | None, preset: str | None, logs: Sequence[Path]) -> Model
     if isinstance(first, Log) and first.imposed is not None and preset is None:
         return hard_floor(first.rover, first.gravity_m_s2)
     rover = first.rover if isinstance(first, Log) else "luvmi_x"
-    return make_model(rover, terrain="flat", preset=preset or "consistent")
+    return make_model(rover, terrain="flat", preset="consistent" if preset is None else preset)
+
+
+def _require_imposed(option: str, given: Sequence[str] | None, logs: Sequence[Path]) -> None:
+    """Raises `UserError` for what only fits of drives with imposed wheel speeds look at."""
+    from lunar_mjx.logs import Log, read_campaign
+
+    if given and not any(isinstance(log, Log) and log.imposed is not None for log in read_campaign(logs)):
+        remedy = "leave it out, or state imposed in log.toml"
+        raise bad_input("compare", option, given[0], "is for logs with imposed wheel speeds", remedy)
 
 
 def _with_priors(model: Model, prior: Sequence[str] | None, fix: Sequence[str] | None) -> Model:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from lunar_mjx.commands.options import MOST_SEED
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, require_within
 
 BAD_DATA_STATUS = 10
 
@@ -143,6 +143,8 @@ def noise(
     from lunar_mjx.model.describe import make_console, make_table
 
     read = [log for log in read_campaign(logs) if isinstance(log, Log)]
+    if not read:
+        raise bad_input("log noise", "logs", ", ".join(map(str, logs)), "hold no drive", "name logs of drives")
     found = noise_table(read)
     if as_json:
         plain = {
@@ -173,7 +175,10 @@ def check(
     from lunar_mjx.logs.findings import is_bad
 
     read = read_campaign(logs)
-    found = check_logs(read, _numbers("--slowest", slowest))
+    constants = _numbers("--slowest", slowest)
+    for name, seconds in constants.items():
+        require_within("log check", f"--slowest {name}", seconds, 0.0, above=True)
+    found = check_logs(read, constants)
     if as_json:
         print(
             json.dumps(
@@ -212,7 +217,7 @@ def _print_findings(logs: list[Any], found: list[Any]) -> None:
         for f in mine:
             mark = "BAD" if f.severity == "bad_data" else "note"
             line = "" if f.line is None else str(f.line)
-            table.add_row(mark, escape(f.table), line, escape(f.column), f.kind, escape(f.message))
+            table.add_row(mark, escape(f.table), line, escape(_short(f.column)), f.kind, escape(f.message))
         console.print(table)
 
 
@@ -278,6 +283,10 @@ def _effect(text: str) -> tuple[str, dict[str, float]]:
     own = re.fullmatch(r"(.+\.py:\w+)(?::(.*))?", text)
     name, rest = (own[1], own[2] or "") if own else text.partition(":")[::2]
     return name, _numbers("--effect", rest.split(",") if rest else [])
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 80 else name[:77] + "..."
 
 
 def _numbers(option: str, pairs: list[str] | None) -> dict[str, float]:

@@ -144,7 +144,7 @@ def view(
         shown = replayed(replay, log)
         _serve(Viewer(shown, port, given or camera_sun(shown.model.sun)))
         return
-    built = load_model(model) if model else make_model(rover, terrain, preset or DEFAULT_PRESET)
+    built = load_model(model) if model else make_model(rover, terrain, DEFAULT_PRESET if preset is None else preset)
     for effect in effects or []:
         built = built.add(effect, "--effects")
     light = given or camera_sun(built.sun)

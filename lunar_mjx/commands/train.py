@@ -19,6 +19,9 @@ EnvSetOption = Annotated[
     list[str] | None, typer.Option("--env", help="name=value: an option of the environment, as JSON or text.")
 ]
 
+MOST_EPISODES = 1_000_000
+"""Side by side on one device; their states alone take gigabytes."""
+
 
 def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
     """Name and value of `name=value` texts."""
@@ -37,7 +40,7 @@ def env_options(texts: list[str] | None) -> dict[str, Any]:
     for name, text in pairs("--env", texts).items():
         try:
             value = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             value = text
         options[name] = tuple(value) if isinstance(value, list) else value
     return options
@@ -61,7 +64,7 @@ def train(
     settings: SetOption = None,
     env: EnvSetOption = None,
     eval_every: Annotated[float, typer.Option(help="s of training between evaluations.")] = 30.0,
-    eval_episodes: Annotated[int, typer.Option(min=1)] = 256,
+    eval_episodes: Annotated[int, typer.Option(min=1, max=MOST_EPISODES)] = 256,
     checkpoint_every: Annotated[float, typer.Option(help="s between checkpoints.")] = 300.0,
     restart: Annotated[bool, typer.Option(help="Begin anew although the folder has a checkpoint.")] = False,
     quiet: Annotated[bool, typer.Option(help="No progress.")] = False,
@@ -135,7 +138,7 @@ TaskOption = Annotated[
 def evaluate(
     agent: AgentArgument = "luvmi_x",
     agent_option: AgentOption = None,
-    episodes: Annotated[int, typer.Option(min=1)] = 256,
+    episodes: Annotated[int, typer.Option(min=1, max=MOST_EPISODES)] = 256,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 54321,
     task: TaskOption = "large",
     terrain: Annotated[str | None, typer.Option(help="Terrain; the policy's unseen one if left out.")] = None,

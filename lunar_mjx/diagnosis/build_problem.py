@@ -9,7 +9,7 @@ from lunar_mjx.diagnosis.runs import Run
 from lunar_mjx.diagnosis.tables.problem import TableProblem, default_units, points
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, require_within
 from lunar_mjx.logs import Log, SteadyLog
 from lunar_mjx.wheel_bed.bed import EARTH_GRAVITY, WheelBed
 
@@ -66,6 +66,18 @@ def require_splits(splits: Mapping[str, str], logs: Sequence[Any]) -> None:
             )
 
 
+def require_discrepancy(discrepancy: Mapping[str, float], logs: Sequence[Any]) -> None:
+    """Raises `UserError` for a known error of the model that is negative, or of a quantity that no table holds.
+
+    Channels of drives are looked up where drives are compared: their names may hold `*`.
+    """
+    known = dict.fromkeys(q for log in logs if isinstance(log, SteadyLog) for q in log.table.measured)
+    for name, size in discrepancy.items():
+        if known and name not in known:
+            raise bad_input("--discrepancy", "quantity", name, "was not measured", f"use one of {', '.join(known)}")
+        require_within("--discrepancy", name, size, 0.0)
+
+
 def candidates_of(run: Run, only: Sequence[str] | None = None) -> dict[str, Effect]:
     """Candidates of a run's drives by name: those asked for, else all that drives could show.
 
@@ -86,10 +98,6 @@ def table_problem(run: Run, logs: Sequence[SteadyLog], candidates: Mapping[str, 
     gravities = {float(log.gravity_m_s2 or EARTH_GRAVITY) for log in logs}
     if len(gravities) > 1:
         raise UserError(f"{logs[0].folder}: tables of different gravity do not go into one run; compare them apart.")
-    known = {q for log in logs for q in log.table.measured}
-    for name in run.discrepancy:
-        if name not in known:
-            raise bad_input("--discrepancy", "quantity", name, "was not measured", f"use one of {', '.join(known)}")
     model = run.model
     bed = WheelBed(model.effects, {name: _single(values) for name, values in model.parameters.items()}, gravities.pop())
     return TableProblem(logs, bed, candidates, run.splits, extra_sigma=run.discrepancy)

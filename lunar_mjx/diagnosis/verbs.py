@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis.build_problem import require_splits
+from lunar_mjx.diagnosis.build_problem import require_discrepancy, require_splits
 from lunar_mjx.diagnosis.drives.loop import build_drives, grown_drives
 from lunar_mjx.diagnosis.drives.windows import verbs as windows
 from lunar_mjx.diagnosis.folder.refits import write_refits
@@ -21,7 +21,7 @@ from lunar_mjx.diagnosis.tables.loop import better_law, build_tables, grown_mode
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.diagnosis.weighed.form import Problem, SearchSettings
-from lunar_mjx.errors import UserError
+from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.observations import Observations
@@ -84,6 +84,7 @@ def compare(
 def _compare(run: Run, progress: Progress) -> Run:
     campaign = gate(run)
     require_splits(run.splits, campaign)
+    require_discrepancy(run.discrepancy, campaign)
     if windows.imposed(campaign):
         return windows.compare(run, campaign, progress)
     run.write()
@@ -237,6 +238,8 @@ def add(folder: str | Path | Run, effect: str, out: str | Path, progress: Progre
       UserError: no such effect, or it is in the model already.
     """
     run = folder if isinstance(folder, Run) else load_run(folder)
+    if Path(out).resolve() == run.folder.resolve():
+        raise bad_input("add", "--out", out, "is the run itself, which would be lost", "name another folder")
     campaign = gate(run)
     if windows.imposed(campaign):
         return windows.add(run, campaign, effect, Path(out), progress)

@@ -185,8 +185,10 @@ def load_file(path: str | Path) -> dict[str, Effect]:
         spec.loader.exec_module(module)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    # Whatever a user's file does wrong becomes one sentence; SystemExit because scripts end with it.
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    # Whatever a user's file does wrong becomes one sentence: SystemExit too, because scripts end with it.
+    except BaseException as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{path}: does not run: {type(error).__name__}: {reason}; mend the file.") from error
     found = _by_name(v for v in vars(module).values() if isinstance(v, Effect))

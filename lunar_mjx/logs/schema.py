@@ -116,6 +116,8 @@ CHANNELS: tuple[Channel, ...] = (
 )
 """Every channel of the schema."""
 
+GREATEST_GRAVITY = 100.0
+"""m/s2: of a centrifuge with a test bed in it; no rover meets more."""
 ANGLE_LIMIT = 2.0 * 3.141592653589793
 """Steering and suspension joints do not turn further, rad; wheels do."""
 

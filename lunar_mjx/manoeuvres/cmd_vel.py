@@ -15,12 +15,15 @@ import numpy as np
 
 from lunar_mjx.dynamics.kinematics import wheel_feet
 from lunar_mjx.effects.joint.motor import WINDINGS
-from lunar_mjx.errors import bad_input, require_finite
+from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands, constant_commands
 
 _STILL = 1e-9
 """m/s; a wheel that is to move slower keeps its steering at zero."""
+
+FASTEST = 10.0
+"""m/s and rad/s: no rover moves or turns faster."""
 
 
 class CmdVel:
@@ -138,6 +141,6 @@ def cmd_vel_commands(model: Model, wanted: str, duration: float) -> Commands:
         raise bad_input(
             "simulate", "--cmd-vel", wanted, "is not three numbers", "write v_x,v_y,yaw_rate as in 0.1,0,0.2"
         )
-    motion = [require_finite("simulate", "--cmd-vel", part) for part in parts]
+    motion = [require_within("simulate", "--cmd-vel", part, -FASTEST, FASTEST) for part in parts]
     held = constant_commands(model, duration)
     return Commands(np.tile(np.asarray(CmdVel(model)(*motion)), (len(held.values), 1)), held.interval)

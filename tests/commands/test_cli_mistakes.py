@@ -44,6 +44,22 @@ MODEL = ["simulate", "--model", "FILES/model.toml", "--out", "OUT"]
 TABLE = [*LUVMI, "--commands", "FILES/commands.csv"]
 SHOW = ["effect", "show", "FILES/mine.py"]
 
+STEADY: dict[str, object] = {
+    "bed/log.toml": """format = "lunar-mjx-log/1"
+kind = "steady_state"
+file = "points.csv"
+slip_definition = "wheel_frame"
+[wheel]
+radius_m = 0.1
+width_m = 0.1
+[noise.drawbar_pull_N]
+std = 1.0
+""",
+    "bed/points.csv": "slip_ratio,slip_angle_deg,normal_load_N,drawbar_pull_N\n"
+    + "".join(f"{0.05 * i:.2f},0,60,{2.3 * i - 5 + 0.7 * (i % 3):.2f}\n" for i in range(12)),
+}
+TABLE_RUN = ["compare", "FILES/bed", "--out", "OUT/run"]
+
 # what is wrong: (arguments, files to write, words that the line must hold)
 MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
     "URDF missing": (CONVERT, {}, ["rover.urdf", "not there"]),
@@ -221,6 +237,68 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
     "layers without width": (["train", "point", "--set", "actor_layers=0", "--out", "OUT"], {}, ["actor_layers = 0"]),
     "pictures beyond the range": (["render", "OUT", "--fps", "99"], {}, ["render: --fps = '99' is above 60"]),
     "seed below the range": (["terrain", "info", "flat", "--seed", "-1"], {}, ["--seed = '-1' is below 0"]),
+    "speed of no rover": ([*LUVMI, "--drive", "1e300"], {}, ["lf_drive_speed_rad_s = 1e+300", "-100 to 100"]),
+    "steering beyond a turn": (
+        [*LUVMI, "--steer", "1e10"],
+        {},
+        ["lf_steer_angle_rad = 10000000000.0", "less than once"],
+    ),
+    "motion of no rover": ([*LUVMI, "--cmd-vel", "1e300,0,0"], {}, ["--cmd-vel", "10 at most"]),
+    "heading of no rover": ([*LUVMI, "--yaw-deg", "1e308"], {}, ["--yaw-deg = 1e+308", "36000 at most"]),
+    "command of no rover in a table": (
+        TABLE,
+        {"commands.csv": csv(**{DRIVE: [0.1, 0.1, -1e9, 0.1]})},
+        [f"{DRIVE} = -1000000000.0", "out of range"],
+    ),
+    "simulated preset without a name": ([*LUVMI, "--preset", ""], {}, ["preset = ''", "consistent, field, paper"]),
+    "rover in bytes of another encoding": ([*LUVMI, "--rover", "a\udcffb"], {}, ["a\\udcffb", "luvmi_x"]),
+    "rover that turns the text around": ([*LUVMI, "--rover", "a\u202eb"], {}, ["a\\u202eb", "luvmi_x"]),
+    "drive into a name too long": ([*LUVMI[:-1], "x" * 5000], {}, ["x" * 150, "check the path"]),
+    "URDF in an unknown encoding": (
+        CONVERT,
+        {"rover.urdf": '<?xml version="1.0" encoding="klingon"?>\n' + urdf("steered", "steered")},
+        ["rover.urdf", "encoding"],
+    ),
+    "URDF nested too deep": (CONVERT, {"rover.urdf": "<a>" * 20_000}, ["rover.urdf"]),
+    "URDF whose name breaks the line": (
+        CONVERT,
+        {"rover.urdf": urdf('<robot name="steered">', '<robot name="a&#10;b">')},
+        ["rover.urdf", "name"],
+    ),
+    "grid of endless columns": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols inf\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n3 4\n"},
+        ["a.asc", "ncols", "inf"],
+    ),
+    "model with a key of 40 kB": (MODEL, {"model.toml": toml("k" * 40_000 + " = 1")}, ["model.toml"]),
+    "model nested too deep": (MODEL, {"model.toml": toml("a = " + "[" * 3000)}, ["model.toml"]),
+    "model with a number of 5000 digits": (MODEL, {"model.toml": toml("gravity_m_s2 = " + "9" * 5000)}, ["model.toml"]),
+    "drive into nothing": ([*LUVMI[:-1], ""], {}, ["--out = ''", "empty; name a path"]),
+    "mesh into nothing": (["terrain", "export", "flat", ""], {}, ["empty; name a path"]),
+    "effect file raises what is no Exception": (
+        SHOW,
+        {"mine.py": "class A(BaseException): pass\nraise A('x')\n"},
+        ["mine.py", "does not run", "A: x"],
+    ),
+    "option nested too deep": (["evaluate", "zero", "--env", "x=" + "[" * 3000], {}, ["x"]),
+    "episodes without number": (["evaluate", "zero", "--episodes", "9" * 11], {}, ["--episodes", "above 1000000"]),
+    "discrepancy below zero": ([*TABLE_RUN, "--discrepancy", "drawbar_pull=-1"], STEADY, ["drawbar_pull = -1", "0 or"]),
+    "discrepancy of nothing": ([*TABLE_RUN, "--discrepancy", "lift=1"], STEADY, ["'lift'", "drawbar_pull"]),
+    "odds below zero": ([*TABLE_RUN, "--setting", "effect_odds=-1"], STEADY, ["effect_odds", "give above 0"]),
+    "prior where none is read": ([*TABLE_RUN, "--prior", "soil.n=1+-0.1"], STEADY, ["--prior", "imposed wheel"]),
+    "value held where none is read": ([*TABLE_RUN, "--fix", "soil.n=1"], STEADY, ["--fix", "imposed wheel speeds"]),
+    "audit of no time": (["why", "OUT", "--audit", "nan"], {}, ["--audit = 'nan'", "below 0"]),
+    "noise of a table": (["log", "noise", "FILES/bed"], STEADY, ["hold no drive", "logs of drives"]),
+    "time constant below zero": (
+        ["log", "check", "FILES/bed", "--slowest", "heat=-1"],
+        STEADY,
+        ["--slowest heat = -1", "give above 0"],
+    ),
+    "bias beyond the channel": (
+        ["log", "simulate", "OUT/log", "--rover", "luvmi_x", "--bias", "gyro_z_rad_s=1e300"],
+        {},
+        ["bias gyro_z_rad_s = 1e+300", "40 at most"],
+    ),
     "option without its value": (["figures", "--only"], {}, ["--only", "requires an argument", "--help"]),
     "option unknown": (["view", "--prot", "3"], {}, ["--prot", "--port", "see lunar-mjx view --help"]),
     "command unknown": (["figurs"], {}, ["'figurs'", "lunar-mjx --help"]),
@@ -246,6 +324,7 @@ def test_mistake(mistake: str, run: Run, tmp_path: Path) -> None:
     given, out = tmp_path / "given", tmp_path / "out"
     given.mkdir()
     for name, content in files.items():
+        (given / name).parent.mkdir(exist_ok=True)
         if isinstance(content, Image.Image):
             content.save(given / name)
         elif isinstance(content, bytes):
@@ -259,11 +338,12 @@ def test_mistake(mistake: str, run: Run, tmp_path: Path) -> None:
     result = run(*(a.replace("FILES", str(given)).replace("OUT", str(out)) for a in arguments))
     assert_one_sentence(result, words)
     assert not result.out
-    assert {p.name: p.read_bytes() for p in out.iterdir()} == kept, "bad input loses nothing"
+    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == kept, "bad input loses nothing"
 
 
 def assert_one_sentence(result: Result, words: list[str]) -> None:
     assert result.status == 2, result
+    assert len(result.err) < 1500, "a sentence, not a page"
     assert result.err.startswith("lunar-mjx: ") and result.err.endswith("\n") and result.err.count("\n") == 1, (
         result.err
     )

@@ -65,7 +65,7 @@ def test_blanks_sentinels_clocks_and_sums(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), (" ", ".")])
 def test_the_separator_is_guessed(tmp_path: Path, separator: str, decimal: str) -> None:
     rows = [("time", "speed", "note"), *((f"{0.1 * k:.2f}", f"{k + 0.5:.3f}", f"{k}") for k in range(30))]
-    text = "\n".join(separator.join(v.replace(".", decimal) for v in row) for row in rows)
+    text = "".join(separator.join(v.replace(".", decimal) for v in row) + "\n" for row in rows)
     (tmp_path / "a.csv").write_text(text, encoding="utf-8")
     mapping = write_map(
         tmp_path,
@@ -208,7 +208,7 @@ def test_places_in_metres(tmp_path: Path) -> None:
     # a degree of latitude is 111,133 m at 45 degrees and one of longitude 78,847 m (WGS84)
     east, north = tangent_plane(np.array([45.0005, 45.0]), np.array([8.0, 8.0005]), (45.0, 8.0))
     assert abs(north[0] - 0.0005 * 111132.1) < 1e-3 and abs(east[1] - 0.0005 * 78846.8) < 1e-3
-    rows = "\n".join(f"{0.2 * k:.1f} {45.0 + 1e-6 * k:.7f} {8.0 + 2e-6 * k:.7f} {k % 7}" for k in range(40))
+    rows = "".join(f"{0.2 * k:.1f} {45.0 + 1e-6 * k:.7f} {8.0 + 2e-6 * k:.7f} {k % 7}\n" for k in range(40))
     (tmp_path / "a.txt").write_text("0.0 0 0 1\n" + rows.replace("0.0 45", "0.1 45", 1), encoding="utf-8")
     mapping = write_map(
         tmp_path,
@@ -290,7 +290,7 @@ def test_groups_are_drives_that_begin_in_motion(tmp_path: Path) -> None:
 def test_bad_maps_are_answered_in_one_sentence(
     run: Run, tmp_path: Path, old: str, new: str, words: tuple[str, ...]
 ) -> None:
-    rows = "\n".join(f"{0.5 * k:.1f} 1.0 {k % 9} 12:00:{k:02d}.5" for k in range(40))
+    rows = "".join(f"{0.5 * k:.1f} 1.0 {k % 9} 12:00:{k:02d}.5\n" for k in range(40))
     (tmp_path / "a.txt").write_text(rows, encoding="utf-8")
     assert old in MAP
     mapping = write_map(tmp_path, MAP.replace(old, new, 1))
@@ -343,7 +343,7 @@ def test_the_example_is_imported_and_passes_the_gate(run: Run, tmp_path: Path) -
 def test_the_documented_map_is_read(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "measurement_logs.md").read_text(encoding="utf-8")
     text = next(b for b in re.findall(r"```toml\n(.*?)```", page, re.DOTALL) if "{drive}_motors.txt" in b)
-    rows = "\n".join(f"14:31:{k:02d}.5 500 {10 + k} -1000 3.0 {k} 36.7157{k:02d} -4.4885" for k in range(40))
+    rows = "".join(f"14:31:{k:02d}.5 500 {10 + k} -1000 3.0 {k} 36.7157{k:02d} -4.4885\n" for k in range(40))
     (tmp_path / "run07_motors.txt").write_text(rows, encoding="utf-8")
     imu = pd.DataFrame({"t": 5.0 + 0.01 * np.arange(200), "wz": np.sin(np.arange(200.0))})
     imu.to_csv(tmp_path / "run07_imu.csv", index=False)

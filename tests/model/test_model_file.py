@@ -370,3 +370,11 @@ def test_broken_effect_file(text: str, words: list[str], tmp_path: Path) -> None
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     assert_refused(tmp_path / "gone.toml", ["not there"])
     assert_refused(tmp_path, ["is a folder"])
+
+
+def test_a_byte_order_mark_is_no_part_of_a_model(tmp_path: Path) -> None:
+    """As editors of Windows write it before UTF-8."""
+    plain, marked = tmp_path / "a.toml", tmp_path / "b.toml"
+    plain.write_bytes(tomli_w.dumps(MINIMAL).encode())
+    marked.write_bytes(b"\xef\xbb\xbf" + plain.read_bytes())
+    assert_same(load_model(marked), load_model(plain))

@@ -33,8 +33,8 @@ class _Run(_Stored):
     splits: dict[str, Split] = {}
     added: list[str] = []
     parent: str | None = None
-    seed: Annotated[int, Field(ge=0)] = 0
-    discrepancy: dict[str, Number] = {}
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
+    discrepancy: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = {}
     test_opened: list[dict[str, Any]] = []
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from lunar_mjx.diagnosis.weighed.conclusion import LARGEST_CLASS
 from lunar_mjx.effects.base import Effect
-from lunar_mjx.errors import bad_input
+from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import NotTested
@@ -72,6 +72,8 @@ class SearchSettings:
                 values[name] = _like(usual[name], value)
             except (TypeError, ValueError):
                 raise bad_input("settings", name, value, "has another kind", f"give it like {usual[name]}") from None
+            if isinstance(values[name], float):  # a size, a share or odds, of which the logarithm is taken
+                require_within("settings", name, value, 0.0, above=name.endswith("_odds"))
         return cls(**values)
 
     @property

@@ -11,6 +11,8 @@ import pandas as pd
 from lunar_mjx.errors import bad_input
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+LATEST = 1e11
+"""s: no clock counts 3000 years."""
 DAY = 86400.0
 """s."""
 
@@ -53,7 +55,14 @@ def seconds(frame: pd.DataFrame, time: TimeColumn, path: Path) -> np.ndarray:
         shown = str(cells.iloc[row])
         remedy = "write clock = true for times of day and dates" if ":" in shown else "correct the cell"
         raise bad_input(path, f"{time.column}, row {row}", shown, "is no number", remedy)
-    return UNITS[time.unit] * values
+    seconds = UNITS[time.unit] * values
+    far = np.abs(seconds) > LATEST
+    if far.any():
+        row = int(np.argmax(far))
+        raise bad_input(
+            path, f"{time.column}, row {row}", values[row], "is thousands of years", "state the unit in the map's table"
+        )
+    return seconds
 
 
 def _clock(cells: pd.Series, path: Path) -> np.ndarray:

@@ -21,6 +21,7 @@ from lunar_mjx.logs.readers.recorded_drive import (
     without_copies,
     without_empty,
 )
+from lunar_mjx.logs.readers.table import cut_row
 from lunar_mjx.logs.readers.table_files import SUFFIXES, read_table_file
 
 GAPS = ("", "nan", "na", "n/a", "null", "none", "-", "inf", "-inf")
@@ -149,6 +150,9 @@ def _rising(frame: pd.DataFrame) -> np.ndarray:
 def _frame(path: Path, table: TableMap, where: str, notes: list[str]) -> pd.DataFrame:
     """Time, channels and what groups or places need, from one file."""
     raw = read_table_file(path, table.layout, table.columns)
+    if cut := cut_row(path, raw):
+        notes.append(f"{table.file}, row {cut[0]}: {cut[1]}")
+        raw = raw.iloc[:-1]
     unknown = [c for c in table.columns if c not in raw.columns]
     if unknown:
         shown = ", ".join(list(raw.columns)[:20])
@@ -157,6 +161,9 @@ def _frame(path: Path, table: TableMap, where: str, notes: list[str]) -> pd.Data
     left = [c for c in raw.columns if c not in table.columns]
     if left:
         notes.append(f"{table.file}: columns not mapped and not read: {', '.join(left)}")
+    for column in table.columns:
+        if raw[column].dtype.kind == "f" and (count := int(np.isinf(raw[column]).sum())):
+            notes.append(f"{table.file}: {column} reads inf in {count} rows, which are gaps")
     out = {TIME: seconds(raw, table.clock, path)}
     for channel, source in table.channels.items():
         out[channel] = _values(raw, source, table.missing, path)
@@ -177,19 +184,22 @@ def _values(raw: pd.DataFrame, source: Source, missing: tuple[float, ...], path:
 
 
 def _numbers(cells: pd.Series, missing: tuple[float, ...], path: Path, column: str) -> np.ndarray:
-    values = np.asarray(pd.to_numeric(cells, errors="coerce"), float)
-    if cells.dtype.kind not in "fiub":
-        text = cells.astype(str).str.strip().str.lower()
-        wrong = ~np.isfinite(values) & ~text.isin(GAPS).to_numpy(bool)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise bad_input(
-                path,
-                f"{column}, row {row}",
-                str(cells.iloc[row]),
-                "is neither a number nor a gap",
-                "correct the cell, or state separator, decimal and skip_rows in the map",
-            )
+    if cells.dtype.kind in "fiub":
+        values = np.asarray(cells, float)
+        wrong = np.zeros(len(values), bool)
+    else:  # whole numbers of hundreds of digits are objects, which only as text become infinite
+        text = cells.astype(str).str.strip()
+        values = np.asarray(pd.to_numeric(text, errors="coerce"), float)
+        wrong = ~np.isfinite(values) & ~text.str.lower().isin(GAPS).to_numpy(bool)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise bad_input(
+            path,
+            f"{column}, row {row}",
+            str(cells.iloc[row]),
+            "is neither a number nor a gap",
+            "correct the cell, or state separator, decimal and skip_rows in the map",
+        )
     values = np.where(np.isfinite(values), values, np.nan)
     return np.where(np.isin(values, missing), np.nan, values) if missing else values
 

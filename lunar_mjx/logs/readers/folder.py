@@ -8,13 +8,25 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.logs.attitude import body_attitude, with_angles
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Imu, Log, LogTable, Noise, SteadyLog
 from lunar_mjx.logs.readers.steady import read_steady
 from lunar_mjx.logs.readers.table import read_log_table
-from lunar_mjx.logs.schema import FORMAT, IMPOSED, NOISE_SOURCES, SPLITS, find_channel, is_quantity, parse_column
+from lunar_mjx.logs.schema import (
+    FORMAT,
+    GREATEST_GRAVITY,
+    IMPOSED,
+    NOISE_SOURCES,
+    SPLITS,
+    find_channel,
+    is_quantity,
+    limits,
+    parse_column,
+)
 from lunar_mjx.toml_fields import Fields
 
 LOG_FILE = "log.toml"
@@ -35,6 +47,14 @@ INITIAL = {
     "winding_temperature_degC": 1,
     "housing_temperature_degC": 1,
 }
+INITIAL_CHANNEL = {
+    "position_m": "position_x_m",
+    "world_velocity_m_s": "world_velocity_x_m_s",
+    "angular_velocity_rad_s": "gyro_x_rad_s",
+    "winding_temperature_degC": "winding_lf_drive_temperature_degC",
+    "housing_temperature_degC": "housing_lf_drive_temperature_degC",
+}
+"""A channel whose physical range holds for a key of `initial`, in all its axes."""
 """Initial values by name and number of entries; a channel of one joint may be named as well."""
 TOP = (
     "format",
@@ -139,7 +159,7 @@ def _read_drive(folder: Path, top: Fields) -> Log:
         name=folder.resolve().name,
         rover=_near(folder, top.text("rover"), "rover.toml"),
         manoeuvre=top.text("manoeuvre", ""),
-        gravity_m_s2=top.positive("gravity_m_s2", 1.625),
+        gravity_m_s2=top.positive("gravity_m_s2", 1.625, GREATEST_GRAVITY),
         terrain=_near(folder, top.text("terrain", "flat"), "terrain.toml"),
         terrain_origin_m=(origin[0], origin[1]),
         split=top.choice("split", SPLITS),
@@ -285,6 +305,11 @@ def _initial(fields: Fields) -> dict[str, Any]:
                 f"use one of {', '.join(INITIAL)}, or a channel's name",
             )
         initial[key] = fields.number(key) if count in (None, 1) else fields.vector(key, count)
+        low, high, why = limits(INITIAL_CHANNEL.get(key, key))
+        numbers = np.atleast_1d(initial[key])
+        if (numbers < low).any() or (numbers > high).any():
+            problem = f"is outside [{low:g}, {high:g}] ({why})"
+            raise bad_input(fields.path, fields.field(key), value, problem, "check its unit")
     return initial
 
 
@@ -337,6 +362,11 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
         if column is not None and column.problem:
             raise bad_input(fields.path, fields.field(key), key, column.problem, "state the noise in that unit")
         name, scale = (column.name, column.scale) if column is not None else (key, 1.0)
+        low, high, _ = limits(name)
+        if std * abs(scale) > high - low:
+            raise bad_input(
+                fields.path, f"{fields.field(key)}.std", std, "is more than the channel's whole range", "check its unit"
+            )
         exact[name] = Noise(std * abs(scale), source, correlation)
     for pattern, noise in patterns:
         for name in channels or ():

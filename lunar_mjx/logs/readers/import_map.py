@@ -252,6 +252,13 @@ def _missing(entry: Fields) -> tuple[float, ...]:
     return entry.vector("missing", len(values), ())
 
 
+def _scale(fields: Fields) -> float:
+    scale = fields.number("scale", 1.0)
+    if scale == 0.0:
+        raise bad_input(fields.path, fields.field("scale"), scale, "makes every value zero", "give another factor")
+    return scale
+
+
 def _column(entry: Fields, key: str) -> str:
     """A column by its name, or by its place counted from 0 where a file has no header."""
     value = entry.values.get(key)
@@ -308,7 +315,7 @@ def _source(source: Fields) -> Source:
     terms = source.values.get("sum")
     if terms is None:
         key = "field" if "field" in source.values else "column"
-        return Source((Term(_column(source, key), source.number("scale", 1.0)),), offset, missing)
+        return Source((Term(_column(source, key), _scale(source)),), offset, missing)
     if not isinstance(terms, list) or not terms or not all(isinstance(t, Mapping) for t in terms):
         raise bad_input(
             source.path,
@@ -321,7 +328,7 @@ def _source(source: Fields) -> Source:
     for k, term in enumerate(terms):
         one = Fields(source.path, term, source.field(f"sum[{k}]"))
         one.known(("field", "column", "scale"))
-        parts.append(Term(_column(one, "field" if "field" in term else "column"), one.number("scale", 1.0)))
+        parts.append(Term(_column(one, "field" if "field" in term else "column"), _scale(one)))
     return Source(tuple(parts), offset, missing)
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, require_within
 from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import Noise, SteadyLog
-from lunar_mjx.logs.readers.table import numbers, read_frame
-from lunar_mjx.logs.schema import SPLITS, STEADY_CHANNELS, conversion
+from lunar_mjx.logs.readers.table import cut_row, numbers, read_frame
+from lunar_mjx.logs.schema import GREATEST_GRAVITY, SPLITS, STEADY_CHANNELS, conversion
 from lunar_mjx.toml_fields import Fields
 from lunar_mjx.wheel_bed.bed import SLIP_DEFINITIONS
 from lunar_mjx.wheel_bed.table import QUANTITIES, SteadyStateTable
@@ -32,6 +32,9 @@ TOP = (
     "commitment",
 )
 REQUIRED = ("slip_ratio", "slip_angle_deg", "normal_load_N")
+LARGEST_WHEEL = 5.0
+"""m: the radius or width of no wheel on a test bed; what is larger is in another unit."""
+MOST_GROUSERS = 1000
 WHEEL = ("radius_m", "width_m", "grouser_count", "grouser_height_m")
 _SUFFIX = re.compile(r"_(ratio|deg|N|m_s|Nm|m)$")
 
@@ -47,8 +50,14 @@ def read_steady(folder: Path, top: Fields, read_noise: Callable[[Fields], dict[s
     path = folder / _file(top)
     wheel = top.table("wheel")
     wheel.known(WHEEL)
-    size = {key: wheel.positive(key) for key in WHEEL[:2]}
+    size = {key: wheel.positive(key, most=LARGEST_WHEEL) for key in WHEEL[:2]}
     size |= {key: wheel.number(key, 0.0) for key in WHEEL[2:]}
+    for key, high in (("grouser_count", MOST_GROUSERS), ("grouser_height_m", size["radius_m"])):
+        require_within(top.path, wheel.field(key), size[key], 0.0, high)
+    if size["grouser_count"] % 1.0:
+        raise bad_input(
+            top.path, wheel.field("grouser_count"), size["grouser_count"], "is no whole number", "count the grousers"
+        )
     definition = top.choice("slip_definition", tuple(SLIP_DEFINITIONS))
     if definition is None:
         raise bad_input(top.path, "slip_definition", None, "is missing", f"use one of {', '.join(SLIP_DEFINITIONS)}")
@@ -78,7 +87,7 @@ def read_steady(folder: Path, top: Fields, read_noise: Callable[[Fields], dict[s
         wheel=size,
         noise=noise,
         split=top.choice("split", SPLITS),
-        gravity_m_s2=top.positive("gravity_m_s2", 9.81),
+        gravity_m_s2=top.positive("gravity_m_s2", 9.81, GREATEST_GRAVITY),
         source=source,
         row_std={c: v[keep] for c, v in row_std.items()},
         rows=np.arange(count)[keep],
@@ -104,6 +113,9 @@ def _file(top: Fields) -> str:
 def _columns(path: Path, log: str, problems: list[Finding]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Columns of the schema and their stated standard deviations, in the schema's units."""
     frame = read_frame(path, "the steady-state table")
+    if cut := cut_row(path, frame):
+        problems.append(Finding(log, path.stem, cut[0], "", "short", cut[1], WARNING))
+        frame = frame.iloc[:-1]
     if frame.empty:
         raise UserError(f"{path}: holds no rows; give one row per run.")
     columns: dict[str, np.ndarray] = {}

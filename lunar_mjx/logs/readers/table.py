@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import warnings
 from collections.abc import Mapping
@@ -48,6 +49,20 @@ def read_frame(path: Path, what: str) -> pd.DataFrame:
     return frame
 
 
+def cut_row(path: Path, frame: pd.DataFrame) -> tuple[int, str] | None:
+    """The last row of a text file that was not written to its end, and what says so; None where all rows are whole.
+
+    A row that ends the file without a new line may lack cells, or digits of its last cell: nothing tells.
+    """
+    if path.suffix.lower() in (".parquet", ".pq", ".mat") or frame.empty:
+        return None
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        if file.read(1) in b"\r\n":
+            return None
+    return len(frame) - 1, "is not ended by a new line: it may be half written, and is left out"
+
+
 def _read_parquet(path: Path) -> pd.DataFrame:
     if importlib.util.find_spec("pyarrow") is None:
         raise UserError(f"{path}: a Parquet file needs the package pyarrow; install lunar-mjx[parquet] or save as CSV.")
@@ -88,6 +103,9 @@ def read_log_table(
     path = folder / entry.text("file")
     frame = read_frame(path, f"the table {name}")
     frame.columns = [str(c).strip() for c in frame.columns]
+    if cut := cut_row(path, frame):
+        problems.append(Finding(log, name, cut[0], "", "short", cut[1], WARNING))
+        frame = frame.iloc[:-1]
     if TIME not in frame.columns:
         shown = ", ".join(list(frame.columns)[:5])
         raise bad_input(path, "columns", shown, f"lack {TIME}", "add the time in seconds as the first column")

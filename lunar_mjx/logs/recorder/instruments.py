@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.errors import bad_input, require_finite
+from lunar_mjx.errors import bad_input, require_finite, require_within
 from lunar_mjx.logs.log import Noise
-from lunar_mjx.logs.schema import is_command
+from lunar_mjx.logs.schema import is_command, limits
 
 
 class Instrument(NamedTuple):
@@ -85,7 +85,8 @@ class Recording:
         if not 0.0 <= require_finite("log simulate", "dropouts", self.dropouts) <= 0.25:
             raise bad_input("log simulate", "dropouts", self.dropouts, "is not in [0, 0.25]", "give a share of samples")
         for channel, value in self.bias.items():
-            require_finite("log simulate", f"bias {channel}", value)
+            low, high, _ = limits(channel)
+            require_within("log simulate", f"bias {channel}", value, low - high, high - low)
 
     @property
     def instruments(self) -> tuple[Instrument, ...]:
