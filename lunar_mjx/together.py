@@ -32,7 +32,7 @@ def join(coordinator: str | None, processes: int, process: int) -> None:
             raise bad_input("train", "--coordinator", "left out", "is needed for several processes", "give HOST:PORT")
         return
     host, colon, port = coordinator.rpartition(":")
-    if not (host and colon and port.isdigit()):
+    if not (host and colon and port.isdecimal() and 0 < int(port[:9]) < 2**16):
         raise bad_input("train", "--coordinator", coordinator, "is not HOST:PORT", "give it as 10.0.0.1:1234")
     if processes < 2:
         raise bad_input("train", "--processes", processes, "is below 2", "say how many processes train together")

@@ -24,6 +24,14 @@ from lunar_mjx.terrain import height
 from lunar_mjx.trust import require_trust
 
 VIEWS = ("auto", "camera", "top")
+
+
+def require_view(view: str) -> None:
+    """Raises `UserError` for a view that does not exist."""
+    if view not in VIEWS:
+        raise bad_input("play", "view", view, "does not exist", f"use one of {', '.join(VIEWS)}")
+
+
 UNSEEN_LADDER = {"ranges": "unseen", "hardness": 1.1}
 """What agents are scored on: worlds of another seed, harder than the training's by a tenth, and the held-out soil."""
 _MARGIN = 4.0
@@ -125,8 +133,7 @@ class Episode:
         Raises:
           UserError: unknown view, or `camera` without OpenGL.
         """
-        if view not in VIEWS:
-            raise bad_input("play", "view", view, "does not exist", f"use one of {', '.join(VIEWS)}")
+        require_view(view)
         frames, still = self._frames(view)
         table = np.column_stack(
             [

@@ -135,8 +135,18 @@ TaskOption = Annotated[
 ]
 
 
+SHIPPED_AGENT = "luvmi_x"
+
+
+def _one_agent(argument: str, option: str | None) -> str:
+    """The agent that was named, as an argument or as an option."""
+    if option is not None and argument not in (SHIPPED_AGENT, option):
+        raise bad_input("evaluate", "--agent", option, f"is given beside {argument!r}", "name one agent")
+    return argument if option is None else option
+
+
 def evaluate(
-    agent: AgentArgument = "luvmi_x",
+    agent: AgentArgument = SHIPPED_AGENT,
     agent_option: AgentOption = None,
     episodes: Annotated[int, typer.Option(min=1, max=MOST_EPISODES)] = 256,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 54321,
@@ -155,11 +165,12 @@ def evaluate(
     from lunar_mjx.agents.play import knowing, open_agent
     from lunar_mjx.agents.run import unseen_params
 
-    made, act, unseen = open_agent(agent_option or agent, task, env_options(env))
+    wanted = _one_agent(agent, agent_option)
+    made, act, unseen = open_agent(wanted, task, env_options(env))
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}
     params = made.params if seen and terrain is None else unseen_params(made, {} if seen else unseen)
-    act = knowing(agent_option or agent, made, params, act)
+    act = knowing(wanted, made, params, act)
     score = Evaluator(made, lambda _, state, key: act(state, key), episodes)(params, (), seed)
     print(
         f"success {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of {score.episodes} "
@@ -174,12 +185,12 @@ def evaluate(
         )
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_text(out, json.dumps({"agent": agent_option or agent, **score.record()}, indent=1) + "\n")
+        write_text(out, json.dumps({"agent": wanted, **score.record()}, indent=1) + "\n")
         print(out)
 
 
 def play(
-    agent: AgentArgument = "luvmi_x",
+    agent: AgentArgument = SHIPPED_AGENT,
     agent_option: AgentOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("runs/play"),
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 0,
@@ -194,14 +205,16 @@ def play(
 
     check_folder(out)
     select_device(device)
-    from lunar_mjx.agents.play import knowing, open_agent, play_episode
+    from lunar_mjx.agents.play import knowing, open_agent, play_episode, require_view
     from lunar_mjx.agents.run import unseen_params
 
-    made, act, unseen = open_agent(agent_option or agent, task, env_options(env))
+    require_view(view)
+    wanted = _one_agent(agent, agent_option)
+    made, act, unseen = open_agent(wanted, task, env_options(env))
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}
     params = unseen_params(made, unseen)
-    episode = play_episode(made, params, knowing(agent_option or agent, made, params, act), seed)
+    episode = play_episode(made, params, knowing(wanted, made, params, act), seed)
     print(episode.sentence)
     for path in episode.write(make_folder(out), view):
         print(path)
