@@ -256,7 +256,7 @@ def test_the_clock_of_an_imu_is_told_by_turning(tmp_path):
     folder = tmp_path / "late"
     log_of = 'file = "imu.csv"\nclock_offset_std_s = 0.4\n'
     (tmp_path / "imu.csv").write_text(
-        "time_s,gyro_z_rad_s\n" + "\n".join(f"{t:.3f},{v:.6f}" for t, v in zip(own, late, strict=True))
+        "time_s,gyro_z_rad_s\n" + "".join(f"{t:.3f},{v:.6f}\n" for t, v in zip(own, late, strict=True))
     )
     log = write_drive(folder, drive, tables="[tables.imu]\n" + log_of.replace("imu.csv", "../imu.csv"))
     sides = [log.channel(f"joint_{s}_drive_speed_rad_s") for s in ("left", "right")]
@@ -305,7 +305,7 @@ def test_slow_wheel_speeds_are_cut_about_their_readings(tmp_path, model):
     time = np.arange(0.0, 60.0, 5.0)
     slow.write_text(
         "time_s,joint_left_drive_speed_rad_s,joint_right_drive_speed_rad_s\n"
-        + "\n".join(f"{t},{2.0 + 0.1 * (k % 2)},{2.0}" for k, t in enumerate(time))
+        + "".join(f"{t},{2.0 + 0.1 * (k % 2)},{2.0}\n" for k, t in enumerate(time))
     )
     fine = np.arange(0.0, 60.0, 0.1)
     columns = {"time_s": fine, "motor_left_drive_current_A": 3.0 + 0.0 * fine, "motor_right_drive_current_A": fine}
