@@ -38,6 +38,7 @@ def join(coordinator: str | None, processes: int, process: int) -> None:
         raise bad_input("train", "--processes", processes, "is below 2", "say how many processes train together")
     if not 0 <= process < processes:
         raise bad_input("train", "--process", process, f"is not one of 0 to {processes - 1}", "number them from 0")
+    # how processes on CPUs exchange values
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         jax.distributed.initialize(coordinator, processes, process)
@@ -78,6 +79,7 @@ def agreed(doing: str) -> Iterator[None]:
     try:
         yield
     except BaseException:
+        # told before it is raised: the others wait in the same exchange and end with a sentence instead of hanging
         _of_all(1.0)
         raise
     failed = np.flatnonzero(_of_all(0.0)[:, 0])
@@ -99,6 +101,7 @@ def everywhere(tree: Any) -> Any:
 
 def _of_all(*values: float) -> np.ndarray:
     """(process, n) values of every process."""
+    # JAX exchanges float32 here; with one process values are rounded alike, so that both decide the same
     own = np.asarray(values, np.float32)
     if jax.process_count() == 1:
         return own[None]

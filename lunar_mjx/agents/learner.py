@@ -217,6 +217,7 @@ class Learner:
             iterations=jnp.zeros((), jnp.int32),
             env=env,
             buffer=None if self.buffer is None else self.buffer.init(example),
+            # every device spreads the whole range over its share
             noise=jnp.linspace(c.noise[0], c.noise[1], mine),
             key=jax.random.fold_in(key_run, rank)[None],
             guard=guard.start(env, action),
@@ -248,6 +249,7 @@ class Learner:
         key, key_noise = jax.random.split(state.key[0])
         obs = self._normalised(state.statistics, state.env.obs, "obs")
         action = self.agent.explore(state.agent, obs, state.noise, key_noise)
+        # both are drawn in every step: a compiled loop has one program for random steps and later ones
         blind = jax.random.uniform(jax.random.fold_in(key_noise, 1), action.shape, action.dtype, -1.0, 1.0)
         action = jnp.where(state.iterations < c.random_steps, blind, action)
         env = self.env.step(params, state.env, action)

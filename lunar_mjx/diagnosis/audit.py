@@ -98,9 +98,11 @@ def audit(folder: str | Path | Run, seconds: float, progress: Progress = silent)
 
     begun = time.monotonic()
     done = 0
+    # two at least: a null and an effect
     while done < 2 or time.monotonic() < end:
         done += 1
         progress(f"auditing, case {len(cases) + 1}", min(1.0, (time.monotonic() - begun) / max(end - begun, 1e-9)))
+        # numbered on from the stored ones, so that no case is drawn twice
         cases.append(one(len(cases)))
         summary = _summary(cases)
         run.save(AUDIT_FILE, {"key": key, "version": __version__, **summary.to_dict()})
@@ -123,6 +125,8 @@ def _sizes(form: DriveForm, base: Refit) -> dict[str, float]:
     for name, length in base.linear.shows().items():
         if length >= LEAST_SIGNAL:
             low, high = form.drives.bounds(form.candidates[name])
+            # effects that would drown at their nominal size are made visible: an audit of what cannot be seen says
+            # nothing
             sizes[name] = float(np.clip(max(1.0, _VISIBLE / length), 0.0, np.min(np.maximum(high, -low))))
     return sizes
 
@@ -170,6 +174,7 @@ def draw_noise(observations: Observations, rng: np.random.Generator) -> np.ndarr
         out[part] = s.white * rng.standard_normal(s.stop - s.start)
         if s.time is None or s.coloured <= 0.0:
             continue
+        # exact at any spacing of samples (Gillespie 1996)
         slow = np.empty(s.stop - s.start)
         slow[0] = rng.standard_normal()
         keep = np.exp(-np.diff(s.time) / max(s.correlation_time, 1e-9))

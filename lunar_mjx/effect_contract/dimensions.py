@@ -177,12 +177,14 @@ _SUFFIX = {
     "_m_s2": "m/s2",
     "_rad": "rad",
     "_rad_s": "rad/s",
+    # angles are pure numbers in every system of units, and the degree is the channel's own factor
     "_deg": "1",
     "_A": "A",
     "_W": "W",
     "_V": "V",
     "_Nm": "N m",
     "_N": "N",
+    # differences alone are rescaled: the offset of degrees Celsius is a channel's convention
     "_degC": "K",
     "_ratio": "1",
 }
@@ -238,6 +240,7 @@ class Rescaling:
     @contextlib.contextmanager
     def constants(self) -> Iterator[None]:
         """Gives constants with a unit, in every module of effects that holds them, their numbers in the other units."""
+        # constants of a module are physics with a unit, too: a function that reads one must see it rescaled
         held = [
             (vars(module), name, value, value * self.of(unit))
             for module in self._modules
@@ -286,6 +289,7 @@ class Rescaling:
         units = UNITS[type(value)]
         if isinstance(value, c.Context | SensorContext):
             mode = value.rover.mode
+        # k_c and k_phi are per m^n: their factor depends on the exponent of the same soil
         n = value.n if isinstance(value, c.Soil | SoilGrids) and value.n is not None else 1.0
         changed = {
             f.name: self.value(getattr(value, f.name), units[f.name], n, mode) for f in dataclasses.fields(value)

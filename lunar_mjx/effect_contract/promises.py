@@ -39,6 +39,7 @@ class Tolerances:
 TOLERANCES = Tolerances()
 
 
+# no factor is a power of another, so that wrong units do not cancel by accident
 _FACTORS = {"[length]": 1.7, "[mass]": 0.6, "[time]": 2.3, "[temperature]": 0.8, "[current]": 1.4}
 Outputs = dict[str, Any]
 _Act = Callable[[Mapping[str, Any] | None, Any], Outputs]
@@ -181,6 +182,7 @@ def _null(effect: Effect, runs: Sequence[tuple[_Act, Any]]) -> Check:
         with_it = jax.vmap(functools.partial(act, _numbers(effect.null())))(s)
         forces_without = jax.vmap(functools.partial(act, None))(s)
         for key, ulp in _ulps(jax.device_get(with_it), jax.device_get(forces_without)).items():
+            # written so that not a number counts as worse
             if not ulp <= worst:
                 worst, worst_quantity = ulp, key
     detail = f"{worst:.2g} ulp" + (f" in {worst_quantity}" if worst else "")
@@ -193,6 +195,7 @@ def _ulps(got: Outputs, want: Outputs) -> dict[str, float]:
     """Largest deviation in ulp of the largest component on the same rover; moments count with the forces."""
     largest = {k: np.abs(v).reshape(len(v), -1).max(axis=1) for k, v in want.items()}
     if "wheel_moment" in largest:
+        # a moment is a force times a lever of about a metre: cancelled moments carry the rounding of their forces
         largest["wheel_moment"] = np.maximum(largest["wheel_moment"], largest["wheel_force"])
     out = {}
     for key, value in want.items():
@@ -210,6 +213,7 @@ def _derivatives(effect: Effect, runs: Sequence[tuple[_Act, Any]], seed: int) ->
     weights = {}
     for label, values in (("null", effect.null()), ("nominal", effect.nominal())):
         numbers = _numbers(values)
+        # one random direction: a derivative that is not finite shows in it unless its factor is zero
         way = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), (numbers, s))
 
         def one(numbers: Any, state: Any, toward: Any) -> Any:
@@ -328,6 +332,7 @@ def _cost(cost: float, noise: float) -> Check:
     measured = f"{100 * cost:+.1f} % of the effects of a step, repeats differ by {100 * noise:.1f} %"
     if cost <= TOLERANCES.overhead:
         return Check("cost", True, measured)
+    # a busy machine must not fail an effect
     if cost - noise <= TOLERANCES.overhead:
         return Check("cost", None, measured + ": too near the limit of 5 % for a verdict on this machine")
     return Check("cost", False, measured + "; the limit is 5 %")

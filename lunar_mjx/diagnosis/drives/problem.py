@@ -226,6 +226,7 @@ class DriveProblem:
         The step's error leads joints by a step or so, which an encoder sees. How much of it logs contain is a
         nuisance: all where a rover was measured, nothing where a simulator with the same step recorded it.
         """
+        # the integrator is of first order: halving the step halves its error, so that twice the change is all of it
         if self._step_error is None:
             origin = self.origin()[None]
             coarse, fine = (self._simulations(b, origin, silent)[0] for b in (self.bench, self.bench.halved()))
@@ -237,6 +238,7 @@ class DriveProblem:
         """(k, n) what a bench predicts for rows of coordinates, without linear nuisances, kept or simulated."""
         keys = self._keys(bench, rows)
         known_rows = {k: row for k in dict.fromkeys(keys) if (row := SIMULATED.get(k)) is not None}
+        # by key, so that a row that is asked for twice is simulated once
         new = {k: n for n, k in enumerate(keys) if k not in known_rows}
         if new:
             wanted = rows[list(new.values())]
@@ -265,6 +267,7 @@ class DriveProblem:
         acting = frozenset(moved | (needed & set(self._additions)))
         if not acting:
             return self.bench
+        # a bench that is there and holds a little more costs less than compiling another
         wide_enough = [names for names in list(self._wider) if acting <= names]
         if wide_enough:
             return self._wider[min(wide_enough, key=len)]
