@@ -32,18 +32,29 @@ SKY, GROUND, ROCK, ROVER = range(4)
 
 TINT = ALBEDO / ALBEDO[0]
 """Colour of regolith, red first."""
-ROCK_BRIGHTNESS = 1.5
-"""Of rocks over that of soil: their surfaces are less dusty. A choice."""
-_SKIN = 0.012
-"""How far before a surface its shadow ray begins, m: bilinear patches and the smooth normals on them differ by less."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BatchView:
+    """How pictures of a batch are lit and how far they see."""
+
+    rock_brightness: float = 1.5
+    """Of rocks over that of soil: their surfaces are less dusty. A choice."""
+    skin: float = 0.012
+    """How far before a surface its shadow ray begins, m: bilinear patches and the smooth normals on them differ by
+    less."""
+    far_shadow: float = 150.0
+    """Longest way on which ground is looked for towards the Sun, m."""
+    lit_ground: float = 0.12
+    """Share of sunlight that ground throws back to all sides."""
+    horizon: float = 0.02
+    """Share of the sky that lit slopes fill, as level ground sees it."""
+
+
+BATCH_VIEW = BatchView()
+
 SHADOW_STEPS = 48
 """Of the march towards the Sun."""
-_FAR_SHADOW = 150.0
-"""Longest way on which ground is looked for towards the Sun, m."""
-_LIT_GROUND = 0.12
-"""Share of sunlight that ground throws back to all sides."""
-_HORIZON = 0.02
-"""Share of the sky that lit slopes fill, as level ground sees it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +133,7 @@ def picture(
         face = jnp.where((label == ROVER)[..., None], normal(rovers, surface, point), face)
     to_eye = -direction / jnp.sqrt(jnp.sum(direction**2, axis=-1, keepdims=True))
     # Lifted off its own surface, which would otherwise shade itself where the march's bilinear patch lies above it.
-    lit = _sunlit(terrain, point + _SKIN * face, to_sun, rovers, shadow_steps)
+    lit = _sunlit(terrain, point + BATCH_VIEW.skin * face, to_sun, rovers, shadow_steps)
     bright = _brightness(terrain, light, label, face, to_eye, to_sun, lit, point, paint)
     if rovers is not None:
         colour = rovers.colour[surface]
@@ -232,7 +243,7 @@ def _sunlit(terrain: Terrain, point: Any, to_sun: Any, rovers: Placed | None, st
     if terrain.rocks is not None:
         top = jnp.maximum(top, jnp.max(terrain.rocks.centers[:, 2] + terrain.rocks.radii))
     # A low Sun asks for long rays, whose steps would grow coarse: cut off, far shadows are lost before near ones.
-    end = jnp.clip((top - point[..., 2]) / jnp.maximum(to_sun[2], 1e-4), 0.0, _FAR_SHADOW)
+    end = jnp.clip((top - point[..., 2]) / jnp.maximum(to_sun[2], 1e-4), 0.0, BATCH_VIEW.far_shadow)
     blocked = jnp.isfinite(march(terrain, point, towards, end, steps, start=0.03, refine=0))
     if rovers is not None:
         blocked |= jnp.isfinite(hit(rovers, point, towards)[0])
@@ -258,13 +269,13 @@ def _brightness(
     def under(to_light: Any) -> Any:
         mu0 = jnp.sum(face * to_light, axis=-1)
         ground = soil.radiance_factor(mu0, mu, jnp.sum(to_eye * to_light, axis=-1))
-        ground = ground * jnp.where(label == ROCK, ROCK_BRIGHTNESS, 1.0)
+        ground = ground * jnp.where(label == ROCK, BATCH_VIEW.rock_brightness, 1.0)
         return jnp.where(label == ROVER, jnp.maximum(mu0, 0.0), ground)
 
     direct = under(to_sun) * lit + light.earthshine * under(jnp.asarray(earth, face.dtype))
     # sunlit ground fills the half of the sky below a wall, and a little of it above level ground
-    seen = 0.5 * (1.0 - face[..., 2]) + _HORIZON
-    thrown = seen * _LIT_GROUND * jnp.maximum(to_sun[2], 0.0)
+    seen = 0.5 * (1.0 - face[..., 2]) + BATCH_VIEW.horizon
+    thrown = seen * BATCH_VIEW.lit_ground * jnp.maximum(to_sun[2], 0.0)
     diffuse = jnp.where(label == ROVER, 1.0, soil.radiance_factor(0.5, 1.0, 0.5) / 0.5)
     bright = direct + thrown * diffuse
     if paint is not None:

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.windows.began import MOST_AFTER, began
-from lunar_mjx.diagnosis.drives.windows.cut import LEVELLING_S, Cut
+from lunar_mjx.diagnosis.drives.windows.began import ONSET, began
+from lunar_mjx.diagnosis.drives.windows.cut import CUTTING, Cut
 from lunar_mjx.diagnosis.drives.windows.following import Follower, Steps
 from lunar_mjx.diagnosis.drives.windows.settings import DIFFERENCES
 from lunar_mjx.diagnosis.runs import Run, load_run, plain
@@ -185,7 +185,7 @@ class _Watch:
             else:
                 waited = 0.0 if end > last_end else waited
                 last_end = max(last_end, end)
-                yield from self._follow(log, windows, end if once else end - LEVELLING_S, once)
+                yield from self._follow(log, windows, end if once else end - CUTTING.levelling_s, once)
                 if once or waited >= idle_s:
                     yield from self._name(log, windows, True)
                     return
@@ -220,7 +220,7 @@ class _Watch:
             onset_s=self.seen[change.onset],
             first_s=self.seen[change.first],
             last_s=self.seen[change.last] + length,
-            raised_s=self.seen[change.seen] + length + LEVELLING_S,
+            raised_s=self.seen[change.seen] + length + CUTTING.levelling_s,
             differences={k: p for k, p in change.kinds.items() if p >= 0.01},
             size=self._size(kind, float(change.amount[list(steps.names).index(kind)])),
         )
@@ -238,7 +238,7 @@ class _Watch:
         waiting = []
         for n, (alarm, change) in enumerate(self.open):
             following = self.open[n + 1][1].first if n + 1 < len(self.open) else len(self.seen)
-            if not ended and following == len(self.seen) and len(self.seen) - change.last <= MOST_AFTER:
+            if not ended and following == len(self.seen) and len(self.seen) - change.last <= ONSET.most_after:
                 waiting.append((alarm, change))
                 continue
             numbers = np.searchsorted(found.start_s, np.array(self.seen[:following]) - 1e-6)

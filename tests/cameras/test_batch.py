@@ -26,7 +26,7 @@ from lunar_mjx.cameras import (
     rover_shapes,
     stereo,
 )
-from lunar_mjx.cameras.batch import _HORIZON, _LIT_GROUND, ROCK_BRIGHTNESS, TINT
+from lunar_mjx.cameras.batch import BATCH_VIEW, TINT
 from lunar_mjx.cameras.shapes import BOX
 from lunar_mjx.rover import load_rover
 from lunar_mjx.terrain import Terrain, build_rocks, flat
@@ -77,11 +77,11 @@ def analytic(pose, light: Light) -> tuple[np.ndarray, np.ndarray]:
 
     def under(m0, g):
         bright = np.asarray(soil.radiance_factor(jnp.asarray(m0), jnp.asarray(mu), jnp.asarray(g)))
-        return bright * np.where(label == 2, ROCK_BRIGHTNESS, 1.0)
+        return bright * np.where(label == 2, BATCH_VIEW.rock_brightness, 1.0)
 
     value = under(mu0, phase) * ~shadow + light.earthshine * under(face @ earth, -(unit @ earth))
     diffuse = float(soil.radiance_factor(0.5, 1.0, 0.5)) / 0.5
-    value = value + (0.5 * (1 - face[..., 2]) + _HORIZON) * _LIT_GROUND * to_sun[2] * diffuse
+    value = value + (0.5 * (1 - face[..., 2]) + BATCH_VIEW.horizon) * BATCH_VIEW.lit_ground * to_sun[2] * diffuse
     value = np.where(label == 0, 0.0, value)[..., None] * TINT * float(light.film.gain(soil, to_sun[2]))
     return np.clip(value, 0, 1) ** (1 / light.film.gamma), label
 

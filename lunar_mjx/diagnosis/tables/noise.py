@@ -12,14 +12,22 @@ from lunar_mjx.wheel_bed.table import SAME_LOAD, SteadyStateTable, replicate_gro
 if TYPE_CHECKING:
     from lunar_mjx.logs import SteadyLog
 
-_MOST = 0.95
-"""Largest correlation that is believed: at 1 no point would add anything to its neighbour."""
-_SURE = 2.5
-"""Standard errors from which a correlation counts."""
-_FEWEST = 8
-"""Pairs of neighbours from which a correlation is estimated."""
-_GAP = 1.5
-"""Median steps of slip beyond which two points of a sweep are no neighbours."""
+
+@dataclasses.dataclass(frozen=True)
+class NeighbourNoise:
+    """When the noise of neighbouring points counts as correlated."""
+
+    most: float = 0.95
+    """Largest correlation that is believed: at 1 no point would add anything to its neighbour."""
+    sure: float = 2.5
+    """Standard errors from which a correlation counts."""
+    fewest: int = 8
+    """Pairs of neighbours from which a correlation is estimated."""
+    gap: float = 1.5
+    """Median steps of slip beyond which two points of a sweep are no neighbours."""
+
+
+NEIGHBOURS = NeighbourNoise()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,13 +75,13 @@ def _neighbours(log: SteadyLog, residual: np.ndarray) -> tuple[float, float]:
     first, second = residual[order][:-1][follows[1:]], residual[order][1:][follows[1:]]
     power = float(first @ first)
     size = float(np.sqrt(power * (second @ second)))
-    if len(first) < _FEWEST or size <= 0.0:
+    if len(first) < NEIGHBOURS.fewest or size <= 0.0:
         return 0.0, 1.0
     correlation = float(first @ second) / size
     # 1/sqrt(n) is the standard error of a correlation that is none; a negative one is no memory of the bed
-    if correlation <= _SURE / np.sqrt(len(first)):
+    if correlation <= NEIGHBOURS.sure / np.sqrt(len(first)):
         return 0.0, 1.0
-    correlation = min(correlation, _MOST)
+    correlation = min(correlation, NEIGHBOURS.most)
     left = second - correlation * first
     return correlation, float(np.sqrt(np.mean(left**2) / np.mean(residual**2)))
 
@@ -95,7 +103,7 @@ def sweeps(table: SteadyStateTable, key: np.ndarray) -> tuple[np.ndarray, np.nda
     same_sweep = np.diff(sweep[order]) == 0
     gap = np.diff(slip[order])
     # a gap in a sweep is a point that was left out or measured elsewhere: noise need not go on across it
-    near = gap <= _GAP * np.median(gap[same_sweep]) if same_sweep.any() else same_sweep
+    near = gap <= NEIGHBOURS.gap * np.median(gap[same_sweep]) if same_sweep.any() else same_sweep
     return order, np.concatenate([[False], same_sweep & near])
 
 

@@ -24,12 +24,21 @@ from lunar_mjx.inference.evidence import Field
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.logs import Log
 
-MOST_BEFORE, MOST_AFTER = 20, 20
-"""Windows on either side of an onset that are weighed: the last before it, the first after it."""
-HELD_OUT = 3
-"""One later window of so many is held out."""
-SECONDS = 60.0
-"""Time that the search may take, s."""
+
+@dataclasses.dataclass(frozen=True)
+class Onset:
+    """How much is weighed of what began within a drive."""
+
+    # Windows on either side of an onset that are weighed: the last before it, the first after it.
+    most_before: int = 20
+    most_after: int = 20
+    held_out: int = 3
+    """One later window of so many is held out."""
+    seconds: float = 60.0
+    """Time that the search may take, s."""
+
+
+ONSET = Onset()
 
 
 class BeganForm(WindowForm):
@@ -111,11 +120,11 @@ def began(
       restless: how much undisturbed drives move. progress: told of refits.
     """
     first, last = onset
-    before = np.arange(max(0, first - MOST_BEFORE), first)
-    after = np.arange(last + (first != last), len(found))[:MOST_AFTER]
+    before = np.arange(max(0, first - ONSET.most_before), first)
+    after = np.arange(last + (first != last), len(found))[: ONSET.most_after]
     part = found.part(np.append(before, after))
     later = np.arange(len(part)) >= len(before)
-    held = later & ((np.arange(len(part)) - len(before)) % HELD_OUT == HELD_OUT - 1)
+    held = later & ((np.arange(len(part)) - len(before)) % ONSET.held_out == ONSET.held_out - 1)
     made: dict[str | None, WindowProblem] = {}
 
     def problem(form: str | None) -> WindowProblem:
@@ -131,4 +140,4 @@ def began(
     form = BeganForm(problem, base, suspects, observations, settings, later, moved)
     effects = {name: catalogue.CATALOGUE[name] for name in form.candidates if name in catalogue.CATALOGUE}
     run.folder.mkdir(parents=True, exist_ok=True)
-    return answer.diagnose(run, Problem((form,), effects, (), settings), progress, SECONDS)[0]
+    return answer.diagnose(run, Problem((form,), effects, (), settings), progress, ONSET.seconds)[0]

@@ -13,28 +13,48 @@ from lunar_mjx.dynamics.imposed import Windows
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log
 
-WINDOW_S = 2.0
-"""Length of a window: short beside a drive, long beside the 0.1 s in which loads and yaw rate settle."""
-SHORTEST_BIN_S = 0.1
-"""Faster samples are averaged: currents at 100 Hz show the ripple of gears, which nobody models."""
-SLOW_S, SLOW_BINS = 0.4, 10
-"""Interval of wheel speeds from which they are known only about each reading: windows then lie about the readings, and
-have so many samples of what is measured faster."""
-LEVELLING_S = 1.0
-"""Span over which an accelerometer is averaged to tell the slope: longer than a wheel takes over a stone, shorter than
-the rover takes into another slope."""
-STRATA = (0.05, 0.3)
-"""Bounds between standing, slow and fast, m/s, of the mean and of half the difference of the sides' rim speeds."""
+
+@dataclasses.dataclass(frozen=True)
+class Cutting:
+    """How drives are cut into windows, and which windows are left out."""
+
+    window_s: float = 2.0
+    """Length of a window: short beside a drive, long beside the 0.1 s in which loads and yaw rate settle."""
+    shortest_bin_s: float = 0.1
+    """Faster samples are averaged: currents at 100 Hz show the ripple of gears, which nobody models."""
+    # Interval of wheel speeds from which they are known only about each reading: windows then lie about the readings,
+    # and have so many samples of what is measured faster.
+    slow_s: float = 0.4
+    slow_bins: int = 10
+    levelling_s: float = 1.0
+    """Span over which an accelerometer is averaged to tell the slope: longer than a wheel takes over a stone, shorter
+    than the rover takes into another slope."""
+    strata: tuple[float, float] = (0.05, 0.3)
+    """Bounds between standing, slow and fast, m/s, of the mean and of half the difference of the sides' rim speeds."""
+    # Time between two positions that tell a speed, and the most over it: poses by lidar come up to 0.1 s early or
+    # late, so that neighbours would tell 6 m/s of a rover that drives 1 m/s (DRIVE).
+    speed_span_s: float = 0.5
+    most_span: float = 5.0
+    unknown_heading_deg: float = 20.0
+    """Standard deviation of an IMU's mounting about the vertical from which its heading has no known zero."""
+    # Share of the wheels' turning below which a rover that turns on the spot is held, and the least turning of the
+    # wheels that is asked. A free one on even ground turns by a third of it and more: friction across the wheels acts
+    # on shorter levers than friction along them.
+    held: float = 0.1
+    turning_rad_s: float = 0.1
+    # Steps in which clocks are laid against each other; time after which what a gyroscope shows beyond the wheels'
+    # turning is another matter, so that so many seconds count as one measurement.
+    lag_step_s: float = 0.02
+    independent_s: float = 0.5
+
+
+CUTTING = Cutting()
+
 CURRENTS = ("motor_left_drive_current_A", "motor_right_drive_current_A")
 GYRO, AHEAD = "gyro_z_rad_s", "body_velocity_x_m_s"
 CHANNELS = (*CURRENTS, GYRO, AHEAD)
 """What windows are judged by, as far as a log tells it: currents of the sides (or of their wheels), yaw rate (or
 heading), and speed over ground along the chassis (or positions with a heading)."""
-SPEED_SPAN_S, MOST_SPAN = 0.5, 5.0
-"""Time between two positions that tell a speed, and the most over it: poses by lidar come up to 0.1 s early or late, so
-that neighbours would tell 6 m/s of a rover that drives 1 m/s (DRIVE)."""
-UNKNOWN_HEADING_DEG = 20.0
-"""Standard deviation of an IMU's mounting about the vertical from which its heading has no known zero."""
 SIDES = ("left", "right")
 
 
@@ -130,9 +150,9 @@ def cut(
     """
     speeds = [[_speed(log, j) for j in joints] for log in logs]
     intervals = [float(np.median(np.diff(s[0][0]))) for s in speeds]
-    interval = max(SHORTEST_BIN_S, float(np.median(intervals)))
-    slow = interval > SLOW_S
-    interval = WINDOW_S / SLOW_BINS if slow else interval
+    interval = max(CUTTING.shortest_bin_s, float(np.median(intervals)))
+    slow = interval > CUTTING.slow_s
+    interval = CUTTING.window_s / CUTTING.slow_bins if slow else interval
     if interval_s is not None:
         interval = interval_s
     clocks = {}
@@ -148,7 +168,7 @@ def cut(
     log, start, speed, up, yaw, values = whole
     if not len(log):
         raise UserError(
-            f"{logs[0].folder}: no window of {WINDOW_S:g} s has wheel speeds without a gap; give longer logs."
+            f"{logs[0].folder}: no window of {CUTTING.window_s:g} s has wheel speeds without a gap; give longer logs."
         )
     if not np.isfinite(values).any():
         raise UserError(
@@ -157,7 +177,9 @@ def cut(
         )
     moving = np.abs(radius * speed).mean(axis=(1, 2)) > STANDING_M_S
     if not moving.any():
-        raise UserError(f"{logs[0].folder}: the wheels turn in no window of {WINDOW_S:g} s; give logs of driving.")
+        raise UserError(
+            f"{logs[0].folder}: the wheels turn in no window of {CUTTING.window_s:g} s; give logs of driving."
+        )
     left = np.array([j.startswith("l") for j in joints])
     rim_left, rim_right = (radius * speed[..., mine].mean(axis=(1, 2)) for mine in (left, ~left))
     held = moving & _held(rim_left, rim_right, values[:, CHANNELS.index(GYRO)], track)
@@ -182,12 +204,6 @@ def cut(
     )
 
 
-HELD, TURNING_RAD_S = 0.1, 0.1
-"""Share of the wheels' turning below which a rover that turns on the spot is held, and the least turning of the wheels
-that is asked. A free one on even ground turns by a third of it and more: friction across the wheels acts on shorter
-levers than friction along them."""
-
-
 def _held(left: np.ndarray, right: np.ndarray, yaw_rate: np.ndarray, track: float) -> np.ndarray:
     """(window,) whether the sides turn against each other and the rover does not.
 
@@ -197,7 +213,12 @@ def _held(left: np.ndarray, right: np.ndarray, yaw_rate: np.ndarray, track: floa
     turn = (right - left) / track
     seen = np.asarray(np.isfinite(yaw_rate).any(axis=1))
     mean = np.nanmean(np.where(seen[:, None], yaw_rate, 0.0), axis=1)
-    return seen & (left * right < 0.0) & (np.abs(turn) > TURNING_RAD_S) & (np.abs(mean) < HELD * np.abs(turn))
+    return (
+        seen
+        & (left * right < 0.0)
+        & (np.abs(turn) > CUTTING.turning_rad_s)
+        & (np.abs(mean) < CUTTING.held * np.abs(turn))
+    )
 
 
 STANDING_M_S = 0.02
@@ -240,11 +261,6 @@ def _sides(
     return left, right
 
 
-LAG_STEP_S, INDEPENDENT_S = 0.02, 0.5
-"""Steps in which clocks are laid against each other; time after which what a gyroscope shows beyond the wheels'
-turning is another matter, so that so many seconds count as one measurement."""
-
-
 def imu_clock(
     log: Log, left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray, np.ndarray]
 ) -> tuple[float, float] | None:
@@ -264,13 +280,13 @@ def imu_clock(
     yaw = log.channel(GYRO)
     if yaw is None or stated <= 0.0 or len(yaw[0]) < 10:
         return None
-    width = max(SHORTEST_BIN_S, float(np.median(np.diff(left[0]))))
+    width = max(CUTTING.shortest_bin_s, float(np.median(np.diff(left[0]))))
     reach = 3.0 * stated
-    grid = np.arange(max(left[0][0], right[0][0]) + reach, min(left[0][-1], right[0][-1]) - reach, LAG_STEP_S)
-    if len(grid) * LAG_STEP_S < 10.0 * INDEPENDENT_S:
+    grid = np.arange(max(left[0][0], right[0][0]) + reach, min(left[0][-1], right[0][-1]) - reach, CUTTING.lag_step_s)
+    if len(grid) * CUTTING.lag_step_s < 10.0 * CUTTING.independent_s:
         return 0.0, stated
     turn = np.interp(grid, *right) - np.interp(grid, *left)
-    lags = np.arange(-reach, reach + 0.5 * LAG_STEP_S, LAG_STEP_S)
+    lags = np.arange(-reach, reach + 0.5 * CUTTING.lag_step_s, CUTTING.lag_step_s)
     left_over = np.zeros(len(lags))
     for k, lag in enumerate(lags):
         seen = _means(yaw[0] + lag, yaw[1], grid, width)
@@ -281,12 +297,12 @@ def imu_clock(
         columns = np.column_stack([turn[ok], np.ones(ok.sum())])
         fitted = columns @ np.linalg.lstsq(columns, seen[ok], rcond=None)[0]
         left_over[k] = np.mean((seen[ok] - fitted) ** 2)
-    count = len(grid) * LAG_STEP_S / INDEPENDENT_S
+    count = len(grid) * CUTTING.lag_step_s / CUTTING.independent_s
     score = -0.5 * count * np.log(np.maximum(left_over, 1e-12)) - 0.5 * (lags / stated) ** 2
     weight = np.exp(score - score.max())
     weight /= weight.sum()
     mean = float(weight @ lags)
-    return mean, float(max(np.sqrt(weight @ (lags - mean) ** 2), 0.5 * LAG_STEP_S))
+    return mean, float(max(np.sqrt(weight @ (lags - mean) ** 2), 0.5 * CUTTING.lag_step_s))
 
 
 def _windows(
@@ -301,7 +317,7 @@ def _windows(
 ) -> tuple[np.ndarray, ...]:
     """All windows of a log: number, start, speeds at edges, up at edges, yaw rate, and measurements."""
     left, right = _sides(speeds, joints)
-    count = max(3, round(WINDOW_S / interval))
+    count = max(3, round(CUTTING.window_s / interval))
     start = np.array(_about_readings(left[0], right[0]) if slow else _in_stretches(left[0], right[0], interval, count))
     if slow:
         start = start + 0.5 * interval
@@ -347,8 +363,8 @@ def _about_readings(left: np.ndarray, right: np.ndarray) -> list[float]:
     starts: list[float] = []
     for before, at, after in zip(left[:-2], left[1:-1], left[2:], strict=True):
         near = after - before < 2.0 * 1.6 * usual and np.abs(right - at).min() < 0.5 * usual
-        if near and (not starts or at - 0.5 * WINDOW_S >= starts[-1] + WINDOW_S):
-            starts.append(float(at - 0.5 * WINDOW_S))
+        if near and (not starts or at - 0.5 * CUTTING.window_s >= starts[-1] + CUTTING.window_s):
+            starts.append(float(at - 0.5 * CUTTING.window_s))
     return starts
 
 
@@ -397,13 +413,13 @@ def _turning(log: Log) -> tuple[np.ndarray, np.ndarray] | None:
 def _over_ground(log: Log) -> tuple[np.ndarray, np.ndarray] | None:
     """The speed along the chassis from positions and heading, at the middle of two positions half a second apart."""
     x, y, yaw = (log.channel(c) for c in ("position_x_m", "position_y_m", "yaw_deg"))
-    lost = log.imu.attitude and log.imu.mounting_std_deg[2] > UNKNOWN_HEADING_DEG
+    lost = log.imu.attitude and log.imu.mounting_std_deg[2] > CUTTING.unknown_heading_deg
     if x is None or y is None or yaw is None or lost or len(x[0]) < 3 or len(x[0]) != len(y[0]):
         return None
-    later = np.searchsorted(x[0], x[0] + SPEED_SPAN_S - 1e-6)
+    later = np.searchsorted(x[0], x[0] + CUTTING.speed_span_s - 1e-6)
     first = np.flatnonzero(later < len(x[0]))
     last = later[first]
-    first, last = (k[x[0][last] - x[0][first] < MOST_SPAN * SPEED_SPAN_S] for k in (first, last))
+    first, last = (k[x[0][last] - x[0][first] < CUTTING.most_span * CUTTING.speed_span_s] for k in (first, last))
     if len(first) < 2:
         return None
     step = x[0][last] - x[0][first]
@@ -455,12 +471,14 @@ def _up(
     g = log.gravity_m_s2
     force = [log.channel(c) for c in LEANS_BY[0]]
     if all(f is not None for f in force):
-        up = np.stack([_means(f[0] + clock_s, f[1], edges, LEVELLING_S) for f in force if f is not None], axis=-1)
+        up = np.stack(
+            [_means(f[0] + clock_s, f[1], edges, CUTTING.levelling_s) for f in force if f is not None], axis=-1
+        )
         turn = _mounting(log)
         if turn is not None:
             up = turn.apply(up.reshape(-1, 3)).reshape(up.shape)
-        ahead = [np.interp(edges + 0.5 * s * LEVELLING_S, *side) for side in sides for s in (1, -1)]
-        up[..., 0] -= radius * 0.5 * (ahead[0] - ahead[1] + ahead[2] - ahead[3]) / LEVELLING_S
+        ahead = [np.interp(edges + 0.5 * s * CUTTING.levelling_s, *side) for side in sides for s in (1, -1)]
+        up[..., 0] -= radius * 0.5 * (ahead[0] - ahead[1] + ahead[2] - ahead[3]) / CUTTING.levelling_s
         level = np.array([0.0, 0.0, g])
         up = np.where(np.isfinite(up).all(axis=-1, keepdims=True), up, level)
         size = np.linalg.norm(up, axis=-1, keepdims=True)
@@ -477,7 +495,7 @@ def _stratified(
 ) -> np.ndarray:
     """Numbers of the windows to use, in order: as many of every stratum of speed and turn and of every log."""
     ahead, turn = 0.5 * (left + right), 0.5 * (right - left)
-    stratum = np.sign(ahead) * np.digitize(np.abs(ahead), STRATA) + 10 * np.sign(turn) * np.digitize(
+    stratum = np.sign(ahead) * np.digitize(np.abs(ahead), CUTTING.strata) + 10 * np.sign(turn) * np.digitize(
         np.abs(turn), (0.02, 0.1)
     )
     order: list[int] = []

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from lunar_mjx.diagnosis.drives.windows.bench import WINDOWS_FILE
 from lunar_mjx.diagnosis.drives.windows.coordinates import baseline, sizes
-from lunar_mjx.diagnosis.drives.windows.cut import STRATA, WINDOW_S, Cut, cut
+from lunar_mjx.diagnosis.drives.windows.cut import CUTTING, Cut, cut
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, Proportion, WindowProblem, corners, proportion
 from lunar_mjx.diagnosis.drives.windows.settings import DIFFERENCES, WindowSettings
@@ -162,7 +162,9 @@ class Follower:
 
     def detector(self, steps: Steps, restless: Restlessness, hours: float) -> ChangeDetector:
         """A detector for a drive with so many hours of driving from one false alarm to the next, at least."""
-        return ChangeDetector(restless.of(steps.amounts), steps.amounts.jumps(steps.names), 3600.0 * hours / WINDOW_S)
+        return ChangeDetector(
+            restless.of(steps.amounts), steps.amounts.jumps(steps.names), 3600.0 * hours / CUTTING.window_s
+        )
 
     def restlessness(self, progress: Progress = silent) -> Restlessness:
         """How much the run's own drives move within themselves; learnt once and kept in the run's folder."""
@@ -202,7 +204,7 @@ def _motion(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(window, `MOTION`) how windows are driven, each between -1 and 1, from (window,) rim speeds of the sides, m/s."""
     ahead, turn = 0.5 * (left + right), 0.5 * (right - left)
     whole = np.maximum(np.abs(ahead) + np.abs(turn), 1e-9)
-    fast = np.clip(whole / STRATA[1] - 1.0, -1.0, 1.0)
+    fast = np.clip(whole / CUTTING.strata[1] - 1.0, -1.0, 1.0)
     return np.stack([ahead / whole, turn / whole, 2.0 * np.abs(turn) / whole - 1.0, fast], axis=1)
 
 
