@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.envs.ladder.chart import COARSE, REACH, Chart, begin, coarse_prices, look, straight, way
+from lunar_mjx.envs.ladder.chart import CHART, Chart, begin, coarse_prices, look, straight, way
 
 COUNT, CELL = 40, 0.8
 GOAL, START = jnp.asarray([[28.4, 16.4]]), jnp.asarray([[6.0, 16.4]])
@@ -16,7 +16,7 @@ WORLD = jnp.zeros(1, jnp.int32)
 
 def yard() -> np.ndarray:
     """A yard that is open to the west between start and goal, on the planning grid: 8 m deep and 16 m wide."""
-    free = np.ones((COUNT * COARSE, COUNT * COARSE), bool)
+    free = np.ones((COUNT * CHART.coarse, COUNT * CHART.coarse), bool)
     free[20:60, 44:49] = False
     free[20:25, 26:49] = free[56:61, 26:49] = False
     return free
@@ -24,7 +24,7 @@ def yard() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def price():
-    return jnp.asarray(coarse_prices(yard(), CELL / COARSE)[None], jnp.float32)
+    return jnp.asarray(coarse_prices(yard(), CELL / CHART.coarse)[None], jnp.float32)
 
 
 def test_prices_are_dear_beside_what_is_blocked_and_a_quarter_of_a_node_blocks_nothing(price):
@@ -49,7 +49,7 @@ def test_who_has_seen_nothing_goes_straight(price):
 
 def test_it_sees_ahead_and_not_behind(price):
     seen = np.asarray(look(begin(COUNT, GOAL, CELL), price, WORLD, START, jnp.zeros(1), GOAL, CELL).seen[0])
-    assert seen[20, 7 + REACH - 2] and not seen[20, 7 + REACH + 1]
+    assert seen[20, 7 + CHART.reach - 2] and not seen[20, 7 + CHART.reach + 1]
     assert seen[20, 6] and not seen[20, 2] and not seen[35, 7]
 
 

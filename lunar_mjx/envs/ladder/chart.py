@@ -7,6 +7,7 @@ on (real-time dynamic programming, Barto et al. 1995). No other map of the world
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -17,23 +18,32 @@ from scipy import ndimage
 
 from lunar_mjx.pytree import pytree
 
-WIDE = 1.6
-"""m from what is blocked at which a way costs no more than its length."""
-CLOSE = 3.0
-"""Price of a metre right beside what is blocked, over that of an open one. Shortest ways brush past boulders, and a
-rover that drifts a hand's breadth hangs on them."""
-COARSE = 2
-"""Nodes of the planning grid to a side of a node of the chart."""
-REACH = 20
-"""Nodes ahead that a rover sees: 16 m for one as wide as LUVMI-X."""
-AROUND = 2.5
-"""Nodes that it knows on all sides, from its wheels and what it has just passed."""
+
+@dataclasses.dataclass(frozen=True)
+class ChartReach:
+    """What a rover sees of its world, and how it plans on what it has seen."""
+
+    wide: float = 1.6
+    """m from what is blocked at which a way costs no more than its length."""
+    close: float = 3.0
+    """Price of a metre right beside what is blocked, over that of an open one. Shortest ways brush past boulders, and a
+    rover that drifts a hand's breadth hangs on them."""
+    coarse: int = 2
+    """Nodes of the planning grid to a side of a node of the chart."""
+    reach: int = 20
+    """Nodes ahead that a rover sees: 16 m for one as wide as LUVMI-X."""
+    around: float = 2.5
+    """Nodes that it knows on all sides, from its wheels and what it has just passed."""
+    sweeps: int = 2
+    """Relaxations a control step: the news of a dead end spreads by so many nodes, 16 m/s at 10 Hz."""
+    steps: int = 6
+    """Nodes along the way that are told."""
+
+
+CHART = ChartReach()
+
 HALF_VIEW = math.radians(60.0)
 """Half the horizontal angle of view."""
-SWEEPS = 2
-"""Relaxations a control step: the news of a dead end spreads by so many nodes, 16 m/s at 10 Hz."""
-STEPS = 6
-"""Nodes along the way that are told."""
 
 
 @pytree
@@ -52,7 +62,7 @@ class Chart:
 def prices(free: np.ndarray, cell: float) -> np.ndarray:
     """Price of a metre at every node of a planning grid, from where a rover fits, (row, column) booleans."""
     clear = cell * np.asarray(ndimage.distance_transform_edt(free))
-    return 1.0 + (CLOSE - 1.0) * np.clip(1.0 - (clear - cell) / WIDE, 0.0, 1.0)
+    return 1.0 + (CHART.close - 1.0) * np.clip(1.0 - (clear - cell) / CHART.wide, 0.0, 1.0)
 
 
 def coarse_prices(free: np.ndarray, cell: float) -> np.ndarray:
@@ -61,10 +71,10 @@ def coarse_prices(free: np.ndarray, cell: float) -> np.ndarray:
     Were half of them enough, a quarter of rung 3's pairs of start and goal would have no way on the coarser grid. So
     all have one, and ridges, four and a half nodes thick, stay closed.
     """
-    count = free.shape[0] // COARSE
+    count = free.shape[0] // CHART.coarse
 
     def mean(grid: np.ndarray) -> np.ndarray:
-        return grid.reshape(count, COARSE, count, COARSE).mean(axis=(1, 3))
+        return grid.reshape(count, CHART.coarse, count, CHART.coarse).mean(axis=(1, 3))
 
     return np.where(mean(free.astype(float)) >= 0.5, mean(prices(free, cell)), np.inf)
 
@@ -89,7 +99,7 @@ def begin(count: int, goal: Any, cell: Any) -> Chart:
 
 
 def look(chart: Chart, price: Any, world: Any, position: Any, yaw: Any, goal: Any, cell: Any) -> Chart:
-    """The chart after a look around and `SWEEPS` relaxations.
+    """The chart after a look around and `CHART.sweeps` relaxations.
 
     A camera on a mast higher than the boulders sees, behind each, the tops of all that are no lower. That hills hide
     what lies behind them is left out.
@@ -105,7 +115,7 @@ def look(chart: Chart, price: Any, world: Any, position: Any, yaw: Any, goal: An
     far = jnp.sqrt(dx * dx + dy * dy)
     cos, sin = jnp.cos(yaw)[:, None, None], jnp.sin(yaw)[:, None, None]
     ahead = dx * cos + dy * sin > far * math.cos(HALF_VIEW)
-    seen = chart.seen | ((far < REACH) & (ahead | (far < AROUND)))
+    seen = chart.seen | ((far < CHART.reach) & (ahead | (far < CHART.around)))
     # the fence of the world is known from the beginning
     edge = jnp.zeros((count, count), bool).at[0].set(True).at[-1].set(True).at[:, 0].set(True).at[:, -1].set(True)
     known = jnp.where(seen | edge, price[world], 1.0)
@@ -123,7 +133,7 @@ def look(chart: Chart, price: Any, world: Any, position: Any, yaw: Any, goal: An
         best = jnp.minimum(straight + cell * known, aslant + math.sqrt(2.0) * cell * known)
         return jnp.where(at_goal, 0.0, best), None
 
-    return Chart(seen, jax.lax.scan(relax, chart.cost, length=SWEEPS)[0])
+    return Chart(seen, jax.lax.scan(relax, chart.cost, length=CHART.sweeps)[0])
 
 
 def way(chart: Chart, price: Any, world: Any, position: Any, goal: Any, cell: Any) -> tuple[Any, Any, Any]:
@@ -140,7 +150,7 @@ def way(chart: Chart, price: Any, world: Any, position: Any, goal: Any, cell: An
     env, cell_position = jnp.arange(position.shape[0]), position / cell
     steps = jnp.asarray([(i, j) for j in (-1, 0, 1) for i in (-1, 0, 1)])
     stride = cell * jnp.sqrt(jnp.sum(steps * steps, axis=-1).astype(position.dtype))
-    share = jnp.linspace(0.0, 1.0, 2 * STEPS + 1)[1:, None, None]
+    share = jnp.linspace(0.0, 1.0, 2 * CHART.steps + 1)[1:, None, None]
 
     def blocked(points: Any) -> Any:
         at = jnp.clip(points.astype(jnp.int32), 0, count - 1)
@@ -149,7 +159,7 @@ def way(chart: Chart, price: Any, world: Any, position: Any, goal: Any, cell: An
     node = jnp.clip(cell_position.astype(jnp.int32), 0, count - 1)
     aim, straight, nodes = node + 0.5, jnp.ones(node.shape[0], bool), []
     left: Any = None
-    for k in range(STEPS):
+    for k in range(CHART.steps):
         near = jnp.clip(node + steps[:, None, :], 0, count - 1)
         cost = chart.cost[env, near[..., 1], near[..., 0]]
         # staying is best at the goal alone: a cost that is out of date must not hold the rover
@@ -171,6 +181,6 @@ def straight(position: Any, goal: Any, cell: Any) -> tuple[Any, Any, Any]:
     """As of `way`, without a chart: straight for the goal."""
     away = goal - position
     far = jnp.sqrt(jnp.sum(away * away, axis=-1, keepdims=True))
-    reach = jnp.minimum(cell * jnp.arange(1, STEPS + 1), far)
+    reach = jnp.minimum(cell * jnp.arange(1, CHART.steps + 1), far)
     nodes = away[:, None] / jnp.maximum(far, 1e-3)[..., None] * reach[..., None]
     return nodes[:, -1], nodes, far[:, 0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from lunar_mjx.envs.ladder.chart import STEPS
+from lunar_mjx.envs.ladder.chart import CHART
 from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.envs.navigation.view import SCAN_SCALE, VIEW
 
@@ -52,7 +52,7 @@ def _scan(env: NavigationEnv, wider: float = 1.0) -> list[Label]:
     ]
 
 
-_PLACES = ("aim", *(f"node {k + 1} of the way" for k in range(STEPS)))
+_PLACES = ("aim", *(f"node {k + 1} of the way" for k in range(CHART.steps)))
 
 LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
     "position": _axes("m"),
