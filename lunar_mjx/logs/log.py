@@ -99,7 +99,8 @@ class Log:
       imposed: "wheel_speed" where the measured wheel speeds are taken as what the wheels did; None where the commands
         are what drove the rover.
       magnitudes: channels that hold a size without its sign, with what each reads where there is nothing, in its unit.
-      ground: what was driven on, in the user's words; nothing is computed from it.
+      ground: what was driven on, in the user's words. Where a model was fitted on other ground, `why` expects that
+        something of the ground differs.
       geodetic_origin: latitude_deg, longitude_deg and projection of the point from which positions count, if stated.
     """
 

@@ -48,6 +48,7 @@ _TOP = (
     "control",
     "effects",
     "priors",
+    "grounds",
     "sun",
 )
 _AMBIENT = ("temperature_degC", "noon_temperature_degC", "night_temperature_degC", "noon_time_s", "period_s")
@@ -90,6 +91,7 @@ def load_model(path: str | Path) -> Model:
         timestep=_number(path, "timestep_s", data.get("timestep_s", model.timestep)),
         thermal_integrator=_text(path, "thermal_integrator", data.get("thermal_integrator", model.thermal_integrator)),
         ambient=ambient,
+        grounds=_grounds(path, data.get("grounds", [])),
         sun=read_sun(path, _table(path, "sun", data["sun"])) if "sun" in data else None,
         modes={**model.modes, **modes},
         gains={**model.gains, **gains},
@@ -167,6 +169,7 @@ def _record(model: Model, path: Path) -> dict[str, Any]:
             if e.parameters
         },
         **({"sun": _sun(model.sun, folder)} if model.sun is not None else {}),
+        **({"grounds": list(model.grounds)} if model.grounds else {}),
         **({"priors": {k: {"value": v, "std": s} for k, (v, s) in model.priors.items()}} if model.priors else {}),
     }
 
@@ -207,6 +210,12 @@ def _control(path: Path, table: Mapping[str, Any], model: Model) -> tuple[dict[s
             for key, old in zip(GAINS, model.gains[group], strict=True)
         )
     return modes, gains
+
+
+def _grounds(path: Path, names: Any) -> tuple[str, ...]:
+    if not isinstance(names, list) or not all(isinstance(n, str) and n for n in names):
+        raise bad_input(path, "grounds", names, "is no list of names", 'write it like ["flooring", "asphalt"]')
+    return tuple(names)
 
 
 def _priors(path: Path, table: Mapping[str, Any]) -> dict[str, tuple[float, float]]:

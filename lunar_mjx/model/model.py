@@ -51,6 +51,7 @@ class Model:
       effect_files: catalogue name or /absolute/file.py:name of every effect.
       priors: value and standard deviation of what is known of a parameter (`effect.parameter`) or of an instrument
         (`calibration.pitch`) before a fit; a standard deviation of zero fixes it.
+      grounds: what the logs that it was fitted to were driven on, in their words.
       sun: where the Sun stands or how it moves, for power, heat and cameras; None where each has its own default.
     """
 
@@ -69,6 +70,7 @@ class Model:
     effect_files: Mapping[str, str] = dataclasses.field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     sun: SunSettings | None = None
+    grounds: tuple[str, ...] = ()
 
     @property
     def effect_names(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.logs.readers.clocks import seconds
-from lunar_mjx.logs.readers.import_map import ImportMap, Source, TableMap, file_pattern
+from lunar_mjx.logs.readers.import_map import FOLDER, ImportMap, Source, TableMap, file_pattern
 from lunar_mjx.logs.readers.recorded_drive import (
     LATITUDE,
     LONGITUDE,
@@ -105,6 +105,8 @@ def _read(name: str, files: Files, mapping: ImportMap) -> Iterator[RecordedDrive
     notes = [f"has no file for the table {t} ({mapping.tables[t].file})" for t in missing]
     parts: dict[str, tuple[str, pd.DataFrame]] = {}
     settings, copies = {}, []
+    if mapping.settings.get("ground") == FOLDER:
+        settings["ground"] = next(iter(files.values())).resolve().parent.name.lower()
     for t, path in files.items():
         table = mapping.tables[t]
         frame = _frame(path, table, f"{mapping.path}: tables.{t}", notes)

@@ -19,6 +19,8 @@ from lunar_mjx.toml_fields import Fields
 SHIPPED = Path(__file__).resolve().parent / "maps"
 """Folder of the maps that ship with the package."""
 DRIVE = "{drive}"
+FOLDER = "{folder}"
+"""What `log.ground` may be: the name of the folder that a drive's files lie in."""
 """Stands in a file's pattern for the text by which files of one drive belong together."""
 PROJECTIONS = ("tangent", "utm")
 HELD = ("auto", "never")
@@ -169,6 +171,8 @@ def read_map(path: str | Path) -> ImportMap:
             "name topics as well as files",
             "write one map for the bag and one for the files",
         )
+    if log.values.get("ground") == FOLDER and any(t.topic for t in tables.values()):
+        raise bad_input(path, "log.ground", FOLDER, "is for files, and the map names topics", "name the ground itself")
     if 0 < sum(bool(t.group) for t in tables.values()) < len(tables):
         lacking = next(name for name, t in tables.items() if not t.group)
         raise bad_input(

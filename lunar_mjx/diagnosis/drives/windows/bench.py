@@ -69,7 +69,19 @@ class Bench:
         """The model and what may be missing of it, against the windows with their noise."""
         observations = observe(self.problem(None), noise, self.names, self.splits)
         mine = self.suspects if suspects is None else suspects
-        return WindowForm(self.problem, self.base, mine, observations, WindowSettings())
+        return WindowForm(self.problem, self.base, mine, observations, WindowSettings(), self.other_ground)
+
+    @property
+    def grounds(self) -> tuple[str, ...]:
+        """What the logs that are fitted were driven on, as far as they say."""
+        fitted = np.unique(self.cut.log[self.fitted])
+        return tuple(sorted({self.logs[k].ground for k in fitted} - {""}))
+
+    @property
+    def other_ground(self) -> bool:
+        """Whether every log names a ground, and none that the model was fitted on."""
+        named = {log.ground for log in self.logs}
+        return bool(self.model.grounds) and "" not in named and not named & set(self.model.grounds)
 
     def question(self, noise: Sequence[Noise], suspects: Sequence[Suspect] | None = None) -> Problem:
         """The windows and everything that may be missing, as the problem that the search of hypotheses takes.

@@ -25,6 +25,7 @@ from lunar_mjx.diagnosis.drives.windows.settings import (
     DIFFERENCES,
     DRIFTED,
     LATE_S,
+    LAW_SHARE,
     NOISE_LOG_STD,
     UNEVEN_DEG,
     UNKNOWN_SLOPE_DEG,
@@ -33,6 +34,7 @@ from lunar_mjx.diagnosis.drives.windows.settings import (
 )
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
 from lunar_mjx.effects import catalogue
+from lunar_mjx.inference.bounded_descent import minimise
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
 from lunar_mjx.inference.observations import Observations, Series
@@ -53,6 +55,8 @@ DRAG, RISE = Unknown("rolling_resistance", "coefficient", 0.03), Unknown(CALIBRA
 """What differs from recording to recording and no fit moves: resistance of the ground over its load; its slope, deg."""
 DRIVE = "this drive"
 """Effect of the coordinates that belong to the one recording there is."""
+OF_THE_GROUND = ("ground", "friction")
+"""Families of suspects that another ground brings with it."""
 FIXED = 1e-3
 """Prior standard deviation of a coordinate that does not move."""
 
@@ -141,6 +145,7 @@ class WindowForm(MeasuredForm):
         suspects: Sequence[Suspect],
         observations: WindowObservations,
         settings: WindowSettings,
+        other_ground: bool = False,
     ):
         """Makes the form.
 
@@ -148,6 +153,7 @@ class WindowForm(MeasuredForm):
           problem: of a form of the ground (None: as the model has it).
           base: the model's own unknowns. suspects: what may be missing.
           observations: what was measured. settings: how rare things are.
+          other_ground: whether the logs say that they were driven on other ground than those of the model's fit.
         """
         self.name, self.log_prior = "the model's own ground", 0.0
         self.problem, self.settings, self.observations = problem, settings, observations  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -186,11 +192,31 @@ class WindowForm(MeasuredForm):
         sizes = {n: self.model.priors.get(f"{BETWEEN}.{d.key}", (0.0, d.size))[1] for n, d in DIFFERENCES.items()}
         self._fields = tuple(Field(name, sizes[name] / self.shares[name]) for name in DIFFERENCES)
         self.terms = (
-            *(Term(name, EFFECT, settings.effect_log_odds) for name in candidates),
+            *(Term(s.name, EFFECT, self._log_odds(s, suspects, other_ground)) for s in suspects),
             *(Term(name, UNLISTED, settings.unlisted_log_odds) for name, d in DIFFERENCES.items() if d.unlisted),
         )
         self.fit = observations.in_split("fit")
         self._low, self._high = self._bounds()
+
+    def _log_odds(self, suspect: Suspect, suspects: Sequence[Suspect], other_ground: bool) -> float:
+        """Log of the prior odds of a suspect: what belongs to the ground shares the odds that other ground differs."""
+        if not other_ground or suspect.family not in OF_THE_GROUND:
+            return self.settings.effect_log_odds
+        return math.log(self.settings.other_ground_odds / sum(s.family in OF_THE_GROUND for s in suspects))
+
+    def _by_motion(self) -> np.ndarray:
+        """(window, k) columns of what differs from motion to motion: of all recordings together, and of each."""
+        problem = self.problem(None)
+        recordings = problem.cut.recordings
+        if self.single:
+            return by_motion(*problem.rims)
+        columns = [math.sqrt(LAW_SHARE) * by_motion(*problem.rims)]
+        for n in np.unique(recordings):
+            mine = recordings == n
+            own = by_motion(*problem.rims[:, mine])
+            columns.append(np.zeros((len(mine), own.shape[1])))
+            columns[-1][mine] = math.sqrt(1.0 - LAW_SHARE) * own
+        return np.concatenate(columns, axis=1)
 
     def usual_differences(self) -> dict[str, float]:
         """Usual size of every difference between drives, in units of its coordinates' priors."""
@@ -214,16 +240,6 @@ class WindowForm(MeasuredForm):
         flat = bool(self.problem(None).cut.unlevelled)
         out.append(("lateness of currents", Unknown(CALIBRATION, "current_clock", LATE_S)))
         out.append(("slope", dataclasses.replace(RISE, std=UNKNOWN_SLOPE_DEG if flat else UNEVEN_DEG)))
-        return out
-
-    def _by_motion(self) -> dict[int, np.ndarray]:
-        """(window, k) columns of what differs from motion to motion, by recording; zero in windows of others."""
-        problem, out = self.problem(None), {}
-        for n in np.unique(problem.cut.recordings):
-            mine = problem.cut.recordings == n
-            columns = by_motion(*problem.rims[:, mine])
-            out[int(n)] = np.zeros((len(mine), columns.shape[1]))
-            out[int(n)][mine] = columns
         return out
 
     def _coordinate(self, effect: str, q: Unknown, prior: float) -> Coordinate:
@@ -330,18 +346,20 @@ class WindowForm(MeasuredForm):
         ground = ("friction_angle", "", "shear_modulus") if soft else ("mu", "side", "slip_scale")
         grip, side, slip = (by(f"{SOFT if soft else 'hard_ground'}.{name}") for name in ground)
         drag, tilt = (slopes[:, k] / q.std for k, q in ((-2, DRAG), (-1, RISE)))
-        shapes = (drag, grip, side, slip, size, apart, drag, grip, size)
+        shapes = (drag, grip, side, slip, size, apart, drag, grip, side, size)
         columns, field, std = [], [], []
         for number, (name, shape) in enumerate(zip(DIFFERENCES, shapes, strict=True)):
-            motions = name.endswith(BY_MOTION)
-            if shape is None or (self.single and not motions):
+            if shape is None:
                 continue
-            for n in np.unique(recording):
-                mine = np.where(recording == n, shape, 0.0) * self.shares[name]
-                parts = self._motions[n][at[1]] if motions else np.ones((len(mine), 1))
-                columns += list((mine[:, None] * parts).T)
-                field += [number] * parts.shape[1]
-                std += [1.0] * parts.shape[1]
+            if name.endswith(BY_MOTION):
+                mine = (shape * self.shares[name])[:, None] * self._motions[at[1]]
+            elif not self.single:
+                mine = np.where(recording[:, None] == np.unique(recording), shape[:, None] * self.shares[name], 0.0)
+            else:
+                continue
+            columns += list(mine.T)
+            field += [number] * mine.shape[1]
+            std += [1.0] * mine.shape[1]
         clock, late = by(f"{CALIBRATION}.imu_clock"), by(f"{CALIBRATION}.current_clock")
         if late is not None and not self.single:
             for n in np.unique(recording):
@@ -427,6 +445,9 @@ class WindowForm(MeasuredForm):
             u[free] = start[free]
         elif near is not None:
             u[free] = near.u[free]
+        if effects:
+            # what usually differs may have taken up what an effect now explains, and would not give it back by steps
+            u[list(self._field)] = 0.0
         if SOFT in effects:
             u[self.instead] = 1.0
             free = free[free != self.instead]
@@ -456,6 +477,43 @@ class WindowForm(MeasuredForm):
                 failed = ""
                 break
         return Refit(self.name, effects, u, self.linearise(u)[0], failed)
+
+    def alone(self, refit: Refit) -> np.ndarray:
+        """See `MeasuredForm`: where neither recordings nor motions differ, and each window counts once per channel.
+
+        Samples of one window repeat one motion. Were each to count, parameters would leave their priors for what a law
+        is off by at the motions that were driven most.
+        """
+        observations, fit = self.observations, self.fit
+        places = [self.candidates[e] for e in self.candidates if e in refit.effects]
+        free = np.concatenate([self.baseline, *places]).astype(int)
+        free = free[free != self.instead]
+        sizes = np.append(refit.linear.evidence(self.listed(refit.effects))[1].tau, 1.0)
+        field = np.array([self._field.get(i, -1) for i in free])
+        prior = np.array([self.coordinates[i].prior for i in free]) * sizes[field]
+        centre = np.array([self.coordinates[i].centre for i in free])
+        channel, window = observations.at[0][fit], observations.window[fit]
+        samples = np.zeros((len(CHANNELS), window.max() + 1))
+        np.add.at(samples, (channel, window), 1.0)
+        square = (observations.value - self.predicted(refit.u))[fit] ** 2
+        usual = np.sqrt(
+            np.bincount(channel, square, len(CHANNELS)) / np.maximum(np.bincount(channel, minlength=len(CHANNELS)), 1)
+        )
+        weight = 1.0 / (np.maximum(usual[channel], 1e-9) * np.sqrt(samples[channel, window]))
+
+        def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            place = refit.u.copy()
+            place[free] = x
+            value, slope = self.slopes(place, free)
+            off = weight * (observations.value - value)[fit]
+            return (
+                np.concatenate([off, (x - centre) / prior]),
+                np.vstack([-weight[:, None] * slope[fit][:, free], np.diag(1.0 / prior)]),
+            )
+
+        u = refit.u.copy()
+        u[free] = minimise(at, u[free], self._low[free] + 1e-9, self._high[free] - 1e-9, SETTLED, STEPS)
+        return u
 
     def _cost(
         self, linear: Linear, columns: np.ndarray, sizes: tuple[np.ndarray, np.ndarray], free: np.ndarray

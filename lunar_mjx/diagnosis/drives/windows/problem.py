@@ -209,7 +209,8 @@ class WindowProblem:
         out = []
         both = of("current_scale")
         half = 0.5 * of("current_difference")
-        scale = [1.0 + both + half + of("current_left"), 1.0 + both - half + of("current_right")]
+        # scales are positive: a third of a current is as far from the whole as three times it
+        scale = [np.exp(both + half + of("current_left")), np.exp(both - half + of("current_right"))]
         friction = [0.5 * of("friction_difference") * self._sense[0], -0.5 * of("friction_difference") * self._sense[1]]
         for side, channel in enumerate(CURRENTS):
             series = whole(scale[side] * (late(current[:, side], of("current_clock")) + friction[side]))

@@ -18,6 +18,9 @@ class WindowSettings(SearchSettings):
 
     most_terms: int = 4
     """1; terms of one hypothesis at most: a drive tells less than a table."""
+    other_ground_odds: float = 1.0
+    """1; prior odds that something of the ground differs where the logs name another ground than the model's logs did:
+    as likely as not. Else each suspect of the ground has `effect_odds`, as any other."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +59,9 @@ DIFFERENCES: Mapping[str, Difference] = MappingProxyType(
         "wheel_shear: friction by motion": Difference(
             "grip_by_motion", "friction on the ground from one motion to another", 0.1
         ),
+        "wheel_shear: side friction by motion": Difference(
+            "side_grip_by_motion", "friction across over along the wheels from one motion to another", 0.1
+        ),
         "motor_torque: current by motion": Difference(
             "current_by_motion", "current for a torque from one motion to another", 0.05
         ),
@@ -68,9 +74,13 @@ Several recordings teach their own sizes. Unlisted: ground that gives way resist
 (Wong 2008), friction spans from ice to rubber, and gears, magnets and ammeters that are out of order change a current
 by a quarter.
 
-The last three depend on how the rover moves (see `by_motion`): no contact law and no gear follows its law exactly, to 5
+The last four depend on how the rover moves (see `by_motion`): no contact law and no gear follows its law exactly, to 5
 to 10 % (Wong 2008), and what a law is off by on a pivot it is off by on every pivot, however many windows hold one.
 """
+
+LAW_SHARE = 0.5
+"""Share of the variance of differences by motion that all recordings have in common, which is the law's own error; the
+rest belongs to each recording's ground."""
 
 TURNED_RAD, FASTER = 0.5, 0.7
 """How unlike two motions are of which one says little of a law's error at the other: difference of the angle whose

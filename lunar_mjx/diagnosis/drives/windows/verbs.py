@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from lunar_mjx.diagnosis.drives.windows.bench import WINDOWS_FILE, Bench
 from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, DRIFT, Unknown, catalogue_of, data_sheet
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS
-from lunar_mjx.diagnosis.drives.windows.form import DRIVE, INSTEAD, WindowForm, between
+from lunar_mjx.diagnosis.drives.windows.form import DRIVE, INSTEAD, OF_THE_GROUND, WindowForm, between
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, corners
 from lunar_mjx.diagnosis.folder.refits import write_refits
 from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE, Run
@@ -79,12 +79,14 @@ def compare(run: Run, logs: Sequence[Log], progress: Progress = silent, like: Be
         question = bench.question(noise, ())
         progress("fitting", math.nan)
         refit = _form(question).refit(frozenset(), None, None)
+        alone = _form(question).alone(refit)
         own = question.own
         start = own.residual(own.origin())
         _save_windows(bench, noise)
-        run.save(COMPARISON_FILE, comparison(bench, question, start, refit, time.monotonic() - begin))
-        answer.save_series(run, own, start, {"refitted": (own, refit.u)})
-        save_model(fitted_model(_form(question), refit), run.folder / FITTED_FILE)
+        run.save(COMPARISON_FILE, comparison(bench, question, start, refit, alone, time.monotonic() - begin))
+        answer.save_series(run, own, start, {"refitted": (own, alone)})
+        fitted = dataclasses.replace(fitted_model(_form(question), refit), grounds=bench.grounds)
+        save_model(fitted, run.folder / FITTED_FILE)
     return run
 
 
@@ -114,14 +116,21 @@ def _save_windows(bench: Bench, noise: Sequence[Noise]) -> None:
     )
 
 
-def comparison(bench: Bench, question: Problem, start: np.ndarray, refit: Refit, seconds: float) -> dict[str, Any]:
-    """What `comparison.json` holds: errors in sigma and in the channels' units, parameters, what is not told."""
+def comparison(
+    bench: Bench, question: Problem, start: np.ndarray, refit: Refit, alone: np.ndarray, seconds: float
+) -> dict[str, Any]:
+    """What `comparison.json` holds: errors in sigma and in the channels' units, parameters, what is not told.
+
+    Args:
+      bench, question: the windows and what they are asked. start: (n,) whitened residuals of the model as given.
+      refit: of the model. alone: (coordinates,) where it predicts best by itself. seconds: that it took.
+    """
     form = _form(question)
-    found = answer.comparison(question, start, refit)
+    found = answer.comparison(question, start, refit, alone)
     rows = found["by_channel"]
     place = {(r["manoeuvre"], r["split"], r["channel"]): r for r in rows}
     observations = form.observations
-    off = {"as_given": form.predicted(form.origin()), "refitted": form.predicted(refit.u)}
+    off = {"as_given": form.predicted(form.origin()), "refitted": form.predicted(alone)}
     sigma: dict[str, Noise] = dict(zip(CHANNELS, observations.noise, strict=True))
     for s in observations.series:
         part = np.arange(s.start, s.stop)
@@ -250,7 +259,8 @@ def why(run: Run, logs: Sequence[Log], only: Sequence[str] | None, seconds: floa
         form = _form(question)
         base = found.base(form.name).refit
         start = form.residual(form.origin())
-        run.save(COMPARISON_FILE, comparison(bench, question, start, base, time.monotonic() - begin))
+        alone = form.alone(base)
+        run.save(COMPARISON_FILE, comparison(bench, question, start, base, alone, time.monotonic() - begin))
         tried = {tuple(sorted(h.effects)): h.refit.u for h in found.hypotheses if h.refitted and h.effects}
         write_refits(run.folder, {e: (form.residual(u), form.predicted(u)) for e, u in tried.items()})
         untold = not_told(form, base)
@@ -361,12 +371,13 @@ def add(run: Run, logs: Sequence[Log], name: str, out: Path, progress: Progress)
     for key in {q.key for q in suspect.unknowns} | {q.key for q in bench.base if q.effect == CALIBRATION}:
         q, value = wide[key], model.priors[key][0]
         priors[key] = (value, q.std * value if q.factor else q.std)
-    model = dataclasses.replace(model, priors=priors)
+    grounds = bench.grounds if suspect.family in OF_THE_GROUND else run.model.grounds
+    model = dataclasses.replace(model, priors=priors, grounds=grounds)
     child = dataclasses.replace(
         run, folder=Path(out), model=model, added=(*run.added, name), parent=str(run.folder.resolve())
     )
     compare(child, logs, progress, bench)
-    _say_what_moved(child, errors(form, form.predicted(base.u)))
+    _say_what_moved(child, errors(form, form.predicted(form.alone(base))))
     return child
 
 
