@@ -14,6 +14,7 @@ EFFECTS = (
     "motor",
     "directional_gear_efficiency",
     "coulomb_friction",
+    "viscous_friction",
     "com_offset",
     "soil",
     "hard_surface",
@@ -35,6 +36,9 @@ class Tyres:
     """Damping of the rover on its tyres over the critical one."""
     gear_friction: float = 0.02
     """Coulomb friction of a drive over the torque that lifts the whole weight at the rim; 2 N m of a Husky's 97."""
+    gear_drag: float = 0.01
+    """Torque of a drive's viscous friction at a rim speed of 1 m/s over the torque that lifts the whole weight at the
+    rim: half of the Coulomb friction, as grease in gears of some tens to one makes."""
     # Rubber on floors and asphalt: friction; slip at which it is reached to 1/e; friction across a tyre over along
     # it.
     friction: float = 0.6
@@ -77,4 +81,6 @@ def hard_floor(rover: str | Path | Rover, gravity: float | None = None) -> Model
         slip_scale=TYRES.slip_scale,
         side=TYRES.side,
     )
-    return model.set("coulomb_friction", "hard floor", torque=TYRES.gear_friction * load * len(wheels) * radius)
+    lifting = load * len(wheels) * radius
+    model = model.set("viscous_friction", "hard floor", damping=TYRES.gear_drag * lifting * radius)
+    return model.set("coulomb_friction", "hard floor", torque=TYRES.gear_friction * lifting)

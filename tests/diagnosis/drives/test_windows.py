@@ -329,7 +329,7 @@ def test_the_husky_file_is_the_hard_floor_of_any_rover(model):
     """`models/husky/hard_floor.toml` spells out what `hard_floor` derives from a rover's weight and size."""
     derived = hard_floor("husky")
     assert [e.name for e in derived.effects] == [e.name for e in model.effects]
-    for name in ("hard_ground", "coulomb_friction"):
+    for name in ("hard_ground", "coulomb_friction", "viscous_friction"):
         for key, value in derived.parameters[name].items():
             np.testing.assert_allclose(value, model.parameters[name][key], rtol=0.05)
 
