@@ -148,10 +148,13 @@ class Field:
     Attributes:
       name: for reports.
       usual: scale of tau's half-normal prior, in the unit of the amplitudes (such as 0.05 for 5 % of a stress).
+      log_std: standard deviation of log tau where other measurements have told tau; if positive, tau has a log-normal
+        distribution about `usual` in place of the half-normal one.
     """
 
     name: str
     usual: float
+    log_std: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -321,7 +324,7 @@ def infer(
     usual = np.array([f.usual for f in fields])
     # sizes are positive, and their posterior is nearer to a normal one in the logarithm: Laplace's method is used there
     x = np.log(np.concatenate([usual, np.ones(len(noises))] if start is None else [*start]))
-    here = _density(x, gram, amplitudes, usual, noises)
+    here = _density(x, gram, amplitudes, fields, noises)
     promised = np.inf
     for _ in range(SIZE_DESCENT.most_steps):
         step = _newton_step(here)
@@ -331,7 +334,7 @@ def infer(
         # in the logarithms a long step leaves the region in which the density is near its quadratic
         step *= min(1.0, SIZE_DESCENT.longest / max(float(np.abs(step).max()), 1e-300))
         for _ in range(30):
-            there = _density(x + step, gram, amplitudes, usual, noises)
+            there = _density(x + step, gram, amplitudes, fields, noises)
             if there.value >= here.value:
                 break
             step *= 0.5
@@ -403,14 +406,16 @@ def _condition(
     return -0.5 * (size + square - float(downhill @ mean) + log_det), mean, covariance, scale
 
 
-def _density(x: np.ndarray, gram: Gram, amplitudes: Amplitudes, usual: np.ndarray, noises: Sequence[NoiseSize]) -> _At:
+def _density(
+    x: np.ndarray, gram: Gram, amplitudes: Amplitudes, fields: Sequence[Field], noises: Sequence[NoiseSize]
+) -> _At:
     """Log density of measurements and log sizes together, with exact first and second derivatives.
 
     With V the covariance of the measurements, V_i its derivative by a log size (V_ii = 2 V_i) and q = V^-1 r:
     gradient_i = (q V_i q - tr V^-1 V_i)/2; -Hessian_ij = q V_i V^-1 V_j q - tr(V^-1 V_i V^-1 V_j)/2, and on the
     diagonal tr V^-1 V_i - q V_i q beside it. Woodbury's identity brings all of them into the space of the amplitudes.
     """
-    many, groups, k = len(usual), len(noises), gram.width
+    many, groups, k = len(fields), len(noises), gram.width
     tau, noise = np.exp(x[:many]), np.exp(x[many:])
     value, mean, inverse, scale = _condition(gram, amplitudes, tau, noise)
     shift = amplitudes.mean
@@ -449,10 +454,16 @@ def _density(x: np.ndarray, gram: Gram, amplitudes: Amplitudes, usual: np.ndarra
     quadratic[many:, :many], traces[many:, :many] = quadratic[:many, many:].T, traces[:many, many:].T
     gradient = power - trace
     hessian = 4.0 * quadratic - 2.0 * traces + np.diag(2.0 * (trace - power))
-    for i in range(many):
+    for i, field in enumerate(fields):
+        if field.log_std > 0.0:
+            off = (x[i] - math.log(field.usual)) / field.log_std
+            value -= 0.5 * off**2 + math.log(field.log_std) + 0.5 * _LOG_2PI
+            gradient[i] -= off / field.log_std
+            hessian[i, i] += 1.0 / field.log_std**2
+            continue
         # Half-normal prior of tau with the Jacobian of its logarithm.
-        share = (tau[i] / usual[i]) ** 2
-        value += 0.5 * math.log(2.0 / math.pi) + x[i] - math.log(usual[i]) - 0.5 * share
+        share = (tau[i] / field.usual) ** 2
+        value += 0.5 * math.log(2.0 / math.pi) + x[i] - math.log(field.usual) - 0.5 * share
         gradient[i] += 1.0 - share
         hessian[i, i] += 2.0 * share
     for c, prior in enumerate(noises):

@@ -12,7 +12,7 @@ from lunar_mjx.inference import evidence
 from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize, infer, log_box
 
 N, OWN, EACH = 60, 3, 8
-FIELDS = (Field("a", 0.5), Field("b", 0.2))
+FIELDS = (Field("a", 0.5), Field("b", 0.2, log_std=0.4))
 NOISES = (NoiseSize("stated", 0.3), NoiseSize("replicates", freedom=20.0))
 
 
@@ -40,7 +40,9 @@ def dense(columns, residual, group, amplitudes, tau, noise):
 
 def priors(tau, noise):
     """Log prior density of the logarithms of the sizes."""
-    total = sum(stats.halfnorm.logpdf(t, scale=f.usual) + math.log(t) for t, f in zip(tau, FIELDS, strict=True))
+    half, told = FIELDS
+    total = stats.halfnorm.logpdf(tau[0], scale=half.usual) + math.log(tau[0])
+    total += stats.norm.logpdf(math.log(tau[1] / told.usual), scale=told.log_std)
     total += stats.norm.logpdf(math.log(noise[0]), scale=0.3)
     v = NOISES[1].freedom
     variance = noise[1] ** 2
@@ -53,7 +55,7 @@ def test_density_at_given_sizes_is_that_of_the_dense_gaussian(drawn):
     for tau, noise in (([0.4, 0.1], [1.0, 0.9]), ([3.0, 1e-3], [0.5, 2.0])):
         tau, noise = np.array(tau), np.array(noise)
         x = np.log(np.concatenate([tau, noise]))
-        found = evidence._density(x, gram, amplitudes, np.array([f.usual for f in FIELDS]), NOISES)
+        found = evidence._density(x, gram, amplitudes, FIELDS, NOISES)
         wanted = dense(columns, residual, group, amplitudes, tau, noise) + priors(tau, noise)
         assert found.value == pytest.approx(wanted, abs=1e-8)
 
@@ -61,11 +63,10 @@ def test_density_at_given_sizes_is_that_of_the_dense_gaussian(drawn):
 def test_gradient_and_hessian_are_derivatives(drawn):
     columns, residual, group, amplitudes = drawn
     gram = Gram.of(columns, residual, group, 2)
-    usual = np.array([f.usual for f in FIELDS])
     x = np.log([0.6, 0.15, 1.2, 0.9])
 
     def at(y):
-        return evidence._density(y, gram, amplitudes, usual, NOISES)
+        return evidence._density(y, gram, amplitudes, FIELDS, NOISES)
 
     step = 1e-5 * np.eye(4)
     slope = np.array([(at(x + h).value - at(x - h).value) / 2e-5 for h in step])
@@ -109,7 +110,7 @@ def test_laplace_over_sizes_agrees_with_quadrature(seed):
 
     def density(log_s, log_tau):
         x = np.array([log_tau, log_s])
-        return math.exp(evidence._density(x, gram, amplitudes, np.array([0.2]), noise).value - found.log_evidence)
+        return math.exp(evidence._density(x, gram, amplitudes, field, noise).value - found.log_evidence)
 
     # tau below 1e-4 changes nothing: its prior mass there is negligible
     ratio = integrate.dblquad(density, math.log(1e-4), math.log(2.0), -1.5, 1.5, epsabs=1e-3)[0]

@@ -29,6 +29,7 @@ from lunar_mjx.diagnosis.drives.windows.settings import (
     NOISE_LOG_STD,
     UNEVEN_DEG,
     UNKNOWN_SLOPE_DEG,
+    Difference,
     WindowSettings,
     by_motion,
 )
@@ -189,8 +190,7 @@ class WindowForm(MeasuredForm):
         self.unknowns, self.coordinates, self.candidates = tuple(unknowns), tuple(coordinates), candidates
         self._all = (*self.unknowns, DRAG, RISE)
         self.words = {name: d.words for name, d in DIFFERENCES.items()}
-        sizes = {n: self.model.priors.get(f"{BETWEEN}.{d.key}", (0.0, d.size))[1] for n, d in DIFFERENCES.items()}
-        self._fields = tuple(Field(name, sizes[name] / self.shares[name]) for name in DIFFERENCES)
+        self._fields = tuple(self._size(name, d) for name, d in DIFFERENCES.items())
         self.terms = (
             *(Term(s.name, EFFECT, self._log_odds(s, suspects, other_ground)) for s in suspects),
             *(Term(name, UNLISTED, settings.unlisted_log_odds) for name, d in DIFFERENCES.items() if d.unlisted),
@@ -203,6 +203,11 @@ class WindowForm(MeasuredForm):
         if not other_ground or suspect.family not in OF_THE_GROUND:
             return self.settings.effect_log_odds
         return math.log(self.settings.other_ground_odds / sum(s.family in OF_THE_GROUND for s in suspects))
+
+    def _size(self, name: str, d: Difference) -> Field:
+        """Size of a difference before these logs: as other logs have told it, else as it usually is."""
+        told, std = self.model.priors.get(f"{BETWEEN}.{d.key}", (0.0, 0.0))
+        return Field(name, (told or d.size) / self.shares[name], std / told if told else 0.0)
 
     def _by_motion(self) -> np.ndarray:
         """(window, k) columns of what differs from motion to motion: of all recordings together, and of each."""
@@ -572,9 +577,13 @@ class WindowForm(MeasuredForm):
         return best, left
 
 
-def between(linear_tau: np.ndarray, log_std: np.ndarray, shares: Mapping[str, float]) -> dict[str, float]:
-    """Sizes of what differs between recordings by the key of a model's file, from fitted sizes of the fields."""
+def between(tau: np.ndarray, log_std: np.ndarray, shares: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Sizes of what differs between recordings and their standard deviations, by the key of a model's file.
+
+    Args:
+      tau, log_std: (field,) fitted sizes of the fields and how well their logarithms are known. shares: by field.
+    """
     return {
-        f"{BETWEEN}.{d.key}": float(t * math.exp(s**2) * shares[name])
-        for (name, d), t, s in zip(DIFFERENCES.items(), linear_tau, log_std, strict=True)
+        f"{BETWEEN}.{d.key}": (float(t * shares[name]), float(t * s * shares[name]))
+        for (name, d), t, s in zip(DIFFERENCES.items(), tau, log_std, strict=True)
     }

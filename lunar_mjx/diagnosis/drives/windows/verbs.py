@@ -230,7 +230,7 @@ def fitted_model(form: WindowForm, refit: Refit) -> Model:
     cut = form.problem(None).cut
     if len(np.unique(cut.recordings[np.unique(form.observations.window[form.fit])])) > 2:
         _, found, _ = refit.linear.evidence(form.listed(refit.effects))
-        priors |= {k: (0.0, size) for k, size in between(found.tau, found.tau_log_std, form.shares).items()}
+        priors |= between(found.tau, found.tau_log_std, form.shares)
     return dataclasses.replace(model, priors=priors)
 
 
