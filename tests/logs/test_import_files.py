@@ -62,6 +62,21 @@ def test_blanks_sentinels_clocks_and_sums(tmp_path: Path) -> None:
     assert log.source["files"] == "a.txt"
 
 
+def test_the_ground_may_be_the_name_of_the_folder(tmp_path: Path) -> None:
+    ice = tmp_path / "ICE"
+    ice.mkdir()
+    (ice / "a.txt").write_text("2 1 500 10:00:00.0\n4 1 600 10:00:00.5\n", encoding="utf-8")
+    text = MAP.replace("[log]", '[log]\nground = "{folder}"')
+    found = import_drives(ice, tmp_path / "log", write_map(tmp_path, text))
+    assert drive(found.folder).ground == "ice"
+    told = import_drives(ice, tmp_path / "other", write_map(tmp_path, text), changes={"ground": "frozen lake"})
+    assert drive(told.folder).ground == "frozen lake"
+    bag = text[: text.index("[tables.drive]")] + '[tables.drive]\ntopic = "/odom"\n[tables.drive.channels]\n'
+    bag += 'body_velocity_x_m_s = "twist.twist.linear.x"\n'
+    with pytest.raises(UserError, match="log.ground"):
+        read_map(write_map(tmp_path, bag, "bag.toml"))
+
+
 @pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), (" ", ".")])
 def test_the_separator_is_guessed(tmp_path: Path, separator: str, decimal: str) -> None:
     rows = [("time", "speed", "note"), *((f"{0.1 * k:.2f}", f"{k + 0.5:.3f}", f"{k}") for k in range(30))]

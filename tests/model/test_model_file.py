@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import tomllib
 from pathlib import Path
@@ -36,7 +37,8 @@ MINIMAL: dict[str, Any] = {"format": FORMAT, "rover": "luvmi_x", "terrain": "fla
 
 def assert_same(a: Model, b: Model) -> None:
     """Bit by bit the same model (effects of a user's file are made anew by every load)."""
-    for field in ("preset", "terrain_spec", "gravity", "timestep", "thermal_integrator", "ambient", "modes", "gains"):
+    settings = ("preset", "terrain_spec", "gravity", "timestep", "thermal_integrator", "ambient", "modes", "gains")
+    for field in (*settings, "grounds"):
         assert getattr(a, field) == getattr(b, field), field
     assert a.effect_names == b.effect_names and a.effect_files == b.effect_files
     assert {k: dict(v) for k, v in a.parameters.items()} == {k: dict(v) for k, v in b.parameters.items()}
@@ -66,6 +68,7 @@ def varied(tmp_path: Path) -> dict[str, Model]:
         ),
         "globals": base.replace(gravity=9.81, timestep=1e-3 / 3.0, thermal_integrator="euler"),
         "slope": make_model("luvmi_x", "slope:7.5deg", "paper"),
+        "fitted": dataclasses.replace(base, grounds=("asphalt", "flooring")),
     }
 
 
@@ -314,6 +317,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "nested list": ({"effects": {"motor": {"resistance": [[1.0]]}}}, ["effects.motor.resistance", "not a number"]),
     "value of no group": ({"effects": {"motor": {"gear_ratio": {"arm": 3.0}}}}, ["gear_ratio.arm = 3.0", "drive"]),
+    "grounds that are no list": ({"grounds": "ice"}, ["grounds = 'ice'", "is no list of names"]),
     "groups for one number": (soil(n={"drive": 1.0}), ["effects.soil.n", "give one number here"]),
 }
 

@@ -16,6 +16,7 @@ from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.dynamics.imposed import Windows
 from lunar_mjx.errors import UserError
+from lunar_mjx.inference.weighing.hypotheses import EFFECT
 from lunar_mjx.inference.weighing.search import search
 from lunar_mjx.logs import read_campaign
 from lunar_mjx.model.file import load_model, save_model
@@ -392,6 +393,48 @@ def test_like_motions_share_what_a_law_is_off_by():
     np.testing.assert_allclose(np.diag(covariance), 1.0, atol=0.1)
     assert min(covariance[0, 1], covariance[2, 3]) > 0.8
     assert np.abs([covariance[0, 2], covariance[0, 4], covariance[2, 4]]).max() < 0.1
+
+
+def test_half_of_a_laws_error_is_shared_by_recordings(model):
+    """Windows of one motion share all of it within a recording, and half of it between recordings."""
+    found = dataclasses.replace(drives(), log=np.arange(24) // 12)
+    form = form_of(model, found)
+    covariance = form._motions @ form._motions.T
+    within, between = covariance[0, 6], covariance[0, 12]
+    assert within == pytest.approx(1.0, abs=0.1)
+    assert between == pytest.approx(0.5, abs=0.1)
+
+
+def test_other_ground_raises_the_odds_of_what_belongs_to_it(model):
+    problem = WindowProblem(drives(), model)
+    splits = np.array(["fit"] * 24)
+    observations = observe(problem, NOISE, [f"log {k}" for k in range(4)], splits)
+    suspects = [s for s in coordinates.suspects_of(model) if s.name in SUSPECTS]
+    settings = WindowSettings()
+
+    def odds(other_ground):
+        base = coordinates.baseline(model)
+        form = WindowForm(lambda _: problem, base, suspects, observations, settings, other_ground)
+        return {t.name: np.exp(t.log_prior) for t in form.terms if t.kind == EFFECT}
+
+    usual, raised = odds(False), odds(True)
+    assert set(usual.values()) == {pytest.approx(settings.effect_odds)}
+    of_ground = {"rolling_resistance", "hard_ground.mu"}
+    assert {n for n in usual if raised[n] > 2.0 * usual[n]} == of_ground
+    assert sum(raised[n] for n in of_ground) == pytest.approx(settings.other_ground_odds)
+
+
+def test_alone_a_model_predicts_better_than_with_differences_taken_out(model):
+    """Where every recording differs by as much, the model alone has to take it up, and the refit leaves it to them."""
+    found = measured(drives(), model, {"calibration.current_scale": -0.25}, np.random.default_rng(5))
+    form = form_of(model, found)
+    refit = form.refit(frozenset(), None, None)
+    current = (form.observations.at[0] < 2) & form.fit
+
+    def error(u):
+        return float(np.sqrt(np.mean((form.observations.value - form.predicted(u))[current] ** 2)))
+
+    assert error(form.alone(refit)) < 0.8 * error(refit.u)
 
 
 def test_parts_held_out_are_spread_over_a_drive():
