@@ -73,7 +73,7 @@ def test_the_ground_may_be_the_name_of_the_folder(tmp_path: Path) -> None:
     assert drive(told.folder).ground == "frozen lake"
     bag = text[: text.index("[tables.drive]")] + '[tables.drive]\ntopic = "/odom"\n[tables.drive.channels]\n'
     bag += 'body_velocity_x_m_s = "twist.twist.linear.x"\n'
-    with pytest.raises(UserError, match="log.ground"):
+    with pytest.raises(UserError, match=r"log\.ground"):
         read_map(write_map(tmp_path, bag, "bag.toml"))
 
 
