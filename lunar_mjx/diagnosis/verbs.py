@@ -154,7 +154,7 @@ def why(
     Args:
       folder: of the run. only: candidates to consider; all if None. progress: told what is being done.
       seconds: after which the answer is to be there, as far as it is known by then; without, logs with imposed wheel
-        speeds have `windows.SECONDS` and others as long as it takes.
+        speeds have `windows.TELLING.seconds` and others as long as it takes.
 
     Raises:
       UserError: the folder is no run.
@@ -166,7 +166,7 @@ def why(
     except BadData as bad:
         return bad.diagnosis
     if windows.imposed(campaign):
-        return windows.why(run, campaign, only, windows.SECONDS if seconds is None else seconds, progress)
+        return windows.why(run, campaign, only, windows.TELLING.seconds if seconds is None else seconds, progress)
     problem = _problem(run, campaign, only, progress)
     left = math.inf if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
     diagnosis, model_search = answer.diagnose(run, problem, progress, left)

@@ -18,17 +18,12 @@ from scipy import linalg
 
 from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, Suspect, Unknown
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS
-from lunar_mjx.diagnosis.drives.windows.problem import SLOPE, STEP, Noise, WindowProblem
+from lunar_mjx.diagnosis.drives.windows.problem import PROGRAM, SLOPE, Noise, WindowProblem
 from lunar_mjx.diagnosis.drives.windows.settings import (
     BETWEEN,
     BY_MOTION,
     DIFFERENCES,
-    DRIFTED,
-    LATE_S,
-    LAW_SHARE,
-    NOISE_LOG_STD,
-    UNEVEN_DEG,
-    UNKNOWN_SLOPE_DEG,
+    WINDOW_PRIORS,
     Difference,
     WindowSettings,
     by_motion,
@@ -46,20 +41,30 @@ SOFT = "soft_ground"
 """The suspect that takes the place of a hard surface: it has no null, and a program of its own."""
 INSTEAD = "instead"
 """Name of the coordinate that tells whether soft ground takes the place of the hard surface: 0 or 1."""
-STEPS = 10
-"""Gauss-Newton steps of a refit at most."""
-SETTLED = 0.1
-"""Gain of chi-square by a step after which a fit has settled."""
-LONGEST_STEP = 3.0
-"""Longest step, in standard deviations of a prior."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowRefit:
+    """How refits of windows descend."""
+
+    steps: int = 10
+    """Gauss-Newton steps of a refit at most."""
+    settled: float = 0.1
+    """Gain of chi-square by a step after which a fit has settled."""
+    longest_step: float = 3.0
+    """Longest step, in standard deviations of a prior."""
+    fixed: float = 1e-3
+    """Prior standard deviation of a coordinate that does not move."""
+
+
+WINDOW_REFIT = WindowRefit()
+
 DRAG, RISE = Unknown("rolling_resistance", "coefficient", 0.03), Unknown(CALIBRATION, SLOPE, 1.0)
 """What differs from recording to recording and no fit moves: resistance of the ground over its load; its slope, deg."""
 DRIVE = "this drive"
 """Effect of the coordinates that belong to the one recording there is."""
 OF_THE_GROUND = ("ground", "friction")
 """Families of suspects that another ground brings with it."""
-FIXED = 1e-3
-"""Prior standard deviation of a coordinate that does not move."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -184,7 +189,9 @@ class WindowForm(MeasuredForm):
             if s.name == SOFT:
                 self.instead = len(unknowns)
                 unknowns.append(Unknown(SOFT, INSTEAD, 1.0))
-                coordinates.append(Coordinate(SOFT, INSTEAD, 0.0, 1.0, 0.0, 1.0, prior=FIXED, amplitude=True))
+                coordinates.append(
+                    Coordinate(SOFT, INSTEAD, 0.0, 1.0, 0.0, 1.0, prior=WINDOW_REFIT.fixed, amplitude=True)
+                )
                 self.exchanged = (SOFT,)
             candidates[s.name] = np.arange(first, len(unknowns))
         self.unknowns, self.coordinates, self.candidates = tuple(unknowns), tuple(coordinates), candidates
@@ -215,12 +222,12 @@ class WindowForm(MeasuredForm):
         recordings = problem.cut.recordings
         if self.single:
             return by_motion(*problem.rims)
-        columns = [math.sqrt(LAW_SHARE) * by_motion(*problem.rims)]
+        columns = [math.sqrt(WINDOW_PRIORS.law_share) * by_motion(*problem.rims)]
         for n in np.unique(recordings):
             mine = recordings == n
             own = by_motion(*problem.rims[:, mine])
             columns.append(np.zeros((len(mine), own.shape[1])))
-            columns[-1][mine] = math.sqrt(1.0 - LAW_SHARE) * own
+            columns[-1][mine] = math.sqrt(1.0 - WINDOW_PRIORS.law_share) * own
         return np.concatenate(columns, axis=1)
 
     def usual_differences(self) -> dict[str, float]:
@@ -243,8 +250,13 @@ class WindowForm(MeasuredForm):
             name, size = next(share)
             out.append((name, Unknown(CALIBRATION, instrument, size)))
         flat = bool(self.problem(None).cut.unlevelled)
-        out.append(("lateness of currents", Unknown(CALIBRATION, "current_clock", LATE_S)))
-        out.append(("slope", dataclasses.replace(RISE, std=UNKNOWN_SLOPE_DEG if flat else UNEVEN_DEG)))
+        out.append(("lateness of currents", Unknown(CALIBRATION, "current_clock", WINDOW_PRIORS.late_s)))
+        out.append(
+            (
+                "slope",
+                dataclasses.replace(RISE, std=WINDOW_PRIORS.unknown_slope_deg if flat else WINDOW_PRIORS.uneven_deg),
+            )
+        )
         return out
 
     def _coordinate(self, effect: str, q: Unknown, prior: float) -> Coordinate:
@@ -261,7 +273,10 @@ class WindowForm(MeasuredForm):
         for i in self.baseline:
             if self.unknowns[i].key in self.model.priors and self.coordinates[i].effect != DRIVE:
                 centre = self.coordinates[i].centre
-                low[i], high[i] = max(low[i], centre - DRIFTED), min(high[i], centre + DRIFTED)
+                low[i], high[i] = (
+                    max(low[i], centre - WINDOW_PRIORS.drifted),
+                    min(high[i], centre + WINDOW_PRIORS.drifted),
+                )
         return low, high
 
     def _soft(self, u: np.ndarray) -> bool:
@@ -303,7 +318,7 @@ class WindowForm(MeasuredForm):
                 same.append((i, mine[q.key]))
         moved = np.array(list(mine.values()), int)
         # towards the null or the prior's mean, so that bounds are not left
-        step = np.where(u[moved] > 0.0, -STEP, STEP)
+        step = np.where(u[moved] > 0.0, -PROGRAM.step, PROGRAM.step)
         rows = np.repeat(u[None], len(moved) + 1, axis=0)
         rows[1 + np.arange(len(moved)), moved] += step
         values = self._rows(rows, soft)
@@ -322,9 +337,9 @@ class WindowForm(MeasuredForm):
             return (here - self._rows(other[None], False)[0])[:, None]
         moduli = [i for i in wanted if i != self.instead]
         rows = np.repeat(other[None], len(moduli) + 1, axis=0)
-        rows[1 + np.arange(len(moduli)), moduli] += STEP
+        rows[1 + np.arange(len(moduli)), moduli] += PROGRAM.step
         there = self._rows(rows, True)
-        columns = {i: (there[1 + k] - there[0]) / STEP for k, i in enumerate(moduli)}
+        columns = {i: (there[1 + k] - there[0]) / PROGRAM.step for k, i in enumerate(moduli)}
         columns[self.instead] = there[0] - here
         return np.stack([columns[i] for i in wanted], axis=1)
 
@@ -370,12 +385,12 @@ class WindowForm(MeasuredForm):
             for n in np.unique(recording):
                 columns.append(np.where(recording == n, late, 0.0))
                 field.append(-1)
-                std.append(LATE_S)
+                std.append(WINDOW_PRIORS.late_s)
         for n in () if self.single else np.unique(recording):
             flat = cut.unlevelled & set(cut.log[cut.recordings == n].tolist())
             columns.append(np.where(recording == n, tilt, 0.0))
             field.append(-1)
-            std.append(UNKNOWN_SLOPE_DEG if flat else UNEVEN_DEG)
+            std.append(WINDOW_PRIORS.unknown_slope_deg if flat else WINDOW_PRIORS.uneven_deg)
         if clock is not None:
             for n, (_, spread) in cut.clocks.items():
                 columns.append(np.where(log == n, clock, 0.0))
@@ -434,7 +449,7 @@ class WindowForm(MeasuredForm):
             calibration={},
             following={},
             fields=self._fields,
-            noises=tuple(NoiseSize(c, NOISE_LOG_STD) for c in CHANNELS),
+            noises=tuple(NoiseSize(c, WINDOW_PRIORS.noise_log_std) for c in CHANNELS),
             judged=sum(held.values(), start=Gram(np.zeros(len(CHANNELS), int), np.zeros(whole))) if held else None,
             wide=settings.unlisted_discrepancy,
             far=1.0,
@@ -459,13 +474,13 @@ class WindowForm(MeasuredForm):
         low, high = self._low[free] + 1e-9, self._high[free] - 1e-9
         u[free] = np.clip(u[free], low, high)
         terms, sizes, failed = self.listed(effects), None, "the fit still moves"
-        for _ in range(STEPS):
+        for _ in range(WINDOW_REFIT.steps):
             linear, columns, residual = self.linearise(u, free)
             _, found, chosen = linear.evidence(terms, sizes)
             sizes = found.tau, found.noise
             where = {int(p): k for k, p in enumerate(chosen)}
             step = np.array([found.mean[where[int(i)]] for i in free])
-            step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+            step *= min(1.0, WINDOW_REFIT.longest_step / max(float(np.abs(step).max()), 1e-12))
             cost = self._cost(linear, columns, sizes, free)
             before = cost(residual, u)
             for share in (1.0, 0.4, 0.15, 0.05):
@@ -478,7 +493,7 @@ class WindowForm(MeasuredForm):
                 failed = ""
                 break
             u = trial
-            if before - after < SETTLED:
+            if before - after < WINDOW_REFIT.settled:
                 failed = ""
                 break
         return Refit(self.name, effects, u, self.linearise(u)[0], failed)
@@ -517,7 +532,9 @@ class WindowForm(MeasuredForm):
             )
 
         u = refit.u.copy()
-        u[free] = minimise(at, u[free], self._low[free] + 1e-9, self._high[free] - 1e-9, SETTLED, STEPS)
+        u[free] = minimise(
+            at, u[free], self._low[free] + 1e-9, self._high[free] - 1e-9, WINDOW_REFIT.settled, WINDOW_REFIT.steps
+        )
         return u
 
     def _cost(

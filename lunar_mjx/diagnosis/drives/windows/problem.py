@@ -19,16 +19,31 @@ from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.logs.schema import KINDS
 from lunar_mjx.model import Model
 
-SIZES = (64, 1024)
-"""Windows simulated at once, few and many: a program is compiled for each; the state of 1,024 stays in the cache."""
-FEW = 4
-"""Batches of few that take less time than one of many: 0.07 s against 0.5 s on one core."""
-LONGEST_STEP_S = 0.008
-"""Time step: currents of a Husky on its tyres differ from those at 2.5 ms by less than 0.01 A."""
-STEP = 0.25
-"""Step of difference quotients in units of the prior's standard deviation, and at most `STEP` of it."""
-FREEDOM = 4.0
-"""Degrees of freedom of Student's noise: heavy tails with a finite variance."""
+
+@dataclasses.dataclass(frozen=True)
+class WindowProgram:
+    """How windows are simulated, and how their noise is learnt."""
+
+    sizes: tuple[int, int] = (64, 1024)
+    """Windows simulated at once, few and many: a program is compiled for each; the state of 1,024 stays in the
+    cache."""
+    few: int = 4
+    """Batches of few that take less time than one of many: 0.07 s against 0.5 s on one core."""
+    longest_step_s: float = 0.008
+    """Time step: currents of a Husky on its tyres differ from those at 2.5 ms by less than 0.01 A."""
+    step: float = 0.25
+    """Step of difference quotients in units of the prior's standard deviation, and at most `step` of it."""
+    freedom: float = 4.0
+    """Degrees of freedom of Student's noise: heavy tails with a finite variance."""
+    most_programs: int = 8
+    """Compiled programs that are kept; the oldest goes first."""
+    shares: tuple[float, ...] = (0.0, 0.1, 0.2, 0.4, 0.8)
+    """Noise in proportion to what is measured, over its root mean square, that is tried: patches differ in friction by
+    so many per cent, whatever the current."""
+
+
+PROGRAM = WindowProgram()
+
 SLOPE = "slope"
 """Calibration by which all windows lean, whether or not their slope was measured, deg."""
 TILTS = ("pitch", "roll", SLOPE)
@@ -165,7 +180,7 @@ class WindowProblem:
         jobs = np.stack(np.meshgrid(np.arange(count), np.arange(windows), indexing="ij"), -1).reshape(-1, 2)
         at = 0
         while at < len(jobs):
-            size = SIZES[1] if len(jobs) - at > FEW * SIZES[0] else SIZES[0]
+            size = PROGRAM.sizes[1] if len(jobs) - at > PROGRAM.few * PROGRAM.sizes[0] else PROGRAM.sizes[0]
             part = jobs[at : at + size]
             part = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
             row, window = part[:, 0], part[:, 1]
@@ -225,7 +240,7 @@ class WindowProblem:
 
     def linearise(self, unknowns: Sequence[Unknown], u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Predictions (channel, window, sample) at (unknown,), and derivatives (channel, window, sample, unknown)."""
-        step = np.where(u > 0.0, -STEP, STEP)  # towards the prior's mean, so that bounds are not left
+        step = np.where(u > 0.0, -PROGRAM.step, PROGRAM.step)  # towards the prior's mean, so that bounds are not left
         values = self.predict(unknowns, np.concatenate([u[None], u + np.diag(step)]))
         slopes = np.moveaxis((values[1:] - values[0]) / step[:, None, None, None], 0, -1)
         return values[0], slopes
@@ -274,16 +289,15 @@ def patterns(there: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 _PROGRAMS: dict[Any, KinematicDrive] = {}
 """Programs take every number as an argument, so that models of one rover with the same effects share them."""
-_MOST_PROGRAMS = 8
 
 
 def _program(model: Model, bin_s: float) -> KinematicDrive:
     """The program of a model's effects, compiled once in a process."""
     key = str(model.rover.folder), tuple(id(e) for e in model.effects), round(bin_s, 9), float(model.gravity)
     if key not in _PROGRAMS:
-        while len(_PROGRAMS) >= _MOST_PROGRAMS:
+        while len(_PROGRAMS) >= PROGRAM.most_programs:
             _PROGRAMS.pop(next(iter(_PROGRAMS)))
-        _PROGRAMS[key] = KinematicDrive(model, round(bin_s, 9), LONGEST_STEP_S)
+        _PROGRAMS[key] = KinematicDrive(model, round(bin_s, 9), PROGRAM.longest_step_s)
     return _PROGRAMS[key]
 
 
@@ -300,11 +314,6 @@ def corners(model: Model) -> list[str]:
     require_drives_alone(model)
     names = {w.drive: f"{w.corner}_{KINDS[0]}" for w in model.rover.wheels}
     return [names[j] for j in model.rover.joints]
-
-
-SHARES = (0.0, 0.1, 0.2, 0.4, 0.8)
-"""Noise in proportion to what is measured, over its root mean square, that is tried: patches differ in friction by so
-many per cent, whatever the current."""
 
 
 def proportions(residual: np.ndarray, there: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -349,7 +358,7 @@ def proportion(residual: np.ndarray, there: np.ndarray, size: np.ndarray) -> Pro
     usual = power <= np.quantile(power, 0.9)
     whole = max(float(np.sqrt(np.mean(size[mine] ** 2))), 1e-12)
     best, found = np.inf, Proportion()
-    for share in SHARES:
+    for share in PROGRAM.shares:
         tried = Proportion(share, whole)
         grown = tried.scale(size[mine]) ** 2
         score = np.log(np.mean(power[usual] / grown[usual])) + np.mean(np.log(grown[usual]))
@@ -404,6 +413,6 @@ def student_weights(residual: np.ndarray, there: np.ndarray, noise: Sequence[Noi
         for kind, rows in patterns(there[c]):
             factor = noise[c].factor(kind, interval_s)
             white = linalg.solve_triangular(factor, residual[c][rows][:, kind].T, lower=True)
-            share = (FREEDOM + kind.sum()) / (FREEDOM + np.sum(white**2, axis=0))
+            share = (PROGRAM.freedom + kind.sum()) / (PROGRAM.freedom + np.sum(white**2, axis=0))
             weight[c, rows] = np.minimum(share, 1.0)
     return weight

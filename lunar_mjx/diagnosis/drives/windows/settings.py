@@ -78,15 +78,35 @@ The last four depend on how the rover moves (see `by_motion`): no contact law an
 to 10 % (Wong 2008), and what a law is off by on a pivot it is off by on every pivot, however many windows hold one.
 """
 
-LAW_SHARE = 0.5
-"""Share of the variance of differences by motion that all recordings have in common, which is the law's own error; the
-rest belongs to each recording's ground."""
 
-TURNED_RAD, FASTER = 0.5, 0.7
-"""How unlike two motions are of which one says little of a law's error at the other: difference of the angle whose
-tangent is the sides' half difference over their mean (0: straight, pi/2: a pivot), and log of the ratio of speeds."""
-LEAST_SHARE = 0.02
-"""Share of the variance of differences by motion that is left out, to have few columns."""
+@dataclasses.dataclass(frozen=True)
+class WindowPriors:
+    """How large usual errors of windows are, and what counts as alike."""
+
+    law_share: float = 0.5
+    """Share of the variance of differences by motion that all recordings have in common, which is the law's own error;
+    the rest belongs to each recording's ground."""
+    # How unlike two motions are of which one says little of a law's error at the other: difference of the angle whose
+    # tangent is the sides' half difference over their mean (0: straight, pi/2: a pivot), and log of the ratio of
+    # speeds.
+    turned_rad: float = 0.5
+    faster: float = 0.7
+    least_share: float = 0.02
+    """Share of the variance of differences by motion that is left out, to have few columns."""
+    # Tilt that an accelerometer shows over a second on rough ground; slope along the drive of ground that a log says
+    # nothing of, where 5 % is the steepest of most paths and yards.
+    uneven_deg: float = 1.0
+    unknown_slope_deg: float = 3.0
+    late_s: float = 0.05
+    """By how much currents come later in one recording than in another: a third of a sample."""
+    noise_log_std: float = 0.3
+    """How well the noise's size is known from the residuals that it was learnt from."""
+    drifted: float = 3.0
+    """Standard deviations by which what other logs taught may have drifted: beyond, it is a change, and has to be named
+    as one. Without this bound the refit of a hard-floor model on ice takes a friction of 0.15 without a word."""
+
+
+WINDOW_PRIORS = WindowPriors()
 
 
 def by_motion(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -99,12 +119,12 @@ def by_motion(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
     angle = np.arctan2(0.5 * (right - left), 0.5 * (left + right))
     pace = np.log(np.maximum(np.hypot(left, right), STANDING_M_S))
-    turned = (1.0 - np.cos(angle[:, None] - angle)) / TURNED_RAD**2
-    faster = 0.5 * ((pace[:, None] - pace) / FASTER) ** 2
+    turned = (1.0 - np.cos(angle[:, None] - angle)) / WINDOW_PRIORS.turned_rad**2
+    faster = 0.5 * ((pace[:, None] - pace) / WINDOW_PRIORS.faster) ** 2
     values, vectors = np.linalg.eigh(np.exp(-turned - faster))
     # the largest first, until what is left out is little
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
-    many = int(np.searchsorted(np.cumsum(values), (1.0 - LEAST_SHARE) * values.sum())) + 1
+    many = int(np.searchsorted(np.cumsum(values), (1.0 - WINDOW_PRIORS.least_share) * values.sum())) + 1
     return vectors[:, :many] * np.sqrt(values[:many])
 
 
@@ -112,14 +132,3 @@ BY_MOTION = " by motion"
 """End of the names of `DIFFERENCES` that depend on how the rover moves."""
 BETWEEN = "between_drives"
 """First part of the keys by which a model's file holds what was learnt of the sizes of `DIFFERENCES`."""
-
-UNEVEN_DEG, UNKNOWN_SLOPE_DEG = 1.0, 3.0
-"""Tilt that an accelerometer shows over a second on rough ground; slope along the drive of ground that a log says
-nothing of, where 5 % is the steepest of most paths and yards."""
-LATE_S = 0.05
-"""By how much currents come later in one recording than in another: a third of a sample."""
-NOISE_LOG_STD = 0.3
-"""How well the noise's size is known from the residuals that it was learnt from."""
-DRIFTED = 3.0
-"""Standard deviations by which what other logs taught may have drifted: beyond, it is a change, and has to be named as
-one. Without this bound the refit of a hard-floor model on ice takes a friction of 0.15 without a word."""

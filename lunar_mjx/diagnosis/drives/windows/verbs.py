@@ -34,12 +34,28 @@ from lunar_mjx.model import Model
 from lunar_mjx.model.file import save_model
 
 FITTED_FILE = "fitted.toml"
-SECONDS = 240.0
-"""Time that a search may take unless told otherwise, s."""
-SAME = 0.005
-"""Share of its error by which a model has to change it to count as having moved."""
-NOT_TOLD = 0.7
-"""Posterior over prior standard deviation from which logs count as not telling a parameter."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Telling:
+    """When the verbs on windows end, and what they tell."""
+
+    seconds: float = 240.0
+    """Time that a search may take unless told otherwise, s."""
+    same: float = 0.005
+    """Share of its error by which a model has to change it to count as having moved."""
+    not_told: float = 0.7
+    """Posterior over prior standard deviation from which logs count as not telling a parameter."""
+    sure: float = 0.95
+    """Probability that a name helps what it never saw."""
+    # Difference of the sides' rim speeds over their mean below which a window is straight; rim speed between slow and
+    # fast; windows of a kind from which it counts as driven.
+    straight: float = 0.1
+    fast_m_s: float = 0.3
+    least: int = 3
+
+
+TELLING = Telling()
 
 
 def imposed(logs: Sequence[Any]) -> bool:
@@ -182,7 +198,7 @@ def _posterior(form: WindowForm, refit: Refit) -> dict[int, float]:
 def not_told(form: WindowForm, refit: Refit) -> list[str]:
     """The model's own unknowns that these logs hardly tell."""
     std = _posterior(form, refit)
-    return [form.unknowns[i].key for i in form.baseline if std.get(int(i), 0.0) > NOT_TOLD]
+    return [form.unknowns[i].key for i in form.baseline if std.get(int(i), 0.0) > TELLING.not_told]
 
 
 def at_edge(form: WindowForm, refit: Refit) -> list[str]:
@@ -305,7 +321,7 @@ def _held_to_account(diagnosis: Diagnosis, found: ModelSearch, families: Mapping
         return diagnosis
     details = {**diagnosis.details, "held_out_of_usual": held.to_dict("windows")}
     diagnosis = dataclasses.replace(diagnosis, details=details)
-    if held.helps(SURE):
+    if held.helps(TELLING.sure):
         return diagnosis
     names = ", ".join([*diagnosis.effects, *(["something unlisted"] if diagnosis.unlisted else [])])
     sentence = (
@@ -320,15 +336,6 @@ def _held_to_account(diagnosis: Diagnosis, found: ModelSearch, families: Mapping
     return dataclasses.replace(diagnosis, verdict=Verdict.UNKNOWN, effects=(), further=(), sentence=sentence)
 
 
-SURE = 0.95
-"""Probability that a name helps what it never saw."""
-
-
-STRAIGHT, FAST_M_S, LEAST = 0.1, 0.3, 3
-"""Difference of the sides' rim speeds over their mean below which a window is straight; rim speed between slow and
-fast; windows of a kind from which it counts as driven."""
-
-
 def _what_next(bench: Bench) -> str:
     """What the windows lack that would tell resistance, friction and instruments apart, as a sentence."""
     speed = np.asarray(bench.cut.imposed.speed)
@@ -336,15 +343,15 @@ def _what_next(bench: Bench) -> str:
     left = np.array([j.startswith("l") for j in corners(bench.model)])
     sides = [radius * speed[..., mine].mean(axis=(1, 2)) for mine in (left, ~left)]
     ahead, turn = 0.5 * (sides[0] + sides[1]), 0.5 * (sides[1] - sides[0])
-    straight = np.abs(turn) < STRAIGHT * np.abs(ahead)
+    straight = np.abs(turn) < TELLING.straight * np.abs(ahead)
     lacks = []
-    if straight.sum() < LEAST:
+    if straight.sum() < TELLING.least:
         lacks.append("straight drives (resistance without scrub)")
-    elif (straight & (ahead > 0.0)).sum() < LEAST or (straight & (ahead < 0.0)).sum() < LEAST:
+    elif (straight & (ahead > 0.0)).sum() < TELLING.least or (straight & (ahead < 0.0)).sum() < TELLING.least:
         lacks.append("straight drives there and back (resistance apart from slope)")
-    if (~straight).sum() < LEAST:
+    if (~straight).sum() < TELLING.least:
         lacks.append("turns on the spot (friction across the wheels)")
-    if min((np.abs(ahead) > FAST_M_S).sum(), (np.abs(ahead) <= FAST_M_S).sum()) < LEAST:
+    if min((np.abs(ahead) > TELLING.fast_m_s).sum(), (np.abs(ahead) <= TELLING.fast_m_s).sum()) < TELLING.least:
         lacks.append("a second speed (friction that grows with it)")
     return f" Drive next, on the same ground: {', '.join(lacks)}." if lacks else ""
 
@@ -388,10 +395,10 @@ def _say_what_moved(child: Run, before: Mapping[str, float]) -> None:
     for split, label in (("fit", "fitted"), ("held_out", "held-out")):
         if split in before and split in after:
             was, now = before[split], after[split]
-            if now > was * (1.0 + SAME):
+            if now > was * (1.0 + TELLING.same):
                 content["certificate"]["problems"].append(
                     f"the error on {label} windows rises from {was:.2f} to {now:.2f}"
                 )
-            elif now > was * (1.0 - SAME):
+            elif now > was * (1.0 - TELLING.same):
                 content["certificate"]["problems"].append(f"nothing moved on {label} windows ({was:.2f} to {now:.2f})")
     child.save(COMPARISON_FILE, content)
