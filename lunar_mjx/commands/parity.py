@@ -35,6 +35,8 @@ def parity(
     from lunar_mjx.report import console_progress
 
     named = [e.strip() for e in engines.split(",") if e.strip()]
+    if engines and not named:
+        raise bad_input("parity", "--engines", engines, "names no engine", "leave it out for all that are installed")
     used, note = (named, "") if named else available(DEFAULT_ENGINES)
     presets = ("consistent", "paper") if preset == "both" else (preset,)
     with console_progress() as report:

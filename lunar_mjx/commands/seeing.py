@@ -132,6 +132,8 @@ def view(
     given = None if sun is None else _sun(sun)
     check_port(port)
     keep_compiled()
+    if log and replay is None:
+        raise bad_input("lunar-mjx view", "--log", log, "is one of a run's logs", "give --replay RUN as well")
     if policy is not None and replay is not None:
         raise bad_input("lunar-mjx view", "--replay", str(replay), "does not go with --policy", "give one of the two")
     if policy is not None:

@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from lunar_mjx.errors import UserError, bad_input, one_line
 from lunar_mjx.files import replacing
 from lunar_mjx.rover.couplings import place_couplings
-from lunar_mjx.rover.description import GROUPS, Description, read_description
+from lunar_mjx.rover.description import GROUPS, HEAVIEST, Description, read_description
 from lunar_mjx.rover.load import FORMAT, MARKER, load_rover
 from lunar_mjx.rover.loops import PlacedLoop, place_loops
 from lunar_mjx.rover.mjcf import build_spec, scene_of, ties, to_xml
@@ -78,6 +78,9 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
             record = _record(source, name, roles, loops, described, model, height, height_notes, driven)
     except Warning as error:
         raise _uncompilable(source, error) from None
+    if record["mass"] > HEAVIEST:
+        remedy = "correct the masses of the links, which are in kg"
+        raise bad_input(source.path, "mass", record["mass"], f"is above {HEAVIEST:g} kg", remedy)
     out = Path(out)
     title = f"# Written by `lunar-mjx convert` from {source.path.name}; edit that and convert again.\n"
     try:

@@ -15,6 +15,8 @@ from typing import Any
 from lunar_mjx import toml_fields
 from lunar_mjx.errors import bad_input, require_file, require_finite
 
+HEAVIEST = 1e5
+"""kg: no rover weighs as much as a train."""
 GROUPS = ("drive", "steer", "suspension")
 MODES = ("position", "velocity", "torque", "current")
 MOTOR_KEYS = ("torque_constant_Nm_A", "resistance_ohm", "current_limit_A")

@@ -16,7 +16,7 @@ import numpy as np
 from lunar_mjx.errors import UserError, bad_input, one_line, require_file
 from lunar_mjx.resources import find, shipped
 from lunar_mjx.rover import description as toml
-from lunar_mjx.rover.description import GROUPS, MODES, WINDINGS
+from lunar_mjx.rover.description import GROUPS, HEAVIEST, MODES, WINDINGS
 from lunar_mjx.rover.fields import check_sizes, refuse_unused_fields
 from lunar_mjx.rover.rover import DriveGroup, JointGroup, Loop, Rover, Wheel
 
@@ -81,6 +81,8 @@ def load_rover(name_or_path: str | Path) -> Rover:
         raise UserError(f"{mjcf}: MuJoCo cannot compile it ({reason}); {_CONVERT_AGAIN}.") from None
     refuse_unused_fields(mjcf, model)
     mass = toml.at_least(path, "mass", data["mass"], 0.0, strict=True)
+    if mass > HEAVIEST:
+        raise bad_input(path, "mass", mass, f"is above {HEAVIEST:g} kg", "correct the masses, which are in kg")
     total = float(model.body_mass.sum())
     if abs(total - mass) > _MASS_TOLERANCE * mass:
         raise bad_input(path, "mass", mass, f"is not the {total:.12g} kg of {mjcf.name}: mass was lost", _CONVERT_AGAIN)

@@ -270,6 +270,28 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {"a.asc": "ncols inf\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n3 4\n"},
         ["a.asc", "ncols", "inf"],
     ),
+    "grid with two widths": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols 2\nncols 3\nnrows 1\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3\n"},
+        ["a.asc", "ncols", "twice"],
+    ),
+    "grid nowhere": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols 2\nnrows 2\nxllcorner 1e300\nyllcorner 0\ncellsize 1\n1 2\n3 4\n"},
+        ["a.asc", "xllcorner = '1e300'", "out of range"],
+    ),
+    "grid at no number": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols 2\nnrows 2\nxllcorner 0\nyllcorner nan\ncellsize 1\n1 2\n3 4\n"},
+        ["a.asc", "yllcorner = 'nan'", "not finite"],
+    ),
+    "rover of 1e30 kg": (
+        CONVERT,
+        {"rover.urdf": re.sub(r'<mass value="[\d.]+"/>', '<mass value="1e30"/>', urdf("steered", "steered"))},
+        ["mass", "above 100000 kg"],
+    ),
+    "log to look at without a run": (["view", "--web", "--log", "x"], {}, ["--log = 'x'", "--replay RUN"]),
+    "engines that are none": (["parity", "--engines", ", ,", "--out", "OUT"], {}, ["--engines", "names no engine"]),
     "model with a key of 40 kB": (MODEL, {"model.toml": toml("k" * 40_000 + " = 1")}, ["model.toml"]),
     "model nested too deep": (MODEL, {"model.toml": toml("a = " + "[" * 3000)}, ["model.toml"]),
     "model with a number of 5000 digits": (MODEL, {"model.toml": toml("gravity_m_s2 = " + "9" * 5000)}, ["model.toml"]),

@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input, require_finite
+from lunar_mjx.errors import UserError, bad_input, require_finite, require_within
 from lunar_mjx.terrain.dem import DEM_LIMITS, Dem, fill_holes, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions
+
+FARTHEST = 1e12
+"""Metres that no projection of a map exceeds, nor a count of its cells."""
 
 
 def read_npy(path: Path, options: ReadOptions) -> Dem:
@@ -83,8 +86,12 @@ def _header(path: Path, lines: list[str]) -> tuple[dict[str, float], list[str]]:
         if len(words) != 2 or not words[0][0].isalpha() or words[0].lower() in ("nan", "inf"):
             return header, lines[k:]
         key = words[0].lower()
-        # the mark of nodata may be nan
-        header[key] = math.nan if words[1].lower() == "nan" else require_finite(path, words[0], words[1])
+        if key in header:
+            raise bad_input(path, key, words[1], "stands twice in the header", "keep one of them")
+        if key == "nodata_value":
+            header[key] = math.nan if words[1].lower() == "nan" else require_finite(path, words[0], words[1])
+        else:
+            header[key] = require_within(path, words[0], words[1], -FARTHEST, FARTHEST)
     return header, []
 
 
