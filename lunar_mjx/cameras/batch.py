@@ -1,4 +1,4 @@
-"""Colour, depth and labels of many cameras in pure JAX: rays marched over ground and rocks, and onto rovers' shapes.
+"""Colour, depth and labels of many cameras in pure JAX: rays onto ground, rocks and rovers' shapes.
 
 One ray a pixel finds what is seen, a second one whether the Sun reaches it: shadows are hard, from ground, rocks and
 rovers, at any height of the Sun. Light that sunlit ground throws onto what faces it stands in for what a path tracer
@@ -18,33 +18,22 @@ from jaxtyping import Array, Float, Int
 from lunar_mjx.cameras.mount import front_mount
 from lunar_mjx.cameras.photometry import Film, Regolith
 from lunar_mjx.cameras.pinhole import Pinhole, Pose
-from lunar_mjx.cameras.raymarch import STEPS, march, mounted
+from lunar_mjx.cameras.raymarch import in_parts, mounted
+from lunar_mjx.cameras.rays.trace import GROUND, ROCK, ROVER, SKY, trace
 from lunar_mjx.cameras.scene import Sun
-from lunar_mjx.cameras.shapes import Placed, hit, normal, placed, rover_shapes, together
+from lunar_mjx.cameras.shapes import Placed, bodies, placed, rover_shapes, together
 from lunar_mjx.cameras.texture import ALBEDO
 from lunar_mjx.rover import Rover
-from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import HeightField, Terrain, sample
-from lunar_mjx.terrain.rocks import form_at, nearest_rock
-
-SKY, GROUND, ROCK, ROVER = range(4)
-"""Labels, as `LABELS` names them."""
 
 TINT = ALBEDO / ALBEDO[0]
 """Colour of regolith, red first."""
-
-
 @dataclasses.dataclass(frozen=True)
 class BatchView:
-    """How pictures of a batch are lit and how far they see."""
+    """How pictures of a batch are lit."""
 
     rock_brightness: float = 1.5
     """Of rocks over that of soil: their surfaces are less dusty. A choice."""
-    skin: float = 0.012
-    """How far before a surface its shadow ray begins, m: bilinear patches and the smooth normals on them differ by
-    less."""
-    far_shadow: float = 150.0
-    """Longest way on which ground is looked for towards the Sun, m."""
     lit_ground: float = 0.12
     """Share of sunlight that ground throws back to all sides."""
     horizon: float = 0.02
@@ -52,9 +41,6 @@ class BatchView:
 
 
 BATCH_VIEW = BatchView()
-
-SHADOW_STEPS = 48
-"""Of the march towards the Sun."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,8 +83,6 @@ def picture(
     paint: HeightField | None = None,
     key: Any = None,
     far: float = 60.0,
-    steps: int = STEPS,
-    shadow_steps: int = SHADOW_STEPS,
 ) -> Pictures:
     """What one camera sees.
 
@@ -110,33 +94,19 @@ def picture(
       sun: (3,) unit vector towards the Sun in place of `light.sun`, so that it may differ between cameras of a batch.
       paint: brightness of the ground over that of plain soil, such as mottling and wheel tracks; see `painted`.
       key: random key of the noise; no noise if None.
-      far: largest depth that is looked for, m. steps, shadow_steps: of the marches; more find thinner things.
+      far: largest depth that is looked for, m.
     """
     light = light or Light()
     dtype = position.dtype
     to_sun = jnp.asarray(light.sun.direction if sun is None else sun, dtype)
-    rays = jnp.asarray(camera.rays(), dtype)
-    direction = jnp.sum(turn * rays[..., None, :], axis=-1)
-    depth = march(terrain, position, direction, far, steps)
-    label = jnp.where(jnp.isfinite(depth), GROUND, SKY)
-    surface = jnp.zeros(depth.shape, jnp.int32)
-    if rovers is not None:
-        near, surface = hit(rovers, position, direction)
-        on_rover = (near < depth) & (near > camera.near)
-        depth, label = jnp.where(on_rover, near, depth), jnp.where(on_rover, ROVER, label)
-    # Pixels of the sky are shaded like the others and blanked at the end: any finite distance will do.
-    finite_depth = jnp.where(jnp.isfinite(depth), depth, 1.0)
-    point = position + finite_depth[..., None] * direction
-    face, on_rock = _surface_normal(terrain, point)
-    label = jnp.where((label == GROUND) & on_rock, ROCK, label)
-    if rovers is not None:
-        face = jnp.where((label == ROVER)[..., None], normal(rovers, surface, point), face)
+    found = trace(terrain, position, turn, camera, far, to_sun, None if rovers is None else bodies(rovers))
+    depth, label, face = found.depth, found.label, found.face
+    direction = jnp.sum(turn * jnp.asarray(camera.rays(), dtype)[..., None, :], axis=-1)
+    point = position + jnp.where(label == SKY, 0.0, depth)[..., None] * direction
     to_eye = -direction / jnp.sqrt(jnp.sum(direction**2, axis=-1, keepdims=True))
-    # Lifted off its own surface, which would otherwise shade itself where the march's bilinear patch lies above it.
-    lit = _sunlit(terrain, point + BATCH_VIEW.skin * face, to_sun, rovers, shadow_steps)
-    bright = _brightness(terrain, light, label, face, to_eye, to_sun, lit, point, paint)
+    bright = _brightness(light, label, face, to_eye, to_sun, found.lit, point, paint)
     if rovers is not None:
-        colour = rovers.colour[surface]
+        colour = rovers.colour[found.which]
         bright = jnp.where((label == ROVER)[..., None], bright * colour, bright * jnp.asarray(TINT, dtype))
     else:
         bright = bright * jnp.asarray(TINT, dtype)
@@ -163,9 +133,9 @@ def pictures(
       rover: what they are. qpos: their coordinates.
       camera: optics. mount: the camera's pose in the chassis frame; `front_mount` if None. light: see `Light`.
       others: coordinates of other rovers of the kind that each camera may see.
-      at_once: how many pictures are in memory at once (all if None).
+      at_once: how many pictures are in memory at once; all if None, at most 65,535.
       detail: whether parts too small for small pictures are drawn, such as grousers.
-      more: `far`, `steps`, `shadow_steps`, `paint` of `picture`.
+      more: `far` and `paint` of `picture`.
     """
     shapes, optics = rover_shapes(rover, detail), camera or Pinhole(64, 48)
     camera_mount = mount or front_mount(rover)
@@ -178,10 +148,7 @@ def pictures(
         return picture(terrain, position, turn, optics, light, seen, **more)
 
     given = (qpos,) if others is None else (qpos, others)
-    # All at once is fastest; in parts, where the pictures do not fit into memory together.
-    if at_once is None:
-        return jax.vmap(lambda *a: one(a))(*given)
-    return jax.lax.map(one, given, batch_size=at_once)
+    return in_parts(one, given, at_once)
 
 
 def stereo(mount: Pose, baseline: float) -> tuple[Pose, Pose]:
@@ -207,59 +174,8 @@ def painted(shade: np.ndarray, low: Any, metres: Any) -> HeightField:
     )
 
 
-def _surface_normal(terrain: Terrain, point: Any) -> tuple[Any, Any]:
-    """Unit normals of ground or rock at points on them, and whether it is rock.
-
-    The ground's slope is that of smooth shading: a central difference over two cells, not the patch's own.
-    """
-    x, y = point[..., 0], point[..., 1]
-    cell = terrain.field.cell
-    east = (sample(terrain.field, x + cell, y)[0] - sample(terrain.field, x - cell, y)[0]) / (2.0 * cell)
-    north = (sample(terrain.field, x, y + cell)[0] - sample(terrain.field, x, y - cell)[0]) / (2.0 * cell)
-    size = jnp.sqrt(1.0 + east**2 + north**2)
-    face = jnp.stack([-east / size, -north / size, 1.0 / size], axis=-1)
-    if terrain.rocks is None:
-        return face, jnp.zeros(x.shape, bool)
-    cx, cy, cz, radius = nearest_rock(terrain.rocks, x, y)
-    away = jnp.stack([x - cx, y - cy, point[..., 2] - cz], axis=-1)
-    if terrain.rocks.forms is not None:
-        form = form_at(terrain.rocks, x, y)
-        above = cz + form.height(away[..., 0], away[..., 1]) > sample(terrain.field, x, y)[0]
-        on_rock = (form.outline(away[..., 0], away[..., 1]) < 1.0001) & above & (radius > 0.0)
-        outward = form.times(Vec3.of(away)).unit(1e-9).stack()
-        return jnp.where(on_rock[..., None], outward, face), on_rock
-    flat = away[..., 0] ** 2 + away[..., 1] ** 2
-    above = cz + jnp.sqrt(jnp.maximum(radius**2 - flat, 0.0)) > sample(terrain.field, x, y)[0]
-    on_rock = (flat < radius**2 * 1.0001) & above & (radius > 0.0)
-    stone = away / jnp.maximum(jnp.sqrt(jnp.sum(away**2, axis=-1, keepdims=True)), 1e-9)
-    return jnp.where(on_rock[..., None], stone, face), on_rock
-
-
-def _sunlit(terrain: Terrain, point: Any, to_sun: Any, rovers: Placed | None, steps: int) -> Any:
-    """Whether nothing stands between points and the Sun; all rays at once."""
-    towards = jnp.broadcast_to(to_sun, point.shape)
-    # nothing is in the way once a ray is above all ground and all rocks
-    top = jnp.max(terrain.field.heights)
-    if terrain.rocks is not None:
-        top = jnp.maximum(top, jnp.max(terrain.rocks.centers[:, 2] + terrain.rocks.radii))
-    # A low Sun asks for long rays, whose steps would grow coarse: cut off, far shadows are lost before near ones.
-    end = jnp.clip((top - point[..., 2]) / jnp.maximum(to_sun[2], 1e-4), 0.0, BATCH_VIEW.far_shadow)
-    blocked = jnp.isfinite(march(terrain, point, towards, end, steps, start=0.03, refine=0))
-    if rovers is not None:
-        blocked |= jnp.isfinite(hit(rovers, point, towards)[0])
-    return ~blocked & (to_sun[2] > 0.0)
-
-
 def _brightness(
-    terrain: Terrain,
-    light: Light,
-    label: Any,
-    face: Any,
-    to_eye: Any,
-    to_sun: Any,
-    lit: Any,
-    point: Any,
-    paint: HeightField | None,
+    light: Light, label: Any, face: Any, to_eye: Any, to_sun: Any, lit: Any, point: Any, paint: HeightField | None
 ) -> Any:
     """I/F of what is seen, (..., 1), before its colour."""
     soil = light.soil

@@ -1,4 +1,4 @@
-"""Rovers as boxes, cylinders, capsules and ellipsoids, placed by their joints and hit by rays, in pure JAX."""
+"""Rovers as boxes, cylinders, capsules and ellipsoids, placed by their joints, in pure JAX."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo is a compiled module without type stubs)
@@ -14,10 +14,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from lunar_mjx.cameras.rays.solids import BOX, CAPSULE, CYLINDER, ELLIPSOID, table
+from lunar_mjx.cameras.rays.trace import Bodies
 from lunar_mjx.rover import Rover
 from lunar_mjx.rover.look import LOOK, seen_spec
 
-BOX, CYLINDER, CAPSULE, ELLIPSOID = range(4)
 _KINDS = {
     mujoco.mjtGeom.mjGEOM_BOX: BOX,
     mujoco.mjtGeom.mjGEOM_CYLINDER: CYLINDER,
@@ -26,8 +27,6 @@ _KINDS = {
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: ELLIPSOID,
     mujoco.mjtGeom.mjGEOM_MESH: BOX,
 }
-_FAR = 1e9
-"""m; the depth of a ray that meets nothing: a large number, since infinities less infinities are not numbers."""
 
 
 class Shapes(NamedTuple):
@@ -170,138 +169,7 @@ def together(*parts: Placed) -> Placed:
     return Placed(kind[order], *(jnp.concatenate(a)[order] for a in zip(*(p[1:] for p in parts), strict=True)))
 
 
-def hit(placed: Placed, origin: Any, direction: Any) -> tuple[Any, Any]:
-    """Where rays first enter a shape.
-
-    Args:
-      placed: the shapes, sorted by kind.
-      origin: (3,) or (..., 3) m. direction: (..., 3), of any length.
-
-    Returns:
-      Multiple of `direction` at the entry, infinite where nothing is hit; and which shape it is.
-    """
-    distances, first = [], 0
-    for kind in range(4):
-        count = int(np.sum(placed.kind == kind))
-        if count:
-            part = slice(first, first + count)
-            distances.append(_ENTRY[kind](placed.size[part], *_local(placed, part, origin, direction)))
-        first += count
-    t = jnp.concatenate(distances)
-    which = jnp.argmin(t, axis=0)
-    near = jnp.min(t, axis=0)
-    return jnp.where(near < _FAR, near, jnp.inf), which
-
-
-def _local(placed: Placed, part: slice, origin: Any, direction: Any) -> tuple[tuple, tuple]:
-    """Origin and direction of rays in each shape's frame, components with the shapes' axis first."""
-    extra = (1,) * (direction.ndim - 1)
-
-    def of(a: Any) -> Any:
-        return a.reshape(a.shape[0], *extra)
-
-    turn, place = placed.turn[part], placed.place[part]
-    from_ = [origin[..., i][None] - of(place[:, i]) for i in range(3)]
-    o = tuple(sum(of(turn[:, i, k]) * from_[i] for i in range(3)) for k in range(3))
-    d = tuple(sum(of(turn[:, i, k]) * direction[..., i][None] for i in range(3)) for k in range(3))
-    return o, d
-
-
-def _column(size: Any, i: int, like: Any) -> Any:
-    return size[:, i].reshape(-1, *(1,) * (like.ndim - 1))
-
-
-def _over(value: Any) -> Any:
-    """1 / value without a division by zero."""
-    return 1.0 / jnp.where(jnp.abs(value) < 1e-9, jnp.where(value < 0, -1e-9, 1e-9), value)
-
-
-def _first(enter: Any, leave: Any) -> Any:
-    """The entry if it lies ahead and before the exit."""
-    return jnp.where((enter < leave) & (enter > 0.0), enter, _FAR)
-
-
-def _box(size: Any, o: tuple, d: tuple) -> Any:
-    enter, leave = -jnp.inf, jnp.inf
-    for i in range(3):
-        half, inverse = _column(size, i, d[0]), _over(d[i])
-        a, b = (-half - o[i]) * inverse, (half - o[i]) * inverse
-        enter, leave = jnp.maximum(enter, jnp.minimum(a, b)), jnp.minimum(leave, jnp.maximum(a, b))
-    return _first(enter, leave)
-
-
-def _round(a: Any, b: Any, c: Any) -> tuple[Any, Any]:
-    """Where a t^2 + 2 b t + c is negative: from, to; an empty span where it never is."""
-    root = b * b - a * c
-    some = root > 0.0
-    root, inverse = jnp.sqrt(jnp.where(some, root, 0.0)), _over(a)
-    # along the axis nothing changes: all of the ray is within, or nothing
-    along = a < 1e-12
-    never, always = jnp.where(along & (c < 0.0), -_FAR, _FAR), jnp.where(along & (c < 0.0), _FAR, -_FAR)
-    some = some & ~along
-    return jnp.where(some, (-b - root) * inverse, never), jnp.where(some, (-b + root) * inverse, always)
-
-
-def _cylinder(size: Any, o: tuple, d: tuple) -> Any:
-    r, half = _column(size, 0, d[0]), _column(size, 1, d[0])
-    enter, leave = _round(d[0] ** 2 + d[1] ** 2, o[0] * d[0] + o[1] * d[1], o[0] ** 2 + o[1] ** 2 - r * r)
-    inverse = _over(d[2])
-    a, b = (-half - o[2]) * inverse, (half - o[2]) * inverse
-    return _first(jnp.maximum(enter, jnp.minimum(a, b)), jnp.minimum(leave, jnp.maximum(a, b)))
-
-
-def _sphere(o: tuple, d: tuple, r: Any, lift: Any) -> Any:
-    z = o[2] - lift
-    return _first(
-        *_round(
-            d[0] ** 2 + d[1] ** 2 + d[2] ** 2,
-            o[0] * d[0] + o[1] * d[1] + z * d[2],
-            o[0] ** 2 + o[1] ** 2 + z * z - r * r,
-        )
-    )
-
-
-def _capsule(size: Any, o: tuple, d: tuple) -> Any:
-    r, half = _column(size, 0, d[0]), _column(size, 1, d[0])
-    caps = jnp.minimum(_sphere(o, d, r, half), _sphere(o, d, r, -half))
-    return jnp.minimum(_cylinder(size, o, d), caps)
-
-
-def _ellipsoid(size: Any, o: tuple, d: tuple) -> Any:
-    inverse = [1.0 / _column(size, i, d[0]) for i in range(3)]
-    o, d = (tuple(v * k for v, k in zip(w, inverse, strict=True)) for w in (o, d))
-    return _sphere(o, d, 1.0, 0.0)
-
-
-_ENTRY = {BOX: _box, CYLINDER: _cylinder, CAPSULE: _capsule, ELLIPSOID: _ellipsoid}
-
-
-def normal(placed: Placed, which: Any, point: Any) -> Any:
-    """Outward unit normals (..., 3) of the shapes `which` at points (..., 3) on their surfaces."""
-    turn, size = placed.turn[which], placed.size[which]
-    kind = jnp.asarray(placed.kind)[which]
-    away = point - placed.place[which]
-    x, y, z = (jnp.sum(turn[..., :, k] * away, axis=-1) for k in range(3))
-    sx, sy, sz = (size[..., i] for i in range(3))
-    # a box's face is the one that the point is nearest to, as a share of the half size
-    ax, ay, az = jnp.abs(x) / sx, jnp.abs(y) / sy, jnp.abs(z) / sz
-    zero = jnp.zeros_like(x)
-    on_x, on_y = (ax >= ay) & (ax >= az), (ay > ax) & (ay >= az)
-    box = (
-        jnp.where(on_x, jnp.sign(x), zero),
-        jnp.where(on_y, jnp.sign(y), zero),
-        jnp.where(on_x | on_y, zero, jnp.sign(z)),
-    )
-    on_cap = jnp.abs(z) / sy > jnp.sqrt(x * x + y * y) / sx
-    cylinder = (jnp.where(on_cap, zero, x), jnp.where(on_cap, zero, y), jnp.where(on_cap, jnp.sign(z), zero))
-    capsule = (x, y, z - jnp.clip(z, -sy, sy))
-    ellipsoid = (x / sx**2, y / sy**2, z / sz**2)
-    own = []
-    for i in range(3):
-        value = box[i]
-        for code, other in ((CYLINDER, cylinder), (CAPSULE, capsule), (ELLIPSOID, ellipsoid)):
-            value = jnp.where(kind == code, other[i], value)
-        own.append(value)
-    length = jnp.sqrt(sum(v * v for v in own))
-    unit = [v / jnp.maximum(length, 1e-12) for v in own]
-    return jnp.stack([sum(turn[..., i, k] * unit[k] for k in range(3)) for i in range(3)], axis=-1)
+def bodies(placed: Placed) -> Bodies:
+    """Placed shapes as rays meet them; see `rays.trace`."""
+    counts = tuple(int(np.sum(placed.kind == kind)) for kind in range(4))
+    return Bodies(counts, table(placed.kind, placed.place, placed.turn, placed.size))

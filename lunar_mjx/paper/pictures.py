@@ -165,9 +165,7 @@ def _taken(
 
     def look(terrain: Any, coordinates: Any, place: Any, turn: Any) -> Pictures:
         stand = [placed(s, r, q) for s, (r, _), q in zip(shapes, rovers, coordinates, strict=True)]
-        return picture(
-            terrain, place, turn, camera, light, together(*stand), paint=paint, far=90.0, steps=512, shadow_steps=256
-        )
+        return picture(terrain, place, turn, camera, light, together(*stand), paint=paint, far=90.0)
 
     coordinates = [jnp.asarray(qpos, jnp.float32) for _, qpos in rovers]
     given = (jnp.asarray(v, jnp.float32) for v in (pose.position, pose.rotation))

@@ -46,9 +46,7 @@ def boulder() -> Terrain:
 def draw():
     """A compiled camera without rovers."""
     return jax.jit(
-        lambda terrain, position, turn, to_sun: picture(
-            terrain, position, turn, EYE, Light(sun=SUN), sun=to_sun, steps=256, shadow_steps=128
-        )
+        lambda terrain, position, turn, to_sun: picture(terrain, position, turn, EYE, Light(sun=SUN), sun=to_sun)
     )
 
 
@@ -144,7 +142,7 @@ def test_agrees_with_the_renderer(scene) -> None:
     @jax.jit
     def draw_all(q):
         position, turn = mounted(front_mount(rover), q)
-        return picture(bumpy(), position, turn, EYE, rovers=placed(shapes, rover, q), steps=256)
+        return picture(bumpy(), position, turn, EYE, rovers=placed(shapes, rover, q))
 
     found = draw_all(jnp.asarray(qpos, jnp.float32))
     depth, label = np.asarray(found.depth), np.asarray(found.label)
@@ -159,9 +157,7 @@ def test_a_free_camera_sees_the_rover_as_the_renderer_does(scene) -> None:
     pose = look_at(np.array([-0.5, -1.0, 0.9]), qpos[:3])
     images = camera.take(pose, EYE)
     given = (jnp.asarray(v, jnp.float32) for v in (pose.position, pose.rotation, qpos))
-    found = jax.jit(
-        lambda p, t, q: picture(bumpy(), p, t, EYE, rovers=placed(rover_shapes(rover), rover, q), steps=256)
-    )(*given)
+    found = jax.jit(lambda p, t, q: picture(bumpy(), p, t, EYE, rovers=placed(rover_shapes(rover), rover, q)))(*given)
     label, depth = np.asarray(found.label), np.asarray(found.depth)
     assert (images.segmentation == 3).sum() > 300
     assert (label == images.segmentation).mean() > 0.985
@@ -193,12 +189,11 @@ def test_batches_agree_with_one_and_see_each_other() -> None:
     qpos = np.tile(rover.compile().qpos0, (3, 1))
     qpos[:, :3] = [[-3.0, 0.0, 0.4], [-1.5, 0.0, 0.4], [-2.0, 2.0, 0.4]]
     qpos = jnp.asarray(qpos, jnp.float32)
-    whole = pictures(terrain, rover, qpos, eye)
-    parts = pictures(terrain, rover, qpos, eye, at_once=2)
+    whole, parts = (jax.jit(lambda q, n=n: pictures(terrain, rover, q, eye, at_once=n))(qpos) for n in (None, 2))
     assert whole.rgb.shape == (3, 18, 24, 3) and whole.label.shape == (3, 18, 24)
     for a, b in zip(whole, parts, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-    company = pictures(terrain, rover, qpos[:1], eye, others=qpos[None, 1:])
+    company = jax.jit(lambda q: pictures(terrain, rover, q[:1], eye, others=q[None, 1:]))(qpos)
     assert int((company.label == 3).sum()) > int((whole.label[0] == 3).sum()) + 3
 
 
@@ -237,7 +232,7 @@ def test_dust_and_vignetting() -> None:
     pose = look_at((0.0, 0.0, 1.5), (4.0, 0.3, 0.3))
     given = [jnp.asarray(v, jnp.float32) for v in (pose.position, pose.rotation)]
     plain, veiled, dim = (
-        np.asarray(picture(boulder(), *given, EYE, Light(sun=SUN, film=film)).rgb)
+        np.asarray(jax.jit(lambda f=film: picture(boulder(), *given, EYE, Light(sun=SUN, film=f)).rgb)())
         for film in (Film(gamma=1.0), Film(gamma=1.0, dust=0.2), Film(gamma=1.0, vignetting=True))
     )
     assert veiled[0, 0].mean() > 0.005 and plain[0, 0].max() == 0.0  # even the sky

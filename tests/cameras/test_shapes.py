@@ -11,12 +11,29 @@ import numpy as np
 import pytest
 
 from lunar_mjx.cameras import placed, rover_shapes, together
-from lunar_mjx.cameras.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, Placed, body_poses, hit, normal
+from lunar_mjx.cameras.rays import solids
+from lunar_mjx.cameras.rays.ground import FAR, take
+from lunar_mjx.cameras.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, Placed, bodies, body_poses
 from lunar_mjx.rover import load_rover
 from lunar_mjx.rover.look import seen_spec
+from lunar_mjx.spatial import Vec3
 
 SHOWN = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 """Groups of geoms that the eye sees."""
+
+
+def hit(shapes: Placed, origin, direction):
+    """Multiple of the direction at which rays enter a shape, infinite for none, and which shape."""
+    counts, table = bodies(shapes)
+    start = Vec3(*(jnp.full(direction.shape[0], v) for v in origin))
+    end = jnp.full(direction.shape[0], FAR)
+    found, which = solids.meet(counts, table, take, start, Vec3(*direction.T), end)
+    return jnp.where(found < FAR, found, jnp.inf), which
+
+
+def normal(shapes: Placed, which, point):
+    """Unit normals of shapes at points (n, 3)."""
+    return solids.normal(*bodies(shapes), take, which, Vec3(*point.T)).stack()
 
 
 def some_pose(rover, seed: int):

@@ -1,0 +1,1 @@
+"""Rays against ground, rocks and rovers: where they hit, and what they hit there."""

@@ -1,0 +1,210 @@
+"""All pixels of a camera at once: what each ray meets, the surface's normal there, and whether the Sun reaches it.
+
+On a GPU of NVIDIA's one kernel does it all for a few pixels at a time, with everything in registers (Pallas by Triton);
+elsewhere the same code runs on arrays. Pixels are taken in small tiles, whose rays go much the same way.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from lunar_mjx.cameras.pinhole import Pinhole
+from lunar_mjx.cameras.rays import ground, solids
+from lunar_mjx.cameras.rays.ground import FAR, Grid, Load, Tables
+from lunar_mjx.spatial import Vec3
+from lunar_mjx.terrain import Terrain
+
+SKY, GROUND, ROCK, ROVER = range(4)
+"""Labels, as `LABELS` names them."""
+
+SKIN = 0.012
+"""How far before a surface its shadow ray begins, m: bilinear patches and the smooth normals on them differ by less."""
+SHADOW_START = 0.03
+"""Way after which a shadow ray may meet ground, m."""
+
+ABOVE, UPON = 5, 1
+"""Levels of the squares with which rays from a camera begin, and shadow rays."""
+
+TILE = (8, 4)
+"""Pixels of a kernel's program, across and down; powers of two."""
+WARPS = 1
+"""Warps of 32 threads that share a program's pixels."""
+MOST = 65_535
+"""Most pictures that one start of the kernel draws: a CUDA grid is no longer along its second axis."""
+AT_ONCE = 128
+"""Pixels that arrays hold at once away from a GPU: few enough that one slow ray keeps few others waiting."""
+
+
+class Traced(NamedTuple):
+    """What rays met.
+
+    Attributes:
+      depth: m along the optical axis, infinite in the sky. label: SKY, GROUND, ROCK or ROVER.
+      which: shape of the rovers, 0 where none is seen. face: unit normal, (..., 3). lit: whether the Sun shines there.
+    """
+
+    depth: Float[Array, "height width"]
+    label: Int[Array, "height width"]
+    which: Int[Array, "height width"]
+    face: Float[Array, "height width 3"]
+    lit: Any
+
+
+class Bodies(NamedTuple):
+    """Rovers' shapes: how many of each kind, in the table's order, and the flat table of `rays.solids`."""
+
+    counts: tuple[int, ...]
+    table: Any
+
+
+class _Plan(NamedTuple):
+    """What is known when the program is built."""
+
+    grid: Grid
+    counts: tuple[int, ...]
+    width: int
+    height: int
+    focal: float
+    near: float
+    shaded: bool
+
+
+def trace(
+    terrain: Terrain,
+    position: Float[Array, "3"],
+    turn: Float[Array, "3 3"],
+    camera: Pinhole,
+    far: Any,
+    to_sun: Any = None,
+    bodies: Bodies | None = None,
+    kernel: str = "auto",
+) -> Traced:
+    """What one camera's pixels see.
+
+    Args:
+      terrain: ground and rocks. position, turn: of the camera. camera: optics. far: largest depth, m.
+      to_sun: (3,) unit vector; if None, `face` and `lit` are not sought. bodies: of rovers.
+      kernel: "auto", one kernel on a GPU and arrays elsewhere; "arrays"; "interpreted", the kernel on any device,
+        for tests.
+    """
+    grid, table = ground.tables(terrain)
+    dtype = position.dtype
+    counts = (0,) * 4 if bodies is None else bodies.counts
+    plan = _Plan(grid, counts, camera.width, camera.height, float(camera.focal), float(camera.near), to_sun is not None)
+    sun = jnp.zeros(3, dtype) if to_sun is None else jnp.asarray(to_sun, dtype)
+    view = jnp.concatenate([position, turn.reshape(-1), sun, jnp.asarray(far, dtype)[None]])
+    shapes = jnp.zeros(solids.WIDTH, dtype) if bodies is None else bodies.table
+    if kernel == "arrays" or (kernel == "auto" and jax.default_backend() != "gpu"):
+        found = _by_arrays(plan, table, view, shapes)
+    elif kernel == "interpreted":
+        found = _by_kernel(plan, table, view, shapes, interpret=True)
+    else:
+        found = jax.lax.platform_dependent(
+            table, view, shapes, cuda=functools.partial(_by_kernel, plan), default=functools.partial(_by_arrays, plan)
+        )
+    depth, label, which, *face, lit = (f.reshape(camera.height, camera.width) for f in found)
+    return Traced(depth, label, which, jnp.stack(face, axis=-1), lit)
+
+
+def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, column: Any, row: Any) -> tuple:
+    """What the rays through pixels meet: depth, label, shape, the normal's components, light; entries like `column`.
+
+    Args:
+      plan, table, shapes: the scene. view: position, rotation row by row, direction of the Sun, largest depth.
+      load: reads tables. column, row: of pixels; those beyond the picture look ahead, too, and are not kept.
+    """
+    position, sun = (Vec3(*(view[k] for k in range(n, n + 3))) for n in (0, 12))
+    turn, far = [view[k] for k in range(3, 12)], view[15]
+    dtype = far.dtype
+    px = (column.astype(dtype) + (0.5 - 0.5 * plan.width)) * (1.0 / plan.focal)
+    py = ((0.5 * plan.height - 0.5) - row.astype(dtype)) * (1.0 / plan.focal)
+    direction = Vec3(*(turn[3 * i] * px + turn[3 * i + 1] * py - turn[3 * i + 2] for i in range(3)))
+    zero = jnp.zeros_like(px)
+    eye = Vec3(*(p + zero for p in position))
+    t, rock = ground.meet(plan.grid, table, load, eye, direction, zero, far + zero, ABOVE)
+    label = jnp.where(rock == -1, GROUND, jnp.where(rock >= 0, ROCK, SKY))
+    which = jnp.zeros_like(label)
+    if sum(plan.counts):
+        # what lies before the near plane is not seen
+        step = plan.near
+        near, shape = solids.meet(plan.counts, shapes, load, eye + direction * step, direction, t - step)
+        on_rover = shape >= 0
+        t, label = jnp.where(on_rover, near + step, t), jnp.where(on_rover, ROVER, label)
+        which = jnp.where(on_rover, shape, 0)
+    depth = jnp.where(label == SKY, jnp.inf, t)
+    if not plan.shaded:
+        return depth, label, which, zero, zero, zero, zero
+    point = eye + direction * jnp.where(label == SKY, 0.0, t)
+    face = ground.slope_normal(plan.grid, table, load, point.x, point.y)
+    if plan.grid.rock_rows:
+        centre, _, form = ground.stone(load, table.stones, jnp.maximum(rock, 0))
+        face = form.times(point - centre).unit(1e-9).where(label == ROCK, face)
+    if sum(plan.counts):
+        face = solids.normal(plan.counts, shapes, load, which, point).where(label == ROVER, face)
+    # no ray for what is turned away from the Sun, nor below the horizon
+    sought = (label != SKY) & (face.dot(sun) > 0.0) & (sun.z > 0.0)
+    start, way = point + face * SKIN, Vec3(*(s + zero for s in sun))
+    end = jnp.where(sought, FAR, -FAR)
+    if sum(plan.counts):
+        _, shape = solids.meet(plan.counts, shapes, load, start, way, end)
+        sought = sought & (shape < 0)
+        end = jnp.where(sought, FAR, -FAR)
+    shadow = ground.meet(plan.grid, table, load, start, way, zero + SHADOW_START, end, UPON)
+    lit = jnp.where(sought & (shadow.rock < -1), 1.0, zero)
+    return depth, label, which, *face, lit
+
+
+def _by_arrays(plan: _Plan, table: Tables, view: Any, shapes: Any) -> tuple:
+    """`_pixels` on arrays, some rows of the picture after the other."""
+    rows = max(1, min(plan.height, AT_ONCE // plan.width))
+    parts = math.ceil(plan.height / rows)
+
+    def some(first: Any) -> tuple:
+        row, column = jnp.meshgrid(first + jnp.arange(rows), jnp.arange(plan.width), indexing="ij")
+        return _pixels(plan, table, view, shapes, ground.take, column.reshape(-1), row.reshape(-1))
+
+    found = jax.lax.map(some, rows * jnp.arange(parts))
+    return tuple(f.reshape(-1)[: plan.height * plan.width] for f in found)
+
+
+def _by_kernel(plan: _Plan, table: Tables, view: Any, shapes: Any, interpret: bool = False) -> tuple:
+    """`_pixels` as one kernel, each program with one tile."""
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
+    wide, high = TILE
+    across, down = math.ceil(plan.width / wide), math.ceil(plan.height / high)
+
+    def load(ref: Any, index: Any) -> Any:
+        return triton.load(ref.at[index]) if np.ndim(index) else ref[index]
+
+    def program(*refs: Any) -> None:
+        given, view_ref, shapes_ref, out = Tables(*refs[:5]), refs[5], refs[6], refs[7:]
+        number, lane = pallas.program_id(0), jnp.arange(wide * high, dtype=jnp.int32)
+        column = (number % across) * wide + lane % wide
+        row = (number // across) * high + lane // wide
+        found = _pixels(plan, given, view_ref, shapes_ref, load, column, row)
+        kept = (column < plan.width) & (row < plan.height)
+        place = jnp.where(kept, row * plan.width + column, 0)
+        for ref, value in zip(out, found, strict=True):
+            triton.store(ref.at[place], value, mask=kept)
+
+    count, dtype = plan.width * plan.height, view.dtype
+    kinds = (dtype, jnp.int32, jnp.int32, *(dtype,) * 4)
+    call: Callable = pallas.pallas_call(
+        program,
+        out_shape=[jax.ShapeDtypeStruct((count,), k) for k in kinds],
+        grid=(across * down,),
+        compiler_params=None if interpret else triton.CompilerParams(num_warps=WARPS, num_stages=1),
+        interpret=interpret,
+        name="trace",
+    )
+    return tuple(call(*table, view, shapes))
