@@ -28,6 +28,8 @@ from lunar_mjx.terrain import HeightField, Terrain, sample
 
 TINT = ALBEDO / ALBEDO[0]
 """Colour of regolith, red first."""
+
+
 @dataclasses.dataclass(frozen=True)
 class BatchView:
     """How pictures of a batch are lit."""

@@ -1,0 +1,74 @@
+"""Guides stay short, and sentences are such as one reads without turning back."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+GUIDES = {"criticism.md": 1500, "reinforcement_learning.md": 1500}
+LONG = 40
+"""Words; no sentence has as many."""
+
+
+def prose(text: str) -> list[str]:
+    """Paragraphs and list items of a page of Markdown, without code, tables, headings and the targets of links."""
+    text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    text = re.sub(r"!\[[^\]]*\]\([^)]*\)", "", text)
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    blocks: list[list[str]] = [[]]
+    for line in text.splitlines():
+        stripped = line.lstrip("> ").strip()
+        if (
+            not stripped
+            or stripped.startswith(("|", "#", ":::", "options:"))
+            or (line.startswith("    ") and not blocks[-1])
+        ):
+            blocks.append([])
+        elif re.match(r"([-*]|\d+\.) ", stripped):
+            blocks.append([stripped])
+        else:
+            blocks[-1].append(stripped)
+    return [" ".join(b) for b in blocks if b]
+
+
+def sentences(text: str) -> list[str]:
+    """Sentences of a page; a full stop, question mark or exclamation mark ends one."""
+    ends = r"(?<=[.?!])[\"')*_]*\s+"
+    return [s for block in prose(text) for s in re.split(ends, block) if s]
+
+
+def words(sentence: str) -> int:
+    """Words of a sentence; what stands between back quotes is one."""
+    return len(re.findall(r"[^\s]*\w[^\s]*", re.sub(r"`[^`]*`", "x", sentence)))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_no_sentence_is_long(page: Path) -> None:
+    found = [f"{words(s)}: {s}" for s in sentences(page.read_text(encoding="utf-8")) if words(s) >= LONG]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("name", GUIDES)
+def test_guides_are_short(name: str) -> None:
+    """All that stands on the page counts: tables and code, too."""
+    assert len((ROOT / "docs" / name).read_text(encoding="utf-8").split()) <= GUIDES[name]
+
+
+def test_the_readme_is_short_and_opens_in_plain_words() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) < 150
+    first = " ".join(lines[:45]).lower()
+    assert not re.search(r"terramechanic|bekker|janosi|residual|covariance|pytree|likelihood", first)
+
+
+def test_sentences_are_counted() -> None:
+    page = (
+        "# Title\n\nOne two three. Four\nfive `a b c` six? [Seven](x.md) eight.\n\n    a b\n\n| a |\n\n- nine ten\n- 11"
+    )
+    assert [words(s) for s in sentences(page)] == [3, 4, 2, 2, 1]
+    assert [s for s in sentences("A " + "word " * 40 + "end.") if words(s) >= LONG]
