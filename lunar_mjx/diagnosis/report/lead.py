@@ -53,7 +53,7 @@ def _sentence(name: str, named: Sequence[str], port: str, added: Sequence[str]) 
         if len(named) > 1
         else f"The model lacks {_and(named)}, or something that is on no list.",
         "UNKNOWN": f"The model lacks something{at_port} that no effect of the catalogue explains.",
-        "UNDECIDABLE": "These measurements hold no trace that could decide about the effect asked for.",
+        "UNDECIDABLE": "Nothing can be named from these measurements so far.",
         "BAD_FIT": "The fit of the model did not converge, so nothing is said about physics.",
         "BAD_DATA": "The logs contradict themselves, so nothing is said about physics.",
     }.get(name, "")
@@ -74,10 +74,20 @@ def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
             "Drive that manoeuvre, and compare with its log too.",
         ],
         "UNKNOWN": [f"lunar-mjx unknown {run}  (suggests a formula, as a ready effect file)"],
-        "UNDECIDABLE": [f"lunar-mjx next {run}  (names the manoeuvre that would show it)"],
+        "UNDECIDABLE": [
+            f"lunar-mjx next {run}  (names the manoeuvre that would show it)"
+            if _searched(judge)
+            else f"lunar-mjx why {run}  (without --seconds: its search ended before it was done)"
+        ],
         "BAD_FIT": ["The sentence above says what failed: look at the log and the model there, and compare again."],
         "BAD_DATA": ["Mend what the findings below name.", f"lunar-mjx log check {log}"],
     }.get(name, [])
+
+
+def _searched(judge: Result) -> bool:
+    """Whether the search for effects came to its own end."""
+    search = ((judge.verdict or {}).get("details") or {}).get("search") or {}
+    return bool(search.get("complete", True))
 
 
 _SURE = 0.95

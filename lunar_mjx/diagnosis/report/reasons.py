@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lunar_mjx.diagnosis.report.words import and_list, shown
+from lunar_mjx.diagnosis.report.words import and_list, percent, shown
 
 ALIKE = 0.9
 """|cos| between two traces from which a reader is told that they look alike; the report's isolability says the same."""
@@ -72,15 +72,9 @@ def _probable(probability: float | None) -> list[str]:
     if probability is None:
         return []
     if probability >= _SURE:
-        return [f"Its probability is {_percent(probability)}."]
+        return [f"Its probability is {percent(probability)}."]
     words = "more than the 5 % that would rule it out" if probability > 1.0 - _SURE else "so it is ruled out"
-    return [f"Its probability is {_percent(probability)}, {words}."]
-
-
-def _percent(p: float) -> str:
-    if p > 0.999:
-        return "more than 99.9 %"
-    return "less than 0.1 %" if p < 0.001 else f"{100.0 * p:.2g} %"
+    return [f"Its probability is {percent(probability)}, {words}."]
 
 
 def _plain(name: str) -> str:

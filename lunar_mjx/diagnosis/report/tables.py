@@ -11,7 +11,7 @@ from typing import Any
 from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error, Step
-from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, port_label, shown
+from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, percent, port_label, shown
 from lunar_mjx.model.describe import by_group
 from lunar_mjx.report.page import Block, Facts, Table, Text
 
@@ -46,19 +46,25 @@ def _with_interval(e: Error | None) -> str:
     return f"{shown(e.value)} ({shown(e.low)} to {shown(e.high)})"
 
 
+LISTED = 0.001
+"""Probability from which a hypothesis has a row of its own."""
+
+
 def hypotheses(result: Result) -> list[Block]:
     """Probabilities of the hypotheses, and what remains at every port; nothing where hypotheses were not weighed."""
     verdict = result.verdict or {}
     blocks: list[Block] = []
     if listed := verdict.get("probabilities"):
-        rows = [[name, f"{p:.4f}"] for name, p in listed.items()]
+        rows = [[name, percent(p)] for name, p in listed.items() if p >= LISTED]
+        rest = sum(p for p in listed.values() if p < LISTED)
+        rows += [[f"{len(listed) - len(rows)} others together", percent(rest)]] if len(rows) < len(listed) else []
         note = (
             "Probabilities of all hypotheses that were weighed, together 1. Discrepancy of usual size at every port, "
             "calibration errors of usual size and the noise's uncertain size belong to each of them."
         )
         blocks.append(Table("Hypotheses", ["hypothesis", "probability"], rows, note, texts=1))
     if len(forms := verdict.get("forms") or {}) > 1:
-        rows = [[name, f"{p:.4f}"] for name, p in forms.items()]
+        rows = [[name, percent(p)] for name, p in forms.items()]
         blocks.append(Table("Contact laws", ["law", "probability"], rows, texts=1))
     if remains := verdict.get("discrepancy"):
         rows = [
@@ -157,7 +163,7 @@ def _weighed(verdict: Mapping[str, Any]) -> list[Block]:
         rows.append(
             [
                 e["effect"],
-                "cannot be tested with these logs" if untested else f"{e.get('probability') or 0.0:.4f}",
+                "not testable" if untested else percent(e.get("probability") or 0.0),
                 shown(e.get("separable_sigma")),
                 "-" if untested else values or "-",
                 f"{near[0]} ({near[1]:.2f})" if near[0] else "-",
@@ -167,10 +173,11 @@ def _weighed(verdict: Mapping[str, Any]) -> list[Block]:
         return []
     note = (
         "Probability: that the effect is missing, whatever else is. Would show: length of its signature at its usual "
-        "size that a refit of the model cannot absorb. Parameters with one standard deviation, SI units."
+        "size that a refit of the model cannot absorb. Not testable: these logs hold no trace of it. Parameters with "
+        "one standard deviation, SI units."
     )
     header = ["effect", "probability", "would show, sigma", "parameters, SI", "nearest confounder (|cos|)"]
-    return [Table("Every effect of the catalogue", header, rows, note, texts=2)]
+    return [Table("Every effect of the catalogue", header, rows, note, texts=2, folded=True)]
 
 
 def parameters(first: Result, last: Result) -> list[Block]:

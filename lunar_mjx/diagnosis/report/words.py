@@ -55,3 +55,10 @@ def port_label(label: str) -> str:
 def and_list(names: list[str] | tuple[str, ...]) -> str:
     """Names in a sentence."""
     return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)
+
+
+def percent(p: float) -> str:
+    """A probability in words that claim no more digits than it has."""
+    if p > 0.999:
+        return "more than 99.9 %"
+    return "less than 0.1 %" if p < 0.001 else f"{100.0 * p:.3g} %"

@@ -24,6 +24,24 @@ def test_every_verdict_has_a_sentence_and_says_what_to_do_next(verdict: Verdict)
     assert found.tone in ("good", "open", "bad")
 
 
+def test_a_search_that_was_cut_short_is_to_be_asked_again():
+    verdict = {"verdict": "UNDECIDABLE", "details": {"search": {"complete": False}}}
+    judge = result("run1", verdict)
+    assert lead([judge], judge).next[0].startswith("lunar-mjx why run1 ")
+    judge = result("run1", {**verdict, "details": {"search": {"complete": True}}})
+    assert lead([judge], judge).next[0].startswith("lunar-mjx next run1 ")
+
+
+def test_probabilities_claim_no_more_digits_than_they_have():
+    listed = {"slip_sinkage": 0.997, "grousers": 0.0025, "side_wall": 4e-4, "toe": 1e-9}
+    table = tables.hypotheses(result("run1", {"probabilities": listed}))[0]
+    assert table.rows == [  # type: ignore[union-attr]
+        ["slip_sinkage", "99.7 %"],
+        ["grousers", "0.25 %"],
+        ["2 others together", "less than 0.1 %"],
+    ]
+
+
 def test_what_was_named_is_added_by_the_command_that_follows():
     judge = result("run1", {"verdict": "KNOWN", "effects": ["slip_sinkage"]})
     found = lead([judge], judge)
