@@ -1,7 +1,7 @@
 """Images per second: pictures, depth and height images in JAX by batch and size, and MuJoCo's renderer beside them.
 
     python benchmarks/cameras.py --batches 4,16 --sizes 64x48,320x240 --repeats 2 --out benchmarks/cameras_2cores.json
-    python benchmarks/cameras.py --only pictures --batches 2048 --sizes 64x48,320x240 --out benchmarks/cameras_h200.json
+    python benchmarks/cameras.py --only pictures --batches 8192 --sizes 64x48,320x240 --out benchmarks/cameras_h100.json
 
 Pictures are colour, depth and labels with shadows. A row of the JAX cameras counts only where `median_error` is there:
 the depth of one picture of the same size against MuJoCo's renderer; `labels` is the share of pixels whose label agrees.
