@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -132,8 +133,10 @@ def test_friction_on_rock(base: Any) -> None:
     assert (normal.resistance == 0.0).all() and (normal.sigma_m == 0.0).all()
 
 
+@pytest.mark.optimised  # it counts rounding, which fewer optimisations place elsewhere (29 ulp)
 def test_soil_is_untouched_by_the_law_for_rock() -> None:
     """`hard_ground` leaves a wheel on soil alone, to 4 ulp of its largest component."""
+    jax.clear_caches()  # other tests of this file have compiled the same programs with fewer optimisations
     state, motion = wheels()
     for names in (CLOSED, INTEGRAL):
         with_rock, without = (forces(n, {}, state, motion)[:2] for n in ((*names, "hard_ground"), names))
