@@ -53,7 +53,7 @@ def rut_under(ctx, p, x):
     """What earlier passes left under each wheel.
 
     Args:
-      ctx: wheel positions. p: spacing. x: places (place, wheel) with x, y and depth, m, and each wheel's latest one.
+      ctx: wheel positions. p: spacing. x: places (place, wheel) with x, y and depth, m.
 
     Returns:
       Depth that earlier passes pressed the soil to, m, and how fully the wheel stands in a track (0 to 1), per wheel.
@@ -65,42 +65,32 @@ def rut_under(ctx, p, x):
     near = near * near
     places, wheels = x.depth.shape
     # A wheel stands in the soil that it is pressing now; its own latest places are that soil and no earlier pass.
-    fresh = jnp.mod(x.latest - jnp.arange(places)[:, None], places) < TRACK.fresh
-    near = jnp.where(jnp.eye(wheels, dtype=bool)[None] & fresh[:, :, None], 0.0, near)
-    # Both sums in one reduction: a batch's weights would else be written to memory between two, a third of the step.
-    terms = near[None] * jnp.where(jnp.arange(2)[:, None, None, None] == 0, 1.0, x.depth[:, :, None])
-    total, weighted = jnp.sum(terms, axis=(1, 2))
-    return weighted / (total + TRACK.faint), total / (total + TRACK.faint)
+    own = jnp.eye(wheels, dtype=bool)[None] & (jnp.arange(places) < TRACK.fresh)[:, None, None]
+    near = jnp.where(own, 0.0, near)
+    total = jnp.sum(near, axis=(0, 1))
+    return jnp.sum(near * x.depth[:, :, None], axis=(0, 1)) / (total + TRACK.faint), total / (total + TRACK.faint)
 
 
 def _remember(ctx, ground, p, x):
-    """Drops a place where the wheel is `spacing` away from its latest one, in place of the oldest.
+    """Drops a place where the wheel is `spacing` away from its last one, and forgets the oldest.
 
     The latest place deepens with the wheel: a wheel that is set down touches its first place before it sinks in.
     """
-    wheel_at, depth = ctx.wheel_position, jnp.where(ground.rock < 0.5, ctx.contact.sinkage, 0.0)
-    gone = (wheel_at.x - x.latest_x) ** 2 + (wheel_at.y - x.latest_y) ** 2
-    drop = (gone > p.spacing**2) & (depth > 0.0)
-    places = x.depth.shape[0]
-    latest = jnp.where(drop, jnp.mod(x.latest + 1.0, places), x.latest)
-    # A ring and not a queue: only entries of the latest place change, so that a batch's memory is not moved about.
-    at = jnp.arange(places)[:, None] == latest
-    return {
-        "place_x": jnp.where(at & drop, wheel_at.x, x.place_x),
-        "place_y": jnp.where(at & drop, wheel_at.y, x.place_y),
-        "depth": jnp.where(at, jnp.maximum(jnp.where(drop, 0.0, x.depth), depth), x.depth),
-        "latest": latest,
-        "latest_x": jnp.where(drop, wheel_at.x, x.latest_x),
-        "latest_y": jnp.where(drop, wheel_at.y, x.latest_y),
-    }
+    wheel_at, depth = ctx.wheel_position, ctx.contact.sinkage
+    gone = (wheel_at.x - x.place_x[0]) ** 2 + (wheel_at.y - x.place_y[0]) ** 2
+    drop = (gone > p.spacing**2) & (depth > 0.0) & (ground.rock < 0.5)
+
+    def push(old, new):
+        return jnp.where(drop, jnp.concatenate([new[None], old[:-1]]), old)
+
+    deep = push(x.depth, depth)
+    latest = jnp.maximum(deep[:1], jnp.where(ground.rock < 0.5, depth, 0.0)[None])
+    places = {"place_x": push(x.place_x, wheel_at.x), "place_y": push(x.place_y, wheel_at.y)}
+    return places | {"depth": jnp.concatenate([latest, deep[1:]])}
 
 
 def _place(axis: str) -> StateVariable:
     return StateVariable(TRACK.nowhere, "m", f"{axis} of the places that the wheel has visited", slots=TRACK.places)
-
-
-def _latest(axis: str) -> StateVariable:
-    return StateVariable(TRACK.nowhere, "m", f"{axis} of the latest place")
 
 
 @effect(
@@ -111,9 +101,6 @@ def _latest(axis: str) -> StateVariable:
         "place_x": _place("x"),
         "place_y": _place("y"),
         "depth": StateVariable(0.0, "m", "sinkage of the wheel at those places", slots=TRACK.places),
-        "latest": StateVariable(0.0, "1", "number of the latest of them"),
-        "latest_x": _latest("x"),
-        "latest_y": _latest("y"),
     },
     plastic=Parameter(
         0.8,
