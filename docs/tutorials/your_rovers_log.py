@@ -112,8 +112,8 @@ assert after["refitted"]["fit"] < before["as_given"]["fit"]
 
 # %% [markdown]
 # The error falls a little, on the windows that were held out as well. The certificate would say so if an error rose or
-# nothing moved. It says that the ground's stiffness ended at a bound: twenty seconds do not tell it. The current of the left motor, measured
-# and by both models:
+# nothing moved. It says that the stiffness ended at a bound: twenty seconds do not tell it.
+# The current of the left motor, measured and by both models:
 
 # %%
 import numpy as np
