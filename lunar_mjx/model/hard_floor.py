@@ -38,7 +38,7 @@ class Tyres:
     """Coulomb friction of a drive over the torque that lifts the whole weight at the rim; 2 N m of a Husky's 97."""
     gear_drag: float = 0.01
     """Torque of a drive's viscous friction at a rim speed of 1 m/s over the torque that lifts the whole weight at the
-    rim: half of the Coulomb friction, as grease in gears of some tens to one makes."""
+    rim. A choice: half of the Coulomb friction; a fit takes it a factor of e up or down."""
     # Rubber on floors and asphalt: friction; slip at which it is reached to 1/e; friction across a tyre over along
     # it.
     friction: float = 0.6
