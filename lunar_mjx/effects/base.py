@@ -32,6 +32,8 @@ import jax.numpy as jnp
 
 from lunar_mjx.errors import UserError, bad_input, require_finite
 
+# A step's order is physical: what the controller asks for, what the motor gives, the rover's true shape, the ground,
+# then what the ground does to the wheels. Heat and readings come last because they need the rest.
 PORTS = (
     "command",
     "motor_torque",
@@ -74,10 +76,14 @@ class Parameter:
 
     def __post_init__(self) -> None:
         low, high = self.bounds
+        # Bounds are checked when the effect is declared, at import, so that a typing error in a catalogue never reaches
+        # a model.
         if not low <= self.nominal <= high:
             raise UserError(
                 f"Parameter: nominal = {self.nominal} is outside the bounds {self.bounds}; widen the bounds."
             )
+        # A null outside the bounds could not be set by a model, and no comparison with and without the effect could be
+        # made.
         if self.null is not None and not low <= self.null <= high:
             raise UserError(f"Parameter: null = {self.null} is outside the bounds {self.bounds}; widen the bounds.")
         if self.axis not in AXES:
@@ -109,6 +115,7 @@ class StateVariable:
 
     def reset(self, like: Any) -> Any:
         """The state at reset; `like` is an array of zeros over its axis."""
+        # Slots come first, so that wheels or joints stay the last axis, along which ports broadcast.
         like = jnp.broadcast_to(like, (self.slots, *like.shape)) if self.slots else like
         # Added to the array of zeros, so that the state gets its type and shape from it.
         return like + self.initial
@@ -170,6 +177,7 @@ class Effect:
                 raise UserError(f"effect {self.name}: port = {port!r} does not exist; use one of {', '.join(PORTS)}.")
         if not self.ports:
             raise UserError(f"effect {self.name}: ports is empty; name at least one of {', '.join(PORTS)}.")
+        # Other effects see a state only through `recall`; without a state there is nothing to see.
         if self.recall is not None and not self.state:
             raise UserError(f"effect {self.name}: recall is given without a state; declare the state that it reads.")
 

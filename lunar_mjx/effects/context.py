@@ -183,6 +183,8 @@ class WheelForce:
     direction: Float[Array, "wheel"]
     force: Vec3
     moment: Vec3
+    # Optional terms of the law: None, and not a neutral number, so that a model without them compiles no operation for
+    # them.
     circle: Any = None
     lug: Any = None
     grip: Any = None
@@ -301,6 +303,7 @@ class Context:
     terrain: Terrain
     rover: RoverInfo
     parameters: Any
+    # None before its port has run: an effect that reads ahead of the order fails at once instead of reading old values.
     command: Command | None = None
     torque: Float[Array, "joint"] | None = None
     geometry: Geometry | None = None

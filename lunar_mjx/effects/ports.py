@@ -28,6 +28,7 @@ from lunar_mjx.pytree import pytree
 from lunar_mjx.spatial import Vec3
 from lunar_mjx.terrain import inside, sample
 
+# The same floor for slip, for direction and for the lateral slip, so that all three fade together at rest.
 SLIP_SPEED_FLOOR: Annotated[float, "m/s"] = 2e-3
 """Smallest denominator of the instantaneous slip, m/s; below it slip fades to zero."""
 
@@ -79,6 +80,8 @@ class Pipeline:
         for effect in self._at.get(port, ()):
             own = state.get(effect.name, {})
             result = effect.ports[port](ctx, ctx.parameters[effect.name], SimpleNamespace(**own), value)
+            # An effect without state returns its value alone; the choice is made while tracing and costs a step
+            # nothing.
             if not effect.state:
                 value = result
                 continue
@@ -87,6 +90,8 @@ class Pipeline:
             for name, old in own.items():
                 value_now = update.get(name, old)
                 if name in update and effect.state[name].rate:
+                    # Euler's step, as the ports see one context per step; effects that need more (shear_state)
+                    # integrate exactly themselves.
                     value_now = old + ctx.dt * update[name]
                 # A weakly typed new state would compile the next call of the step anew.
                 new[name] = jnp.asarray(value_now, old.dtype)
@@ -125,12 +130,15 @@ def wheel_contact(ctx: Context) -> Contact:
     ahead = ctx.wheel_axle.cross(normal).unit(1e-6)
     across = normal.cross(ahead)
     cos, sin = jnp.cos(geometry.toe), jnp.sin(geometry.toe)
+    # Toe turns the heading about the ground's normal and not about the steering axis: alike for small angles, and the
+    # heading stays in the ground plane.
     forward, left = ahead * cos + across * sin, across * cos - ahead * sin
     v_x, v_y = ctx.wheel_velocity.dot(forward), ctx.wheel_velocity.dot(left)
     rim_speed = geometry.radius * ctx.wheel_angular_velocity.dot(ctx.wheel_axle)
     # The faster of rim and travel decides the direction: it is the one that is not zero for a spinning or a sliding
     # wheel.
     roll = jnp.where(jnp.abs(rim_speed) > jnp.abs(v_x), rim_speed, v_x)
+    # Zero counts as forward: a sign of 0 would erase the slip's derivative at rest.
     heading = jnp.where(roll < 0.0, -1.0, 1.0)
     slip = heading * (rim_speed - v_x) / jnp.maximum(jnp.abs(roll), SLIP_SPEED_FLOOR)
     travel = jnp.maximum(jnp.abs(v_x), SLIP_SPEED_FLOOR)
@@ -138,6 +146,8 @@ def wheel_contact(ctx: Context) -> Contact:
         sinkage=sinkage,
         sinkage_rate=-ctx.wheel_velocity.dot(normal),
         slip=slip,
+        # The arc tangent needs no clipping and stays within 90 deg where a wheel slides broadside, as a quotient does
+        # not.
         slip_angle=jnp.arctan2(v_y, travel),
         v_x=v_x,
         v_y=v_y,
@@ -153,6 +163,7 @@ def wheel_contact(ctx: Context) -> Contact:
 def _ground_below(ctx: Context, geometry: Geometry) -> tuple[Any, Any, Any]:
     """Height of the plane that each wheel meets, below its centre, m, and the plane's slopes by x and y."""
     place = ctx.wheel_position
+    # The tangent below the axle serves models whose effects fit no plane: they take no further sample of the terrain.
     tangent = sample(ctx.terrain.field, place.x, place.y)
     if geometry.rim_share is None:
         return tangent
@@ -161,6 +172,7 @@ def _ground_below(ctx: Context, geometry: Geometry) -> tuple[Any, Any, Any]:
         ground = sample(ctx.terrain.field, x, y)[0]
         return ground if geometry.relief is None else ground + geometry.relief.at(x, y)[0]
 
+    # A mix of both planes keeps the share differentiable, so that a fit can tell how much of the rim counts.
     fitted = fitted_plane(height_at, place, ctx.wheel_axle, geometry.radius, geometry.width)
     height, slope_x, slope_y = (t + geometry.rim_share * (f - t) for t, f in zip(tangent, fitted, strict=True))
     return height, slope_x, slope_y
@@ -169,6 +181,7 @@ def _ground_below(ctx: Context, geometry: Geometry) -> tuple[Any, Any, Any]:
 def initial_soil(like: Any) -> Soil:
     """Soil before any effect has set it: zeros, and ones where effects divide by the value."""
     zero, one = jnp.zeros_like(like), jnp.ones_like(like)
+    # Ones where laws divide by a modulus or raise it to a power; strength is 0, so that no ground means no grip.
     return Soil(zero, one, one, zero, zero, one, one, zero)
 
 
@@ -188,6 +201,7 @@ def initial_wheel(contact: Contact) -> WheelForce:
     return WheelForce(
         slip_x=(contact.rim_speed - contact.v_x) / speed,
         slip_y=lateral_slip_speed(contact) / speed,
+        # Falls to 0 at rest instead of jumping by sign: a parked wheel has no direction in which its contact leans.
         direction=jnp.clip(roll / SLIP_SPEED_FLOOR, -1.0, 1.0),
         force=zero,
         moment=zero,
@@ -212,10 +226,12 @@ def apply_effects(
     """Runs every force port in order; returns the forces, the completed context and the effects' new state."""
     command, state = pipeline.run("command", ctx, state, Command(control, jnp.zeros_like(control)))
     ctx = dataclasses.replace(ctx, command=command)
+    # Motors start from zero torque: `motor` adds what current gives, and each friction takes its share away, in order.
     torque, state = pipeline.run("motor_torque", ctx, state, jnp.zeros_like(ctx.joint_angle))
     ctx = dataclasses.replace(ctx, torque=torque)
     geometry, state = pipeline.run("geometry", ctx, state, nominal_geometry(ctx.rover))
     ctx = dataclasses.replace(ctx, geometry=geometry)
+    # Only from here on: the motor's law does not know gravity, but contact, soil and bulldozing do.
     if geometry.gravity is not None:
         ctx = dataclasses.replace(ctx, gravity=geometry.gravity)
     ctx = dataclasses.replace(ctx, contact=wheel_contact(ctx))
@@ -227,6 +243,7 @@ def apply_effects(
     if "power" in pipeline:
         power, state = pipeline.run("power", ctx, state, Power(zero, zero, zero))
         ctx = dataclasses.replace(ctx, power=power)
+    # Forces are found in the wheel's frame, where the laws are stated, and turned into the world once, for all laws.
     contact, wheel = ctx.contact, ctx.wheel
 
     def to_world(v: Vec3) -> Vec3:
@@ -245,5 +262,6 @@ def apply_effects(
 
 def heat_flow(pipeline: Pipeline, ctx: Context, state: EffectState) -> tuple[Heat, EffectState]:
     """The port heat: net heat into the two nodes of every motor, for the temperatures in the context."""
+    # Capacities of 1: a model without `motor` has no heat capacity, and heat is divided by it.
     zero, one = jnp.zeros_like(ctx.joint_angle), jnp.ones_like(ctx.joint_angle)
     return pipeline.run("heat", ctx, state, Heat(zero, zero, one, one))

@@ -39,6 +39,7 @@ def com_offset(ctx, p, x, geometry):
 
 
 @effect(
+    # Added, not multiplied: caked soil and wear are lengths, whatever the radius.
     "geometry",
     offset=Parameter(0.0, 0.0, (-0.05, 0.05), "m", "wheel radius beyond the nominal one", _HERE, axis="wheel"),
 )
@@ -70,6 +71,7 @@ def steering_toe(ctx, p, x, geometry):
 )
 def wheel_wear(ctx, p, x, geometry):
     """r(d) = r_0 - w d with d the distance rolled: wheels that wear, or grow as soil cakes on them (Archard 1953)."""
+    # By the rim's own turning, slip included: a wheel that spins on the spot wears as well.
     rolled = geometry.radius * jnp.abs(ctx.wheel_angular_velocity.dot(ctx.wheel_axle))
     # Half the radius is far beyond any wear that is meant; it keeps a radius of a long drive from reaching zero.
     worn = jnp.maximum(geometry.radius - p.wear * x.distance, 0.5 * geometry.radius)
@@ -92,6 +94,7 @@ def gravity_error(ctx, p, x, geometry):
 
     Stands for an error in the stated value, or of the slope's reference to first order (Newton's second law).
     """
+    # Before gravity enters the context, so that contact, soil and the weight of pushed soil follow it.
     stated = ctx.gravity if geometry.gravity is None else geometry.gravity
     return dataclasses.replace(geometry, gravity=stated * (1.0 + p.relative))
 
@@ -107,6 +110,7 @@ def gravity_error(ctx, p, x, geometry):
 )
 def parking_brake(ctx, p, x, wrench):
     """Holds every drive joint at the angle where the brake caught it, as a stiff damped spring; blocks the wheels."""
+    # Drives alone: a brake on the steering would fight the position controller.
     held = (ctx.rover.joint_group == 0) & (p.engaged > 0.5)
     # While released the state follows the joint, so that the brake catches the wheel where it is.
     angle = jnp.where(held, x.angle, ctx.joint_angle)
@@ -139,5 +143,6 @@ def tether(ctx, p, x, wrench):
     # Parameters may be one number for a batch of rovers; the sum gives each rover its own.
     nil = jnp.zeros_like(ctx.position.x)
     force = Vec3(p.force_x + nil, p.force_y + nil, p.force_z + nil)
+    # The hitch turns with the rover, the pull does not: a long tether keeps its direction in the world.
     arm = ctx.frame.to_world(Vec3(p.x, p.y, p.z))
     return dataclasses.replace(wrench, force=wrench.force + force, moment=wrench.moment + arm.cross(force))

@@ -13,6 +13,7 @@ STEFAN_BOLTZMANN: Annotated[float, "W/m2/K4"] = 5.670374419e-8
 
 def _winding_to_housing(ctx):
     """Heat flow from winding to housing, W (eq. 1)."""
+    # The resistance is the motor's own parameter: both ends of one path read one number, so that heat is conserved.
     return (ctx.winding_temperature - ctx.housing_temperature) / ctx.parameters["motor"].R_th1
 
 
@@ -62,6 +63,7 @@ def housing_convection(ctx, p, x, heat):
 )
 def housing_conduction(ctx, p, x, heat):
     """The housing loses G (T_S - T_A) into the structure, which follows the ambient temperature."""
+    # Linear in the temperatures: a bolted joint conducts; what the housing radiates is another effect.
     flow = p.conductance * (ctx.housing_temperature - ctx.ambient_temperature)
     return dataclasses.replace(heat, housing=heat.housing - flow)
 
@@ -77,5 +79,6 @@ def housing_conduction(ctx, p, x, heat):
 )
 def housing_radiation(ctx, p, x, heat):
     """In vacuum the housing radiates epsilon sigma A (T_S^4 - T_A^4); replaces the in-air figure (flaw 9)."""
+    # The ambient temperature stands for all that the housing sees; regolith_infrared replaces it by ground and sky.
     flow = p.emissivity * STEFAN_BOLTZMANN * p.area * (ctx.housing_temperature**4 - ctx.ambient_temperature**4)
     return dataclasses.replace(heat, housing=heat.housing - flow)

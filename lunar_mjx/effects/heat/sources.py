@@ -26,6 +26,7 @@ def _iron_drag(ctx, p, x, torque):
 
 def _iron_heat(ctx, p, x, heat):
     speed = ctx.parameters["motor"].gear_ratio * ctx.joint_speed
+    # Eddy currents arise in the iron that carries the winding, so the winding's node takes the heat.
     return dataclasses.replace(heat, winding=heat.winding + p.coefficient * speed**2)
 
 
@@ -83,6 +84,7 @@ def gear_friction_heat(ctx, p, x, heat):
     motor = ctx.parameters["motor"]
     # Torque of the rotor without any loss; whatever does not arrive at the joint was lost between.
     rotor = motor.gear_ratio * constant_at(ctx.parameters, ctx.winding_temperature) * ctx.command.current
+    # Iron drag acts at the same port but heats the winding, not the gear: left in, its power would be counted twice.
     iron = ctx.parameters.get("iron_loss")
     drag = 0.0 if iron is None else _iron_damping(ctx, iron) * ctx.joint_speed
     return dataclasses.replace(heat, housing=heat.housing + p.share * (rotor - ctx.torque - drag) * ctx.joint_speed)
@@ -127,11 +129,13 @@ def solar_flux(ctx, p, x, heat):
     if ctx.sunlight is not None:
         return _warmed(ctx, p, heat, ctx.sunlight.direction, ctx.sunlight.irradiance)
     level = jnp.cos(p.sun_elevation)
+    # Azimuth counts from north (y) clockwise: sine goes to east (x), the reverse of a mathematical angle.
     sun = Vec3(level * jnp.sin(p.sun_azimuth), level * jnp.cos(p.sun_azimuth), jnp.sin(p.sun_elevation))
     return _warmed(ctx, p, heat, sun, jnp.where(p.sun_elevation > 0.0, p.flux, 0.0))
 
 
 def _warmed(ctx, p, heat, sun, lit):
+    # Only the horizontal part of the Sun's direction counts, since the housings' normals lie in the body's plane.
     """The heat with what the housings absorb of sunlight of irradiance `lit`, W/m2, from the direction `sun`."""
     ahead, left = sun.dot(ctx.frame.forward), sun.dot(ctx.frame.left)
     cosine = jnp.maximum(ahead * jnp.cos(p.facing) + left * jnp.sin(p.facing), 0.0)
@@ -172,6 +176,7 @@ def regolith_infrared(ctx, p, x, heat):
 
     Together with housing_radiation of the same eps A it is eps sigma A (F_g T_g^4 + F_s T_sky^4 - T_S^4).
     """
+    # Less T_A^4, since housing_radiation has already let the housing see its surroundings at the ambient temperature.
     seen = p.view * p.ground_temperature**4 + (1.0 - p.view) * p.sky_temperature**4
     flow = STEFAN_BOLTZMANN * p.area * (seen - ctx.ambient_temperature**4)
     return dataclasses.replace(heat, housing=heat.housing + flow)

@@ -64,9 +64,11 @@ def actuator_delay(ctx, p, x, command):
     target = command.target
     for i, age in enumerate(ages):
         # share of this step during which the change is still on its way
+        # The share, and no whole step, makes the delay continuous: a fit has a derivative by it.
         share = jnp.where(p.delay >= age, jnp.minimum((p.delay - age) / ctx.dt, 1.0), 0.0)
         target = target + share * (values[i + 1] - values[i])
     memory = {f"value_{i}": v for i, v in enumerate(values)}
+    # The age grows after use: a change made at this step is of age 0 within it.
     memory |= {f"age_{i}": age + ctx.dt for i, age in enumerate(ages)}
     return dataclasses.replace(command, target=target), memory
 
@@ -137,6 +139,7 @@ def backlash(ctx, p, x, command):
     stiffness = jnp.where(acts, stiffness, 1.0)
     free = (k_d * x.gap + ctx.dt * per_ampere * command.current) / stiffness
     gap = jnp.where(free > p.half_gap, p.half_gap, jnp.where(free < -p.half_gap, -p.half_gap, free))
+    # What the ends cut off of the free motion is the share of the step for which the torque passes.
     passed = command.current + (k_d * x.gap - stiffness * gap) / (ctx.dt * per_ampere)
     current = jnp.where(acts, passed, command.current)
     return dataclasses.replace(command, current=current), {"gap": jnp.where(acts, gap, x.gap)}

@@ -62,6 +62,8 @@ def voltage_saturation(ctx, p, x, command):
     limit = p.limit if ctx.bus_voltage is None else limit_of(ctx.bus_voltage)
     droop = ctx.parameters.get("bus_droop")
     if droop is not None:
+        # The droop needs the power, and the power the droop: the voltage before it is taken, once. Sags of some per
+        # cent leave an error of their square.
         power = jnp.sum(_limited(voltage, limit) * command.current)
         # a fifth at least: beyond the power that the resistance passes on, the formula turns negative
         sagged = jnp.maximum(1.0 - droop.resistance * power / droop.voltage**2, 0.2)
@@ -70,6 +72,8 @@ def voltage_saturation(ctx, p, x, command):
     wanted = (_limited(voltage, limit) - voltage) / resistance
     # slope of the braking torque by speed, against what an explicit step takes
     stiffness = torque_per_ampere(motor) * constant / resistance / largest_damping(ctx)
+    # Below half of what an explicit step takes, the correction acts at once; above it only as fast as the motor
+    # follows.
     correction = x.correction + (wanted - x.correction) / (1.0 + jnp.maximum(stiffness - 0.5, 0.0))
     return dataclasses.replace(command, current=command.current + correction), {"correction": correction}
 
@@ -98,5 +102,6 @@ def bus_droop(ctx, p, x, signals):
     power = 0.0
     for joint in ctx.joints:
         power = power + signals.channels[f"motor_{joint}_voltage_V"] * signals.channels[f"motor_{joint}_current_A"]
+    # By V_0 and not by the sagged voltage: the equation in V would be quadratic, for a change of second order.
     bus = p.voltage - p.resistance * power / p.voltage
     return signals.with_channels({"bus_voltage_V": bus + jnp.zeros_like(signals.time)})

@@ -34,6 +34,7 @@ def largest_damping(ctx) -> Any:
 
 def speed_sign(ctx, level: Any, scale: Any) -> Any:
     """tanh(omega/omega_s), with omega_s as large as a friction torque of `level`, N m, needs for stability."""
+    # A smoothing speed that grows with the torque keeps the slope within J/dt at any friction that a fit may try.
     return jnp.tanh(ctx.joint_speed / jnp.maximum(scale, level / largest_damping(ctx)))
 
 
@@ -98,6 +99,7 @@ def stribeck_friction(ctx, p, x, torque):
 
     Source: Armstrong-Helouvry et al. 1994.
     """
+    # Smoothed by the same sign as Coulomb's, so that the sum of both stays odd in the speed and zero at rest.
     fade = jnp.exp(-((ctx.joint_speed / p.stribeck_speed) ** 2))
     return torque - p.torque * fade * speed_sign(ctx, p.torque, p.speed)
 
@@ -142,6 +144,7 @@ def cold_grease(ctx, p, x, torque):
     The exponent stays within +-12 (a factor of 1.6e5). The power of a planetary gear rises towards -190 degC in
     Sci. Rep. 12:21815; that one runs dry on MoS2, so kappa is a choice and is meant to be fitted.
     """
+    # The housing's temperature: the grease is in the gear, whose metal follows the housing and not the winding.
     exponent = jnp.clip(-p.rate * (ctx.housing_temperature - REFERENCE_TEMPERATURE), -12.0, 12.0)
     return torque - jnp.minimum(p.damping * jnp.exp(exponent), largest_damping(ctx)) * ctx.joint_speed
 
@@ -215,5 +218,6 @@ def cogging(ctx, p, x, torque):
 
     It makes no energy over a revolution. Source: MuJoCo's dcmotor note (cogging).
     """
+    # By the joint's angle and not by time: teeth and magnets stand still on the joint.
     phase = p.cycles * ctx.joint_angle
     return torque + p.sine * jnp.sin(phase) + p.cosine * jnp.cos(phase)

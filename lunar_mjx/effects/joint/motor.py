@@ -25,6 +25,7 @@ WINDINGS = {
 }
 """Windings by nominal voltage, V: resistance ohm, torque constant N m/A, stall current A."""
 
+# Numbers and not names: arrays of joints hold them, so that one step serves all modes.
 POSITION, VELOCITY, TORQUE, CURRENT = range(4)
 MODES = ("position", "velocity", "torque", "current")
 MODE_UNITS = ("rad", "rad/s", "N m", "A")
@@ -54,10 +55,12 @@ def joint_control(ctx, p, x, command):
     motor, rover = ctx.parameters["motor"], ctx.rover
     target, mode = command.target, rover.mode
     position = rover.position_gain * (target - ctx.joint_angle) - rover.velocity_gain * ctx.joint_speed
+    # Without feedforward: the paper's controller has none, and a steady drag then shows as a steady speed error.
     velocity = rover.velocity_gain * (target - ctx.joint_speed)
     torque = jnp.where(mode == POSITION, position, jnp.where(mode == VELOCITY, velocity, target))
     # The controller does not know how warm the winding is: it asks for the current that gives the torque at 25 degC.
     current = jnp.where(mode == CURRENT, target, torque / torque_per_ampere(motor))
+    # The amplifier clips current, whatever asked for it: a torque limit would move with the winding's temperature.
     return dataclasses.replace(command, current=jnp.clip(current, -p.current_limit, p.current_limit))
 
 
@@ -89,6 +92,7 @@ def thermal_cutoff(ctx, p, x, command):
     """
     closes_at = p.temperature - p.hysteresis
     # A state of floats holds the flag, since states of all effects are one kind of array.
+    # Hysteresis needs the state: between the two temperatures both answers are right, and the past decides.
     stays = (x.tripped > 0.5) & (ctx.winding_temperature >= closes_at)
     tripped = (ctx.winding_temperature >= p.temperature) | stays
     current = jnp.where(tripped, 0.0, command.current)
@@ -101,6 +105,7 @@ def _motor_torque(ctx, p, x, torque):
 
 
 def _motor_heat(ctx, p, x, heat):
+    # I^2 R with the resistance of the warm winding: copper gains 0.4 % per kelvin, so a hot winding heats faster still.
     joule = ctx.command.current**2 * winding_resistance(p, ctx.winding_temperature)
     one = jnp.ones_like(joule)
     return dataclasses.replace(

@@ -19,8 +19,10 @@ def _exchange(ctx, p, x, heat):
     temperature = chassis_temperature(p, x)
     # what housings lose the chassis gains: the same number on both sides keeps the energy
     flow = p.conductance * (ctx.housing_temperature - temperature)
+    # What the radiator sees of the ground; the rest of its view is black sky at 3 K, whose fourth power is nothing.
     ground = p.ground_view * ctx.ambient_temperature**4
     radiated = p.radiator * STEFAN_BOLTZMANN * (temperature**4 - ground)
+    # Whatever the heading: no side of the chassis is told apart from the others.
     sunlight = 0.0 if ctx.sunlight is None else p.absorber * ctx.sunlight.irradiance
     losses = 0.0 if ctx.power is None else ctx.power.loss
     gain = jnp.sum(flow) + losses + sunlight - radiated

@@ -37,7 +37,10 @@ def motor_power(ctx, p, x, power):
     per_motor = current * (winding_resistance(motor, ctx.winding_temperature) * current + back_emf)
     # motor by motor: on one rover some drive while others brake, and only a driving one pays the amplifier's loss
     drawn, braking = jnp.sum(jnp.maximum(per_motor, 0.0)), jnp.sum(jnp.minimum(per_motor, 0.0))
+    # Returned power is negative load, so that a rover downhill may charge its battery.
     load = drawn / p.efficiency + p.returned * braking
+    # The balance of energy: what is drawn and reaches no motor, and braking power that is not returned, heats the
+    # chassis.
     return dataclasses.replace(power, load=power.load + load, loss=power.loss + load - drawn - braking)
 
 
@@ -83,6 +86,7 @@ def solar_panels(ctx, p, x, power):
     to = light.direction
     ahead, left, up = (to.dot(axis) for axis in (ctx.frame.forward, ctx.frame.left, ctx.frame.up))
     sides = ((p.top, up), (p.front, ahead), (p.rear, -ahead), (p.left, left), (p.right, -left))
+    # Panels do not shade each other: opposite sides are never lit at once, and each counts only what faces the Sun.
     facing = sum(area * jnp.maximum(cosine, 0.0) for area, cosine in sides)
     return dataclasses.replace(power, solar=power.solar + p.efficiency * light.irradiance * facing)
 
@@ -112,6 +116,7 @@ beyond 1; a quarter of the way holds it up to 7 and settles within some ten step
 
 def terminal_voltage(p, x):
     """Voltage of the battery under its load, V, as the step before left it; at reset that without load."""
+    # The current of the step before breaks the loop between the voltage and the motors that draw by it.
     return open_voltage(p, charge_of(p, x.used)) - p.resistance * x.current
 
 
@@ -138,6 +143,7 @@ def _store(ctx, p, x, power):
     return dataclasses.replace(power, loss=loss, current=current, voltage=voltage - p.resistance * current), {
         "used": used,
         "used_lost": (used - x.used) - step,
+        # The motors' voltage follows behind the current (see `_FOLLOW`); charge and reading take the current itself.
         "current": x.current + _FOLLOW * (current - x.current),
         "flat": flat,
     }

@@ -46,6 +46,7 @@ def clock_offset(ctx, p, x, signals):
     voltages, torques, bus), temperature, wheel (sinkage, slip, forces). Before the first sample the channel goes on
     straight. Source: mujoco.sysid treats a delay as a parameter of the measurement.
     """
+    # Behind the instruments' own errors: a late stamp shifts what was read, bias and scale included.
     return shifted(signals, {name: getattr(p, name) for name in FAMILIES})
 
 
@@ -66,6 +67,7 @@ _RATES: dict[str, Any] = {name: _rate(name) for name in FAMILIES}
 @effect("sensor", order=91, **_RATES)
 def clock_drift(ctx, p, x, signals):
     """Each family's clock drifts: y_m(t) = y(t - eps (t - t_0)) with t_0 the first sample; families as clock_offset."""
+    # From the first sample, since nobody knows when a clock was set; the offset there is clock_offset's.
     since = ctx.time - ctx.time[..., :1]
     return shifted(signals, {name: getattr(p, name) * since for name in FAMILIES})
 
@@ -101,6 +103,8 @@ def channel_scale(ctx, p, x, signals):
         error = getattr(p, quantity)
         for name in _matching(signals, pattern):
             value = jnp.asarray(signals.channels[name])
+            # Visual odometry measures motion: its scale error grows with the distance from the start and leaves the
+            # start.
             base = value - value[..., :1] if quantity == "position" else value
             changed[name] = value + error * base
     return signals.with_channels(changed)
@@ -166,6 +170,7 @@ def odometry_drift(ctx, p, x, signals):
 
     s is the distance travelled in the plane since the first sample. Yaw drifts by psi as well.
     """
+    # All three or none: a drift of the heading mixes x and y, so one alone could not be turned.
     names = [f"position_{a}_m" for a in "xyz"]
     if not set(names) <= signals.channels.keys():
         return signals
@@ -238,6 +243,7 @@ def imu_bias(ctx, p, x, signals):
             biases = [getattr(p, f"{sensor}_{a}") for a in "xyz"]
             changed.update({n: v + b for n, v, b in zip(names, turned, biases, strict=True)})
     for name, bias in (("roll_deg", p.roll_bias), ("pitch_deg", p.pitch_bias)):
+        # Angles add only for small biases; the quaternion below is turned exactly.
         if name in signals.channels:
             changed[name] = signals.channels[name] + jnp.rad2deg(bias)
     if set(QUATERNION) <= signals.channels.keys():
@@ -256,6 +262,7 @@ def _turn_back(roll: Any, pitch: Any, v: list[Any]) -> list[Any]:
 def _turned_quaternion(q: list[Any], roll: Any, pitch: Any) -> list[Any]:
     """q times a pitch about body y and a roll about the body x that this gives."""
     c, s = jnp.cos(0.5 * pitch), jnp.sin(0.5 * pitch)
+    # Products written out: four channels of a log come as four arrays, with leading axes of a batch.
     w, x, y, z = q[0] * c - q[2] * s, q[1] * c - q[3] * s, q[2] * c + q[0] * s, q[3] * c + q[1] * s
     c, s = jnp.cos(0.5 * roll), jnp.sin(0.5 * roll)
     return [w * c - x * s, x * c + w * s, y * c + z * s, z * c - y * s]
@@ -296,6 +303,7 @@ def thermistor_lag(ctx, p, x, signals):
         names = _matching(signals, rf"{node}_.*_temperature_degC")
         if names:
             values = jnp.stack([jnp.asarray(signals.channels[name]) for name in names], axis=-2)
+            # Self-heating is added after the lag: the measuring current has flowed since long before the log.
             late = lag(jnp.asarray(signals.time)[..., None, :], values, getattr(p, node)) + p.self_heating
             changed.update({name: late[..., i, :] for i, name in enumerate(names)})
     return signals.with_channels(changed)

@@ -18,6 +18,7 @@ _SOURCEBOOK = "Heiken et al. 1991, Lunar Sourcebook, ch. 9"
 
 def least_stiffness(k_c: Any, k_phi: Any, wheel_widths: Sequence[float]) -> tuple[float, float]:
     """Width of the narrowest wheel, m, and the least k_c/b + k_phi under it, N/m^(n+2), of one soil or of a grid."""
+    # The narrowest wheel decides: k_c/b counts most under it, and only a negative k_c can make the sum negative.
     narrowest = min(wheel_widths)
     return narrowest, float(np.min(np.asarray(k_c, float) / narrowest + np.asarray(k_phi, float)))
 
@@ -37,6 +38,7 @@ def _positive_stiffness(values: Mapping[str, Any], wheel_widths: Sequence[float]
 
 @effect(
     "soil",
+    # First of all effects on soil: those after it scale what it sets, and would be overwritten if it came later.
     order=-100,
     validate=_positive_stiffness,
     k_c=Parameter(1.4e3, None, BOUNDS["k_c"], "N/m^(n+1)", "cohesive modulus of sinkage", _SOURCEBOOK),
@@ -68,6 +70,7 @@ def soil(ctx, p, x, ground):
     one = jnp.ones_like(ground.rock)
     return dataclasses.replace(
         ground,
+        # Times ones: a parameter is one number, while effects and engines expect an entry per wheel.
         k_c=p.k_c * one,
         k_phi=p.k_phi * one,
         n=p.n * one,
@@ -87,6 +90,8 @@ def surface_type(ctx, p, x, ground):
     """
     terrain, wheel_at = ctx.terrain, ctx.wheel_position
     if terrain.grids is not None:
+        # Along the ground's normal and not straight down: on a slope the wheel touches uphill of the point below its
+        # axle.
         foot = wheel_at - ctx.contact.normal * ctx.geometry.radius
         ground = dataclasses.replace(ground, **soil_parameters(terrain.grids, foot.x, foot.y))
     if terrain.soil is None:
@@ -105,6 +110,7 @@ def surface_type(ctx, p, x, ground):
 )
 def hard_surface(ctx, p, x, ground):
     """Turns the whole terrain into hard rock, whatever the map says."""
+    # The larger of both, so that rock on the map stays rock; a step at a half, as for the map.
     return dataclasses.replace(ground, rock=jnp.maximum(ground.rock, jnp.where(p.fraction > 0.5, 1.0, 0.0)))
 
 
@@ -132,6 +138,7 @@ def soft_ground(ctx, p, x, ground):
     return dataclasses.replace(
         ground,
         k_c=0.0 * one,
+        # The modulus per width is left out: with one wheel's width only the sum k_c/b + k_phi can be told by a log.
         k_phi=p.stiffness * one,
         n=p.n * one,
         cohesion=p.cohesion * one,

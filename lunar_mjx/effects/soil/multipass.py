@@ -67,6 +67,7 @@ def rut_under(ctx, p, x):
     # A wheel stands in the soil that it is pressing now; its own latest places are that soil and no earlier pass.
     own = jnp.eye(wheels, dtype=bool)[None] & (jnp.arange(places) < TRACK.fresh)[:, None, None]
     near = jnp.where(own, 0.0, near)
+    # Weights are normalised, so that the depth found does not depend on how many places lie near.
     total = jnp.sum(near, axis=(0, 1))
     return jnp.sum(near * x.depth[:, :, None], axis=(0, 1)) / (total + TRACK.faint), total / (total + TRACK.faint)
 
@@ -78,9 +79,12 @@ def _remember(ctx, ground, p, x):
     """
     wheel_at, depth = ctx.wheel_position, ctx.contact.sinkage
     gone = (wheel_at.x - x.place_x[0]) ** 2 + (wheel_at.y - x.place_y[0]) ** 2
+    # Only soil that is loaded is remembered: a wheel over rock or in the air leaves no rut.
     drop = (gone > p.spacing**2) & (depth > 0.0) & (ground.rock < 0.5)
 
     def push(old, new):
+        # The whole list moves by one or stays: a ring with an index would gather and scatter, which brought no gain on
+        # a GPU.
         return jnp.where(drop, jnp.concatenate([new[None], old[:-1]]), old)
 
     deep = push(x.depth, depth)
@@ -139,8 +143,10 @@ def multipass(ctx, p, x, ground):
     """
     depth, inside = rut_under(ctx, p, x)
     # The factor by which a shorter sinkage, (1 - e) z_u, has to give the pressure of z_u.
+    # The power, not its first order: with e = 0.8 and n = 1 pressed soil is five times as stiff.
     firm = 1.0 + inside * (jnp.power(1.0 - p.plastic, -ground.n) - 1.0)
     pressed = p.plastic * depth
+    # The deeper of two ruts: what two effects remember of one pass must not add up.
     rut = pressed if ground.rut is None else jnp.maximum(pressed, ground.rut)
     soil = dataclasses.replace(ground, k_c=ground.k_c * firm, k_phi=ground.k_phi * firm, rut=rut)
     soil = compacted(soil, pressed, p.compacted_depth * ctx.geometry.width)

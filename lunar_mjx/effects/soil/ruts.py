@@ -57,6 +57,7 @@ class Relief:
 
     def at(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Soil moved and depth pressed, m, at points of any shape, bilinear between the centres of cells."""
+        # Half a cell off: values belong to the middle of cells, and the bilinear weights run from middle to middle.
         u, v = x / self.cell - 0.5, y / self.cell - 0.5
         i, j = jnp.floor(u), jnp.floor(v)
         s, t = u - i, v - j
@@ -64,6 +65,7 @@ class Relief:
         for di, ws in ((0.0, 1.0 - s), (1.0, s)):
             for dj, wt in ((0.0, 1.0 - t), (1.0, t)):
                 slot, tile = _address(i + di, j + dj)
+                # A neighbour of another tile is untouched soil here, however its slot looks.
                 own = jnp.where(self.tile[slot] == tile, ws * wt, 0.0)
                 moved, pressed = moved + own * self.moved[slot], pressed + own * self.pressed[slot]
         return moved, pressed
@@ -86,6 +88,7 @@ def cell_numbers(tile: Any) -> tuple[Any, Any]:
 
 def tile_of(u: Any, v: Any) -> Any:
     """Tiles of all slots (last axis) in the patch whose middle lies nearest to a place, in cells."""
+    # A slot stands for cells one patch apart; the copy nearest to the rover is the one that its wheels can reach.
     slot = jnp.arange(PATCH.side * PATCH.side)
     tile_i, tile_j = (
         jnp.round((middle[..., None] - 0.5 - number) / PATCH.side)
@@ -121,9 +124,11 @@ def _soil(ctx, p, x, ground):
     # Which way the wheel rolls, without a jump at rest.
     way = jnp.clip(contact.rim_speed / p.turning, -1.0, 1.0)
     reach = radius * jnp.sin(entrance_angle(contact.sinkage, radius))
+    # Half of the contact's length ahead of the axle: there the rim meets the ground that an earlier pass left.
     lead_x, lead_y = wheel_at.x + 0.5 * way * reach * ahead.x, wheel_at.y + 0.5 * way * reach * ahead.y
     _, rut = relief.at(lead_x, lead_y)
     rut = jnp.where(ground.rock > 0.5, 0.0, rut)
+    # From untouched to pressed within some thousandths of a radius: a jump would shake the wheel at a rut's end.
     firm = 1.0 + rut / (rut + PATCH.faint * radius) * (jnp.power(1.0 - p.plastic, -ground.n) - 1.0)
     soil = dataclasses.replace(
         ground,
@@ -133,6 +138,7 @@ def _soil(ctx, p, x, ground):
     )
     soil = compacted(soil, rut, p.compacted_depth * width)
 
+    # A wheel at rest works no soil; without the bound its creep would dig for ever.
     working = (contact.sinkage > 0.0) & (ground.rock < 0.5) & (jnp.abs(way) > 0.5)
     share = jnp.reshape(jnp.asarray(_ACROSS, wheel_at.x.dtype), (-1, 1))
     side_x, side_y = wheel_at.x + share * width * beside.x, wheel_at.y + share * width * beside.y
@@ -151,17 +157,21 @@ def _soil(ctx, p, x, ground):
     heap = jnp.mean(relief.at(back_x, back_y)[0], axis=0)
     hole = jnp.mean(relief.at(dug_x, dug_y)[0], axis=0)
     # soil heaped steeper than it stands runs back to where it came from
+    # 1 on level ground, 0 where the heap stands at the angle of friction over the hole, tan(phi) times their distance.
     room = 1.0 - (heap - hole) / (PATCH.behind[0] * radius * ground.tan_phi)
+    # Only what lies below the rut's bottom is new soil to carry.
     deep = jnp.minimum(jnp.maximum(contact.sinkage - rut, 0.0), radius)
     volume = ctx.dt * p.carried * deep * jnp.abs(slide) * jnp.clip(room, 0.0, 1.0) * width
     # A volume spread over cells: what is taken from some is brought to others, so that soil is conserved.
     height = jnp.where(working, volume, 0.0) / relief.cell**2
+    # The plastic part alone stays; the rest springs back when the wheel has passed.
     press = jnp.where(working, p.plastic * contact.sinkage, 0.0)
 
     points_x, points_y = (jnp.concatenate(v) for v in ((dug_x, back_x, trail_x), (dug_y, back_y, trail_y)))
     relief, slot = _touched(relief, points_x, points_y)
     taken, brought, none = (0.0 * v for v in (dug_x, back_x, trail_x))
     change = jnp.concatenate([taken - height / len(dug_x), brought + height / len(back_x), none])
+    # Added, since several points may fall into one cell: setting would keep only one of them, and lose soil.
     moved = relief.moved.at[slot].add(change.reshape(-1))
     # The deepest pass counts: pressing twice to one depth presses once.
     pressed = relief.pressed.at[slot].max(jnp.concatenate([taken, brought, none + press]).reshape(-1))

@@ -61,6 +61,7 @@ def shared_ground(
     """
     if require_finite("shared ruts", "cell", cell) <= 0.0:
         raise UserError(f"shared ruts: cell = {cell:g} is not positive; give the side of a cell in m.")
+    # Floor division, as cells are numbered: truncation would give two cells the number 0.
     first, last = (tuple(int(v // cell) for v in corner) for corner in (low, high))
     if not (first[0] < last[0] and first[1] < last[1]):
         raise UserError(f"shared ruts: high = {high} is not beyond low = {low}; give the north-eastern corner in m.")
@@ -96,10 +97,12 @@ def exchange(
         return jnp.where(inside, col, cols).astype(jnp.int32), jnp.where(inside, row, rows).astype(jnp.int32), inside
 
     # a cell that was given up for the next tile on keeps in the grid what it had been told
+    # Only the difference to what was told is new: adding the patch whole would count soil at each exchange again.
     done = moved - jnp.where(tile == told_tile, moved_soil, 0.0)
     col, row, _ = places(tile)
     # Scatters of all rovers at once: soil adds up, whoever moved it, and what lies beyond the grid is dropped.
     total = ground.moved.at[world, row, col].add(done, mode="drop")
+    # The deepest pass counts, whoever made it; sums would press soil deeper the more often rovers exchange.
     deepest = ground.pressed.at[world, row, col].max(pressed, mode="drop")
 
     # Every patch is laid anew about where its rover is now, whatever it held before.

@@ -53,12 +53,14 @@ def slip_sinkage(ctx, p, x, ground):
     wheel's radius, p = p_0 (z/r)^(n - n_0), so that the moduli keep their meaning whatever the exponent.
     """
     slip = ctx.contact.soil_slip
+    # Two coefficients: a driven wheel throws soil out behind it, a braked one piles it up before itself.
     change = p.driving * jnp.maximum(slip, 0.0) + p.skid * jnp.maximum(-slip, 0.0)
     return with_exponent(ctx, ground, change)
 
 
 def lateral_slip(contact):
     """Lateral speed over the larger of rim and travel speed, within [-1, 1]."""
+    # The root keeps the quotient finite at rest and its derivative continuous.
     travel = jnp.sqrt(contact.v_x**2 + contact.v_y**2 + _STILL**2)
     return contact.v_y / jnp.maximum(jnp.abs(contact.rim_speed), travel)
 

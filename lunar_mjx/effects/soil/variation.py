@@ -85,6 +85,7 @@ def slope_stiffness(ctx, p, x, ground):
     up = ctx.contact.normal
     # tan^2 of the slope from the normal, without an angle: smooth on level ground.
     grade = (up.x * up.x + up.y * up.y) / (up.z * up.z)
+    # The floor of 0.05 (3 deg): for soil without friction the share of its strength would be infinite.
     strength_used = grade / jnp.maximum(ground.tan_phi, 0.05) ** 2
     # Beyond twice its strength no slope stands; there the soil grows no softer.
     soft = jnp.exp(-p.stiffness * jnp.minimum(strength_used, 2.0))
@@ -131,6 +132,7 @@ def _soil_patches(ctx, p: SimpleNamespace, x, ground):
     for i in range(PATCHES):
         squared = (place.x - values[f"x_{i}"]) ** 2 + (place.y - values[f"y_{i}"]) ** 2
         total = total + values[f"amplitude_{i}"] * jnp.exp(-0.5 * squared / p.width**2)
+    # Patches overlap and may add up; within e^5 the moduli stay within what soils have, and the exponential finite.
     total = jnp.clip(total, -5.0, 5.0)
     firm = jnp.exp(total)
     return dataclasses.replace(
@@ -166,4 +168,5 @@ def places_along(x: np.ndarray, y: np.ndarray) -> dict[str, float]:
     at = np.linspace(0.0, gone[-1], PATCHES)
     out = {f"x_{i}": float(np.interp(s, gone, x)) for i, s in enumerate(at)}
     out |= {f"y_{i}": float(np.interp(s, gone, y)) for i, s in enumerate(at)}
+    # Two thirds of the spacing: neighbours overlap, so that no stretch of the track is left to none of them.
     return out | {"width": max(2.0 / 3.0 * float(gone[-1]) / (PATCHES - 1), 0.05)}

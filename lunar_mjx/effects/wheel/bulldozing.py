@@ -62,10 +62,13 @@ def bulldozing(ctx, p, x, wheel):
     ahead = jnp.clip(wheel.direction - wheel.slip_x, -1.0, 1.0)
     front = -p.front * soft * geometry.width * passive_pressure(soil, weight, z, z * z) * ahead
     length = r * jnp.sin(jnp.minimum(normal.entrance, 0.5 * jnp.pi))
+    # Mobilised as shear is: a wall that has not moved yet meets no passive pressure (Janosi's curve stands for the
+    # way).
     moved = janosi(r * (normal.entrance - normal.theta_m) * wheel.slip_y, soil.shear_modulus_y)
     wall = passive_pressure(soil, weight, 2.0 / 3.0 * z, 8.0 / 15.0 * z * z)
     side = -p.side * soft * length * wall * moved
     # the side force acts at the rim's depth, and at the centroid of the buried side, 3/8 of its length ahead
+    # The front's force has no arm here: it is taken at the wheel's centre, as the compaction resistance is.
     force = Vec3(front, side, jnp.zeros_like(side))
     moment = Vec3(r * side, jnp.zeros_like(side), 0.375 * length * wheel.direction * side)
     return dataclasses.replace(wheel, force=wheel.force + force, moment=wheel.moment + moment)
@@ -91,6 +94,7 @@ def rolling_resistance(ctx, p, x, wheel):
 
     A couple that the motor feels; on the rover it slows through the slip that it takes to overcome.
     """
+    # A wheel that is pulled down (negative load) has no rolling resistance; tanh takes the jump at rest.
     load = jnp.maximum(wheel.force.z, 0.0)
     couple = p.coefficient * ctx.geometry.radius * load * jnp.tanh(ctx.contact.rim_speed / p.speed_scale)
     return dataclasses.replace(wheel, moment=wheel.moment._replace(y=wheel.moment.y - couple))

@@ -129,6 +129,7 @@ def pressure_sinkage(ctx, p, x, normal):
     """
     contact, geometry = contact_with_soil(ctx), ctx.geometry
     theta_1 = entrance_angle(contact.sinkage, geometry.radius)
+    # Half of theta_1 lies within what Wong & Reece measured, 0.2 to 0.75, growing with slip; `exit_angle` lets it move.
     theta_m = 0.5 * theta_1
     sigma_m = max_normal_stress(ctx.soil, geometry.width, geometry.radius, theta_m, theta_1)
     a, b = geometry_factors(theta_m)
@@ -237,6 +238,7 @@ def lateral_slip_speed(contact):
     # a wheel at rest counts as driving: its ratio of speeds would be 0/0
     rolling = jnp.abs(contact.v_x) > STANDSTILL_SPEED
     speed = jnp.where(rolling, contact.v_x, 1.0)
+    # At equal speeds of rim and travel both formulas agree, so that nothing jumps where braking begins.
     factor = jnp.where(braking & rolling, 2.0 - jnp.clip(contact.rim_speed / speed, -1.0, 1.0), 1.0)
     return contact.v_y * factor
 

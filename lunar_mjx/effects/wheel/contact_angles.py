@@ -21,6 +21,7 @@ from lunar_mjx.effects.wheel.stress_integral import integrate
 
 def _arc(theta_1, theta_m, theta_2) -> Arc:
     """Integrals over the contact arc of a stress that rises linearly from theta_2 to theta_m and falls to theta_1."""
+    # Divided by the lengths of the two flanks: their slopes make the stress 1 at theta_m and 0 at both ends.
     rear, front = theta_m - theta_2, theta_1 - theta_m
     return Arc(
         cos=cos_difference(theta_m, theta_2) / rear + cos_difference(theta_m, theta_1) / front,
@@ -56,6 +57,7 @@ def exit_angle(ctx, p, x, normal):
     # not jnp.maximum, which would halve the derivative at the null
     behind = jnp.minimum(jnp.where(behind < 0.0, 0.0, behind), 0.95)
     theta_m = 0.5 * theta_1 + ahead * theta_1
+    # Negative: behind the lowest point. The bound of 0.95 leaves the rear arc shorter than the front one.
     theta_2 = -behind * theta_1
     sigma_m = grounded(contact, max_normal_stress(ctx.soil, geometry.width, geometry.radius, theta_m, theta_1))
     if normal.stress is not None:

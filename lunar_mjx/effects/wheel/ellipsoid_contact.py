@@ -76,6 +76,7 @@ def contact_with_box(form: Form, gap: Vec3, frame: Frame, half: Vec3) -> tuple[V
     return point, (-z).where(inside, toward), jnp.where(inside, 1.0 / jnp.sqrt(m.zz), depth)
 
 
+# First order in the depth is enough: penalties go millimetres deep into stones of decimetres.
 def _normal_and_depth(form: Form, q: Vec3) -> tuple[Vec3, Any]:
     outward = form.times(q)
     steep = outward.norm(1e-9)
@@ -86,6 +87,7 @@ def _normal_and_depth(form: Form, q: Vec3) -> tuple[Vec3, Any]:
 def _across(axle: Vec3) -> tuple[Vec3, Vec3]:
     """Two unit vectors square to the axle and to each other (Duff et al. 2017); which ones does not matter."""
     sign = jnp.where(axle.z < 0.0, -1.0, 1.0)
+    # Duff's formula is exact but where axle.z = -sign, which the choice of the sign excludes.
     a = -1.0 / (sign + axle.z)
     b = axle.x * axle.y * a
     first = Vec3(1.0 + sign * axle.x * axle.x * a, sign * b, -sign * axle.x)
@@ -108,6 +110,7 @@ def _least_on_disc(m_11: Any, m_12: Any, m_22: Any, b_1: Any, b_2: Any, radius: 
     for _ in range(_NEWTON):
         u, v, bent = solved(more)
         squared = jnp.maximum(u * u + v * v, 1e-18)
+        # With a multiplier of 0 a minimum within the disc stays where it is.
         more = jnp.maximum(more + squared / jnp.maximum(bent, 1e-18) * (jnp.sqrt(squared) / radius - 1.0), 0.0)
     u, v, _ = solved(more)
     return u, v
@@ -115,6 +118,7 @@ def _least_on_disc(m_11: Any, m_12: Any, m_22: Any, b_1: Any, b_2: Any, radius: 
 
 def _least_on_rectangle(m: Form, b_x: Any, b_y: Any, half: Vec3) -> tuple[Any, Any]:
     """(x, y) within half sides where m/2 - b is least, of the xx, yy and xy of m."""
+    # First x as if y were free, then y at that x, then x again: exact for a convex form, as for the box's z.
     x = jnp.clip((b_x - m.xy * b_y / m.yy) / (m.xx - m.xy * m.xy / m.yy), -half.x, half.x)
     y = jnp.clip((b_y - m.xy * x) / m.yy, -half.y, half.y)
     return jnp.clip((b_x - m.xy * y) / m.xx, -half.x, half.x), y

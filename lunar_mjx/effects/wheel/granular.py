@@ -78,6 +78,7 @@ def traction(theta, along, across, rim):
     speed = jnp.sqrt((along - rim * cos) ** 2 + across**2 + (rim * sin) ** 2 + _TINY)
     x1, x2, x3 = rim * sin / speed, cos, along * sin / speed
     terms = [x1**a * x2**b * x3**c for a, b, c in _POWERS]
+    # Over FLAT, so that Bekker's moduli keep their meaning: a flat plate pushed down has the stress k z^n.
     f1, f2, f3 = (sum(c * t for c, t in zip(row, terms, strict=True)) / FLAT for row in _FACTORS)
     # stress = f1 normal + f2 motion + f3 down
     return -(f1 + f2 * x3 + f3 * x2), f2 * (along * cos - rim) / speed - f3 * sin, f2 * across / speed
@@ -85,6 +86,7 @@ def traction(theta, along, across, rim):
 
 def _travel(contact):
     """Direction of travel along the wheel, 1 or -1, and the speeds in the frame that looks that way."""
+    # The polynomials hold for motion ahead; backing up is the same seen from behind.
     way = jnp.where(contact.v_x < 0.0, -1.0, 1.0)
     return way, (way * contact.v_x, contact.v_y, way * contact.rim_speed)
 
@@ -102,6 +104,7 @@ def _normal(ctx, p, x, normal):
     load = r * b * jnp.sum(weight * sigma * jnp.cos(theta), axis=0)
     resistance = r * b * jnp.sum(weight * sigma * jnp.sin(theta), axis=0)
     damping = jnp.maximum(normal_damping_force(ctx, p.damping, theta_1), -load)
+    # The angle of maximum stress of the closed form, for effects that ask for it; the integral does not use it.
     theta_m = 0.5 * theta_1
     return dataclasses.replace(
         normal,

@@ -42,6 +42,7 @@ def grousers(ctx, p, x, wheel):
     # Area of the grousers' faces over that of the rim between them.
     faces = p.count * p.height / (_TURN * ctx.geometry.radius)
     lug = p.area_share * p.height * jnp.ones_like(wheel.slip_x)
+    # Both factors go by the height, so that grousers of height zero change nothing.
     return dataclasses.replace(wheel, lug=lug, grip=1.0 + jnp.minimum(faces, p.largest - 1.0))
 
 

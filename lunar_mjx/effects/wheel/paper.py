@@ -125,6 +125,7 @@ def printed_shear(ctx, p, x, wheel):
     normal_radius = p.mend_shear_radius * r + (1.0 - p.mend_shear_radius) * r_s
     shear_radius = p.mend_shear_radius * r_s + (1.0 - p.mend_shear_radius) * r
     drawbar = shear_radius * b * tau * a_factor - normal_radius * b * sigma_m * b_factor
+    # 1.553 rad are 89 deg.
     tangent = jnp.tan(jnp.clip(printed_slip_angle(contact), -1.553, 1.553))
     mended_side = p.mend_side > 0.5
     # |tan(beta)| inside and the sign outside: opposing, also where eq. 9 puts beta beyond 90 deg
@@ -138,6 +139,7 @@ def printed_shear(ctx, p, x, wheel):
     moment = Vec3(
         r * side,
         -heading * r_s * r_s * b * tau * theta_m,
+        # The second term is that of eq. 14 as printed; it vanishes for wheels that point straight ahead.
         jnp.where(mended_side, heading, 1.0) * jnp.sin(theta_m) * r * side - drawbar * b * theta_s / (8.0 * jnp.pi),
     )
     return dataclasses.replace(wheel, force=wheel.force + force, moment=wheel.moment + moment)
@@ -164,6 +166,7 @@ def engine_friction(ctx, p, x, wheel):
     """
     contact, radius = ctx.contact, ctx.geometry.radius
     slide_x, slide_y = contact.v_x - contact.rim_speed, contact.v_y
+    # The root's floor, a micrometre per second, gives a derivative at rest.
     speed = jnp.sqrt(slide_x**2 + slide_y**2 + 1e-12)
     load = ctx.normal.load + ctx.normal.damping
     friction = p.mu * load * jnp.tanh(speed / p.speed_scale) / speed

@@ -42,16 +42,19 @@ def fitted_plane(height_at, center, axle, radius, width):
     x = jnp.concatenate([center.x + u * ahead_x, (center.x - half * ahead_y)[None], (center.x + half * ahead_y)[None]])
     y = jnp.concatenate([center.y + u * ahead_y, (center.y + half * ahead_x)[None], (center.y - half * ahead_x)[None]])
     height = height_at(x, y)
+    # Heights relative to the foot: on a mountain, metres of height would eat the digits of millimetres of sinkage.
     foot = height[len(ALONG) // 2]
     along, left, right = height[:-2] - foot, height[-2], height[-1]
     clear = center.z - foot - along
     within = radius * (1.0 + MARGIN) - jnp.sqrt(u * u + clear * clear)
     # Far above ground no sample lies within the rim; those next to the axle then define a plane all the same.
     near = jnp.where(jnp.abs(share) < 0.3, _AIRBORNE, 0.0)
+    # Squared: the weight and its derivative go to zero where the rim leaves the ground.
     weight = jnp.maximum(within / radius, 0.0) ** 2 + near
     total = jnp.sum(weight, axis=0)
     mean_u, mean_h = jnp.sum(weight * u, axis=0) / total, jnp.sum(weight * along, axis=0) / total
     off = u - mean_u
+    # The samples next to the foot always weigh something, so that the denominator is never zero.
     slope = jnp.sum(weight * off * along, axis=0) / jnp.sum(weight * off * off, axis=0)
     across = (left - right) / width
     return (foot + mean_h - slope * mean_u, slope * ahead_x - across * ahead_y, slope * ahead_y + across * ahead_x)

@@ -32,6 +32,7 @@ def _rock_normal(ctx, p, x, normal):
         normal,
         entrance=jnp.where(rock, theta_1, normal.entrance),
         theta_m=jnp.where(rock, 0.5 * theta_1, normal.theta_m),
+        # Effects after this one that read the soil's stress find none on rock.
         sigma_m=jnp.where(rock, zero, normal.sigma_m),
         load=jnp.where(rock, load, normal.load),
         resistance=jnp.where(rock, zero, normal.resistance),
@@ -43,6 +44,7 @@ def _rock_normal(ctx, p, x, normal):
 def _rock_shear(ctx, p, x, wheel):
     """Replaces the soil's shear by f = mu F_N (1 - exp(-|k| L/K)) k/|k|, with k the slip vector of the shear state."""
     rock = ctx.soil.rock > 0.5
+    # Friction by the whole normal force, damping included: while a wheel lands, it presses harder.
     load = ctx.normal.load + ctx.normal.damping
     # The floor keeps the root's derivative finite for a wheel that has not slipped at all.
     slip = jnp.sqrt(wheel.slip_x**2 + wheel.slip_y**2 + 1e-12)
@@ -90,6 +92,7 @@ def _closest_point_to_sphere(center: Vec3, wheel_center: Vec3, axle: Vec3, radiu
     gap = center - wheel_center
     axial = gap.dot(axle)
     radial = gap - axle * axial
+    # Clipped length by length: radial and axial parts of a cylinder's nearest point do not depend on each other.
     length = radial.norm(1e-9)
     closest = radial * (jnp.minimum(length, radius) / length) + axle * jnp.clip(axial, -0.5 * width, 0.5 * width)
     apart = gap - closest
@@ -99,11 +102,13 @@ def _closest_point_to_sphere(center: Vec3, wheel_center: Vec3, axle: Vec3, radiu
 
 def _penalty(depth, rate, stiffness, damping):
     """max(k depth + c rate, 0) where in contact, N."""
+    # Never negative: a rock does not hold a wheel back when it leaves.
     return jnp.where(depth > 0.0, jnp.maximum(stiffness * depth + damping * rate, 0.0), 0.0)
 
 
 def _sliding_friction(velocity: Vec3, normal: Vec3, mu, load, speed_scale) -> Vec3:
     """mu F_N against the tangential velocity, smoothed below `speed_scale`."""
+    # Only the tangential part; the normal part is the penalty's own damping.
     tangential = velocity - normal * velocity.dot(normal)
     speed = tangential.norm(1e-6)
     return tangential * (-mu * load * jnp.tanh(speed / speed_scale) / speed)
@@ -207,10 +212,12 @@ def static_boulders(ctx, p, x, wheel):
     touch = _touch_boulder(ctx, p)
     sliding = touch.velocity - touch.toward * touch.velocity.dot(touch.toward)
     moved = Vec3(x.bristle_x, x.bristle_y, x.bristle_z) + sliding * ctx.dt
+    # The plane of contact has turned with the wheel's place on the boulder; what now points into it is no deflection.
     moved = moved - touch.toward * moved.dot(touch.toward)
     most = p.mu * touch.load
     # Beyond mu F_N the bristle slides along: its length is cut to what friction can hold.
     moved = moved * jnp.minimum(most / (p.tangential_stiffness * moved.norm(1e-9)), 1.0)
+    # Damping while it sticks: a spring alone would let a leaning rover swing for ever.
     pull = moved * -p.tangential_stiffness - sliding * p.tangential_damping
     friction = pull * jnp.minimum(most / pull.norm(1e-9), 1.0)
     bristles = {"bristle_x": moved.x, "bristle_y": moved.y, "bristle_z": moved.z}
@@ -225,6 +232,7 @@ def _boulders_under_chassis(ctx, p) -> list[tuple[Vec3, Vec3]]:
     """Force on the chassis, N, and its arm from the chassis frame, m, per quadrant of a box; world frame."""
     center, half = ctx.rover.box_center, ctx.rover.box_half
     rocks = []
+    # Four probes, since the grid of boulders returns one boulder per place and a chassis covers several cells.
     for fore, side in _QUADRANTS:
         probe = ctx.frame.to_world(Vec3(center.x + fore * half.x, center.y + side * half.y, center.z)) + ctx.position
         form = None if ctx.terrain.rocks.forms is None else form_at(ctx.terrain.rocks, probe.x, probe.y)
@@ -239,6 +247,7 @@ def _boulders_under_chassis(ctx, p) -> list[tuple[Vec3, Vec3]]:
             apart = gap - nearest
             distance = apart.norm(1e-9)
             inside = distance < 1e-6
+            # A centre within the box has no direction outward: the box is pushed up, where it came from.
             down = Vec3(jnp.zeros_like(distance), jnp.zeros_like(distance), -jnp.ones_like(distance))
             toward = ctx.frame.to_world(down.where(inside, apart * (1.0 / distance)))
             reached = radius - jnp.where(inside, 0.0, distance)
@@ -246,6 +255,7 @@ def _boulders_under_chassis(ctx, p) -> list[tuple[Vec3, Vec3]]:
             nearest, toward, reached = contact_with_box(form, gap, ctx.frame, half)
         arm = ctx.frame.to_world(nearest + center)
         velocity = ctx.velocity + ctx.angular_velocity.cross(arm)
+        # As for wheels: no boulder, no contact.
         depth = jnp.where(radius > 0.0, reached, -1.0)
         load = share * _penalty(depth, velocity.dot(toward), p.stiffness, p.damping)
         out.append((toward * -load + _sliding_friction(velocity, toward, p.mu, load, p.speed_scale), arm))
@@ -284,6 +294,7 @@ def joint_limits(ctx, p, x, wrench):
     """Joint stops as passive springs with damping, so that the solver sees equality constraints only."""
     below = jnp.maximum(ctx.rover.joint_lower - ctx.joint_angle, 0.0)
     above = jnp.maximum(ctx.joint_angle - ctx.rover.joint_upper, 0.0)
+    # Damping only against the stop: a joint that leaves it is not held back.
     upward = jnp.where(below > 0.0, jnp.maximum(p.stiffness * below - p.damping * ctx.joint_speed, 0.0), 0.0)
     downward = jnp.where(above > 0.0, jnp.maximum(p.stiffness * above + p.damping * ctx.joint_speed, 0.0), 0.0)
     return dataclasses.replace(wrench, joint_torque=wrench.joint_torque + upward - downward)

@@ -41,6 +41,7 @@ _ALONG, _ALONG_WEIGHTS = (a.tolist() for a in np.polynomial.legendre.leggauss(6)
 
 def slip_angle_tangent(contact):
     """|v_y|/|v_x|, fading to 0 at standstill; 1000 at most."""
+    # Bounded by a share of v_y itself: broadside, the quotient would be infinite.
     return jnp.abs(contact.v_y) / jnp.sqrt(contact.v_x**2 + (1e-3 * contact.v_y) ** 2 + _STILL**2)
 
 
@@ -52,6 +53,7 @@ def scaled_stress(ctx, normal, factor):
             normal, sigma_m=normal.sigma_m * f, load=normal.load * f, resistance=normal.resistance * f
         )
     theta, weight, old = normal.stress.theta, normal.stress.weight, normal.stress.sigma
+    # The integral is redone from the nodes: a factor that differs along the arc has no factor for the sum.
     f = factor(theta)
     change = ctx.geometry.radius * ctx.geometry.width * weight * old * (f - 1.0)
     # What changes is added, so that nothing is rounded where nothing changes.

@@ -45,6 +45,7 @@ def integrate(ctx, contact, theta_1, theta_m, theta_2, reversal=None):
         # Quadrature across a kink converges slowly, so the arc is divided where the shear turns about.
         edges = [theta_2, jnp.minimum(turn, theta_m), jnp.maximum(turn, theta_m), theta_1]
     parts = list(itertools.pairwise(edges))
+    # The whole arc in one array: two loops over its parts would compile twice.
     theta = jnp.concatenate([low + (high - low) * share for low, high in parts])
     weight = jnp.concatenate([half * (high - low) for low, high in parts])
     # The rear stress at theta is the front stress at the angle that lies as far, in proportion, from theta_m.
@@ -56,7 +57,9 @@ def integrate(ctx, contact, theta_1, theta_m, theta_2, reversal=None):
     # depth^n by its logarithm: XLA's power also handles negative numbers, at twice the time
     sigma = grounded(contact, modulus * jnp.exp(ctx.soil.n * jnp.log(depth)))
     area = r * b
+    # Weighted once here: load, resistance and shear all sum the same products.
     pressed = weight * sigma
+    # cos = 1 - 2 sin^2(theta/2), from the half angles at hand; no further cosine per node.
     load = area * jnp.sum(pressed * (1.0 - 2.0 * sine * sine), axis=0)
     resistance = area * jnp.sum(2.0 * pressed * sine * cosine, axis=0)
     return load, resistance, Stress(theta=theta, weight=weight, sigma=sigma)
@@ -87,6 +90,7 @@ def _shear(ctx, p, x, wheel):
     r, b, r_s = geometry.radius, geometry.width, shearing_radius(p, geometry, wheel)
     theta_1, stress = normal.entrance, normal.stress
     theta = stress.theta
+    # Strength at nodes before any sum: the law is linear in it, but the mobilisation differs from node to node.
     strength = grounded(ctx.contact, soil.cohesion + stress.sigma * soil.tan_phi)
     sine, cosine = half_angle(theta)
     j_x = shear_along(wheel, normal, theta, r_s, r, (sine, cosine))
@@ -100,6 +104,7 @@ def _shear(ctx, p, x, wheel):
         -area * across,
         normal.load + normal.damping + wheel.direction * r_s * b * lift,
     )
+    # The normal stress acts through the axle and gives no moment; only shear turns the wheel.
     moment = Vec3(-r * area * roll, -r_s * r_s * b * turn, -wheel.direction * r * area * yaw)
     return dataclasses.replace(wheel, force=wheel.force + force, moment=wheel.moment + moment)
 
