@@ -69,12 +69,14 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
             # MuJoCo warns of inertia that is next to singular; numbers computed from it would be noise
             warnings.simplefilter("error")
             model = _compile(source, spec)
+            # Compiled twice: springs follow from weights that only the compiled model knows.
             level_springs(spec, model, roles, described)
             model = _compile(source, spec)
             xml = to_xml(spec)
             # What is compared with the URDF is the text as anyone will read it, not the model in memory.
             again = mujoco.MjModel.from_xml_string(xml)
             _assert_nothing_lost(source, roles, loops, ties(driven) + len(couplings), again)
+            # From the compiled model: what the record says of masses and gains is what MuJoCo will simulate.
             record = _record(source, name, roles, loops, described, model, height, height_notes, driven)
     except Warning as error:
         raise _uncompilable(source, error) from None
@@ -96,6 +98,7 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
             record_part.write_text(title + _compact(tomli_w.dumps(record)), encoding="utf-8")
     except OSError as error:
         raise UserError(f"{out}: cannot be written ({error.strerror}); give another output folder.") from None
+    # Loaded as users will: what was just written must pass every check of a foreign file.
     return load_rover(out.resolve())
 
 
@@ -150,6 +153,7 @@ def _assert_nothing_lost(
     """
     expected = sum(link.mass for link in urdf.links.values())
     total = float(model.body_mass.sum())
+    # The text keeps twelve digits; a lost link is grams.
     if abs(total - expected) > 1e-9 * expected:
         raise bad_input(
             urdf.path, "total mass", f"{expected:.12g} kg", f"became {total:.12g} kg in the MJCF", "report this"
@@ -183,6 +187,7 @@ def _record(
 ) -> dict[str, Any]:
     """The contents of `rover.toml`."""
     base = roles.bodies[0]
+    # Points, not meshes: contact costs a height each, and a hull's corners touch first.
     points, point_notes = _chassis_points(base, roles)
     wheels = []
     for w in roles.wheels:
@@ -221,6 +226,7 @@ def _record(
         "standing_height": height,
         "gravity": description.gravity,
         "chassis": base.name,
+        # Plus zero, since -0.0 would be written as such.
         "chassis_points": [[round(float(v), 6) + 0.0 for v in p] for p in points],
         "notes": [*urdf.notes, *roles.notes, *_passive_notes(roles, loops), *notes, *point_notes],
         "groups": groups,
@@ -268,6 +274,7 @@ def _passive_notes(roles: Roles, loops: tuple[PlacedLoop, ...]) -> list[str]:
     parents = {b.name: b.parent for b in roles.bodies}
     guided: set[str | None] = {body for loop in loops for body in (loop.body1, loop.body2)}
     for name in list(guided):
+        # A loop guides every link of the chain that it closes, up to the base.
         while name is not None:
             guided.add(name)
             name = parents[name]
@@ -288,6 +295,7 @@ def _chassis_points(base: Body, roles: Roles) -> tuple[np.ndarray, list[str]]:
     if not len(corners):
         centers = np.array([w.center for w in roles.wheels])
         low, high = centers.min(axis=0), centers.max(axis=0)
+        # Wheel centres are all at one height; a wheel's diameter gives the box some.
         high[2] = low[2] + max(w.radius for w in roles.wheels) * 2
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         notes.append("the chassis has no primitive shape: its contact points are the box between the wheel centres")
@@ -308,16 +316,19 @@ def _box_corners(shape: Geometry) -> list[np.ndarray]:
     elif shape.kind == "cylinder":
         half = np.array([shape.size[0], shape.size[0], shape.size[1] / 2])
     else:
+        # A sphere's box; its corners lie outside it, which errs on the side of touching early.
         half = np.full(3, shape.size[0])
     return [shape.pose.apply(half * [x, y, z]) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 
 
 def _farthest(points: np.ndarray, count: int) -> np.ndarray:
     """`count` of the points, each the farthest from those taken before, in the order given."""
+    # Rounded: distances that are equal by symmetry would be ordered by the machine's last digit.
     distance = np.round(np.linalg.norm(points - points.mean(axis=0), axis=1), 9)
     chosen: list[int] = []
     for _ in range(count):
         chosen.append(int(np.argmax(distance)))
         step = np.round(np.linalg.norm(points - points[chosen[-1]], axis=1), 9)
         distance = step if len(chosen) == 1 else np.minimum(distance, step)
+    # In the order given, so that files do not depend on the order of choice.
     return points[np.sort(chosen)]

@@ -42,6 +42,7 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
         """-1 where the conversion has reversed the joint's axis, which also turns frames; told by the limits' axis."""
         body = moving[joint]
         assert body.joint is not None
+        # In the root's frame at zero angles, where both descriptions can be compared.
         pose = world_poses(bodies)[body.name].rotation @ body.joint.axis
         return 1.0 if _drawn_axis(urdf, joint) @ pose > 0.0 else -1.0
 
@@ -51,6 +52,7 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
         field = f"joint '{joint.name}' mimic joint"
         if joint.mimic.leader not in moving or joint.mimic.leader == joint.name:
             raise bad_input(urdf.path, field, joint.mimic.leader, "is no other moving joint", "correct the name")
+        # A chain would need an order of constraints; naming the first leader says the same.
         if written[joint.mimic.leader].mimic is not None:
             raise bad_input(urdf.path, field, joint.mimic.leader, "follows a joint itself", "follow that joint")
         # The converter turns axes so that positive drives forward; a ratio written for the URDF's axes changes its sign
@@ -75,9 +77,11 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
             raise bad_input(
                 path, f"differentials[{i}].joint2", pair.joint2, "is not parallel to joint1", "name the rockers' pivots"
             )
+        # Opposite in space: where the axes themselves point opposite ways, equal angles are.
         couplings.append(Coupling(pair.joint2, pair.joint1, -1.0 if cosine > 0.0 else 1.0, 0.0))
     followers = [c.follower for c in couplings]
     for name in followers:
+        # Two constraints on one joint would fight each other within the solver.
         if followers.count(name) > 1:
             raise bad_input(path, "joint", name, "follows two joints", "leave one of them out")
     return tuple(couplings)

@@ -90,6 +90,7 @@ class LoopDescription:
 def _default_groups() -> dict[str, GroupDescription]:
     return {
         "drive": GroupDescription("velocity"),
+        # Steering and suspension turn slowly: a gear of more stages than a drive's, which loses more.
         "steer": GroupDescription("position", gear_ratio=1526.0, gear_efficiency=0.6),
         "suspension": GroupDescription("position", gear_ratio=1526.0, gear_efficiency=0.6),
     }
@@ -163,6 +164,7 @@ def read_description(path: str | Path) -> Description:
     check_keys(path, "joints", joints, set(GROUPS))
     groups = _default_groups()
     for name, table in joints.items():
+        # What a table leaves out keeps the group's default, not the class's.
         groups[name] = _group(path, f"joints.{name}", table, groups[name])
     return Description(**given, groups=groups, stated=frozenset(joints))
 
@@ -224,6 +226,7 @@ def _group(path: Path, where: str, table: Mapping[str, Any], default: GroupDescr
     if given.get("gear_efficiency", 1.0) > 1:
         raise bad_input(path, f"{where}.gear_efficiency", given["gear_efficiency"], "is above 1", "give a fraction")
     group = GroupDescription(**{**default.__dict__, **given})
+    # Level is where a spring bears the weight; without one there is nothing to set.
     if group.spring_reference == "level" and group.stiffness == 0:
         raise bad_input(path, f"{where}.spring_reference", "level", "needs a spring", "give a stiffness above zero")
     return group
@@ -263,6 +266,7 @@ def text(path: Path, where: str, value: Any) -> str:
 
 def number(path: Path, where: str, value: Any) -> float:
     """Returns a finite float, or raises `UserError`; a text or a truth value is not a number here."""
+    # bool is an int to Python.
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise bad_input(path, where, value, "is not a number", "give a finite number")
     return require_finite(path, where, value)
@@ -286,6 +290,7 @@ def numbers(path: Path, where: str, value: Any, count: int) -> tuple[float, ...]
 
 def one_of(path: Path, where: str, value: Any, choices: tuple[Any, ...]) -> Any:
     """Returns `value` if it is one of `choices`."""
+    # True == 1 to Python, and would pass as a choice of numbers.
     if value not in choices or isinstance(value, bool):
         raise bad_input(path, where, value, "is not known", f"choose from {', '.join(map(str, choices))}")
     return value

@@ -45,6 +45,7 @@ def _joints(model: mujoco.MjModel) -> list[str]:
     single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     for j in range(model.njnt):
         name = f"the joint {model.joint(j).name!r}"
+        # MuJoCo turns the joint by its position less ref, the library by the position itself.
         if model.jnt_type[j] in single and model.qpos0[model.jnt_qposadr[j]] != 0.0:
             problems.append(f"ref of {name}")
         if model.jnt_actfrclimited[j]:
@@ -58,6 +59,7 @@ def _actuators(model: mujoco.MjModel) -> list[str]:
         name = f"the motor {model.actuator(i).name!r}"
         if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT:
             problems.append(f"transmission of {name}")
+        # A gear of its own would multiply the gear of rover.toml.
         if not np.array_equal(model.actuator_gear[i], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]):
             problems.append(f"gear of {name}")
         if model.actuator_ctrllimited[i]:
@@ -82,6 +84,7 @@ def check_sizes(path: Path, model: mujoco.MjModel, wheels: Sequence[Wheel], stan
       UserError: a wheel's radius does not go with the height at which the rover stands, or its shape in the MJCF.
     """
     data = mujoco.MjData(model)
+    # At zero angles; no dynamics are needed for heights.
     mujoco.mj_kinematics(model, data)
     chassis = float(data.xpos[1][2])
     for i, wheel in enumerate(wheels):

@@ -69,6 +69,7 @@ def load_rover(name_or_path: str | Path) -> Rover:
     toml.check_keys(path, "", data, _TOP, _TOP - {"source", "notes", "loops", "drive_groups", "gravity"})
     toml.one_of(path, "format", data["format"], (FORMAT,))
     file = toml.text(path, "mjcf", data["mjcf"])
+    # A path would let a rover's folder name files elsewhere.
     if Path(file).name != file:
         raise bad_input(path, "mjcf", file, "is not the name of a file beside it", _CONVERT_AGAIN)
     mjcf = require_file(folder / file, "the rover's MJCF")
@@ -79,6 +80,7 @@ def load_rover(name_or_path: str | Path) -> Rover:
     except (ValueError, Warning) as error:
         reason = one_line(error)
         raise UserError(f"{mjcf}: MuJoCo cannot compile it ({reason}); {_CONVERT_AGAIN}.") from None
+    # Before anything is read: a field that would be ignored makes another rover.
     refuse_unused_fields(mjcf, model)
     mass = toml.at_least(path, "mass", data["mass"], 0.0, strict=True)
     if mass > HEAVIEST:
@@ -123,6 +125,7 @@ def _gravity(path: Path, data: Mapping[str, Any], model: mujoco.MjModel) -> tupl
     if "gravity" not in data:
         return None, (f"the MJCF's gravity {np.linalg.norm(mjcf):g} m/s2 is not used: rover.toml states none",)
     gravity = toml.at_least(path, "gravity", data["gravity"], 0.0, strict=False)
+    # MuJoCo's viewer would show another weight than the library simulates.
     if np.abs(mjcf - [0.0, 0.0, -gravity]).max() > GRAVITY_TOLERANCE:
         shown = " ".join(f"{v:g}" for v in mjcf)
         raise bad_input(path, "gravity", gravity, f'is not the MJCF\'s gravity="{shown}"', _CONVERT_AGAIN)
@@ -186,6 +189,7 @@ def _groups(path: Path, data: Any, model: mujoco.MjModel) -> tuple[JointGroup, .
             )
         )
     listed = [joint for group in groups for joint in group.joints]
+    # In order, since controls are arrays without names.
     if listed != actuators:
         motors = ", ".join(actuators)
         raise bad_input(path, "groups joints", ", ".join(listed), f"are not the motors {motors}", _CONVERT_AGAIN)

@@ -47,6 +47,7 @@ def place_loops(urdf: Urdf, bodies: tuple[Body, ...], description: Description) 
             raise bad_input(
                 path, f"loops[{i}].link2", loop.link2, "belongs to the body of link1", "tie two bodies that move"
             )
+        # At zero angles both anchors must be one point: a solver would close a wrong gap by bending the rover.
         gap = float(np.linalg.norm(poses[body1].apply(anchor1) - poses[body2].apply(anchor2)))
         if gap > CLOSED:
             raise bad_input(

@@ -46,6 +46,7 @@ def build_spec(
     option = spec.option
     option.timestep = description.timestep
     option.gravity = [0.0, 0.0, -description.gravity]
+    # Semi-implicit Euler, as the library's own engines step: parity compares like with like.
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     # Equalities alone make a quadratic problem, which one Newton step solves.
@@ -57,6 +58,7 @@ def build_spec(
     for group in GROUPS:
         for joint in roles.group(group):
             motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            # Torque in, torque out: control and motor physics are effects and not MuJoCo's.
             motor.set_to_motor()
     for i, loop in enumerate(loops):
         _add_connect(spec, f"loop_{i}", loop, description)
@@ -65,6 +67,7 @@ def build_spec(
             _add_tie(spec, f"{group.name}_{joint}", Coupling(joint, group.joints[0], 1.0, 0.0), description)
         for joint in group.joints:
             # One rotor turns with all wheels of the group.
+            # Shared out, because the tie adds the wheels' inertias up again.
             spec.joint(joint).armature = spec.joint(joint).armature / len(group.joints)
     for coupling in couplings:
         _add_tie(spec, f"{coupling.follower}_follows_{coupling.leader}", coupling, description)
@@ -74,6 +77,7 @@ def build_spec(
 def _add_body(
     parent: mujoco.MjsBody, body: Body, description: Description, roles: Roles, standing_height: float
 ) -> mujoco.MjsBody:
+    # The base stands on the ground at zero angles, so that a scene can be looked at as it is.
     position = np.array([0.0, 0.0, standing_height]) if body.parent is None else body.pose.position
     added = parent.add_body(name=body.name, pos=position, quat=quaternion(body.pose.rotation))
     # From the URDF, never from the shapes, whose density MuJoCo would invent.
@@ -97,6 +101,7 @@ def _add_body(
         for name in GROUPS:
             if body.joint.name in roles.group(name):
                 group = description.groups[name]
+                # The rotor turns N times as fast, and its torque counts N times at the joint.
                 joint.armature = group.rotor_inertia_kg_m2 * group.gear_ratio**2
                 _set_linear(joint, "stiffness", group.stiffness)
                 _set_linear(joint, "damping", group.damping)
@@ -113,12 +118,15 @@ def _add_body(
             pos=shape.pose.position,
             quat=quaternion(shape.pose.rotation),
             rgba=shape.rgba,
+            # The shape is for looking and touching; the body's mass is explicit.
             mass=0.0,
             contype=0,
             conaffinity=1,
         )
     for link, pose in body.frames.items():
         if link != body.name:
+            # Links that were fused keep their frames as sites: instruments are mounted there. Group 4 is hidden by
+            # default.
             added.add_site(name=link, pos=pose.position, quat=quaternion(pose.rotation), group=4)
     return added
 
@@ -158,11 +166,13 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     """Unit quaternion (4,), w first and not negative, of a rotation matrix (3, 3)."""
     result = np.zeros(4)
     mujoco.mju_mat2Quat(result, np.ascontiguousarray(rotation).reshape(9))
+    # One sign of two that mean the same, so that files do not differ; 0.0 - x writes no -0.
     return result if result[0] >= 0 else 0.0 - result
 
 
 def digits(values: np.ndarray | float) -> str:
     """Numbers as text with twelve significant digits: what is written and read again is the same model."""
+    # Rounding of rotations leaves 1e-17 where zero is meant.
     cleaned = [0.0 if abs(v) < 1e-15 else float(v) for v in np.atleast_1d(values)]
     return " ".join(f"{v:.12g}" for v in cleaned)
 
@@ -191,6 +201,7 @@ def to_xml(spec: mujoco.MjSpec) -> str:
                 _put(child, "pos", source.pos, np.zeros(3))
                 _put(child, "quat", source.quat, np.array([1.0, 0, 0, 0]))
         for joint in element.findall("joint"):
+            # MuJoCo writes free joints as <joint>, which then takes defaults such as armature; <freejoint> takes none.
             if joint.get("type") == "free":
                 element.insert(list(element).index(joint), ET.Element("freejoint", {"name": joint.attrib["name"]}))
                 element.remove(joint)
@@ -201,6 +212,7 @@ def to_xml(spec: mujoco.MjSpec) -> str:
             for key in ("armature", "damping", "stiffness", "springref"):
                 _put(joint, key, np.ravel(getattr(source, key))[:1], np.zeros(1))
     for motor in root.findall("actuator/general"):
+        # A plain motor written in full as <general> hides that it is one.
         motor.tag = "motor"
     ET.indent(root, "  ")
     return ET.tostring(root, encoding="unicode").replace(" />", "/>") + "\n"
@@ -213,6 +225,7 @@ def _spell_out_options(root: ET.Element, spec: mujoco.MjSpec) -> None:
     given = dict(option.attrib)
     option.attrib.clear()
     option.set("timestep", digits(spec.option.timestep))
+    # Defaults may change with MuJoCo's version; the closures rely on these.
     option.attrib.update({"integrator": "Euler", "solver": "Newton", **given})
 
 

@@ -71,7 +71,9 @@ def assign_roles(urdf: Urdf, bodies: tuple[Body, ...], description: Description)
     wheels = _name_corners(urdf, wheels, description)
     notes: list[str] = []
     if not description.wheels:
+        # Only inferred roles: who names a rocker as a suspension means it.
         wheels, notes = _drop_shared(bodies, wheels)
+    # Signs before frames: aligning a wheel reads the mended axis.
     bodies, flips = _mend_signs(bodies, poses, wheels)
     bodies = _align_wheels(bodies, poses, wheels)
     return Roles(tuple(wheels), bodies, tuple(notes + flips))
@@ -115,6 +117,7 @@ def _rim(body: Body) -> tuple[Geometry, float, float] | None:
             rims.append((shape, shape.size[0], shape.size[1]))
         elif shape.kind == "sphere":
             rims.append((shape, shape.size[0], shape.size[0]))
+    # The largest: hubs and spokes are drawn as smaller shapes.
     return max(rims, key=lambda f: f[1], default=None)
 
 
@@ -127,6 +130,7 @@ def _candidates(bodies: tuple[Body, ...], poses: dict[str, Pose]) -> list[Body]:
         if body.joint is None or body.joint.kind not in _HINGES or body.name in parents:
             continue
         rim = _rim(body)
+        # 25 deg of camber or toe at most, beyond which it is no wheel of a rover that faces x.
         if rim is None or abs(_world_axis(body, poses)[1]) < 0.9:
             continue
         candidates.append(body)
@@ -170,6 +174,7 @@ def _role(
     radius, width = given.radius, given.width
     center = poses[body.name].position
     if rim is not None:
+        # What the description says wins over what is drawn.
         radius, width = radius or rim[1], width or rim[2]
         center = (poses[body.name] @ rim[0].pose).position
     if radius is None or width is None:
@@ -190,6 +195,7 @@ def _role(
             # A steering joint lies below the suspension; a turning mast above it would be something else.
             if upright > 0.9 and steer is None and suspension is None:
                 steer = ancestor.joint.name
+            # Level within 6 deg; the nearest such ancestor, since a bogie is closer to its wheel than its rocker.
             elif upright < 0.1 and suspension is None:
                 suspension = ancestor.joint.name
         parent = ancestor.parent
@@ -214,6 +220,7 @@ def _name_corners(urdf: Urdf, wheels: list[WheelRole], description: Description)
     for letter, row in zip(letters, rows, strict=True):
         for wheel in sorted(row, key=lambda w: -w.center[1]):
             y = wheel.center[1]
+            # A wheel in the middle plane belongs to neither side.
             side = "c" if abs(y) < _SAME_PLACE else "l" if y > 0 else "r"
             named.append(replace(wheel, corner=wheel.corner or side + letter))
     corners = [w.corner for w in named]
@@ -252,6 +259,7 @@ def _mend_signs(
     by_joint = {b.joint.name: b for b in bodies if b.joint is not None}
     reverse: dict[str, str] = {}
     for wheel in wheels:
+        # A wheel that turns about +y (left) by the right hand rolls forward, its top moving ahead.
         if _world_axis(by_joint[wheel.drive], poses)[1] < 0:
             reverse[wheel.drive] = "drives forward"
         if wheel.steer is not None and _world_axis(by_joint[wheel.steer], poses)[2] < 0:
@@ -266,6 +274,7 @@ def _mend_signs(
                     f"joint '{wheel.suspension}': turning it does not move the wheel '{wheel.body}' up or down; "
                     "name another suspension joint in the description beside the URDF ([[wheels]])."
                 )
+            # Positive shall raise the chassis, and so push the wheel down relative to it.
             if lift > 0:
                 reverse[wheel.suspension] = "raises the chassis"
     mended = tuple(flip_axis(b) if b.joint is not None and b.joint.name in reverse else b for b in bodies)
@@ -282,6 +291,7 @@ def _align_wheels(bodies: tuple[Body, ...], poses: dict[str, Pose], wheels: list
             pose = poses[body.name]
             axle = _world_axis(body, poses)
             forward = np.cross(axle, [0.0, 0.0, 1.0])
+            # Level, whatever the camber: the wheel frame's x is where it rolls to.
             forward /= np.linalg.norm(forward)
             turn = pose.rotation.T @ np.column_stack([forward, axle, np.cross(forward, axle)])
             # Only along the axle: the joint's axis must go through the body's origin.

@@ -58,10 +58,12 @@ def holding_torques(model: mujoco.MjModel, roles: Roles) -> dict[str, float]:
         jacobian = np.zeros((3, model.nv))
         # Straight below the axle: no moment about the drive joint.
         mujoco.mj_jac(model, data, jacobian, None, data.xpos[body] - [0, 0, wheel.radius], body)
+        # Unit vertical force at each wheel's foot, as generalised forces.
         columns.append(jacobian[2])
     joints = roles.group("suspension")
     for joint in joints:
         unit = np.zeros(model.nv)
+        # Unit torque at each suspension joint.
         unit[model.joint(joint).dofadr[0]] = 1.0
         columns.append(unit)
     if data.nefc:
@@ -70,7 +72,9 @@ def holding_torques(model: mujoco.MjModel, roles: Roles) -> dict[str, float]:
             mujoco.mju_sparse2dense(rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
         else:
             rows = data.efc_J.reshape(data.nefc, model.nv)
+        # Whatever force the loops need, they give; it must not be put on the springs.
         columns.extend(rows)
+    # The rover is in rest where these forces carry its weight (qfrc_bias at zero speed).
     matrix = np.array(columns).T
     # Loads of four wheels on flat ground are one too many to be determined: the smallest loads are the symmetric ones.
     solution, *_ = np.linalg.lstsq(matrix, data.qfrc_bias, rcond=1e-9)
@@ -101,6 +105,7 @@ def effective_inertia(model: mujoco.MjModel, joint: str) -> float:
     dof = model.joint(joint).dofadr[0]
     unit[0, dof] = 1.0
     mujoco.mj_solveM(model, data, response, unit)
+    # One over the diagonal of the inverse and not of M: the others are free to yield, so the joint feels less.
     return float(1.0 / response[0, dof])
 
 
@@ -114,6 +119,7 @@ def gains(model: mujoco.MjModel, roles: Roles, description: Description, name: s
     joints = roles.group(name)
     position, velocity = 0.0, 0.0
     if joints and group.mode in ("position", "velocity"):
+        # The smallest: one gain serves the group, and must be stable at each joint.
         inertia = min(effective_inertia(model, j) for j in joints)
         dt = description.timestep
         if group.mode == "velocity":
@@ -121,10 +127,13 @@ def gains(model: mujoco.MjModel, roles: Roles, description: Description, name: s
         else:
             load = 0.0
             if name == "suspension" and group.stiffness == 0:
+                # A position loop has no integral part: what it carries, it carries by an error.
                 load = max(abs(t) for t in holding_torques(model, roles).values())
             wanted = max(inertia * GAIN_RULES.bandwidth**2, load / GAIN_RULES.sag)
             position = min(wanted, GAIN_RULES.position_share * inertia / dt**2)
+            # k_d = 2 zeta sqrt(k_p I), of a second-order system.
             velocity = 2 * GAIN_RULES.damping_ratio * np.sqrt(position * inertia)
+    # Three digits: gains are choices, and files shall not differ between machines.
     chosen = Gains(float(f"{position:.3g}"), float(f"{velocity:.3g}"))
     return Gains(
         chosen.position if group.position_gain is None else group.position_gain,

@@ -50,9 +50,11 @@ def bodies_of(urdf: Urdf) -> tuple[Body, ...]:
         link, parent, pose, joint = waiting.pop(0)
         frames = _fixed_frames(link, joints)
         if joint is None:
+            # Many URDFs begin with an empty footprint link, whose frame says nothing of the rover.
             link, frames = _base_frame(urdf, link, frames)
         body = _fuse(urdf, link, parent, pose, joint, frames)
         bodies.append(body)
+        # Children of any fused link hang from the fused body.
         children = [j for j in joints if j.parent in frames and j.kind != "fixed"]
         for child in reversed(children):  # depth first keeps each leg's bodies together
             waiting.insert(0, (child.child, body.name, frames[child.parent] @ child.pose, child))
@@ -78,6 +80,7 @@ def locate(bodies: tuple[Body, ...], link: str) -> tuple[Body, Pose] | None:
 def flip_axis(body: Body) -> Body:
     """A body with its joint's positive direction reversed."""
     assert body.joint is not None
+    # Limits change sides with the sign: the motion that they allow stays.
     low, high = body.joint.limits
     return replace(body, joint=replace(body.joint, axis=0.0 - body.joint.axis, limits=(-high, -low)))
 
@@ -85,6 +88,7 @@ def flip_axis(body: Body) -> Body:
 def reframe(body: Body, frame: Pose) -> Body:
     """The same body described in another frame, given in the present one; only for a body without children."""
     assert body.joint is not None
+    # The inverse of a rotation is its transpose.
     inverse = Pose(-frame.rotation.T @ frame.position, frame.rotation.T)
     return replace(
         body,
@@ -168,4 +172,5 @@ def _fuse(urdf: Urdf, name: str, parent: str | None, pose: Pose, joint: Joint | 
         inertia += link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     check_inertia(urdf.path, name, inertia)
     geometry = tuple(replace(g, pose=frame @ g.pose) for link, frame in links for g in link.geometry)
+    # Symmetric to the last digit, as MuJoCo demands.
     return Body(name, parent, pose, joint, mass, com, (inertia + inertia.T) / 2, geometry, frames)

@@ -119,6 +119,7 @@ def read_urdf(path: str | Path) -> Urdf:
     """
     path = require_file(path, "the URDF")
     try:
+        # The standard library's parser: it resolves no external entities.
         robot = ET.parse(path).getroot()
     except (ET.ParseError, ValueError, LookupError, RecursionError) as error:  # LookupError: of the encoding
         raise UserError(f"{path}: the URDF is not well-formed XML ({error}); mend the file at that place.") from None
@@ -135,6 +136,7 @@ def read_urdf(path: str | Path) -> Urdf:
                 "expand the file first: xacro in.xacro > out.urdf",
             )
     reader = _Reader(path)
+    # Colours may be defined once at the top and used by name.
     colours = {m.get("name", ""): reader.colour(m) for m in robot.findall("material") if m.find("color") is not None}
     links = [reader.link(element, colours) for element in robot.findall("link")]
     joints = [reader.joint(element) for element in robot.findall("joint")]
@@ -176,6 +178,7 @@ class _Reader:
         name = element.get("name", "").strip()
         if not name:
             raise bad_input(self.path, f"{what} name", "", "is missing", f"name every {what}")
+        # Names become channel names and stand in messages of one line.
         if not name.isprintable() or len(name) > LONGEST_NAME:
             remedy = f"give at most {LONGEST_NAME} characters of one line"
             raise bad_input(self.path, f"{what} name", name, "is no name", remedy)
@@ -222,6 +225,7 @@ class _Reader:
             self.number(tensor, key, f"{field} inertia") for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
         pose = self.pose(inertial, f"{field} inertial")
+        # Inertia may be given in a turned frame; from here on it is the link's.
         inertia = pose.rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ pose.rotation.T
         return Link(name, mass, pose.position, inertia, geometry)
 
@@ -255,6 +259,7 @@ class _Reader:
             if not link:
                 raise bad_input(self.path, f"{field} {end}", "", "is missing", f"name the {end} link")
             ends.append(link)
+        # x is URDF's default axis.
         axis = self.numbers(element.find("axis"), "xyz", "1 0 0", f"{field} axis")
         length = float(np.linalg.norm(axis))
         if length < 1e-9 and kind not in ("fixed", "floating"):
@@ -262,6 +267,7 @@ class _Reader:
         limits = (-np.inf, np.inf)
         limit = element.find("limit")
         if kind in ("revolute", "prismatic"):
+            # URDF demands limits of these joints; one without would be 'continuous'.
             if limit is None:
                 raise bad_input(self.path, f"{field} limit", "", "is missing", "give it, or use 'continuous'")
             lower, upper = (float(self.numbers(limit, k, "0", f"{field} limit", 1)[0]) for k in ("lower", "upper"))
@@ -308,10 +314,12 @@ def _check_tree(path: Path, links: dict[str, Link], joints: list[Joint]) -> str:
             )
         parent_of[joint.child] = joint
     roots = [name for name in links if name not in parent_of]
+    # Two roots would be two rovers.
     if len(roots) > 1:
         raise bad_input(
             path, "root links", ", ".join(roots), "are not connected by joints", "join all links into one tree"
         )
+    # Each link has one parent, so what cannot be reached from the root runs in a circle.
     if not roots or len(_reachable(roots[0], joints)) < len(links):
         stray = sorted(set(links) - (_reachable(roots[0], joints) if roots else set()))
         raise bad_input(path, "links", ", ".join(stray), "form a cycle of joints", "break the cycle")

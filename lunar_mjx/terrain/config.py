@@ -126,6 +126,7 @@ def parse_config(table: dict[str, Any], source: str) -> TerrainConfig:
         for other in ("dem", "surface", "crop", "detail", "rocks", "soil"):
             if getattr(config, other) is not None:
                 raise bad_input(source, other, "given", "does not go with [plane]", "remove one of the two")
+    # An empty [soil] would pass in silence, and its writer take a default for what was meant.
     elif config.soil is not None and (config.soil.rock_fraction, config.soil.grids, config.soil.classes) == (None,) * 3:
         raise bad_input(source, "soil", "empty", "says nothing", "give rock_fraction, [soil.grids] or [soil.classes]")
     elif config.soil is not None and None not in (config.soil.grids, config.soil.classes):
@@ -152,14 +153,17 @@ def _build(cls: type, table: Any, source: str, where: str) -> Any:
     try:
         return cls(**values)
     except UserError as error:
+        # Checks of the dataclasses do not know the file; its name is put before them here.
         raise UserError(f"{source}: [{where}] {error}") from None
 
 
 def _convert(hint: Any, value: Any, source: str, where: str) -> Any:
     if isinstance(hint, types.UnionType):
+        # Optional fields are written by leaving them out, so a value is never None.
         hint = next(h for h in typing.get_args(hint) if h is not type(None))
     if dataclasses.is_dataclass(hint):
         return _build(hint, value, source, where)  # pyright: ignore[reportArgumentType]
+    # TOML tells 1 from 1.0; nobody who writes a length does.
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = require_finite(source, where, value)
     kinds = {

@@ -82,6 +82,7 @@ def profile(r: Any, depth: Any, xp: Any = np) -> Any:
     Returns:
       Height in m: a parabolic bowl and an r^-3 rim, joined by a smooth minimum, zero beyond `CRATER_SHAPE.reach`.
     """
+    # Bowl and blanket meet at r = 1, where both have the height of the rim.
     rim = CRATER_SHAPE.rim * depth
     bowl = rim + depth * (r * r - 1)
     # Inside half a radius the bowl is far below the blanket, whose value there only has to be finite.
@@ -90,6 +91,7 @@ def profile(r: Any, depth: Any, xp: Any = np) -> Any:
     # Beyond this many widths the smooth minimum is the minimum, and exp() would overflow.
     lower, gap = xp.minimum(bowl, blanket), xp.minimum(xp.abs(bowl - blanket) / width, 40.0)
     joined = lower - width * xp.log1p(xp.exp(-gap))
+    # Less the blanket's height where it is cut off, so that no step rings the crater.
     return xp.where(r < CRATER_SHAPE.reach, joined - rim * CRATER_SHAPE.reach**-3.0, 0.0)
 
 
@@ -126,6 +128,7 @@ def draw(
     x, y = west - margin + wide * rng.random(n), south - margin + high * rng.random(n)
     ratio = craters.shallowest * (craters.deepest / craters.shallowest) ** rng.random(n)
     far = 0.5 * CRATER_SHAPE.reach * diameter
+    # Drawn over the margin of the largest; small ones that cannot reach the terrain are left out.
     near = (x > west - far) & (x < east + far) & (y > south - far) & (y < north + far)
     return x[near], y[near], diameter[near], (ratio * diameter)[near]
 
@@ -139,6 +142,7 @@ def stamp(
 ) -> None:
     """Adds craters to `heights` in place; `x0`, `y0` are the coordinates of `heights[0, 0]`, m."""
     rows, cols = heights.shape
+    # One by one: each touches few nodes, and summing all over all nodes would take gigabytes.
     for x, y, diameter, depth in zip(*population, strict=True):
         radius = diameter / 2
         far = CRATER_SHAPE.reach * radius

@@ -61,6 +61,7 @@ class Dem:
 
     def __post_init__(self) -> None:
         heights = np.asarray(self.heights, np.float64)
+        # Frozen, yet always float64: map heights of kilometres need its digits.
         object.__setattr__(self, "heights", heights)
         require_cell(self.source, "cell", self.cell)
         if heights.ndim != 2 or min(heights.shape) < 2:
@@ -104,6 +105,7 @@ class Dem:
             if require_finite(self.source, f"crop {field}", value) <= 0:
                 raise bad_input(self.source, f"crop {field}", value, "is not positive", "give it in m above zero")
         west, south, east, north = self.bounds
+        # Beyond half a cell more than rounding is missing; up to there a pixel's own area covers the rectangle.
         slack = 1e-6 * self.cell
         spans = []
         for axis, middle, extent, low, high in (("x", x, width, west, east), ("y", y, height, south, north)):
@@ -146,6 +148,7 @@ class Dem:
           UserError: the spacing is not positive, or leaves fewer than 2 x 2 or too many nodes.
         """
         require_cell(self.source, "cell", cell)
+        # The same corner and never beyond the old grid: a spline continued outside would be an invention.
         rows, cols = (int(np.floor((n - 1) * self.cell / cell + 1e-9)) + 1 for n in self.heights.shape)
         if min(rows, cols) < 2:
             raise bad_input(self.source, "cell", cell, "leaves fewer than 2 x 2 nodes", "give a smaller spacing")
@@ -156,6 +159,7 @@ class Dem:
             # A Gaussian of half the new spacing leaves 1 % of a wave at the new Nyquist limit's double. The odd
             # reflection at the edges keeps a slope straight there.
             sigma = 0.5 * np.sqrt(ratio**2 - 1)
+            # As far as scipy's filter reaches (its default truncation of 4 sigma).
             rim = int(4 * sigma + 0.5)
             padded = np.pad(heights, rim, mode="reflect", reflect_type="odd")
             heights = ndimage.gaussian_filter(padded, sigma)[rim : rim + heights.shape[0], rim : rim + heights.shape[1]]
@@ -175,9 +179,11 @@ class Dem:
         """
         west, south, east, north = self.bounds
         rows, cols = self.heights.shape
+        # A node near the middle, not the mean: it is a height of the ground, and local heights begin near 0 there.
         middle = self.heights[(rows - 1) // 2, (cols - 1) // 2]
         origin = np.round(np.array([(west + east) / 2, (south + north) / 2, middle]))
         field = HeightField(
+            # Subtracted before the conversion: after it the digits would be gone.
             heights=jnp.asarray(self.heights - origin[2], dtype),
             x0=jnp.asarray(west - origin[0], dtype),
             y0=jnp.asarray(south - origin[1], dtype),
@@ -235,6 +241,7 @@ def fill_holes(heights: np.ndarray, source: str) -> tuple[np.ndarray, tuple[str,
         return heights, ()
     if count == heights.size:
         raise bad_input(source, "heights", "only nodata", "leave nothing to drive on", "give a DEM with heights in it")
+    # Beyond half, what one drives on would be interpolation and not data.
     if count > DEM_LIMITS.most_nodata * heights.size:
         raise bad_input(
             source, "heights", f"{count} of {heights.size} nodata", "are more than half", "crop to the part with data"
@@ -252,6 +259,7 @@ def _across(heights: np.ndarray, hole: np.ndarray) -> np.ndarray:
     neither encloses, at the edges of the grid, takes the nearest height.
     """
     value, weight = np.zeros(int(hole.sum())), np.zeros(int(hole.sum()))
+    # Numbers of the holes, transposed with the grid, so that rows and columns add to the same sums.
     number = np.zeros(heights.shape, np.int32)
     number[hole] = np.arange(len(value), dtype=np.int32)
     for line, gap, at in ((heights, hole, number), (heights.T, hole.T, number.T)):
@@ -268,6 +276,7 @@ def _across(heights: np.ndarray, hole: np.ndarray) -> np.ndarray:
     enclosed = weight > 0.0
     value[enclosed] /= weight[enclosed]
     if not enclosed.all():
+        # Holes at the grid's edge have data on one side only; a straight continuation would run away.
         nearest: Any = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
         value[~enclosed] = heights[tuple(axis[hole][~enclosed] for axis in nearest)]
     return value
@@ -286,6 +295,7 @@ def undeclared_nodata(raw: np.ndarray, source: str) -> tuple[np.ndarray, tuple[s
     notes: tuple[str, ...] = ()
     usual = np.isin(raw, DEM_LIMITS.usual_nodata)
     if usual.any():
+        # Compared in the file's own numbers: after a scale a mark would no longer be one of the usual ones.
         valid = raw[~usual & np.isfinite(raw)]
         for mark in DEM_LIMITS.usual_nodata:
             marked = raw == mark

@@ -41,6 +41,7 @@ def dequantise(heights: np.ndarray, quantum: float) -> np.ndarray:
       Heights in m, nowhere farther than half a level from the given ones.
     """
     plane = _plane(heights)
+    # Without the plane the mirror at the edges would be a ridge, whose spectrum is no roughness.
     relief = heights - plane
     noise = quantum**2 / 12
     amplitude = _amplitude(relief, noise)

@@ -38,6 +38,7 @@ def to_mesh(terrain: Terrain, *, rocks: bool = True, solid: bool = False, depth:
         )
     if solid and depth <= 0:
         raise bad_input(terrain.name, "depth", depth, "is not positive", "give the floor's depth in m")
+    # Meshes are closed by sums of heights and a depth; float32 would leave slits.
     heights = np.asarray(field.heights, np.float64)
     rows, cols = heights.shape
     x = float(field.x0) + np.arange(cols) * float(field.cell)
@@ -50,7 +51,9 @@ def to_mesh(terrain: Terrain, *, rocks: bool = True, solid: bool = False, depth:
     bodies = [trimesh.Trimesh(vertices, faces, process=False)]
     if rocks and terrain.rocks is not None:
         for center, axes, turn in zip(np.asarray(terrain.rocks.centers), *semi_axes(terrain.rocks), strict=True):
+            # Dummies of the look-up have radius 0.
             if axes[0] > 0:
+                # 320 faces: 2 % of the radius from the sphere at most, below what a wheel feels.
                 body = trimesh.creation.icosphere(subdivisions=2)
                 body.vertices = body.vertices * axes @ turn.T + center.astype(np.float64)
                 bodies.append(body)

@@ -39,6 +39,7 @@ class HeightField:
 
 def take(flat: Array, index: Int[Array, "*points"]) -> Array:
     """`flat[index]` for indices known to be in bounds, without the selects that guard against others."""
+    # JAX would guard every gather by selects; a step has dozens, and grid_index has clamped already.
     return flat.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
@@ -81,6 +82,7 @@ def bilinear(
 def _cells(field: HeightField, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
     dtype = field.heights.dtype
     x, y = jnp.asarray(x, dtype), jnp.asarray(y, dtype)
+    # In the heights' own dtype: a float64 position would turn a float32 step into float64.
     return (x - field.x0) / field.cell, (y - field.y0) / field.cell
 
 

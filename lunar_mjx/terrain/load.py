@@ -51,6 +51,7 @@ def load_terrain(
     Raises:
       UserError: the specification or a file that it names is wrong; the sentence says which, and the remedy.
     """
+    # First: "slope:10deg" could be the name of a folder as well.
     if isinstance(spec, str) and spec.startswith("slope"):
         return _slope(spec, dtype)
     if isinstance(spec, dict):
@@ -63,6 +64,7 @@ def load_terrain(
             read_dem(path)  # which says that this format is not read, and which ones are
         raise UserError(f"{path}: is not there; check the path or its spelling.")
     if path.suffix != ".toml":
+        # A name stands for its folder, so that shipped and own terrains are loaded alike.
         path = find("terrain", spec, CONFIG) / CONFIG
     config = read_config(path)
     name = path.resolve().parent.name if path.name == CONFIG else path.stem
@@ -75,6 +77,7 @@ def _slope(spec: str, dtype: np.dtype | type) -> Terrain:
         angle = float(match.group(1)) if match else float("nan")
     except ValueError:
         angle = float("nan")
+    # Written so that NaN fails, too.
     if not abs(angle) < 90:
         raise bad_input("terrain", "spec", spec, "is not a slope below 90 degrees", "write it as slope:10deg")
     return inclined(np.radians(angle), dtype=dtype, name=spec)
@@ -128,6 +131,7 @@ def build_terrain(
     dtype: np.dtype | type = np.float32,
 ) -> Terrain:
     """Makes the terrain of a checked configuration; relative files are looked for in `folder`. See `load_terrain`."""
+    # A seed of 0 counts: only None means the configuration's.
     seed = config.seed if seed is None else seed
     if config.plane is not None:
         p = config.plane
@@ -144,6 +148,7 @@ def build_terrain(
         bounds = (west - origin[0], south - origin[1], east - origin[0], north - origin[1])
 
         # Rocks are placed in float64 on the host, on the surface that the simulator samples: bilinear.
+        # Order 1 and mode "nearest" are the simulator's rule between nodes and beyond the edge.
         def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             at = np.stack([(y - bounds[1]) / ground.cell, (x - bounds[0]) / ground.cell])
             return ndimage.map_coordinates(ground.heights - origin[2], at, order=1, mode="nearest")
@@ -194,6 +199,7 @@ def _variable(name: str) -> str:
 
 def _dem_file(config: TerrainConfig, name: str, folder: Path, dem: str | Path | None) -> Path | None:
     """The DEM to read: the argument, else the environment's, else the configuration's, else none."""
+    # The nearer wins: a call's argument, then the shell's, then the file's.
     for source, given in (("dem", dem), (_variable(name), os.environ.get(_variable(name)))):
         if given:
             path = Path(given)

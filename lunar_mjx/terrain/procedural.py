@@ -25,8 +25,10 @@ _ROUGHNESS, _CRATERS, _ROCKS, _SOIL = range(4)
 
 def stream(seed: int, feature: int) -> np.random.Generator:
     """The random stream of one feature of the terrain with this seed."""
+    # bool is an int to Python; True would silently be seed 1.
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise bad_input("terrain", "seed", seed, "is not a whole number of at least 0", "give one such as 1")
+    # A pair as entropy: NumPy mixes both words, so neighbouring seeds share nothing.
     return np.random.default_rng([int(seed), feature])
 
 
@@ -63,6 +65,7 @@ def make_surface(
     for field, value in (("width", width), ("height", height)):
         if require_finite("terrain", field, value) < cell:
             raise bad_input("terrain", field, value, f"is less than one cell of {cell:g} m", "make it larger")
+    # One node more than cells: the extent asked for lies between the outermost nodes.
     rows, cols = round(height / cell) + 1, round(width / cell) + 1
     require_size("terrain", rows, cols)
     heights = np.zeros((rows, cols))
@@ -101,6 +104,7 @@ def add_detail(
         raise bad_input(
             dem.source, "detail cell", cell, f"is not finer than the DEM's {dem.cell:g} m", "give a smaller one"
         )
+    # Whole, so that the DEM's nodes are nodes of the result and its means can be kept.
     ratio = int(np.ceil(dem.cell / cell - 1e-6))
     cell = dem.cell / ratio
     rows, cols = ((n - 1) * ratio + 1 for n in dem.heights.shape)
@@ -109,11 +113,13 @@ def add_detail(
     if roughness is not None:
         # Two cells are the shortest wave that the DEM can hold.
         detail += fractal(rows, cols, cell, roughness, stream(seed, _ROUGHNESS), longest=2 * dem.cell)
+    # Larger ones the DEM shows itself; drawn again they would be there twice.
     if craters is not None and craters.smallest < 2 * dem.cell:
         craters = dataclasses.replace(craters, largest=min(craters.largest, 2 * dem.cell))
         west, south, east, north = dem.bounds
         population = cratering.draw(craters, (west, south, east, north), stream(seed, _CRATERS))
         cratering.stamp(detail, cell, west, south, population)
+    # The DEM's own heights are means over cells: detail with means would move them.
     detail = _without_means(detail, ratio, dem.heights.shape)
     heights = spline(dem.heights, rows, cols, 1 / ratio) + detail
     note = f"procedural detail below {dem.cell:g} m added at {cell:g} m, seed {seed}"
@@ -171,6 +177,7 @@ def make_soil_patches(
     cell = max(patch / 8, dem.cell)
     rows, cols = (max(2, int(np.ceil(extent / cell)) + 1) for extent in (north - south, east - west))
     noise = ndimage.gaussian_filter(stream(seed, _SOIL).standard_normal((rows, cols)), patch / cell / 2, mode="wrap")
+    # By quantile, so that the share is met exactly, whatever the noise's distribution.
     rock = noise < np.quantile(noise, rock_fraction) if 0 < rock_fraction < 1 else np.full(noise.shape, rock_fraction)
     _, origin = dem.to_heightfield()
     x0, y0, cell = (jnp.asarray(v, dtype) for v in (west - origin[0], south - origin[1], cell))

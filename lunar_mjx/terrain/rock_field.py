@@ -80,6 +80,7 @@ class RockField:
 
     def _cumulative(self) -> tuple[np.ndarray, np.ndarray]:
         q = 1.79 + 0.152 / self.abundance
+        # Geometric: the density falls over decades, and most rocks are small.
         d = np.geomspace(self.smallest, self.largest, 400)
         density = 4 / (np.pi * d * d) * q * self.abundance * np.exp(-q * d)
         steps = 0.5 * (density[1:] + density[:-1]) * np.diff(d)
@@ -96,6 +97,7 @@ class RockField:
             return np.zeros(0)
         grid, above = self._cumulative()
         u = rng.random(int(rng.poisson(expected))) * above[0]
+        # Largest first: a large rock finds no place among many small ones.
         return np.sort(np.interp(u, above[::-1], grid[::-1]))[::-1]
 
 

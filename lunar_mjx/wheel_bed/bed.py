@@ -142,6 +142,7 @@ def wheel_test(
     along = jnp.where(slip >= 0.0, 1.0 - slip, 1.0)
     travel = along if slip_definition == "travel_speed" else along / jnp.cos(angle)
     # The faster of the two runs at the bed's speed, whatever the slip: neither becomes so slow that a speed floor acts.
+    # Only the proportion of the two speeds counts: no shipped steady effect knows a rate.
     scale = SPEED / jnp.maximum(rim, travel)
     return WheelTest(scale * rim, scale * travel, angle, load, radius, width)
 
@@ -159,6 +160,7 @@ class WheelBed:
         self, effects: Sequence[Effect | str], parameters: Parameters | None = None, gravity: float = EARTH_GRAVITY
     ):
         effect_list = [catalogue.get(e) if isinstance(e, str) else e for e in effects]
+        # Without states there is no history to run in: one evaluation of the ports is the steady state.
         self.effects = tuple(e for e in effect_list if not e.transient and any(port in PORTS for port in e.ports))
         given = parameters or {}
         self.parameters = {e.name: {**e.nominal(), **given.get(e.name, {})} for e in self.effects}
@@ -196,6 +198,7 @@ class WheelBed:
         if preset not in presets.PRESETS:
             raise bad_input("WheelBed", "preset", preset, "does not exist", f"use one of {', '.join(presets.PRESETS)}")
         values: dict[str, Any] = {}
+        # Twice: the first bed tells which effects stay, so that values of the others are not refused.
         bed = cls(presets.PRESETS[preset])
         for name in bed.parameters:
             values[name] = presets.PRESET_PARAMETERS[preset].get(name, {})
@@ -214,6 +217,7 @@ class WheelBed:
 
     def with_values(self, values: Parameters) -> WheelBed:
         """The bed with other parameter values, by effect and name; what was compiled is shared."""
+        # Shallow, so that the compiled function goes along: parameters are its arguments and not part of it.
         bed = copy.copy(self)
         bed.parameters = self.merged(values)
         return bed
@@ -290,11 +294,13 @@ class WheelBed:
         low, high, reached = jax.lax.fori_loop(0, BED_SEARCH.scan + BED_SEARCH.bisections, probe, start)
         root = jnp.where(reached, 0.5 * (low + high), deepest)
         load_at_root, slope = jax.jvp(loads, (root,), (jnp.ones_like(root),))
+        # Held fixed: the step's derivative is then that of an implicit function, without second derivatives.
         slope = jax.lax.stop_gradient(slope)
         # A root of zero slope has no derivative; it is left where the bisection put it.
         firm = reached & (jnp.abs(slope.vertical) > 0.0)
         change = jnp.where(firm, (test.normal_load - load_at_root.vertical) / jnp.where(firm, slope.vertical, 1.0), 0.0)
         settled = jax.tree.map(lambda value, rate: value + rate * change, load_at_root, slope)
+        # The force at the root tells how well the search did; the settled one would equal the load by construction.
         return WheelResult(settled.drawbar, settled.side, settled.torque, root + change, load_at_root.vertical, reached)
 
     def _loads(self, parameters: Parameters, test: WheelTest, terrain: Terrain, sinkage: Any) -> _Loads:
@@ -310,6 +316,7 @@ class WheelBed:
         ctx, _ = wheel_ports(self._pipeline, ctx, {})
         wheel = ctx.wheel
         assert wheel is not None
+        # Signs of test beds: what the motor supplies and what opposes the side slip are positive.
         return _Loads(wheel.force.x[0], -wheel.force.y[0], -wheel.moment.y[0], wheel.force.z[0])
 
 
@@ -332,6 +339,7 @@ def _bed_context(parameters: Parameters, test: WheelTest, terrain: Terrain, sink
     )
     return Context(
         time=nil,
+        # Read by friction limits alone; no state is stepped.
         dt=nil + 1e-3,
         gravity=nil + gravity,
         ambient_temperature=nil + 298.15,

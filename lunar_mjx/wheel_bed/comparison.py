@@ -53,6 +53,7 @@ class Comparison:
 
     def score(self, angles_deg: tuple[float, ...]) -> float:
         """Root mean square residual over all quantities at some slip angles, in sigma."""
+        # All quantities in one list: in units of scatter they weigh by their number.
         keep = at_angles(self.table.test["slip_angle_deg"], angles_deg)
         return _rms(np.concatenate([r[keep] for r in self.residual.values()]))
 
@@ -129,6 +130,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _worst(table: SteadyStateTable, quantity: str, predicted: np.ndarray, residual: np.ndarray) -> Worst:
+    # In sigma and not in newtons, so that the worst is where the model is most surely wrong.
     i = int(np.argmax(np.abs(residual)))
     slip, angle = (float(table.test[c][i]) for c in ("slip_ratio", "slip_angle_deg"))
     return Worst(slip, angle, float(table.measured[quantity][i]), float(predicted[i]), float(residual[i]))

@@ -47,6 +47,7 @@ def load_figures(name: str = "cmu_smooth_wheel") -> SteadyStateTable:
         test={c: np.asarray(frame[c], float) for c in imposed},
         measured=measured,
         replicates=np.asarray(frame["replicates"], int),
+        # Pooled over all points; the CSV's own column is per point, from few runs each.
         sigma={q: about["sigma"][QUANTITIES[q][0]] for q in measured},
         radius=about["wheel"]["radius_m"],
         width=about["wheel"]["width_m"],

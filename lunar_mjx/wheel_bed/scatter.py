@@ -24,13 +24,16 @@ def point_scatter(squares: np.ndarray, freedom: np.ndarray, reading: np.ndarray)
     """
     x2 = (reading / max(float(np.sqrt(np.mean(reading**2))), 1e-300)) ** 2
     shape = 1.0 + _RATIOS[:, None] ** 2 * x2
+    # The scale a integrated under 1/a: what is left of the likelihood is a power of this sum.
     whole = np.sum(squares / shape, axis=1)
     total = float(freedom.sum())
     log_p = -0.5 * np.log(shape) @ freedom - 0.5 * total * np.log(np.maximum(whole, 1e-300))
     # Half of the prior for constant noise, the other half spread over all ratios: growth has to be seen to be believed.
     log_p[0] += np.log(_CONSTANT)
     log_p[1:] += np.log((1.0 - _CONSTANT) / (len(_RATIOS) - 1))
+    # Less the largest: likelihoods of hundreds of runs underflow otherwise.
     p = np.exp(log_p - log_p.max())
+    # The mean of variances and not of deviations: noise adds by its square.
     return np.sqrt((p / p.sum()) @ (whole[:, None] / total * shape))
 
 
@@ -50,4 +53,5 @@ def grows(squares: np.ndarray, freedom: np.ndarray, reading: np.ndarray, stated:
     shares = np.linspace(0.0, MOST_SHARE, 41)[:, None]
     factor = np.geomspace(1.0, 100.0, 81)[:, None]
     growing = log_likelihood(stated**2 + (shares * reading) ** 2).max()
+    # One unknown each, so that the likelihoods compare without a penalty.
     return bool(growing >= log_likelihood((factor * stated) ** 2).max())

@@ -138,6 +138,7 @@ def _solve(
                 x0,
                 jac=jacobian,  # pyright: ignore[reportArgumentType]
                 bounds=(0.0, 1.0),
+                # Steps of a tenth of each range: parameters are places in [0, 1], of like size.
                 x_scale=0.1,
             )
             solutions.append(solution)
@@ -174,6 +175,7 @@ def fit(
         raise UserError(f"{table.name}: holds none of the slip angles {SOIL_FIT.fit_angles} deg; the fit needs them.")
     fixed = {e: dict(v) for e, v in FIXED.items() if e in bed.parameters}
     base = bed.with_values(fixed)
+    # Refuses effects that do not act on this wheel before the fit begins.
     base.merged({f.effect: {f.name: f.low} for f in free})
     solutions = _solve(base, seen, free, starts, seed, progress)
     rms = tuple(float(np.sqrt(2.0 * s.cost / len(s.fun))) for s in solutions)
@@ -202,6 +204,7 @@ def fit(
 
 def _physical(f: Free, unit: Any, numpy: Any) -> Any:
     """The parameter's value at a place in [0, 1] of its range."""
+    # Moduli range over decades: a step by a share is alike everywhere.
     if f.log:
         return numpy.exp(np.log(f.low) + unit * np.log(f.high / f.low))
     return f.low + unit * (f.high - f.low)
@@ -217,5 +220,6 @@ def _functions(bed: WheelBed, table: SteadyStateTable, free: Sequence[Free]) -> 
             values[f.effect][f.name] = _physical(f, place[i], jnp)
         return jnp.concatenate(list(residuals(bed(values, test), table).values()))
 
+    # Forward mode: a handful of parameters and hundreds of residuals.
     run, slope = jax.jit(vector), jax.jit(jax.jacfwd(vector))
     return (lambda x: np.asarray(run(x))), (lambda x: np.asarray(slope(x)))

@@ -77,6 +77,7 @@ class SteadyStateTable:
         if not all(speed in columns for speed in _SPEEDS):
             return wheel_test(columns["slip_ratio"], angle, load, self.radius, self.width, self.slip_definition)
         rim, travel = columns["rim_speed_m_s"], columns["travel_speed_m_s"]
+        # Scaled to the bed's speed in proportion: slow tests would meet the floors that regularise standstill.
         scale = SPEED / np.maximum(rim, travel)
         radius, width = np.full(len(self), self.radius), np.full(len(self), self.width)
         return WheelTest(scale * rim, scale * travel, angle, load, radius, width)  # type: ignore[arg-type]
@@ -238,6 +239,7 @@ def replicate_groups(table: SteadyStateTable) -> np.ndarray:
     load = table.test["normal_load_N"]
     for group in np.unique(first):
         rows = np.flatnonzero(first == group)
+        # Gaps between sorted loads divide groups: readings of one load scatter without gaps.
         order = rows[np.argsort(load[rows], kind="stable")]
         level[order[1:]] = np.cumsum(np.diff(load[order]) > SAME_LOAD * load[order[:-1]])
     return np.unique(np.column_stack([first, level]), axis=0, return_inverse=True)[1].reshape(-1)
@@ -245,6 +247,7 @@ def replicate_groups(table: SteadyStateTable) -> np.ndarray:
 
 def _planned(values: np.ndarray) -> bool:
     """Whether values are settings of a plan, which repeat, and not readings, which hardly do."""
+    # A plan repeats each setting at least three times or so; readings to many digits hardly repeat.
     return len(np.unique(values)) <= max(len(values) // 3, 1)
 
 
@@ -264,6 +267,7 @@ def average(table: SteadyStateTable) -> SteadyStateTable:
         return np.bincount(group, weights=values) / count
 
     measured = {q: mean(v) for q, v in table.measured.items()}
+    # One mean is taken from each point.
     freedom = len(table) - len(count)
     sigma = {}
     if freedom > 0:

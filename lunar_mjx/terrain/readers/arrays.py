@@ -21,6 +21,7 @@ def read_npy(path: Path, options: ReadOptions) -> Dem:
         raise bad_input(path, "cell", None, "leaves the array without a scale", f"{WHERE}, the spacing in m")
     cell = require_cell(str(path), "cell", options.cell)
     try:
+        # A pickle runs code of its writer's.
         data = np.load(path, allow_pickle=False)
     except Exception as error:  # NumPy parses the header as Python: anything from SyntaxError to TokenError
         reason = "it holds pickled objects" if "ickle" in str(error) else " ".join(str(error).split())[:200]
@@ -43,6 +44,7 @@ def grid(
         heights, filled = fill_holes(heights, source)
         notes = notes + filled
     return Dem(
+        # Files begin in the north, fields in the south.
         heights[::-1],
         cell,
         x0,
@@ -63,6 +65,7 @@ def read_asc(path: Path, options: ReadOptions) -> Dem:
     rows, cols = (_count(path, header, key) for key in ("nrows", "ncols"))
     require_size(str(path), rows, cols)
     try:
+        # Line breaks mean nothing: writers wrap rows at any width.
         numbers = np.array(" ".join(body).split(), np.float64)
     except ValueError as error:
         raise UserError(f"{path}: heights hold something else than numbers ({error}); repair the file.") from None
@@ -74,6 +77,7 @@ def read_asc(path: Path, options: ReadOptions) -> Dem:
     heights[heights == header.get("nodata_value", -9999.0)] = np.nan
     heights, undeclared = undeclared_nodata(heights, str(path))
     cell = _asc_cell(path, header)
+    # A corner lies half a cell outside the first node's centre.
     x0 = header.get("xllcenter", header.get("xllcorner", 0.0) + cell / 2)
     y0 = header.get("yllcenter", header.get("yllcorner", 0.0) + cell / 2)
     return grid(heights, cell, x0, y0, str(path), undeclared, options)
@@ -88,6 +92,7 @@ def _header(path: Path, lines: list[str]) -> tuple[dict[str, float], list[str]]:
         key = words[0].lower()
         if key in header:
             raise bad_input(path, key, words[1], "stands twice in the header", "keep one of them")
+        # NaN is a legal mark of nodata and of nothing else.
         if key == "nodata_value":
             header[key] = math.nan if words[1].lower() == "nan" else require_finite(path, words[0], words[1])
         else:

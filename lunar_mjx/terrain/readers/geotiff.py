@@ -43,11 +43,13 @@ def _read(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> D
     if not np.issubdtype(data.dtype, np.number) or np.issubdtype(data.dtype, np.complexfloating):
         raise bad_input(path, "data type", data.dtype, "is not a real number", "give a raster of heights")
     heights, undeclared = undeclared_nodata(np.ma.filled(data.astype(np.float64), np.nan), str(path))
+    # Scale and offset after the marks of nodata were taken out: marks are written unscaled.
     heights = heights * raster.scales[band - 1] + raster.offsets[band - 1]
     if options.heights:
         heights = heights * _unit(path, raster.units[band - 1])
     if raster.count > 1:
         undeclared = (*undeclared, f"band {band} of {raster.count} used")
+    # The transform speaks of a pixel's edge, a Dem of its centre.
     x0 = west + (window.col_off + 0.5) * cell
     y0 = north - (window.row_off + window.height - 0.5) * cell
     return grid(heights, cell, x0, y0, str(path), undeclared, options)
@@ -69,6 +71,7 @@ def _grid(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> t
             "has no metres",
             "reproject it to a projection in metres, such as lunar polar stereographic, with gdalwarp",
         )
+    # Rotated rasters could be resampled here, but how (and with what loss) is the user's to decide.
     if transform.b or transform.d:
         raise bad_input(path, "transform", "rotated", "is not north up", "resample it with gdalwarp")
     if transform.a <= 0 or transform.e >= 0:
@@ -79,6 +82,7 @@ def _grid(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> t
         )
     metres = 1.0
     if crs is not None and crs.is_projected:
+        # Some projections count in feet.
         metres = float(crs.linear_units_factor[1])
     return transform.c * metres, transform.f * metres, transform.a * metres
 
@@ -98,6 +102,7 @@ def _pixels(raster: rasterio.DatasetReader, crop: Window | None, west: float, no
             f"stay within x {west:g} .. {west + raster.width * cell:g} m, "
             f"y {north - raster.height * cell:g} .. {north:g} m",
         )
+    # A pixel more on every side, for the exact crop by nodes that follows.
     c0, r0 = max(0, int(c0) - 1), max(0, int(r0) - 1)
     c1, r1 = min(raster.width, int(np.ceil(c1)) + 1), min(raster.height, int(np.ceil(r1)) + 1)
     return PixelWindow(c0, r0, c1 - c0, r1 - r0)  # pyright: ignore[reportCallIssue]

@@ -40,6 +40,7 @@ def read_image(path: Path, options: ReadOptions) -> Dem:
 def _levels(path: Path) -> tuple[np.ndarray, int]:
     try:
         with warnings.catch_warnings():
+            # Pillow only warns of images that unpack to gigabytes; here that is refused.
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(path) as image:
                 require_size(str(path), image.height, image.width)
@@ -52,6 +53,7 @@ def _levels(path: Path) -> tuple[np.ndarray, int]:
                         "is not grey of 8 or 16 bits",
                         "save it as a grey image without transparency",
                     )
+                # Black is 0 whatever the darkest pixel: stretching would change the scale from image to image.
                 return np.asarray(image, np.float64), _WHITE[mode]
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
         raise UserError(f"{path}: the image cannot be read ({error}); fetch the file again.") from None

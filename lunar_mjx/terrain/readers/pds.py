@@ -55,6 +55,7 @@ def read_pds(path: Path, options: ReadOptions) -> Dem:
     offset = _number(label_path, label, "OFFSET", 0.0) * unit
     radius = _number(label_path, label, "A_AXIS_RADIUS", 0.0) * 1e3
     reference = "as in the source"
+    # Within a metre: labels round the sphere's radius.
     if radius > 0 and abs(offset - radius) < 1.0:
         offset, reference = 0.0, f"sphere of radius {radius:.0f} m"
     heights = heights * (_number(label_path, label, "SCALING_FACTOR", 1.0) * unit) + offset
@@ -64,6 +65,7 @@ def read_pds(path: Path, options: ReadOptions) -> Dem:
     # The projection's centre lies at these pixel coordinates (1-based centres shifted by 1, PDS3 Standards Reference).
     column = _number(label_path, label, "SAMPLE_PROJECTION_OFFSET", 0.0)
     line = _number(label_path, label, "LINE_PROJECTION_OFFSET", float(rows - 1))
+    # Lines count southward from the top, y northward from the bottom line.
     x0, y0 = -column * cell, (line - (rows - 1)) * cell
     return Dem(heights[::-1], cell, x0, y0, str(image), reference, notes)
 
@@ -78,6 +80,7 @@ def _find(path: Path) -> tuple[Path, Path, Label]:
             raise bad_input(path, "^IMAGE", label.get("^IMAGE"), "is not beside the label", "put it there")
         return image, path, label
     with path.open("rb") as file:
+        # By what the file begins with: the suffix .img says nothing about where the label is.
         attached = file.read(64).lstrip().startswith((b"PDS_VERSION_ID", b"ODL_VERSION_ID", b"CCSD"))
     if attached:
         return path, path, _parse(path)
@@ -104,6 +107,7 @@ def _parse(path: Path) -> Label:
         pair = _PAIR.match(line)
         if pair:
             key, value = pair.groups()
+            # The first of a key counts: later objects of a label repeat some.
             label.setdefault(key, value.split("/*")[0].strip().strip('"'))
     if "LINES" not in label:
         raise bad_input(path, "LINES", None, "is not in the label", "give the PDS3 label of an image")
@@ -134,6 +138,7 @@ def _samples(image: Path, label_path: Path, label: Label, rows: int, cols: int) 
             f"is less than the {needed} that {label_path.name} announces",
             "fetch the whole file again",
         )
+    # So many samples and no more: images carry tails such as histograms.
     data = np.fromfile(image, dtype, rows * cols, offset=start)
     return data.reshape(rows, cols)
 
@@ -144,6 +149,7 @@ def _start(path: Path, label: Label) -> int:
     number = re.search(r"(\d+)\s*(<\s*BYTES\s*>)?", pointer)
     if number is None:
         return 0
+    # Pointers count from 1.
     first = int(number.group(1)) - 1
     return first if number.group(2) else first * _integer(path, label, "RECORD_BYTES")
 
@@ -155,6 +161,7 @@ def _missing(data: np.ndarray, path: Path, label: Label) -> np.ndarray:
         if key not in label:
             continue
         text = label[key]
+        # For reals the constant stands as a bit pattern: as a number it would be another value.
         bits = re.fullmatch(r"16#([0-9A-Fa-f]+)#", text)
         if bits and data.dtype.kind == "f":
             pattern = int(bits.group(1), 16).to_bytes(data.dtype.itemsize, "big")

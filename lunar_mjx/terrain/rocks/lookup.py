@@ -68,6 +68,7 @@ def nearest_rock(
         zero = jnp.zeros_like(x)
         return zero, zero, zero, zero
     # One gather finds the number, the others read that rock: no loop over rocks, however many there are.
+    # The grid only decides which rock; where its surface lies is computed, not read.
     k = _number(rocks, x, y)
     flat = rocks.centers.reshape(-1)
     return take(flat, 3 * k), take(flat, 3 * k + 1), take(flat, 3 * k + 2), take(rocks.radii, k)
@@ -129,8 +130,10 @@ def build_rocks(
         raise bad_input("rocks", "radii", radii.min(), "is not positive", "give radii in m above zero")
     west, south, east, north = bounds
     cols, rows = (max(1, int(np.ceil((b - a) / cell))) for a, b in ((west, east), (south, north)))
+    # A cell's centre judges for its corners, which lie up to cell/sqrt(2) farther.
     index = _nearest_index(centers, radii, west, south, rows, cols, cell, reach + cell / np.sqrt(2))
     return Rocks(
+        # A dummy of radius 0 at the end: terrains without rocks keep the same code and shapes.
         centers=jnp.asarray(np.vstack([centers, np.zeros((1, 3))]), dtype),
         radii=jnp.asarray(np.append(radii, 0.0), dtype),
         index=jnp.asarray(index, jnp.int32),
@@ -178,6 +181,7 @@ def build_ellipsoids(
         )
     if not np.allclose(turns @ turns.swapaxes(1, 2), np.eye(3), atol=1e-6):
         raise UserError("rocks: turns hold a matrix that is no rotation; give orthonormal columns.")
+    # By the sphere around each, which reaches at least as far as the ellipsoid.
     rocks = build_rocks(centers, axes.max(axis=1), bounds, cell=cell, reach=reach, dtype=dtype)
     return dataclasses.replace(rocks, forms=jnp.asarray(np.vstack([forms_of(axes, turns), _UNIT]), dtype))
 
@@ -239,6 +243,7 @@ def smallest_gap(centers: np.ndarray, radii: np.ndarray) -> float:
     centers, radii = np.asarray(centers), np.asarray(radii)
     if len(radii) < 2:
         return float("inf")
+    # In plan, since the look-up is.
     tree = KDTree(centers[:, :2])
     gap = np.inf
     # Ten metres more than the radii: gaps wider than that matter to nobody.

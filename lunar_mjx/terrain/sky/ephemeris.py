@@ -100,11 +100,13 @@ def _body_fixed(vector: np.ndarray, days: np.ndarray) -> np.ndarray:
     def series(terms: dict[int, float], wave: Any) -> Any:
         return sum(size * wave(angle[k - 1]) for k, size in terms.items())
 
+    # The pole's drift counts by Julian centuries, the spin by days.
     centuries = days / 36525.0
     ascension = 269.9949 + 0.0031 * centuries + series(_ASCENSION, np.sin)
     declination = 66.5392 + 0.0130 * centuries + series(_DECLINATION, np.cos)
     spin = 38.3213 + 13.17635815 * days - 1.4e-12 * days**2 + series(_SPIN, np.sin)
     x, y, z = vector
+    # Pole and meridian as the IAU defines them: R_z(W) R_x(90 deg - delta) R_z(90 deg + alpha).
     for turn, about_z in ((90.0 + ascension, True), (90.0 - declination, False), (spin, True)):
         cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
         if about_z:

@@ -59,12 +59,14 @@ def horizon_elevation(horizon: Horizon, x: Points, y: Points, towards_x: Points,
       towards_x, towards_y: direction, east and north; of any length.
     """
     bearings, rows, cols = horizon.elevation.shape
+    # East over north: azimuths count clockwise from north.
     turn = jnp.arctan2(towards_x, towards_y) / (2.0 * jnp.pi)
     w = (turn - jnp.floor(turn)) * bearings
     u = jnp.clip((x - horizon.x0) / horizon.cell, 0, cols - 1)
     v = jnp.clip((y - horizon.y0) / horizon.cell, 0, rows - 1)
     k, i, j = grid_index(w, bearings - 1), grid_index(u, max(cols - 2, 0)), grid_index(v, max(rows - 2, 0))
     flat = horizon.elevation.reshape(-1)
+    # A grid of one row or column has no neighbour to interpolate to.
     right, up = min(cols - 1, 1), cols * min(rows - 1, 1)
 
     def plane(bearing: Any) -> Any:
@@ -74,6 +76,7 @@ def horizon_elevation(horizon: Horizon, x: Points, y: Points, towards_x: Points,
         return low + (v - j) * (high - low)
 
     first = plane(k)
+    # The last direction's neighbour is the first one.
     return first + (w - k) * (plane(jnp.where(k + 1 == bearings, 0, k + 1)) - first)
 
 
@@ -102,6 +105,7 @@ def compute_horizon(
     cell = max(east - west, north - south) / max(places - 1, 1)
     cols, rows = (int(np.floor(extent / cell + 1e-9)) + 1 for extent in (east - west, north - south))
     x, y = (a.ravel() for a in np.meshgrid(west + np.arange(cols) * cell, south + np.arange(rows) * cell))
+    # Without the eye's height, the ground's own roughness would hide a low Sun from every place.
     stand = _heights(ground, x, y) + eye
     elevation = np.zeros((bearings, len(x)))
     for dem in (ground, *around):
@@ -116,6 +120,7 @@ def compute_horizon(
             at_y = y[:, None] + np.cos(bearing) * steps
             rise = _heights(dem, at_x, at_y) - stand[:, None] - steps**2 / (2.0 * HORIZON_GRID.moon_radius)
             inside = (at_x >= w) & (at_x <= e) & (at_y >= s) & (at_y <= n)
+            # The largest tangent, before any arc tangent: it grows with the angle, and one is enough.
             steepest = np.where(inside, rise / steps, 0.0).max(axis=1)
             # The highest of all DEMs: where two overlap, the coarser one may miss a ridge but invents none.
             elevation[k] = np.maximum(elevation[k], np.arctan(steepest))

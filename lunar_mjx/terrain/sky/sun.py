@@ -42,6 +42,7 @@ class Sun:
 
     def towards(self, time: Any) -> Vec3:
         """Unit vector towards the Sun at `time`, s."""
+        # Interpolated and made a unit again: between samples the chord is shorter.
         return Vec3(*(self._at(self.direction[:, k], time) for k in range(3))).unit()
 
     def _at(self, values: Float[Array, "times"], time: Any) -> Any:
@@ -57,6 +58,7 @@ class Sun:
         """Direction, and irradiance behind the horizon, at `time`, s, and a place, m."""
         to = self.towards(time)
         edge = 0.0 if self.horizon is None else horizon_elevation(self.horizon, x, y, to.x, to.y)
+        # The whole disc, not its middle: near the poles sunset lasts for many hours.
         return Sunlight(to, self._at(self.irradiance, time) * share_above(jnp.arcsin(to.z) - edge))
 
 
@@ -108,6 +110,7 @@ def fixed_sun(
       irradiance: W/m2. horizon: of the terrain, or None. dtype: of the arrays.
     """
     towards = unit_vector(math.radians(azimuth_deg), math.radians(elevation_deg))
+    # Divided by elsewhere, so never zero; a Sun below the horizon keeps the ground cold.
     highest = max(math.sin(math.radians(elevation_deg)), 1e-6)
     return Sun(
         jnp.asarray(towards[None], dtype),

@@ -60,6 +60,7 @@ class SoilLayers:
         at = [jnp.asarray(v, dtype) for v in (self.x0 - origin[0], self.y0 - origin[1], self.cell)]
         given = {k: v for k, v in self.values.items() if k != ROCK}
         if "friction_angle" in given:
+            # The laws use the tangent; taken once here, not in each step.
             given["tan_phi"] = np.tan(given.pop("friction_angle"))
         rock = SoilMap(jnp.asarray(self.values[ROCK], dtype), *at) if ROCK in self.values else None
         return rock, SoilGrids(*at, **{k: jnp.asarray(v, dtype) for k, v in given.items()}) if given else None
@@ -100,6 +101,7 @@ def read_grids(path: Path, layers: Sequence[Any], place: Place, ground: Dem) -> 
         if name not in known:
             raise bad_input(path, "layer", name, "is no parameter of a soil", f"use some of {', '.join(known)}")
         low, high = BOUNDS.get(name, (0.0, 1.0))
+        # The worst node is named, so that the message shows how far off the grid is.
         worst = float(grid.heights.flat[np.argmax(np.maximum(low - grid.heights, grid.heights - high))])
         if not low <= worst <= high:
             raise bad_input(path, name, worst, f"is outside [{low:g}, {high:g}]{_unit(name)}", "correct the grid")

@@ -43,6 +43,7 @@ def plan(
         raise bad_input("particles", "--controls", controls, "is out of range", f"give 0 to {len(points)}")
     table = [Run(wheel, sand, gravity, p, numerics) for p in points]
     layout(table)  # refuses voxels that do not show the wheel
+    # Middles of equal parts of the list, so that neither its first nor its last point stands for all.
     chosen = np.unique(np.round((np.arange(controls) + 0.5) * len(points) / max(controls, 1) - 0.5).astype(int))
     varied = [
         dataclasses.replace(table[i], numerics=variant_numerics(numerics, v), variant=v)
@@ -69,6 +70,7 @@ def read_plan(data: Sequence[dict[str, Any]]) -> list[Run]:
 
 def missing(runs: Sequence[Run], folder: Path) -> list[Run]:
     """Runs whose results a folder does not hold."""
+    # By key and not by line number: a plan may have grown since.
     have = {r["key"] for r in read_results(folder)}
     return [r for r in runs if r.key not in have]
 
@@ -153,12 +155,14 @@ def compute(
     new_runs = missing(runs, folder)
     name = open_device(device) if new_runs else "cpu"
     todo = batches(new_runs, most_particles or MOST_PARTICLES[name.split(":")[0]])
+    # Planned work, not the number of batches: points of high slip take many times as long.
     share = np.array([work(batch) for batch in todo])
     share = share / share.sum() if len(share) else share
     rate = None  # seconds for the whole, as the last batch tells
     stopped = ""
     for number, batch in enumerate(todo):
         spent = time.perf_counter() - begun
+        # Not begun rather than cut off: a batch that is cut off is lost whole.
         if spent >= seconds or (rate is not None and spent + rate * share[number] > seconds):
             stopped = "time limit"
             break
@@ -183,6 +187,7 @@ def compute(
             stopped = "time limit, within a batch that is lost"
             break
         took = time.perf_counter() - start
+        # From the last batch alone: the first one also compiled.
         rate = took / share[number]
         new = [
             {
@@ -198,6 +203,7 @@ def compute(
             }
             for r, s in zip(batch, series, strict=True)
         ]
+        # After each batch, since hours lie between them.
         with appending(folder / RUNS_FILE) as path, path.open("a", encoding="utf-8") as file:
             file.writelines(json.dumps(entry) + "\n" for entry in new)
         results += new

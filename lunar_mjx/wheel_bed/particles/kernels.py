@@ -38,6 +38,7 @@ def sum_impulses(
     """Adds up impulses and their moments about each body's centre; the last row is all that does not move."""
     i = wp.tid()
     c = collider[i]
+    # Most nodes touch nothing.
     if c < 0:
         return
     p = scale * impulse[i]
@@ -51,6 +52,7 @@ def sum_impulses(
         arm = place[i] - wp.transform_get_translation(pose[b])
     moment = wp.cross(arm, p)
     for k in range(3):
+        # Sums in no fixed order: the last digits differ from run to run, as do those of any GPU's sums.
         wp.atomic_add(total, row, k, p[k])
         wp.atomic_add(total, row, 3 + k, moment[k])
     wp.atomic_add(total, row, 6, 1.0)
@@ -87,13 +89,16 @@ def record_and_move(
     t = float(step) * dt
     if step > 0:
         before = t - dt
+        # The share that the finished step was given, so that what is recorded belongs to what was imposed.
         share = rise(before, settle_time, ramp_time) * (1.0 - rise(before, arrived, ramp_time))
         load = imposed[b, 4] * rise(t, 0.0, load_time)
+        # Implicit in the damper, so that its strength sets no limit to the time step.
         vz = (m * place[b, 3] - dt * load + total[b, 2]) / (m + dt * c)
         place[b, 0] = place[b, 0] + dt * share * v
         place[b, 2] = place[b, 2] + dt * vz
         place[b, 3] = vz
         place[b, 4] = place[b, 4] + dt * share * omega
+        # Impulses over the step, hence means of the force, in the wheel's own directions.
         record[step - 1, b, 0] = (cosine * total[b, 0] + sine * total[b, 1]) / dt
         record[step - 1, b, 1] = (-sine * total[b, 0] + cosine * total[b, 1]) / dt
         record[step - 1, b, 2] = total[b, 2] / dt
@@ -101,6 +106,7 @@ def record_and_move(
         record[step - 1, b, 4] = place[b, 2]
         record[step - 1, b, 5] = place[b, 0]
         record[step - 1, b, 6] = total[b, 6]
+        # Walls belong to all boxes; one thread copies their sum.
         if b == 0:
             walls = total.shape[0] - 1
             for k in range(3):
@@ -108,6 +114,7 @@ def record_and_move(
     share = rise(t, settle_time, ramp_time) * (1.0 - rise(t, arrived, ramp_time))
     load = imposed[b, 4] * rise(t + dt, 0.0, load_time)
     vz = (m * place[b, 3] - dt * load) / (m + dt * c)
+    # The wheel travels along x and is turned to its slip angle: boxes stay aligned with the grid.
     heading = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), wp.atan2(sine, cosine))
     turned = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), place[b, 4])
     pose[b] = wp.transform(wp.vec3(place[b, 0], place[b, 1], place[b, 2]), heading * turned)

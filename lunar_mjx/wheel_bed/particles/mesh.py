@@ -20,6 +20,7 @@ def rim(wheel: ParticleWheel) -> np.ndarray:
     count = wheel.grouser_count
     pitch = 2.0 * np.pi / count
     per_gap = max(4, _SEGMENTS // count)
+    # A middle corner on the grouser's tip keeps it round, too.
     high = np.linspace(0.0, _THICKNESS * pitch, 3)
     low = np.linspace(_THICKNESS * pitch, pitch, per_gap + 1)
     angle = np.concatenate([high, low[:-1], [pitch]])
@@ -48,6 +49,7 @@ def wheel_mesh(wheel: ParticleWheel) -> tuple[np.ndarray, np.ndarray]:
         ]
     )
     corners = np.concatenate([right, left, hubs]).astype(np.float32)
+    # The order of corners decides which side is inside; the solver pushes sand to the outside.
     if volume(corners, faces) < 0.0:
         faces = faces[:, [0, 2, 1]]
     return corners, faces.astype(np.int32)
@@ -56,4 +58,5 @@ def wheel_mesh(wheel: ParticleWheel) -> tuple[np.ndarray, np.ndarray]:
 def volume(corners: np.ndarray, faces: np.ndarray) -> float:
     """Enclosed volume, m3; negative where the normals point inward."""
     a, b, c = (corners[faces[:, k]].astype(float) for k in range(3))
+    # Signed tetrahedra to the origin (divergence theorem).
     return float(np.sum(a * np.cross(b, c)) / 6.0)

@@ -41,6 +41,7 @@ VARIANTS: Mapping[str, Mapping[str, float]] = {
 
 def variant_numerics(numerics: Numerics, variant: str) -> Numerics:
     """The settings with one of `VARIANTS` changed."""
+    # The other contact law, whichever the table has.
     if variant == "contact":
         return dataclasses.replace(numerics, contact="pic8" if numerics.contact == "S2" else "S2")
     if variant == "jitter":
@@ -75,11 +76,13 @@ def steady(run: Run, series: Series) -> dict[str, Any]:
     """
     begin = run.settle_time + run.ramp_time
     window = series.time > begin + (1.0 - STEADY_PART.window) * (series.time[-1] - begin)
+    # The last fifth before the drive, when the wheel shall have come to rest under its load.
     still = (series.time > 0.8 * run.settle_time) & (series.time <= run.settle_time)
     values, error, drift = {}, {}, {}
     for quantity in MEASURED:
         seen = getattr(series, quantity)[window]
         half = len(seen) // 2
+        # Means of blocks, since neighbouring steps are correlated and would claim too small an error.
         blocks = np.array([block.mean() for block in np.array_split(seen, STEADY_PART.blocks)])
         values[quantity] = float(seen.mean())
         error[quantity] = float(blocks.std(ddof=1) / np.sqrt(STEADY_PART.blocks))
@@ -87,6 +90,7 @@ def steady(run: Run, series: Series) -> dict[str, Any]:
     carried = float(series.vertical_force[window].mean())
     usable = bool(
         np.isfinite(list(values.values())).all()
+        # A wheel that still sinks or rises carries more or less than its load.
         and abs(carried / run.point.load - 1.0) < STEADY_PART.load_error
         and values["sinkage"] < run.wheel.radius
     )
@@ -133,10 +137,12 @@ def numerical_error(results: Iterable[Mapping[str, Any]]) -> dict[str, dict[str,
             parts["drift"] = float(np.sqrt(np.mean([r["drift"][quantity] ** 2 for r in base.values()])))
             parts["time"] = float(np.sqrt(np.mean([r["error"][quantity] ** 2 for r in base.values()])))
         if parts:
+            # Independent causes: squares add.
             parts["total"] = float(np.sqrt(sum(v**2 for v in parts.values())))
         out[quantity] = parts
     return out
 
 
 def _point(result: Mapping[str, Any]) -> tuple[float, ...]:
+    # JSON and arithmetic may differ in the last digit of one point.
     return tuple(round(v, 9) for v in result["point"].values())

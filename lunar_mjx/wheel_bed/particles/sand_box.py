@@ -44,6 +44,7 @@ SAND_BOX = SandBoxNumbers()
 @contextlib.contextmanager
 def _without_native_warnings() -> Iterator[None]:
     """Holds back what compiled code writes to standard error: Warp warns there of every machine without a GPU."""
+    # File descriptor 2 and not sys.stderr: compiled code knows nothing of Python's object.
     sys.stderr.flush()
     kept = os.dup(2)
     with open(os.devnull, "w") as nowhere:
@@ -75,6 +76,7 @@ def open_device(device: str) -> str:
         raise UserError(
             f"particles: Newton and Warp, which compute the sand, are not installed; install the extra: {EXTRA}."
         ) from error
+    # A private method is overridden below (see `_slide_solver`), which other versions may not have.
     if not newton.__version__.startswith("1.8"):
         raise UserError(
             f"particles: newton {newton.__version__} is here, but 1.8 is needed; install the extra: {EXTRA}."
@@ -122,6 +124,7 @@ def particle_places(box: Layout, seed: int, jitter: float = SAND_BOX.jitter) -> 
     spacing = box.voxel / box.per_edge
     axes = [(np.arange(n * box.per_edge) + 0.5) * spacing for n in box.cells]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    # A perfect lattice would shear along its own planes.
     moved = jitter * spacing * (np.random.default_rng(seed).random(lattice.shape) - 0.5)
     return (lattice + moved).astype(np.float32)
 
@@ -130,6 +133,7 @@ def add_sand(builder: Any, box: Layout, sand: Sand, count: int) -> float:
     """Adds particles whose places come later; returns the mass of one, kg."""
     spacing = box.voxel / box.per_edge
     mass = float(sand.density * spacing**3)
+    # Number, mass and radius only; places are assigned as one array after the model is made.
     nowhere = [(0.0, 0.0, 0.0)] * count
     builder.add_particles(pos=nowhere, vel=nowhere, mass=[mass] * count, radius=[0.5 * spacing] * count)
     return mass
@@ -163,6 +167,7 @@ def set_sand(model: Any, sand: Sand, gravity: float) -> None:
     model.set_gravity((0.0, 0.0, -gravity))
     model.mpm.friction.fill_(sand.friction)
     model.mpm.yield_stress.fill_(sand.strength)
+    # At critical state: sand that has been sheared far enough no longer changes its volume.
     model.mpm.dilatancy.fill_(0.0)
 
 
@@ -206,9 +211,11 @@ class SandBoxes:
                 "particles: runs of one batch differ in wheel, sand, gravity or time step; batch them apart."
             )
         self.runs, self.device, self.box = runs, device, layout(runs)
+        # All boxes run as long as the longest; each series is cut at its own end.
         self.steps = max(r.steps for r in runs) + math.ceil(first.ramp_time / first.time_step)
         corner = [k * self.box.pitch for k in range(len(runs))]
         places = [
+            # Each box has its own jitter, or the scatter between boxes would be none.
             particle_places(self.box, 1000 * r.numerics.seed + k) + np.array([0.0, y, 0.0], np.float32)
             for k, (r, y) in enumerate(zip(runs, corner, strict=True))
         ]
@@ -236,6 +243,7 @@ class SandBoxes:
         place[:, 0] = self.box.start
         place[:, 1] = [y + 0.5 * self.box.size[1] for y in corner]
         clear = 0.25 * first.numerics.voxel if first.numerics.contact == "S2" else 0.0
+        # Sinkage counts from the surface as strewn.
         self.hub_height = self.box.size[2] + first.wheel.radius  # of a wheel that just touches
         place[:, 2] = self.hub_height + first.wheel.grouser_height + clear
         assert imposed.shape[1] == IMPOSED
@@ -252,8 +260,10 @@ class SandBoxes:
     def _imposed(self, run: Run) -> list[float]:
         angle = math.radians(run.point.slip_angle)
         mass = run.point.load / run.gravity
+        # Of a spring m g/R: the stiffness of sand in which the wheel sinks by its radius under its weight.
         damping = SAND_BOX.damping * 2.0 * mass * math.sqrt(run.gravity / run.wheel.radius)
         arrived = run.settle_time + run.ramp_time + run.drive_time
+        # The larger of both is 1 in a point, so `speed` is that of the faster one.
         travel, turn = run.speed * run.point.travel, run.speed * run.point.rim / run.wheel.radius
         # A wheel that slides to its left along x points to the right of x.
         return [travel, turn, math.cos(angle), -math.sin(angle), run.point.load, mass, damping, arrived]
@@ -270,6 +280,7 @@ class SandBoxes:
         solver = solver_class(self.model, config=config)
         n = len(self.runs)
         solver.setup_collider(
+            # The mass that the implicit damper lets the sand feel.
             body_mass=wp.array(imposed[:, 5] + dt * imposed[:, 6], dtype=float, device=self.device),
             body_inv_inertia=wp.zeros(n, dtype=wp.mat33, device=self.device),
             body_q=self.state.body_q,
@@ -329,6 +340,8 @@ class SandBoxes:
                 place,
                 solver.collider_body_index,
                 state.body_q,
+                # The field counts, per volume of a voxel, what the wheel gives the sand; the sign turns it to what the
+                # wheel gets.
                 -(self.box.voxel**3),
                 len(self.runs),
                 self.total,
@@ -350,6 +363,7 @@ class SandBoxes:
         """
         for step in range(1, self.steps + 1):
             self.advance(step)
+            # Each look waits for the GPU and copies from it.
             if step % SAND_BOX.look_every == 0 and not np.isfinite(self.place.numpy()).all():
                 raise FloatingPointError(f"a wheel's place is not finite after step {step}")
             if not going_on(step / self.steps):
@@ -368,6 +382,7 @@ class SandBoxes:
             along, left, up = (dt * record[:, k, i].sum() for i in range(3))
             cosine, sine = math.cos(angle), math.sin(angle)
             impulse += [cosine * along - sine * left, sine * along + cosine * left, up]
+        # Gravity's impulse less what walls and wheels took: zero but for the solver's error.
         left_over = self._momentum() - self.start_momentum + impulse + np.array([0.0, 0.0, weight])
         out = []
         for k, r in enumerate(self.runs):
@@ -376,6 +391,7 @@ class SandBoxes:
                 Series(
                     time=dt * np.arange(1, r.steps + 1),
                     drawbar_pull=own[:, 0],
+                    # Test beds call the force positive that opposes a slip angle to the left.
                     side_force=-own[:, 1],
                     vertical_force=own[:, 2],
                     driving_torque=-own[:, 3],

@@ -46,6 +46,7 @@ def settlement(
     box = Layout((6, 6, depth), voxel, 2, 0.0)
     strewn = particle_places(box, 0)
     after = _left_alone(strewn, box, sand, gravity, open_device(device), SLUMP.settled, time_step)
+    # The top layer of voxels: below it sand settles less.
     top = strewn[:, 2] > box.size[2] - voxel
     return float((strewn - after)[top, 2].mean())
 
@@ -63,6 +64,7 @@ def slump_angle(sand: Sand, gravity: float, voxel: float, height: int = 8, devic
     box = Layout((5 * height, 3, height), voxel, 2, 0.0)
     places = particle_places(box, 0)
     column = places[places[:, 0] < 1.5 * height * voxel]
+    # By the speed of a fall from the column's height: nothing moves faster.
     time_step = SLUMP.step * voxel / math.sqrt(2.0 * gravity * box.size[2])
     return surface_angle(
         _left_alone(column, box, sand, gravity, open_device(device), SLUMP.free_falls, time_step), voxel
@@ -102,6 +104,7 @@ def surface_angle(places: np.ndarray, voxel: float) -> float:
     """
     column = np.floor(places[:, 0] / voxel).astype(int)
     top = np.array([places[column == k, 2].max() if (column == k).any() else 0.0 for k in range(column.max() + 1)])
+    # Tops of columns and not a cloud's outline: single grains that rolled off do not count as slope.
     middle = (np.arange(len(top)) + 0.5) * voxel
     crest = top.max()
     slope = (top > SLUMP.trim * crest) & (top < (1.0 - SLUMP.trim) * crest)
