@@ -27,6 +27,7 @@ def log_modes(log: Log, model: Model) -> dict[str, str]:
     names = set(log.channel_names)
     channels = _channels_by_joint(model)
     for group in model.rover.groups:
+        # The unit of a command tells the controller's mode: who commands rad/s runs a speed controller.
         stated_modes = [m for m in MODES if any(_command(c, m) in names for j in group.joints for c in channels[j])]
         if len(stated_modes) > 1:
             shown = ", ".join(f"command_*_{_KIND[group.name]}_{COMMAND_UNITS[m]}" for m in stated_modes)
@@ -93,14 +94,17 @@ def commands(log: Log, model: Model) -> tuple[Commands, float]:
                 f"differ from the model's mode {model.modes[group]}",
                 "make the model with log_model(log, model)",
             )
+    # The whole log and not the commands' table: telemetry before the first command wants a simulation, too.
     start, end = log.span_s
     names = _command_names(log, model)
+    # Whole time steps: a command that changed within a step would have to be split between two.
     interval = _interval([log.table_of(n) for n in names if log.table_of(n) is not None], model.timestep)
     grid = start + interval * np.arange(max(1, int(np.floor((end - start) / interval + 1e-6)) + 1))
     values = np.zeros((len(grid), len(names)))
     for column, name in enumerate(names):
         samples = log.channel(name)
         if samples is not None and samples[0].size:
+            # Held and never interpolated: a controller acts on the last command that it has.
             values[:, column] = hold(samples[0], samples[1], grid)
     return Commands(values, interval), start
 
@@ -113,12 +117,14 @@ def _command_names(log: Log, model: Model) -> list[str]:
     for group in model.rover.groups:
         for joint in group.joints:
             own = [_command(c, model.modes[group.name]) for c in channels[joint]]
+            # The wheel's own channel wins: it says more than that of its side.
             names.append(next((n for n in own if n in logged), own[0]))
     return names
 
 
 def hold(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Zero-order hold of samples (sorted `time`, `values`) at the times `grid`; the first value before the first."""
+    # A microsecond later, since times of steps and of rows differ by rounding.
     return values[np.maximum(np.searchsorted(time, grid + 1e-6, side="right") - 1, 0)]
 
 
@@ -161,7 +167,9 @@ def log_model(log: Log, base: Model) -> Model:
     model = base.replace(**changes)
     if any(log.terrain_origin_m):
         x, y = log.terrain_origin_m
+        # The terrain moves to the log's coordinates, so that all channels stay as they were written.
         model = model.replace(terrain=moved(model.terrain, -x, -y), terrain_spec="")
+    # The arrangement last: a stand holds the rover as it was changed.
     return _arranged(log, _sun(log, _changed_rover(log, model)))
 
 
@@ -219,6 +227,7 @@ def _with_payload(model: Model, mass: float, position: Any, source: str) -> Mode
     if "payload" in model.effect_names:
         old = model.parameters["payload"]
         total_mass = float(old["mass"]) + mass  # type: ignore[arg-type]
+        # The effect knows one point mass: the inertia of the two about their common centre is left out.
         position = [
             (float(old[k]) * float(old["mass"]) + p * mass) / total_mass  # type: ignore[arg-type]
             for k, p in zip("xyz", position, strict=True)
@@ -228,6 +237,7 @@ def _with_payload(model: Model, mass: float, position: Any, source: str) -> Mode
 
 
 def _set(model: Model, effect: str, source: str, /, **values: Any) -> Model:
+    # A model that has the effect already keeps its place in the list.
     return model.set(effect, source, **values) if effect in model.effect_names else model.add(effect, source, **values)
 
 
@@ -236,6 +246,7 @@ def _sun(log: Log, model: Model) -> Model:
         value = environment_value(log, key)
         if value is None:
             continue
+        # Every effect with such a parameter: panels, housings and radiators see one Sun.
         for effect in model.effects:
             if name in effect.parameters:
                 unit = np.radians(value) if effect.parameters[name].unit == "rad" else value

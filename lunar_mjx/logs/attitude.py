@@ -27,12 +27,14 @@ def body_attitude(tables: Mapping[str, LogTable], imu: Imu) -> dict[str, LogTabl
     out = {}
     for name, table in tables.items():
         channels = dict(table.channels)
+        # R_body = R_imu R(q)^T: the mounting acts on the body's side, so it is multiplied from the right.
         mounted = _mounting(imu).inv() if imu.attitude else Rotation.identity()
         if all(q in channels for q in QUATERNION):
             there, turned = _of_quaternion(channels)
             turned = turned * mounted
             if imu.attitude:
                 size = np.sqrt(sum(channels[q][there] ** 2 for q in QUATERNION))
+                # With the norm as logged, so that the check of norms still sees what was written.
                 channels |= _filled(QUATERNION, (turned.as_quat(scalar_first=True) * size[:, None]).T, there)
             # Angles that were logged beside the quaternion stay as logged: they are measurements of their own.
             if not any(e in known for e in EULER):
@@ -47,12 +49,14 @@ def body_attitude(tables: Mapping[str, LogTable], imu: Imu) -> dict[str, LogTabl
 
 def _of_quaternion(channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation]:
     parts = np.stack([channels[q] for q in QUATERNION], axis=1)
+    # Rows of zeros are what some drivers write before their first fix.
     known = np.isfinite(parts).all(axis=1) & (np.linalg.norm(np.nan_to_num(parts), axis=1) > 1e-6)
     return known, Rotation.from_quat(parts[known], scalar_first=True)
 
 
 def _of_angles(channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation]:
     roll, pitch = (channels[e] for e in EULER[:2])
+    # Roll and pitch alone still tell the vertical.
     yaw = channels.get(EULER[2], np.zeros(len(roll)))
     known = np.isfinite(roll) & np.isfinite(pitch) & np.isfinite(yaw)
     angles = np.stack([yaw, pitch, roll], axis=1)[known]

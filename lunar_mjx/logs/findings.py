@@ -33,6 +33,7 @@ class Finding:
     @property
     def line(self) -> int | None:
         """Line of a CSV file, whose header is line 1."""
+        # Rows count from 0, lines from 1, and line 1 is the header.
         return None if self.row is None else self.row + 2
 
     @property

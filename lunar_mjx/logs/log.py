@@ -74,6 +74,7 @@ class LogTable:
     @property
     def common_time_s(self) -> np.ndarray:
         """(n,) times on the log's common clock, s."""
+        # Added when read: the times as written stay, for messages that name rows.
         return self.time_s + self.clock_offset_s
 
     def __len__(self) -> int:
@@ -130,6 +131,7 @@ class Log:
         for table in self.tables.values():
             if name in table.channels:
                 values = table.channels[name]
+                # Gaps are left out here, once, so that no reader has to think of them.
                 keep = np.isfinite(values) & np.isfinite(table.time_s)
                 return table.common_time_s[keep], values[keep]
         return None

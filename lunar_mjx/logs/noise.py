@@ -102,8 +102,10 @@ def noise_of(log: Log, channel: str) -> ChannelNoise | None:
     """
     stated = log.noise.get(channel)
     if stated is not None and stated.std > 0.0:
+        # Not 1: a covariance without any white part is next to singular.
         share = 0.99 if stated.correlation_time_s > 0.0 else 0.0
         return ChannelNoise(stated.std, share, stated.correlation_time_s, stated.source)
+    # What is asked about is the drive; its noise is larger than that at rest.
     return estimated_noise(log, channel, moving=True) or estimated_noise(log, channel, moving=False)
 
 
@@ -136,6 +138,7 @@ def estimated_noise(log: Log, channel: str, moving: bool) -> ChannelNoise | None
     scatter = (float(np.quantile(logs, 0.75)) - float(np.quantile(logs, 0.25))) / 1.349
     spread = float(np.sqrt(max(scatter**2 - 0.25 * float(polygamma(1, 0.5 * free)), 0.0)))
     family = find_channel(channel)
+    # Families that shake with the drive are named so; the rest is an estimate.
     name = _NAMES.get(family[0].family if family else "", "estimate") if moving else "rest"
     # the median of windows is as good as two thirds of them
     freedom = 2.0 / 3.0 * free * windows.shape[1]
@@ -160,6 +163,7 @@ def noise_table(logs: Sequence[Log]) -> dict[str, dict[str, ChannelNoise]]:
                 if one is not None:
                     noises.setdefault(kind, []).append(one)
         if noises:
+            # The median log: one that hit a kerb shall not speak for all.
             out[name] = {k: sorted(v, key=lambda n: n.std)[len(v) // 2] for k, v in noises.items()}
     return out
 
@@ -174,8 +178,10 @@ def _moving(log: Log, time: np.ndarray, channel: str) -> np.ndarray:
             for t, v in series:
                 after = np.clip(np.searchsorted(t, time), 0, len(t) - 1)
                 before = np.clip(after - 1, 0, len(t) - 1)
+                # The samples on both sides: a slow channel may miss when a wheel started.
                 moves |= np.maximum(np.abs(v[before]), np.abs(v[after])) > NOISE_ESTIMATE.still_rad_s
             return moves
+    # Without any wheel's speed all counts as motion.
     return np.ones(len(time), bool)
 
 
@@ -189,10 +195,13 @@ def _windows(time: np.ndarray, values: np.ndarray, moves: np.ndarray, moving: bo
     out = []
     for k in starts[:: max(1, len(starts) // NOISE_ESTIMATE.windows)]:
         piece = slice(k, k + count)
+        # One lost sample passes; more would bend the correlation's time scale.
         even = np.diff(time[piece]).max() < 2.5 * step
         # a sensor that stands still in its resolution shows no noise
         if even and np.all(moves[piece] == moving) and np.ptp(values[piece]) > 0.0:
+            # Less its first value: positions of kilometres would eat the digits of a millimetre's noise.
             out.append(values[piece] - values[k])
+    # Rounded, so that steps that differ in the last digit share a cached factor.
     return round(step, 6), np.array(out).T if out else np.zeros((count, 0))
 
 
@@ -201,6 +210,7 @@ def _colour(step: float, windows: np.ndarray) -> tuple[float, float]:
     best, most = (0.0, 0.0), -np.inf
     white = _likelihood(step, windows, 0.0, 1.0)
     for tau in NOISE_ESTIMATE.times_s:
+        # A memory of less than half a step cannot be told from white noise.
         for share in NOISE_ESTIMATE.shares[1:] if tau >= 0.5 * step else ():
             likelihood = _likelihood(step, windows, share, tau)
             if likelihood > most:
@@ -213,6 +223,7 @@ def _likelihood(step: float, windows: np.ndarray, share: float, tau: float) -> f
     weight, determinant = _about_parabola(len(windows), step, share, tau)
     squares = np.sum(windows * (weight @ windows), axis=0)
     free = len(windows) - NOISE_ESTIMATE.parabola
+    # Each window's size at its best and so out of the question: windows differ by speed and ground.
     return -0.5 * float(np.sum(free * np.log(np.maximum(squares, NOISE_ESTIMATE.quietest)) + determinant))
 
 
@@ -221,6 +232,7 @@ def _about_parabola(count: int, step: float, share: float, tau: float) -> tuple[
     """Inverse covariance (count, count) of what is left about a parabola, and that covariance's log determinant."""
     t = step * np.arange(count)
     parabola = np.stack([np.ones(count), t - t.mean(), (t - t.mean()) ** 2], axis=1)
+    # What is orthogonal to every parabola: its likelihood does not depend on the motion (REML).
     contrasts = np.linalg.qr(parabola, mode="complete")[0][:, NOISE_ESTIMATE.parabola :]
     covariance = (1.0 - share) * np.eye(count)
     if share > 0.0:

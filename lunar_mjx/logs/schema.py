@@ -55,6 +55,7 @@ class Channel:
     @functools.cached_property
     def pattern(self) -> re.Pattern[str]:
         joint = f"(?P<joint>{'|'.join(KINDS)})"
+        # Sides only where joints are driven: no rover steers a side as one.
         side = f"(?:{'|'.join(SIDES)})(?=_drive)" if "{c}_{j}" in self.stem else ""
         corner = f"(?P<corner>{'|'.join(CORNERS)}{'|' if side else ''}{side})"
         text = self.stem.replace("{c}", corner).replace("{j}", joint).replace("{x}", "(?P<axis>[xyz])")
@@ -69,6 +70,7 @@ def _channel(
 
 def unit_of(suffix: str) -> str:
     """A unit as names carry it (`m_s2`, `Nm`, `deg_s`) in the grammar of `lunar_mjx.units` ("m/s2")."""
+    # Ratios carry a word and no unit.
     if suffix in ("", "ratio"):
         return "1"
     text = suffix.replace("_per_", "_")
@@ -170,6 +172,7 @@ class ChannelName:
         """`left`, `right`, or "" where the channel belongs to neither."""
         if self.corner in SIDES:
             return self.corner
+        # Corners begin with their side's letter; the middle rows of six wheels do, too.
         return {"l": "left", "r": "right"}.get(self.corner[:1], "")
 
     @property
@@ -251,6 +254,7 @@ def limits(name: str) -> tuple[float, float, str]:
     if found is None:
         return -float("inf"), float("inf"), ""
     channel, match = found
+    # The one range that depends on the joint.
     if channel.suffix == "rad" and match["joint"] != "drive":
         return -ANGLE_LIMIT, ANGLE_LIMIT, "steering and suspension turn less than once"
     return channel.low, channel.high, channel.why
@@ -287,6 +291,7 @@ def conversion(suffix: str, unit: str, source: str, field: str) -> tuple[float, 
     given = "percent" if suffix in ("percent", "pct") else unit_of(suffix)
     try:
         offset = to_unit(0.0, given, unit, source, field)
+        # Units convert by straight lines, so two values tell scale and offset (degF to degC).
         scale = to_unit(1.0, given, unit, source, field) - offset
     except UserError:
         shown = "a pure number" if unit == "1" else unit

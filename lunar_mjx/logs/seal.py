@@ -48,6 +48,7 @@ class Answer:
 
     def commitment(self) -> str:
         """SHA-256 of everything above, in one canonical spelling."""
+        # One spelling: a hash of the same content must not depend on the order of keys.
         text = json.dumps(dataclasses.asdict(self), sort_keys=True, separators=(",", ":"))
         return PREFIX + hashlib.sha256(text.encode()).hexdigest()
 
@@ -89,11 +90,13 @@ def read_answer(path: str | Path) -> Answer:
 def hash_tables(tables: Mapping[str, pd.DataFrame]) -> str:
     """SHA-256 over the names and values of all tables, as a log file holds them (nine digits)."""
     digest = hashlib.sha256()
+    # In a fixed order, whatever order the tables were written in.
     for name in sorted(tables):
         frame = tables[name]
         digest.update(name.encode())
         for column in frame.columns:
             digest.update(str(column).encode())
+            # As text of nine digits, since that is what comes back from a CSV.
             digest.update(",".join(f"{v:.9g}" for v in np.asarray(frame[column], float)).encode())
     return digest.hexdigest()
 

@@ -20,6 +20,7 @@ def continuous(log: Log, name: str) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     time, values = samples
     period = PERIODS.get(name)
+    # An angle within little more than a turn wraps; one that counts on does not.
     if period is None and is_quantity(name, "joint_angle") and np.ptp(values) <= 6.5:
         period = 2.0 * np.pi
     return time, values if period is None else np.unwrap(values, period=period)
@@ -47,6 +48,7 @@ def span(log: Log, names: Sequence[str]) -> tuple[float, float] | None:
 
 def edges(low: float, high: float, count: int = 40, shortest: float = 0.5) -> np.ndarray:
     """Edges of windows over a span: `count` of them, but none shorter than `shortest` s."""
+    # Forty windows tell a correlation; half a second is longer than controllers and filters lag.
     return np.linspace(low, high, max(2, min(count, int((high - low) / shortest)) + 1))
 
 
@@ -59,9 +61,11 @@ def increments(log: Log, name: str, windows: np.ndarray) -> np.ndarray:
 def integrals(log: Log, name: str, windows: np.ndarray, like: str | None = None) -> np.ndarray:
     """Integral of a channel over each window, its edges smoothed as `increments` smooths those of `like`."""
     time, values = continuous(log, name)  # type: ignore[misc]
+    # Trapezoids over the samples' own times: rates need not be regular.
     total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
     if like is not None:
         length = SMOOTHED * np.median(np.diff(continuous(log, like)[0]))  # type: ignore[index]
+        # The same smoothing on both sides, or a difference of filters would look like one of channels.
         total = smooth(total, max(1, round(float(length / np.median(np.diff(time))))))
     return np.diff(np.interp(windows, time, total))
 

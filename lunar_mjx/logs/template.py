@@ -121,6 +121,7 @@ def new_log(folder: str | Path, rover: str = "viper", manoeuvre: str = "speed_st
         _write(folder / "log.toml", _STEADY.format(folder=folder, format=FORMAT))
         _write(folder / "points.csv", ",".join(_POINTS) + "\n")
         return folder
+    # The template is text that is read as TOML again.
     for field, value in (("--rover", rover), ("--manoeuvre", manoeuvre)):
         if any(c in value for c in '"\n\r\\'):
             raise bad_input("log new", field, value, "holds a quote, a backslash or a line break", "name it without")
@@ -129,6 +130,7 @@ def new_log(folder: str | Path, rover: str = "viper", manoeuvre: str = "speed_st
     tables = noise = ""
     for name, channels in columns.items():
         tables += f'[tables.{name}]\nfile = "{name}.csv"\nrate_hz = {RATES[name]:g}.0\n\n'
+        # Headers alone: a line of made-up numbers might be left in.
         empty = pd.DataFrame({"time_s": np.zeros(0)} | {c: np.zeros(0) for c in channels})
         _write(folder / f"{name}.csv", empty.to_csv(index=False))
     for instrument in Recording().instruments:

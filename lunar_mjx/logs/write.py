@@ -146,6 +146,7 @@ def write_frame(frame: pd.DataFrame, path: Path) -> None:
             frame.to_parquet(part, index=False, engine="pyarrow")
         return
     with replacing(path) as part:
+        # Nine digits bring every float32 back to the last bit.
         frame.to_csv(part, index=False, float_format="%.9g")
 
 
@@ -161,6 +162,7 @@ def _check_frame(name: str, frame: pd.DataFrame) -> None:
 def _rate(frame: pd.DataFrame) -> float:
     """Median rate of a table's time, Hz; 0 where time nowhere rises, which is for the gate to tell."""
     steps = np.diff(np.asarray(frame["time_s"], float))
+    # Times that go back are the gate's to tell; here they would spoil the median.
     steps = steps[steps > 0.0]
     return float(1.0 / np.median(steps)) if steps.size else 0.0
 

@@ -36,6 +36,7 @@ def check_clock(log: Log) -> list[Finding]:
     findings: list[Finding] = []
     for table in log.tables.values():
         findings += _check_table(log, table)
+    # Spans of clocks that jump say nothing.
     return findings or _check_overlap(log)
 
 
@@ -92,6 +93,7 @@ def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
     if windows is None:
         return []
     rate = np.median(windows, axis=1) / base
+    # Times rounded to hundredths jitter by half a step at 50 Hz.
     changed = np.abs(rate - 1.0) > CLOCK_LIMITS.rate_tolerance + _resolution(table.time_s) / base
     # Lost samples make some steps multiples of the base, and a sensor that reports when it has news makes all sorts of
     # steps: only a run of one and the same step is another rate.
@@ -100,6 +102,7 @@ def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
     ) > CLOCK_LIMITS.mostly
     if not changed.any():
         return []
+    # The middle of the first window that differs.
     row = int(np.argmax(changed)) + CLOCK_LIMITS.window // 2
     return [
         _finding(
@@ -121,6 +124,7 @@ def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
     for row in np.flatnonzero(steps > 3.0 * base):
         for integral, rate in _pairs(table):
             moved, expected, still = _over_gap(table, int(row), integral, rate, base)
+            # Movements below 20 sigma decide nothing.
             sigma = log.noise[integral].std if integral in log.noise else 0.0
             # The clock jumped if what the sensor moved fits one ordinary step and not the gap, each clearly.
             if (
@@ -183,6 +187,7 @@ def _pairs(table: LogTable) -> list[tuple[str, str]]:
 def _over_gap(table: LogTable, row: int, integral: str, rate: str, base: float) -> tuple[float, float, float]:
     """Movement over a gap, what its rate lets expect, and what one ordinary step would have given."""
     values, speed = table.channels[integral], table.channels[rate]
+    # A rover's speed hardly changes within a gap of some steps.
     mean = 0.5 * float(speed[row] + speed[row + 1])
     gap = float(table.time_s[row + 1] - table.time_s[row])
     moved = float(values[row + 1] - values[row])
@@ -199,6 +204,7 @@ def _check_overlap(log: Log) -> list[Finding]:
     for table in tables:
         first, last = table.common_time_s[0], table.common_time_s[-1]
         shared = min(high, last) - max(low, first)
+        # Half: instruments are switched on and off one after the other, but within one drive.
         if shared < 0.5 * (last - first):
             return [
                 _finding(

@@ -46,7 +46,9 @@ def check_frames(log: Log) -> list[Finding]:
     findings = _quaternion(log)
     if not findings:
         findings += _euler(log) + _gravity(log)
+    # Reported even so: they do not use the attitude.
     findings += _velocities(log) + _turning(log)
+    # Course and sides read the channels checked before; broken ones would accuse good ones.
     return findings or _course(log) + _left_right(log)
 
 
@@ -68,6 +70,7 @@ def _quaternion(log: Log) -> list[Finding]:
         return []
     # The first table with a quaternion: a second one would be another estimate of one attitude.
     norm = np.sqrt(sum(tables[0].channels[q] ** 2 for q in QUATERNION))
+    # Six sigma: four components and thousands of rows.
     tolerance = max(FRAME_LIMITS.norm_tolerance, 6.0 * max(sigma(log, q) for q in QUATERNION))
     wrong = np.isfinite(norm) & (np.abs(norm - 1.0) > tolerance)
     if not wrong.any():
@@ -123,8 +126,10 @@ def _euler(log: Log) -> list[Finding]:
     limits = span(log, (*QUATERNION, "roll_deg", "pitch_deg", "yaw_deg"))
     if limits is None:
         return []
+    # A fixed number of times, since the tables have rates of their own.
     time = np.linspace(*limits, 200)
     one, two = attitude(log, time), _euler_rotation(log, time)
+    # The angle between two rotations from the trace of R_1^T R_2.
     cosine = 0.5 * (np.einsum("nij,nij->n", one, two) - 1.0)  # type: ignore[arg-type]
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     if np.median(angle) < 5.0:
@@ -151,12 +156,14 @@ def _gravity(log: Log) -> list[Finding]:
     w, x, y, z = (np.full(1, v) for v in log.imu.quaternion)
     measured = measured @ _rotation(w, x, y, z)[0].T
     turn = attitude(log, time)
+    # The last row of body-to-world is the world's z in the body's axes.
     up = np.tile([0.0, 0.0, 1.0], (len(time), 1)) if turn is None else turn[:, 2, :]
     # Medians, because a drive over boulders has jolts of many g.
     force, expected = np.median(measured, axis=0), np.median(up, axis=0)
     size, g = float(np.linalg.norm(force)), log.gravity_m_s2
     angle = float(np.degrees(np.arccos(np.clip(force @ expected / max(size, 1e-12) / np.linalg.norm(expected), -1, 1))))
     shown = ", ".join(f"{v:.3g}" for v in force)
+    # First the sign: a reversed axis would also fail the size's and the axes' tests.
     if angle > 150.0:
         return [
             _finding(
@@ -200,6 +207,7 @@ def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Ag
         return None
     windows = edges(*limits)
     length = float(windows[1] - windows[0])
+    # Noise of a sum over a window at 20 Hz: the root of its length by the step.
     noise = sigma(log, integral) + abs(scale) * sigma(log, rate) * np.sqrt(length * 0.05)
     expected = scale * integrals(log, rate, windows, like=integral)
     least = next(v for word, v in LEAST.items() if integral.startswith(word))
@@ -270,6 +278,7 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
     for key, (integral, rate) in pairs.items():
         own = rate_agreement(log, integral, rate, scale)
         other_pairs = [p[1] for k, p in pairs.items() if k != key]
+        # A rate that follows another angle than its own is another axis's.
         twin = next((o for o in other_pairs if _alike(rate_agreement(log, integral, o, scale))), None)
         cosine = 0.0 if own is None else own.cosine
         if twin is not None and abs(cosine) < FRAME_LIMITS.unlike and span(log, (rate,)) is not None:
@@ -278,6 +287,7 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
         elif own is None:
             continue
         elif abs(own.cosine) > FRAME_LIMITS.alike and abs(own.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
+            # A wrong sign is an axis, a wrong size a unit.
             kind = "frame" if own.factor < 0.0 else "unit"
             findings.append(
                 _finding(
@@ -289,6 +299,7 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
                     f"as fast{guess(own.factor)}; correct one of the two",
                 )
             )
+        # No movement where its rate lets expect some: a stuck channel has no cosine to speak of.
         elif abs(own.cosine) < FRAME_LIMITS.unlike and own.series < 0.2 * own.reference:
             findings.append(
                 _finding(
@@ -312,6 +323,7 @@ def wheel_means(log: Log, windows: np.ndarray, corners: Sequence[str], kind: str
     """Mean over some corners of a channel such as `joint_{}_drive_speed_rad_s`, by window."""
     names = [kind.format(c) for c in corners]
     present = [n for n in names if span(log, (n,)) is not None]
+    # All or none: a mean over fewer wheels would be of another place.
     return None if len(present) < len(names) else np.mean([means(log, n, windows) for n in present], axis=0)
 
 
@@ -369,7 +381,9 @@ def _left_right(log: Log) -> list[Finding]:
     if steer[0] is None or span(log, [STEER.format(c) for c in ("lf", "rf")]) is None:
         return []
     forward = 0.5 * (left + right)
+    # Rear wheels steered the same way crab, the other way turn.
     bend = steer[0] - (0.0 if steer[1] is None else steer[1])
+    # Backing up, the same steering turns the rover the other way: hence times the speed.
     pair = agreement(yaw, bend * forward, 0.01 * float(np.abs(forward).max()))
     if pair is not None and pair.cosine < -0.8:
         return [
@@ -394,6 +408,7 @@ def _climbs(log: Log, windows: np.ndarray, spin: np.ndarray) -> np.ndarray:
     limits = span(log, ("pitch_deg",))
     if limits is None or limits[0] > windows[0] or limits[1] < windows[-1]:
         return np.zeros(len(windows) - 1, bool)
+    # A positive pitch has the nose down (right-handed about y, to the left).
     uphill = -means(log, "pitch_deg", windows) * np.sign(spin) > FRAME_LIMITS.level
     height = span(log, ("position_z_m",))
     if height is None or height[0] > windows[0] or height[1] < windows[-1]:
@@ -412,10 +427,12 @@ def _course(log: Log) -> list[Finding]:
     east, north = (increments(log, n, windows) for n in names[:2])
     spin = np.mean([means(log, d, windows) for d in drives], axis=0)
     turned = np.abs(increments(log, "yaw_deg", windows))
+    # Backing up, course and heading point opposite ways by right.
     moved = np.hypot(east, north) * np.sign(spin)
     keep = (np.abs(moved) > max(20.0 * sigma(log, names[0]), 1e-3)) & (np.abs(spin) > 0.05) & (turned < 20.0)
     heading = np.radians(means(log, "yaw_deg", windows))
     along, across = east * np.cos(heading) + north * np.sin(heading), north * np.cos(heading) - east * np.sin(heading)
+    # Angle of the course off the heading, in the direction that the wheels drive.
     off = np.degrees(np.arctan2(across * np.sign(spin), along * np.sign(spin)))
     if log.imu.attitude and log.imu.mounting_std_deg[2] > FRAME_LIMITS.unknown_yaw and keep.any():
         # yaw counts from nowhere: only that the difference stays the same can be asked

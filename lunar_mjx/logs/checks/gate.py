@@ -54,6 +54,7 @@ def _check_length(logs: Sequence[Log | SteadyLog], slowest_s: Slowest) -> list[F
     drives = [(log.span_s[1] - log.span_s[0], log) for log in logs if isinstance(log, Log) and _timed(log)]
     if not drives:
         return []
+    # The longest decides: one log that shows a slow effect is enough for a campaign.
     longest, log = max(drives, key=lambda pair: pair[0])
     return [
         Finding(

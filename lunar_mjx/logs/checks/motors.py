@@ -39,6 +39,7 @@ def check_motors(log: Log) -> list[Finding]:
     for kind in ("drive", "steer", "sus"):
         for quantity in ("speed_rad_s", "angle_rad"):
             findings += _follows(log, kind, quantity)
+        # Angles, currents and temperatures are compared with the joints' speeds, which must be sound.
         if not is_bad(findings):
             findings += _angles(log, kind) + _electric(log, kind) + _heat(log, kind)
     return findings
@@ -91,6 +92,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
     for a in corners:
         noise = max(sigma(log, measured[a]), 1e-3)
         mine, other = wanted[a], seen[a]
+        # A third of the noise: the agreement is taken over hundreds of samples.
         pair = None if mine is None or other is None else agreement(other, mine, noise / 3.0)
         # one command tells neither sign nor unit: a controller may scale it down, or trade the sides' speeds for a turn
         if pair is None or mine is None or other is None or len(np.unique(mine[mine != 0.0])) < 2:
@@ -106,6 +108,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
                     f"is {pair.factor:.3g} times its command{guess(pair.factor)}; correct its unit, or the command's",
                 )
             )
+        # Both: about zero and about the means, since a constant offset can turn either alone.
         elif pair.cosine < -FRAME_LIMITS.alike and _together(mine, other) < -FRAME_LIMITS.unlike:
             findings.append(
                 _finding(
@@ -145,6 +148,7 @@ def _swapped(
     corners = list(names)
     for i, a in enumerate(corners):
         for b in corners[i + 1 :]:
+            # Two joints that are told the same cannot be told apart.
             apart = float(np.sqrt(np.nanmean((wanted[a] - wanted[b]) ** 2)))
             noise = max(sigma(log, names[a]), sigma(log, names[b]), 1e-3)
             own, crossed = max(miss(a, a), 1e-12) + miss(b, b), miss(a, b) + miss(b, a)
@@ -172,6 +176,7 @@ def _angles(log: Log, kind: str) -> list[Finding]:
     findings = []
     for c, angle in angles.items():
         pair = rate_agreement(log, angle, speeds[c]) if c in speeds else None
+        # A steering joint that is held moves less than its rounding.
         if pair is None or (kind != "drive" and pair.reference < 0.02):
             continue
         if abs(pair.cosine) > FRAME_LIMITS.alike and abs(pair.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
@@ -240,6 +245,7 @@ def _electric(log: Log, kind: str) -> list[Finding]:
         if fit is None:
             continue
         (resistance, back_emf), (error_r, error_k) = fit
+        # A motor that turns adds to its voltage; twenty errors, as noise is not white.
         if back_emf < -20.0 * error_k:
             findings.append(
                 _finding(
@@ -271,6 +277,7 @@ def _circuit(voltage: np.ndarray, current: np.ndarray, speed: np.ndarray) -> tup
     if not (size > 0.0).all():
         return None
     scaled = design / size
+    # A steady drive draws current in proportion to its speed.
     if np.linalg.cond(scaled) > 100.0:
         return None
     coefficients, *_ = np.linalg.lstsq(scaled, voltage, rcond=None)
@@ -316,9 +323,11 @@ def _heat(log: Log, kind: str) -> list[Finding]:
         limits = span(log, (winding[c], housing[c], current[c]))
         if limits is None:
             continue
+        # Twice a second: heat moves in seconds.
         time = np.arange(*limits, 0.5)
         power = _average(at(log, current[c], time), 0.5 / 10.0)  # type: ignore[arg-type]
         apart = at(log, winding[c], time) - at(log, housing[c], time)  # type: ignore[operator]
+        # Twenty seconds, about two time constants of a winding.
         if len(time) < 40:
             continue
         rise, cosine = _slope(power, apart)
@@ -338,6 +347,7 @@ def _average(current: np.ndarray, share: float) -> np.ndarray:
     """Squared current through a first-order lag, as the winding's heat follows it."""
     out, state = np.zeros_like(current), float(current[0] ** 2)
     for i, value in enumerate(current):
+        # A lag of ten seconds: order of a small motor's winding.
         state += share * (value**2 - state)
         out[i] = state
     return out

@@ -48,6 +48,7 @@ def rest_segments(log: Log) -> list[tuple[float, float]]:
     if not commands:
         return []
     start, end = log.span_s
+    # Finer than any rest that is used.
     grid = np.arange(start, end, 0.05)
     at_rest = np.ones(len(grid), bool)
     for name in commands:
@@ -75,6 +76,7 @@ def _quiet_command(log: Log, name: str, grid: np.ndarray) -> np.ndarray:
         return np.ones(len(grid), bool)
     time, values = samples
     held = values[np.maximum(np.searchsorted(time, grid + 1e-6, side="right") - 1, 0)]
+    # A steering angle that is held is at rest, whatever its value.
     quiet = np.ones(len(grid), bool) if is_quantity(name, "command_angle") else held == 0.0
     for change_time in time[1:][np.diff(values) != 0.0]:
         quiet &= (grid < change_time) | (grid > change_time + NOISE_LIMITS.settle)
@@ -113,15 +115,18 @@ def rest_noise(log: Log, name: str, spans: list[tuple[float, float]]) -> tuple[f
         keep = (time >= low) & (time <= high)
         if keep.sum() < NOISE_LIMITS.fewest:
             continue
+        # Times within [-1, 1]: powers of seconds would make the parabola ill-conditioned.
         t = 2.0 * (time[keep] - low) / (high - low) - 1.0
         residual = values[keep] - np.polynomial.polynomial.polyval(
             t, np.polynomial.polynomial.polyfit(t, values[keep], 2)
         )
         squares += float(residual @ residual)
         products += float(residual[1:] @ residual[:-1])
+        # Three coefficients are fitted to each span.
         count, freedom, pairs = count + len(t), freedom + len(t) - 3, pairs + len(t) - 1
     if freedom < NOISE_LIMITS.fewest - 3 or squares == 0.0:
         return None
+    # Negative ones count as none: noise of instruments is white or slow.
     correlation = float(np.clip(products / pairs / (squares / count), 0.0, 0.98))
     # variance of a variance under AR(1): as from n (1 - rho^2)/(1 + rho^2) independent samples
     independent = freedom * (1.0 - correlation**2) / (1.0 + correlation**2)
@@ -150,11 +155,13 @@ def check_noise(log: Log) -> list[Finding]:
 def _contradiction(log: Log, name: str, noise: Noise, std: float, correlation: float, independent: float) -> str:
     values = log.channel(name)[1]  # type: ignore[index]
     step = quantum(values)
+    # Rounding adds the variance of a uniform error.
     expected = float(np.hypot(noise.std, step / np.sqrt(12.0)))
     ratio = std / expected
     if noise.correlation_time_s > 0.0 or correlation > 0.5:
         independent = min(independent, 10.0)  # spans of a few seconds hold few correlation times
     statistic, freedom = independent * ratio**2, independent
+    # Both large and sure: with many samples 10 % is sure, with few a factor of two is chance.
     if ratio > NOISE_LIMITS.factor and stats.chi2.sf(statistic, freedom) < VALUE_LIMITS.chance:
         side = "is noisier than stated"
     elif (

@@ -19,6 +19,7 @@ def check_steady(log: SteadyLog) -> list[Finding]:
     if len(log.table) == 0:
         return [Finding(log.name, "", None, "", "dropout", "holds no usable row; see the other findings, or fill it")]
     findings = _copies(log) + _ranges(log) + _signs(log) + _swapped(log) + _clipped(log) + _noiseless(log)
+    # Scatter of a table with wrong rows or signs would be blamed on its noise.
     return findings + (_replicates(log) if not findings else [])
 
 
@@ -39,7 +40,9 @@ def _copies(log: SteadyLog) -> list[Finding]:
     if measured.shape[1] < 2:  # one quantity with few digits repeats by chance
         measured = np.column_stack([measured, *log.table.test.values()])
     _, first, count = np.unique(measured, axis=0, return_index=True, return_counts=True)
+    # Rows of zeros are a wheel that was not driven, not a copy.
     trivial = np.all(measured[first] == 0.0, axis=1)
+    # Judged by the number that chance would bring: one coincidence among thousands proves nothing.
     copies = int((count - 1)[~trivial].sum())
     if not copies or stats.poisson.sf(copies - 1, _coincidences(log)) >= VALUE_LIMITS.chance:
         return []
@@ -63,6 +66,7 @@ def _coincidences(log: SteadyLog) -> float:
         max((pairs([group, values]) - whole) / max(number, 1.0), _agree(values, group))
         for values in log.table.measured.values()
     ]
+    # As if the quantities agreed independently, given the point.
     return number * float(np.prod(shares))
 
 
@@ -76,6 +80,7 @@ def _agree(values: np.ndarray, group: np.ndarray) -> float:
     scatter = np.sqrt(float(deviation @ deviation) / freedom) if freedom else 0.0
     if not len(steps) or not scatter > 0.0:
         return 0.0
+    # Two Gaussians within one step: step over 2 sqrt(pi) sigma.
     return float(min(1.0, steps.min() / (2.0 * np.sqrt(np.pi) * scatter)))
 
 
@@ -129,6 +134,7 @@ def _signs(log: SteadyLog) -> list[Finding]:
         values = log.table.measured.get(quantity)
         if values is None or len(values) < 8 or np.ptp(slip) < 0.3:
             continue
+        # By rank, since pull saturates with slip.
         rank = float(np.asarray(stats.spearmanr(slip, values))[0])
         noise = log.table.sigma.get(quantity, 0.0)
         if rank < -0.7 and np.ptp(values) > 10.0 * noise:
@@ -184,6 +190,7 @@ def _clipped(log: SteadyLog) -> list[Finding]:
         for at, extreme in ((-1, values.max()), (0, values.min())):
             other_counts = np.delete(count, at)
             often = max(8.0, _AT_LIMIT * len(values), 4.0 * float(other_counts.max(initial=1)))
+            # Zero is what many quantities honestly are.
             if len(count) > 2 and extreme != 0.0 and count[at] >= often:
                 row = int(np.argmax(values == extreme))
                 message = f"stays at {extreme:.5g} in {count[at]} of {len(values)} rows; leave out what was cut off"
@@ -211,6 +218,7 @@ def _replicates(log: SteadyLog) -> list[Finding]:
     count = np.bincount(group)
     freedom = int((count - 1).sum())
     findings: list[Finding] = []
+    # Fewer degrees of freedom tell a factor of two by chance.
     if freedom < 3:
         return findings
     for quantity, values in log.table.measured.items():

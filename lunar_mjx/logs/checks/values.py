@@ -110,6 +110,7 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
 
 def _kelvin(log: Log, values: np.ndarray) -> str:
     ambient = environment_value(log, "ambient_temperature_degC")
+    # At the start motors have their surroundings' temperature; later they may be hot.
     start = float(np.median(values[:5]))
     if ambient is not None and ambient < 150.0 and abs(start - ambient) > VALUE_LIMITS.far_from_ambient:
         hint = " (looks like kelvin)" if abs(start - 273.15 - ambient) < 100.0 else ""
@@ -124,6 +125,7 @@ def _kelvin(log: Log, values: np.ndarray) -> str:
 
 def quantum(values: np.ndarray) -> float:
     """Smallest step between the values of a channel; 0 for a constant one."""
+    # Between values that occur and not between neighbours in time, which may all jump.
     steps = np.diff(np.unique(values))
     # what remains of a decimal number written with nine digits is no step
     steps = steps[steps > 1e-8 * max(1e-12, float(np.abs(values).max()))]
@@ -135,6 +137,7 @@ def _lost(there: np.ndarray) -> float:
     rows = np.flatnonzero(there)
     distances = np.diff(rows)
     spacing = int(np.median(distances)) if distances.size else 1
+    # A slower sensor in a fast table leaves regular gaps, which are no losses.
     if spacing < 2 or float((distances == spacing).mean()) < VALUE_LIMITS.evenly:
         return float(1.0 - there.mean())
     return max(0.0, 1.0 - len(rows) * spacing / len(there))
@@ -183,6 +186,7 @@ def _stuck(
     if length < VALUE_LIMITS.shortest_run:
         return None
     noise = sigma(log, name)
+    # A channel that never changes shows no step of its own; its siblings have the same instrument.
     step = quantum(values) or _siblings_quantum(table, name)
     if noise > 0.0 and step is not None and length >= _possible_run(noise, step, len(values)):
         return first, length, float(values[first])
@@ -196,7 +200,9 @@ def _possible_run(noise: float, step: float, count: int) -> float:
 
     At least a tenth of the variance is taken to be white, the rest to stand still in the middle of a quantum.
     """
+    # Chance that white noise stays within the quantum in whose middle the rest stands.
     inside = math.erf(0.5 * step / (np.sqrt(0.1) * noise * np.sqrt(2.0)))
+    # Two samples agree if both stay inside, or both leave to the same side.
     repeat_chance = min(inside**2 + 0.5 * (1.0 - inside) ** 2, 1.0 - 1e-12)
     return max(VALUE_LIMITS.shortest_run, math.log(VALUE_LIMITS.chance / count) / math.log(max(repeat_chance, 1e-3)))
 
@@ -229,6 +235,7 @@ def _siblings_move(table: LogTable, name: str) -> bool:
 def _clipped(log: Log, name: str, values: np.ndarray) -> float | None:
     """The extreme value, if far more samples have exactly that than noise allows."""
     noise = sigma(log, name)
+    # With noise of less than two quanta every value is frequent.
     if noise <= 0.0 or len(values) < 100 or noise < 2.0 * (step := quantum(values)):
         return None
     for extreme in (float(values.max()), float(values.min())):

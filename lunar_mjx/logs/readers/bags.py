@@ -100,6 +100,7 @@ class _Decoders:
         self.path, self.ros, self.made = path, None, {}
 
     def of(self, channel: Any, schema: Any) -> Any:
+        # Decoders are compiled from the message's definition, once a channel and not once a message.
         if channel.id not in self.made:
             self.made[channel.id] = self._make(channel, schema)
         return self.made[channel.id]
@@ -189,6 +190,7 @@ def stamp(value: Any) -> int:
     Raises:
       KeyError: it is none.
     """
+    # A plain number means seconds, as JSON writers put it.
     if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
         return round(1e9 * value)
 

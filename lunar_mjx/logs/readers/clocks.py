@@ -41,6 +41,7 @@ def seconds(frame: pd.DataFrame, time: TimeColumn, path: Path) -> np.ndarray:
       UserError: the column is missing, or a cell is no time.
     """
     if not time.column:
+        # Divided and not summed up, so that no rounding adds up over an hour.
         return np.arange(len(frame)) / time.rate_hz
     if time.column not in frame.columns:
         shown = ", ".join(map(str, frame.columns[:20]))

@@ -84,6 +84,7 @@ def group_files(paths: Sequence[Path], mapping: ImportMap) -> dict[str, Files]:
         shown = ", ".join(t.file for t in mapping.tables.values())
         raise UserError(f"{paths[0]}: holds no file that {mapping.path.name} reads ({shown}); name files or folders.")
     names = [key or parent.resolve().name for parent, key in found]
+    # Folders of one day's drives often number them alike.
     if len(set(names)) < len(names):
         names = [f"{parent.resolve().name}_{name}" for (parent, _), name in zip(found, names, strict=True)]
     return dict(zip(names, found.values(), strict=True))
@@ -110,6 +111,7 @@ def _read(name: str, files: Files, mapping: ImportMap) -> Iterator[RecordedDrive
     for t, path in files.items():
         table = mapping.tables[t]
         frame = _frame(path, table, f"{mapping.path}: tables.{t}", notes)
+        # Copies are told by the file's own rows, before groups cut them.
         found = {"": frame}
         if table.held == "auto":
             found, left = without_copies(frame, _rising(frame))
@@ -223,6 +225,7 @@ def _from_zero(tables: Mapping[str, pd.DataFrame], own: Mapping[str, bool]) -> d
     shared = [float(np.min(f[TIME])) for n, f in tables.items() if not own[n]]
     begin = min(shared) if shared else 0.0
     return {
+        # Nanoseconds: what a difference of large times leaves behind is no time.
         n: f.assign(**{TIME: np.round(f[TIME] - (float(np.min(f[TIME])) if own[n] else begin), 9)})
         for n, f in tables.items()
     }

@@ -47,6 +47,7 @@ INITIAL = {
     "winding_temperature_degC": 1,
     "housing_temperature_degC": 1,
 }
+"""Initial values by name and number of entries; a channel of one joint may be named as well."""
 INITIAL_CHANNEL = {
     "position_m": "position_x_m",
     "world_velocity_m_s": "world_velocity_x_m_s",
@@ -55,7 +56,6 @@ INITIAL_CHANNEL = {
     "housing_temperature_degC": "housing_lf_drive_temperature_degC",
 }
 """A channel whose physical range holds for a key of `initial`, in all its axes."""
-"""Initial values by name and number of entries; a channel of one joint may be named as well."""
 TOP = (
     "format",
     "kind",
@@ -93,6 +93,7 @@ def read_log(folder: str | Path) -> Log | SteadyLog:
       UserError: the folder, a file, a key or a value is missing, unknown or of the wrong kind.
     """
     folder = Path(folder)
+    # Shells complete to the file; its folder is what is meant.
     if folder.name == LOG_FILE and folder.is_file():
         folder = folder.parent
     path = folder / LOG_FILE
@@ -117,6 +118,7 @@ def read_campaign(paths: str | Path | Sequence[str | Path]) -> list[Log | Steady
     Raises:
       UserError: a path holds no log, or a log cannot be read.
     """
+    # `logs/*` names answers, too; a reader of logs must not open one.
     given = without_answers([paths] if isinstance(paths, str | Path) else paths)
     if not given:
         raise UserError("read_campaign: no log is given; name at least one folder with a log.toml.")
@@ -126,6 +128,7 @@ def read_campaign(paths: str | Path | Sequence[str | Path]) -> list[Log | Steady
         for folder in _log_folders(path):
             if folder.resolve() in seen:
                 raise bad_input("read_campaign", "log", str(folder), "is named twice", "name every log once")
+            # By the real path: a log read twice would count as two measurements.
             seen.add(folder.resolve())
             logs.append(read_log(folder))
     return logs
@@ -151,6 +154,7 @@ def _read_drive(folder: Path, top: Fields) -> Log:
     environment, columns = _environment(top.table("environment"))
     tables = _tables(folder, top, columns, problems)
     imu = _imu(top.table("imu"))
+    # Before anything reads angles; noise is told for what the log then holds.
     tables = body_attitude(tables, imu)
     names = tuple(c for t in tables.values() for c in t.channels)
     origin = top.vector("terrain_origin_m", 2, (0.0, 0.0))
@@ -237,6 +241,7 @@ def _tables(folder: Path, top: Fields, extra: dict[str, str], problems: list[Fin
         entry = stated.table(key)
         entry.known(("file", "rate_hz", "on_change", "clock_offset_s", "clock_offset_std_s"))
         tables[key] = read_log_table(folder, name, key, entry, extra, problems)
+    # One table per channel: two readings of one sensor would count as independent.
     owner: dict[str, str] = {}
     for key, table in tables.items():
         for channel in table.channels:
@@ -317,6 +322,7 @@ def _imu(fields: Fields) -> Imu:
     fields.known(("position_m", "quaternion", "mounting_std_deg", "attitude"))
     p, q = fields.vector("position_m", 3, (0.0,) * 3), fields.vector("quaternion", 4, (1.0, 0.0, 0.0, 0.0))
     norm = sum(v * v for v in q) ** 0.5
+    # Quaternions are written with four digits or more; more than that is no rounding.
     if abs(norm - 1.0) > 1e-3:
         raise bad_input(fields.path, fields.field("quaternion"), list(q), f"has the norm {norm:.4g}", "normalise it")
     std = fields.vector("mounting_std_deg", 3, (0.0,) * 3)
@@ -355,6 +361,7 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
         if std < LEAST_NOISE:
             remedy = "state what is measured, or a digit's last place over sqrt(12)"
             raise bad_input(fields.path, f"{fields.field(key)}.std", std, "is less than any instrument's noise", remedy)
+        # Kept for later: exact names win over patterns, in whatever order they stand.
         if "*" in key:
             patterns.append((key, Noise(std, source, correlation)))
             continue
@@ -367,6 +374,7 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
             raise bad_input(
                 fields.path, f"{fields.field(key)}.std", std, "is more than the channel's whole range", "check its unit"
             )
+        # Noise takes the unit's scale, never its offset.
         exact[name] = Noise(std * abs(scale), source, correlation)
     for pattern, noise in patterns:
         for name in channels or ():
@@ -378,4 +386,5 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
 def _near(folder: Path, spec: str, marker: str) -> str:
     """A path counted from the log's folder as an absolute one; a name as it is."""
     near = folder.resolve() / spec
+    # What lies beside the log wins over a shipped name: a log travels with its rover.
     return str(near) if near.is_file() or (near / marker).is_file() else spec

@@ -76,10 +76,12 @@ def utm(latitude_deg: np.ndarray, longitude_deg: np.ndarray, zone: int) -> tuple
     lam = np.radians(np.asarray(longitude_deg) - (6.0 * zone - 183.0))
     e = np.sqrt(_E2)
     tau = np.tan(phi)
+    # Karney's form by tangents: no digits are lost near the poles, as by latitudes.
     sigma = np.sinh(e * np.arctanh(e * tau / np.sqrt(1.0 + tau**2)))
     conformal = tau * np.sqrt(1.0 + sigma**2) - sigma * np.sqrt(1.0 + tau**2)
     xi0 = np.arctan2(conformal, np.cos(lam))
     eta0 = np.arcsinh(np.sin(lam) / np.hypot(conformal, np.cos(lam)))
+    # From the sphere that the conformal latitude maps to, to the ellipsoid.
     xi = xi0 + sum(a * np.sin(2 * k * xi0) * np.cosh(2 * k * eta0) for k, a in enumerate(alpha, 1))
     eta = eta0 + sum(a * np.cos(2 * k * xi0) * np.sinh(2 * k * eta0) for k, a in enumerate(alpha, 1))
     easting = WGS84.utm_false_easting + WGS84.utm_scale * radius * eta

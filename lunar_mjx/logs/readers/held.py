@@ -70,6 +70,7 @@ def held_samples(time: np.ndarray, values: np.ndarray, recurs: bool = True) -> H
         return None
     t, v = time[rows], values[rows]
     step = float(np.median(np.diff(t)))
+    # Any channel of the message: one component may stay while another moves.
     changed = np.concatenate([[True], (np.diff(v, axis=0) != 0.0).any(axis=1)])
     at = np.flatnonzero(changed)
     if len(at) < HELD_READINGS.fewest_changes + 1 or step <= 0.0:
@@ -80,6 +81,7 @@ def held_samples(time: np.ndarray, values: np.ndarray, recurs: bool = True) -> H
     intervals = intervals[moving & (intervals > 0.0)]
     if len(intervals) < HELD_READINGS.fewest_changes or all(_is_ramp(column) for column in v.T):
         return None
+    # Weighted by time, since a few short intervals must not hide long ones.
     middle = _weighted_median(intervals)
     if middle < HELD_READINGS.slower * step:
         return None
@@ -107,6 +109,7 @@ def _weighted_median(intervals: np.ndarray) -> float:
     """The interval in which the middle of the time lies."""
     order = np.sort(intervals)
     total = np.cumsum(order)
+    # The plain median would count a burst of new readings as typical.
     return float(order[np.searchsorted(total, 0.5 * total[-1])])
 
 
@@ -124,10 +127,12 @@ def _regular(intervals: np.ndarray, period: float, step: float) -> bool:
 def _spaced(changed: np.ndarray) -> bool:
     """Whether changes keep a distance of two rows or more from each other."""
     at = np.flatnonzero(changed[: -HELD_READINGS.spaced_most])
+    # Fewer changes leave shares too rough to compare.
     if len(at) < 30:
         return False
     after = np.array([changed[at + lag].mean() for lag in range(1, HELD_READINGS.spaced_most + 1)])
     most = float(after.max())
+    # Of a share among so many changes (binomial).
     error = np.sqrt(most * (1.0 - most) / len(at)) + 1e-12
     return after[0] < HELD_READINGS.spaced * most and most - after[0] > HELD_READINGS.spaced_sigma * error
 

@@ -86,6 +86,7 @@ def import_drives(
     folder = Path(folder)
     if not paths:
         raise UserError("log import: no recording is given; name a file or a folder.")
+    # Before hours of reading.
     refuse_used(folder)
     for path in paths:
         if not path.exists():
@@ -140,6 +141,7 @@ def _rover(mapping: ImportMap, changes: Mapping[str, Any] | None) -> str:
 
 def _settings(drive: RecordedDrive, mapping: ImportMap, changes: Mapping[str, Any] | None) -> dict[str, Any]:
     """Keys of `log.toml`: the map's, what reading found, and the user's own over both."""
+    # The nearer to the user the later: map, then what the recording says, then the call.
     settings = _merged(mapping.settings, drive.settings)
     settings = _merged(settings, {k: v for k, v in (changes or {}).items() if k != "rover"})
     channels = {c for frame in drive.tables.values() for c in frame.columns}
@@ -148,6 +150,7 @@ def _settings(drive: RecordedDrive, mapping: ImportMap, changes: Mapping[str, An
         kept = [m for m in stated if _names(m, channels)]
         settings["magnitudes"] = {m: stated[m] for m in kept} if isinstance(stated, Mapping) else kept
     if not any(is_quantity(c, "joint_speed", "drive") for c in channels):
+        # A map serves many drives; one without wheel speeds cannot have them imposed.
         settings.pop("imposed", None)
     return {**settings, "source": {**settings.get("source", {}), **drive.source}}
 
@@ -180,4 +183,5 @@ def _offsets(drive: RecordedDrive, mapping: ImportMap) -> dict[str, tuple[float,
 
 
 def _by_length(names: Iterable[str]) -> list[str]:
+    # The longest first: `imu_left` shall not be taken for a part of `imu`.
     return sorted(names, key=len, reverse=True)

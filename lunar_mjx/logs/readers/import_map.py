@@ -19,9 +19,9 @@ from lunar_mjx.toml_fields import Fields
 SHIPPED = Path(__file__).resolve().parent / "maps"
 """Folder of the maps that ship with the package."""
 DRIVE = "{drive}"
+"""Stands in a file's pattern for the text by which files of one drive belong together."""
 FOLDER = "{folder}"
 """What `log.ground` may be: the name of the folder that a drive's files lie in."""
-"""Stands in a file's pattern for the text by which files of one drive belong together."""
 PROJECTIONS = ("tangent", "utm")
 HELD = ("auto", "never")
 
@@ -163,6 +163,7 @@ def read_map(path: str | Path) -> ImportMap:
     if not stated.values:
         raise UserError(f"{path}: the table [tables.NAME] is missing; name a topic or a file, and the channels in it.")
     tables = {name: _table(stated.table(name)) for name in stated.values}
+    # A bag and a folder of files have no clock in common that a map could state.
     if len({bool(t.topic) for t in tables.values()}) > 1:
         raise bad_input(
             path,
@@ -173,6 +174,7 @@ def read_map(path: str | Path) -> ImportMap:
         )
     if log.values.get("ground") == FOLDER and any(t.topic for t in tables.values()):
         raise bad_input(path, "log.ground", FOLDER, "is for files, and the map names topics", "name the ground itself")
+    # Rows without a group could belong to any drive.
     if 0 < sum(bool(t.group) for t in tables.values()) < len(tables):
         lacking = next(name for name, t in tables.items() if not t.group)
         raise bad_input(
@@ -258,6 +260,7 @@ def _missing(entry: Fields) -> tuple[float, ...]:
 
 def _scale(fields: Fields) -> float:
     scale = fields.number("scale", 1.0)
+    # A channel of zeros would pass every check but those of its siblings.
     if scale == 0.0:
         raise bad_input(fields.path, fields.field("scale"), scale, "makes every value zero", "give another factor")
     return scale
@@ -370,5 +373,6 @@ def _noise(entry: Fields) -> Noise:
 
 def file_pattern(pattern: str) -> re.Pattern[str]:
     """A pattern of file names as a regular expression whose group `drive` names the drive."""
+    # Everything but the two signs is literal; names of files hold dots and brackets.
     text = re.escape(pattern).replace(re.escape(DRIVE), "(?P<drive>.+)", 1).replace(re.escape("*"), ".*")
     return re.compile(text, re.IGNORECASE)

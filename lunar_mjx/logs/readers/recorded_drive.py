@@ -70,6 +70,7 @@ def positions(frame: pd.DataFrame, geodetic: Geodetic) -> tuple[pd.DataFrame, di
     if not there.any():
         return out, {}
     first = int(np.argmax(there))
+    # The first fix: local metres near zero keep their digits in float32.
     origin = geodetic.origin_deg or (float(latitude[first]), float(longitude[first]))
     if geodetic.projection == "utm":
         zone = utm_zone(origin[1])
@@ -104,6 +105,7 @@ def without_copies(frame: pd.DataFrame, time: np.ndarray) -> tuple[dict[str, pd.
         quantity = channel_name(found.name).quantity
         if not is_command(found.name):
             # angles of one attitude come in one message
+            # Grouped, since a repeat of one component alone may be chance.
             family = "attitude" if found.channel.family == "attitude" else quantity
             groups.setdefault(family, []).append(column)
     out, copies, rest = {}, [], frame
@@ -114,6 +116,7 @@ def without_copies(frame: pd.DataFrame, time: np.ndarray) -> tuple[dict[str, pd.
             out[quantity] = frame.loc[held.readings, [*others, *columns]].reset_index(drop=True)
             named = tuple(_PLACES.get(c, c) for c in columns)
             copies.append(Copies(named, held.period_s, int(held.readings.sum()), len(frame)))
+    # Time alone is no table.
     if len(rest.columns) > len(others) or not out:
         out[""] = rest
     return out, copies
@@ -138,6 +141,7 @@ def cut(drive: RecordedDrive, gap_s: float | None, rest_s: float | None) -> Iter
     Every sample is in one piece; what is too short to be a table (fewer than three rows) is told in the notes.
     """
     edges = [*(_gaps(drive, gap_s) if gap_s else ()), *(_rests(drive, rest_s) if rest_s else ())]
+    # Every sample falls into one piece.
     bounds = [-np.inf, *sorted(edges), np.inf]
     pieces: list[RecordedDrive] = []
     for low, high in itertools.pairwise(bounds):
@@ -160,6 +164,7 @@ def cut(drive: RecordedDrive, gap_s: float | None, rest_s: float | None) -> Iter
     for k, piece in enumerate(pieces, 1):
         start = min(float(f[TIME].iloc[0]) for f in piece.tables.values())
         where = f"{start:.2f} s to {start + piece.seconds:.2f} s"
+        # All tables of a piece by one start: their offsets to each other are what clocks are checked by.
         shifted = {n: f.assign(**{TIME: f[TIME] - start}) for n, f in piece.tables.items()}
         notes, copies = ((*drive.notes, *piece.notes), drive.copies) if k == 1 else (piece.notes, ())
         source = {**drive.source, "segment": where}
@@ -171,6 +176,7 @@ def cut(drive: RecordedDrive, gap_s: float | None, rest_s: float | None) -> Iter
 def _gaps(drive: RecordedDrive, gap_s: float) -> list[float]:
     time = np.sort(np.concatenate([f[TIME].to_numpy(float) for f in drive.tables.values()]))
     at = np.flatnonzero(np.diff(time) > gap_s)
+    # Cut in the middle, where no sample lies.
     return [0.5 * float(time[k] + time[k + 1]) for k in at]
 
 

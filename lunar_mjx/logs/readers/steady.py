@@ -64,6 +64,7 @@ def read_steady(folder: Path, top: Fields, read_noise: Callable[[Fields], dict[s
     problems: list[Finding] = []
     columns, row_std = _columns(path, name, problems)
     count = len(next(iter(columns.values())))
+    # Bad rows are left out and told; a table of hundreds of runs survives some.
     keep = _usable(name, path.stem, columns, problems)
     noise = read_noise(top.table("noise"))
     measured = {q: columns[c][keep] for q, (c, _, _) in QUANTITIES.items() if c in columns}
@@ -90,6 +91,7 @@ def read_steady(folder: Path, top: Fields, read_noise: Callable[[Fields], dict[s
         gravity_m_s2=top.positive("gravity_m_s2", 9.81, GREATEST_GRAVITY),
         source=source,
         row_std={c: v[keep] for c, v in row_std.items()},
+        # Rows of the file, so that findings name lines which the user can find.
         rows=np.arange(count)[keep],
         trial=columns["trial"][keep] if "trial" in columns else None,
         problems=tuple(problems),
@@ -157,6 +159,7 @@ def _columns(path: Path, log: str, problems: list[Finding]) -> tuple[dict[str, n
                     f"holds {shown!r}, which is neither a number nor a gap; correct the cell",
                 )
             )
+        # A deviation scales, but has no offset and no sign.
         into[name] = np.abs(scale) * values if is_std else scale * values + offset
     for name in REQUIRED:
         if name not in columns and name not in bad_units:

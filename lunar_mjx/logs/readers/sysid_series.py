@@ -60,6 +60,7 @@ def to_time_series(
             raise UserError(f"{table.file}: time_s does not rise; run lunar-mjx log check on the log first.")
         signals = []
         for c in mine:
+            # Sysid replays controls and compares the rest.
             kind = sysid.SignalType.MjCtrl if is_command(c) else sysid.SignalType.CustomObs
             name = (names or {}).get(c, c)
             name, kind = (name, kind) if isinstance(name, str) else name

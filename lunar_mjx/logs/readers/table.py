@@ -36,6 +36,7 @@ def read_frame(path: Path, what: str) -> pd.DataFrame:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)  # rows longer than the header
             warnings.simplefilter("ignore", pd.errors.DtypeWarning)  # a text deep in a column of numbers is found below
+            # Without index_col=False, pandas shifts the columns where rows end with a comma.
             frame = pd.read_csv(path, index_col=False, comment=None)
     except (ValueError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
         raise UserError(
@@ -75,6 +76,7 @@ def _read_parquet(path: Path) -> pd.DataFrame:
 def numbers(frame: pd.DataFrame, column: str) -> tuple[np.ndarray, int | None]:
     """A column as float64 with NaN at gaps, and the first row that holds something else than a number or a gap."""
     series = frame[column]
+    # Columns of plain numbers skip the way over text.
     if series.dtype.kind in "fiu":
         values = np.asarray(series, float)
         wrong = np.isinf(values)
@@ -119,6 +121,7 @@ def read_log_table(
     for column in frame.columns:
         if column == TIME:
             continue
+        # A column that log.toml names for the environment need not have a channel's name.
         if column in wanted:
             channel, scale, offset = wanted[column], 1.0, 0.0
         else:
@@ -146,6 +149,7 @@ def read_log_table(
         values, wrong = numbers(frame, column)
         if wrong is not None:
             problems.append(_no_number(log, name, wrong, column, frame))
+        # In the schema's unit, in which the ranges are stated.
         channels[channel] = _without_spikes(scale * values + offset, channel, (log, name, column), problems)
         columns[channel] = column
     return LogTable(
@@ -206,4 +210,5 @@ def _no_number(log: str, table: str, row: int, column: str, frame: pd.DataFrame)
 def _rate(time: np.ndarray) -> float:
     steps = np.diff(time[np.isfinite(time)])
     steps = steps[steps > 0.0]
+    # The gate refuses a time that never rises; until then any rate will do.
     return float(1.0 / np.median(steps)) if steps.size else 1.0

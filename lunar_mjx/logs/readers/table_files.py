@@ -68,6 +68,7 @@ def read_table_file(path: Path, layout: Layout, wanted: Sequence[str] = ()) -> p
 
 def _text(path: Path, layout: Layout) -> pd.DataFrame:
     try:
+        # Spreadsheets write a byte order mark, which would become part of the first name.
         with path.open(encoding="utf-8-sig", newline="") as stream:
             start = stream.read(_SNIFFED_BYTES)
     except (UnicodeDecodeError, OSError) as error:
@@ -111,11 +112,13 @@ def guess_separator(start: str, decimal: str = ".") -> str:
     Args:
       start: the first rows. decimal: sign in numbers, which is then no separator.
     """
+    # Without the first line: a header or title may have another number of cells.
     lines = [line for line in start.splitlines()[1:200] if line.strip()] or start.splitlines()
     best, most = r"\s+", 1
     for sign in (",", ";", "\t"):
         if sign == decimal:
             continue
+        # By csv, since quoted cells may hold the sign.
         counts = [len(next(csv.reader([line], delimiter=sign))) for line in lines]
         typical = int(np.median(counts))
         if typical > most and np.mean(np.array(counts) == typical) > MOST_ROWS:
@@ -159,6 +162,7 @@ def _matlab(path: Path, wanted: Sequence[str]) -> pd.DataFrame:
         shown = ", ".join(f"{name} {count}" for name, count in mine.items())
         raise bad_input(path, "rows", shown, "differ", "put variables of different length into tables of their own")
     lengths = list(mine.values()) or [len(v) for v in columns.values()]
+    # The most frequent length, of equals the longest: MATLAB files mix series and settings.
     rows = max(set(lengths), key=lambda n: (lengths.count(n), n))
     return pd.DataFrame({k: v for k, v in columns.items() if len(v) == rows})
 

@@ -99,6 +99,7 @@ class Recording:
 
     def instrument(self, channel: str) -> Instrument | None:
         """The instrument of a channel; None if the rover carries none."""
+        # The first pattern counts, case and all: channel names are exact.
         return next((i for i in self.instruments if fnmatchcase(channel, i.pattern)), None)
 
 
@@ -135,6 +136,7 @@ def record(
     for name, rate in RATES.items():
         mine = [c for c in signals if (i := recording.instrument(c)) is not None and i.table == name]
         count = int(np.floor((time[-1] - time[0]) * rate + 1e-6)) + 1
+        # Fewer samples than any check can use.
         if not mine or count < 8:
             continue
         when = time[0] + np.arange(count) / rate
@@ -160,8 +162,10 @@ def _measured(
 ) -> np.ndarray:
     values = np.asarray(values, float)
     if is_command(channel):
+        # Commands are what was sent: held, and without noise.
         return values[np.maximum(np.searchsorted(time, when + 1e-6, side="right") - 1, 0)]
     turn = channel in ("roll_deg", "pitch_deg", "yaw_deg")
+    # Unwrapped first: between 179 and -179 deg the straight line would pass through zero.
     sampled = np.interp(when, time, np.unwrap(values, period=360.0) if turn else values)
     instrument = recording.instrument(channel)
     assert instrument is not None
@@ -178,7 +182,9 @@ def _noise(when: np.ndarray, recording: Recording, rng: np.random.Generator) -> 
     if not recording.coloured:
         return white
     keep = np.exp(-(when[1] - when[0]) / recording.correlation_time_s)
+    # So sized that the variance is one at every time.
     shocks = rng.standard_normal(len(when)) * np.sqrt(1.0 - keep * keep)
+    # Begun in its stationary state and not at zero.
     state = float(rng.standard_normal())
     slow = np.empty(len(when))
     for i, shock in enumerate(shocks):
@@ -193,5 +199,6 @@ def _lossy(frame: pd.DataFrame, share: float, rng: np.random.Generator) -> pd.Da
     for channel in [c for c in frame.columns if c != "time_s" and not is_command(c)]:
         frame.loc[rng.random(len(frame)) < 0.5 * share, channel] = np.nan
     keep = rng.random(len(frame)) >= 0.5 * share
+    # A log's length shall not hang on which samples are lost.
     keep[0] = keep[-1] = True
     return frame.loc[keep].reset_index(drop=True)

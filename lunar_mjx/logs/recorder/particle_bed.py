@@ -63,6 +63,7 @@ def write_particle_log(folder: str | Path, results: Sequence[Mapping[str, Any]],
         )
     first = next(r for r in results if r["variant"] == "table")
     error = numerical_error(results)
+    # Numerical error as noise: to a fit it is what replicates' scatter is on a test bed.
     noise = {
         QUANTITIES[q][0]: Noise(parts["total"], "datasheet")
         for q, parts in error.items()
@@ -76,6 +77,7 @@ def write_particle_log(folder: str | Path, results: Sequence[Mapping[str, Any]],
         "numerics": json.dumps(first["numerics"]),
         "numerical_error": json.dumps({q: {k: float(f"{v:.3g}") for k, v in p.items()} for q, p in error.items()}),
     }
+    # Written beside and renamed: a reader never meets half a log.
     log, part = Path(folder) / LOG_FOLDER, Path(folder) / f".{LOG_FOLDER}.part"
     shutil.rmtree(part, ignore_errors=True)
     write_steady_log(

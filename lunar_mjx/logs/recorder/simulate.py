@@ -94,6 +94,7 @@ def simulate_log(
     wanted = base.replace(modes={"drive": plan.drive_mode})
     moves = commands(plan, wanted, scale)
     name = base.rover.name if Path(str(rover)).name == str(rover) and model is None else str(base.rover.folder)
+    # Through the log's own settings: what a reader will build from the files is what is driven here.
     seen = log_model(_planned(out, name, wanted, moves, settings), hidden)
     time, signals = _drive(seen, moves, plan.start, engine)
     nonce = secrets.token_hex(32)
@@ -186,11 +187,13 @@ def _drive(
     split = next(
         k
         for k in range(1, steps_per_command + 1)
+        # The coarsest telemetry that is fine enough, in whole parts of a command.
         if (steps_per_command % k == 0 and moves.interval / k <= _FINEST) or k == steps_per_command
     )
     fine = np.repeat(moves.values, split, axis=0)
     interval = moves.interval / split
     settle = round(SETTLE / interval)
+    # Commands of zero: the rover stands and sinks in before its clock begins.
     still = np.zeros((settle, fine.shape[1]))
     system, seen = simulate(model, Commands(np.concatenate([still, fine]), interval), *start, engine=engine)
     # the log's clock begins when the rover stands; what is measured before is left out
@@ -199,6 +202,7 @@ def _drive(
     names = (*observe(system, seen).channels, BUS)
     signals = measure(system, seen).channels
     channels = {n: np.asarray(signals[n], float) for n in names if n in signals}
+    # A bus that never sags: without the channel its absence would tell that nothing is hidden there.
     channels.setdefault(BUS, np.full(len(fine), BUS_VOLTAGE))
     if not all(np.isfinite(v).all() for v in channels.values()):
         raise UserError("log simulate: an effect at the port sensor gives values that are not finite; mend the effect.")
