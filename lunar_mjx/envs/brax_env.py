@@ -39,11 +39,13 @@ class BraxEnv(Env):
         self.env = env
 
     def reset(self, rng: jax.Array) -> BraxState:
+        # A batch of one: brax's wrappers vmap over single environments.
         return _single(self.env.reset(self.env.params, jnp.asarray(rng)[None]))
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         own = jax.tree.map(lambda leaf: leaf[None], state.pipeline_state)
         new = _single(self.env.step(self.env.params, own, action[None]))
+        # Brax's wrappers keep their own counters in info.
         return new.replace(info={**state.info, **new.info})  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
@@ -67,6 +69,7 @@ def _metrics(state: Any) -> dict[str, Any]:
 
 def _single(state: Any) -> BraxState:
     one = jax.tree.map(lambda leaf: leaf[0], state)
+    # The true successor: brax resets by itself, and would otherwise see the next episode's beginning.
     return BraxState(one, one.final_obs, one.reward, one.terminated.astype(one.reward.dtype), _metrics(one), {})
 
 
@@ -93,6 +96,7 @@ class _Batch(Env):
         own: Any = self.env.step(self.env.params, before, action)
         metrics, info, reward = _metrics(own), state.info, own.reward
         done = own.done.astype(reward.dtype)
+        # Sums begin anew in the step after an episode's end, as brax's own wrapper has it.
         going = 1.0 - info["episode_done"]
         adds = {"sum_reward": reward, "length": jnp.ones_like(reward), **metrics}
         totals = {k: info["episode_metrics"][k] * going + v for k, v in adds.items()}
@@ -104,6 +108,7 @@ class _Batch(Env):
             "episode_done": done,
             "episode_metrics": totals,
         }
+        # Here the next episode's observation: a native batch has reset itself.
         return BraxState(own, own.obs, reward, done, metrics, new)
 
     @property

@@ -85,6 +85,7 @@ def where(condition: Bool[Array, "env"], new: Any, old: Any) -> Any:
     """Takes whole environments from `new` where the condition holds, from `old` elsewhere."""
 
     def choose(a: Any, b: Any) -> Any:
+        # The condition is stretched over the trailing axes, whatever each leaf's width.
         return jnp.where(condition.reshape(-1, *([1] * (jnp.ndim(a) - 1))), a, b)
 
     return jax.tree.map(choose, new, old)
@@ -108,6 +109,7 @@ def side_by_side(tree: Any, wanted: bool | None = None) -> Any:
     Args:
       tree: a pytree of arrays. wanted: whether to ask for it; only on GPUs if None.
     """
+    # Only a GPU reads the memory of neighbouring environments together.
     if not (jax.default_backend() == "gpu" if wanted is None else wanted):
         return tree
     columns = Layout(major_to_minor=(1, 0))

@@ -93,12 +93,14 @@ class SingleEnv(gym.Env):
         if self._state is None:
             raise bad_input("gym.step", "action", "a step", "comes before the first reset", "call reset first")
         self._state = self._step(self.env.params, self._state, jnp.asarray(action, jnp.float32)[None])
+        # One transfer: field by field each would wait for the device.
         state = jax.device_get(self._state)
         done = bool(state.done[0])
         if self._picture:
             self._picture.add(self._state, done)
         info = _info(state, 0) | ({k: float(v[0]) for k, v in state.metrics.items()} if done else {})
         return (
+            # Gymnasium's single environment does not reset itself.
             np.asarray(state.final_obs[0], np.float32),
             float(state.reward[0]),
             bool(state.terminated[0]),
@@ -221,6 +223,7 @@ class VectorEnv(gym.vector.VectorEnv):
         if self.state is None:
             raise bad_input("gym.step", "actions", "a step", "comes before the first reset", "call reset first")
         self.state = self._step(self.env.params, self.state, jnp.asarray(actions, jnp.float32))
+        # The inner state stays on the device: for thousands of rovers it is most of the bytes.
         seen = {
             name: getattr(self.state, name)
             for name in ("obs", "final_obs", "reward", "terminated", "truncated", "info", "metrics")
@@ -229,9 +232,11 @@ class VectorEnv(gym.vector.VectorEnv):
         infos = self._infos(seen["info"])
         done = seen["terminated"] | seen["truncated"]
         if done.any():
+            # Gymnasium's own form: None where the episode goes on.
             final = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(done):
                 final[i] = np.asarray(seen["final_obs"][i], np.float32)
+            # Sums of unfinished episodes mean nothing.
             metrics = {k: np.where(done, v, 0.0) for k, v in seen["metrics"].items()}
             infos |= {
                 "final_obs": final,

@@ -48,6 +48,7 @@ class Picture:
         self.close()
         self._qpos = np.asarray(state.inner.physics.qpos[0])
         self._goal = np.asarray(state.inner.goal[0])
+        # The ground where the rover starts: cameras and markers count heights from there.
         self._ground = float(self._qpos[2]) - self.env.model.rover.standing_height
         self._path = [self._qpos[:2]]
         self._top, self._camera, self._tried = None, None, False
@@ -84,6 +85,7 @@ class Picture:
 
     def _open(self) -> Chase | None:
         if self._camera is None and self._view != "top" and not self._tried:
+            # Tried once an episode: without OpenGL every further frame would wait for the same failure.
             self._tried = True
             try:
                 self._camera = Chase(self.env.model.rover, self.env.params.system.terrain, self._places())

@@ -64,12 +64,15 @@ class PointEnv:
         reward = 10.0 * (before - distance) + 5.0 * success
         steps = inner.steps + 1
         if self._poison:
+            # For tests of guards against numbers that are not finite.
             reward = jnp.where(steps > self._poison, jnp.nan, reward)
+        # Not both: a learner bootstraps from truncated states alone.
         truncated = ~success & (steps >= self.episode_steps)
         total = inner.total + reward
         ended = PointState(position, inner.goal, inner.key, steps, total)
         final_obs, final_privileged = self._observe(ended)
         done = success | truncated
+        # Made for all and taken by few: cheap here, while a rover's reset is prepared.
         inner = where(done, self._fresh(inner.key), ended)
         obs, privileged = self._observe(inner)
         metrics = {

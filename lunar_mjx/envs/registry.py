@@ -41,6 +41,7 @@ def register(name: str, maker: Callable[..., Environment]) -> None:
     Raises:
       UserError: the name is one of this package's, or cannot be told from a file.
     """
+    # A file is told from a name by its sign; plain words cannot be mistaken.
     if name in SHIPPED or not name.isidentifier():
         why = "is taken" if name in SHIPPED else "is no plain word"
         raise bad_input("envs.register", "name", name, why, "choose another name of letters, digits and underscores")

@@ -33,6 +33,7 @@ class SB3VecEnv(VecEnv):
         self._seed: int | None = None
 
     def reset(self) -> np.ndarray:
+        # One seed for the batch: its environments have keys of their own.
         obs, _ = self.envs.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
@@ -44,6 +45,7 @@ class SB3VecEnv(VecEnv):
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
         obs, reward, terminated, truncated, seen = self.envs.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        # Few environments end in a step; infos of the others stay empty.
         for i in np.flatnonzero(terminated | truncated):
             final = seen["final_info"]
             episode = {"r": float(final["episode_return"][i]), "l": int(final["episode_length"][i])}

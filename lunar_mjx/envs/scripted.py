@@ -62,6 +62,7 @@ def make_agent(name: str, env: Environment, params: Any = None) -> Agent:
 
 
 def _toward(goal: Any) -> Any:
+    # The longer component at full speed; slower within 0.1 m, so as not to overshoot.
     return goal / jnp.maximum(jnp.max(jnp.abs(goal), axis=-1, keepdims=True), 0.1)
 
 
@@ -81,6 +82,7 @@ def _driver(env: NavigationEnv) -> Agent:
             angle = jnp.mean(state.info["joint_angle"][:, jnp.array(fronts)], axis=-1)
             steer = 2.0 * (wanted - angle) / limit
             speed = state.info["body_velocity"][:, 0]
+            # Torque has no speed of its own; without a loop the rover would run away downhill.
             drive = jnp.clip(2.0 * (0.5 - speed), -1.0, 1.0)
         else:
             steer, drive = wanted / limit, jnp.ones_like(bearing)
@@ -140,16 +142,19 @@ def reactive_rule(env: NavigationEnv, settings: Reactive | None = None) -> Agent
         waited = 10.0 * state.obs[:, env.blocks["waited"]][:, 0]
         bearing = jnp.arctan2(goal[:, 1], goal[:, 0])
         far = jnp.sqrt(jnp.sum(goal * goal, axis=-1))
+        # Holes as well as boulders.
         wall = (jnp.abs(scan) > scale * r.tall)[:, None, :] & corridor
         free = jnp.min(jnp.where(wall, along, horizon), axis=-1)
         # what lies behind the goal does not matter
         free = jnp.where(free > far[:, None], horizon, jnp.minimum(free, horizon)) / horizon
+        # A goal behind is sought on the side where it is: all headings look ahead.
         off = jnp.abs(jnp.clip(bearing, -1.4, 1.4)[:, None] - headings)
         best = jnp.argmax(free - r.turn_price * off, axis=-1)
         heading = jnp.asarray(headings)[best]
         room = horizon * jnp.take_along_axis(free, best[:, None], axis=-1)[:, 0]
         backing = (room < scale * r.near) | (waited > r.patience)
         steer = r.gain * heading / limit
+        # Backing off, the wheels are turned the other way, so that the rover comes out facing the free side.
         return _wheels(env, jnp.where(backing, -0.7, 1.0), jnp.where(backing, -steer, steer))
 
     return act

@@ -62,6 +62,7 @@ class Chart:
 def prices(free: np.ndarray, cell: float) -> np.ndarray:
     """Price of a metre at every node of a planning grid, from where a rover fits, (row, column) booleans."""
     clear = cell * np.asarray(ndimage.distance_transform_edt(free))
+    # Falls gradually: a step would let ways run along its edge.
     return 1.0 + (CHART.close - 1.0) * np.clip(1.0 - (clear - cell) / CHART.wide, 0.0, 1.0)
 
 
@@ -94,6 +95,7 @@ def begin(count: int, goal: Any, cell: Any) -> Chart:
     end = jnp.clip((goal / cell).astype(jnp.int32), 0, count - 1)[:, :, None, None]
     up, along = jnp.abs(row - end[:, 1]), jnp.abs(column - end[:, 0])
     short, long = jnp.minimum(up, along), jnp.maximum(up, along)
+    # The cost that value iteration on an empty map ends with, so that nothing has to settle first.
     cost = cell * (long + (math.sqrt(2.0) - 1.0) * short).astype(goal.dtype)
     return Chart(jnp.zeros(cost.shape, bool), cost)
 
@@ -114,15 +116,18 @@ def look(chart: Chart, price: Any, world: Any, position: Any, yaw: Any, goal: An
     dx, dy = column + 0.5 - cell_position[:, 0, None, None], row + 0.5 - cell_position[:, 1, None, None]
     far = jnp.sqrt(dx * dx + dy * dy)
     cos, sin = jnp.cos(yaw)[:, None, None], jnp.sin(yaw)[:, None, None]
+    # By cosine: no angle to wrap.
     ahead = dx * cos + dy * sin > far * math.cos(HALF_VIEW)
     seen = chart.seen | ((far < CHART.reach) & (ahead | (far < CHART.around)))
     # the fence of the world is known from the beginning
     edge = jnp.zeros((count, count), bool).at[0].set(True).at[-1].set(True).at[:, 0].set(True).at[:, -1].set(True)
+    # Optimism: what is unseen is taken for open, so that the way leads there and finds out.
     known = jnp.where(seen | edge, price[world], 1.0)
     end = jnp.clip((goal / cell).astype(jnp.int32), 0, count - 1)[:, :, None, None]
     at_goal = (row == end[:, 1]) & (column == end[:, 0])
 
     def relax(cost: Any, _: Any) -> tuple[Any, None]:
+        # Beyond the border there is no way.
         wide = jnp.pad(cost, ((0, 0), (1, 1), (1, 1)), constant_values=jnp.inf)
 
         def near(j: int, i: int) -> Any:
@@ -130,6 +135,7 @@ def look(chart: Chart, price: Any, world: Any, position: Any, yaw: Any, goal: An
 
         straight = jnp.minimum(jnp.minimum(near(0, 1), near(0, -1)), jnp.minimum(near(1, 0), near(-1, 0)))
         aslant = jnp.minimum(jnp.minimum(near(1, 1), near(1, -1)), jnp.minimum(near(-1, 1), near(-1, -1)))
+        # The old cost is left out of the minimum: costs must be able to rise where a dead end shows itself.
         best = jnp.minimum(straight + cell * known, aslant + math.sqrt(2.0) * cell * known)
         return jnp.where(at_goal, 0.0, best), None
 

@@ -92,10 +92,13 @@ class Follower:
             near = jnp.clip(node + (2 if k == 0 else 1) * steps[:, None, :], 0, count - 1)
             best = jnp.argmin(self.costs[way, near[..., 1], near[..., 0]], axis=0)
             node = jnp.take_along_axis(near, best[None, :, None], axis=0)[0]
+            # The straight line is sampled twice a node: it may cut a corner that the way goes around.
             clear = self._free(way, cell_position + share * (node + 0.5 - cell_position)).all(axis=0)
+            # The first node always counts, or a rover off the way would have no aim.
             seen = seen & (clear | (k == 0))
             aim = jnp.where(seen[:, None], node + 0.5, aim)
         target = aim * self.cell + corner
+        # Within two cells the grid is coarser than the goal.
         close = jnp.sum((inner.goal - position) ** 2, axis=-1) < (2.0 * self.cell) ** 2
         return jnp.where(close[:, None], inner.goal, target) - position, ~self._free(way, cell_position)
 
@@ -105,6 +108,7 @@ class Follower:
         w, x, y, z = (inner.physics.qpos[:, k] for k in (3, 4, 5, 6))
         yaw = jnp.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
         turn = jnp.arctan2(to[:, 1], to[:, 0]) - yaw
+        # Wrapped: 350 deg to the left are 10 to the right.
         turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
         # what it hangs on it must leave by more than the step that ends the waiting
         return toward(turn, inner.waited, beside & (inner.last_action[:, 0] < 0.0))

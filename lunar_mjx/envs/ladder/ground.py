@@ -57,8 +57,10 @@ def make_world(rung: Rung, key: Any, hardness: Any = 1.0) -> World:
         curriculum, above it for worlds that are harder than the training's.
     """
     k_relief, k_rough, k_craters, k_rocks = jax.random.split(key, 4)
+    # Roughness is left as it is: it shakes a rover but blocks no way.
     heights = relief(rung, k_relief) * hardness + rough(rung, k_rough)
     x = nodes(rung.size, rung.cell)
+    # All worlds end at height 0, so that neighbours on one map join without a cliff.
     window = jnp.clip((0.5 * rung.size - jnp.abs(x)) / RIM, 0.0, 1.0)
     heights = add_craters(rung, heights, k_craters, hardness) * window[:, None] * window[None, :]
     centers, radii = boulders(rung, heights, k_rocks, hardness)
@@ -69,7 +71,9 @@ def _fractal(rung: Rung, key: Any, hurst: float, shortest: float) -> Any:
     """A self-affine surface on a torus of the world's size without waves shorter than `shortest` m; any scale."""
     count = round(rung.size / rung.cell)
     k = np.hypot(np.fft.fftfreq(count)[:, None], np.fft.rfftfreq(count)[None, :]) / rung.cell
+    # The mean's frequency, whose gain is set to zero below, must not divide by zero.
     k[0, 0] = 1.0
+    # Amplitudes of a surface in the plane fall as k^-(H+1), its spectrum as k^-(2H+2).
     gain = np.where(k * shortest > 1.0, 0.0, k ** -(hurst + 1.0))
     gain[0, 0] = 0.0
     noise = jnp.fft.rfft2(jax.random.normal(key, (count, count)))
@@ -85,6 +89,7 @@ def steepness(heights: Any, cell: float) -> Any:
 def relief(rung: Rung, key: Any) -> Any:
     """Hills of waves longer than four rovers, scaled to the rung's slope."""
     shape = _fractal(rung, key, HURST, 10.0 * rung.plan_cell)
+    # Not the maximum: one steep node would flatten the whole world.
     tall = jnp.percentile(steepness(shape, rung.cell), 99.0)
     return shape * (math.tan(math.radians(rung.slope_deg)) / jnp.maximum(tall, 1e-12))
 
@@ -105,9 +110,11 @@ def add_craters(rung: Rung, heights: Any, key: Any, hardness: Any) -> Any:
     for i, (small, large) in enumerate(octaves):
         population = Craters(small, large, rung.craters, 2.0, 0.02, rung.deepest)
         mean = population.number(small) * rung.size**2
+        # Fixed shapes for a compiled program: three sigma over the mean; more are not drawn.
         most = math.ceil(mean + 3.0 * math.sqrt(mean)) + 1
         draws = jax.random.uniform(jax.random.fold_in(key, i), (4, most))
         present = jnp.arange(most) < jax.random.poisson(jax.random.fold_in(key, 100 + i), mean)
+        # Inverse of the cumulative power law of exponent 2, cut at the octave's ends.
         diameter = (small**-2 - draws[0] * (small**-2 - large**-2)) ** -0.5
         ratio = 0.02 * (rung.deepest / 0.02) ** draws[1] * hardness
         place = (draws[2:] - 0.5) * rung.size
@@ -116,7 +123,9 @@ def add_craters(rung: Rung, heights: Any, key: Any, hardness: Any) -> Any:
         def stamp(ground: Any, crater: Any, patch: int = patch) -> tuple[Any, None]:
             x, y, diameter, depth = crater
             first = [
-                jnp.clip(jnp.floor((c + 0.5 * rung.size) / rung.cell - 0.5 * patch), 0, count - patch) for c in (y, x)
+                # The patch is pushed inside the world, the crater within it is not.
+                jnp.clip(jnp.floor((c + 0.5 * rung.size) / rung.cell - 0.5 * patch), 0, count - patch)
+                for c in (y, x)
             ]
             row, column = (f.astype(jnp.int32) for f in first)
             middles = (jnp.arange(patch) + 0.5) * rung.cell - 0.5 * rung.size
@@ -125,6 +134,7 @@ def add_craters(rung: Rung, heights: Any, key: Any, hardness: Any) -> Any:
             old = jax.lax.dynamic_slice(ground, (row, column), (patch, patch))
             return jax.lax.dynamic_update_slice(ground, old + bowl, (row, column)), None
 
+        # Those that are not there are stamped too, too shallow to be seen; a depth of 0 would divide.
         depth = jnp.where(present, ratio * diameter, 1e-9)
         heights, _ = jax.lax.scan(stamp, heights, (place[0], place[1], diameter, depth))
     return heights
@@ -141,16 +151,19 @@ def boulders(rung: Rung, heights: Any, key: Any, hardness: Any) -> tuple[Any, An
     # fields of boulders: where a smooth field is high they lie twice as dense as on average, elsewhere hardly any
     dense = jax.image.resize(jax.random.normal(k_field, (max(2, count // 5),) * 2), (count, count), "cubic")
     share = 2.0 * jax.nn.sigmoid(2.0 * dense)
+    # A lattice with one place per square: no two boulders meet, and a look-up is arithmetic.
     present = jax.random.uniform(k_there, (count, count)) < rung.presence * hardness * share
     at = nodes(rung.size, side)
     free = jnp.abs(at) < 0.5 * rung.size - RIM
     present = (present | ridge) & free[:, None] & free[None, :]
+    # Off the square's middle as far as it fits; less in ridges, which must stay closed.
     room = 0.5 * (side - diameter)[..., None] * jnp.where(ridge, 0.3, 0.9)[..., None]
     shift = room * jax.random.uniform(k_place, (count, count, 2), minval=-1.0, maxval=1.0)
     x, y = at[None, :] + shift[..., 0], at[:, None] + shift[..., 1]
     radius = 0.5 * diameter
     cells = heights.shape[0]
     row, column = (jnp.clip(((c + 0.5 * rung.size) / rung.cell).astype(jnp.int32), 0, cells - 1) for c in (y, x))
+    # A share of the height below ground: the centre lies (1 - 2 b) r above it.
     z = heights[row, column] + (1.0 - 2.0 * BURIAL) * radius
     centers = jnp.stack([x, y, z], axis=-1).reshape(-1, 3)
     return centers, jnp.where(present, radius, 0.0).reshape(-1)
@@ -163,6 +176,7 @@ def ridges(rung: Rung, key: Any, hardness: Any) -> Any:
     up, along = (jax.random.uniform(k, (blocks, blocks)) < rung.ridges * hardness for k in jax.random.split(key))
     square = jnp.arange(count)
     block, first = square // per, square % per == 0
+    # A ridge stands on a block's edge, a square of the lattice thick.
     on_column = first[None, :] & up[block[:, None], block[None, :]]
     on_row = first[:, None] & along[block[:, None], block[None, :]]
     return on_column | on_row
@@ -177,6 +191,7 @@ def near_boulders(rung: Rung, centers: Any, radii: Any, x: Any, y: Any) -> tuple
     count = round(rung.size / rung.lattice)
     row, column = (jnp.floor((c + 0.5 * rung.size) / rung.lattice).astype(jnp.int32) for c in (y, x))
     best, number = jnp.full(x.shape, jnp.inf), jnp.full(x.shape, -1, jnp.int32)
+    # A boulder lies within its square, so that nine squares hold every near one.
     for j in (-1, 0, 1):
         for i in (-1, 0, 1):
             k = jnp.clip(row + j, 0, count - 1) * count + jnp.clip(column + i, 0, count - 1)

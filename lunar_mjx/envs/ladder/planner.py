@@ -46,6 +46,7 @@ class Planner:
         at = (np.arange(self.count) + 0.5) * cell
         x, y = np.meshgrid(self.corner[0] + at, self.corner[1] + at)
         slope = self._slopes(terrain, x, y)
+        # Blocked and not just dear: a cheap detour over a cliff would be none.
         self.free = (slope < math.tan(steepest)) & (self._clearance(terrain, x, y, size) > half_width)
         self._graph = self._edges(1.0 + slope_cost * slope / math.tan(steepest))
 
@@ -55,6 +56,7 @@ class Planner:
         cell = float(field.cell)
         column, row = (np.rint((c - float(c0)) / cell).astype(int) for c, c0 in ((x[0], field.x0), (y[:, 0], field.y0)))
         part = np.asarray(field.heights)[row[0] : row[-1] + 1, column[0] : column[-1] + 1].astype(float)
+        # Averaged over what a wheel covers; single nodes are rougher than a rover feels.
         north, east = np.gradient(uniform_filter(part, 3), cell)
         steep = np.hypot(north, east)
         return steep[np.ix_(row - row[0], column - column[0])]
@@ -83,6 +85,7 @@ class Planner:
             both_free = self.free[one] & self.free[other]
             begins.append(number[one][both_free])
             ends.append(number[other][both_free])
+            # The mean of both ends, so that ways cost the same in both directions.
             lengths.append((0.5 * (cost[one] + cost[other]) * math.hypot(i, j) * self.cell)[both_free])
         begin, end, length = (np.concatenate(a) for a in (begins, ends, lengths))
         return coo_array((length, (begin, end)), shape=(n * n, n * n)).tocsr()
@@ -93,6 +96,7 @@ class Planner:
 
     def ways(self, goal: Any, starts: np.ndarray) -> list[np.ndarray | None]:
         """The cheapest way from every start to a goal as points (point, 2), m; None where there is none."""
+        # From the goal, once for all starts.
         cost, before = dijkstra(self._graph, directed=False, indices=self._node(goal), return_predecessors=True)
         cells_of_ways: list[np.ndarray | None] = []
         for start in starts:

@@ -87,6 +87,7 @@ def way_left(pool: Pool, place: Any, position: Any) -> tuple[Any, Any]:
         for i in (0, 1):
             length = pool.ways[way, row + j, column + i]
             part = (share[:, 0] if i else 1.0 - share[:, 0]) * (share[:, 1] if j else 1.0 - share[:, 1])
+            # Nodes within a boulder's margin have no way; the others share their weight.
             part = jnp.where(jnp.isfinite(length), part, 0.0)
             total, weight = total + part * jnp.where(part > 0.0, length, 0.0), weight + part
     return total / jnp.maximum(weight, 1e-3), weight > 1e-3
@@ -108,6 +109,7 @@ def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: f
     valid = np.asarray(goals["valid"])
     if not valid.any():
         raise bad_input("ladder", "worlds", worlds, "have no such places", "raise it, or lower the hardness")
+    # About square: float32 places are finest near the map's middle.
     across = math.ceil(math.sqrt(worlds))
     middles = _middles(worlds, across, rung.size)
     return Pool(
@@ -129,9 +131,11 @@ def _worlds(rung: Rung, worlds: int, half_width: float) -> Any:
         world = make_world(rung, k_world, hardness)
         free, roomy = passable(rung, world, half_width)
         keys = jax.random.split(k_goals, GOALS)
+        # Distances are found once per goal and kept: a step then only reads them.
         return world, jax.vmap(lambda k: draw_goal(rung, free, roomy, k, STARTS))(keys), free
 
     def all_of(key: Any, hardness: Any) -> Any:
+        # A few at a time: all at once would need their distances' memory at once.
         return jax.lax.map(lambda k: one(k, hardness), jax.random.split(key, worlds), batch_size=BATCH)
 
     return jax.jit(all_of)
@@ -154,6 +158,7 @@ def _atlas(rung: Rung, world: World, middles: np.ndarray, across: int) -> Terrai
         high, wide = grids.shape[1:]
         return full.reshape(rows, across, high, wide).swapaxes(1, 2).reshape(rows * high, across * wide)
 
+    # Boulders of all worlds are one list; indices move by the worlds before.
     number = world.index + rocks_each * jnp.arange(count)[:, None, None]
     index = jnp.where(world.index == rocks_each, count * rocks_each, number)
     shift = jnp.pad(jnp.asarray(middles, jnp.float32), ((0, 0), (0, 1)))
@@ -176,6 +181,7 @@ def _places(goals: dict[str, Any], valid: np.ndarray, middles: np.ndarray, seed:
     """The pairs of the goals that have starts, repeated until there are as many as with all goals."""
     starts, shortest = (np.asarray(goals[k]) for k in ("starts", "shortest"))
     good = np.flatnonzero(valid.reshape(-1))
+    # Repeated to a fixed number, so that another seed's pool has the same shapes.
     way = np.repeat(np.resize(good, valid.size), starts.shape[2])
     world_number = np.tile(np.arange(starts.shape[2]), valid.size)
     world = way // valid.shape[1]

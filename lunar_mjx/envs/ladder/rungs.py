@@ -89,12 +89,14 @@ class Rung:
         mean_area = float(np.mean(np.pi / 4.0 * self.diameters() ** 2))
         in_ridges = self.on_edges * np.pi / 4.0 * self.ridge_diameter**2 / self.lattice**2
         outside_ridges = (self.coverage - in_ridges) * self.lattice**2 / mean_area
+        # What ridges cover counts towards the coverage; the rest is spread over the squares that carry none.
         return outside_ridges / (1.0 - self.on_edges)
 
     def diameters(self, count: int = 256) -> np.ndarray:
         """Quantiles of the diameters: dN ~ D^-2 exp(-q D) dD between the bounds, q = 1.79 (Golombek & Rapp 1997)."""
         d = np.geomspace(self.smallest, self.largest, 512)
         density = np.exp(-1.79 * d) / d**2
+        # Quantiles by trapezoids: the density has no closed integral.
         above = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(d))])
         return np.interp((np.arange(count) + 0.5) / count, above / above[-1], d)
 
@@ -103,6 +105,7 @@ class Rung:
         if factor == 1.0:
             return self
         lattice, block = self.lattice * factor, self.block * factor
+        # Whole blocks, so that ridges close at the world's border.
         size = math.ceil(self.size / block) * block
         return dataclasses.replace(
             self,

@@ -26,6 +26,7 @@ def slope_grid(rung: Rung, heights: Any) -> Any:
     smooth = sum(wide[j : j + count, i : i + count] for j in range(3) for i in range(3)) / 9.0
     per = round(rung.plan_cell / rung.cell)
     blocks = steepness(smooth, rung.cell).reshape(count // per, per, count // per, per)
+    # The greatest within a node: a ledge across it must not be averaged away.
     return blocks.max(axis=(1, 3))
 
 
@@ -37,6 +38,7 @@ def passable(rung: Rung, world: World, half_width: float) -> tuple[Any, Any]:
     slope = slope_grid(rung, world.heights)
     inside = jnp.abs(at) < 0.5 * rung.size - RIM
     inside = inside[:, None] & inside[None, :]
+    # Lengths were chosen for LUVMI-X, whose half width with margin is 0.4 m.
     room = ROOM * half_width / 0.4
     free = inside & (gap > half_width) & (slope < math.tan(STEEPEST))
     return free, free & (gap > room) & (slope < math.tan(0.7 * STEEPEST))
@@ -60,6 +62,7 @@ def distances(free: Any, row: Any, column: Any, cell: float, price: Any = 1.0) -
         for j, i, length in _STEPS:
             near = jax.lax.dynamic_slice(wide, (1 + j, 1 + i), free.shape)
             best = jnp.minimum(best, near + length * cell * price)
+        # Infinity added keeps blocked nodes blocked, whatever their neighbours offer.
         best = best + blocked
         return best, jnp.any(best < old)
 
@@ -76,12 +79,14 @@ def draw_goal(rung: Rung, free: Any, roomy: Any, key: Any, starts: int) -> dict[
     at = nodes(rung.size, rung.plan_cell)
     count = at.shape[0]
     k_goal, k_start = jax.random.split(key)
+    # Evenly over free nodes: log weights of zero or never.
     chance = jnp.where(roomy.reshape(-1), 0.0, -jnp.inf)
     end = jax.random.categorical(k_goal, chance)
     way = distances(free, end // count, end % count, rung.plan_cell)
     goal = jnp.stack([at[end % count], at[end // count]])
     straight = jnp.hypot(at[None, :] - goal[0], at[:, None] - goal[1])
     low, high = rung.goal_distance
+    # A detour is asked for, so that driving straight is not enough.
     fits = roomy & jnp.isfinite(way) & (straight >= low) & (straight <= high) & (way >= rung.detour * straight)
     begin = jax.random.categorical(k_start, jnp.where(fits.reshape(-1), 0.0, -jnp.inf), shape=(starts,))
     return {

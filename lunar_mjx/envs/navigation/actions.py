@@ -79,6 +79,7 @@ def action_map(
                 f"drives {group} motors, which {rover.name} lacks",
                 "use joint_torque, joint_current or joint_velocity",
             )
+    # Scales by rover: an action of 1 means much, whatever the rover's size.
     limits = _limits(model, mode, top_speed, load_share)
     groups = [g.name for g in rover.groups for _ in g.joints]
     if mode.startswith("joint"):
@@ -102,7 +103,9 @@ def _six(rover: Rover, mode: str, groups: list[str], limits: np.ndarray, all_ste
         source.append({"drive": 0, "steer": 1}.get(group, names.index(joint) if joint in names else 0))
         value, kind = limit, modes.get(group, TORQUE if torque else POSITION)
         if group == "steer" and joint not in front:
+            # Rear wheels the other way: the circle driven is half as wide.
             value = -limit if all_steer and joint in rear else 0.0
+            # Held straight by position: without a target, torque control would let the wheel turn freely.
             kind = kind if value else POSITION
         scale.append(value)
         code.append(kind)
@@ -132,6 +135,7 @@ def _limits(model: Model, mode: str, top_speed: float, load_share: float) -> np.
     compiled = rover.compile()
     data = mujoco.MjData(compiled)  # type: ignore[attr-defined]
     mujoco.mj_forward(compiled, data)  # type: ignore[attr-defined]
+    # In the model's own gravity: torque that climbs on the Moon is a sixth of the Earth's.
     load = rover.mass * model.gravity / len(rover.wheels)
     wheel_of = {j: w for w in rover.wheels for j in (w.drive, w.steer, w.suspension) if j}
     motor = model.parameters["motor"]
@@ -148,12 +152,15 @@ def _limits(model: Model, mode: str, top_speed: float, load_share: float) -> np.
             speed, torque, angle = top_speed / radius, load_share * load * radius, 2 * np.pi
         elif group.name == "steer":
             inertia = group.rotor_inertia * ratio[i] ** 2
+            # From rest through the span: s = a t^2/2.
             speed, torque, angle = span / STEER_TIME, 2 * inertia * span / STEER_TIME**2, span
         else:
             body = compiled.body(wheel.body).id if wheel else compiled.body(rover.chassis).id
+            # In plan, as the load is vertical.
             arm = np.linalg.norm((data.xpos[body] - data.xanchor[joint.id])[:2])
             speed, torque, angle = span / STEER_TIME, 0.5 * load * arm, 0.4 * span
         if mode == "joint_current":
+            # The current that gives this torque at 25 degC.
             values.append(torque / (ratio[i] * efficiency[i] * constant[i]))
         elif mode == "joint_velocity" or (mode == "velocity" and group.name == "drive"):
             values.append(speed)

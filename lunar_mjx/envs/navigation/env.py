@@ -182,6 +182,7 @@ class NavigationEnv:
     """
 
     def __init__(self, model: Model, config: NavigationConfig, engine: str = "auto"):
+        # Before anything is compiled.
         randomise.check_ranges(model, config.randomise)
         self.model, self.config = model, config
         self.system: System = build(model, engine)
@@ -199,6 +200,7 @@ class NavigationEnv:
         if "power" in config.observations and not (self._battery and model.sun is not None):
             remedy = "add the effect battery and a Sun to the model, or leave it out"
             raise bad_input("navigation", "observations", "power", "needs a battery and a Sun", remedy)
+        # Metrics have a fixed set of names, told once.
         more = ("collided",) if config.collisions == "end" else ()
         self._ends_told = (*ENDS, *more, *(("drained",) if self._battery else ()))
         self.params = self.place(model)
@@ -263,6 +265,7 @@ class NavigationEnv:
         """The ladder's worlds of a seed, for this rover."""
         c = self.config
         half_width = (self._outline or tally.Outline(self.system)).half[1] + 0.1
+        # Whole multiples of LUVMI-X's world: grids and boulders then divide as they do there.
         rung = get_rung(c.rung).scaled(max(1.0, round(half_width / 0.4)))
         return make_pool(rung, seed, c.worlds or rung.worlds, half_width, c.hardness if hardness is None else hardness)
 
@@ -278,6 +281,7 @@ class NavigationEnv:
             *(jnp.asarray(a, jnp.result_type(float)) for a in (bounds, gains)),
             shortest=at.shortest if c.tally else None,
             arrivals=at.arrivals if c.arrive_within < np.pi or "arrival" in c.observations else None,
+            # Looked at once; over a map of many worlds it would cost every step.
             ground=jnp.stack([heights.min(), heights.max()]),
             side=pool.size,
             # the map is in `system` already
@@ -322,6 +326,7 @@ class NavigationEnv:
         c, inner = self.config, state.inner
         # before rewards see it: an agent must not be punished or paid for what the motors never got
         action = jnp.clip(action, -1.0, 1.0).astype(inner.last_action.dtype)
+        # From the physics and not from the view: the view is of after the step.
         before = inner.goal - inner.physics.qpos[:, :2]
         inner, view = self._advance(params, inner, action)
         to_goal = inner.goal - view.position[:, :2]
@@ -343,6 +348,7 @@ class NavigationEnv:
         terminated = functools.reduce(jnp.logical_or, ends.values())
         running = sum(terms.values())
         if c.divergence == "reset":
+            # A state that is gone has no honest running reward; the failure's counts.
             running = jnp.where(ends["diverged"], 0.0, bounded(running))
         reward = running + jnp.where(success, c.success, jnp.where(terminated, c.failure, 0.0))
         inner = dataclasses.replace(inner, steps=inner.steps + 1, total=inner.total + reward)
@@ -435,6 +441,7 @@ class NavigationEnv:
             c.decimation,
             axes,
             lambda seen: (seen.slip, seen.sinkage, *power(seen)),
+            # The step is compiled once, not once more for the steps whose telemetry nobody reads.
             one_body=True,
             last=True,
         )
@@ -531,6 +538,7 @@ class NavigationEnv:
         pick = jax.vmap(lambda k: jax.random.randint(k, (), 0, params.starts.shape[0]))(split[:, 1])
         start, goal = params.starts[pick], params.goals[pick]
         turn = jax.vmap(lambda k: jax.random.uniform(k, (), minval=-1.0, maxval=1.0))(split[:, 2])
+        # Headings are drawn about the goal's bearing.
         bearing = jnp.arctan2(goal[:, 1] - start[:, 1], goal[:, 0] - start[:, 0])
         drawn = randomise.draw(c.randomise, params.system, params.bounds, split[:, 3])
         system, axes = randomise.apply(params.system, drawn)
@@ -574,7 +582,9 @@ class NavigationEnv:
             low, high = (jnp.broadcast_to(corner, start.shape) for corner in (low, high))
         else:
             # the world in which the episode began
+            # Nodes are the cells' middles, worlds meet at cells' edges.
             corner = low - 0.5 * field.cell
+            # By where the episode began: a rover that crosses the border has left its world.
             low = corner + jnp.floor((start - corner) / params.side) * params.side
             high = low + params.side
         return jnp.stack([low + self.config.edge, high - self.config.edge], axis=1)
@@ -641,6 +651,7 @@ class NavigationEnv:
         c, terrain = self.config, params.system.terrain
         seen = None
         if any(name.startswith(CAMERA) for name in names):
+            # Pictures only where a block or a critic asks for them.
             light = Light(sun=c.sun)
             seen = pictures(terrain, self.model.rover, view.qpos, c.camera, light=light, far=c.camera_far)
         return Scene(terrain, inner.drawn, self._ride, self._scale, params.system.sun, seen, c.camera_far)
@@ -656,6 +667,7 @@ class NavigationEnv:
 
 def _split(keys: Any) -> Any:
     """(env, 4, 2) keys of an episode; the first one is the next episode's."""
+    # One key for what comes next, three for place, heading and parameters of now.
     return jax.vmap(lambda k: jax.random.split(k, 4))(keys)
 
 

@@ -79,12 +79,14 @@ def gains(config: KalmanConfig, dt: float, most: int = 4096) -> np.ndarray:
     covariance = np.diag([*np.diag(r), config.acceleration_deviation**2])
     table: list[np.ndarray] = []
     for _ in range(most):
+        # Gains depend on the count of measurements alone, not on what was measured: a table serves all rovers.
         covariance = f @ covariance @ f.T + q
         gain = np.linalg.solve(h @ covariance @ h.T + r, h @ covariance).T
         # Joseph's form: it stays symmetric and positive under rounding, which (I - K H) P does not
         keep = np.eye(3) - gain @ h
         covariance = keep @ covariance @ keep.T + gain @ r @ gain.T
         table.append(gain)
+        # From there on the last row serves for ever.
         if len(table) > 1 and np.abs(table[-1] - table[-2]).max() < 1e-12 * np.abs(gain).max():
             break
     return np.stack(table)
@@ -93,6 +95,7 @@ def gains(config: KalmanConfig, dt: float, most: int = 4096) -> np.ndarray:
 def start(position: Float[Array, "*env 3"], velocity: Float[Array, "*env 3"]) -> KalmanState:
     """The filter after the first measurement, with no acceleration known yet."""
     count = jnp.zeros(position.shape[:-1], jnp.int32)
+    # At rest before the first step, so zero is the best guess.
     return KalmanState(position, velocity, jnp.zeros_like(position), count)
 
 

@@ -77,6 +77,7 @@ def goal_body(v: View, s: Scene) -> Any:
     """Distance to the goal, 1 - exp(-distance / 3 m), and cosine and sine of its bearing from the heading."""
     ahead = goal_in_body(v)
     distance = jnp.sqrt(jnp.sum(ahead * ahead, axis=-1, keepdims=True))
+    # Both: metres for planning, and a number that stays within 1 and is fine near the goal.
     return jnp.concatenate([distance, 1.0 - jnp.exp(-distance / 3.0), ahead / jnp.maximum(distance, 1e-3)], axis=-1)
 
 
@@ -97,6 +98,7 @@ def body_rates(v: View, s: Scene) -> Any:
 
 def joints(v: View, s: Scene) -> Any:
     """Angles of the joints that do not turn on and on, as sine (drive joints too), and speeds, rad/s."""
+    # As a sine, since drive angles grow without end.
     return jnp.concatenate([jnp.sin(v.joint_angle), v.joint_speed], axis=-1)
 
 
@@ -117,6 +119,7 @@ def sinkage(v: View, s: Scene) -> Any:
 
 def scan(v: View, s: Scene) -> Any:
     """Height of ground and rocks at a pattern of places around the rover, m, within 1 m of its standing plane."""
+    # Bounded: a cliff must not drown what lies before the wheels.
     return jnp.clip(height_scan(s.terrain, v, s.scan_scale, s.ride), -1.0, 1.0)
 
 
@@ -127,8 +130,8 @@ def far_scan(v: View, s: Scene) -> Any:
 
 
 def trail(v: View, s: Scene) -> Any:
-    """Where the rover was: means of its past positions that fade within the times `TRAIL`, along and across the heading
-    from where it is now, m. Dead reckoning tells it; it is all the memory that a policy without any has."""
+    """Where the rover was: means of its past positions that fade within the times `VIEW.trail`, along and across the
+    heading from where it is now, m. Dead reckoning tells it; it is all the memory that a policy without any has."""
     assert v.trail is not None, "the environment keeps the trail that this block asks for"
     away = v.trail - v.position[:, None, :2]
     cos, sin = jnp.cos(v.yaw)[:, None], jnp.sin(v.yaw)[:, None]
@@ -143,6 +146,7 @@ def border(v: View, s: Scene) -> Any:
     rays = v.yaw[:, None] + 0.5 * jnp.pi * jnp.arange(4)
     way = []
     for k, along in enumerate((jnp.cos(rays), jnp.sin(rays))):
+        # Distance to the side that the ray runs towards, along x and along y; the nearer one is met first.
         gap = jnp.where(along > 0.0, high[:, k, None], -low[:, k, None])
         way.append(gap / jnp.maximum(jnp.abs(along), 1e-6))
     return jnp.clip(jnp.minimum(*way) / 10.0, 0.0, 1.0)
@@ -226,6 +230,7 @@ def waited(v: View, s: Scene) -> Any:
 
 def drawn(v: View, s: Scene) -> Any:
     """What was drawn for the episode, logarithms of the sizes; for critics only, a rover cannot know it."""
+    # Logarithms: moduli range over decades.
     parts = [jnp.log(jnp.abs(a).reshape(a.shape[0], -1) + 1e-6) for _, a in sorted(s.drawn.items())]
     return jnp.concatenate(parts, axis=-1) if parts else jnp.zeros((v.yaw.shape[0], 0))
 

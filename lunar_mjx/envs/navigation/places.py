@@ -45,6 +45,7 @@ def draw_places(
     Raises:
       UserError: the terrain has no room for such pairs.
     """
+    # On the host: a search with trees, once per environment.
     terrain = jax.device_get(terrain)
     heights = np.asarray(terrain.field.heights, float)
     x0, y0, cell = (float(v) for v in (terrain.field.x0, terrain.field.y0, terrain.field.cell))
@@ -73,11 +74,13 @@ def draw_places(
     starts, goals, have = [], [], 0
     if (last > first).all():
         for _ in range(_TRIES):
+            # Many at a time, since on rough ground few of a hundred are free.
             n = max(256, min(count, 20_000))
             begin = first + rng.random((n, 2)) * (last - first)
             angle, far = 2 * np.pi * rng.random(n), rng.uniform(*distance, n)
             end = begin + far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
             inside = ((end >= low) & (end <= high)).all(axis=1)
+            # The cheap test first; rocks are searched for what is left.
             begin, end = begin[inside], end[inside]
             good = free(begin) & free(end)
             starts.append(begin[good])

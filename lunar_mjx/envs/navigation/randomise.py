@@ -71,6 +71,7 @@ def check_ranges(model: Model, ranges: Sequence[Range], source: str = "navigatio
         value = np.asarray(model.parameters[effect][name], float)
         for bound in (r.low, r.high):
             for number in np.ravel(value * bound if r.relative else bound):
+                # Both ends are checked as any value of the model is: a draw then cannot leave the bounds.
                 owner.check(name, float(number), f"{source}, randomise")
 
 
@@ -99,6 +100,7 @@ def draw(
             value = low + share[:, i] * (high - low)
         if r.relative:
             own = _own(params, r.parameter)
+            # One factor for all wheels or joints: they differ as a set, from rover to rover.
             value = value.reshape(-1, *([1] * own.ndim)) * own
         drawn[r.parameter] = value
     return drawn
@@ -130,12 +132,14 @@ def apply(params: Params, drawn: dict[str, Any]) -> tuple[Params, Any]:
         elif parameter == "ambient":
             ambient = dataclasses.replace(
                 params.ambient,
+                # Noon and night alike: within an episode of minutes the lunar day stands still.
                 noon=value,
                 night=value,
                 noon_time=jnp.broadcast_to(params.ambient.noon_time, value.shape),
                 period=jnp.broadcast_to(params.ambient.period, value.shape),
             )
             ambient_axis = 0
+        # That one is a state and no parameter; reset takes it.
         elif parameter != "winding_temperature":
             effect, _, name = parameter.partition(".")
             effects[effect][name] = value

@@ -67,6 +67,7 @@ def way(t: Transition) -> Any:
 def heading(t: Transition) -> Any:
     """r_head: cosine of the angle between heading and goal, as printed (the z component of the second vector is 0)."""
     along = t.to_goal[..., 0] * jnp.cos(t.yaw) + t.to_goal[..., 1] * jnp.sin(t.yaw)
+    # At the goal itself there is no direction.
     return along / jnp.maximum(length(t.to_goal), _TINY)
 
 
@@ -148,6 +149,7 @@ def reached(to_goal: Float[Array, "env 2"], radius: Any) -> Any:
 
 def rolled_over(up_z: Float[Array, "env"], most_tilt: Any) -> Any:
     """Flipped: the chassis' up axis leans more than `most_tilt` rad from the vertical."""
+    # By the axis and not by roll and pitch, which mix on steep ground.
     return up_z < jnp.cos(most_tilt)
 
 

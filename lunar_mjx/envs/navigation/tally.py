@@ -48,7 +48,9 @@ def update(tally: Tally, moved: Any, power: Any, slip: Any, touching: Any, inter
       moved: way of the step in plan, m. power: (env, joint) electrical, W; none flows back.
       slip: (env, wheel). touching: see `Outline.touches`. interval: of control, s.
     """
+    # Braking power is lost in a resistor, as in the effect `motor_power`.
     drawn = jnp.maximum(power, 0.0).sum(-1)
+    # Where contact begins: a rover that leans on a boulder has hit it once.
     struck = (touching & ~tally.touching).astype(moved.dtype)
     return Tally(
         tally.travelled + moved,
@@ -98,8 +100,10 @@ class Outline:
         probe = x0 + cos * fore - sin * side, y0 + sin * fore + cos * side
         cx, cy, cz, radius = nearest_rock(terrain.rocks, *probe)
         high = radius if terrain.rocks.forms is None else form_at(terrain.rocks, *probe).apex().z
+        # What the belly clears is no collision.
         tall = cz + high - sample(terrain.field, cx, cy)[0] > self.belly
         ahead, aside = cos * (cx - x0) + sin * (cy - y0), cos * (cy - y0) - sin * (cx - x0)
+        # Distance from the boulder's centre to a rectangle.
         gap = jnp.hypot(
             jnp.maximum(jnp.abs(ahead) - self.half[0], 0.0), jnp.maximum(jnp.abs(aside) - self.half[1], 0.0)
         )

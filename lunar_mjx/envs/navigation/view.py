@@ -103,6 +103,7 @@ class View:
 
 def rotation(quaternion: Float[Array, "env 4"]) -> Float[Array, "env 3 3"]:
     """Rotation matrices, body to world."""
+    # Made a unit first: the engine's drifts by rounding between its own corrections.
     q = quaternion / jnp.sqrt(jnp.sum(quaternion * quaternion, axis=-1, keepdims=True))
     w, x, y, z = (q[..., i] for i in range(4))
     rows = [
@@ -119,6 +120,7 @@ class Reader:
     def __init__(self, system: System):
         model = system.engine.mj_model
         joints = [model.joint(name) for name in system.joint_names]
+        # Positions and velocities of a free body differ in number, so each has its own places.
         self._qpos = [int(j.qposadr[0]) for j in joints]
         self._qvel = [int(j.dofadr[0]) for j in joints]
 
@@ -129,8 +131,10 @@ class Reader:
         return {
             "position": physics.qpos[:, :3],
             "velocity": velocity,
+            # MuJoCo gives a free body's rates in its own axes, its velocity in the world's.
             "angular_velocity": _turn(matrix, rates),
             "roll": jnp.arctan2(matrix[:, 2, 1], matrix[:, 2, 2]),
+            # Clipped, since rounding may pass 1 by a digit, where the arc sine is no number.
             "pitch": jnp.arcsin(jnp.clip(-matrix[:, 2, 0], -1.0, 1.0)),
             "yaw": jnp.arctan2(matrix[:, 1, 0], matrix[:, 0, 0]),
             "up": matrix[:, :, 2],

@@ -69,4 +69,5 @@ def world(name: str) -> Terrain:
     rocks = terrain.rocks
     if rocks is None:
         return terrain
+    # Shapes decide what is compiled.
     return dataclasses.replace(terrain, rocks=padded(rocks, -len(rocks.radii) % _ROCKS))
