@@ -21,6 +21,7 @@ def new_figure(columns: int, width: float = 5.0, height: float = 3.6) -> Any:
     from matplotlib.figure import Figure
 
     with styled():
+        # Without pyplot, whose figures are global and not safe in threads.
         figure = Figure(figsize=(columns * width, height), layout="constrained")
         FigureCanvasAgg(figure)
         return figure, figure.subplots(1, columns, squeeze=False)[0]
@@ -28,6 +29,7 @@ def new_figure(columns: int, width: float = 5.0, height: float = 3.6) -> Any:
 
 def moving_mean(values: Sequence[float] | np.ndarray, width: int = EPISODES) -> np.ndarray:
     """Mean over the last `width` values, fewer at the beginning."""
+    # Differences of a running sum: the width costs nothing.
     total = np.cumsum(np.insert(np.asarray(values, float), 0, 0.0))
     last = np.arange(1, len(values) + 1)
     first = np.maximum(last - width, 0)

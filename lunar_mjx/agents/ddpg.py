@@ -124,6 +124,7 @@ class DDPG:
         critic_loss, critic, critic_optimiser = gradient_update_fn(self.critic_loss, self.critic_optimiser, axis)(
             state.critic, batch, target, optimizer_state=state.critic_optimiser
         )
+        # By the critic as it has just become, as Stable-Baselines3 does.
         actor_loss, actor, actor_optimiser = gradient_update_fn(self.actor_loss, self.actor_optimiser, axis)(
             state.actor, critic, batch, optimizer_state=state.actor_optimiser
         )
@@ -142,6 +143,7 @@ class DDPG:
         """r + discount Q'(s', pi'(s')) within `value_range`, (batch,)."""
         action = self.act(state.actor_target, batch.next_obs)
         value = self._value(state.critic_target, batch.next_obs, batch.next_privileged, action)
+        # No more than the task can pay: see `value_range`.
         return jnp.clip(self.config.reward_scale * batch.reward + batch.discount * value, *self.config.value_range)
 
     def critic_loss(self, critic: Any, batch: Batch, target: Any) -> Any:

@@ -111,6 +111,7 @@ class Evaluator:
         key_reset, key = jax.random.split(jax.random.PRNGKey(seed))
         state = self._reset(env_params, key_reset)
         carry = self._carry(state)
+        # In pieces, so that an evaluation whose episodes are all over can end early.
         for i in range(math.ceil(self.env.episode_steps / _PIECE)):
             carry = self._piece(env_params, agent_params, carry, jax.random.fold_in(key, i))
             # Looked at between pieces only: a test in every step would wait for the device.
@@ -138,6 +139,7 @@ def score(result: dict[str, np.ndarray], interval: float) -> Score:
         ends={
             "success": float(success.mean()),
             **ends,
+            # What no end names was cut off; rounding must not make it negative.
             "time": max(0.0, 1.0 - float(success.mean()) - sum(ends.values())),
         },
         **(_costs(result) if "travelled" in result else {}),
@@ -151,6 +153,7 @@ def _costs(result: dict[str, np.ndarray]) -> dict[str, float]:
     km = max(float(travelled.sum()) / 1000.0, 1e-9)
     return {
         "spl": float((result["success"] * direct).mean()),
+        # Of all ways together: the mean of ratios would weigh short drives most.
         "collisions_per_km": float(result["collisions"].sum()) / km,
         "wh_per_km": float(result["energy"].sum()) / 3600.0 / km,
         "slip": float(result["slip"].mean()),

@@ -46,6 +46,7 @@ def start(state: State, action: Any) -> Guard:
 def watch(guard: Guard, before: State, action: Any, after: State, iteration: Any) -> Guard:
     """Looks at one step of a batch; remembers the first environment that broke, as it was before the step."""
     fine = jnp.isfinite(after.reward) & jnp.isfinite(after.final_obs).all(-1) & jnp.isfinite(after.obs).all(-1)
+    # Only what a learner reads: an inner state may hold infinities by design.
     fine = fine & jnp.isfinite(after.final_privileged).all(-1)
     # argmin of booleans is the first false one.
     first = jnp.argmin(fine)

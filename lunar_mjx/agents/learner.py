@@ -154,7 +154,9 @@ class Learner:
         self._epoch = self._over_devices(self._epoch_share, (shared, self.specs), (self.specs, reports), donate=(1,))
 
     def _over_devices(self, function: Any, ins: Any, outs: Any, donate: tuple[int, ...] = ()) -> Any:
+        # Each device runs its own environments; only gradients and statistics cross between them.
         mapped = jax.shard_map(function, mesh=self.mesh, in_specs=ins, out_specs=outs, check_vma=False)
+        # The state is donated: a buffer of millions of transitions exists once.
         return jax.jit(mapped, donate_argnums=donate)
 
     def init(self, seed: int) -> TrainState:
@@ -188,6 +190,7 @@ class Learner:
 
     def abstract(self) -> TrainState:
         """Shapes, types and shardings of a state, without making one."""
+        # Shapes without memory: a resumed training would otherwise hold its state twice.
         shapes = jax.eval_shape(self._init, self.env.params, jax.random.PRNGKey(0))
         return jax.tree.map(
             lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), shapes, self.shardings(shapes)
@@ -207,6 +210,7 @@ class Learner:
         c, mine = self.config, self.config.envs // self.devices
         key_agent, key_env, key_run = jax.random.split(key, 3)
         rank = jax.lax.axis_index(AXIS)
+        # By rank, or all devices would drive the same episodes.
         env = self.env.reset(params, jax.random.split(jax.random.fold_in(key_env, rank), mine))
         action = jnp.zeros((mine, self.env.action_size), env.obs.dtype)
         example = _transition(env, action, env)
@@ -257,6 +261,7 @@ class Learner:
         new = dataclasses.replace(
             state,
             env=env,
+            # The true successors: `obs` may already be the next episode's.
             statistics=self._counted(state.statistics, env.final_obs, env.final_privileged),
             buffer=self.buffer.insert(state.buffer, _transition(state.env, action, env)),
             key=key[None],
@@ -294,6 +299,7 @@ class Learner:
         algorithm = self.config.algorithm
         assert isinstance(algorithm, PPOConfig)
         state, (seen, rows, observed) = jax.lax.scan(step, state, length=algorithm.unroll)
+        # scan stacks by time; minibatches are drawn by environment.
         rollout = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), rows)
         agent, losses = self.agent.update(state.agent, rollout, jax.random.fold_in(state.key[0], 1), AXIS)
         # after the updates: divergence and ratios are of the policy that acted
@@ -301,6 +307,7 @@ class Learner:
 
     def _seen(self, env: State) -> dict[str, Any]:
         """Of a step, what the reports need: sums over episodes that ended, means over steps for `reward_` terms."""
+        # Sums and counts instead of means: episodes of an epoch weigh alike, whenever they end.
         ended = {k: jnp.sum(jnp.where(env.done, v, 0.0)) for k, v in env.metrics.items() if not k.startswith("reward_")}
         means = {k: jnp.mean(v) for k, v in env.metrics.items() if k.startswith("reward_")}
         seen = {"ended": ended, "count": jnp.sum(env.done), "means": {**means, "reward": jnp.mean(env.reward)}}
@@ -327,6 +334,7 @@ class Learner:
         def wait(agent: Any) -> Any:
             return agent, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(learn, agent)[1])
 
+        # One program for both times: the buffer must hold whole n-step transitions first.
         agent, losses = jax.lax.cond(state.iterations >= c.random_steps, learn, wait, state.agent)
         return dataclasses.replace(state, agent=agent), losses
 

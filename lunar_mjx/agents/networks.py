@@ -68,6 +68,7 @@ def make_actor(
     module = mlp((*layers, actions), activation, layer_norm)
 
     def init(key: Any) -> Any:
+        # Scaled after the initialiser, so that hidden layers keep their own.
         params = module.init(key, jnp.zeros((1, obs)))
         last = f"hidden_{len(layers)}"
         inner = params["params"]
@@ -90,6 +91,7 @@ def make_critics(
 
     def init(key: Any) -> Any:
         one = jnp.zeros((1, obs + actions))
+        # One set of weights with a leading axis: all critics are one batched product.
         return jax.vmap(lambda k: module.init(k, one))(jax.random.split(key, count))
 
     def apply(params: Any, x: Any, action: Any) -> Any:
@@ -100,4 +102,5 @@ def make_critics(
 
 def first_critic(params: Any) -> Any:
     """The parameters of the first critic alone, still with the leading axis."""
+    # The axis stays, so that the same function applies them.
     return jax.tree.map(lambda a: a[:1], params)

@@ -64,6 +64,7 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     options = options or {}
     if name in AGENTS:
         if name == "mapper" and task in TASKS and "observations" not in options:
+            # The mapper drives by a block that policies do not all have.
             options = {**options, "observations": (*TASKS[task].observations, "plan")}
         env = make("navigation", **{"task": task, **options})
         unseen = {"terrain": "world:heldout", "ranges": "unseen"} if task == "large" else {}
@@ -84,7 +85,9 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     if not made_in:
         remedy = "take its actions in Python by load_policy, or train it in an environment that has a name"
         raise bad_input(path, "environment.name", None, "says of no environment how it is made", remedy)
+    # JSON knows lists only; settings are compared as tuples.
     arguments = {k: tuple(v) if isinstance(v, list) else v for k, v in made_in["options"].items()}
+    # A policy may name a Python file as its environment, which would run.
     require_trust(path, "environment.name", made_in["name"])
     env = make(made_in["name"], **{**arguments, **options})
     if env.observation_size != policy.network["obs"] or env.action_size != policy.network["actions"]:
@@ -192,6 +195,7 @@ class Episode:
                     raise
             else:
                 ground = float(height(terrain.field, *self.goal[:2]))
+                # Smoothed over a second, or the camera shakes with the rover.
                 yaw = ndimage.gaussian_filter1d(np.unwrap(self.yaw), 1.0 / self.env.control_interval, mode="nearest")
                 frames = [camera.frame(self.qpos[i], float(yaw[i]), self.goal, ground, i) for i in steps]
                 camera.close()

@@ -117,6 +117,7 @@ def load_policy(path: str | Path) -> Policy:
     try:
         # NumPy leaves a file open that is no archive
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            # JSON within the archive: no pickle, and readable by anything.
             record = json.loads(str(data["record"]))
             arrays = {name: data[name] for name in data.files if name != "record"}
         _Record.model_validate(record)
@@ -125,6 +126,7 @@ def load_policy(path: str | Path) -> Policy:
         raise UserError(f"{path}: is no policy ({reason}); give an .npz that `lunar-mjx train` wrote.") from None
     environment = record["environment"]
     if environment.get("name") == "navigation" and not {"model", "preset"} & environment["options"].keys():
+        # A policy's physics must not change with the default.
         environment["options"]["preset"] = FORMER_PRESET
     if record.get("format") != FORMAT:
         raise bad_input(path, "format", record.get("format"), "is not known", f"give a file of format {FORMAT}")
@@ -140,6 +142,7 @@ def load_policy(path: str | Path) -> Policy:
             raise UserError(f"{path}: {name} does not fit the network's {network['obs']} observations; fetch it again.")
     if ("mean" in arrays) != ("deviation" in arrays):
         raise UserError(f"{path}: holds only one of mean and deviation; fetch it again.")
+    # The network's record says which weights must be there, and of what shape.
     shapes = jax.eval_shape(make_actor(**network).init, jax.random.PRNGKey(0))
     leaves = []
     for place, leaf in jax.tree_util.tree_leaves_with_path(shapes):

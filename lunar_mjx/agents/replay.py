@@ -100,6 +100,7 @@ class ReplayBuffer:
         """An empty buffer for transitions like `example`, whose leaves have the leading axis `env`."""
 
         def empty(leaf: Any) -> Any:
+            # Environments first: a device holds whole rings, and sampling never crosses devices.
             return jnp.zeros((leaf.shape[0], self.length, *leaf.shape[1:]), leaf.dtype)
 
         zero = jnp.zeros((), jnp.int32)
@@ -127,14 +128,17 @@ class ReplayBuffer:
         envs = store.reward.shape[0]
         key_env, key_time = jax.random.split(key)
         env = jax.random.randint(key_env, (batch,), 0, envs)
+        # Once full, the slot to be written next holds the oldest step.
         oldest = jnp.where(state.filled < self.length, 0, state.head)
         age = jax.random.randint(key_time, (batch,), 0, jnp.maximum(state.filled - self.n_step + 1, 1))
         window = (oldest + age[:, None] + jnp.arange(self.n_step)) % self.length
         reward, ended, cut = (a[env[:, None], window] for a in (store.reward, store.terminated, store.truncated))
+        # Ends and cuts alike stop the sum; only an end also takes the value away.
         going = jnp.cumprod(1.0 - (ended | cut)[:, :-1].astype(reward.dtype), axis=1)
         alive = jnp.concatenate([jnp.ones((batch, 1), reward.dtype), going], axis=1)
         powers = self.gamma ** jnp.arange(self.n_step, dtype=reward.dtype)
         steps = jnp.sum(alive, axis=1)
+        # The last step that was taken: its successor's value closes the sum.
         last = window[jnp.arange(batch), steps.astype(jnp.int32) - 1]
         stays = 1.0 - store.terminated[env, last].astype(reward.dtype)
         first = window[:, 0]

@@ -43,6 +43,7 @@ def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
     ranges = None
     if options.get("ranges") == "unseen":
         ranges = tuple(unseen.get(r.parameter, r) for r in env.config.randomise)
+    # Any other seed; a prime, far from seeds that are counted up by hand.
     return env.place(model, ranges, seed=env.config.place_seed + 7919, hardness=options.get("hardness"))
 
 
@@ -106,6 +107,7 @@ class Scorer:
         """Scores the policy of a state."""
         if self._evaluator is None:
             self._evaluator = Evaluator(self._env, learner_agent(learner), self._episodes)
+        # To one device: the evaluator is compiled for one, whatever the training's mesh.
         params = jax.device_put(jax.device_get(learner.policy(state)))
         return self._evaluator(self.params, params, seed)
 
@@ -158,6 +160,7 @@ def run_training(
     learner = Learner(env, training.train)
     scorer = Scorer(env, training.unseen, eval_episodes, eval_every, target, folder, environment)
     result = train(learner, run, folder, environment, scorer)
+    # Another seed than the scores during training, by which the best policy was chosen.
     score = scorer.score(learner, result.state, seed=54321)
     record = {
         "training": name,

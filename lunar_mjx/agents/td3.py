@@ -112,6 +112,7 @@ class TD3:
             actor=actor,
             actor_target=jax.tree.map(jnp.copy, actor),
             critic=critic,
+            # Copies: a state is donated to the next epoch, and one buffer may be given away once only.
             critic_target=jax.tree.map(jnp.copy, critic),
             actor_optimiser=self.actor_optimiser.init(actor),
             critic_optimiser=self.critic_optimiser.init(critic),
@@ -130,6 +131,7 @@ class TD3:
         """Actions of the policy with noise of each environment's `deviation`, (env, action)."""
         action = self.act(state.actor, obs)
         noise = jax.random.normal(key, action.shape, obs.dtype)
+        # Each environment keeps its deviation: some explore widely while others show what the policy is worth.
         return jnp.clip(action + deviation[:, None] * noise, -1.0, 1.0)
 
     def update(self, state: TD3State, batch: Batch, key: Any, axis: str | None = None) -> tuple[TD3State, dict]:
@@ -183,14 +185,17 @@ class TD3:
         """What the critics should say: (batch,) returns, or (batch, atom) probabilities."""
         c = self.config
         noise = c.target_noise * jax.random.normal(key, batch.action.shape, batch.action.dtype)
+        # Smooths the target over near actions, so that the policy cannot exploit a spike of the critics.
         noise = jnp.clip(noise, -c.target_clip, c.target_clip)
         action = jnp.clip(self.act(state.actor_target, batch.next_obs) + noise, -1.0, 1.0)
         seen = jnp.concatenate([batch.next_obs, batch.next_privileged], axis=-1)
         out = self.critics.apply(state.critic_target, seen, action)
         reward = c.reward_scale * batch.reward
         if self.support is None:
+            # The least of the critics: the mean of maxima over noisy estimates is too high.
             return reward + batch.discount * jnp.min(out[..., 0], axis=0)
         probabilities = jax.nn.softmax(out, axis=-1)
+        # By the mean, and then its whole distribution: a minimum atom by atom is no distribution.
         least = jnp.argmin(self.mean_value(probabilities), axis=0)
         chosen = jnp.take_along_axis(probabilities, least[None, :, None], axis=0)[0]
         return project(self.support, reward[:, None] + batch.discount[:, None] * self.support, chosen)
@@ -210,6 +215,7 @@ class TD3:
     def actor_loss(self, actor: Any, critic: Any, batch: Batch) -> Any:
         """Minus the first critic's value of the policy's actions."""
         seen = jnp.concatenate([batch.obs, batch.privileged], axis=-1)
+        # The first alone, as in the paper's algorithm: the minimum serves targets.
         out = self.critics.apply(first_critic(critic), seen, self.act(actor, batch.obs))[0]
         value = out[..., 0] if self.support is None else self.mean_value(jax.nn.softmax(out, axis=-1))
         return -jnp.mean(value)
@@ -226,6 +232,7 @@ def _with_params(optimiser: optax.GradientTransformation, params: Any) -> optax.
 
 def polyak(target: Any, new: Any, tau: float) -> Any:
     """(1 - tau) target + tau new."""
+    # One product in place of two.
     return jax.tree.map(lambda t, n: t + tau * (n - t), target, new)
 
 
@@ -239,6 +246,7 @@ def project(support: Any, places: Any, probabilities: Any) -> Any:
       (batch, atom) probabilities at the support.
     """
     step = support[1] - support[0]
+    # Returns beyond the support count as its ends.
     at = jnp.clip((places - support[0]) / step, 0.0, len(support) - 1.0)
     # triangular weights in one fused sum: a scatter would be slow on a GPU, and a matrix product would need them stored
     weights = jnp.clip(1.0 - jnp.abs(at[:, :, None] - jnp.arange(len(support))), 0.0, 1.0)

@@ -137,6 +137,7 @@ class _Loop:
         if self.checkpoints and run.resume:
             restored = self.checkpoints.newest(learner.abstract())
         elif self.checkpoints:
+            # Else the newest of the old training would be resumed by the next command.
             self.checkpoints.clear()
         if restored is not None:
             self.state, notes = restored
@@ -152,6 +153,7 @@ class _Loop:
     def run(self, callback: Callback | None) -> Result:
         c, total = self.config, max(1, math.ceil(self.config.steps / self.per_epoch))
         begin = saved = self.clock()
+        # Time of callbacks is taken off: evaluations shall not shorten a training by time.
         before, stop, outside = self.elapsed, False, 0.0
         while self.epochs < total and not stop:
             tick = self.clock()
@@ -183,6 +185,7 @@ class _Loop:
 
     def _epoch(self) -> dict[str, Any]:
         self.state, (numbers, episodes) = self.learner.epoch(self.learner.env.params, self.state)
+        # Waits for the epoch: from here its time is known.
         row = {k: float(v) for k, v in jax.device_get(numbers).items()}
         first = self.epochs * self.per_epoch
         self.epochs += 1
@@ -196,6 +199,7 @@ class _Loop:
             return
         on_host = jax.device_get(episodes)
         env, step = np.nonzero(on_host["done"])
+        # By the step in which they ended, as one learner meets them.
         order = np.lexsort((env, step))
         env, step = env[order], step[order]
         for name in EPISODE:
@@ -216,6 +220,7 @@ class _Loop:
     def _diverged(self) -> None:
         envs = self.learner.config.envs // self.learner.devices
         seen = everywhere(self.state.guard)
+        # The environments are sound, so the learning diverged.
         if not np.any(seen.tripped):
             raise guard.DivergenceError(
                 "train: the agent's parameters are not finite although all environments are; "
@@ -266,6 +271,7 @@ def only_writer(folder: Path) -> IO[str]:
     try:
         import fcntl
 
+        # A lock of the open file: it falls with the process, where a file that is merely there would stay.
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except ImportError:  # Windows refuses to rename over open files instead
         pass

@@ -139,6 +139,7 @@ def pictures(
       detail: whether parts too small for small pictures are drawn, such as grousers.
       more: `far` and `paint` of `picture`.
     """
+    # Small by default: pictures for learning, not for looking.
     shapes, optics = rover_shapes(rover, detail), camera or Pinhole(64, 48)
     camera_mount = mount or front_mount(rover)
 
@@ -167,6 +168,7 @@ def painted(shade: np.ndarray, low: Any, metres: Any) -> HeightField:
     """
     cols = shade.shape[1]
     cell = float(np.ravel(metres)[0]) / cols
+    # Pictures have the north at the top, fields in the last row.
     values = jnp.asarray(np.asarray(shade, np.float32)[::-1])
     return HeightField(
         values,
@@ -188,11 +190,13 @@ def _brightness(
         mu0 = jnp.sum(face * to_light, axis=-1)
         ground = soil.radiance_factor(mu0, mu, jnp.sum(to_eye * to_light, axis=-1))
         ground = ground * jnp.where(label == ROCK, BATCH_VIEW.rock_brightness, 1.0)
+        # Paint diffuses; regolith throws light back to where it comes from.
         return jnp.where(label == ROVER, jnp.maximum(mu0, 0.0), ground)
 
     direct = under(to_sun) * lit + light.earthshine * under(jnp.asarray(earth, face.dtype))
     # sunlit ground fills the half of the sky below a wall, and a little of it above level ground
     seen = 0.5 * (1.0 - face[..., 2]) + BATCH_VIEW.horizon
+    # By the sine of the Sun's height: low light brings little onto level ground.
     thrown = seen * BATCH_VIEW.lit_ground * jnp.maximum(to_sun[2], 0.0)
     diffuse = jnp.where(label == ROVER, 1.0, soil.radiance_factor(0.5, 1.0, 0.5) / 0.5)
     bright = direct + thrown * diffuse
@@ -216,6 +220,8 @@ def _exposed(bright: Any, light: Light, camera: Pinhole, to_sun: Any, key: Any) 
         value = (1.0 - film.dust) * value + film.dust * veil
     if key is not None and film.full_well > 0.0:
         electrons = film.full_well * jnp.maximum(value, 0.0)
+        # Shot noise is the root of the electrons; read noise adds by its square.
         spread = jnp.sqrt(electrons + film.read_noise**2) / film.full_well
         value = value + spread * jax.random.normal(key, value.shape, value.dtype)
+    # Clipped before gamma, as a sensor saturates in light and not on the screen.
     return jnp.clip(value, 0.0, 1.0) ** (1.0 / film.gamma)

@@ -84,6 +84,7 @@ class RoverCamera:
         self.data = mujoco.MjData(self.model)
         self._chassis = self.model.body(rover.chassis).id
         # The last entry is the sky: geom -1 picks it.
+        # Looked up once: a segmentation is then one indexing.
         self._labels = np.array([_label(self.model.geom(i).name) for i in range(self.model.ngeom)] + [0])
         self._offscreen = Offscreen(
             self.model, max(largest[0], self.camera.width), max(largest[1], self.camera.height), backends
@@ -106,6 +107,7 @@ class RoverCamera:
         if wanted.shape != (self.model.nq,):
             raise bad_input("camera", "qpos", wanted.shape, "has another shape", f"give ({self.model.nq},)")
         self.data.qpos[:] = wanted
+        # Poses alone; dynamics do not show in a picture.
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
@@ -131,6 +133,7 @@ class RoverCamera:
     def picture(self, pose: Pose, camera: Pinhole | None = None) -> np.ndarray:
         """The colours alone, (height, width, 3) uint8: half the work of `take`."""
         at = self.data.xpos[self._chassis]
+        # The shadows' light follows the rover: its shadow map covers some metres only.
         self._offscreen.look(self.data, pose, camera or self.camera, at + 10.0 * self.sun.direction)
         return self._offscreen.colours()
 

@@ -46,6 +46,7 @@ def context_class(backends: Sequence[str] | None = None) -> Any:
       UserError: none works.
     """
     names = tuple(backends) if backends is not None else wanted_backends()
+    # Tried once: a failing backend takes seconds.
     if names not in _chosen:
         _chosen[names] = _first(names)
     return _chosen[names]
@@ -58,6 +59,7 @@ def _first(names: tuple[str, ...]) -> Any:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of OpenGL libraries that find no device
                 context_class = importlib.import_module(f"mujoco.{name}").GLContext
+                # Imported is not working: only a context that is made shows it.
                 context = context_class(64, 64)
                 context.make_current()
                 context.free()
@@ -93,7 +95,9 @@ class Offscreen:
         self._context.make_current()
         self._mjr: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
+        # Freed with the object even if nobody calls close: contexts are few on some drivers.
         self._free = weakref.finalize(self, _free, self._mjr, self._context)
+        # The reversed buffer keeps digits far away, where the usual one has none.
         self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
 
     def look(self, data: Any, pose: Pose, camera: Pinhole, sun: np.ndarray | None = None) -> None:
@@ -119,6 +123,7 @@ class Offscreen:
         """The picture, (height, width, 3) uint8."""
         out = np.empty((self._size[1], self._size[0], 3), np.uint8)
         self._render(out, None)
+        # OpenGL's rows begin at the bottom.
         return out[::-1].copy()
 
     def depth_and_geoms(self) -> tuple[np.ndarray, np.ndarray]:

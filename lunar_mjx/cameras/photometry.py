@@ -52,6 +52,7 @@ class Regolith:
 
     def radiance_factor(self, mu0: Any, mu: Any, cos_phase: Any) -> Any:
         """I/F, of any shape; 0 where light or viewer is below the surface."""
+        # A viewer in the surface's plane divides by zero where the Sun is there, too.
         mu0, mu = jnp.maximum(mu0, 0.0), jnp.maximum(mu, 1e-3)
         if self.law == "lambert":
             return _lambert_albedo(self) * mu0
@@ -72,6 +73,7 @@ class Regolith:
     def _surge(self, cos_phase: Any) -> Any:
         """1 + B_S(g), B_S = B_S0 / (1 + tan(g/2) / h_S)."""
         # tan^2(g/2) = (1 - cos g) / (1 + cos g)
+        # By cosines, so that no angle has to be taken.
         tangent = jnp.sqrt(jnp.maximum(1.0 - cos_phase, 0.0) / jnp.maximum(1.0 + cos_phase, 1e-9))
         return 1.0 + self.surge / (1.0 + tangent / self.surge_width)
 
@@ -125,6 +127,7 @@ class Film:
         """Display value of I/F = 1; `sun_height` is the sine of the Sun's elevation."""
         if self.exposure is not None:
             return self.exposure
+        # A camera that exposed for a set Sun would show noise.
         mu0 = jnp.maximum(sun_height, _LOWEST_SUN)
         # across the light, the cosine between viewer and light is the product of their heights
         return self.mid / soil.radiance_factor(mu0, _METERED, mu0 * _METERED)

@@ -143,6 +143,7 @@ def contract_of(policy: Policy, env: Any, source: str, sha256: dict[str, str]) -
         "environment": policy.environment,
         "notes": policy.notes,
         "control_interval_s": env.control_interval,
+        # Both interval and rate: robots are set up by either.
         "rate_hz": 1.0 / env.control_interval,
         "normalisation": _normalisation(policy),
     }
@@ -187,6 +188,7 @@ def _blocks(env: NavigationEnv) -> list[Block]:
     return [
         Block(
             name=name,
+            # The block's own docstring, so that contract and code cannot differ.
             about=" ".join((inspect.getdoc(BLOCKS[name]) or "").split()),
             start=env.blocks[name].start,
             names=[label.name for label in parts],
@@ -202,6 +204,7 @@ def _joints(env: NavigationEnv) -> list[Joint]:
         rover.joints, env.actions.source, env.actions.scale, env.actions.mode, strict=True
     ):
         word, unit = MODES[int(mode)]
+        # JSON has no infinity.
         low, high = (value if math.isfinite(value) else None for value in map(float, rover.joint_limits[name]))
         joints.append(
             Joint(name=name, mode=word, unit=unit, action=int(source), scale=float(scale), low=low, high=high)  # type: ignore[arg-type]

@@ -53,6 +53,7 @@ class Policy:
         path = os.path.join(folder, "policy.onnx")
         with open(path, "rb") as file:
             content = file.read()
+        # Weights and meaning travel as two files: a mix of two exports would drive somehow.
         if hashlib.sha256(content).hexdigest() != self.contract["sha256"].get("policy.onnx"):
             raise ContractError(f"{path}: is not the file that the contract was written for; export the policy again.")
         wrong = [j["name"] for j in self.contract["joints"] if j["mode"] not in FIELD]
@@ -87,6 +88,7 @@ class Acceleration:
         p, v, a = self.state
         t = self.interval
         p, v = p + t * (v + 0.5 * t * a), v + t * a
+        # The last gain is the steady one.
         gain = self.gains[min(self.count, len(self.gains) - 1)]
         error = np.stack([position - p, velocity - v])
         self.state, self.count = np.stack([p, v, a]) + gain @ error, self.count + 1

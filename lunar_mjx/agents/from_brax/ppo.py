@@ -127,11 +127,14 @@ class PPO:
         module = mlp((*c.critic_layers, 1), c.activation, c.layer_norm)
         self.value = brax_networks.FeedForwardNetwork(
             init=lambda key: module.init(key, jnp.zeros((1, obs + privileged))),
+            # Brax hands on its own normaliser first; observations come normalised here.
             apply=lambda _, params, seen: module.apply(params, seen)[..., 0],
         )
         self.networks = PPONetworks(self.network, self.value, self.distribution)
         self.optimiser = optax.chain(
-            optax.clip_by_global_norm(c.max_gradient), optax.inject_hyperparams(optax.adam)(learning_rate=c.rate)
+            # As a hyperparameter in the state: the rate follows the divergence from update to update.
+            optax.clip_by_global_norm(c.max_gradient),
+            optax.inject_hyperparams(optax.adam)(learning_rate=c.rate),
         )
 
     def init(self, key: Any) -> PPOState:
@@ -151,6 +154,7 @@ class PPO:
         """Draws from the policy for observations (env, obs): actions, and of `Rollout` raw, logits and log_prob."""
         logits = self.network.apply(None, state.params.policy, obs)
         raw = self.distribution.sample_no_postprocessing(logits, key)
+        # Raw actions are kept: the inverse of the squashing loses digits at the bounds.
         return self.distribution.postprocess(raw), raw, logits, self.distribution.log_prob(logits, raw)
 
     def loss(self, params: Any, data: Any, key: Any) -> tuple[Any, dict[str, Any]]:
@@ -184,6 +188,7 @@ class PPO:
             observation=rollout.seen,
             action=rollout.raw,
             reward=rollout.reward,
+            # Ends and cuts alike; brax tells them apart by `truncation`.
             discount=1.0 - rollout.done,
             next_observation=rollout.next_seen,
             extras={

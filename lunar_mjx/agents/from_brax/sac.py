@@ -103,6 +103,7 @@ class SAC:
         )
         values = brax_networks.FeedForwardNetwork(
             init=self.critics.init,
+            # Brax wants critics last.
             apply=lambda _, params, seen, action: jnp.moveaxis(self.critics.apply(params, seen, action)[..., 0], 0, -1),
         )
         self.losses = brax_losses.make_losses(
@@ -156,6 +157,7 @@ class SAC:
             gradient_update_fn(loss, optimiser, axis)
             for loss, optimiser in zip(self.losses, self.optimisers, strict=True)
         )
+        # The logarithm is learnt, so that the temperature stays positive.
         alpha = jnp.exp(state.temperature)
         temperature_loss, temperature, temperature_optimiser = of_temperature(
             state.temperature, state.actor, None, data, keys[0], optimizer_state=state.temperature_optimiser
@@ -173,6 +175,7 @@ class SAC:
         actor_loss, actor, actor_optimiser = of_actor(
             state.actor, None, state.critic, alpha, data, keys[2], optimizer_state=state.actor_optimiser
         )
+        # The policy has no target: its entropy keeps it from jumping.
         target = jax.tree.map(lambda t, n: t + c.tau * (n - t), state.critic_target, critic)
         new = SACState(actor, critic, target, temperature, actor_optimiser, critic_optimiser, temperature_optimiser)
         return new, {

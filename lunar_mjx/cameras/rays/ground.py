@@ -80,6 +80,7 @@ def tables(terrain: Terrain) -> tuple[Grid, Tables]:
     field = terrain.field
     heights = field.heights
     rows, cols = heights.shape
+    # A square pyramid of a power of two, whatever the grid: levels are then shifts of indices.
     levels = math.ceil(math.log2(max(rows, cols) - 1))
     cells = jnp.maximum(
         jnp.maximum(heights[:-1, :-1], heights[1:, :-1]), jnp.maximum(heights[:-1, 1:], heights[1:, 1:])
@@ -90,12 +91,14 @@ def tables(terrain: Terrain) -> tuple[Grid, Tables]:
         zero = jnp.zeros(1, dtype)
         rock_shape, rock, stones, places = (0, 0), jnp.zeros(1, jnp.int32), zero, (zero[0],) * 3
     else:
+        # Spheres as ellipsoids: one formula, and no branch between them.
         rocks = with_forms(rocks)
         rock_shape, rock, places = rocks.index.shape, rocks.index.reshape(-1), (rocks.x0, rocks.y0, rocks.cell)
         parts = [rocks.centers, rocks.radii[:, None], jnp.asarray(rocks.forms)]
         stones = jnp.concatenate(parts, axis=1).astype(dtype).reshape(-1)
         cells = jnp.maximum(cells, _stones_over(terrain, rocks, (rows - 1, cols - 1)))
     side = 2**levels
+    # Beyond the grid lies nothing that a ray could meet.
     level = jnp.pad(cells, ((0, side - rows + 1), (0, side - cols + 1)), constant_values=LOW)
     pyramid = [level]
     while level.shape[0] > 1:
@@ -123,6 +126,7 @@ def _stones_over(terrain: Terrain, rocks: Any, shape: tuple[int, int]) -> Any:
     # beyond its edges the grid of the rocks continues
     x_gap = jnp.maximum(jnp.maximum(west - centre[..., 0], centre[..., 0] - west - rocks.cell), 0.0)
     y_gap = jnp.maximum(jnp.maximum(south[:, None] - centre[..., 1], centre[..., 1] - south[:, None] - rocks.cell), 0.0)
+    # A per cent more: a bound that is too high costs a step, one too low loses a rock's edge.
     over = (x_gap**2 + y_gap**2 < (radius * 1.01) ** 2) & (radius > 0.0)
     tops = jnp.where(over, centre[..., 2] + radius, LOW)
 
@@ -148,6 +152,7 @@ def _stones_over(terrain: Terrain, rocks: Any, shape: tuple[int, int]) -> Any:
 
 def over(value: Any) -> Any:
     """1 / value without a division by zero."""
+    # The sign is kept: it tells on which side a ray leaves.
     return 1.0 / jnp.where(jnp.abs(value) < 1e-9, jnp.where(value < 0, -1e-9, 1e-9), value)
 
 
@@ -182,6 +187,7 @@ def meet(
     ends_u = (-u0 * iu, (grid.cols - 1 - u0) * iu)
     ends_v = (-v0 * iv, (grid.rows - 1 - v0) * iv)
     ceiling = (top - origin.z) * iz
+    # Slabs: a ray is within the grid between its latest entry and its earliest exit.
     start = jnp.maximum(jnp.maximum(start, jnp.minimum(*ends_u)), jnp.minimum(*ends_v))
     end = jnp.minimum(jnp.minimum(end, jnp.maximum(*ends_u)), jnp.maximum(*ends_v))
     start = jnp.maximum(start, jnp.where(dz < 0.0, ceiling, start))
@@ -196,6 +202,7 @@ def meet(
 
     def leave(i: Any, j: Any, level: Any, t: Any) -> tuple[Any, Any]:
         """Where a ray leaves square (i, j), and whether it leaves the square above, too."""
+        # The edge ahead: the eastern one for rays that go east, the square's own for others.
         tu = (((i + east_i) << level).astype(u0.dtype) - u0) * iu
         tv = (((j + north_i) << level).astype(u0.dtype) - v0) * iv
         # the odd half of the square above is the eastern, northern one
@@ -216,12 +223,14 @@ def meet(
         out, outer = leave(i, j, level, t)
         out = jnp.minimum(out, end)
         now, then = origin.z + dz * t, origin.z + dz * out
+        # A ray is straight, so its lower end within the square decides.
         above = jnp.minimum(now, then) > highest
         # what comes down from above goes on to where it may touch
         down = jnp.where((now > highest) & ~above, jnp.maximum((highest - origin.z) * iz - nudge, t), t)
         going = state > 0
         before = going & ~above & (level == 0)
         t = jnp.where(going, jnp.where(above, out, down), t)
+        # Coarser again only when the next larger square is left, too: else it would be asked twice.
         level = jnp.where(going, jnp.where(above, jnp.minimum(level + outer, grid.levels), level - 1), level)
         state = jnp.where(going & (t >= end), 0, jnp.where(before, -1, state))
         return count + 1, t, jnp.maximum(level, 0), state
@@ -238,6 +247,7 @@ def meet(
         far = jnp.minimum(out, end) - t
         found, which = _in_cell(grid, table, load, origin, direction, (u0, v0, du, dv), (i, j), t, far, nudge)
         before = state < 0
+        # Up to the nudge beyond the cell, so that no ray slips through between two.
         hit = before & (found <= jnp.minimum(far + nudge, end - t))
         t = jnp.where(hit, t + found, jnp.where(before, t + far, t))
         rock = jnp.where(hit, which, rock)
@@ -277,6 +287,7 @@ def _in_cell(
     g2 = -c * du * dv
     root = g1 * g1 - 4.0 * g2 * g0
     # with g0 > 0, the first root ahead is the one whose inverse is largest
+    # Multiplied out, since g2 is zero along the grid's axes, where the usual formula divides by it.
     inverse = jnp.sqrt(jnp.maximum(root, 0.0)) - g1
     soil = jnp.where((root >= 0.0) & (inverse > 0.0), 2.0 * g0 / jnp.where(inverse > 0.0, inverse, 1.0), FAR)
     best, which = jnp.where(g0 <= 0.0, 0.0, soil), jnp.full_like(i, -1)
@@ -312,6 +323,7 @@ def _enter(load: Load, stones: Any, number: Any, here: Vec3, direction: Vec3) ->
     away = here - centre
     a, b, c = form.between(direction, direction), form.between(direction, away), form.between(away, away) - 1.0
     root = b * b - a * c
+    # The nearer root is where the ray enters.
     entry = (-b - jnp.sqrt(jnp.maximum(root, 0.0))) * over(a)
     ahead = jnp.where((root > 0.0) & (entry > 0.0), entry, FAR)
     return jnp.where(radius > 0.0, jnp.where(c < 0.0, 0.0, ahead), FAR)
@@ -331,6 +343,7 @@ def slope_normal(grid: Grid, table: Tables, load: Load, x: Any, y: Any) -> Vec3:
         high = load(table.heights, k + grid.cols) * (1.0 - s) + load(table.heights, k + grid.cols + 1) * s
         return low * (1.0 - r) + high * r
 
+    # Smooth shading: facets of bilinear patches would show as a checkerboard under a low Sun.
     twice = 0.5 / cell
     east, north = (height(u + 1.0, v) - height(u - 1.0, v)) * twice, (height(u, v + 1.0) - height(u, v - 1.0)) * twice
     return Vec3(-east, -north, jnp.ones_like(east)).unit()

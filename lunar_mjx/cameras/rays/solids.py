@@ -31,6 +31,7 @@ def table(kind: np.ndarray, place: Any, turn: Any, size: Any) -> Any:
     x, y, z = size[:, 0], size[:, 1], size[:, 2]
     box, cylinder = jnp.sqrt(x * x + y * y + z * z), jnp.sqrt(x * x + y * y)
     rest = jnp.where(kind == CAPSULE, x + y, jnp.max(size, axis=1))
+    # Radius of the sphere that holds each, which sorts out most rays by a few products.
     held = jnp.where(kind == BOX, box, jnp.where(kind == CYLINDER, cylinder, rest))
     middle = jnp.mean(place, axis=0)
     reach = jnp.max(jnp.sqrt(jnp.sum((place - middle) ** 2, axis=1)) + held)
@@ -57,6 +58,7 @@ def meet(counts: tuple[int, ...], table: Any, load: Load, origin: Vec3, directio
         along = away.dot(direction)
         passes = away.dot(away) - along * along * inverse <= held * held
         reaches = along + held * jnp.sqrt(squared) >= 0.0
+        # What begins behind the nearest hit cannot be seen.
         begins = along - held * jnp.sqrt(squared) <= before * squared
         return (passes & reaches & begins & (before > 0.0)).astype(jnp.int32)
 
@@ -65,6 +67,7 @@ def meet(counts: tuple[int, ...], table: Any, load: Load, origin: Vec3, directio
 
     def each(carry: tuple) -> tuple:
         first = 0
+        # Sorted by kind, so that each loop has one formula and no choice within.
         for kind, count in enumerate(counts):
 
             def body(k: Any, carry: tuple, kind: int = kind) -> tuple:
@@ -85,6 +88,7 @@ def meet(counts: tuple[int, ...], table: Any, load: Load, origin: Vec3, directio
 
     whole = [load(table, WIDTH * sum(counts) + i) for i in range(4)]
     carry = (end, jnp.full(end.shape, -1, jnp.int32))
+    # Most tiles miss the whole rover, and skip all of its parts.
     best, which = jax.lax.cond(some(Vec3(*whole[:3]), whole[3], end), each, lambda c: c, carry)
     return jnp.where(which >= 0, best, FAR), which
 

@@ -100,6 +100,7 @@ def trace(
     counts = (0,) * 4 if bodies is None else bodies.counts
     plan = _Plan(grid, counts, camera.width, camera.height, float(camera.focal), float(camera.near), to_sun is not None)
     sun = jnp.zeros(3, dtype) if to_sun is None else jnp.asarray(to_sun, dtype)
+    # One short array: a kernel takes arrays only, and each has a cost of its own.
     view = jnp.concatenate([position, turn.reshape(-1), sun, jnp.asarray(far, dtype)[None]])
     shapes = jnp.zeros(solids.WIDTH, dtype) if bodies is None else bodies.table
     if kernel == "arrays" or (kernel == "auto" and jax.default_backend() != "gpu"):
@@ -107,6 +108,7 @@ def trace(
     elif kernel == "interpreted":
         found = _by_kernel(plan, table, view, shapes, interpret=True)
     else:
+        # Chosen when the program is lowered: the same traced function may run on a CPU later.
         found = jax.lax.platform_dependent(
             table, view, shapes, cuda=functools.partial(_by_kernel, plan), default=functools.partial(_by_arrays, plan)
         )
@@ -124,6 +126,7 @@ def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, colu
     position, sun = (Vec3(*(view[k] for k in range(n, n + 3))) for n in (0, 12))
     turn, far = [view[k] for k in range(3, 12)], view[15]
     dtype = far.dtype
+    # Through the middle of pixels; rows count downward, the picture's y upward.
     px = (column.astype(dtype) + (0.5 - 0.5 * plan.width)) * (1.0 / plan.focal)
     py = ((0.5 * plan.height - 0.5) - row.astype(dtype)) * (1.0 / plan.focal)
     direction = Vec3(*(turn[3 * i] * px + turn[3 * i + 1] * py - turn[3 * i + 2] for i in range(3)))
@@ -135,10 +138,12 @@ def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, colu
     if sum(plan.counts):
         # what lies before the near plane is not seen
         step = plan.near
+        # Begun at the near plane: the camera sits in the rover's own head.
         near, shape = solids.meet(plan.counts, shapes, load, eye + direction * step, direction, t - step)
         on_rover = shape >= 0
         t, label = jnp.where(on_rover, near + step, t), jnp.where(on_rover, ROVER, label)
         which = jnp.where(on_rover, shape, 0)
+    # Directions have length 1 along the optical axis, so that t is the depth.
     depth = jnp.where(label == SKY, jnp.inf, t)
     if not plan.shaded:
         return depth, label, which, zero, zero, zero, zero
@@ -151,6 +156,7 @@ def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, colu
         face = solids.normal(plan.counts, shapes, load, which, point).where(label == ROVER, face)
     # no ray for what is turned away from the Sun, nor below the horizon
     sought = (label != SKY) & (face.dot(sun) > 0.0) & (sun.z > 0.0)
+    # Off the surface along its normal, or rounding would let the surface shade itself.
     start, way = point + face * SKIN, Vec3(*(s + zero for s in sun))
     end = jnp.where(sought, FAR, -FAR)
     if sum(plan.counts):
@@ -164,6 +170,7 @@ def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, colu
 
 def _by_arrays(plan: _Plan, table: Tables, view: Any, shapes: Any) -> tuple:
     """`_pixels` on arrays, some rows of the picture after the other."""
+    # A loop over arrays ends with its slowest ray; few rays wait for it here.
     rows = max(1, min(plan.height, AT_ONCE // plan.width))
     parts = math.ceil(plan.height / rows)
 
@@ -189,10 +196,12 @@ def _by_kernel(plan: _Plan, table: Tables, view: Any, shapes: Any, interpret: bo
     def program(*refs: Any) -> None:
         given, view_ref, shapes_ref, out = Tables(*refs[:5]), refs[5], refs[6], refs[7:]
         number, lane = pallas.program_id(0), jnp.arange(wide * high, dtype=jnp.int32)
+        # Tiles and not rows: neighbouring rays ask the same squares, which then are in the cache.
         column = (number % across) * wide + lane % wide
         row = (number // across) * high + lane // wide
         found = _pixels(plan, given, view_ref, shapes_ref, load, column, row)
         kept = (column < plan.width) & (row < plan.height)
+        # Pixels beyond the edge aim at the first one, and the mask keeps them from writing.
         place = jnp.where(kept, row * plan.width + column, 0)
         for ref, value in zip(out, found, strict=True):
             triton.store(ref.at[place], value, mask=kept)
