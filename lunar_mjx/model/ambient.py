@@ -34,5 +34,6 @@ class Ambient:
 
     def under(self, sun: Any) -> Any:
         """Temperature, K, where the sine of the Sun's elevation is `sun` times its highest."""
+        # The inner `where` keeps the root's infinite derivative at sunset out of gradients.
         up = jnp.where(sun > 0.0, jnp.where(sun > 0.0, sun, 1.0) ** 0.25, 0.0)
         return self.night + (self.noon - self.night) * up

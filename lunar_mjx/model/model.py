@@ -106,6 +106,7 @@ class Model:
         kept = [e for e in self.effects if e.name not in added.replaces]
         # In the place of the first that it replaces: order within a port may matter.
         kept.insert(replaced[0] if replaced else len(kept), added)
+        # Values of effects that are gone must not be saved.
         parameters = {k: v for k, v in self.parameters.items() if k not in added.replaces}
         parameters[added.name] = added.nominal()
         files = {k: v for k, v in self.effect_files.items() if k not in added.replaces}
@@ -147,6 +148,7 @@ class Model:
                 _check_length(self.rover, effect, key, checked, source)
             new[key] = checked
         model = dataclasses.replace(self, parameters={**self.parameters, name: new})
+        # After all values are set: an order of setting must not refuse what is sound in the end.
         effect.check_together(new, [wheel.width for wheel in self.rover.wheels], source)
         return model
 
@@ -286,6 +288,7 @@ def check_settings(model: Model, source: str | Path) -> None:
     """
     if require_finite(source, "gravity_m_s2", model.gravity) < 0.0:
         raise bad_input(source, "gravity_m_s2", model.gravity, "is negative", "give the magnitude; it points down")
+    # Beyond, explicit contact forces are unstable; below, a drive takes days.
     if not 1e-5 <= require_finite(source, "timestep_s", model.timestep) <= 0.02:
         raise bad_input(source, "timestep_s", model.timestep, "is outside [1e-5, 0.02] s", "use about 0.002 s")
     if model.thermal_integrator not in THERMAL_INTEGRATORS:
@@ -357,9 +360,11 @@ def settled(kind: str, spec: str | Path, marker: str) -> str:
       A shipped one's name, else the absolute path where there is such a file or folder, else `spec` itself.
     """
     path = Path(spec)
+    # A shipped name, or a spec that no file stands for.
     if not path.is_file() and not (path / marker).is_file():
         return str(spec)
     full = path.resolve()
+    # By name, so that a saved model survives another installation.
     return full.name if full.is_dir() and full.parent == shipped(kind).resolve() else str(full)
 
 
@@ -401,6 +406,7 @@ def make_model(
         effects=effects,
         parameters={e.name: e.nominal() for e in effects},
         preset=preset,
+        # The paper's own integration; Heun is of second order at twice the heat's cost.
         thermal_integrator="euler" if preset == "paper" else "heun",
         modes=modes,
         gravity=LUNAR_GRAVITY if loaded.gravity is None else loaded.gravity,
@@ -409,6 +415,7 @@ def make_model(
     )
     if preset in presets.PRESET_AMBIENT:
         model = dataclasses.replace(model, ambient=(*presets.PRESET_AMBIENT[preset], 0.0, SYNODIC_DAY))
+    # The preset after the rover: a preset may state another gear.
     model = preset_values(rover_motors(model))
     model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded))
     return model.replace(**changes, gains=given_gains)
@@ -441,6 +448,7 @@ def _gains_of_gear(model: Model, rover: Rover) -> dict[str, tuple[float, float]]
         rotor = group.rotor_inertia / rover.wheels_per_motor(group.joints[0])
         # The compiled inertia holds the rotor through the rover's own gear already; only the difference is added.
         reflected = rotor * (ratio**2 - group.gear_ratio**2)
+        # Gains in proportion to the inertia keep the loop's bandwidth.
         scale = (inertia + reflected) / inertia
         gains[group.name] = (group.position_gain * scale, group.velocity_gain * scale)
     return gains

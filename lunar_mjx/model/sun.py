@@ -89,6 +89,7 @@ def read_sun(path: Path, table: Mapping[str, Any]) -> SunSettings:
             raise bad_input(path, f"sun.{key}", value, f"is not {wanted}", f"give {wanted}")
         values[key] = kind(value)
     if "horizon_dem" in values:
+        # Paths count from the file that says them.
         values["horizon_dem"] = str(path.parent.resolve() / values["horizon_dem"])
     return SunSettings(**values)
 
@@ -101,6 +102,7 @@ def make_sun(settings: SunSettings | None, terrain: Terrain) -> Sun | None:
     """
     if settings is None:
         return None
+    # Computed on the host once; a step then only looks it up.
     horizon = _horizon(terrain, settings.horizon_dem) if settings.horizon else None
     if settings.date is None:
         return fixed_sun(settings.azimuth_deg, settings.elevation_deg, settings.irradiance_W_m2, horizon, _float())

@@ -46,11 +46,13 @@ def wheel_contact(
     normal = np.empty(c.wheel_position.shape)
     normal[..., 0], normal[..., 1], normal[..., 2] = -slope_x * up, -slope_y * up, up
     lean = dot(c.wheel_axle, normal)
+    # The floors are the JAX effects' own, as numbers of the model: engines are compared to rounding.
     level = np.sqrt(np.maximum(1.0 - lean * lean, 1e-6))  # cosine of the wheel's camber against the ground
     sinkage = np.maximum(radius * level - (c.wheel_position[..., 2] - height) * up, 0.0)
     forward = cross(c.wheel_axle, normal)
     forward /= np.sqrt(np.maximum(dot(forward, forward), 1e-12))[..., None]
     left = cross(normal, forward)
+    # Most models have no toe; the branch saves the products.
     if toe.any():
         cos, sin = np.cos(toe)[..., None], np.sin(toe)[..., None]
         forward, left = forward * cos + left * sin, left * cos - forward * sin
@@ -107,6 +109,7 @@ def rim_plane(c: Context, field: Grid, moved: Moved | None = None) -> tuple[np.n
     clear = center[..., 2, None] - foot[..., None] - along
     depth = 1.0 + CONTACT.margin - np.sqrt(u * u + clear * clear) / r[..., None]
     weight = np.maximum(depth, 0.0) ** 2 + CONTACT.airborne * (np.abs(ALONG) < 0.3)
+    # Normalised once; the JAX effect divides by the sum instead, which is the same line.
     weight /= weight.sum(-1, keepdims=True)
     mean_u, mean_h = (weight * u).sum(-1), (weight * along).sum(-1)
     off = u - mean_u[..., None]
@@ -126,6 +129,7 @@ def side_speed(contact: Values) -> np.ndarray:
     braking = (np.abs(rim) <= np.abs(v_x)) & (np.abs(v_x) > CONTACT.standing)
     if not braking.any():
         return v_y
+    # Divided only where wheels brake: elsewhere v_x may be zero.
     ratio = np.divide(rim, v_x, out=np.ones_like(rim), where=braking)
     return v_y * (2.0 - clamp(ratio, -1.0, 1.0))
 

@@ -57,8 +57,10 @@ class ForceModel:
         self._normal = tuple((_NORMAL[n], numbers.effects[n]) for n in order if n in _NORMAL)
         self._shear = tuple((_SHEAR[n], numbers.effects[n]) for n in order if n in _SHEAR)
         self._body = tuple((n, _BODY.get(n), numbers.effects[n]) for n in order if n in (*_BODY, "parking_brake"))
+        # -1 stands for no steering joint: index 0 is read and multiplied by zero.
         self._steer, self._steered = np.maximum(numbers.steer, 0), (numbers.steer >= 0).astype(float)
         self._nominal = self._drawn()
+        # Computed once: the soil is the same everywhere and always.
         self._uniform = soil.uniform_soil(numbers.effects.get("soil"), self._nominal["radius"])
 
     def _drawn(self) -> Values:
@@ -112,6 +114,7 @@ class ForceModel:
           c: context that `start` completed.
           state: the effects' state, left as it is.
         """
+        # A copy of the table, not of the arrays: functions return new ones.
         new = dict(state)
         self._motor(c, state, new)
         self._contact(c, state)
@@ -144,6 +147,7 @@ class ForceModel:
                 c.resistance_factor = changed["resistance"] / resistance
                 resistance, constant = changed["resistance"], changed["torque_constant"]
             c.resistance, c.torque_constant = resistance, constant
+        # Before the voltage limit, as a controller asks before the amplifier gives.
         c.current = hooks.call("current", c, current) if "current" in hooks else current
         if "voltage_saturation" in effects:
             p = effects["voltage_saturation"]
@@ -162,6 +166,7 @@ class ForceModel:
         hooks = self.hooks
         c.geometry = self._nominal
         if "geometry" in hooks:
+            # Copies: hooks may write, and the nominal geometry serves every step.
             c.geometry = hooks.call("geometry", c, {k: v.copy() for k, v in self._nominal.items()})
         place = c.wheel_position
         wheels = place.shape[1]
@@ -170,6 +175,7 @@ class ForceModel:
             points = np.matmul(self.numbers.chassis_points, c.rotation.swapaxes(-1, -2)) + c.position[:, None]
             place = np.concatenate([place, points], axis=1)
             c.chassis_point = points
+        # One look-up for wheels and chassis.
         height, slope_x, slope_y, inside = self.ground.field.value(place[..., 0], place[..., 1])
         c.chassis_ground = height[:, wheels:], slope_x[:, wheels:], slope_y[:, wheels:]
         flat, along_x, along_y = height[:, :wheels], slope_x[:, :wheels], slope_y[:, :wheels]
@@ -200,6 +206,7 @@ class ForceModel:
             c.soil = hooks.call("soil", c, {k: v.copy() for k, v in c.soil.items()})
         zero = np.zeros(c.wheel_position.shape[:-1])
         c.normal = {
+            # An empty arc that is not of length zero, through which the laws divide; as the JAX ports begin.
             "entrance": zero + 2e-4,
             "exit": zero,
             "theta_m": zero + 1e-4,
@@ -245,6 +252,7 @@ class ForceModel:
         dt, flow = c.dt, first
         rate_w, rate_h = flow["winding"] / flow["winding_capacity"], flow["housing"] / flow["housing_capacity"]
         if self.numbers.integrator == "heun":
+            # Heun: the mean of the flows at both ends of the step, of second order.
             heat_ahead = self._heat_at(c, c.winding_temperature + dt * rate_w, c.housing_temperature + dt * rate_h)
             flow = {
                 **first,

@@ -43,6 +43,7 @@ def rock_shear(c: Context, p: SimpleNamespace) -> None:
         return
     load = c.normal["load"] + c.normal["damping"]
     k_x, k_y, r = c.slip["slip_x"], c.slip["slip_y"], c.geometry["radius"]
+    # The floor is that of the JAX effect, so that parked wheels agree.
     k = np.sqrt(k_x * k_x + k_y * k_y + 1e-12)
     share = -p.mu * load * np.expm1(-k / p.slip_scale) / k
     along, side = share * k_x, -p.side * share * k_y
@@ -145,6 +146,7 @@ def _chassis_boulders(c: Context, p: SimpleNamespace) -> None:
         return
     # quarters that found the same boulder share its push
     same_boulder = (rock[..., :, None, :2] == rock[..., None, :, :2]).all(-1)
+    # Counted with themselves, so that a boulder found once has a share of 1.
     share = 1.0 / same_boulder.sum(-1)
     gap = np.einsum("...ji,...j->...i", rotation, rock - c.position[:, None, None]) - center
     nearest = clamp(gap, -half, half)
@@ -154,6 +156,7 @@ def _chassis_boulders(c: Context, p: SimpleNamespace) -> None:
     depth = np.where(radius > 0.0, radius - np.where(within, 0.0, distance), -1.0)
     if not (depth > 0.0).any():
         return
+    # A centre inside the box has no outside nearest: the box is lifted.
     toward = np.where(within[..., None], np.array([0.0, 0.0, -1.0]), apart / distance[..., None])
     toward = np.einsum("...ij,...j->...i", rotation, toward)
     if c.ground.has_forms:

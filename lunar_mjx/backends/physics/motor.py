@@ -19,6 +19,7 @@ def controller(c: Context, p: SimpleNamespace) -> np.ndarray:
     numbers, motor = c.numbers, c.numbers.effects["motor"]
     error = np.where(numbers.mode == 0, c.target - c.joint_angle, 0.0)
     speed = c.joint_speed - np.where(numbers.mode == 1, c.target, 0.0)
+    # One formula for both loops: the position loop's speed error is the speed itself.
     torque = numbers.position_gain * error - numbers.velocity_gain * speed
     torque = np.where(numbers.mode < 2, torque, c.target)
     current = torque / (motor.gear_ratio * motor.gear_efficiency * motor.torque_constant)
@@ -53,6 +54,7 @@ def voltage_limit(c: Context, p: SimpleNamespace, state: Values) -> Values:
     motor = c.numbers.effects["motor"]
     constant = c.torque_constant * motor.gear_ratio
     voltage = c.resistance * c.current + constant * c.joint_speed
+    # The eighth power: see `voltage_saturation`, of which this is the plain form.
     within = voltage * (1.0 + p.limit * np.abs(voltage / 48.0) ** 8) ** -0.125
     # limited voltage acts like a damper; where it is stiffer than the inertia takes in a step, the correction is
     # filtered, or an explicit step would turn the joint around
@@ -93,6 +95,7 @@ def heat_flow(c: Context, winding_K: np.ndarray, housing_K: np.ndarray) -> Value
         elif name == "housing_conduction":
             into_housing = into_housing - p.conductance * (housing_K - c.ambient_temperature)
         elif name == "housing_radiation":
+            # Two products: NumPy's power is slower by far.
             squared = housing_K * housing_K
             lost = squared * squared - c.ambient_temperature**4
             into_housing = into_housing - p.emissivity * STEFAN_BOLTZMANN * p.area * lost

@@ -35,6 +35,7 @@ _ACROSS = np.linspace(-0.4, 0.4, 5)[:, None]
 
 def untouched(rovers: int) -> Values:
     """The patches at reset, (rover, cell)."""
+    # Every rover's ground is its own, as in a batch of the JAX engines.
     cells = np.zeros((rovers, RUT_PATCH.side * RUT_PATCH.side))
     return {"moved": cells, "pressed": cells.copy(), "tile": cells + RUT_PATCH.nowhere}
 
@@ -50,6 +51,7 @@ class Relief:
 
     def at(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Soil moved and depth pressed, m, at points (rover, ...), bilinear between the centres of cells."""
+        # Each rover reads its own patch.
         rover = np.arange(len(x)).reshape(-1, *(1,) * (x.ndim - 1))
         u, v = x / self.cell - 0.5, y / self.cell - 0.5
         i, j = np.floor(u), np.floor(v)

@@ -36,6 +36,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 def uniform_soil(p: SimpleNamespace | None, like: np.ndarray) -> Values:
     """One soil under all wheels (effect `soil`); without that effect a soil that bears next to nothing."""
+    # The laws use the tangent.
     given = {} if p is None else vars(p) | {"tan_phi": np.tan(p.friction_angle)}
     bare = {
         "k_c": 0.0,
@@ -80,6 +81,7 @@ def entrance(sinkage: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """theta_1, at which the rim enters the soil: cos theta_1 = 1 - z/r; rad."""
     # by the half angle: arccos(1 - z/r) loses half of the digits where z is small
     ratio = np.minimum(np.maximum(sinkage / radius, CLOSED_FORM.shallow), CLOSED_FORM.deep)
+    # tan^2(theta_1/2) = z/(2 r - z): another formula than the JAX effect's, so that a slip in one shows.
     return 2.0 * np.arctan2(np.sqrt(ratio), np.sqrt(2.0 - ratio))
 
 
@@ -148,6 +150,7 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     """
     contact, r = c.contact, c.geometry["radius"]
     theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
+    # Plain differences: float64 has digits to spare, and the formula stays the source's.
     length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), CLOSED_FORM.shortest * r)
     # rock has no arc in the ground over which shear could build up: bristles take the place of soil
     length = np.where(c.soil["rock"] > 0.5, p.rock_length, length)
@@ -156,6 +159,7 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     share = speed / length
     touching = contact["sinkage"] > 0.0
     # the equation is linear while slip is held, so that its solution over a step holds at any ratio of speed and length
+    # Divided by below; in float64 this is zero for all that matters.
     turned = np.maximum(share * c.dt, 1e-200)
     gain = -np.expm1(-turned) / turned / length
     damped = p.damping_time * np.exp(-share * p.damping_time)
@@ -227,6 +231,7 @@ def integral_normal(c: Context, p: SimpleNamespace) -> None:
     if "reversal" in c.normal:
         turn = clamp(c.normal["reversal"], ends[0], theta_1)
         ends = [ends[0], np.minimum(turn, theta_m), np.maximum(turn, theta_m), theta_1]
+    # The arc is divided where stress or shear has a kink, across which Gauss' nodes converge slowly.
     parts = [(low[..., None], (high - low)[..., None]) for low, high in itertools.pairwise(ends)]
     theta = np.concatenate([low + long * share for low, long in parts], axis=-1)
     weight = np.concatenate([0.5 * long * _WEIGHTS for _, long in parts], axis=-1)
