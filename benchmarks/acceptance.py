@@ -204,17 +204,17 @@ def main() -> int:
     parser.add_argument("--proofs", default=",".join(PROOFS))
     parser.add_argument("--rovers", default="luvmi_x,viper")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--commit", help="where the checkout has no history of its own")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/acceptance.json"))
     options = parser.parse_args()
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    from timing import commit, cpu_name
+    from provenance import commit
+    from timing import cpu_name
 
     jobs = [(p, r) for p in options.proofs.split(",") for r in options.rovers.split(",")]
     record: dict[str, Any] = {"about": {"preset": PRESET}, "rows": []}
     if options.out.is_file():
         record["rows"] = json.loads(options.out.read_text(encoding="utf-8"))["rows"]
-    measured = {"commit": options.commit or commit(), "cpu": cpu_name()}
+    measured = {"commit": commit(), "cpu": cpu_name()}
     context = multiprocessing.get_context("spawn")
     # a process of its own for every proof: what one has compiled is of no use to the next
     with concurrent.futures.ProcessPoolExecutor(options.processes, context, max_tasks_per_child=1) as pool:

@@ -7,14 +7,13 @@ Pictures are colour, depth and labels with shadows. A row of the JAX cameras cou
 the depth of one picture of the same size against MuJoCo's renderer; `labels` is the share of pixels whose label agrees.
 Where there is OpenGL, what the renderer drew is kept in `cameras_drawn.npz`; where there is none, as on most machines
 with a large GPU, pictures are held against that file, and there is no row of the renderer. `mebibytes` is what the
-compiled program needs beyond arguments and results. A checkout without git says its commit as CAMERAS_COMMIT.
+compiled program needs beyond arguments and results.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import platform
 import time
 from functools import partial
@@ -24,7 +23,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import LOCK, alone, commit
+from provenance import commit
+from timing import LOCK, alone
 
 from lunar_mjx.cameras import (
     Pinhole,
@@ -232,7 +232,7 @@ def write(given: argparse.Namespace, rows: list[dict]) -> None:
         "rover": given.rover,
         "terrain": given.terrain,
         "device": jax.devices()[0].device_kind,
-        "commit": os.environ.get("CAMERAS_COMMIT") or commit(),
+        "commit": commit(),
         "jax": jax.__version__,
         "processor": platform.processor() or platform.machine(),
         "repeats": given.repeats,

@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import commit
+from provenance import commit
 
 from lunar_mjx.dynamics import Params, build
 from lunar_mjx.model import Model, make_model

@@ -24,7 +24,7 @@ import argparse
 import dataclasses
 import json
 import math
-import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from lunar_mjx.wheel_bed.particles.settings import Run
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
 PLAN = ROOT / "benchmarks" / "particles" / "plan.json"
 RESULT = ROOT / "benchmarks" / "particle_tables.json"
 ANGLES = (0, 15, 30, 45, 60, 75)
@@ -113,6 +114,7 @@ def run(out: Path, device: str, seconds: float, voxels: float | None) -> None:
 
 def report(out: Path) -> dict:
     """What the results say; every part by its campaign, quantities in SI units."""
+    from benchmarks.provenance import commit
     from lunar_mjx.wheel_bed.particles.campaign import read_results
     from lunar_mjx.wheel_bed.particles.results import numerical_error
 
@@ -227,12 +229,6 @@ def footing_sinkage(result: dict, friction_deg: float) -> float:
 
 def _rms(values: list[float]) -> float:
     return math.sqrt(sum(v * v for v in values) / len(values))
-
-
-def commit() -> str:
-    """The commit that this is run on."""
-    told = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
-    return told.stdout.strip()
 
 
 def teller(name: str) -> Callable[[str, float], None]:

@@ -24,8 +24,9 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
+from provenance import commit
 from speed import _terrain_axes, bare_mjx, control, per_rover_maps, rollout, starts, timed
-from timing import LOCK, commit, cpu_name
+from timing import LOCK, cpu_name
 
 from lunar_mjx.backends import NativeBackend
 from lunar_mjx.backends.physics import SUPPORTED
@@ -151,12 +152,11 @@ def main() -> None:
     parser.add_argument("--only", help="programs, by semicolon; all if left out")
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--lock", type=Path, help="file that is locked while a row is timed, for runs side by side")
-    parser.add_argument("--commit", help="where the checkout has no history of its own")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/programs_gpu.json"))
     options = parser.parse_args()
     LOCK[:] = [options.lock] if options.lock else []
     about = {
-        "commit": options.commit or commit(),
+        "commit": commit(),
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
         "mujoco": mujoco.__version__,

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from provenance import commit
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT, FIGURE = ROOT / "benchmarks" / "real_wheel.json", ROOT / "docs" / "figures" / "real_wheel.svg"
@@ -146,11 +147,10 @@ def main() -> None:
     seconds = time.perf_counter() - begun
     rows = rows_of(out / "runs")
     shown = ["lunar-mjx improve cmu_smooth_wheel", *(f'--split "{w}"' for w in words if w != "--split")]
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
     result = {
         "unit": "pooled standard deviation of single runs",
         "command": " ".join(shown),
-        "commit": commit.stdout.strip(),
+        "commit": commit(),
         "exit_status": ended.returncode,
         "seconds": round(seconds, 1),
         "rows": rows,

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import os
 import platform
-import subprocess
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -37,32 +34,6 @@ def sharded(function: Callable[[Any], Any], state: Any, devices: list[Any]) -> t
     split = jax.sharding.PartitionSpec("batch")
     state = jax.device_put(state, jax.sharding.NamedSharding(mesh, split))
     return jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=split, check_vma=False), state
-
-
-def commit() -> str:
-    """Commit of the checkout, with "+" where files differ from it."""
-    root = Path(__file__).parent
-    head = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
-    changed = subprocess.run(["git", "diff", "--quiet", "HEAD"], cwd=root).returncode
-    return head.stdout.strip() + ("+" if changed else "")
-
-
-def tree() -> str:
-    """Git's hash of the package as it lies there: `git rev-parse COMMIT:lunar_mjx` gives it where nothing differs.
-
-    A machine to which only files are copied may stand at another commit.
-    """
-    root = Path(__file__).parents[1]
-    with tempfile.TemporaryDirectory() as folder:
-        about = {
-            "cwd": root,
-            "env": {**os.environ, "GIT_INDEX_FILE": f"{folder}/index", "GIT_OBJECT_DIRECTORY": folder},
-            "check": True,
-        }
-        subprocess.run(["git", "add", "lunar_mjx"], **about)
-        return subprocess.run(
-            ["git", "write-tree", "--prefix=lunar_mjx/"], **about, capture_output=True, text=True
-        ).stdout.strip()
 
 
 def cpu_name() -> str:

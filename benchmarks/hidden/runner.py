@@ -8,38 +8,22 @@ import hashlib
 import json
 import multiprocessing
 import os
-import subprocess
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.provenance import checkout
+
 Job = tuple[str, int]
 Solve = Callable[..., dict[str, Any]]
-_ROOT = Path(__file__).resolve().parents[2]
-
-
-def commit() -> tuple[str, bool]:
-    """The commit of the code under test, and whether files that count differ from it; "" where git is not there."""
-    try:
-        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=_ROOT, capture_output=True, text=True, check=True)
-        changed = subprocess.run(
-            ["git", "status", "--porcelain", "--", "lunar_mjx", "benchmarks/hidden"],
-            cwd=_ROOT,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return os.environ.get("HIDDEN_COMMIT", ""), False
-    return head.stdout.strip(), bool(changed.stdout.strip())
 
 
 def campaign(out: Path, seed: int | None) -> dict[str, Any]:
     """The campaign's seed, drawn from the commit and the time unless it is given or drawn already."""
     path = out.with_suffix(".seed.json")
-    head, dirty = commit()
+    head, dirty = checkout()
     if path.is_file():
         data = json.loads(path.read_text(encoding="utf-8"))
         if seed is not None and str(seed) != data["seed"]:
@@ -93,7 +77,7 @@ def work(solve: Solve, jobs: Sequence[Job], out: Path, seed: int, minutes: float
     Returns:
       Number of cases done.
     """
-    head, dirty = commit()
+    head, dirty = checkout()
     done = 0
     with out.open("a", encoding="utf-8") as file:
         for row in rows(solve, jobs, seed, minutes, workers, **options):

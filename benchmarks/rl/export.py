@@ -19,8 +19,8 @@ import jax.export
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from benchmarks.provenance import commit
 from benchmarks.rl.harness import save, say
-from benchmarks.timing import commit
 from lunar_mjx.agents.export.write import NODE, export_policy
 from lunar_mjx.agents.play import shipped_policy
 from lunar_mjx.agents.policy import load_policy

@@ -24,8 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from benchmarks.provenance import commit
 from benchmarks.rl.harness import percent, save, say
-from benchmarks.timing import LOCK, alone, commit
+from benchmarks.timing import LOCK, alone
 from lunar_mjx.agents.evaluate import score
 from lunar_mjx.agents.play import UNSEEN_LADDER, shipped_policy
 from lunar_mjx.agents.policy import Policy, load_policy

@@ -33,8 +33,8 @@ import jax.numpy as jnp
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from benchmarks.provenance import commit, tree
 from benchmarks.rl.harness import DURING, FINAL, Clock, digits, in_threads, percent, save, say, write
-from benchmarks.timing import commit, tree
 from lunar_mjx.agents.configs import get_training, override
 from lunar_mjx.agents.evaluate import score
 from lunar_mjx.agents.learner import Learner, normalised
