@@ -34,10 +34,19 @@ def require_view(view: str) -> None:
 
 UNSEEN_LADDER = {"ranges": "unseen", "hardness": 1.1}
 """What agents are scored on: worlds of another seed, harder than the training's by a tenth, and the held-out soil."""
-_MARGIN = 4.0
-"""m around path and goal that the map shows."""
-_FRAMES = 300
-"""Most frames of a video."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodePicture:
+    """How an episode is drawn: a choice."""
+
+    margin: float = 4.0
+    """m around path and goal that the map shows."""
+    most_frames: int = 300
+    """Most frames of a video."""
+
+
+EPISODE_PICTURE = EpisodePicture()
 
 
 def shipped_policy(name: str) -> Path | None:
@@ -161,7 +170,7 @@ class Episode:
             np.savetxt(part, table, delimiter=",", header=",".join(names), comments="", fmt="%.6g")
         with replacing(picture) as part:
             Image.fromarray(still).save(part)
-        stride = max(1, len(self.reward) // _FRAMES)
+        stride = max(1, len(self.reward) // EPISODE_PICTURE.most_frames)
         images = [Image.fromarray(f) for f in frames]
         with replacing(video) as part:
             images[0].save(
@@ -180,8 +189,10 @@ class Episode:
         terrain, rover = self.params.system.terrain, self.env.model.rover
         places = np.vstack([self.qpos[:, :2], self.goal[None]])
         radius, size = self.env.config.goal_radius, 5.0 * self.env.model.rover.standing_height
-        top = GroundMap(terrain, places.min(axis=0) - _MARGIN, places.max(axis=0) + _MARGIN)
-        steps = range(0, len(self.qpos), max(1, len(self.reward) // _FRAMES))
+        top = GroundMap(
+            terrain, places.min(axis=0) - EPISODE_PICTURE.margin, places.max(axis=0) + EPISODE_PICTURE.margin
+        )
+        steps = range(0, len(self.qpos), max(1, len(self.reward) // EPISODE_PICTURE.most_frames))
 
         def drawn(i: int) -> np.ndarray:
             return top.frame(self.qpos[i], float(self.yaw[i]), self.goal, radius, list(self.qpos[: i + 1, :2]), size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,21 +10,28 @@ import numpy as np
 from lunar_mjx.cameras.pinhole import Pose
 from lunar_mjx.rover import Rover
 
-PITCH_DEG = 15.0
-"""How far the front camera looks down."""
 
-_BEFORE = 0.03
-"""Distance before the highest part of the rover, m, so that it does not look into itself."""
+@dataclasses.dataclass(frozen=True)
+class FrontMount:
+    """Where the front camera sits unless a rover says so itself: a choice."""
+
+    pitch_deg: float = 15.0
+    """How far the front camera looks down."""
+    before: float = 0.03
+    """Distance before the highest part of the rover, m, so that it does not look into itself."""
 
 
-def front_mount(rover: Rover, pitch_deg: float = PITCH_DEG) -> Pose:
+FRONT_MOUNT = FrontMount()
+
+
+def front_mount(rover: Rover, pitch_deg: float = FRONT_MOUNT.pitch_deg) -> Pose:
     """Pose of the front camera in the chassis frame: at the front of the rover's highest part, looking ahead and down.
 
     On both shipped rovers that is the head of the mast.
     """
     points = np.asarray(rover.chassis_points, float)
     top = points[points[:, 2] > points[:, 2].max() - 0.02]
-    position = np.array([top[:, 0].max() + _BEFORE, top[:, 1].mean(), top[:, 2].max() - 0.02])
+    position = np.array([top[:, 0].max() + FRONT_MOUNT.before, top[:, 1].mean(), top[:, 2].max() - 0.02])
     return Pose(position, facing(pitch_deg))
 
 

@@ -14,8 +14,19 @@ from jaxtyping import Float
 
 from lunar_mjx.errors import bad_input
 
-NEAR, FAR = 0.02, 400.0
-"""Clipping planes, m."""
+
+@dataclasses.dataclass(frozen=True)
+class ClippingPlanes:
+    """Between which distances a camera sees unless told otherwise: a choice, from the rover's own mast to the end
+    of the finely drawn ground."""
+
+    near: float = 0.02
+    """Nearest distance, m."""
+    far: float = 400.0
+    """Farthest distance, m."""
+
+
+CLIPPING = ClippingPlanes()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,8 +41,8 @@ class Pinhole:
     width: int = 320
     height: int = 240
     fovy_deg: float = 60.0
-    near: float = NEAR
-    far: float = FAR
+    near: float = CLIPPING.near
+    far: float = CLIPPING.far
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):

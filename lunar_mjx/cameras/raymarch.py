@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lunar_mjx.cameras.pinhole import Pinhole, Pose
-from lunar_mjx.cameras.rays.trace import MOST, trace
+from lunar_mjx.cameras.rays.trace import TRACE, trace
 from lunar_mjx.cameras.shapes import rotation
 from lunar_mjx.terrain import Terrain, surface
 
@@ -47,7 +47,7 @@ def depth_images(
 def in_parts(one: Callable[[tuple], Any], given: tuple, at_once: int | None) -> Any:
     """`one` of every entry of `given` along its first axis; at most `at_once` of them, and 65,535, side by side."""
     # all at once is fastest; in parts, where pictures do not fit into memory together
-    at_once = min(at_once or MOST, MOST)
+    at_once = min(at_once or TRACE.most_pictures, TRACE.most_pictures)
     if given[0].shape[0] <= at_once:
         return jax.vmap(one)(given)
     return jax.lax.map(one, given, batch_size=at_once)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,19 @@ from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.errors import UserError, bad_input
 
 VIEWS = ("auto", "camera", "top")
-_MARGIN = 4.0
-"""m around what the map must show."""
-_FAR = 3.0
-"""m beyond start and goal that the map shows, since a rover may leave the straight line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MapMargins:
+    """How far the map of an episode reaches: a choice."""
+
+    around: float = 4.0
+    """m around what the map must show."""
+    beyond: float = 3.0
+    """m beyond start and goal that the map shows, since a rover may leave the straight line."""
+
+
+MAP_MARGINS = MapMargins()
 
 
 class Picture:
@@ -74,14 +84,14 @@ class Picture:
             return camera.frame(self._qpos, yaw, self._goal, self._ground)
         if self._top is None:
             places = self._places()
-            low, high = places.min(axis=0) - _MARGIN, places.max(axis=0) + _MARGIN
+            low, high = places.min(axis=0) - MAP_MARGINS.around, places.max(axis=0) + MAP_MARGINS.around
             self._top = GroundMap(self.env.params.system.terrain, low, high)
         size = 5.0 * self.env.model.rover.standing_height
         return self._top.frame(self._qpos, yaw, self._goal, self.env.config.goal_radius, self._path, size)
 
     def _places(self) -> np.ndarray:
         ends = np.stack([self._path[0], self._goal])
-        return np.concatenate([ends - _FAR, ends + _FAR])
+        return np.concatenate([ends - MAP_MARGINS.beyond, ends + MAP_MARGINS.beyond])
 
     def _open(self) -> Chase | None:
         if self._camera is None and self._view != "top" and not self._tried:

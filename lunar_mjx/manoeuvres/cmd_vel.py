@@ -8,6 +8,7 @@ that do not steer roll at their part along x and scrub the rest: with no steerin
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,11 +20,18 @@ from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands, constant_commands
 
-_STILL = 1e-9
-"""m/s; a wheel that is to move slower keeps its steering at zero."""
 
-FASTEST = 10.0
-"""m/s and rad/s: no rover moves or turns faster."""
+@dataclasses.dataclass(frozen=True)
+class TwistLimits:
+    """Between which speeds a command of a rover's motion is taken up."""
+
+    still: float = 1e-9
+    """m/s; a wheel that is to move slower keeps its steering at zero."""
+    fastest: float = 10.0
+    """m/s and rad/s: no rover moves or turns faster."""
+
+
+TWIST_LIMITS = TwistLimits()
 
 
 class CmdVel:
@@ -102,16 +110,18 @@ class CmdVel:
         needed = jnp.abs(_angle(v_x - yaw_rate * y, v_y + yaw_rate * x))
         exceeds = jnp.any(jnp.where(self._steered, needed > limit, False))
         inward = jnp.sign(yaw_rate) * jnp.where(v_x < 0.0, -1.0, 1.0) * y
-        per_rate = jnp.abs(x) / jnp.maximum(jnp.tan(limit), _STILL) + inward
-        bound = jnp.abs(v_x) / jnp.maximum(jnp.max(jnp.where(self._steered, per_rate, _STILL)), _STILL)
-        car = (jnp.abs(v_x) > _STILL) & (jnp.abs(v_y) <= _STILL)
+        per_rate = jnp.abs(x) / jnp.maximum(jnp.tan(limit), TWIST_LIMITS.still) + inward
+        bound = jnp.abs(v_x) / jnp.maximum(
+            jnp.max(jnp.where(self._steered, per_rate, TWIST_LIMITS.still)), TWIST_LIMITS.still
+        )
+        car = (jnp.abs(v_x) > TWIST_LIMITS.still) & (jnp.abs(v_y) <= TWIST_LIMITS.still)
         return jnp.where(car & exceeds, jnp.clip(yaw_rate, -bound, bound), yaw_rate)
 
 
 def _angle(along: Any, across: Any) -> Any:
     """Steering angle of a wheel that moves so, within 90 degrees, rad; 0 for one that stands."""
     way = jnp.where(along < 0.0, -1.0, 1.0)
-    moving = jnp.abs(along) + jnp.abs(across) > _STILL
+    moving = jnp.abs(along) + jnp.abs(across) > TWIST_LIMITS.still
     return jnp.where(moving, jnp.arctan2(way * across, jnp.where(moving, jnp.abs(along), 1.0)), 0.0)
 
 
@@ -141,6 +151,8 @@ def cmd_vel_commands(model: Model, wanted: str, duration: float) -> Commands:
         raise bad_input(
             "simulate", "--cmd-vel", wanted, "is not three numbers", "write v_x,v_y,yaw_rate as in 0.1,0,0.2"
         )
-    motion = [require_within("simulate", "--cmd-vel", part, -FASTEST, FASTEST) for part in parts]
+    motion = [
+        require_within("simulate", "--cmd-vel", part, -TWIST_LIMITS.fastest, TWIST_LIMITS.fastest) for part in parts
+    ]
     held = constant_commands(model, duration)
     return Commands(np.tile(np.asarray(CmdVel(model)(*motion)), (len(held.values), 1)), held.interval)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import re
 import warnings
 from pathlib import Path
@@ -29,9 +30,21 @@ from lunar_mjx.rover.statics import gains, level_springs
 from lunar_mjx.rover.tree import Body, bodies_of
 from lunar_mjx.rover.urdf import Geometry, Urdf, read_urdf
 
-MAXIMUM_CHASSIS_POINTS = 16
+
+@dataclasses.dataclass(frozen=True)
+class Conversion:
+    """What the converter takes from shapes."""
+
+    most_chassis_points: int = 16
+    """Points of the chassis that may touch the ground: each costs a height in every step."""
+    level: float = 1e-3
+    """m; wheels whose lowest points differ by more do not stand level."""
+
+
+CONVERSION = Conversion()
+
+
 DESCRIPTION_SUFFIX = ".rover.toml"
-_LEVEL = 1e-3  # m; wheels whose lowest points differ by more do not stand level
 
 
 def convert(urdf: str | Path, out: str | Path, description: str | Path | None = None, name: str | None = None) -> Rover:
@@ -137,7 +150,7 @@ def _standing_height(roles: Roles) -> tuple[float, list[str]]:
     """Height of the base frame above the plane under the lowest wheel, in m."""
     bottoms = np.array([w.center[2] - w.radius for w in roles.wheels])
     notes = []
-    if np.ptp(bottoms) > _LEVEL:
+    if np.ptp(bottoms) > CONVERSION.level:
         notes.append(f"the wheels' lowest points differ by {1e3 * np.ptp(bottoms):.1f} mm at zero angles")
     # Rounded to a nanometre, so that a file does not differ between machines in its last digit.
     return round(float(-bottoms.min()), 9), notes
@@ -304,8 +317,8 @@ def _chassis_points(base: Body, roles: Roles) -> tuple[np.ndarray, list[str]]:
     # A flat chassis has no hull of volume; all its corners are on the outside then.
     with contextlib.suppress(QhullError):
         corners = corners[np.sort(ConvexHull(corners).vertices)]
-    if len(corners) > MAXIMUM_CHASSIS_POINTS:
-        corners = _farthest(corners, MAXIMUM_CHASSIS_POINTS)
+    if len(corners) > CONVERSION.most_chassis_points:
+        corners = _farthest(corners, CONVERSION.most_chassis_points)
     return corners, notes
 
 

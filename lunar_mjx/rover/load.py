@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,9 +23,21 @@ from lunar_mjx.rover.rover import DriveGroup, JointGroup, Loop, Rover, Wheel
 
 FORMAT = "lunar-mjx-rover/1"
 MARKER = "rover.toml"
-_MASS_TOLERANCE = 1e-9  # relative
-GRAVITY_TOLERANCE = 1e-9
-"""m/s2, of rounding in the two files."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Agreement:
+    """How closely the two files of a rover must agree: both are written with twelve digits or more."""
+
+    mass: float = 1e-9
+    """Of the total mass, relative."""
+    gravity: float = 1e-9
+    """m/s2, of rounding in the two files."""
+
+
+AGREEMENT = Agreement()
+
+
 _CONVERT_AGAIN = "convert the URDF again"
 _TOP = {
     "format",
@@ -86,7 +99,7 @@ def load_rover(name_or_path: str | Path) -> Rover:
     if mass > HEAVIEST:
         raise bad_input(path, "mass", mass, f"is above {HEAVIEST:g} kg", "correct the masses, which are in kg")
     total = float(model.body_mass.sum())
-    if abs(total - mass) > _MASS_TOLERANCE * mass:
+    if abs(total - mass) > AGREEMENT.mass * mass:
         raise bad_input(path, "mass", mass, f"is not the {total:.12g} kg of {mjcf.name}: mass was lost", _CONVERT_AGAIN)
     bodies = {model.body(i).name for i in range(1, model.nbody)}
     joints = {model.joint(i).name for i in range(model.njnt)}
@@ -126,7 +139,7 @@ def _gravity(path: Path, data: Mapping[str, Any], model: mujoco.MjModel) -> tupl
         return None, (f"the MJCF's gravity {np.linalg.norm(mjcf):g} m/s2 is not used: rover.toml states none",)
     gravity = toml.at_least(path, "gravity", data["gravity"], 0.0, strict=False)
     # MuJoCo's viewer would show another weight than the library simulates.
-    if np.abs(mjcf - [0.0, 0.0, -gravity]).max() > GRAVITY_TOLERANCE:
+    if np.abs(mjcf - [0.0, 0.0, -gravity]).max() > AGREEMENT.gravity:
         shown = " ".join(f"{v:g}" for v in mjcf)
         raise bad_input(path, "gravity", gravity, f'is not the MJCF\'s gravity="{shown}"', _CONVERT_AGAIN)
     return gravity, ()

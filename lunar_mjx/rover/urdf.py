@@ -15,8 +15,20 @@ import numpy as np
 from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "floating")
-# URDFs are written by hand with a few digits: a triangle inequality missed by less than this share is rounding.
-_INERTIA_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class UrdfLimits:
+    """What a URDF may hold."""
+
+    inertia_tolerance: float = 1e-6
+    """Share by which a triangle inequality of moments of inertia may be missed, by rounding: URDFs are written by hand
+    with a few digits."""
+    longest_name: int = 200
+    """Characters of a link's or joint's name, which becomes part of channel names."""
+
+
+URDF_LIMITS = UrdfLimits()
 
 
 @dataclass(frozen=True)
@@ -150,10 +162,6 @@ def read_urdf(path: str | Path) -> Urdf:
     return Urdf(path, robot.get("name", path.stem), by_name, tuple(joints), root, tuple(reader.notes))
 
 
-LONGEST_NAME = 200
-"""Characters of a link's or joint's name, which becomes part of channel names."""
-
-
 class _Reader:
     """Reads elements of one file; holds the path for messages and collects the notes."""
 
@@ -179,8 +187,8 @@ class _Reader:
         if not name:
             raise bad_input(self.path, f"{what} name", "", "is missing", f"name every {what}")
         # Names become channel names and stand in messages of one line.
-        if not name.isprintable() or len(name) > LONGEST_NAME:
-            remedy = f"give at most {LONGEST_NAME} characters of one line"
+        if not name.isprintable() or len(name) > URDF_LIMITS.longest_name:
+            remedy = f"give at most {URDF_LIMITS.longest_name} characters of one line"
             raise bad_input(self.path, f"{what} name", name, "is no name", remedy)
         return name
 
@@ -351,7 +359,7 @@ def check_inertia(path: Path, name: str, inertia: np.ndarray) -> None:
     if moments[0] <= 0:
         raise bad_input(path, field, shown, "are not all positive", "give a positive definite inertia in kg m2")
     # No body has a moment larger than the sum of the other two; tensors typed in by hand often do.
-    if moments[0] + moments[1] < moments[2] * (1 - _INERTIA_TOLERANCE):
+    if moments[0] + moments[1] < moments[2] * (1 - URDF_LIMITS.inertia_tolerance):
         raise bad_input(
             path, field, shown, "break the triangle inequality I1 + I2 >= I3", "compute the inertia from the geometry"
         )

@@ -15,10 +15,20 @@ from lunar_mjx.terrain.dem import Dem, require_cell, require_size, spline
 from lunar_mjx.terrain.roughness import Roughness, fractal
 from lunar_mjx.terrain.soil.maps import SoilMap
 
-TOLERANCE = 1e-3
-"""Most that `add_detail` changes the mean height of a DEM cell, m."""
-_ROUNDS = 60
-"""Corrections of a surface until its means over the coarse cells are within half of `TOLERANCE`."""
+
+@dataclasses.dataclass(frozen=True)
+class MeansKept:
+    """How exactly detail leaves the means of a DEM's cells as they are."""
+
+    tolerance: float = 1e-3
+    """Most that `add_detail` changes the mean height of a DEM cell, m."""
+    most_rounds: int = 60
+    """Corrections of a surface until its means over the coarse cells are within half of `tolerance`."""
+
+
+MEANS_KEPT = MeansKept()
+
+
 # Independent random streams, so that changing the craters does not move the rocks.
 _ROUGHNESS, _CRATERS, _ROCKS, _SOIL = range(4)
 
@@ -84,7 +94,7 @@ def add_detail(
     """Adds roughness and craters below the resolution of a DEM, and nothing above it.
 
     The DEM is interpolated by bicubic splines; the detail has a mean of zero over every cell of the DEM (a square about
-    each node), to within `TOLERANCE`. Craters are limited to two cells of the DEM.
+    each node), to within `MEANS_KEPT.tolerance`. Craters are limited to two cells of the DEM.
 
     Args:
       dem: the DEM.
@@ -141,10 +151,10 @@ def _without_means(detail: np.ndarray, ratio: int, coarse: tuple[int, int]) -> n
     carrier = np.zeros(coarse)
     wanted = residual = cell_means(detail, ratio)
     # The means of a spline through the means are not quite the means: correct by what is left, until little is.
-    for _ in range(_ROUNDS):
+    for _ in range(MEANS_KEPT.most_rounds):
         smooth_part = spline(carrier, rows, cols, 1 / ratio)
         residual = wanted - cell_means(smooth_part, ratio)
-        if np.abs(residual).max() < TOLERANCE / 2:
+        if np.abs(residual).max() < MEANS_KEPT.tolerance / 2:
             return detail - smooth_part
         # Over-relaxed: a spline through the means falls short of them in the same way in every round.
         carrier += 1.3 * residual

@@ -17,10 +17,18 @@ from lunar_mjx.errors import bad_input
 from lunar_mjx.terrain.checks import require_at_least, require_between, require_positive
 from lunar_mjx.terrain.rocks import CELL, REACH, Rocks, build_ellipsoids, build_rocks
 
-_MOST = 20_000
-"""Rocks above which a terrain is refused: each is placed beside those before it."""
-_TRIES = 30
-"""Places tried for a rock before it is left out."""
+
+@dataclasses.dataclass(frozen=True)
+class RockLimits:
+    """How many rocks are placed, and how long a place is looked for."""
+
+    most: int = 20_000
+    """Rocks above which a terrain is refused: each is placed beside those before it."""
+    tries: int = 30
+    """Places tried for a rock before it is left out."""
+
+
+ROCK_LIMITS = RockLimits()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +97,7 @@ class RockField:
     def draw_diameters(self, area: float, rng: np.random.Generator) -> np.ndarray:
         """Draws the diameters (m) of the rocks on an area (m^2), largest first."""
         expected = float(self.number(self.smallest)) * area
-        if expected > _MOST:
+        if expected > ROCK_LIMITS.most:
             raise bad_input(
                 "RockField", "abundance", self.abundance, f"gives {expected:.0f} rocks", "lower it or raise smallest"
             )
@@ -134,7 +142,7 @@ def place_rocks(
     rocks_in_bin: dict[tuple[int, int], list[int]] = {}
     n = 0
     for radius in radii:
-        for _ in range(_TRIES):
+        for _ in range(ROCK_LIMITS.tries):
             place = np.array([west, south]) + rng.random(2) * [east - west, north - south]
             if np.hypot(*(place - middle)) < population.clear + radius:
                 continue

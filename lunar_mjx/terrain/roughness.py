@@ -16,8 +16,18 @@ from scipy import fft
 
 from lunar_mjx.terrain.checks import require_at_least, require_between, require_positive
 
-_MODEL = 512  # nodes of the torus on which the spectral exponent is found
-_LARGE = 2_000_000  # nodes; beyond this the synthesis saves memory and time
+
+@dataclasses.dataclass(frozen=True)
+class Synthesis:
+    """How a surface is synthesised."""
+
+    model_nodes: int = 512
+    """Nodes along a side of the torus on which the spectral exponent is found."""
+    large: int = 2_000_000
+    """Nodes beyond which the synthesis saves memory and time."""
+
+
+SYNTHESIS = Synthesis()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +70,8 @@ def fractal(
     Returns:
       Heights in m of mean zero.
     """
-    factor = 2.0 if rows * cols <= _LARGE else 1.25
-    dtype = np.float64 if rows * cols <= _LARGE else np.float32
+    factor = 2.0 if rows * cols <= SYNTHESIS.large else 1.25
+    dtype = np.float64 if rows * cols <= SYNTHESIS.large else np.float32
     high, wide = (int(fft.next_fast_len(int(factor * n) + 1, real=True) or n) for n in (rows, cols))
     fy, fx = np.fft.fftfreq(high)[:, None], np.fft.rfftfreq(wide)[None, :]
     k = np.hypot(fy, fx)
@@ -93,10 +103,10 @@ def _spectral_hurst(hurst: float) -> float:
     to 0.1 near H = 1. The expected deviogram follows from the spectrum, so the bend is undone by bisection on a grid of
     moderate size.
     """
-    f = np.fft.fftfreq(_MODEL)
+    f = np.fft.fftfreq(SYNTHESIS.model_nodes)
     k = np.hypot(f[:, None], f[None, :])
     k[0, 0] = np.inf
-    lags = np.unique(np.geomspace(2, _MODEL / 32, 12).astype(int))
+    lags = np.unique(np.geomspace(2, SYNTHESIS.model_nodes / 32, 12).astype(int))
     waves = 1 - np.cos(2 * np.pi * f[:, None] * lags)
     low, high = -0.5, 2.0
     for _ in range(12):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -20,8 +21,19 @@ from lunar_mjx.model import ZERO_CELSIUS
 from lunar_mjx.terrain import height
 from lunar_mjx.viewer.pilot import Onlooker
 
-_MOST_STEPS = 2
-"""Control intervals that one tick may catch up with: a slow machine falls behind rather than stops."""
+
+@dataclasses.dataclass(frozen=True)
+class PolicyPace:
+    """How a policy drives in the viewer."""
+
+    most_steps: int = 2
+    """Control intervals that one tick may catch up with: a slow machine falls behind rather than stops."""
+    told: float = 4.0
+    """For how long the end of an episode is told, s."""
+
+
+POLICY_PACE = PolicyPace()
+
 
 ENDS = {
     "success": "Goal reached",
@@ -31,8 +43,6 @@ ENDS = {
     "diverged": "The simulation diverged",
 }
 """How an episode ended, in words, by the environment's metric."""
-_TOLD = 4.0
-"""For how long the end of an episode is told, s."""
 
 
 class PolicyDrive:
@@ -107,7 +117,7 @@ class PolicyDrive:
     def advance(self, duration: float) -> float:
         """Drives on by whole control intervals; what is left over is shown between two states. Returns s driven."""
         interval = self._env.control_interval
-        self._behind = min(self._behind + duration, (_MOST_STEPS + 1) * interval)
+        self._behind = min(self._behind + duration, (POLICY_PACE.most_steps + 1) * interval)
         self._told -= duration
         if self._told < 0.0:
             self.note = ""
@@ -127,7 +137,7 @@ class PolicyDrive:
             end = next((text for k, text in ENDS.items() if flags[k] > 0), "Time is up")
             done = f"{end} after {self.time:.0f} s and {self.path:.1f} m: on to the next goal."
             self._begin()
-            self.note, self._told = done, _TOLD
+            self.note, self._told = done, POLICY_PACE.told
             return
         self._from = self._to
         self._take()

@@ -17,10 +17,18 @@ from lunar_mjx.model import Model
 from lunar_mjx.terrain import surface
 from lunar_mjx.viewer.pilot import Onlooker
 
-FRAMES = 600
-"""Pictures of a drive: one of ten minutes moves once a second, and a page of it stays below 2 MB."""
-_FOOT = 0.5
-"""Share of a rover's reach at which the ground under it is felt for its lean."""
+
+@dataclasses.dataclass(frozen=True)
+class ReplaySizes:
+    """How a drive is shown again."""
+
+    frames: int = 600
+    """Pictures of a drive: one of ten minutes moves once a second, and a page of it stays below 2 MB."""
+    foot: float = 0.5
+    """Share of a rover's reach at which the ground under it is felt for its lean."""
+
+
+REPLAY_SIZES = ReplaySizes()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,7 +79,9 @@ class Replay:
         self, model: Model, title: str, measured: Course, predicted: Sequence[Course], traces: Sequence[Trace]
     ) -> None:
         self.model, self.pilot, self.rate, self.path = model, Onlooker(), 1.0, 0.0
-        time = np.linspace(measured.time[0], measured.time[-1], min(FRAMES, max(2, 10 * len(measured.time))))
+        time = np.linspace(
+            measured.time[0], measured.time[-1], min(REPLAY_SIZES.frames, max(2, 10 * len(measured.time)))
+        )
         stand = _Stand(model)
         self.time = float(time[-1] - time[0])
         self.scene: dict[str, Any] = {
@@ -118,7 +128,7 @@ class _Stand:
         self._data = mujoco.MjData(self._mj)
         self._terrain = model.terrain
         self._height = rover.standing_height
-        self._reach = _FOOT * float(np.abs(np.asarray(rover.chassis_points)[:, :2]).max())
+        self._reach = REPLAY_SIZES.foot * float(np.abs(np.asarray(rover.chassis_points)[:, :2]).max())
         self._wheels = [(int(self._mj.joint(w.drive).qposadr[0]), w.radius) for w in rover.wheels]
 
     def bodies(self, course: Course, time: np.ndarray) -> np.ndarray:

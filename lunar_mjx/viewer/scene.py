@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 from typing import Any
 
 import mujoco
@@ -17,8 +18,19 @@ from lunar_mjx.rover.look import LOOK, seen_spec
 from lunar_mjx.terrain import Terrain
 from lunar_mjx.terrain.rocks import semi_axes
 
-NEAR, NODES = 20.0, 420
-"""How far the ground is drawn finely around the rover, m, and nodes per side there."""
+
+@dataclasses.dataclass(frozen=True)
+class DrawnGround:
+    """How much ground is drawn finely."""
+
+    near: float = 20.0
+    """How far around the rover, m."""
+    nodes: int = 420
+    """Nodes per side there."""
+
+
+DRAWN_GROUND = DrawnGround()
+
 
 _SHAPES = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
@@ -85,7 +97,7 @@ def ground_scene(terrain: Terrain, x: float, y: float) -> dict[str, Any]:
     origin, cell = np.array([float(field.x0), float(field.y0)]), float(field.cell)
     end = origin + cell * np.array([cols - 1, rows - 1])
     middle = np.clip([x, y], origin, end)
-    near = cut(terrain, middle - NEAR, middle + NEAR, NODES)
+    near = cut(terrain, middle - DRAWN_GROUND.near, middle + DRAWN_GROUND.near, DRAWN_GROUND.nodes)
     return {
         "near": _grid(near),
         "far": _grid(cut(terrain, origin, end, SCENE_DETAIL.far_nodes)),

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 _RATIOS = np.concatenate([[0.0], np.geomspace(0.1, 30.0, 15)])
 """Share of the reading over the constant part, at the r.m.s. reading; 0 stands for constant noise."""
-_CONSTANT = 0.5
-"""Prior probability that noise does not grow with its reading."""
-MOST_SHARE = 0.1
-"""Share of the reading beyond which scatter is no noise of an instrument that works."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ScatterPrior:
+    """What is expected of noise before replicates are seen."""
+
+    constant: float = 0.5
+    """Prior probability that noise does not grow with its reading."""
+    most_share: float = 0.1
+    """Share of the reading beyond which scatter is no noise of an instrument that works."""
+
+
+SCATTER_PRIOR = ScatterPrior()
 
 
 def point_scatter(squares: np.ndarray, freedom: np.ndarray, reading: np.ndarray) -> np.ndarray:
@@ -29,8 +40,8 @@ def point_scatter(squares: np.ndarray, freedom: np.ndarray, reading: np.ndarray)
     total = float(freedom.sum())
     log_p = -0.5 * np.log(shape) @ freedom - 0.5 * total * np.log(np.maximum(whole, 1e-300))
     # Half of the prior for constant noise, the other half spread over all ratios: growth has to be seen to be believed.
-    log_p[0] += np.log(_CONSTANT)
-    log_p[1:] += np.log((1.0 - _CONSTANT) / (len(_RATIOS) - 1))
+    log_p[0] += np.log(SCATTER_PRIOR.constant)
+    log_p[1:] += np.log((1.0 - SCATTER_PRIOR.constant) / (len(_RATIOS) - 1))
     # Less the largest: likelihoods of hundreds of runs underflow otherwise.
     p = np.exp(log_p - log_p.max())
     # The mean of variances and not of deviations: noise adds by its square.
@@ -50,7 +61,7 @@ def grows(squares: np.ndarray, freedom: np.ndarray, reading: np.ndarray, stated:
     def log_likelihood(variance: np.ndarray) -> np.ndarray:
         return -0.5 * (np.log(variance) @ freedom + (1.0 / variance) @ squares)
 
-    shares = np.linspace(0.0, MOST_SHARE, 41)[:, None]
+    shares = np.linspace(0.0, SCATTER_PRIOR.most_share, 41)[:, None]
     factor = np.geomspace(1.0, 100.0, 81)[:, None]
     growing = log_likelihood(stated**2 + (shares * reading) ** 2).max()
     # One unknown each, so that the likelihoods compare without a penalty.

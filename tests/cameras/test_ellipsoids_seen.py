@@ -15,7 +15,7 @@ from camera_scene import EYE
 from scipy.spatial.transform import Rotation
 
 from lunar_mjx.cameras import Light, Sun, look_at, picture
-from lunar_mjx.cameras.rays.trace import SKIN
+from lunar_mjx.cameras.rays.trace import TRACE
 from lunar_mjx.cameras.relief import ring, rocks_within
 from lunar_mjx.cameras.scene import build_scene
 from lunar_mjx.rover import load_rover
@@ -60,7 +60,7 @@ def test_depth_labels_and_shadow_are_those_of_rays_in_scaled_space() -> None:
     assert np.quantile(error, 0.95) < 2e-3 and np.median(error) < 3e-4
     # what faces the Sun is bright, and the ground behind the stone lies in its shadow
     point = pose.position + ground[..., None] * rays
-    above = point + np.array([0.0, 0.0, SKIN])  # where a shadow ray begins
+    above = point + np.array([0.0, 0.0, TRACE.skin])  # where a shadow ray begins
     dark = (expected == 1) & np.isfinite(_entry(above, np.broadcast_to(SUN.direction, point.shape)))
     lit = (expected == 1) & ~dark & (np.linalg.norm(point[..., :2] - CENTRE[:2], axis=-1) < 5.0)
     grey = np.asarray(found.rgb)[..., 0]

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from lunar_mjx.backends.parity import compare as parity
-from lunar_mjx.backends.parity.cases import HALF, Case, cases, drive
+from lunar_mjx.backends.parity.cases import PARITY_GRID, Case, cases, drive
 from lunar_mjx.backends.parity.record import record
 from lunar_mjx.backends.physics.ellipsoids import box_in_ellipsoid, wheel_in_ellipsoid
 from lunar_mjx.effects.wheel.ellipsoid_contact import contact_with_box, contact_with_wheel
@@ -169,7 +169,8 @@ def _case(model: Model) -> Case:
     real = radii > 0
     turns = Rotation.random(real.sum(), rng=np.random.default_rng(3)).as_matrix()
     axes = radii[real, None] * np.array([1.4, 1.1, 0.8])
-    edge = (-HALF, -HALF, HALF, HALF)
+    half = PARITY_GRID.half
+    edge = (-half, -half, half, half)
     made = build_ellipsoids(np.asarray(rocks.centers, float)[real], axes, turns, edge, dtype=float)
     terrain = dataclasses.replace(ground.terrain, rocks=jax.device_get(made))
     return Case("ellipsoids, soft", terrain)

@@ -7,7 +7,7 @@ import pytest
 
 from lunar_mjx.terrain import Craters, Dem, Roughness, add_detail, make_surface
 from lunar_mjx.terrain.craters import draw, profile
-from lunar_mjx.terrain.procedural import TOLERANCE, cell_means
+from lunar_mjx.terrain.procedural import MEANS_KEPT, cell_means
 from lunar_mjx.terrain.roughness import deviogram, fractal, hurst_exponent
 
 
@@ -55,7 +55,7 @@ def test_detail_leaves_the_means_of_the_dem(cell):
     plain = add_detail(dem, cell, 7)
     ratio = round(dem.cell / fine.cell)
     change = cell_means(fine.heights - plain.heights, ratio)
-    assert np.abs(change).max() <= TOLERANCE
+    assert np.abs(change).max() <= MEANS_KEPT.tolerance
     assert np.std(fine.heights - plain.heights) > 0.01  # there is detail
     np.testing.assert_allclose(plain.heights[::ratio, ::ratio], dem.heights, atol=1e-9)
     assert fine.bounds == pytest.approx(dem.bounds) and fine.cell <= cell + 1e-12
@@ -76,7 +76,10 @@ def test_detail_on_apollo_15(apollo15):
     dem = read_dem(apollo15, cell=2.0, height_scale=49.0, crop=(100.0, 100.0, 60.0, 60.0))
     fine = add_detail(dem, 0.2, 1, roughness=Roughness(), craters=Craters(smallest=0.6, density=0.05))
     assert fine.heights.shape == (301, 301) and fine.cell == pytest.approx(0.2)
-    assert np.abs(cell_means(fine.heights, 10) - cell_means(add_detail(dem, 0.2, 1).heights, 10)).max() <= TOLERANCE
+    assert (
+        np.abs(cell_means(fine.heights, 10) - cell_means(add_detail(dem, 0.2, 1).heights, 10)).max()
+        <= MEANS_KEPT.tolerance
+    )
 
 
 def test_flat_dem_keeps_flat_without_features():

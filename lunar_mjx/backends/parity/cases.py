@@ -15,8 +15,18 @@ from lunar_mjx.simulate import Commands, constant_commands
 from lunar_mjx.terrain import HeightField, SoilMap, Terrain, stack
 from lunar_mjx.terrain.rocks import build_rocks
 
-HALF, CELL = 20.0, 0.25
-"""Half side and spacing of the grid, m."""
+
+@dataclasses.dataclass(frozen=True)
+class ParityGrid:
+    """The grid of the terrain on which engines are compared."""
+
+    half: float = 20.0
+    """Half its side, m."""
+    cell: float = 0.25
+    """Spacing of its nodes, m."""
+
+
+PARITY_GRID = ParityGrid()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,8 +52,8 @@ def cases(rover: Rover, names: Collection[str] | None = None) -> list[Case]:
       rover: boulders lie in front of its front wheels, and one that its chassis strikes.
       names: of those to keep, all if None.
     """
-    half = round(HALF / CELL)
-    at = np.arange(-half, half + 1) * CELL
+    half = round(PARITY_GRID.half / PARITY_GRID.cell)
+    at = np.arange(-half, half + 1) * PARITY_GRID.cell
     x, y = at[None, :], at[:, None]
     level = np.zeros((len(at), len(at)))
     slope = np.tan(np.deg2rad(8.0)) * (0.8 * x + 0.6 * y)
@@ -83,11 +93,13 @@ def _stones(rover: Rover) -> np.ndarray:
 
 
 def _terrain(name: str, at: np.ndarray, heights: np.ndarray, hard: float, stones: np.ndarray | None) -> Terrain:
-    x0, cell = np.float32(at[0]), np.float32(CELL)
+    x0, cell = np.float32(at[0]), np.float32(PARITY_GRID.cell)
     placed = np.zeros((0, 4)) if stones is None else stones
-    rocks = build_rocks(placed[:, :3], placed[:, 3], (-HALF, -HALF, HALF, HALF))
+    rocks = build_rocks(
+        placed[:, :3], placed[:, 3], (-PARITY_GRID.half, -PARITY_GRID.half, PARITY_GRID.half, PARITY_GRID.half)
+    )
     field = HeightField(*(np.asarray(v, np.float32) for v in (heights, x0, x0, cell)))  # type: ignore[arg-type]
-    soil = SoilMap(*(np.asarray(v, np.float32) for v in (np.full((3, 3), hard), x0, x0, HALF)))  # type: ignore[arg-type]
+    soil = SoilMap(*(np.asarray(v, np.float32) for v in (np.full((3, 3), hard), x0, x0, PARITY_GRID.half)))  # type: ignore[arg-type]
     return Terrain(field, rocks, soil, np.zeros(3, np.float32), name)  # type: ignore[arg-type]
 
 

@@ -59,14 +59,22 @@ DRIVE_QUANTITIES = (
 )
 """What level 3 compares along a drive."""
 
-FLOOR_FACTOR = 10.0
-"""A drive may depart from the reference by its tolerance and this many times the noise floor."""
+
+@dataclasses.dataclass(frozen=True)
+class ParityWindow:
+    """How drives of two engines are compared."""
+
+    floor_factor: float = 10.0
+    """A drive may depart from the reference by its tolerance and this many times the noise floor."""
+    moment: int = 10
+    """Half the width of the window in which a moment is sought, in samples of a drive (0.5 s)."""
+
+
+PARITY_WINDOW = ParityWindow()
+
 
 MOMENTARY = ("sinkage", "slip", "joint_torque")
 """Quantities that are not integrals of the motion: their noise floor counts around its time, not ever after."""
-
-MOMENT = 10
-"""Half the width of that window, in samples of a drive (0.5 s)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,7 +207,7 @@ def compare(
         difference, size = gap(a, b, quantity), np.abs(a)
     allowed = tolerance.absolute + tolerance.relative * size + np.zeros_like(difference)
     if floor is not None:
-        allowed = allowed + FLOOR_FACTOR * floor
+        allowed = allowed + PARITY_WINDOW.floor_factor * floor
     error = np.where(np.isfinite(difference), difference / allowed, np.inf)
     at = np.unravel_index(int(np.argmax(error)), error.shape)
     return float(error[at]), float(difference[at]), _where(model, quantity, a.shape, at), float(np.max(size))
@@ -263,9 +271,9 @@ def judge_drive(
 
 
 def _around(apart: np.ndarray) -> np.ndarray:
-    """The largest value within `MOMENT` samples of each time (first axis)."""
-    padded = np.pad(apart, [(MOMENT, MOMENT)] + [(0, 0)] * (apart.ndim - 1))
-    return np.lib.stride_tricks.sliding_window_view(padded, 2 * MOMENT + 1, axis=0).max(axis=-1)
+    """The largest value within `PARITY_WINDOW.moment` samples of each time (first axis)."""
+    padded = np.pad(apart, [(PARITY_WINDOW.moment, PARITY_WINDOW.moment)] + [(0, 0)] * (apart.ndim - 1))
+    return np.lib.stride_tricks.sliding_window_view(padded, 2 * PARITY_WINDOW.moment + 1, axis=0).max(axis=-1)
 
 
 def gap(a: np.ndarray, b: np.ndarray, quantity: str) -> np.ndarray:

@@ -11,6 +11,7 @@ runs on arrays of XLA and inside a kernel alike. `load` is how it reads the tabl
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -27,13 +28,23 @@ Load = Callable[[Any, Any], Any]
 
 FAR = 1e9
 """Multiple of a direction that stands for "nothing is met", and for what divides by zero."""
-LOW = -1e9
-"""Top of a square beyond the grid, m."""
-NUDGE = 1e-3
-"""Cells by which a ray goes on over an edge, so that rounding never leaves it before: some units in the last place of a
-coordinate of 1,000 cells."""
-SPOILT = 4096
-"""Most rounds of a walk. A ray through n cells needs fewer than 3 n; rays that are not finite end here."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkSettings:
+    """Bounds of the walk of rays through squares."""
+
+    low: float = -1e9
+    """Top of a square beyond the grid, m."""
+    nudge: float = 1e-3
+    """Cells by which a ray goes on over an edge, so that rounding never leaves it before: some units in the last
+    place of a coordinate of 1,000 cells."""
+    most_rounds: int = 4096
+    """Most rounds of a walk. A ray through n cells needs fewer than 3 n; rays that are not finite end here."""
+
+
+WALK = WalkSettings()
+
 
 _NUMBERS = ("x0", "y0", "cell", "rock_x0", "rock_y0", "rock_cell", "top")
 
@@ -99,7 +110,7 @@ def tables(terrain: Terrain) -> tuple[Grid, Tables]:
         cells = jnp.maximum(cells, _stones_over(terrain, rocks, (rows - 1, cols - 1)))
     side = 2**levels
     # Beyond the grid lies nothing that a ray could meet.
-    level = jnp.pad(cells, ((0, side - rows + 1), (0, side - cols + 1)), constant_values=LOW)
+    level = jnp.pad(cells, ((0, side - rows + 1), (0, side - cols + 1)), constant_values=WALK.low)
     pyramid = [level]
     while level.shape[0] > 1:
         half = level.shape[0] // 2
@@ -119,7 +130,7 @@ def tables(terrain: Terrain) -> tuple[Grid, Tables]:
 
 
 def _stones_over(terrain: Terrain, rocks: Any, shape: tuple[int, int]) -> Any:
-    """Upper bound of the rocks' tops over each cell of the ground, m; `LOW` where there is none."""
+    """Upper bound of the rocks' tops over each cell of the ground, m; `WALK.low` where there is none."""
     field, (rows, cols) = terrain.field, rocks.index.shape
     centre, radius = rocks.centers[rocks.index], rocks.radii[rocks.index]
     west, south = rocks.x0 + jnp.arange(cols) * rocks.cell, rocks.y0 + jnp.arange(rows) * rocks.cell
@@ -128,7 +139,7 @@ def _stones_over(terrain: Terrain, rocks: Any, shape: tuple[int, int]) -> Any:
     y_gap = jnp.maximum(jnp.maximum(south[:, None] - centre[..., 1], centre[..., 1] - south[:, None] - rocks.cell), 0.0)
     # A per cent more: a bound that is too high costs a step, one too low loses a rock's edge.
     over = (x_gap**2 + y_gap**2 < (radius * 1.01) ** 2) & (radius > 0.0)
-    tops = jnp.where(over, centre[..., 2] + radius, LOW)
+    tops = jnp.where(over, centre[..., 2] + radius, WALK.low)
 
     def reach(count: int, start: Any, rock_start: Any, last: int) -> tuple[Any, Any]:
         edge = (start + jnp.arange(count + 1) * field.cell - rock_start) / rocks.cell
@@ -145,9 +156,9 @@ def _stones_over(terrain: Terrain, rocks: Any, shape: tuple[int, int]) -> Any:
         return jnp.maximum(best, wide[jnp.minimum(j0 + k, j1), :])
 
     # as many cells of the rocks' grid as one cell of the ground spans, by columns and then by rows
-    low = jnp.full((rows, shape[1]), LOW, tops.dtype)
+    low = jnp.full((rows, shape[1]), WALK.low, tops.dtype)
     wide = jax.lax.fori_loop(0, jnp.max(i1 - i0) + 1, along, low)
-    return jax.lax.fori_loop(0, jnp.max(j1 - j0) + 1, across, jnp.full(shape, LOW, tops.dtype))
+    return jax.lax.fori_loop(0, jnp.max(j1 - j0) + 1, across, jnp.full(shape, WALK.low, tops.dtype))
 
 
 def over(value: Any) -> Any:
@@ -182,7 +193,7 @@ def meet(
     u0, v0 = (origin.x - x0) * per_cell, (origin.y - y0) * per_cell
     du, dv, dz = direction.x * per_cell, direction.y * per_cell, direction.z
     iu, iv, iz = over(du), over(dv), over(dz)
-    nudge = NUDGE * jnp.minimum(jnp.abs(iu), jnp.abs(iv))
+    nudge = WALK.nudge * jnp.minimum(jnp.abs(iu), jnp.abs(iv))
     # within the grid, and below the highest place
     ends_u = (-u0 * iu, (grid.cols - 1 - u0) * iu)
     ends_v = (-v0 * iv, (grid.rows - 1 - v0) * iv)
@@ -211,7 +222,7 @@ def meet(
 
     def walking(carry: tuple) -> Any:
         count, _, _, state = carry
-        return (count < SPOILT) & (jnp.max(state) > 0)
+        return (count < WALK.most_rounds) & (jnp.max(state) > 0)
 
     def step(carry: tuple) -> tuple:
         count, t, level, state = carry
@@ -237,7 +248,7 @@ def meet(
 
     def seeking(carry: tuple) -> Any:
         count, state = carry[0], carry[3]
-        return (count < SPOILT) & (jnp.max(jnp.abs(state)) > 0)
+        return (count < WALK.most_rounds) & (jnp.max(jnp.abs(state)) > 0)
 
     def round_(carry: tuple) -> tuple:
         count, t, level, state, rock = carry

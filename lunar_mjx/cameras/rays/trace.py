@@ -6,6 +6,7 @@ elsewhere the same code runs on arrays. Pixels are taken in small tiles, whose r
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -25,22 +26,31 @@ from lunar_mjx.terrain import Terrain
 SKY, GROUND, ROCK, ROVER = range(4)
 """Labels, as `LABELS` names them."""
 
-SKIN = 0.012
-"""How far before a surface its shadow ray begins, m: bilinear patches and the smooth normals on them differ by less."""
-SHADOW_START = 0.03
-"""Way after which a shadow ray may meet ground, m."""
 
-ABOVE, UPON = 5, 1
-"""Levels of the squares with which rays from a camera begin, and shadow rays."""
+@dataclasses.dataclass(frozen=True)
+class TraceSettings:
+    """Where rays begin, and how many of them run together."""
 
-TILE = (8, 4)
-"""Pixels of a kernel's program, across and down; powers of two."""
-WARPS = 1
-"""Warps of 32 threads that share a program's pixels."""
-MOST = 65_535
-"""Most pictures that one start of the kernel draws: a CUDA grid is no longer along its second axis."""
-AT_ONCE = 128
-"""Pixels that arrays hold at once away from a GPU: few enough that one slow ray keeps few others waiting."""
+    skin: float = 0.012
+    """How far before a surface its shadow ray begins, m: bilinear patches and the smooth normals on them differ by
+    less."""
+    shadow_start: float = 0.03
+    """Way after which a shadow ray may meet ground, m."""
+    above: int = 5
+    """Level of the squares with which rays from a camera begin: far above the ground most squares are missed."""
+    upon: int = 1
+    """Level with which shadow rays begin, upon the ground."""
+    tile: tuple[int, int] = (8, 4)
+    """Pixels of a kernel's program, across and down; powers of two."""
+    warps: int = 1
+    """Warps of 32 threads that share a program's pixels."""
+    most_pictures: int = 65_535
+    """Most pictures that one start of the kernel draws: a CUDA grid is no longer along its second axis."""
+    rays_at_once: int = 128
+    """Pixels that arrays hold at once away from a GPU: few enough that one slow ray keeps few others waiting."""
+
+
+TRACE = TraceSettings()
 
 
 class Traced(NamedTuple):
@@ -132,7 +142,7 @@ def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, colu
     direction = Vec3(*(turn[3 * i] * px + turn[3 * i + 1] * py - turn[3 * i + 2] for i in range(3)))
     zero = jnp.zeros_like(px)
     eye = Vec3(*(p + zero for p in position))
-    t, rock = ground.meet(plan.grid, table, load, eye, direction, zero, far + zero, ABOVE)
+    t, rock = ground.meet(plan.grid, table, load, eye, direction, zero, far + zero, TRACE.above)
     label = jnp.where(rock == -1, GROUND, jnp.where(rock >= 0, ROCK, SKY))
     which = jnp.zeros_like(label)
     if sum(plan.counts):
@@ -157,13 +167,13 @@ def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, colu
     # no ray for what is turned away from the Sun, nor below the horizon
     sought = (label != SKY) & (face.dot(sun) > 0.0) & (sun.z > 0.0)
     # Off the surface along its normal, or rounding would let the surface shade itself.
-    start, way = point + face * SKIN, Vec3(*(s + zero for s in sun))
+    start, way = point + face * TRACE.skin, Vec3(*(s + zero for s in sun))
     end = jnp.where(sought, FAR, -FAR)
     if sum(plan.counts):
         _, shape = solids.meet(plan.counts, shapes, load, start, way, end)
         sought = sought & (shape < 0)
         end = jnp.where(sought, FAR, -FAR)
-    shadow = ground.meet(plan.grid, table, load, start, way, zero + SHADOW_START, end, UPON)
+    shadow = ground.meet(plan.grid, table, load, start, way, zero + TRACE.shadow_start, end, TRACE.upon)
     lit = jnp.where(sought & (shadow.rock < -1), 1.0, zero)
     return depth, label, which, *face, lit
 
@@ -171,7 +181,7 @@ def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, colu
 def _by_arrays(plan: _Plan, table: Tables, view: Any, shapes: Any) -> tuple:
     """`_pixels` on arrays, some rows of the picture after the other."""
     # A loop over arrays ends with its slowest ray; few rays wait for it here.
-    rows = max(1, min(plan.height, AT_ONCE // plan.width))
+    rows = max(1, min(plan.height, TRACE.rays_at_once // plan.width))
     parts = math.ceil(plan.height / rows)
 
     def some(first: Any) -> tuple:
@@ -187,7 +197,7 @@ def _by_kernel(plan: _Plan, table: Tables, view: Any, shapes: Any, interpret: bo
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
-    wide, high = TILE
+    wide, high = TRACE.tile
     across, down = math.ceil(plan.width / wide), math.ceil(plan.height / high)
 
     def load(ref: Any, index: Any) -> Any:
@@ -212,7 +222,7 @@ def _by_kernel(plan: _Plan, table: Tables, view: Any, shapes: Any, interpret: bo
         program,
         out_shape=[jax.ShapeDtypeStruct((count,), k) for k in kinds],
         grid=(across * down,),
-        compiler_params=None if interpret else triton.CompilerParams(num_warps=WARPS, num_stages=1),
+        compiler_params=None if interpret else triton.CompilerParams(num_warps=TRACE.warps, num_stages=1),
         interpret=interpret,
         name="trace",
     )

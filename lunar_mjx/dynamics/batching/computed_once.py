@@ -8,6 +8,7 @@ marks a value that is to be stored. GPUs, whose memory is slow beside their arit
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -18,10 +19,19 @@ from jax.extend import core
 
 from lunar_mjx.dynamics.batching.batch_last import INLINE, bind
 
-KERNEL = 4000.0
-"""Additions of single numbers that take as long as one more kernel, about 0.2 us."""
-TRAFFIC = 2.0
-"""Additions that take as long as to store a number, or to read it again."""
+
+@dataclasses.dataclass(frozen=True)
+class KernelCosts:
+    """What a GPU's work costs, in additions of single numbers."""
+
+    kernel: float = 4000.0
+    """Additions of single numbers that take as long as one more kernel, about 0.2 us."""
+    traffic: float = 2.0
+    """Additions that take as long as to store a number, or to read it again."""
+
+
+KERNEL_COSTS = KernelCosts()
+
 
 _MOVES = {"broadcast_in_dim", "convert_element_type", "copy", "reshape", "slice", "squeeze", "stop_gradient"}
 _ADDITIONS = {
@@ -154,7 +164,8 @@ def _store_if_dear(value: _Value, times: float) -> None:
     """Stores a value that would else be computed `times` over, if that pays."""
     if times <= 1.0 or not value.pending:
         return
-    if sum(value.pending.values()) * (times - 1.0) > KERNEL + TRAFFIC * (times + 1.0) * np.size(value.array):
+    stored = KERNEL_COSTS.kernel + KERNEL_COSTS.traffic * (times + 1.0) * np.size(value.array)
+    if sum(value.pending.values()) * (times - 1.0) > stored:
         value.array = set_xla_metadata(jax.jit(_same)(value.array), inlineable="false")
         value.pending = {}
 

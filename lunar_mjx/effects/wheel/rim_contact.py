@@ -12,12 +12,19 @@ from lunar_mjx.effects.base import Parameter, effect
 ALONG = tuple(np.linspace(-0.9, 0.9, 11).tolist())
 """Where the ground is sampled ahead of and behind the axle, in radii: the rim ends at 1, where it stands upright."""
 
-MARGIN = 0.02
-"""Clearance below which ground counts as near the rim, in radii: it gives a wheel that only just touches three samples
-and with them a slope."""
 
-_AIRBORNE = 1e-6
-"""Weight, in squared radii, of the samples next to the axle's foot where the rim is far from all ground."""
+@dataclasses.dataclass(frozen=True)
+class RimSamples:
+    """How samples of the ground count along the rim."""
+
+    margin: float = 0.02
+    """Clearance below which ground counts as near the rim, in radii: it gives a wheel that only just touches three
+    samples and with them a slope."""
+    airborne: float = 1e-6
+    """Weight, in squared radii, of the samples next to the axle's foot where the rim is far from all ground."""
+
+
+RIM_SAMPLES = RimSamples()
 
 
 def fitted_plane(height_at, center, axle, radius, width):
@@ -46,9 +53,9 @@ def fitted_plane(height_at, center, axle, radius, width):
     foot = height[len(ALONG) // 2]
     along, left, right = height[:-2] - foot, height[-2], height[-1]
     clear = center.z - foot - along
-    within = radius * (1.0 + MARGIN) - jnp.sqrt(u * u + clear * clear)
+    within = radius * (1.0 + RIM_SAMPLES.margin) - jnp.sqrt(u * u + clear * clear)
     # Far above ground no sample lies within the rim; those next to the axle then define a plane all the same.
-    near = jnp.where(jnp.abs(share) < 0.3, _AIRBORNE, 0.0)
+    near = jnp.where(jnp.abs(share) < 0.3, RIM_SAMPLES.airborne, 0.0)
     # Squared: the weight and its derivative go to zero where the rim leaves the ground.
     weight = jnp.maximum(within / radius, 0.0) ** 2 + near
     total = jnp.sum(weight, axis=0)

@@ -6,6 +6,7 @@ depend on how worlds are made.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from typing import Any
@@ -23,10 +24,20 @@ from lunar_mjx.pytree import pytree
 from lunar_mjx.terrain import HeightField, Rocks, Terrain
 from lunar_mjx.terrain.rocks import CELL
 
-GOALS, STARTS = 4, 16
-"""Goals of a world, and starts of a goal."""
-BATCH = 4
-"""Worlds that are made at once."""
+
+@dataclasses.dataclass(frozen=True)
+class PoolSizes:
+    """How many places a world of the pool has, and how worlds are made."""
+
+    goals: int = 4
+    """Goals of a world."""
+    starts: int = 16
+    """Starts of a goal."""
+    batch: int = 4
+    """Worlds that are made at once."""
+
+
+POOL_SIZES = PoolSizes()
 
 
 @pytree
@@ -130,13 +141,13 @@ def _worlds(rung: Rung, worlds: int, half_width: float) -> Any:
         k_world, k_goals = jax.random.split(key)
         world = make_world(rung, k_world, hardness)
         free, roomy = passable(rung, world, half_width)
-        keys = jax.random.split(k_goals, GOALS)
+        keys = jax.random.split(k_goals, POOL_SIZES.goals)
         # Distances are found once per goal and kept: a step then only reads them.
-        return world, jax.vmap(lambda k: draw_goal(rung, free, roomy, k, STARTS))(keys), free
+        return world, jax.vmap(lambda k: draw_goal(rung, free, roomy, k, POOL_SIZES.starts))(keys), free
 
     def all_of(key: Any, hardness: Any) -> Any:
         # A few at a time: all at once would need their distances' memory at once.
-        return jax.lax.map(lambda k: one(k, hardness), jax.random.split(key, worlds), batch_size=BATCH)
+        return jax.lax.map(lambda k: one(k, hardness), jax.random.split(key, worlds), batch_size=POOL_SIZES.batch)
 
     return jax.jit(all_of)
 

@@ -14,7 +14,7 @@ from lunar_mjx.envs.navigation.actions import ACTION_MODES
 from lunar_mjx.envs.navigation.kalman import KalmanConfig
 from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION, check_blocks
 from lunar_mjx.envs.navigation.randomise import Range
-from lunar_mjx.envs.navigation.rewards import CONSISTENT_WEIGHTS, FAILURE, PAPER_WEIGHTS, SUCCESS, TERMS, TOLD_BY_TALLY
+from lunar_mjx.envs.navigation.rewards import CONSISTENT_WEIGHTS, PAPER_ENDS, PAPER_WEIGHTS, TERMS, TOLD_BY_TALLY
 from lunar_mjx.errors import bad_input, require_finite
 
 DIVERGENCE = ("stop", "reset")
@@ -75,8 +75,8 @@ class NavigationConfig:
     start_yaw: float = np.pi
     episode_time: float = 30.0
     weights: Mapping[str, float] = dataclasses.field(default_factory=lambda: dict(CONSISTENT_WEIGHTS))
-    success: float = SUCCESS
-    failure: float = FAILURE
+    success: float = PAPER_ENDS.success
+    failure: float = PAPER_ENDS.failure
     most_tilt: float = np.pi / 3
     stuck_time: float = 8.0
     stuck_distance: float = 0.1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -138,8 +139,18 @@ PAPER_WEIGHTS = {"progress_paper": 20.0, "heading": 0.1, "tilt": 0.05, "excite":
 CONSISTENT_WEIGHTS = {"progress": 20.0, "heading": 0.1, "tilt": 0.05, "excite": 0.1}
 """The paper's sum with signed progress."""
 
-SUCCESS, FAILURE = 500.0, -60.0
-"""G and V of the paper."""
+
+@dataclasses.dataclass(frozen=True)
+class PaperEnds:
+    """What the end of an episode pays in the paper."""
+
+    success: float = 500.0
+    """G: the goal is reached."""
+    failure: float = -60.0
+    """V: the episode ends in any other way but by time."""
+
+
+PAPER_ENDS = PaperEnds()
 
 
 def reached(to_goal: Float[Array, "env 2"], radius: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -32,9 +33,21 @@ TOP = (
     "commitment",
 )
 REQUIRED = ("slip_ratio", "slip_angle_deg", "normal_load_N")
-LARGEST_WHEEL = 5.0
-"""m: the radius or width of no wheel on a test bed; what is larger is in another unit."""
-MOST_GROUSERS = 1000
+
+
+@dataclasses.dataclass(frozen=True)
+class BedLimits:
+    """Sizes that no wheel on a test bed exceeds."""
+
+    largest_wheel: float = 5.0
+    """m: the radius or width of no wheel on a test bed; what is larger is in another unit."""
+    most_grousers: int = 1000
+    """Grousers around a wheel; real ones have some dozens."""
+
+
+BED_LIMITS = BedLimits()
+
+
 WHEEL = ("radius_m", "width_m", "grouser_count", "grouser_height_m")
 _SUFFIX = re.compile(r"_(ratio|deg|N|m_s|Nm|m)$")
 
@@ -50,9 +63,9 @@ def read_steady(folder: Path, top: Fields, read_noise: Callable[[Fields], dict[s
     path = folder / _file(top)
     wheel = top.table("wheel")
     wheel.known(WHEEL)
-    size = {key: wheel.positive(key, most=LARGEST_WHEEL) for key in WHEEL[:2]}
+    size = {key: wheel.positive(key, most=BED_LIMITS.largest_wheel) for key in WHEEL[:2]}
     size |= {key: wheel.number(key, 0.0) for key in WHEEL[2:]}
-    for key, high in (("grouser_count", MOST_GROUSERS), ("grouser_height_m", size["radius_m"])):
+    for key, high in (("grouser_count", BED_LIMITS.most_grousers), ("grouser_height_m", size["radius_m"])):
         require_within(top.path, wheel.field(key), size[key], 0.0, high)
     if size["grouser_count"] % 1.0:
         raise bad_input(

@@ -18,10 +18,19 @@ from lunar_mjx.errors import UserError, bad_input, require_file
 SEPARATORS: Mapping[str, str] = {"comma": ",", "semicolon": ";", "tab": "\t", "blank": r"\s+", ",": ",", ";": ";"}
 """Names of separators in a map, and what pandas calls them; `blank` is any run of blanks and tabs."""
 SUFFIXES = (".csv", ".txt", ".dat", ".tsv", ".log", ".parquet", ".pq", ".mat")
-MOST_ROWS = 0.6
-"""Share of rows that a separator must split into the same number of cells."""
-_SNIFFED_BYTES = 65536
-"""Enough for a header and hundreds of rows, from which the separator is guessed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sniffing:
+    """How a separator is guessed."""
+
+    most_rows: float = 0.6
+    """Share of rows that a separator must split into the same number of cells."""
+    bytes_read: int = 65536
+    """Enough for a header and hundreds of rows, from which the separator is guessed."""
+
+
+SNIFFING = Sniffing()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +79,7 @@ def _text(path: Path, layout: Layout) -> pd.DataFrame:
     try:
         # Spreadsheets write a byte order mark, which would become part of the first name.
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            start = stream.read(_SNIFFED_BYTES)
+            start = stream.read(SNIFFING.bytes_read)
     except (UnicodeDecodeError, OSError) as error:
         raise UserError(f"{path}: is not a text table ({error}); give CSV, TXT, Parquet or MATLAB files.") from None
     if not start.strip():
@@ -121,7 +130,7 @@ def guess_separator(start: str, decimal: str = ".") -> str:
         # By csv, since quoted cells may hold the sign.
         counts = [len(next(csv.reader([line], delimiter=sign))) for line in lines]
         typical = int(np.median(counts))
-        if typical > most and np.mean(np.array(counts) == typical) > MOST_ROWS:
+        if typical > most and np.mean(np.array(counts) == typical) > SNIFFING.most_rows:
             best, most = sign, typical
     return best
 

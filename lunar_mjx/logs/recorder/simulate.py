@@ -23,11 +23,19 @@ from lunar_mjx.manoeuvres import Manoeuvre, commands, load_manoeuvre
 from lunar_mjx.model import LUNAR_GRAVITY, Model, make_model
 from lunar_mjx.simulate import Commands, command_channels, simulate
 
-SETTLE = 2.0
-"""Seconds for which the rover stands before the log begins, as a real one does."""
 
-_FINEST = 0.0101
-"""Longest interval of the telemetry that tables are sampled from, s: 100 Hz for an IMU at 50 Hz."""
+@dataclasses.dataclass(frozen=True)
+class SimulatedDrive:
+    """How a simulated drive begins and is sampled."""
+
+    settle: float = 2.0
+    """Seconds for which the rover stands before the log begins, as a real one does."""
+    finest: float = 0.0101
+    """Longest interval of the telemetry that tables are sampled from, s: 100 Hz for an IMU at 50 Hz."""
+
+
+SIMULATED_DRIVE = SimulatedDrive()
+
 
 BUS = "bus_voltage_V"
 
@@ -188,11 +196,11 @@ def _drive(
         k
         for k in range(1, steps_per_command + 1)
         # The coarsest telemetry that is fine enough, in whole parts of a command.
-        if (steps_per_command % k == 0 and moves.interval / k <= _FINEST) or k == steps_per_command
+        if (steps_per_command % k == 0 and moves.interval / k <= SIMULATED_DRIVE.finest) or k == steps_per_command
     )
     fine = np.repeat(moves.values, split, axis=0)
     interval = moves.interval / split
-    settle = round(SETTLE / interval)
+    settle = round(SIMULATED_DRIVE.settle / interval)
     # Commands of zero: the rover stands and sinks in before its clock begins.
     still = np.zeros((settle, fine.shape[1]))
     system, seen = simulate(model, Commands(np.concatenate([still, fine]), interval), *start, engine=engine)

@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from lunar_mjx.wheel_bed.particles.settings import ParticleWheel
 
-_SEGMENTS = 128
-"""Corners of a smooth rim: it is round to 0.03 % of the radius."""
-_THICKNESS = 0.25
-"""Share of the pitch from grouser to grouser that a grouser takes (choice: thin plates fall between nodes)."""
+
+@dataclasses.dataclass(frozen=True)
+class WheelMesh:
+    """How finely a wheel is drawn for the particles."""
+
+    segments: int = 128
+    """Corners of a smooth rim: it is round to 0.03 % of the radius."""
+    thickness: float = 0.25
+    """Share of the pitch from grouser to grouser that a grouser takes (choice: thin plates fall between nodes)."""
+
+
+WHEEL_MESH = WheelMesh()
 
 
 def rim(wheel: ParticleWheel) -> np.ndarray:
     """Outline of the wheel in the plane of its disc, counter-clockwise, (n, 2) in m: x and z."""
     if not wheel.grouser_count:
-        angle = 2.0 * np.pi * np.arange(_SEGMENTS) / _SEGMENTS
+        angle = 2.0 * np.pi * np.arange(WHEEL_MESH.segments) / WHEEL_MESH.segments
         return wheel.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     count = wheel.grouser_count
     pitch = 2.0 * np.pi / count
-    per_gap = max(4, _SEGMENTS // count)
+    per_gap = max(4, WHEEL_MESH.segments // count)
     # A middle corner on the grouser's tip keeps it round, too.
-    high = np.linspace(0.0, _THICKNESS * pitch, 3)
-    low = np.linspace(_THICKNESS * pitch, pitch, per_gap + 1)
+    high = np.linspace(0.0, WHEEL_MESH.thickness * pitch, 3)
+    low = np.linspace(WHEEL_MESH.thickness * pitch, pitch, per_gap + 1)
     angle = np.concatenate([high, low[:-1], [pitch]])
     radius = np.concatenate([np.full(3, wheel.radius + wheel.grouser_height), np.full(per_gap + 1, wheel.radius)])
     angles = np.concatenate([angle + k * pitch for k in range(count)])

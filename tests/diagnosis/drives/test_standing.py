@@ -17,7 +17,7 @@ from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench
 from lunar_mjx.logs import read_log, simulate_log, write_log
 from lunar_mjx.logs.log import Noise
 from lunar_mjx.logs.recorder.instruments import Recording
-from lunar_mjx.logs.recorder.simulate import SETTLE as RECORDER_SETTLES
+from lunar_mjx.logs.recorder.simulate import SIMULATED_DRIVE
 from lunar_mjx.model import make_model
 from lunar_mjx.simulate import command_channels
 from tests.inference.toy_problem import manoeuvres
@@ -98,7 +98,7 @@ def test_a_log_on_a_slope_tells_how_long_its_rover_had_stood(tmp_path):
     problem = DriveProblem([log], make_model("viper", terrain=log.terrain), {})
     place = next(i for i, c in enumerate(problem.coordinates) if c.name == STOOD)
     c = problem.coordinates[place]
-    stood = np.array([LOG_START.settle, 1.5, RECORDER_SETTLES, 3.0])
+    stood = np.array([LOG_START.settle, 1.5, SIMULATED_DRIVE.settle, 3.0])
     rows = np.repeat(problem.origin()[None], len(stood), axis=0)
     rows[:, place] = (stood - c.start) / c.scale
     currents = np.concatenate([np.r_[s.start : s.stop] for s in problem.observations.series if "current" in s.channel])
