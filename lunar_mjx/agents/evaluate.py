@@ -14,8 +14,18 @@ from lunar_mjx.envs.core import Environment, split_keys
 from lunar_mjx.envs.navigation.tally import METRICS
 from lunar_mjx.envs.scripted import Agent
 
-_PIECE = 50
-_Z = 1.959963984540054
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """How episodes are scored."""
+
+    piece: int = 50
+    """Steps that run on the device between looks whether all episodes are over."""
+    z: float = 1.959963984540054
+    """Standard deviations that a 95 % interval reaches to either side (the normal quantile of 0.975)."""
+
+
+EVALUATION = Evaluation()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +61,10 @@ class Score:
 
 def wilson(successes: float, count: int) -> tuple[float, float]:
     """95 % interval of a share (Wilson 1927)."""
-    share, z2 = successes / count, _Z * _Z
+    share, z2 = successes / count, EVALUATION.z * EVALUATION.z
     # Wilson's interval stays within 0 and 1 and has a width for 0 of n, where the normal approximation has none.
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
-    half = _Z / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
+    half = EVALUATION.z / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
@@ -82,7 +92,7 @@ class Evaluator:
                 result = jax.tree.map(lambda old, new: jnp.where(first, new, old), result, seen)
                 return (state, over | state.done, result), None
 
-            return jax.lax.scan(step, carry, jax.random.split(key, _PIECE))[0]
+            return jax.lax.scan(step, carry, jax.random.split(key, EVALUATION.piece))[0]
 
         self._piece: Any = jax.jit(piece)
 
@@ -112,7 +122,7 @@ class Evaluator:
         state = self._reset(env_params, key_reset)
         carry = self._carry(state)
         # In pieces, so that an evaluation whose episodes are all over can end early.
-        for i in range(math.ceil(self.env.episode_steps / _PIECE)):
+        for i in range(math.ceil(self.env.episode_steps / EVALUATION.piece)):
             carry = self._piece(env_params, agent_params, carry, jax.random.fold_in(key, i))
             # Looked at between pieces only: a test in every step would wait for the device.
             if bool(carry[1].all()):

@@ -44,7 +44,7 @@ class NoiseEstimate:
     """Twice the log-likelihood that a colour must gain over white noise: a chi-square of two degrees exceeds it once in
     a hundred times."""
     still_rad_s: float = 0.02
-    """A wheel that turns slower stands."""
+    """A wheel that turns slower stands: one of 0.25 m moves by less than 5 mm/s."""
     quietest: float = 1e-12
     """Least variance that has a logarithm, in squared units of the channel: below it a channel is constant."""
 

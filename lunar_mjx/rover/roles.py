@@ -15,8 +15,33 @@ from lunar_mjx.rover.description import Description, WheelDescription
 from lunar_mjx.rover.tree import Body, flip_axis, locate, reframe, world_poses
 from lunar_mjx.rover.urdf import Geometry, Pose, Urdf
 
-MINIMUM_WHEELS = 3
-_SAME_PLACE = 1e-3  # m; wheels closer than this along x are in one row, closer to y = 0 are in the middle
+
+@dataclass(frozen=True)
+class RoleRules:
+    """How wheels and the joints behind them are told from a tree."""
+
+    fewest_wheels: int = 3
+    """Wheels below which a rover cannot stand."""
+    same_place: float = 1e-3
+    """m; wheels closer than this along x are in one row, closer to y = 0 are in the middle."""
+    row: float = 0.1
+    """Share of the wheel base within which wheels are in one row: drawn wheels of one axle are not exactly in line."""
+    along_axle: float = 0.98
+    """Least |cosine| between a cylinder and the axle of a rim; a cylinder across it is a hub or a motor."""
+    across: float = 0.9
+    """Least |cosine| between an axle and y: 26 deg of camber and toe are more than any wheel of a rover has."""
+    upright: float = 0.9
+    """Least |cosine| between a steering axis and z."""
+    level: float = 0.1
+    """Largest |cosine| between a suspension's axis and z: level within 6 deg."""
+    hanging: float = 0.5
+    """Radii above the lowest wheel from which a round body is no wheel: suspensions differ by less, a reel on the deck
+    does not come so low."""
+
+
+ROLE_RULES = RoleRules()
+
+
 _HINGES = ("revolute", "continuous")
 
 
@@ -58,13 +83,13 @@ def assign_roles(urdf: Urdf, bodies: tuple[Body, ...], description: Description)
         wheels = [_described(urdf, bodies, poses, description, w) for w in description.wheels]
     else:
         wheels = [_role(urdf, bodies, poses, b, WheelDescription(b.name)) for b in _candidates(bodies, poses)]
-    if len(wheels) < MINIMUM_WHEELS:
+    if len(wheels) < ROLE_RULES.fewest_wheels:
         wheel_names = ", ".join(w.body for w in wheels) or "none"
         raise bad_input(
             urdf.path,
             "wheels",
             wheel_names,
-            f"are fewer than {MINIMUM_WHEELS}",
+            f"are fewer than {ROLE_RULES.fewest_wheels}",
             "give each wheel a continuous joint with an axis along y at zero angles and a cylinder, "
             "or name the wheels in the description beside the URDF ([[wheels]])",
         )
@@ -113,7 +138,7 @@ def _rim(body: Body) -> tuple[Geometry, float, float] | None:
     rims = []
     for shape in body.geometry:
         # A cylinder across the axle is a hub or a motor, not a rim.
-        if shape.kind == "cylinder" and abs(shape.pose.rotation[:, 2] @ body.joint.axis) > 0.98:
+        if shape.kind == "cylinder" and abs(shape.pose.rotation[:, 2] @ body.joint.axis) > ROLE_RULES.along_axle:
             rims.append((shape, shape.size[0], shape.size[1]))
         elif shape.kind == "sphere":
             rims.append((shape, shape.size[0], shape.size[0]))
@@ -130,15 +155,12 @@ def _candidates(bodies: tuple[Body, ...], poses: dict[str, Pose]) -> list[Body]:
         if body.joint is None or body.joint.kind not in _HINGES or body.name in parents:
             continue
         rim = _rim(body)
-        # 25 deg of camber or toe at most, beyond which it is no wheel of a rover that faces x.
-        if rim is None or abs(_world_axis(body, poses)[1]) < 0.9:
+        if rim is None or abs(_world_axis(body, poses)[1]) < ROLE_RULES.across:
             continue
         candidates.append(body)
         bottoms[body.name] = (poses[body.name] @ rim[0].pose).position[2] - rim[1]
     lowest = min(bottoms.values(), default=0.0)
-    # Half a radius above the lowest: wheels of a suspension may differ by that, a reel on the deck does not come so
-    # low.
-    return [b for b in candidates if bottoms[b.name] - lowest < 0.5 * _rim(b)[1]]  # type: ignore[index]
+    return [b for b in candidates if bottoms[b.name] - lowest < ROLE_RULES.hanging * _rim(b)[1]]  # type: ignore[index]
 
 
 def _described(
@@ -158,7 +180,7 @@ def _described(
         joint = getattr(wheel, role)
         if joint is not None and joint not in names:
             raise bad_input(path, f"wheels {role}", joint, f"is not a joint of {urdf.path.name}", "correct the name")
-    if abs(_world_axis(body, poses)[1]) < 0.9:
+    if abs(_world_axis(body, poses)[1]) < ROLE_RULES.across:
         raise bad_input(
             path, "wheels link", wheel.link, "does not turn about y at zero angles", "let the rover face along x"
         )
@@ -193,10 +215,10 @@ def _role(
         if ancestor.joint is not None and ancestor.joint.kind in _HINGES:
             upright = abs(_world_axis(ancestor, poses)[2])
             # A steering joint lies below the suspension; a turning mast above it would be something else.
-            if upright > 0.9 and steer is None and suspension is None:
+            if upright > ROLE_RULES.upright and steer is None and suspension is None:
                 steer = ancestor.joint.name
-            # Level within 6 deg; the nearest such ancestor, since a bogie is closer to its wheel than its rocker.
-            elif upright < 0.1 and suspension is None:
+            # The nearest such ancestor, since a bogie is closer to its wheel than its rocker.
+            elif upright < ROLE_RULES.level and suspension is None:
                 suspension = ancestor.joint.name
         parent = ancestor.parent
     return WheelRole(
@@ -209,8 +231,7 @@ def _name_corners(urdf: Urdf, wheels: list[WheelRole], description: Description)
     rows: list[list[WheelRole]] = []
     spread = max(w.center[0] for w in wheels) - min(w.center[0] for w in wheels)
     for wheel in sorted(wheels, key=lambda w: -w.center[0]):
-        # A tenth of the wheel base: drawn wheels of one axle are not exactly in line.
-        if rows and rows[-1][0].center[0] - wheel.center[0] < max(_SAME_PLACE, 0.1 * spread):
+        if rows and rows[-1][0].center[0] - wheel.center[0] < max(ROLE_RULES.same_place, ROLE_RULES.row * spread):
             rows[-1].append(wheel)
         else:
             rows.append([wheel])
@@ -221,7 +242,7 @@ def _name_corners(urdf: Urdf, wheels: list[WheelRole], description: Description)
         for wheel in sorted(row, key=lambda w: -w.center[1]):
             y = wheel.center[1]
             # A wheel in the middle plane belongs to neither side.
-            side = "c" if abs(y) < _SAME_PLACE else "l" if y > 0 else "r"
+            side = "c" if abs(y) < ROLE_RULES.same_place else "l" if y > 0 else "r"
             named.append(replace(wheel, corner=wheel.corner or side + letter))
     corners = [w.corner for w in named]
     for corner in corners:

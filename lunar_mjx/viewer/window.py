@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 import threading
@@ -22,11 +23,18 @@ from lunar_mjx.viewer.drive import PACE, LiveDrive, Pace
 _KEYS = {265: "forward", 264: "back", 263: "left", 262: "right", 32: "brake"}
 """GLFW's codes of the arrow keys and space."""
 
-_RESET = 259
-"""Backspace, with which MuJoCo's viewer resets too."""
 
-MARGIN = 25.0
-"""How far the ground is drawn finely around the start, m."""
+@dataclasses.dataclass(frozen=True)
+class WindowSettings:
+    """The window of MuJoCo's viewer."""
+
+    reset_key: int = 259
+    """Backspace, with which MuJoCo's viewer resets too."""
+    margin: float = 25.0
+    """How far the ground is drawn finely around the start, m."""
+
+
+WINDOW = WindowSettings()
 
 
 def has_screen() -> bool:
@@ -64,13 +72,13 @@ def show_window(drive: LiveDrive, sun: Sun) -> None:
     import mujoco.viewer
 
     terrain = jax.device_get(drive.model.terrain)
-    model, _ = build_scene(drive.model.rover, terrain, drive.qpos[None, :2], sun, margin=MARGIN)
+    model, _ = build_scene(drive.model.rover, terrain, drive.qpos[None, :2], sun, margin=WINDOW.margin)
     data = mujoco.MjData(model)
     pace = Pace(drive, lambda: None)
 
     def press(code: int) -> None:
         with pace.lock:
-            if code == _RESET:
+            if code == WINDOW.reset_key:
                 drive.reset()
             elif code in _KEYS:
                 drive.pilot.press(_KEYS[code])

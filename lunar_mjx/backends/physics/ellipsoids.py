@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from lunar_mjx.backends.physics.vectors import clamp, cross, dot
 
-_HALVINGS, _SWEEPS = 60, 400
+
+@dataclasses.dataclass(frozen=True)
+class EllipsoidSearch:
+    """How the nearest place of an ellipsoid is sought: plain and long, as the check of a fast method."""
+
+    halvings: int = 60
+    """Halvings of an interval: to the last digit of double precision."""
+    sweeps: int = 400
+    """Rounds of improving one coordinate after the other."""
+
+
+ELLIPSOID_SEARCH = EllipsoidSearch()
 
 
 def wheel_in_ellipsoid(
@@ -42,7 +55,7 @@ def box_in_ellipsoid(
     """
     m = np.einsum("...ji,...jk,...kl->...il", rotation, form, rotation)
     point = clamp(gap, -half, half)
-    for _ in range(_SWEEPS):
+    for _ in range(ELLIPSOID_SEARCH.sweeps):
         before = point.copy()
         for i in range(3):
             pull = dot(m[..., i, :], point - gap) - m[..., i, i] * (point - gap)[..., i]
@@ -69,7 +82,7 @@ def _least_on_disc(m: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarr
     b = np.einsum("...ji,...j->...i", vectors, b)
     # At the upper end the point lies within the disc for certain, since every eigenvalue is positive.
     low, high = np.zeros(b.shape[:-1]), np.sqrt(dot(b, b)) / radius
-    for _ in range(_HALVINGS):
+    for _ in range(ELLIPSOID_SEARCH.halvings):
         middle = 0.5 * (low + high)
         p = b / (values + middle[..., None])
         long = dot(p, p) > radius * radius

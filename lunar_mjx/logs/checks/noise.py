@@ -11,6 +11,7 @@ from scipy import stats
 from lunar_mjx.logs.checks.values import VALUE_LIMITS, quantum
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, Noise
+from lunar_mjx.logs.noise import NOISE_ESTIMATE
 from lunar_mjx.logs.schema import is_command, is_quantity
 
 
@@ -25,7 +26,7 @@ class NoiseLimits:
     nine tenths slow, spans of a few seconds show a third."""
     settle: float = 2.0
     """Seconds after a command has changed in which a rover still rocks."""
-    still: float = 0.02
+    still: float = NOISE_ESTIMATE.still_rad_s
     """rad/s: a wheel of 0.25 m that turns slower moves by less than 5 mm/s."""
     longest: float = 8.0
     """Seconds of rest taken together, over which a parabola follows whatever creeps or cools."""

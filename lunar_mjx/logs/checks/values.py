@@ -11,6 +11,7 @@ from lunar_mjx.logs.apply import environment_value
 from lunar_mjx.logs.checks.clock import CLOCK_LIMITS
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, LogTable
+from lunar_mjx.logs.noise import NOISE_ESTIMATE
 from lunar_mjx.logs.schema import MIRROR, find_channel, is_command, is_quantity, limits
 from lunar_mjx.logs.series import sigma
 
@@ -31,7 +32,7 @@ class ValueLimits:
     """Standard deviations by which a share of few cells may exceed `CLOCK_LIMITS.lost_share` by chance."""
     evenly: float = 0.8
     """Share of the distances between filled cells that must be one and the same for a column of a slower sensor."""
-    still: float = 0.02
+    still: float = NOISE_ESTIMATE.still_rad_s
     """rad/s of a wheel that counts as standing: a wheel of 0.25 m then moves by less than 5 mm/s."""
 
 

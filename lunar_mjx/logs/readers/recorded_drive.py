@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pandas as pd
 
+from lunar_mjx.logs.noise import NOISE_ESTIMATE
 from lunar_mjx.logs.readers.geodesy import tangent_plane, utm, utm_zone
 from lunar_mjx.logs.readers.held import held_samples
 from lunar_mjx.logs.readers.import_map import Geodetic
@@ -18,8 +19,6 @@ TIME = "time_s"
 LATITUDE, LONGITUDE = "latitude_deg", "longitude_deg"
 """Columns of a frame that `positions` replaces."""
 _PLACES = {LATITUDE: "position_x_m", LONGITUDE: "position_y_m"}
-STILL_RAD_S = 0.02
-"""A wheel of 0.25 m that turns slower moves by less than 5 mm/s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +195,9 @@ def _rests(drive: RecordedDrive, rest_s: float) -> list[float]:
     time = np.unique(np.concatenate([t for t, _ in series]))
     still = np.ones(len(time), bool)
     for t, v in series:
-        still &= np.abs(v[np.maximum(np.searchsorted(t, time + 1e-9, side="right") - 1, 0)]) < STILL_RAD_S
+        still &= (
+            np.abs(v[np.maximum(np.searchsorted(t, time + 1e-9, side="right") - 1, 0)]) < NOISE_ESTIMATE.still_rad_s
+        )
     edges = np.diff(np.concatenate([[0], still.astype(int), [0]]))
     spans = zip(time[np.flatnonzero(edges == 1)], time[np.flatnonzero(edges == -1) - 1], strict=True)
     # at the recording's own ends there is nothing to cut off
