@@ -22,7 +22,7 @@ def add(a: Any, b: Any) -> Any:
 
 
 def neg(a: Any) -> Any:
-    """-a."""
+    """The opposite of a number or array, -a."""
     return -a
 
 

@@ -62,7 +62,7 @@ class Fields:
         return cls(path, read_toml(require_file(path, what)))
 
     def field(self, key: str) -> str:
-        """Full name of a key."""
+        """Name of a key with the tables that it stands in, as messages show it."""
         return f"{self.prefix}.{key}" if self.prefix else key
 
     def known(self, keys: Sequence[str]) -> None:

@@ -147,7 +147,7 @@ class DDPG:
         return jnp.clip(self.config.reward_scale * batch.reward + batch.discount * value, *self.config.value_range)
 
     def critic_loss(self, critic: Any, batch: Batch, target: Any) -> Any:
-        """Mean squared error."""
+        """Mean squared error of the critic's values against `target` (batch,)."""
         return jnp.mean((self._value(critic, batch.obs, batch.privileged, batch.action) - target) ** 2)
 
     def actor_loss(self, actor: Any, critic: Any, batch: Batch) -> Any:

@@ -111,7 +111,7 @@ class Evaluator:
         return state, jnp.zeros(self.episodes, bool), seen
 
     def __call__(self, env_params: Any, agent_params: Any, seed: int) -> Score:
-        """Plays the episodes.
+        """The score of one episode in each environment.
 
         Args:
           env_params: of the environment: other terrain, places and ranges than in training.

@@ -58,7 +58,7 @@ class Batch:
 
 @pytree
 class ReplayState:
-    """Contents of a buffer.
+    """What a replay buffer holds: a ring of steps for every environment.
 
     Attributes:
       storage: leaves `[env, time, ...]`.

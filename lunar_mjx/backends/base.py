@@ -78,7 +78,7 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def state(self) -> BackendState:
-        """The state, as copies."""
+        """Copies of the engine's state."""
 
     @abc.abstractmethod
     def set_state(self, state: BackendState) -> None:

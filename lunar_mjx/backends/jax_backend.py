@@ -30,7 +30,7 @@ _EACH_TERRAIN: Any = Params(gravity=None, ambient=None, effects=None, terrain=0)
 
 
 class JaxBackend(Backend):
-    """A JAX engine.
+    """One of the package's JAX engines as a backend.
 
     Args:
       model: the model.
@@ -77,7 +77,7 @@ class JaxBackend(Backend):
         return seen
 
     def set_terrain(self, terrain: Terrain, each: bool = False) -> None:
-        """Takes another ground; one of the same grids compiles nothing anew.
+        """Puts another terrain under the rovers; nothing is compiled anew where its grids have the old one's shapes.
 
         Args:
           terrain: the ground, or with `each` a stack of one per rover.

@@ -108,7 +108,7 @@ class PyBulletBackend(NumpyBackend):
         self.reset()
 
     def close(self) -> None:
-        """Ends the worlds."""
+        """Disconnects from PyBullet, which frees its worlds."""
         for world in self._worlds:
             world.close()
         self._worlds = []

@@ -63,7 +63,7 @@ class Light:
 
 
 class Pictures(NamedTuple):
-    """What cameras see.
+    """Colour, depth and labels of one or many cameras.
 
     Attributes:
       rgb: 0 to 1, as shown on a screen. depth: m along the optical axis, infinite in the sky. label: into `LABELS`.
@@ -86,7 +86,7 @@ def picture(
     key: Any = None,
     far: float = 60.0,
 ) -> Pictures:
-    """What one camera sees.
+    """Colour, depth and labels of one camera.
 
     Args:
       terrain: ground and rocks.

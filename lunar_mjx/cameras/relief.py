@@ -15,7 +15,7 @@ LIGHT = (315.0, 20.0)
 
 
 class Relief(NamedTuple):
-    """A piece of ground.
+    """A rectangle of ground as a shaded picture, with its heights.
 
     Attributes:
       grey: (rows, cols) 0 to 1, south first. heights: m, alike.

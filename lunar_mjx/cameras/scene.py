@@ -68,7 +68,7 @@ class Sun:
 
     @property
     def exposure(self) -> float:
-        """Brightness of the light: level ground looks the same down to a Sun 10 deg high, as a camera would expose."""
+        """Brightness of the light, by which level ground looks alike down to a Sun 10 deg high, as a camera exposes."""
         return 0.55 / max(math.sin(math.radians(self.elevation_deg)), 0.17)
 
 
@@ -108,7 +108,7 @@ def build_scene(
     mount: Pose | None = None,
     fovy_deg: float = 60.0,
 ) -> tuple[Any, TrackPainter]:
-    """Compiles the scene.
+    """The compiled scene of rover and ground, and the painter of its ground.
 
     Args:
       rover, terrain: what stands where.

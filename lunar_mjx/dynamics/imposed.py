@@ -126,7 +126,7 @@ class KinematicDrive:
     """
 
     def __init__(self, model: Model, bin_s: float, longest_step_s: float = 0.005):
-        """Makes the program.
+        """Builds and compiles the program for one model.
 
         Args:
           model: a rover whose wheels' drives are its only joints, on any terrain, which a plane takes the place of.

@@ -16,7 +16,7 @@ def normalized(q: list[Any]) -> list[Any]:
 
 
 def rotation(q: list[Any]) -> Frame:
-    """Body to world."""
+    """Rotation matrix of a unit quaternion, body to world."""
     w, x, y, z = q
     return Frame(
         Vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),

@@ -266,7 +266,7 @@ class RoverInfo:
 
 @pytree
 class Context:
-    """What every port sees.
+    """State of the rover and results of earlier ports, as every port function receives them.
 
     Attributes:
       time: s. dt: time step, s. gravity: m/s2, positive. ambient_temperature: K.

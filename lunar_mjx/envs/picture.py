@@ -54,7 +54,7 @@ class Picture:
         return isinstance(env, NavigationEnv)
 
     def begin(self, state: State) -> None:
-        """A new episode."""
+        """Starts the pictures of a new episode."""
         self.close()
         self._qpos = np.asarray(state.inner.physics.qpos[0])
         self._goal = np.asarray(state.inner.goal[0])
@@ -105,7 +105,7 @@ class Picture:
         return self._camera
 
     def close(self) -> None:
-        """Lets the renderer go."""
+        """Frees the renderer."""
         if self._camera is not None:
             self._camera.close()
             self._camera = None

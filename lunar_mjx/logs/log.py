@@ -49,7 +49,7 @@ class Imu:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LogTable:
-    """One table of a log.
+    """One table of a log: channels that share a clock.
 
     Attributes:
       name: as `[tables.NAME]`. file: its path.

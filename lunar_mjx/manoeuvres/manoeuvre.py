@@ -91,7 +91,7 @@ class Manoeuvre:
 
     @property
     def duration_s(self) -> float:
-        """At scale 1, s."""
+        """Duration of the manoeuvre at scale 1, s."""
         return sum(s.duration_s for s in self.segments)
 
 

@@ -24,7 +24,7 @@ LUNAR_GRAVITY = 1.625
 """m/s2, the seed paper's value."""
 
 ROOM = 298.15
-"""K; 25 degC."""
+"""Room temperature, K (25 degC)."""
 ZERO_CELSIUS = 273.15
 """K; 0 degC, by definition."""
 GAINS = ("position_gain_Nm_rad", "velocity_gain_Nms_rad")
@@ -349,7 +349,7 @@ def _check_ambient(ambient: Sequence[float], source: str | Path) -> None:
 
 
 def settled(kind: str, spec: str | Path, marker: str) -> str:
-    """A rover's or terrain's spec that means the same from every folder.
+    """A rover's or terrain's spec that holds in every folder.
 
     Args:
       kind: "models" or "terrain".
@@ -369,7 +369,7 @@ def settled(kind: str, spec: str | Path, marker: str) -> str:
 
 
 def settled_effect(spec: str) -> str:
-    """An effect's spec that means the same from every folder: catalogue name, or /absolute/file.py:name."""
+    """An effect's spec that holds in every folder: its catalogue name, or /absolute/file.py:name."""
     if ".py" not in spec:
         return spec
     file, colon, member = spec.partition(":")

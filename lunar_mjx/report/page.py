@@ -91,7 +91,7 @@ Block = Figure | Pair | Explorer | Table | Text | Facts
 
 
 class Section(NamedTuple):
-    """A part of a page."""
+    """One section of a report's page."""
 
     title: str
     blocks: Sequence[Block]

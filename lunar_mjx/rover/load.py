@@ -65,7 +65,7 @@ def list_rovers() -> tuple[str, ...]:
 
 
 def load_rover(name_or_path: str | Path) -> Rover:
-    """Loads a rover.
+    """The rover of a name or folder, checked.
 
     Args:
       name_or_path: name of a shipped rover, or the path of a folder that `convert` wrote.

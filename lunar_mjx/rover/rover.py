@@ -14,7 +14,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Wheel:
-    """One wheel.
+    """One wheel of a rover, its joints and its size.
 
     Attributes:
       corner: lf, rf, lr, rr; lm, rm for a middle row.

@@ -21,9 +21,9 @@ class GainRules:
 
     # Shares of the stability bound of an explicit step, so that the gains also hold at twice the time step.
     velocity_share: float = 0.25
-    """kv dt / I"""
+    """Velocity gain times time step over inertia."""
     position_share: float = 0.05
-    """kp dt^2 / I"""
+    """Position gain times the squared time step over inertia."""
     bandwidth: float = 20.0
     """rad/s, about 3 Hz: above the rover's own motion, below the bound"""
     damping_ratio: float = 0.7

@@ -12,7 +12,7 @@ from lunar_mjx.rover.urdf import Geometry, Joint, Pose, Urdf, check_inertia
 
 @dataclass(frozen=True)
 class Body:
-    """One rigid body.
+    """One rigid body of the rover, with all links fused into it.
 
     Attributes:
       name: link that names it; the base carries the name of its first link with mass or shape.

@@ -35,7 +35,7 @@ def load_terrain(
     seed: int | None = None,
     dtype: np.dtype | type = np.float32,
 ) -> Terrain:
-    """Loads a terrain.
+    """The terrain of a name, file, folder or table.
 
     Args:
       spec: a shipped name ("flat", "lunar_plain", "de_gerlache_rim"), "slope:10deg", a folder with a `terrain.toml`,

@@ -71,7 +71,7 @@ def open_engine(model: Model, engine: str) -> Backend:
 
 
 class Driver(Protocol):
-    """What takes the keys."""
+    """Something that the viewer's keys can steer."""
 
     def hold(self, keys: Iterable[str]) -> None: ...
 
@@ -241,7 +241,7 @@ class Pace:
         self.failure: BaseException | None = None
 
     def start(self) -> None:
-        """Starts the thread."""
+        """Starts the thread that drives."""
         self._thread.start()
 
     def stop(self) -> None:

@@ -106,7 +106,7 @@ class Onlooker:
     """Takes the keys of somebody who does not drive."""
 
     def hold(self, keys: Iterable[str]) -> None:
-        """Drops them."""
+        """Ignores the keys: nothing is steered."""
 
 
 def drivable(model: Model) -> Model:

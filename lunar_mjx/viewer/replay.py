@@ -33,7 +33,7 @@ REPLAY_SIZES = ReplaySizes()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Course:
-    """Where a rover was.
+    """Poses of a recorded rover over time.
 
     Attributes:
       label: who says so. time: (n,) s, rising. x, y: (n,) m. yaw: (n,) rad, unwrapped.
@@ -107,15 +107,15 @@ class Replay:
         """Nothing: the page goes back by itself."""
 
     def advance(self, duration: float) -> float:
-        """Nothing goes on: 0 s."""
+        """Simulated time that passes in a tick, s: 0, since a recorded drive is complete."""
         return 0.0
 
     def bodies(self) -> np.ndarray:
-        """No picture is sent."""
+        """Poses of bodies to send: none, since the page holds the whole drive."""
         return np.zeros((0, 7))
 
     def readings(self) -> dict[str, Any]:
-        """No reading is sent."""
+        """Readings to send: none, since the page holds the whole drive."""
         return {}
 
 

@@ -72,7 +72,7 @@ def check_port(port: int) -> None:
 
 
 class Viewer(ThreadingHTTPServer):
-    """Serves one drive.
+    """HTTP server that shows one drive in browsers.
 
     Args:
       drive: what is shown: a drive that goes on, or one that is over. port: 0 for any that is free.

@@ -37,7 +37,7 @@ Transition: Any = brax_types.Transition
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Settings of PPO.
+    """Settings of proximal policy optimisation.
 
     Attributes:
       actor_layers: widths of the policy's hidden layers. critic_layers: of the value's.

@@ -31,7 +31,7 @@ PARITY_GRID = ParityGrid()
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A ground to drive on."""
+    """One terrain of the parity study, and how it is driven on."""
 
     name: str
     terrain: Terrain

@@ -35,7 +35,7 @@ class Run:
 
 @dataclasses.dataclass
 class Pair:
-    """Two engines compared.
+    """How far two engines agree.
 
     Attributes:
       first, second: names. kind: of tolerance. results: of all grounds and levels. judged: whether agreement is

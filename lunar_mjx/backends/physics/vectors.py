@@ -10,7 +10,7 @@ dot = np.vecdot
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b, (..., 3)."""
+    """Vector product a x b, (..., 3)."""
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 

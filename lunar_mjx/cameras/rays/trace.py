@@ -54,7 +54,7 @@ TRACE = TraceSettings()
 
 
 class Traced(NamedTuple):
-    """What rays met.
+    """What the rays of one picture met.
 
     Attributes:
       depth: m along the optical axis, infinite in the sky. label: SKY, GROUND, ROCK or ROVER.

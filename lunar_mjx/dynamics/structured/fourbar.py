@@ -41,7 +41,7 @@ class LoopNumbers(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FourBar:
-    """A loop of a leg.
+    """The closed loop of four bars in a leg.
 
     Attributes:
       links: the first link, the coupler that hangs on it, and the third link.
@@ -159,7 +159,7 @@ def _turn(v: Plane, angle: Any) -> Plane:
 
 
 def _between(v: Plane, w: Plane) -> Any:
-    """Angle from v to w."""
+    """Angle from the vector v to the vector w, rad."""
     return jnp.arctan2(_cross(v, w), _dot(v, w))
 
 

@@ -46,7 +46,7 @@ class WheelSlot:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LegGroup:
-    """Legs of one pattern.
+    """Legs of a rover that have one pattern of bodies and joints, computed together.
 
     Attributes:
       count: of legs. links, wheels, loop: what every leg has.

@@ -66,7 +66,7 @@ def _positive_stiffness(values: Mapping[str, Any], wheel_widths: Sequence[float]
     ),
 )
 def soil(ctx, p, x, ground):
-    """Sets the same soil everywhere; effects after it change it by place, slip or history."""
+    """Sets one soil for the whole ground; effects after it change it by place, slip or history."""
     one = jnp.ones_like(ground.rock)
     return dataclasses.replace(
         ground,

@@ -132,7 +132,7 @@ def _place(axis: str) -> StateVariable:
     ),
 )
 def multipass(ctx, p, x, ground):
-    """Wheels that come later (the rear ones, or the same on another pass) roll in ruts of compacted soil.
+    """Wheels that come later (rear wheels, or any wheel on another pass) roll in ruts of compacted soil.
 
     A pass to depth z_u leaves a rut of depth e z_u; p = p_u - (k_0 + A_u z_u)(z_u - z) of Wong 2008 from there to z_u,
     with k_0 + A_u z_u = p_u/((1 - e) z_u), is approximated by the soil's own law from the bottom of the rut, made

@@ -48,7 +48,7 @@ def nodes(size: float, cell: float) -> Any:
 
 
 def make_world(rung: Rung, key: Any, hardness: Any = 1.0) -> World:
-    """A world of a rung.
+    """One random world of a rung of the ladder.
 
     Args:
       rung: which, static.

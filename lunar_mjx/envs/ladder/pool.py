@@ -60,7 +60,7 @@ class Places:
 
 @pytree
 class Pool:
-    """Worlds side by side.
+    """Worlds side by side on one map, with their places and ways.
 
     Attributes:
       terrain: the map of all; None where it is kept elsewhere.

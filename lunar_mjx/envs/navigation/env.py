@@ -50,7 +50,7 @@ _USED = 0.125
 
 @pytree
 class NavigationParams:
-    """What all environments share; another terrain, other places or ranges of the same shape need no compilation.
+    """Parameters that all environments of a batch share; others with arrays of equal shapes need no compilation.
 
     Attributes:
       system: physical parameters.

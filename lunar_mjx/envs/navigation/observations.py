@@ -54,12 +54,12 @@ def euler(v: View, s: Scene) -> Any:
 
 
 def velocity(v: View, s: Scene) -> Any:
-    """World axes, m/s."""
+    """Velocity of the chassis along the world's axes, m/s."""
     return v.velocity
 
 
 def angular_velocity(v: View, s: Scene) -> Any:
-    """World axes, rad/s."""
+    """Angular velocity of the chassis along the world's axes, rad/s."""
     return v.angular_velocity
 
 
@@ -87,12 +87,12 @@ def up(v: View, s: Scene) -> Any:
 
 
 def body_velocity(v: View, s: Scene) -> Any:
-    """Along the body's axes, m/s."""
+    """Velocity of the chassis along its own axes, m/s."""
     return v.body_velocity
 
 
 def body_rates(v: View, s: Scene) -> Any:
-    """Along the body's axes, rad/s."""
+    """Angular velocity of the chassis along its own axes, rad/s."""
     return v.body_rates
 
 
@@ -103,7 +103,7 @@ def joints(v: View, s: Scene) -> Any:
 
 
 def temperatures(v: View, s: Scene) -> Any:
-    """Windings, in units of 100 K above 25 degC."""
+    """Temperatures of the motors' windings, in units of 100 K above 25 degC."""
     return (v.winding_temperature - 298.15) / 100.0
 
 
@@ -212,7 +212,7 @@ def _flat(pictures: Any) -> Any:
 
 
 def last_action(v: View, s: Scene) -> Any:
-    """The action before."""
+    """The action of the control step before, in [-1, 1]."""
     return v.last_action
 
 

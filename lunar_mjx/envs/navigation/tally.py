@@ -36,13 +36,13 @@ class Tally:
 
 
 def start(count: int, dtype: Any) -> Tally:
-    """Before the first step."""
+    """The tally of an episode before its first step."""
     zero = jnp.zeros(count, dtype)
     return Tally(zero, zero, zero, zero, jnp.zeros(count, bool), zero, zero)
 
 
 def update(tally: Tally, moved: Any, power: Any, slip: Any, touching: Any, interval: float) -> Tally:
-    """After a control step.
+    """The tally with one more control step.
 
     Args:
       moved: way of the step in plan, m. power: (env, joint) electrical, W; none flows back.

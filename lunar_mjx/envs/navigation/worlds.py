@@ -17,7 +17,7 @@ _ROCKS = 512
 
 _ROVER_SIZED = {"abundance": 0.035, "smallest": 0.25, "largest": 1.2, "gap": 1.6}
 _BOULDERS = {"abundance": 0.07, "smallest": 0.5, "largest": 2.4, "gap": 3.2}
-"""Rocks for a small rover, and the same at twice the size for one twice as large, with the share of ground that they
+"""Rocks for a small rover, and rocks of twice the size for one twice as large, with the share of ground that they
 cover about the same (0.8 and 0.9 %)."""
 
 

@@ -52,7 +52,7 @@ def _present(log: Log, pattern: str) -> dict[str, str]:
 
 
 def _against(log: Log) -> list[Finding]:
-    """Currents with a sign: a driven rover takes power, so that current and speed have the same sign on average.
+    """Currents with a sign: a driven rover takes power, so that current and speed agree in sign on average.
 
     A warning only: a motor may brake all the way down a slope that no channel tells.
     """

@@ -14,7 +14,7 @@ UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 LATEST = 1e11
 """s: no clock counts 3000 years."""
 DAY = 86400.0
-"""s."""
+"""Length of a day, s."""
 
 
 @dataclasses.dataclass(frozen=True)

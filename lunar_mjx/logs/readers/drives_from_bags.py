@@ -20,7 +20,7 @@ _HEADER = "header.stamp"
 
 
 def drive_of_bag(recording: Path, mapping: ImportMap) -> RecordedDrive:
-    """The drive in one bag.
+    """The drive that one bag holds.
 
     Messages keep their order, and values that are not finite become gaps: what is wrong with the recording is for
     `check` to say. Time counts from the earliest message that is used.

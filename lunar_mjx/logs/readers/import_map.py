@@ -69,7 +69,7 @@ class Geodetic:
 
 @dataclasses.dataclass(frozen=True)
 class TableMap:
-    """One table of the log.
+    """Where one table of the log comes from.
 
     Attributes:
       topic: of a bag or MCAP file; "" for files.
@@ -108,7 +108,7 @@ class TableMap:
 
 @dataclasses.dataclass(frozen=True)
 class ImportMap:
-    """A map file.
+    """The contents of a map file: which column or field is which channel.
 
     Attributes:
       path: of the file. tables: by name. settings: keys of `log.toml`. rover: name or path. noise: by channel.

@@ -47,7 +47,7 @@ INSTRUMENTS: tuple[Instrument, ...] = (
 """What a simulated rover carries. Torques at the joints and forces at the wheels are not measured on rovers."""
 
 RATES: Mapping[str, float] = {"drive": 20.0, "imu": 50.0, "thermal": 1.0, "camera": 5.0}
-"""Hz, by table."""
+"""Sampling rates by table, Hz."""
 
 FORCE_SENSORS: tuple[Instrument, ...] = (
     Instrument("wheel_*_force_*_N", "drive", 1.0, 0.1, "force-torque sensor of 1 kN, 0.1 %"),

@@ -29,7 +29,7 @@ class Form(NamedTuple):
         )
 
     def between(self, u: Vec3, v: Vec3) -> Any:
-        """u' A v."""
+        """The bilinear form u' A v."""
         return u.dot(self.times(v))
 
     def outline(self, x: Any, y: Any) -> Any:

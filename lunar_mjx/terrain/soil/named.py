@@ -71,4 +71,4 @@ UNITS: dict[str, str] = {
     "shear_modulus_x": "m",
     "shear_modulus_y": "m",
 }
-"""Their units."""
+"""Units of the parameters of a soil."""

@@ -181,7 +181,7 @@ class Run:
 
     @property
     def unit_time(self) -> float:
-        """sqrt(R/g), s."""
+        """Unit of time sqrt(R/g) of wheel and gravity, s."""
         return math.sqrt(self.wheel.radius / self.gravity)
 
     @property
@@ -192,7 +192,7 @@ class Run:
 
     @property
     def time_step(self) -> float:
-        """s."""
+        """Time step of the solver, s."""
         return self.numerics.step_share * self.numerics.voxel / self.speed
 
     @property
@@ -229,7 +229,7 @@ class Layout:
 
     @property
     def particles(self) -> int:
-        """Particles of one box."""
+        """Number of particles in one box."""
         return self.cells[0] * self.cells[1] * self.cells[2] * self.per_edge**3
 
     @property
