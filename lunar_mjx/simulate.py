@@ -67,6 +67,7 @@ def constant_commands(model: Model, duration: float, interval: float | None = No
         too many.
     """
     if interval is None:
+        # Whole time steps: a command that changed within one would have to be split.
         interval = max(1, round(SIMULATE.interval / model.timestep)) * model.timestep
     value = []
     for name, number in groups.items():
@@ -114,6 +115,7 @@ def read_commands(path: str | Path, model: Model) -> Commands:
     for name in table.columns:
         if name not in names:
             raise bad_input(path, "column", name, "is unknown", f"use {', '.join(names[:3])}, ...")
+        # By text, so that whole numbers of hundreds of digits become infinite and are refused.
         numbers = np.asarray(pd.to_numeric(table[name].astype(str), errors="coerce"), float)
         wrong = np.flatnonzero(~np.isfinite(numbers))
         if wrong.size:
@@ -129,6 +131,7 @@ def read_commands(path: str | Path, model: Model) -> Commands:
     steps = np.diff(time)
     if time.size < 2 or (steps <= 0).any():
         raise bad_input(path, "time_s", time[:3].tolist(), "does not rise", "sort the rows by time; give two at least")
+    # A per mille: times in files are rounded; more is another rate.
     if np.ptp(steps) > 1e-3 * steps.mean():
         raise bad_input(
             path,
@@ -149,6 +152,7 @@ def simulate(
       UserError: commands of another number of joints or not finite, an interval that is no whole number of time steps,
         a start off the terrain, an effect that does not run, or a simulation that diverged.
     """
+    # Before the build, whose errors speak of traced arrays.
     check_effects(model, "simulate")
     check_start(model, x, y, yaw)
     system = build(model, engine)
@@ -176,8 +180,10 @@ def simulate(
     state = system.reset(system.params, x, y, yaw)
     run = jax.jit(lambda p, s, c: system.rollout(p, s, c, every=steps_per_command))
     count = len(commands.values)
+    # Filled up to whole pieces, so that one program runs them all; the surplus is cut off below.
     values = jnp.asarray(np.pad(commands.values, ((0, -count % SIMULATE.piece), (0, 0)), mode="edge"))
     try:
+        # Apart from running, so that errors of an effect's code are told from those of a drive.
         compiled = run.lower(system.params, state, values[: SIMULATE.piece]).compile()
     except Exception as error:
         _blame_user_effect(model, error)
@@ -185,6 +191,7 @@ def simulate(
     parts = []
     for first in range(0, count, SIMULATE.piece):
         state, seen = compiled(system.params, state, values[first : first + SIMULATE.piece])
+        # To the host piece by piece: telemetry of long drives does not fit a GPU's memory.
         parts.append(jax.device_get(seen))
     telemetry = jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
     check_finite(telemetry)
@@ -229,6 +236,7 @@ def _blame_user_effect(model: Model, error: Exception) -> None:
     """Raises a `UserError` if the step cannot be traced because of an effect from the user's own file."""
     files = {spec.partition(":")[0]: name for name, spec in model.effect_files.items() if ".py" in spec}
     message = f"{type(error).__name__}: {error}"
+    # The innermost frame within the user's own file is the line to mend.
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if frame.filename in files:
             raise UserError(
@@ -252,6 +260,7 @@ def channels(system: System, seen: Telemetry, commands: Commands) -> pd.DataFram
     Returns:
       `time_s` first, then measured channels and commands; units in the names, temperatures in degrees Celsius.
     """
+    # Differences and wrapped angles of float32 telemetry lose digits otherwise.
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda a: a.astype(float) if np.issubdtype(a.dtype, np.floating) else a, seen)
         signals = measure(system, exact)
@@ -273,6 +282,7 @@ def front_steering(model: Model, commands: Commands, angle: float) -> Commands:
     fronts = [w.steer for w in model.rover.wheels if w.corner in ("lf", "rf") and w.steer]
     if angle and not fronts:
         raise bad_input("command", "steer", angle, "needs steered front wheels, which the rover lacks", "leave it at 0")
+    # The caller keeps its commands.
     values = commands.values.copy()
     if angle and model.modes["steer"] != "position":
         raise bad_input(

@@ -89,10 +89,12 @@ class Vec3(NamedTuple):
 
     def norm(self, floor: float = 1e-12) -> Any:
         """Length, never below `floor`, so that its derivative stays finite at zero."""
+        # The floor keeps the root's derivative finite at the zero vector.
         return jnp.sqrt(jnp.maximum(self.dot(self), floor * floor))
 
     def unit(self, floor: float = 1e-12) -> Vec3:
         """The vector divided by its length; no longer than 1 where it is shorter than `floor`."""
+        # One division for three components.
         return self * (1.0 / self.norm(floor))
 
     def sum(self) -> Vec3:
@@ -115,6 +117,7 @@ class Vec3(NamedTuple):
     @classmethod
     def zero(cls, like: Any) -> Vec3:
         """The zero vector, with components of the shape and type of an array."""
+        # An array and no Python 0, where a state needs its shape.
         z = jnp.zeros_like(like)
         return cls(z, z, z)
 
@@ -142,6 +145,7 @@ class Frame(NamedTuple):
         """The product of this rotation and a turn about its own axis number `axis` (0 forward, 1 left, 2 up)."""
         columns = list(self)
         first, second = columns[(axis + 1) % 3], columns[(axis + 2) % 3]
+        # About one of the frame's own axes the third stays as it is: no matrix product.
         columns[(axis + 1) % 3] = first * cos + second * sin
         columns[(axis + 2) % 3] = second * cos - first * sin
         return Frame(*columns)
@@ -154,6 +158,7 @@ class Frame(NamedTuple):
     def euler(self) -> Vec3:
         """Roll, pitch and yaw in rad (intrinsic z-y'-x'')."""
         roll = jnp.arctan2(self.left.z, self.up.z)
+        # Rounding may pass 1 by a digit. Roll, pitch and yaw are intrinsic z-y'-x''.
         pitch = jnp.arcsin(jnp.clip(-self.forward.z, -1.0, 1.0))
         yaw = jnp.arctan2(self.forward.y, self.forward.x)
         return Vec3(roll, pitch, yaw)

@@ -32,6 +32,7 @@ def join(coordinator: str | None, processes: int, process: int) -> None:
             raise bad_input("train", "--coordinator", "left out", "is needed for several processes", "give HOST:PORT")
         return
     host, colon, port = coordinator.rpartition(":")
+    # The first nine digits only: whole numbers of thousands of digits are slow to read.
     if not (host and colon and port.isdecimal() and 0 < int(port[:9]) < 2**16):
         raise bad_input("train", "--coordinator", coordinator, "is not HOST:PORT", "give it as 10.0.0.1:1234")
     if processes < 2:
@@ -60,6 +61,7 @@ class OtherProcessError(UserError):
 
 def of_the_first(*values: float) -> np.ndarray:
     """(n,) the values that the first process gave; a collective operation."""
+    # All give theirs and take the first's: an exchange needs everybody.
     return _of_all(*values)[0]
 
 
@@ -82,6 +84,7 @@ def agreed(doing: str) -> Iterator[None]:
         # told before it is raised: the others wait in the same exchange and end with a sentence instead of hanging
         _of_all(1.0)
         raise
+    # Every process meets here once, whether it failed or not.
     failed = np.flatnonzero(_of_all(0.0)[:, 0])
     if len(failed):
         raise OtherProcessError(

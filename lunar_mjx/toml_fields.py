@@ -22,6 +22,7 @@ def read_toml(path: Path) -> dict[str, Any]:
       UserError: it is no text, or not TOML.
     """
     try:
+        # Editors of Windows write a byte order mark, which TOML does not know.
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError:
         raise UserError(f"{path}: is not a text file in UTF-8; give a TOML file.") from None
@@ -29,6 +30,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: is not valid TOML (nested too deeply); mend the file.") from None
     except ValueError as error:  # tomllib.TOMLDecodeError, and numbers of thousands of digits
         reason = str(error)
+        # The parser quotes what it met, which may be a whole binary file.
         shown = reason if len(reason) <= 200 else f"{reason[:100]} ... {reason[-60:]}"
         raise UserError(f"{path}: is not valid TOML ({shown}); mend that line.") from None
     _short_keys(path, document)
@@ -73,6 +75,7 @@ class Fields:
 
     def table(self, key: str) -> Fields:
         """A table within; empty if it is not there."""
+        # A table that is left out is an empty one, whose required keys then are missing.
         value = self.values.get(key, {})
         if not isinstance(value, Mapping):
             raise bad_input(self.path, self.field(key), value, "is not a table", f"write it as [{self.field(key)}]")
@@ -115,6 +118,7 @@ class Fields:
         return tuple(self._finite(self.field(key), v) for v in value)
 
     def _finite(self, field: str, value: Any) -> float:
+        # bool is an int to Python.
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise bad_input(self.path, field, value, "is not a number", "give a number")
         return require_finite(self.path, field, value)

@@ -48,6 +48,7 @@ class NativeBackend(NumpyBackend):
         super().__init__(model, hooks, rovers)
         m = self._mj = native_model(model)
         if damped_within:  # M + dt D in place of M, so that MuJoCo's own addition must go
+            # Euler's step with implicit damping has M + dt D; added to the inertia, the loops' forces see it, too.
             m.dof_armature += model.timestep * m.dof_damping
             m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
         self._wheels = np.array([m.body(w.body).id for w in model.rover.wheels])
@@ -56,9 +57,11 @@ class NativeBackend(NumpyBackend):
         joints = [m.joint(j).id for j in model.rover.joints]
         self._qadr, self._dadr = m.jnt_qposadr[joints], m.jnt_dofadr[joints]
         self._bodies = np.concatenate([[self._chassis], self._wheels])
+        # One call steps all rovers: a loop in Python would cost more than the physics.
         self._batch = mujoco_batch.Batch(m, nsim=rovers, nthread=threads, persistent=True)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._xfrc, self._qfrc = self._batch.bind("xfrc_applied"), self._batch.bind("qfrc_applied")
+        # Views of MuJoCo's own memory: read in every step without a copy.
         self._seen = {name: self._batch.bind(name) for name in _DERIVED}
         # Wheels whose centre of mass is their centre need no moment for the shift, the usual case.
         self._at_rim = not m.body_ipos[self._wheels].any()
@@ -74,6 +77,7 @@ class NativeBackend(NumpyBackend):
 
     def _place(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         self._qpos[:], self._qvel[:] = qpos, qvel
+        # Forces of the drive before would act in the first step.
         self._xfrc[:], self._qfrc[:] = 0.0, 0.0
         self._batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -100,12 +104,14 @@ class NativeBackend(NumpyBackend):
         if self._impedance is None:
             self._impedance = self._batch.expand("eq_solimp")
         impedance = self._impedance[rover, :, :2]
+        # MuJoCo's impedance d means a compliance of (1 - d)/d.
         impedance[:] = 1.0 / (1.0 + share * (1.0 / impedance - 1.0))
 
     def _push(self, c: Context) -> None:
         self._carry(c)
         force, moment = self.forces.wheel_world(c)
         if not self._at_rim:
+            # MuJoCo applies forces at the centre of mass.
             moment = moment + cross(c.wheel_position - self._seen["xipos"].take(self._wheels, 1), force)
         self._xfrc[:, self._wheels, :3] = force
         self._xfrc[:, self._wheels, 3:] = moment
@@ -114,6 +120,7 @@ class NativeBackend(NumpyBackend):
         self._xfrc[:, self._chassis, :3] = body["force"]
         self._xfrc[:, self._chassis, 3:] = body["moment"] + cross(arm, body["force"])
         self._qfrc[:, self._dadr] = c.torque + body["joint_torque"]
+        # What depends on positions and velocities is known since the last look, and is not computed again.
         self._batch.step(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def _carry(self, c: Context) -> None:
@@ -131,6 +138,7 @@ class NativeBackend(NumpyBackend):
         fields, b = self._fields, self._chassis
         for i, row in enumerate(carried):
             mass, center, moments, quaternion = _combined(self._drawn_inertia, row)
+            # MuJoCo keeps the sums of masses below each body, and does not renew them itself.
             fields["body_subtreemass"][i, : b + 1] += mass - fields["body_mass"][i, b]
             fields["body_mass"][i, b], fields["body_ipos"][i, b] = mass, center
             fields["body_inertia"][i, b], fields["body_iquat"][i, b] = moments, quaternion
@@ -152,6 +160,7 @@ def native_model(model: Model) -> mujoco.MjModel:
     if "motor" in model.effect_names:
         motor = model.parameters["motor"]
         dofs = [int(m.jnt_dofadr[m.joint(j).id]) for j in model.rover.joints]
+        # The model's motor, not the MJCF's: a preset may state another gear.
         m.dof_armature[dofs] = np.asarray(motor["rotor_inertia"]) * np.asarray(motor["gear_ratio"]) ** 2
     return m
 
@@ -166,8 +175,10 @@ def close_loops(model: Model, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.nd
         for _ in range(6):  # Newton, from loops that are open by micrometres
             jacobian = _loops_at(m, d, q, v)[:, 6:]
             # a pin holds two directions of a planar loop: the third row is nil
+            # The least change (pseudo-inverse) of the joints alone; the base stays.
             q[7:] -= np.linalg.pinv(jacobian, 1e-8) @ d.efc_pos
         jacobian = _loops_at(m, d, q, v)
+        # Speeds are taken off what would open the loops.
         v[6:] -= np.linalg.pinv(jacobian[:, 6:], 1e-8) @ (jacobian @ v)
     return qpos, qvel
 
@@ -198,6 +209,7 @@ def _combined(drawn: tuple[float, np.ndarray, np.ndarray], row: np.ndarray):
         inertia = inertia + part * (d @ d * np.eye(3) - np.outer(d, d))
     # MuJoCo holds an inertia as principal moments and their frame.
     moments, axes = np.linalg.eigh(inertia)
+    # eigh may give a mirrored frame, which no quaternion turns to.
     axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, axes.ravel())

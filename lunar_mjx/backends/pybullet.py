@@ -57,6 +57,7 @@ def import_pybullet() -> ModuleType:
 def _quiet() -> Iterator[None]:
     """Holds back what Bullet's C code prints on the standard streams."""
     sys.stdout.flush()
+    # File descriptors: C code knows nothing of sys.stdout.
     kept = [os.dup(1), os.dup(2)]
     void = os.open(os.devnull, os.O_WRONLY)
     try:
@@ -91,6 +92,7 @@ class PyBulletBackend(NumpyBackend):
     def __init__(self, model: Model, hooks: Iterable[Hook] = (), rovers: int = 1, contact: str = "numpy") -> None:
         if contact not in CONTACTS:
             raise bad_input("pybullet", "contact", contact, "does not exist", f"use one of {', '.join(CONTACTS)}")
+        # Refused, not ignored: a comparison would be of two rovers.
         heavy = [e for e in ("payload", "com_offset") if e in model.effect_names]
         if heavy:
             raise bad_input("pybullet", "effects", ", ".join(heavy), "cannot change a loaded URDF", "remove them")
@@ -152,11 +154,13 @@ class PyBulletBackend(NumpyBackend):
     def _yield_to_engine(self, c: Context) -> np.ndarray:
         """Takes normal force and friction out of the wheel forces where Bullet's contact gives them."""
         everywhere = "penalty_contact" in self.numbers
+        # Where Bullet's own contact carries the wheel.
         bears = np.ones_like(c.soil["rock"], bool) if everywhere else c.soil["rock"] > 0.5
         if everywhere and "engine_friction" in self.numbers:
             kept = c.wheel["force"].copy(), c.wheel["moment"].copy()
             c.wheel = {"force": np.zeros_like(kept[0]), "moment": np.zeros_like(kept[1])}
             for function, p in self.forces.shear_functions():
+                # All laws again but those that Bullet's contact stands for.
                 if function.__name__ not in ("engine_friction", "rock_shear"):
                     function(c, p)
             c.wheel["force"][..., 2] -= c.normal["load"] + c.normal["damping"]
@@ -218,6 +222,7 @@ class _World:
             )
         p.setGravity(0.0, 0.0, -model.gravity, **self._id)
         p.setTimeStep(model.timestep, **self._id)
+        # As exact as Bullet's iterations go: what differs from MuJoCo shall be the method, not its tolerance.
         p.setPhysicsEngineParameter(numSolverIterations=200, solverResidualThreshold=0.0, erp=0.8, **self._id)
         self._dt = model.timestep
         self._join(model)
@@ -243,6 +248,7 @@ class _World:
         self._qadr, self._dadr = mj.jnt_qposadr[ids], mj.jnt_dofadr[ids]
         axes = np.array([info[13] for info in moving])
         turned = np.sum(axes * mj.jnt_axis[ids], axis=1)
+        # Axes may be reversed (see `_sign`), but not turned.
         if np.abs(np.abs(turned) - 1.0).max() > 1e-6:
             wrong = self.names[int(np.argmax(np.abs(np.abs(turned) - 1.0)))]
             raise bad_input(
@@ -255,21 +261,26 @@ class _World:
         self._sign = np.sign(turned)
         self._spring, self._rest = mj.jnt_stiffness[ids].copy(), mj.qpos_spring[self._qadr].copy()
         self._damping = mj.dof_damping[self._dadr].copy()
+        # Rotors and implicit dampers in one: see the module.
         self._inertia = mj.dof_armature[self._dadr] + self._dt * self._damping
         for link in range(-1, len(infos)):
             p.changeDynamics(
                 self._body,
                 link,
+                # Bullet's own damping of 0.04 would slow everything.
                 linearDamping=0.0,
                 angularDamping=0.0,
                 jointDamping=0.0,
                 maxJointVelocity=1e4,
                 **self._id,
             )
+            # No collisions of its own.
             p.setCollisionFilterGroupMask(self._body, link, 0, 0, **self._id)
         for link in self._moving:
+            # Stops are an effect, the same in every engine.
             p.changeDynamics(self._body, link, jointLowerLimit=-1e9, jointUpperLimit=1e9, **self._id)
         count = len(self._moving)
+        # Bullet holds every joint by a motor until told otherwise.
         p.setJointMotorControlArray(self._body, self._moving, p.VELOCITY_CONTROL, forces=[0.0] * count, **self._id)
         base = p.getDynamicsInfo(self._body, -1, **self._id)
         self._base_at, self._base_turn = np.array(base[3]), _matrix(base[4])
@@ -297,13 +308,16 @@ class _World:
             anchors[1].tolist(),
             **self._id,
         )
+        # Far beyond any force in a loop.
         p.changeConstraint(constraint, maxForce=1e9, **self._id)
         return links[0], links[1], np.array(loop.anchor1), np.array(loop.anchor2)
 
     def place(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         p = self._p
+        # Bullet's quaternions have w last.
         turn = _matrix(qpos[[4, 5, 6, 3]])
         arm = turn @ self._base_at
+        # MuJoCo gives a free body's angular velocity in its own axes.
         spin = turn @ qvel[3:6]
         orientation = _quaternion(turn @ self._base_turn)
         p.resetBasePositionAndOrientation(self._body, (qpos[:3] + arm).tolist(), orientation, **self._id)

@@ -60,12 +60,14 @@ def open_engine(model: Model, engine: str) -> Backend:
 
     if engine in ("auto", "native"):
         try:
+            # Tried first: it needs no compilation, and a driver waits for none.
             return NativeBackend(model)
         except UserError:
             if engine == "native":
                 raise
     from lunar_mjx.backends.jax_backend import JaxBackend
 
+    # To standard error, since nothing is wrong and nothing has been printed yet.
     print("view: this engine compiles first, which can take a minute", file=sys.stderr)
     return JaxBackend(model, engine, precision="float32")
 
@@ -130,6 +132,7 @@ class LiveDrive:
         self.backend = open_engine(self.model, engine)
         self.note, self.scene = "", {}
         self._start = (x, y, yaw)
+        # Whole steps, so that a target never changes within one.
         self._steps = max(1, round(PACE.hold / self.model.timestep))
         self._scene = self.model.rover.compile()
         self._data = mujoco.MjData(self._scene)
@@ -151,8 +154,10 @@ class LiveDrive:
     def advance(self, duration: float) -> float:
         """Drives on, in whole control intervals; what is left over is driven next time. Returns the time driven, s."""
         interval = self._steps * self.model.timestep
+        # Time that cannot be caught up is dropped.
         self._behind = min(self._behind + duration, PACE.most + interval)
         driven = 0.0
+        # Rounding of sums must not cost an interval.
         while self._behind >= interval - 1e-9:
             self._go()
             self._behind -= interval
@@ -167,6 +172,7 @@ class LiveDrive:
             if not np.isfinite(self.qpos).all():
                 raise UserError(f"the simulation diverged at {self.time:.2f} s; drive more slowly.")
         except UserError as diverged:
+            # A drive that diverges at its start would begin anew for ever.
             if self.time == 0.0:
                 raise
             self.reset()
@@ -174,6 +180,7 @@ class LiveDrive:
             return
         self._seen = observation(jax.tree.map(lambda a: a[0, 0], seen))
         place = self.qpos[:2]
+        # The first place is where the rover was put.
         self.path += float(np.hypot(*(place - self._place))) if self.time else 0.0
         self.time += interval
         self._place = place
@@ -181,6 +188,7 @@ class LiveDrive:
     def bodies(self) -> np.ndarray:
         """Place and quaternion (w, x, y, z) of every body of the rover's MJCF, (body, 7), the world's first."""
         self._data.qpos[:] = self.qpos
+        # Poses alone, from the coordinates: the engine may be another than MuJoCo.
         mujoco.mj_kinematics(self._scene, self._data)
         return np.concatenate([self._data.xpos, self._data.xquat], axis=1)
 

@@ -94,10 +94,12 @@ class Viewer(ThreadingHTTPServer):
         check_port(port)
         self.drive = drive
         self.terrain = jax.device_get(drive.model.terrain)
+        # Made once: every page that opens asks for it.
         self.scene = json.dumps(rover_scene(drive.model, sun or Sun()) | drive.scene)
         self.pace = Pace(drive, self._show, clock)
         self._fresh = threading.Condition()
         self._picture, self._count, self._closed = "", 0, False
+        # Nobody holds a key yet.
         self._let_go = math.inf
         self._connections: OrderedDict[Any, bool] = OrderedDict()
         self._counting = threading.Lock()
@@ -113,6 +115,7 @@ class Viewer(ThreadingHTTPServer):
                 "name another port, or 0 for any free one",
             ) from error
         own = self.server_address[1]
+        # On port 80 browsers leave the number out of `Host`.
         self.hosts = {f"{name}:{own}" for name in (LOOPBACK, "localhost")} | (
             {LOOPBACK, "localhost"} if own == 80 else set()
         )
@@ -123,6 +126,7 @@ class Viewer(ThreadingHTTPServer):
         try:
             if self.drive.live:
                 self.pace.start()
+            # Control-C is answered within a tenth of a second.
             self.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:
             pass
@@ -161,11 +165,13 @@ class Viewer(ThreadingHTTPServer):
     def _show(self) -> None:
         with self.pace.lock:
             if self.pace.clock() > self._let_go:
+                # A page that was closed must not leave a rover driving.
                 self.drive.pilot.hold([])
             readings = self.drive.readings()
             bodies = self.drive.bodies()
         if self.pace.failure is not None:
             readings["note"] = f"The simulation stopped: {self.pace.failure}"
+        # Hundredths of a millimetre: text, sent 25 times a second.
         text = json.dumps({"bodies": np.round(bodies, 5).tolist(), **_rounded(readings)})
         with self._fresh:
             self._picture, self._count = text, self._count + 1
@@ -181,6 +187,7 @@ class Viewer(ThreadingHTTPServer):
                 del self._connections[idlest]
                 with contextlib.suppress(OSError):
                     idlest.shutdown(socket.SHUT_RDWR)  # its thread reads the end and goes
+        # Waits until the closed connection's thread has gone, so that threads never outnumber connections.
         self._slots.acquire()
         super().process_request(request, client_address)
 
@@ -233,11 +240,13 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         if not self._welcome():
             return
+        # A form on a foreign page cannot send this type without asking first (CORS).
         if self.headers.get("Content-Type", "").split(";")[0] != "application/json":
             self._refuse(415, "send application/json")
             return
         try:
             length = int(self.headers.get("Content-Length", ""))
+            # Read no more than a message can hold, whatever the sender says.
             if not 0 < length <= SERVER.longest:
                 raise ValueError
             message = json.loads(self.rfile.read(length))
@@ -258,12 +267,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Whether a request comes from this page, this machine's programs or the address bar."""
         self.server.heard_of(self.connection)
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        # A foreign name that points here would otherwise make its page ours.
         if host not in self.server.hosts:
             self._refuse(403, f"open this page as {self.server.address}")
             return False
         if origin is not None and origin not in {f"http://{name}" for name in self.server.hosts}:
             self._refuse(403, "pages of another origin may not do this")
             return False
+        # A link elsewhere may open the page; it may not act through it.
         typed = self.command == "GET" and self.headers.get("Sec-Fetch-Mode") == "navigate"
         if self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none") and not typed:
             self._refuse(403, "pages of another site may not do this")
@@ -274,6 +285,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             asked = parse_qs(query)
             x, y = (float(asked[name][0]) for name in ("x", "y"))
+            # float() reads "nan" and "inf".
             if not np.isfinite([x, y]).all():
                 raise ValueError
         except (KeyError, ValueError):
@@ -285,6 +297,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Server-sent events, one per picture, until the page or the drive ends."""
         self.send_response(200)
         self._common("text/event-stream")
+        # A stream has no length: its end is the connection's.
         self.send_header("Connection", "close")
         self.end_headers()
         self.close_connection = True
@@ -327,5 +340,6 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [_rounded(v) for v in value]
     if isinstance(value, float):
+        # JSON knows neither infinity nor NaN.
         return round(value, 4) if math.isfinite(value) else None
     return value
