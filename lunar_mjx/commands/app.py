@@ -62,6 +62,7 @@ class _Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
+            # Typer turns KeyboardInterrupt into a line of its own and status 1; a shell expects 130.
             raise _Interrupted from None
 
 
@@ -70,6 +71,7 @@ app = typer.Typer(
     cls=_Commands,
     help="Lunar rovers on MuJoCo MJX: simulate thousands, hold the model against measurements.",
     no_args_is_help=True,
+    # An error of the package's own shows a plain traceback, which can be pasted into a report.
     pretty_exceptions_enable=False,
 )
 terrain_app = typer.Typer(help="Look at terrains and DEMs, and export them as meshes.", no_args_is_help=True)
@@ -85,6 +87,7 @@ def before_every_command(
         bool, typer.Option(TRUST, help="Run Python code that a received model.toml, run folder or policy names.")
     ] = False,
 ) -> None:
+    # For this command alone: a session in Python that calls commands must not stay trusting.
     ctx.with_resource(trusting(trust))
 
 
@@ -149,6 +152,7 @@ def simulate(
     check_folder(out)
     check_finite(drive=drive, steer=steer, duration=duration, x=x, y=y, yaw_deg=yaw_deg)
     select_device(device)
+    # Imported here, as everywhere in commands: JAX takes seconds, and --help shall not.
     from lunar_mjx.effects.presets import DEFAULT_PRESET
     from lunar_mjx.manoeuvres.cmd_vel import cmd_vel_commands
     from lunar_mjx.model import make_model
@@ -171,8 +175,10 @@ def simulate(
         wanted = cmd_vel_commands(built, cmd_vel, duration)
     else:
         wanted = front_steering(built, constant_commands(built, duration, drive=drive), steer)
+    # Before minutes of compilation.
     _require_possible(wanted, command_channels(built), yaw_deg)
     keep_compiled()
+    # A pipe or a log wants no progress.
     if sys.stderr.isatty():
         print("compiling and driving; the first time can take a minute", file=sys.stderr)
     system, seen = run(built, wanted, x, y, math.radians(yaw_deg))
@@ -180,6 +186,7 @@ def simulate(
     table = channels(system, seen, wanted)
     path = folder / "drive.csv"
     with replacing(path) as part:
+        # Nine digits bring every float32 back.
         table.to_csv(part, index=False, float_format="%.9g")
     save_model(built, folder / "model.toml")
     first, last = table.iloc[0], table.iloc[-1]  # on a slope the chassis leans away from where its wheels were put
@@ -299,8 +306,10 @@ def version() -> None:
 
 def main() -> None:
     """Entry point of the command."""
+    # XLA writes of its own affairs to standard error.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
+        # Not standalone: Click would print its errors in its own way and exit itself.
         status = usage.strict(typer.main.get_command(app)).main(prog_name="lunar-mjx", standalone_mode=False)
     except usage.UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # Typer has printed the help
@@ -314,6 +323,7 @@ def main() -> None:
                 f"{str(error.filename)[:200]}: {error.strerror or error}; check the path and its permissions.",
                 EXIT_STATUS,
             )
+        # An error without a file name is the program's own, unless the disk is full.
         if error.errno not in NO_ROOM:
             raise
         _fail(f"{error.strerror}; free some room where it writes, and run it again.", EXIT_STATUS)
@@ -324,6 +334,7 @@ def main() -> None:
 
 
 def _fail(sentence: str, status: int) -> None:
+    # One line, so that scripts can take the last line of standard error.
     line = " ".join(sentence.splitlines())
     # what no terminal shows as it is: bytes of another encoding, marks that turn the text around, colours
     line = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in line)

@@ -27,11 +27,13 @@ def select_device(device: str) -> None:
     """
     if device not in ("auto", "cpu", "cuda"):
         raise bad_input("lunar-mjx", "--device", device, "does not exist", "use auto, cpu or cuda")
+    # JAX's own choice: a GPU where there is one.
     if device == "auto":
         return
     import jax
 
     if device == "cpu":
+        # Before JAX starts its backends; later it has no effect.
         jax.config.update("jax_platforms", "cpu")
         return
     try:
@@ -50,6 +52,7 @@ def select_device(device: str) -> None:
 
 def check_folder(out: Path) -> None:
     """Refuses, before any work is done, an output folder that is a file or lies in one."""
+    # The nearest part that exists decides; what lies below it can be made.
     for path in (out, *out.parents):
         if path.exists():
             if not path.is_dir():
@@ -87,6 +90,7 @@ def open_terrain(spec: str, dem: Path | None, seed: int | None) -> Any:
     """Loads a terrain; refuses a DEM or seed for one that takes none."""
     from lunar_mjx.terrain import load_terrain
 
+    # Slopes and plain DEM files have no configuration whose DEM or seed could be replaced.
     if spec.startswith("slope") or Path(spec).suffix not in ("", ".toml"):
         for option, value in (("--dem", dem), ("--seed", seed)):
             if value is not None:
