@@ -15,6 +15,24 @@ ABSENT = "no Chromium on the path; get it by: apt-get install chromium (Debian),
 """Why a test of a page is skipped, and what to do about it."""
 
 
+_COLLISIONS = """(() => {
+  const found = [];
+  for (const plot of document.querySelectorAll(".js-plotly-plot")) {
+    const words = [...plot.querySelectorAll("svg text")].filter(text => {
+      const turned = /rotate\\((-?[0-9.]+)/.exec(text.getAttribute("transform") || "");
+      return text.textContent.trim() && !text.closest(".heatmap-label") && !(turned && Number(turned[1]) % 90);
+    });
+    const boxes = words.map(text => text.getBoundingClientRect());
+    boxes.forEach((a, i) => boxes.slice(i + 1).forEach((b, j) => {
+      const x = Math.min(a.right, b.right) - Math.max(a.left, b.left);
+      const y = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
+      if (x > 3 && y > 3) found.push([words[i].textContent, words[i + 1 + j].textContent]);
+    }));
+  }
+  return found;
+})()"""
+
+
 class Browser:
     """One page of a headless Chromium with software WebGL.
 
@@ -113,6 +131,25 @@ class Browser:
         for kind in ("keyDown", "keyUp"):
             more = text if kind == "keyDown" else {}
             self.call("Input.dispatchKeyEvent", type=kind, code=key, key=key, windowsVirtualKeyCode=number[key], **more)
+
+    def click(self, x: float, y: float) -> None:
+        """Moves the mouse to a place of the window and clicks there."""
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def dark(self, on: bool = True) -> None:
+        """Prefers dark pages; a page reads it when it is opened."""
+        value = "dark" if on else "light"
+        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": value}])
+
+    def asked(self) -> list[str]:
+        """Addresses that the page asked for and that it did not itself hold."""
+        return [address for address in self.requests if not address.startswith(("data:", "blob:"))]
+
+    def collisions(self) -> list[list[str]]:
+        """Pairs of words of a figure that lie on each other; numbers within coloured fields are left out."""
+        return self.value(_COLLISIONS)
 
     def resize(self, width: int, height: int) -> None:
         """Gives the page another size, of a phone below 600 pixels."""

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import pytest
+from chromium import ABSENT, CHROMIUM, Browser
 from hypothesis import settings
 
 from lunar_mjx import cli
@@ -45,6 +48,16 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
         return Result(status, out, err)
 
     return call
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    """A page of a real browser; skips where there is none."""
+    if CHROMIUM is None:
+        pytest.skip(ABSENT)
+    opened = Browser(tmp_path / "profile")
+    yield opened
+    opened.close()
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The demonstration at its smallest: one rover of each kind for a fifth of a second."""
+"""The demonstration at its smallest, one rover of each kind for a fifth of a second, and its page in a real browser."""
 
 from __future__ import annotations
 
@@ -11,11 +11,19 @@ from lunar_mjx.demo import run_demo
 from lunar_mjx.errors import UserError
 
 
-@pytest.mark.slow
-def test_the_demonstration_writes_its_page_and_its_numbers(tmp_path):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The page, and what was told while it was made."""
     told: list[tuple[str, float]] = []
-    page = run_demo(tmp_path / "new", lambda what, done: told.append((what, done)), rovers=1, seconds=0.2, starts=1)
-    assert page == tmp_path / "new" / "demo.html"
+    folder = tmp_path_factory.mktemp("demo") / "new"
+    page = run_demo(folder, lambda what, done: told.append((what, done)), rovers=1, seconds=0.2, starts=1)
+    assert page == folder / "demo.html"
+    return page, told
+
+
+@pytest.mark.slow
+def test_the_demonstration_writes_its_page_and_its_numbers(made):
+    page, told = made
     html = page.read_text(encoding="utf-8")
     assert not re.search(r"https?:", html) and len(html.encode()) < 5_000_000
     assert "MIT" in html and "Pavlov" in html and "replicate" not in html.split("<h2>")[0]
@@ -32,6 +40,46 @@ def test_the_demonstration_writes_its_page_and_its_numbers(tmp_path):
     assert husky["error_after"]["fit"] < husky["error_before"]["fit"]
     assert "BorealTC" in html or "LaRocque" in html
     assert numbers["wheel"][0]["fit"] is None and numbers["wheel"][3]["fit"]["values"]["soil"]["n"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_the_page_by_hand_in_a_browser(made, browser, dark):
+    """Mouse, keyboard, words that do not collide, and not one request but for the page itself."""
+    page = made[0].as_uri()
+    browser.dark(dark)
+    browser.open(page)
+    browser.wait("document.body?.dataset.ready")
+    assert browser.value("document.querySelectorAll('.js-plotly-plot .main-svg').length") > 5
+    papers = "[...document.querySelectorAll('.js-plotly-plot')].map(p => p.querySelector('.main-svg').style.background)"
+    paper = browser.value("getComputedStyle(document.body).backgroundColor")
+    assert paper == ("rgb(13, 17, 23)" if dark else "rgb(255, 255, 255)")
+    assert set(browser.value(papers)) == {paper}
+    assert browser.collisions() == []
+    # a click on the legend hides a model in the headline figure
+    mark = "document.querySelector('#figure-0 .legendtoggle')"
+    browser.value(f"{mark}.scrollIntoView({{block: 'center'}})")
+    box = browser.value(f"(() => {{ const b = {mark}.getBoundingClientRect(); return [b.x + 8, b.y + 8]; }})()")
+    browser.click(*box)
+    browser.wait("document.getElementById('figure-0').data[0].visible === 'legendonly'")
+    # tables open by keyboard
+    browser.value("document.querySelector('summary').focus()")
+    browser.press("Enter")
+    browser.wait("document.querySelector('details').open")
+    assert browser.asked() == [page]
+    assert not browser.problems
+
+
+@pytest.mark.slow
+def test_the_page_on_a_phone(made, browser):
+    browser.resize(360, 740)
+    browser.open(made[0].as_uri())
+    browser.wait("document.body?.dataset.ready")
+    assert browser.value("document.documentElement.scrollWidth") <= 360
+    assert browser.collisions() == []
+    wide = "[...document.querySelectorAll('.wide')].filter(box => box.scrollWidth > box.clientWidth)"
+    assert browser.value(f"{wide}.length > 0 && {wide}.every(box => box.tabIndex === 0)")
+    assert not browser.problems
 
 
 def test_a_folder_that_cannot_be_made_is_told(tmp_path):

@@ -134,9 +134,10 @@ def headline_figure(cases: Sequence[Case]) -> go.Figure:
     """How far each wheel model is from the measurements that no fit saw, in scatter of single runs; 1 is perfect."""
     names = [CASE_LABELS.get(c.name, c.name) for c in cases]
     figure = go.Figure()
-    for key, label, look in (
-        ("held out, inside", "slip angles between the fitted ones", SERIES[1]),
-        ("held out, beyond", "slip angles beyond the fitted ones", SERIES[2]),
+    # numbers stand on two sides, for the marks may lie close to each other
+    for key, label, look, side in (
+        ("held out, inside", "slip angles between the fitted ones", SERIES[1], "top center"),
+        ("held out, beyond", "slip angles beyond the fitted ones", SERIES[2], "bottom center"),
     ):
         values = [c.scores()[key] for c in cases]
         figure.add_scatter(
@@ -145,7 +146,7 @@ def headline_figure(cases: Sequence[Case]) -> go.Figure:
             mode="markers+text",
             name=label,
             text=[f"{v:.1f}" for v in values],
-            textposition="top center",
+            textposition=side,
             cliponaxis=False,
             hovertemplate="%{y}: %{x:.1f}<extra></extra>",
             marker={"color": look.colour, "symbol": look.symbol, "size": 13, "line": {"color": INK, "width": 1}},

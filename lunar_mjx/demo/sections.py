@@ -74,14 +74,16 @@ def headline_section(cases: Sequence[Case]) -> Section:
         "Four wheel models against a measured wheel, at slip angles that no fit saw. Left is better; the line is how "
         "well a repeated run agrees. Refitting the soil helps and does not suffice: lunar-mjx why says what is missing."
     )
-    return Section("How far the wheel models are from the measurements", [Figure(headline_figure(cases), caption)])
+    figure = Figure(headline_figure(cases), caption, least=560)
+    return Section("How far the wheel models are from the measurements", [figure])
 
 
 def husky_section(case: HuskyCase) -> Section:
     """A real drive: measured against the model before and after an effect was added."""
     caption = (
         "The current of a Husky's left motor on sandy loam. The wheels turn as measured; the model was fitted on a "
-        "hard floor, and then soft ground took the floor's place. Gaps lie between windows of two seconds."
+        "hard floor, and then soft ground took the floor's place."
+        + (" Gaps lie between windows of two seconds." if np.isnan(case.time).any() else "")
     )
     split_words = {"fit": "fitted windows", "held_out": "held-out windows"}
     steps = (case.error_before, case.error_refitted, case.error_after)
@@ -165,7 +167,7 @@ def driving_section(drives: Sequence[Drive], terrain: Terrain) -> Section:
     title = "What the batch did: median, least and most over the rovers of each kind, column by column"
     blocks = [
         Text([about]),
-        Pair(Figure(paths_figure(drives, terrain), paths), Figure(history_figure(drives), history)),
+        Pair(Figure(paths_figure(drives, terrain), paths, 480), Figure(history_figure(drives), history, 480)),
         Table(title, header, rows, note, folded=True),
     ]
     return Section("Rovers on the Moon", blocks)
@@ -187,7 +189,7 @@ def wheel_section(cases: Sequence[Case]) -> Section:
         f"The same wheel-soil functions that drive the rovers above, in the test bed of the {table.name}: imposed "
         f"slip, slip angle and load. Errors are in units of the scatter of single runs about their mean: {sigma}."
     )
-    figure = Figure(wheel_figure(cases, table, angles, beds), caption)
+    figure = Figure(wheel_figure(cases, table, angles, beds), caption, least=100 + 120 * len(angles))
     blocks = [Text([about]), figure, _error_table(cases), _worst_table(cases), _fit_table(cases)]
     return Section("The wheel against measurements", blocks)
 

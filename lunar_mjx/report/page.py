@@ -14,14 +14,20 @@ import plotly.graph_objects as go
 import plotly.offline
 
 from lunar_mjx.files import write_text
-from lunar_mjx.report.style import DARK
+from lunar_mjx.report.style import DARK_FIGURES
 
 
 class Figure(NamedTuple):
-    """A figure with its caption."""
+    """A figure with its caption.
+
+    Attributes:
+      figure: what is drawn. caption: stands below it.
+      least: width in pixels below which its labels would collide; on a narrower screen it scrolls sideways.
+    """
 
     figure: go.Figure
     caption: str = ""
+    least: int = 0
 
 
 class Pair(NamedTuple):
@@ -51,14 +57,15 @@ class Explorer(NamedTuple):
     """Two figures: what is clicked in the first, or chosen from a list, is drawn in the second.
 
     Points of `figure` carry the key of a panel as their customdata. A panel holds "label" (in the list), "x" and "y",
-    one list per trace of `detail` (x may be one list for all), "title", "x_title" and "y_title" (text as plotly takes
-    it). The first panel is shown at first.
+    one list per trace of `detail` (x may be one list for all), "x_title" and "y_title" (text as plotly takes it). The
+    first panel is shown at first. `least` is the width in pixels below which `figure` scrolls sideways.
     """
 
     figure: go.Figure
     detail: go.Figure
     panels: Mapping[str, Mapping[str, Any]]
     caption: str = ""
+    least: int = 0
 
 
 class Table(NamedTuple):
@@ -147,7 +154,7 @@ def write_page(
         sections=shown,
         figures=figures,
         config=_json(json.dumps(_CONFIG)),
-        dark=_json(json.dumps(DARK)),
+        dark=_json(json.dumps(DARK_FIGURES)),
         plotly=_script(),
     )
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -157,14 +164,14 @@ def write_page(
 def _block(block: Block, figures: list[str]) -> dict[str, Any]:
     kind = type(block).__name__.lower()
     if isinstance(block, Figure):
-        return {"kind": kind, "caption": block.caption, **_placed(block.figure, figures)}
+        return {"kind": kind, "caption": block.caption, **_placed(block.figure, figures, block.least)}
     if isinstance(block, Pair):
         return {"kind": kind, "parts": [_block(part, figures) for part in block]}
     if isinstance(block, Explorer):
         return {
             "kind": kind,
             "caption": block.caption,
-            "map": _placed(block.figure, figures),
+            "map": _placed(block.figure, figures, block.least),
             "detail": _placed(block.detail, figures),
             "panels": packed(json.dumps(block.panels, allow_nan=False)),
             "choices": [(key, panel["label"]) for key, panel in block.panels.items()],
@@ -172,6 +179,6 @@ def _block(block: Block, figures: list[str]) -> dict[str, Any]:
     return {"kind": kind, **block._asdict()}
 
 
-def _placed(figure: go.Figure, figures: list[str]) -> dict[str, int]:
+def _placed(figure: go.Figure, figures: list[str], least: int = 0) -> dict[str, int]:
     figures.append(_json(str(figure.to_json())))
-    return {"height": figure.layout.height or 450, "index": len(figures) - 1}
+    return {"height": figure.layout.height or 450, "least": least, "index": len(figures) - 1}

@@ -51,6 +51,12 @@ HEIGHTS, HEIGHTS_DOWN, RELIEF, SHARES = "cividis", "cividis_r", "gray", "Greys"
 """Colour maps: of numbers, which rise in lightness alike for all eyes; of shaded ground; of counts."""
 SHADES = ((0.0, "#f7fbff"), (0.25, "#c6dbef"), (0.5, "#6baed6"), (0.75, "#2171b5"), (1.0, "#08306b"))
 """From none to much, in one hue: how far the darkness goes is what counts."""
+DARK_SHADES = ("#15202b", "#173a56", "#1b5f8f", "#3f94c9", "#a8d8f5")
+"""The same from none to much on a dark page: there it is lightness that counts."""
+DARK_SERIES = {BLUE: SKY, PURPLE: "#CC79A7", SKY: BLUE}
+"""What takes the place of colours that sink into a dark page."""
+DARK_FIGURES = {**DARK, **DARK_SERIES, **{light: dark for (_, light), dark in zip(SHADES, DARK_SHADES, strict=True)}}
+"""What takes the place of every colour of a figure on a dark page."""
 SANS = ("Helvetica", "Arial", "DejaVu Sans")
 """Fonts of figures that are files; the last one comes with Matplotlib."""
 
@@ -64,8 +70,7 @@ def figure_style(dark: bool = False) -> dict[str, Any]:
     from cycler import cycler
 
     ink, muted, rule, paper = (DARK[c] if dark else c for c in (INK, MUTED, RULE, PAPER))
-    # blue and purple sink into a dark page
-    colours = [{BLUE: SKY, PURPLE: "#CC79A7", SKY: BLUE}.get(c, c) if dark else c for c, _ in LINES]
+    colours = [DARK_SERIES.get(c, c) if dark else c for c, _ in LINES]
     return {
         "font.family": "sans-serif",
         "font.sans-serif": list(SANS),

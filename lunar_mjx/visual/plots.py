@@ -239,7 +239,8 @@ def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
     figure.colorbar(dots, ax=axes, label="mean |slip ratio| of the wheels", shrink=0.6, pad=0.01)
     axes.plot(*place[0], "o", color=LIT, markeredgecolor=SHADOW, markersize=8, label="start", zorder=4)
     axes.plot(*place[-1], "s", color=LIT, markeredgecolor=SHADOW, markersize=8, label="end", zorder=4)
-    axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
+    # above the map: on it, tracks and outline would cross the words
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.3, fontsize=8, ncols=4)
 
 
 def _slope(axes: Axes, drive: RecordedDrive) -> None:
@@ -283,7 +284,9 @@ def _temperature(axes: Axes, drive: RecordedDrive) -> None:
     housing = drive.per_motor("housing_{}_temperature_degC")
     hottest = int(np.argmax(winding.max(axis=0)))
     axes.fill_between(drive.time, winding.min(axis=1), winding.max(axis=1), color=VERMILION, alpha=0.15, linewidth=0)
-    axes.plot(drive.time, winding[:, hottest], color=VERMILION, label=f"winding of {names[hottest]}, the hottest")
+    corner, _, joint = names[hottest].partition("_")
+    where = f"{CORNER_WORDS.get(corner, corner)} {joint}".strip()
+    axes.plot(drive.time, winding[:, hottest], color=VERMILION, label=f"winding, {where}: the hottest")
     axes.plot(drive.time, housing[:, hottest], color=BLUE, linestyle="--", label="its housing")
     style(axes, "temperature, °C")
     axes.legend(fontsize=7, frameon=False, ncols=2)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chromium import ABSENT, CHROMIUM, Browser
 from PIL import Image
 
 from lunar_mjx.diagnosis.report.driven import replayed
@@ -123,8 +122,7 @@ def test_strangers_get_nothing_and_keys_move_nothing(served):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=ABSENT)
-def test_the_page_plays_chooses_and_seeks(served, tmp_path):
+def test_the_page_plays_chooses_and_seeks(served, browser, tmp_path):
     """What plays by the clock is paused before it is read, so that a slow machine sees the same page."""
     seek = "const s = document.getElementById('when'); s.value = {}; s.dispatchEvent(new Event('input'));"
     choose = "const c = document.getElementById('model'); c.selectedIndex = {}; c.dispatchEvent(new Event('change'));"
@@ -134,33 +132,29 @@ def test_the_page_plays_chooses_and_seeks(served, tmp_path):
     gap = "parseFloat(document.getElementById('gap').textContent.match(/[0-9.]+/)[0])"
     # the camera stands still, the ground has come, and what was chosen last has been drawn
     drawn = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
-    browser = Browser(tmp_path / "profile")
-    try:
-        browser.open(served.address)
-        browser.wait("Number(document.body?.dataset.time) > 0.5")
-        assert browser.value("document.title") != "1"  # a log's name is text
-        assert HOSTILE in browser.value("document.getElementById('replay-title').textContent")
-        assert browser.value("document.querySelectorAll('#plots figure').length") == 2
-        browser.value(f"(() => {{ {pause} {watch} {seek.format(6)} }})()")
-        browser.key("keyDown", "Space", " ")
-        browser.wait("window.labels.includes('pause')")  # it plays again
-        browser.value(f"(() => {{ {pause} {seek.format(6)} }})()")
-        browser.key("keyDown", "ArrowRight", "ArrowRight")
-        browser.wait(f"Math.abs({time} - 8) < 0.01")
-        browser.value(f"(() => {{ {seek.format(12)} {choose.format(0)} }})()")
-        assert browser.value(gap) == pytest.approx(AWAY, abs=0.05)
-        browser.value("document.getElementById('camera').click()")
-        browser.wait("document.body.dataset.ground")
-        assert browser.value(drawn)
-        apart = np.asarray(Image.open(browser.picture(tmp_path / "apart.png")).convert("RGB"), int)
-        browser.value(f"(() => {{ {choose.format(1)} }})()")
-        assert browser.value(gap) < 0.05
-        assert browser.value(drawn)
-        with_fit = np.asarray(Image.open(browser.picture(tmp_path / "fit.png")).convert("RGB"), int)
-        middle = (slice(150, 600), slice(300, 900))
-        assert (np.abs(apart[middle] - with_fit[middle]).max(axis=-1) > 40).mean() > 0.01  # the ghost has moved
-        own = served.address
-        assert all(r.startswith(own) for r in browser.requests if not r.startswith(("data:", "about:")))
-        assert not browser.problems
-    finally:
-        browser.close()
+    browser.open(served.address)
+    browser.wait("Number(document.body?.dataset.time) > 0.5")
+    assert browser.value("document.title") != "1"  # a log's name is text
+    assert HOSTILE in browser.value("document.getElementById('replay-title').textContent")
+    assert browser.value("document.querySelectorAll('#plots figure').length") == 2
+    browser.value(f"(() => {{ {pause} {watch} {seek.format(6)} }})()")
+    browser.key("keyDown", "Space", " ")
+    browser.wait("window.labels.includes('pause')")  # it plays again
+    browser.value(f"(() => {{ {pause} {seek.format(6)} }})()")
+    browser.key("keyDown", "ArrowRight", "ArrowRight")
+    browser.wait(f"Math.abs({time} - 8) < 0.01")
+    browser.value(f"(() => {{ {seek.format(12)} {choose.format(0)} }})()")
+    assert browser.value(gap) == pytest.approx(AWAY, abs=0.05)
+    browser.value("document.getElementById('camera').click()")
+    browser.wait("document.body.dataset.ground")
+    assert browser.value(drawn)
+    apart = np.asarray(Image.open(browser.picture(tmp_path / "apart.png")).convert("RGB"), int)
+    browser.value(f"(() => {{ {choose.format(1)} }})()")
+    assert browser.value(gap) < 0.05
+    assert browser.value(drawn)
+    with_fit = np.asarray(Image.open(browser.picture(tmp_path / "fit.png")).convert("RGB"), int)
+    middle = (slice(150, 600), slice(300, 900))
+    assert (np.abs(apart[middle] - with_fit[middle]).max(axis=-1) > 40).mean() > 0.01  # the ghost has moved
+    own = served.address
+    assert all(r.startswith(own) for r in browser.requests if not r.startswith(("data:", "about:")))
+    assert not browser.problems

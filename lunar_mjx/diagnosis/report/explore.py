@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
+from numpy.typing import ArrayLike
 from plotly.subplots import make_subplots
 
 from lunar_mjx.diagnosis.report.figures import SHADES
@@ -34,6 +35,8 @@ class ExploreSizes:
     """Channels drawn over a covariate."""
     maps: int = 6
     """Models of a chain whose heat maps are shown; of longer chains the first five and the last."""
+    name: int = 30
+    """Letters of a manoeuvre's name that stand at a map."""
     shapes: int = 6
     """Effects in the gallery."""
 
@@ -79,9 +82,13 @@ def panels(steps: Sequence[Step]) -> list[Block]:
             row=n,
             col=1,
         )
-    finish(figure, 100 + (height + 34) * len(rms), margin={"l": 200, "r": 16, "t": 36, "b": 64})
-    figure.update_yaxes(autorange="reversed", showgrid=False, type="category")
-    figure.update_xaxes(tickangle=0 if len(units) <= 8 else -45, showgrid=False, type="category", automargin=True)
+    level = len(units) <= 8
+    # seven pixels a letter: manoeuvres below, channels at the left
+    wide = 20 + 7 * min(max(len(o.unit_names[u]) for u in units), EXPLORE.name)
+    beside = 50 + 7 * max(len(plot_text(channel_label(c))) for c in channels)
+    finish(figure, 100 + (height + 34) * len(rms), margin={"l": 16, "r": 16, "t": 36, "b": 64})
+    figure.update_yaxes(autorange="reversed", showgrid=False, type="category", automargin=True)
+    figure.update_xaxes(tickangle=0 if level else -45, showgrid=False, type="category", automargin=True)
     figure.update_annotations(x=0.0, xanchor="left")
     thin = max(1, int(np.ceil(len(o) * 5 / EXPLORE.most_values)))
     worst = sorted(places, key=lambda key: -(rms[0][key] or 0.0))
@@ -93,7 +100,9 @@ def panels(steps: Sequence[Step]) -> list[Block]:
         f"shades.{left} What is held out was never fitted. Click a field, or choose from the list, to see what was "
         "measured, what the models say, and what they leave."
     )
-    return [Explorer(figure, _detail(models), channel_rms, caption)]
+    return [
+        Explorer(figure, _detail(models), channel_rms, caption, least=beside + (wide if level else 44) * len(units))
+    ]
 
 
 def _number(steps: Sequence[Step], step: Step) -> int:
@@ -112,7 +121,7 @@ def _depth(rms: float | None) -> float | None:
 
 def _unit_label(o: Observations, unit: int) -> str:
     """A manoeuvre's name, and below it whether it was held out."""
-    split, name = o.unit_split[unit], plot_text(o.unit_names[unit], 30)
+    split, name = o.unit_split[unit], plot_text(o.unit_names[unit], EXPLORE.name)
     return name if split == "fit" else f"{name}<br><i>{SPLIT_NAMES.get(split, split)}</i>"
 
 
@@ -144,7 +153,7 @@ def dependence(result: Result) -> list[Block]:
         at: dict[str, Any] = {"row": n // columns + 1, "col": n % columns + 1}
         for look, channel in zip(SERIES, worst, strict=False):
             mine = np.concatenate([np.arange(s.start, s.stop) for s in o.series if s.channel == channel])
-            x, mean, error = _binned(covariate[mine], residual[mine])
+            x, (mean, error) = broken(*_binned(covariate[mine], residual[mine]))
             figure.add_scatter(
                 x=x,
                 y=mean,
@@ -166,7 +175,7 @@ def dependence(result: Result) -> list[Block]:
         f"What the model {traces.labels[-1]} leaves in its {len(worst)} worst channels, averaged in bins with 95 % "
         "intervals: noise would scatter about zero whatever it is drawn over."
     )
-    return [Figure(figure, caption)]
+    return [Figure(figure, caption, least=80 + 220 * columns)]
 
 
 def gallery(result: Result) -> list[Block]:
@@ -229,7 +238,7 @@ def gallery(result: Result) -> list[Block]:
         "Shapes of missing effects: what the simulator says each would add at the amount that fits best, less what a "
         "refit of the model absorbs, in the channel and manoeuvre where it shows most."
     )
-    return [Figure(figure, caption)]
+    return [Figure(figure, caption, least=80 + 260 * columns)]
 
 
 def _baseline(traces: Traces) -> int:
@@ -264,22 +273,30 @@ def _panel(models: Sequence[Step], channel: str, unit: int, at: np.ndarray) -> d
     order = np.argsort(x, kind="stable")
     at, x = at[order], x[order]
     o = traces.observations
-    y = [
-        o.value[at],
-        *(m.predicted[at] for m in models),
-        *([] for _ in range(2 - len(models))),
-        *(m.residual[at] for m in models),
-        *([] for _ in range(2 - len(models))),
-    ]
+    x, drawn = broken(x, o.value[at], *(m.predicted[at] for m in models), *(m.residual[at] for m in models))
+    measured, said, left = drawn[0], drawn[1 : 1 + len(models)], drawn[1 + len(models) :]
+    none = [np.zeros(0)] * (2 - len(models))
+    y = [measured, *said, *none, *left, *none]
     name = f"{channel_label(channel)}: {o.unit_names[unit]}"
     return {
         "label": name,
-        "title": plot_text(name, 100),
         "x": _plain(x),
         "y": [_plain(v) for v in y],
         "x_title": x_title,
         "y_title": plot_text(channel_label(channel)),
     }
+
+
+def broken(x: ArrayLike, *values: ArrayLike) -> tuple[np.ndarray, list[np.ndarray]]:
+    """An ascending abscissa and values over it, with NaN values in every gap, so that no line is drawn across it.
+
+    A gap is wider than five usual steps, as between the windows of a drive.
+    """
+    x = np.asarray(x, float)
+    step = np.diff(x)
+    gaps = np.flatnonzero(step > 5.0 * np.median(step)) + 1 if step.size and np.median(step) > 0.0 else []
+    middle = x[gaps] - 0.5 * step[np.asarray(gaps, int) - 1]
+    return np.insert(x, gaps, middle), [np.insert(np.asarray(v, float), gaps, np.nan) for v in values]
 
 
 def _plain(values: np.ndarray | list) -> list[float | None]:
@@ -325,12 +342,7 @@ def _detail(models: Sequence[Step]) -> go.Figure:
         fillcolor=faded(BLUE, 0.12),
         layer="below",
     )
-    finish(
-        figure,
-        480,
-        margin={"l": 70, "r": 16, "t": 90, "b": 52},
-        title={"x": 0.0, "xanchor": "left", "font": {"size": 14}},
-    )
+    finish(figure, 450, margin={"l": 70, "r": 16, "t": 60, "b": 52})
     figure.update_yaxes(title_text="residual, sigma", row=2, col=1)
     return figure
 

@@ -97,7 +97,8 @@ def bars(values: Mapping[str, float | None], title: str, named: str = "") -> go.
             hovertemplate="%{y}: %{x:.4g}<extra></extra>",
         )
     )
-    finish(figure, 90 + 26 * max(len(ascending), 2), margin={"l": 270, "r": 70, "t": 20, "b": 52}, showlegend=False)
+    finish(figure, 90 + 26 * max(len(ascending), 2), margin={"l": 16, "r": 70, "t": 20, "b": 52}, showlegend=False)
+    figure.update_yaxes(automargin=True)
     figure.update_xaxes(title_text=title)
     return figure
 

@@ -38,7 +38,10 @@ def lead(results: Sequence[Result], judge: Result) -> Lead:
     sentence = _sentence(name, named, str(judge.verdict.get("port") or ""), added)
     steps = _next(name, named, judge)
     if judge is not last:
-        steps = [f"lunar-mjx why {last.name}  (this model has not been diagnosed since {_and(added)} was added)"]
+        new = [e for e in added if e not in (judge.run.get("added") or [])]
+        now = f"The model now has {_and(new)}." if new else "The model was compared again."
+        sentence = f"{now} Nobody has asked yet what it still lacks; the findings below are those on {judge.name}."
+        badge, tone, steps = "not diagnosed", "open", [f"lunar-mjx why {last.name}"]
     return Lead(badge, tone, sentence, steps)
 
 

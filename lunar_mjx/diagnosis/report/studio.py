@@ -16,7 +16,7 @@ import numpy as np
 import plotly.offline
 
 from lunar_mjx.diagnosis.folder.refits import read_refits
-from lunar_mjx.diagnosis.report.explore import cells, covariate_along
+from lunar_mjx.diagnosis.report.explore import broken, cells, covariate_along
 from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result, Traces, read_result
 from lunar_mjx.diagnosis.report.reasons import reason
@@ -228,13 +228,16 @@ def _panel(traces: Traces, models: Sequence[_Model], at: np.ndarray, thin: int, 
     x = o.place[at, 0] if o.place is not None else traces.time[at]
     order = np.argsort(x, kind="stable")[::thin]
     at, x = at[order], x[order]
+    said = [m.predicted[at] for m in models if m.predicted is not None]
+    x, drawn = broken(x, o.value[at], *(m.residual[at] for m in models), *said)
+    predicted = iter(drawn[1 + len(models) :])
     return {
         "x": _list(x),
         "x_title": "slip ratio" if traces.is_table else "time, s",
         "y_title": plot_text(channel_label(channel)),
-        "measured": _list(o.value[at]),
-        "predicted": [None if m.predicted is None else _list(m.predicted[at]) for m in models],
-        "residual": [_list(m.residual[at]) for m in models],
+        "measured": _list(drawn[0]),
+        "predicted": [None if m.predicted is None else _list(next(predicted)) for m in models],
+        "residual": [_list(v) for v in drawn[1 : 1 + len(models)]],
     }
 
 

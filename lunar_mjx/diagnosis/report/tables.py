@@ -20,7 +20,11 @@ _MOST_ROWS = 30
 
 def plus_minus(value: Any, std: Any, unit: str = "") -> str:
     """A value with its standard deviation and unit."""
-    text = shown(value) if std is None else f"{shown(value)} ± {shown(std, 2)}"
+    text = shown(value)
+    if std is not None:
+        stem, _, power = text.partition("e")
+        # both in the same power of ten: 2.00e+05 ± 60000 is hard to read
+        text = f"({stem} ± {shown(std / 10.0 ** int(power), 2)})e{power}" if power else f"{text} ± {shown(std, 2)}"
     return f"{text} {unit}".rstrip() if unit not in ("", "1") else text
 
 
@@ -74,10 +78,12 @@ def hypotheses(result: Result) -> list[Block]:
         note = "Size of the smooth error that remains in the model at each port, with its 68 % range."
         blocks.append(Table("What remains", ["port", "the model is", "range"], rows, note, texts=2))
     held = (verdict.get("details") or {}).get("held_out") or {}
-    if held.get("manoeuvres"):
+    groups = held.get("manoeuvres")
+    if groups and held["gain"]:  # exactly zero where no refit was held against them
+        gain = plus_minus(held["gain"], held["se"] if groups > 1 else None)
         text = (
-            f"On {held['manoeuvres']} groups that chose nothing, the log predictive density of the best hypothesis is "
-            f"{plus_minus(held['gain'], held['se'])} above that of the model as it is."
+            f"On {groups} group{'s' if groups > 1 else ''} that chose nothing, the log predictive density of the best "
+            f"hypothesis is {gain} above that of the model as it is."
         )
         blocks.append(Text([text]))
     return blocks

@@ -52,9 +52,6 @@ def _verdict(results: Sequence[Result], judge: Result, steps: Sequence[Step]) ->
     lines = []
     if judge.verdict:
         lines.append(f"Verdict on {judge.name}, {judge.verdict.get('verdict')}: {judge.verdict.get('sentence')}")
-    if not judge.verdict or judge is not results[-1]:
-        last = results[-1].name
-        lines.append(f"{last} has been compared, not diagnosed; ask lunar-mjx why {last} for its verdict.")
     if len(steps) > 1 and comparable(steps):
         splits, measure = judged(steps)
         first, end = error(steps[0], splits), error(steps[-1], splits)
@@ -104,7 +101,7 @@ def _where(judge: Result, steps: Sequence[Step]) -> Section:
     if ports:
         best = max(ports, key=lambda k: ports[k] or 0.0)
         caption = "Probability that something unlisted acts at a port."
-        blocks.append(Figure(figures.bars(ports, "probability", best), caption))
+        blocks.append(Figure(figures.bars(ports, "probability", best), caption, least=520))
     return Section("Where it fails", blocks)
 
 
@@ -116,7 +113,7 @@ def _why(judge: Result, results: Sequence[Result]) -> Section:
             "Isolability: |cos| between the signatures that a refit cannot absorb. From 0.9 on, these logs hardly tell "
             "the two effects apart."
         )
-        blocks.append(Figure(figures.isolability(table), caption))
+        blocks.append(Figure(figures.isolability(table), caption, least=300 + 36 * len(table)))
     named = next((r for r in reversed(results) if (r.verdict or {}).get("effects")), judge)
     blocks += explore.gallery(named)
     return Section("Why: the evidence for every effect", blocks)

@@ -73,3 +73,14 @@ def test_the_gallery_shows_an_effect_where_it_shows_most(result):
     np.testing.assert_allclose(dots.y, result.traces.residual[1, 180:])
     np.testing.assert_allclose(line.y, 8.0 * np.sin(TIME))
     assert "climb" in block.figure.layout.annotations[0].text
+
+
+def test_no_line_is_drawn_across_a_gap():
+    x = np.array([0.0, 0.1, 0.2, 5.0, 5.1])
+    broken, (y, z) = explore.broken(x, 10.0 * x, -x)
+    assert list(broken) == pytest.approx([0.0, 0.1, 0.2, 2.6, 5.0, 5.1])
+    assert np.isnan(y[3]) and np.isnan(z[3]) and np.isfinite(np.delete(y, 3)).all()
+    for whole in (np.arange(5.0), np.array([0.0, 0.0, 0.0, 1.0]), np.array([2.0]), np.zeros(0)):
+        same, (values,) = explore.broken(whole, whole)
+        np.testing.assert_array_equal(same, whole)
+        np.testing.assert_array_equal(values, whole)

@@ -66,8 +66,10 @@ def test_several_are_added_one_by_one_and_a_better_contact_law_first(run):
 def test_a_run_that_was_not_diagnosed_asks_for_it():
     judge = result("run1", {"verdict": "KNOWN", "effects": ["grousers"]})
     last = result("run2", None, added=["grousers"])
-    assert lead([judge, last], judge).next[0].startswith("lunar-mjx why run2 ")
-    assert lead([last], last).next == ["lunar-mjx why run2"]
+    found = lead([judge, last], judge)
+    assert found.next == lead([last], last).next == ["lunar-mjx why run2"]
+    # the page leads with the model as it now is, not with a finding that came before it was mended
+    assert found.badge == "not diagnosed" and "now has grousers" in found.sentence and "run1" in found.sentence
 
 
 class Named:
@@ -125,3 +127,28 @@ def test_who_decided_the_splits_is_said(comparison: dict, splits: dict, words: s
     said = tables._who_split(result("run1", None, comparison, splits=splits), ["a", "b"])
     assert words in said
     assert ("no log states a split" in said) == (not comparison and not splits)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "words"),
+    [
+        (2e5, 6e4, "(2.00 ± 0.6)e+05"),
+        (1.09, 0.12, "1.09 ± 0.12"),
+        (2e5, None, "2.00e+05"),
+        (2.5e-5, 4e-7, "(2.50 ± 0.04)e-05"),
+    ],
+)
+def test_a_value_and_its_deviation_share_their_power_of_ten(value: float, std: float | None, words: str):
+    assert tables.plus_minus(value, std) == words
+
+
+def test_what_was_held_against_no_measurement_is_not_told():
+    def told(**held) -> list[str]:
+        blocks = tables.hypotheses(result("run1", {"details": {"held_out": held}}))
+        return [line for block in blocks for line in block.paragraphs]  # type: ignore[union-attr]
+
+    assert told(manoeuvres=1, gain=0.0, se=0.0) == []
+    (one,) = told(manoeuvres=1, gain=4.0, se=0.0)
+    assert "On 1 group that" in one and "±" not in one  # one group has no scatter
+    (three,) = told(manoeuvres=3, gain=4.0, se=2.0)
+    assert "On 3 groups that" in three and "4 ± 2" in three
