@@ -41,6 +41,7 @@ class BulletGround:
             p.GEOM_HEIGHTFIELD,
             meshScale=[field.cell, field.cell, 1.0],
             heightfieldData=heights.ravel().tolist(),
+            # Bullet's rows run along x, ours along y.
             numHeightfieldRows=field.cols,
             numHeightfieldColumns=field.rows,
             **self._id,
@@ -80,6 +81,8 @@ class BulletGround:
         """Force and moment about `center` on a link in the last step, world coordinates."""
         force, moment = np.zeros(3), np.zeros(3)
         for touch in self._p.getContactPoints(self._body, self._terrain, link, -1, **self._id):
+            # Fields of getContactPoints: 7 and 9 the normal and its force, 10 to 13 both directions of friction, 5 the
+            # place on the first body (PyBullet Quickstart Guide).
             push = touch[9] * np.array(touch[7]) + touch[10] * np.array(touch[11]) + touch[12] * np.array(touch[13])
             force += push
             moment += np.cross(np.array(touch[5]) - center, push)

@@ -71,6 +71,7 @@ class Hooks:
 
     def reset(self) -> None:
         """Puts the state of every hook back to its beginning."""
+        # Deep, since a state may hold arrays that a hook changes in place.
         self.states = [copy.deepcopy(dict(hook.initial)) for hook in self.hooks]
 
     def __contains__(self, point: str) -> bool:

@@ -57,6 +57,7 @@ class JaxBackend(Backend):
 
     @contextlib.contextmanager
     def _precision(self) -> Iterator[None]:
+        # For the call alone: the switch is global, and other engines in this process want theirs.
         with jax.enable_x64(self.precision == "float64"):
             yield
 
@@ -67,8 +68,10 @@ class JaxBackend(Backend):
             new, now = self.system.step_batch(params, carry[0], control, params_axes=axes)
             return new, jax.tree.map(lambda a, b: jnp.where(k == 0, a, b), now, carry[1])
 
+        # A loop needs its carry's shapes before the first step; this finds them without a step.
         shapes = jax.eval_shape(lambda s: self.system.step_batch(params, s, control, params_axes=axes)[1], state)
         empty = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+        # The count is traced: single steps and drives share one compiled program.
         return jax.lax.fori_loop(0, count, one, (state, empty))
 
     def _go(self, control: np.ndarray, count: int) -> Telemetry:

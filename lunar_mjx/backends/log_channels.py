@@ -30,6 +30,7 @@ def log_channels(model: Model, seen: Telemetry, commands: Commands, rover: int =
     time, velocity = own("time"), own("velocity")
     turn = _rotation(own("quaternion"))
     felt = np.gradient(velocity, time, axis=0) if len(time) > 1 else np.zeros_like(velocity)
+    # An accelerometer feels what bears it: at rest it reads gravity, upward.
     felt[:, 2] += model.gravity
     data = {"time_s": time}
     _split(data, "position_{}_m", own("position"), "xyz")

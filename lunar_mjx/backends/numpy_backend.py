@@ -61,6 +61,7 @@ class NumpyBackend(Backend):
         self.hooks.reset()
         self._step = 0
         self._effects = self.forces.initial_state()
+        # A rover that has not driven is as warm as its surroundings, housing and winding alike.
         warm = self.numbers.ambient_temperature(0.0) if winding_temperature is None else winding_temperature
         self._winding = np.zeros_like(self._winding) + warm
         self._housing = self._winding.copy()
@@ -68,6 +69,7 @@ class NumpyBackend(Backend):
         return self.state()
 
     def step(self, control: Any) -> None:
+        # A new one every step: what an earlier step settled must not pass for this one's.
         c = self._context = Context(self.rovers)
         c.step = self._step
         c.winding_temperature, c.housing_temperature = self._winding, self._housing
@@ -97,6 +99,7 @@ class NumpyBackend(Backend):
         self._step = state.step
         self._winding, self._housing = state.winding_temperature.copy(), state.housing_temperature.copy()
         self._effects = {e: {k: v.copy() for k, v in state.effects[e].items()} for e in self._effects}
+        # The state of a backend without hooks tells nothing of them, and leaves them as they are.
         if len(state.hooks) == len(self.hooks.hooks):
             self.hooks.states = copy.deepcopy(state.hooks)
         self._place(state.qpos, state.qvel)
@@ -114,6 +117,7 @@ def observe(c: Context) -> Observation:
     rotation = c.rotation
     euler = [
         np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]),
+        # Rounding may carry the entry past one, where the arcsine is no number.
         np.arcsin(np.clip(-rotation[:, 2, 0], -1.0, 1.0)),
         np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
     ]

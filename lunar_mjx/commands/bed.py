@@ -90,9 +90,11 @@ def simulate(
     )
     g = GRAVITIES.get(gravity)
     g = require_within("bed simulate", "--gravity", gravity, 0.0, 100.0, above=True) if g is None else g
+    # The whole plan first: what the folder lacks of it is what there is to do, after a stop as well.
     runs = campaign.plan(wheel, sand, g, points, numerics, controls)
     if campaign.missing(runs, out):
         open_device(device)  # before anything is written
+    # Points of a table keep its definition of slip, so that both tables can be laid side by side.
     definition = table.slip_definition if table else "wheel_frame"
     folder = make_folder(out)
 
@@ -153,6 +155,7 @@ def _points(
         points = points_of_table(table)
         if slip_angles:
             wanted = _numbers("--slip-angles", slip_angles)
+            # A hundredth of a degree, since a table's angles have been in radians and back.
             points = [p for p in points if any(abs(p.slip_angle - w) < 0.01 for w in wanted)]
         if not points:
             raise bad_input("bed simulate", "--slip-angles", slip_angles, "are not in the table", "name some that are")
@@ -166,6 +169,7 @@ def _points(
             indexing="ij",
         )
         slip, angle, load = (a.reshape(-1) for a in grid)
+        # A wheel that hardly travels never leaves its own pit, which deepens as long as it turns.
         if slip.max() > 1.0 - BOX_SIZE.slowest:
             raise bad_input(
                 "bed simulate",
@@ -198,6 +202,7 @@ def _tell(outcome: Any, folder: Path, points: int) -> None:
     varied = len(outcome.results) - len(table)
     print(f"{len(table)} of {points} points ({len(usable)} usable) and {varied} control runs")
     if table:
+        # Over all runs, as a mean of their quotients would favour short ones.
         spent = sum(r["seconds"] for r in outcome.results) / sum(r["wheel_seconds"] for r in outcome.results)
         worst = max(r["momentum_error"] for r in outcome.results)
         print(

@@ -21,6 +21,7 @@ def policy(
     from lunar_mjx.commands.options import check_folder, make_folder, select_device
 
     check_folder(out)
+    # A graph is traced, not run: it needs no GPU.
     select_device("cpu")
     from lunar_mjx.agents.export.write import GRAPHS, export_policy
     from lunar_mjx.agents.play import shipped_policy

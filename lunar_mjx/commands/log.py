@@ -13,6 +13,7 @@ import typer
 from lunar_mjx.commands.options import MOST_SEED
 from lunar_mjx.errors import UserError, bad_input, require_within
 
+# Not 1 or 2, which a script could not tell from a crash or a mistake in the call.
 BAD_DATA_STATUS = 10
 
 
@@ -91,6 +92,8 @@ def import_(
 
 def _settings(changes: list[str] | None) -> dict[str, Any]:
     """KEY=VALUE pairs as a tree of settings; a value that is not TOML is a text."""
+    # TOML's own reader, so that numbers, booleans and lists mean here what they mean in a map; bare words are spared
+    # the quotes, which a shell would eat.
     tree: dict[str, Any] = {}
     for pair in changes or []:
         key, equals, text = pair.partition("=")
@@ -155,6 +158,7 @@ def noise(
     table = make_table("channel", "kind", "std", "coloured", "time, s", "std of log")
     for channel, kinds in found.items():
         for kind, n in kinds.items():
+            # Where the drive's noise was taken from something else, say from what.
             label = kind if kind in (n.source, "rest") else f"{kind}: {n.source}"
             table.add_row(
                 channel, label, f"{n.std:.3g}", f"{n.share:.2g}", f"{n.correlation_time_s:.2g}", f"{n.log_std:.2g}"
@@ -174,6 +178,7 @@ def check(
     from lunar_mjx.logs import read_campaign
     from lunar_mjx.logs.findings import is_bad
 
+    # All before any is checked: whether a campaign is long enough is told by its longest log.
     read = read_campaign(logs)
     constants = _numbers("--slowest", slowest)
     for name, seconds in constants.items():
@@ -280,12 +285,14 @@ def simulate(
 
 def _effect(text: str) -> tuple[str, dict[str, float]]:
     """NAME:parameter=value,... or my_effects.py:name:parameter=value,... as a name and its values."""
+    # A file's effect has a colon of its own, before the one that begins its values.
     own = re.fullmatch(r"(.+\.py:\w+)(?::(.*))?", text)
     name, rest = (own[1], own[2] or "") if own else text.partition(":")[::2]
     return name, _numbers("--effect", rest.split(",") if rest else [])
 
 
 def _short(name: str) -> str:
+    # A vendor's column may be a whole path; the table must not be torn by it.
     return name if len(name) <= 80 else name[:77] + "..."
 
 
@@ -335,6 +342,7 @@ def manoeuvres() -> None:
     for name in MANOEUVRES:
         plan = load_manoeuvre(name)
         table.add_row(name, f"{plan.duration_s:g}", plan.description, ", ".join(plan.separates))
+    # The TOML files are package data, which a broken build leaves out.
     if not MANOEUVRES:
         raise UserError("manoeuvres: none ships with this installation; reinstall the package.")
     make_console().print(table)

@@ -59,6 +59,7 @@ def parity(
         print(note)
     print(path)
     if any(pair.failed for study in studies for pair in study.pairs):
+        # For scripts: the page has been written all the same.
         raise typer.Exit(1)
 
 

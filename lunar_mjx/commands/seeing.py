@@ -28,6 +28,7 @@ def plot(
 ) -> None:
     """Plot a drive: path on shaded relief, slope, slip, sinkage, temperature and power over time."""
     path = out or run / "summary.png"
+    # Before the imports, which take seconds.
     _check_file(path, (".png", ".svg", ".pdf"))
     from lunar_mjx.visual.plots import drive_summary, save
     from lunar_mjx.visual.recorded import read_drive
@@ -68,6 +69,7 @@ def render(
     from lunar_mjx.commands.options import check_finite
 
     path = out or run / "drive.mp4"
+    # Before the drive is read and its pictures drawn.
     _check_file(path, (".mp4", ".webp", ".gif"))
     check_finite(speed=speed)
     if speed < 0:
@@ -181,6 +183,7 @@ def _policy_drive(name: str, seed: int) -> PolicyDrive:
     from lunar_mjx.viewer.policy_drive import PolicyDrive
 
     env, agent, unseen = open_agent(name)
+    # On standard error, since standard output carries the address for scripts.
     print("view: compiling, which can take some minutes the first time", file=sys.stderr)
     shown = Path(name).stem if name.endswith(".npz") else f"{name}'s policy"
     drive = PolicyDrive(env, agent, shown, unseen_params(env, unseen), seed)

@@ -81,6 +81,7 @@ def train(
 
     check_folder(out)
     require_within("train", "--eval-every", eval_every, 0.0)
+    # Not require_within: inf is a sensible answer here.
     if math.isnan(checkpoint_every) or checkpoint_every < 0.0:
         raise bad_input("train", "--checkpoint-every", checkpoint_every, "is no time", "give s, or inf for none")
     if time_limit is not None:
@@ -99,17 +100,20 @@ def train(
     chosen = override(get_training(training, learner), **pairs("--set", settings))
     options = env_options(env)
     if environment is not None:
+        # The training's options and unseen ground belong to the environment that it brought.
         chosen = dataclasses.replace(chosen, environment=environment, options=options, unseen={})
     elif options:
         chosen = dataclasses.replace(chosen, options={**chosen.options, **options})
     from lunar_mjx.together import join, leads
 
+    # Before anything asks for devices: JAX must know its fellow processes by then.
     join(coordinator, processes, process)
     from lunar_mjx.agents.run import run_training
     from lunar_mjx.agents.train import RunConfig
 
     run = RunConfig(steps or chosen.steps, seed, time_limit, checkpoint_every, not restart, quiet)
     report = run_training(training, chosen, run, make_folder(out), eval_every, eval_episodes, target)
+    # All processes hold the same score; one is to tell it.
     if not leads():
         return
     score = report.score
@@ -140,6 +144,7 @@ SHIPPED_AGENT = "luvmi_x"
 
 def _one_agent(argument: str, option: str | None) -> str:
     """The agent that was named, as an argument or as an option."""
+    # The default of the argument cannot be told from the same name typed.
     if option is not None and argument not in (SHIPPED_AGENT, option):
         raise bad_input("evaluate", "--agent", option, f"is given beside {argument!r}", "name one agent")
     return argument if option is None else option
@@ -170,6 +175,7 @@ def evaluate(
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}
     params = made.params if seen and terrain is None else unseen_params(made, {} if seen else unseen)
+    # After the ground is chosen: agents that know the map must know this one.
     act = knowing(wanted, made, params, act)
     score = Evaluator(made, lambda _, state, key: act(state, key), episodes)(params, (), seed)
     print(

@@ -12,6 +12,7 @@ import typer
 UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
 """Typer's own, wherever this version of Typer keeps it."""
 
+# Of two words for one problem the longer is Typer's, the shorter `_plain_number`'s.
 _PROBLEMS = (
     ("valid integer", "is not a whole number"),
     ("valid int", "is not a whole number"),
@@ -31,6 +32,7 @@ def describe(error: Any, arguments: Sequence[str]) -> str:
     command = error.ctx.command_path if error.ctx else "lunar-mjx"
     names = list(getattr(getattr(error, "param", None), "opts", ()))
     name = next((n for n in names if n.startswith("--")), names[0] if names else "")
+    # By name, since where the class is kept depends on the version of Typer.
     if type(error).__name__ != "BadParameter" or not name:
         text = _clause(error.format_message())
         return f"{command}: {text}; see {command} --help."
@@ -46,6 +48,7 @@ def strict(command: Any) -> Any:
     for parameter in command.params:
         kind = getattr(getattr(parameter, "type_descriptor", None), "annotation", None)
         if kind in (int, float):
+            # In the parameter, not around the command: errors then name the option as Typer's own do.
             parameter.process_value = functools.partial(_plain_number, parameter, parameter.process_value, kind)
         elif kind is Path:
             parameter.process_value = functools.partial(_named_path, parameter, parameter.process_value)
@@ -53,6 +56,7 @@ def strict(command: Any) -> Any:
 
 
 def _plain_number(parameter: Any, process: Callable[[Any, Any], Any], kind: type, ctx: Any, value: Any) -> Any:
+    # Python's int and float read underscores between digits.
     if isinstance(value, str) and "_" in value:
         raise typer.BadParameter(f"{value!r} is not a valid {kind.__name__}", ctx=ctx, param=parameter)
     return process(ctx, value)

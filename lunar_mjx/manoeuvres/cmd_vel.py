@@ -67,9 +67,11 @@ class CmdVel:
         self._steered = np.array([w.steer is not None for w in rover.wheels])
         self.can_crab = bool(self._steered.all())
         if self._steered.any() and not self.can_crab:
+            # Wheels that do not steer can only roll straight, so a turn's centre lies on their line.
             feet = feet - np.array([feet[~self._steered, 0].mean(), 0.0])
         self.position = feet
         limits = [rover.joint_limits[w.steer] if w.steer else (0.0, 0.0) for w in rover.wheels]
+        # The smaller of both sides: a rover is to turn left as it turns right.
         self.steer_limit = np.array([min(-low, high, np.pi / 2) for low, high in limits])
         self._drive = np.array([rover.joints.index(w.drive) for w in rover.wheels])
         self._steer = np.array([rover.joints.index(w.steer) if w.steer else -1 for w in rover.wheels])
@@ -95,7 +97,9 @@ class CmdVel:
         yaw_rate = self._tightest(v_x, v_y, yaw_rate, x, y, limit)
         along, across = v_x - yaw_rate * y, v_y + yaw_rate * x
         angle = jnp.clip(_angle(along, across), -limit, limit)
+        # With the angle that it got, not the one that it would need: what is across the wheel scrubs.
         speed = along * jnp.cos(angle) + across * jnp.sin(angle)
+        # All alike: the path stays, only the time that it takes changes.
         speed = speed / jnp.maximum(jnp.max(jnp.abs(speed)) / self.wheel_limit, 1.0)
         control = jnp.zeros(self._joints).at[self._drive].set(speed / jnp.asarray(self.radius, float))
         if not self._steered.any():
@@ -114,6 +118,7 @@ class CmdVel:
         bound = jnp.abs(v_x) / jnp.maximum(
             jnp.max(jnp.where(self._steered, per_rate, TWIST_LIMITS.still)), TWIST_LIMITS.still
         )
+        # Not for crabbing or a turn on the spot: there the limit is no bound on the yaw rate.
         car = (jnp.abs(v_x) > TWIST_LIMITS.still) & (jnp.abs(v_y) <= TWIST_LIMITS.still)
         return jnp.where(car & exceeds, jnp.clip(yaw_rate, -bound, bound), yaw_rate)
 
@@ -122,6 +127,7 @@ def _angle(along: Any, across: Any) -> Any:
     """Steering angle of a wheel that moves so, within 90 degrees, rad; 0 for one that stands."""
     way = jnp.where(along < 0.0, -1.0, 1.0)
     moving = jnp.abs(along) + jnp.abs(across) > TWIST_LIMITS.still
+    # The inner choice keeps the derivative finite at rest, where arctan2(0, 0) has none.
     return jnp.where(moving, jnp.arctan2(way * across, jnp.where(moving, jnp.abs(along), 1.0)), 0.0)
 
 
@@ -136,6 +142,7 @@ def _no_load_speed(model: Model) -> float:
     )
     drives = [model.rover.joints.index(j) for j in group.joints]
     per_speed = np.broadcast_to(ratio * constant, max(len(model.rover.joints), ratio.size))[drives]
+    # The smallest wheel and the largest product of gear and constant: a speed that every wheel reaches.
     radius = min(w.radius for w in model.rover.wheels)
     return float(group.winding / per_speed.max() * radius)
 

@@ -175,6 +175,7 @@ def _radians(value: Sided) -> Sided:
 def _of_wheel(value: Sided, wheel: Wheel) -> float:
     if not isinstance(value, Mapping):
         return float(value)
+    # A wheel in the middle is neither front nor rear: only its side counts.
     sides = ("left" if wheel.corner[0] == "l" else "right", {"f": "front", "r": "rear"}.get(wheel.corner[1], ""))
     return sum(value.get(side, 0.0) for side in sides)
 
@@ -223,14 +224,17 @@ def commands(manoeuvre: Manoeuvre, model: Model, scale: float = 1.0) -> Commands
     targets = [_targets(s, model) for s in manoeuvre.segments]
     ends = scale * np.cumsum([s.duration_s for s in manoeuvre.segments])
     out = np.empty((count, len(model.rover.joints)))
+    # Row by row and not segment by segment: ends of scaled segments need not fall on the grid of commands.
     for row in range(count):
         time = row * interval
+        # A nanosecond, so that a row at a segment's end belongs to the next one whichever way its time was rounded.
         i = min(int(np.searchsorted(ends, time + 1e-9, side="right")), len(ends) - 1)
         begin = ends[i - 1] if i else 0.0
         # ramps are scaled only as far as they must, so that short versions are not rougher
         stated = manoeuvre.segments[i].ramp_s
         ramp, into = min(stated, max(scale * stated, 0.5 * (ends[i] - begin))), time - begin
         share = 1.0 if into >= ramp else into / ramp
+        # The first ramp starts from rest.
         before = targets[i - 1] if i else np.zeros_like(targets[0])
         out[row] = targets[i] if share == 1.0 else before + share * (targets[i] - before)
     return Commands(out, interval)
@@ -253,6 +257,7 @@ def _targets(segment: Segment, model: Model) -> np.ndarray:
         out[wheel.drive] = drive
         for joint, value in ((wheel.steer, steer), (wheel.suspension, _of_wheel(segment.suspension, wheel))):
             if joint is not None:
+                # One manoeuvre serves every rover: where a joint cannot go as far, it goes as far as it can.
                 low, high = rover.joint_limits[joint]
                 out[joint] = float(np.clip(value, low, high))
     return np.array([out[j] for j in rover.joints])

@@ -35,10 +35,12 @@ def _memory(unit: str, meaning: str) -> StateVariable:
 )
 def stand(ctx, p, x, wrench):
     """Holds the chassis as a damped spring, level and `lift` above where it stood, raised at 0.2 m/s."""
+    # Held where it stands at the first step, which the model cannot know beforehand.
     caught = x.caught > 0.5
     at = Vec3(*(jnp.where(caught, old, present) for old, present in zip((x.x, x.y, x.z), ctx.position, strict=True)))
     ahead = ctx.frame.forward
     held_x, held_y = jnp.where(caught, x.ahead_x, ahead.x), jnp.where(caught, x.ahead_y, ahead.y)
+    # Raised slowly: a lift at once would throw the rover off.
     height = jnp.minimum(x.height + 0.2 * ctx.dt, p.lift)
     gap = Vec3(at.x - ctx.position.x, at.y - ctx.position.y, at.z + height - ctx.position.z)
     force = gap * p.stiffness - ctx.velocity * p.damping

@@ -153,12 +153,14 @@ class JaxRunner(Runner):
             backend = self._on([c.terrain for c in _filled(part, self.WIDTH)])
             backend.reset()
             seen = backend.run(commands)
+            # The rovers that only fill the width are dropped.
             out += [jax.tree.map(lambda a, i=i: a[i : i + 1], seen) for i in range(len(part))]
         return out
 
     def close(self) -> None:
         """Frees the compiled program."""
         self._backend = None
+        # The jitted function alone does not free it: JAX keeps compiled programs in a cache of its own.
         jax.clear_caches()
 
 
@@ -169,6 +171,7 @@ def native_runner(model: Model, hooks: Iterable[Hook] = (), name: str = "native"
 
 def _filled(items: list[Any], width: int) -> list[Any]:
     """The items, and the last of them again up to `width`."""
+    # Another number of rovers would be another program: compiling takes far longer than to drive a few in vain.
     return items + [items[-1]] * (width - len(items))
 
 
@@ -201,6 +204,7 @@ def compare(
     """Largest normalised error, largest difference, where, and the largest difference of the noise floor."""
     if quantity == "orientation":
         a, b = np.atleast_2d(a), np.atleast_2d(b)
+        # q and -q are one orientation; half the angle between two is |a - b| as long as it is small.
         b = b * np.where(np.sum(a * b, -1, keepdims=True) < 0.0, -1.0, 1.0)
         difference, size = 2.0 * np.linalg.norm(a - b, axis=-1), 0.0
     else:
@@ -208,6 +212,7 @@ def compare(
     allowed = tolerance.absolute + tolerance.relative * size + np.zeros_like(difference)
     if floor is not None:
         allowed = allowed + PARITY_WINDOW.floor_factor * floor
+    # NaN would lose against every number in a search for the largest; as infinity it wins.
     error = np.where(np.isfinite(difference), difference / allowed, np.inf)
     at = np.unravel_index(int(np.argmax(error)), error.shape)
     return float(error[at]), float(difference[at]), _where(model, quantity, a.shape, at), float(np.max(size))
@@ -260,6 +265,7 @@ def judge_drive(
     exact, *perturbed = (traces(noise, i) for i in range(len(noise.time)))
     out = []
     for quantity in DRIVE_QUANTITIES:
+        # The farthest of all: how a contact falls is chance, and few drives show too little of it.
         apart = np.max([gap(exact[quantity], n[quantity], quantity) for n in perturbed], axis=0)
         # what has been perturbed stays perturbed, where it is an integral of the motion
         floor = _around(apart) if quantity in MOMENTARY else np.maximum.accumulate(apart, axis=0)
@@ -318,4 +324,5 @@ def first_failure(results: Iterable[Result]) -> Result | None:
     """The first stage of level 1 that failed, in the order of the step: where the engines part."""
     order = {stage: i for i, stage in enumerate(STAGES)}
     failed = [r for r in results if r.level == 1 and not r.passed]
+    # Later stages inherit an earlier one's error, so the first in the order of the step is the cause.
     return min(failed, key=lambda r: (order[r.stage], -r.error), default=None)

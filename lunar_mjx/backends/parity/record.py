@@ -101,6 +101,7 @@ def record(model: Model, case: Case, commands: Commands, count: int) -> tuple[Sa
     exact, start, double, single, soft = (slice(a, b) for a, b in zip([0, *groups], groups, strict=False))
     for rover, share in zip(range(groups[-1])[soft], RECORDING.compliance, strict=False):
         backend.soften_loops(rover, share)
+    # One seed, so that a parity page can be made again.
     chance = np.random.default_rng(0)
     state = backend.reset()
     for part in (start, single):
@@ -127,6 +128,7 @@ def record(model: Model, case: Case, commands: Commands, count: int) -> tuple[Sa
         jax.tree.map(lambda a, at=at: a[at], together) for at in (exact, slice(start.start, double.stop), single, soft)
     )
     if model.rover.loops:
+        # Damping within the loops is a property of the whole backend, so this drive runs by itself.
         within = NativeBackend(model.replace(terrain=case.terrain), damped_within=True).run(commands)
         noise[-1] = jax.tree.map(lambda *a: np.concatenate(a), noise[-1], within)
     return _samples(model, case, states, commands.values[kept]), run, Noise(run, *noise)
@@ -138,6 +140,7 @@ def _samples(model: Model, case: Case, states: list[BackendState], control: np.n
     if model.rover.loops:
         closed = [close_loops(model, s.qpos[:1], s.qvel[:1]) for s in states]
         states = states + [dataclasses.replace(s, qpos=q, qvel=v) for s, (q, v) in zip(states, closed, strict=True)]
+    # The moments become rovers of one batch: one step judges them all.
     joined = _join(states)
     control = np.resize(control, (len(states), *control.shape[1:]))
     probe = NativeBackend(model.replace(terrain=case.terrain), rovers=len(states))
@@ -150,6 +153,7 @@ def evaluate(backend: Backend, state: BackendState, control: np.ndarray) -> tupl
     backend.set_state(state)
     backend.step(control)
     seen, new = backend.observe(), backend.state()
+    # By difference, since not every engine tells its accelerations, and this is what moved the rover.
     seen["acceleration"] = (new.qvel - state.qvel) / backend.model.timestep
     return seen, coordinates(backend.model, new)
 
@@ -172,11 +176,13 @@ def coordinates(model: Model, state: BackendState) -> Observation:
 def _rounded(qpos: np.ndarray) -> np.ndarray:
     """Coordinates as float32 holds them, moved by one more unit in the last place where they are exact."""
     single = qpos.astype(np.float32)
+    # Zeros and halves survive float32 unharmed, and would show a rover without any error.
     return np.where(single == qpos, np.nextafter(single, np.float32(np.inf)), single).astype(float)
 
 
 def _rounded_by_chance(values: np.ndarray, chance: np.random.Generator, precision: type) -> np.ndarray:
     """Values as a precision holds them, moved by chance within `RECORDING.spread` units in the last place."""
+    # Spacing, not a fixed step: an error of rounding grows with the number's size.
     unit = RECORDING.spread * np.spacing(np.abs(values).astype(precision))
     return (values + unit * (chance.random(values.shape) - 0.5)).astype(precision).astype(float)
 

@@ -178,8 +178,10 @@ def kind_of(names: tuple[str, str], model: Model) -> str:
             kinds.append("float32")
         if name.startswith("pybullet"):
             kinds.append("pybullet")
+    # The coarser of two engines decides.
     rounding = max(kinds, key=lambda k: RELATIVE[k])
     exact = [name.startswith(("structured", "pybullet")) for name in names]
+    # Two engines with loops of one kind must agree as if there were none.
     return f"{rounding}, {SOFT_LOOP}" if model.rover.loops and exact[0] != exact[1] else rounding
 
 

@@ -64,6 +64,7 @@ def multipass(c: Context, p: SimpleNamespace, soil: Values, places: Values) -> V
     ) ** 2
     weight = np.maximum(1.0 - gap / (4.0 * p.spacing**2), 0.0) ** 2
     wheels = np.arange(x.shape[1])
+    # What a wheel has just pressed is where it stands, not a rut that it meets.
     weight[:, : MULTIPASS.own_latest, wheels, wheels] = 0.0
     total = weight.sum(axis=(1, 2))
     met = np.sum(weight * places["depth"][..., None], axis=(1, 2)) / (total + MULTIPASS.faint)
@@ -131,12 +132,14 @@ def bulldozing(c: Context, p: SimpleNamespace) -> None:
     theta_1 = c.normal["entrance"]
     length = r * np.sin(np.minimum(theta_1, 0.5 * np.pi))
     moved = mobilised(r * (theta_1 - c.normal["theta_m"]) * c.slip["slip_y"], c.soil["shear_modulus_y"])
+    # Along the wheel's front the depth falls as a parabola, 1 - u^2: 2/3 is its mean, 8/15 that of its square.
     wall = earth_pressure(c, weight, sinkage * (2.0 / 3.0), sinkage * sinkage * (8.0 / 15.0))
     side = -p.side * soft * length * wall * moved
     force, moment = c.wheel["force"], c.wheel["moment"]
     force[..., 0] += front
     force[..., 1] += side
     moment[..., 0] += r * side
+    # The centroid of that parabola lies 3/8 of its length ahead.
     moment[..., 2] += 0.375 * length * c.slip["direction"] * side
 
 
@@ -160,6 +163,7 @@ def static_boulders(c: Context, p: SimpleNamespace, state: Values) -> Values:
     closest, toward, velocity, load = touch
     slide = velocity - toward * dot(velocity, toward)[..., None]
     xi = np.stack([state[f"bristle_{axis}"] for axis in "xyz"], axis=-1) + slide * c.dt
+    # The boulder's surface turns under a rolling wheel: a deflection of before is laid into the present tangent plane.
     xi -= toward * dot(xi, toward)[..., None]
     most = p.mu * load
     long = np.maximum(np.sqrt(dot(xi, xi)), 1e-9)

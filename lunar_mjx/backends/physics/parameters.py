@@ -108,6 +108,7 @@ class Numbers:
         """Ambient temperature at `time` s, K: the equilibrium of a surface under the Sun between night and noon."""
         noon, night, noon_time, period = self.ambient
         sun = np.cos(2.0 * np.pi * (time - noon_time) / period)
+        # Sunlight taken in goes as the cosine of its angle and heat given off as T^4: hence the fourth root.
         return float(night + (noon - night) * max(sun, 0.0) ** 0.25)
 
 
@@ -116,6 +117,7 @@ def check_supported(model: Model, backend: str) -> None:
     foreign = [
         e.name
         for e in model.effects
+        # A user's effect may bear the name of one of ours; its physics is another.
         if e.name not in SUPPORTED or not all(f.__module__.startswith("lunar_mjx.effects") for f in e.ports.values())
     ]
     if foreign:
@@ -186,6 +188,7 @@ def _boxes(model: mujoco.MjModel, chassis: str) -> tuple[np.ndarray, np.ndarray]
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
         rotation = rotation.reshape(3, 3)
         centers.append(model.geom_pos[geom] + rotation @ model.geom_aabb[geom, :3])
+        # Half sides of the box along the axes that holds a turned box.
         halves.append(np.abs(rotation) @ model.geom_aabb[geom, 3:])
     return np.reshape(centers, (-1, 3)), np.reshape(halves, (-1, 3))
 

@@ -33,6 +33,7 @@ def penalty_contact(c: Context, p: SimpleNamespace) -> None:
 def _printed_slip(contact: Values) -> np.ndarray:
     """s = 1 - v_x/(r omega) driving, r omega/v_x - 1 braking (eq. 8); denominators at least `FLOOR`, |s| <= 1."""
     rim, v_x = contact["rim_speed"], contact["v_x"]
+    # Each is divided by the faster of rim and travel; at rest both vanish, which the paper leaves open.
     below = np.where(rim > v_x, rim, v_x)
     below = np.where(np.abs(below) < FLOOR, np.where(below < 0.0, -FLOOR, FLOOR), below)
     return np.minimum(np.maximum((rim - v_x) / below, -1.0), 1.0)
@@ -43,6 +44,7 @@ def _printed_tangent(contact: Values) -> np.ndarray:
     v_x, v_y = contact["v_x"], contact["v_y"]
     moving = (v_x * v_x + v_y * v_y > FLOOR * FLOOR) & (v_y != 0.0)
     beta = np.arctan2(v_y, v_x) * moving
+    # tan(beta) changes sign through infinity at 90 deg, where a wheel slides aside.
     return np.tan(np.minimum(np.maximum(beta, -1.553), 1.553))
 
 
@@ -67,7 +69,10 @@ def printed_shear(c: Context, p: SimpleNamespace) -> None:
     if p.mend_j > 0.5:
         tau = strength * mobilised(j, soil["shear_modulus_x"])
     else:
+        # As printed j can be negative, where the exponential grows without bound.
         tau = strength * (1.0 - np.exp(np.minimum(-j / soil["shear_modulus_x"], 3.0)))
+    # The print takes the shear stress at the rim and the normal stress at the tips of the grousers: the wrong way
+    # about.
     swapped = 1.0 - p.mend_shear_radius
     drawbar = (b * tau * a_factor) * (p.mend_shear_radius * r_s + swapped * r)
     drawbar -= (b * sigma * b_factor) * (p.mend_shear_radius * r + swapped * r_s)
@@ -93,6 +98,7 @@ def engine_friction(c: Context, p: SimpleNamespace) -> None:
     """mu F_N tanh(|v|/v_e) against the sliding of the rim, at the wheel's lowest point."""
     contact, r = c.contact, c.geometry["radius"]
     slide_x, slide_y = contact["v_x"] - contact["rim_speed"], contact["v_y"]
+    # The square of a micrometre per second, lest a wheel at rest divides zero by zero.
     speed = np.sqrt(slide_x * slide_x + slide_y * slide_y + 1e-12)
     friction = p.mu * (c.normal["load"] + c.normal["damping"]) * np.tanh(speed / p.speed_scale) / speed
     along, side = -friction * slide_x, -friction * slide_y

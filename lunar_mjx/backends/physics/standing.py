@@ -23,13 +23,16 @@ def stand(numbers: Numbers, ground: Ground, x: np.ndarray, y: np.ndarray, yaw: n
     foot_y = y[:, None] + sin * feet[:, 0] + cos * feet[:, 1]
     height = ground.field.value(foot_x, foot_y)[0]
     design = np.column_stack([np.ones(len(feet)), feet[:, :2]])
+    # Four wheels or more rarely lie in one plane: the suspension has to take up the rest.
     fit = np.linalg.lstsq(design, height.T, rcond=None)[0]
     above = np.max(height.T - design @ fit, axis=0)
     pitch = -np.arctan(fit[1])
+    # From the third column of R_y(pitch) R_x(roll), which is to be the plane's normal.
     roll = np.arctan(fit[2] * np.cos(pitch))
     quaternion = _product(_about(2, yaw), _product(_about(1, pitch), _about(0, roll)))
     w, i, j, k = quaternion.T
     up = np.stack([2 * (i * k + w * j), 2 * (j * k - w * i), 1 - 2 * (i * i + j * j)], axis=-1)
+    # The height is measured along the normal: on a slope the chassis stands off to a side.
     return np.stack([x, y, fit[0] + above], axis=-1) + numbers.standing_height * up, quaternion
 
 
