@@ -15,6 +15,7 @@ import orbax.checkpoint as ocp
 from lunar_mjx.errors import UserError, bad_input
 
 _KEEP = 2
+"""Newest checkpoints that stay: the last one may be damaged, and the one before it is only an interval older."""
 
 
 class Checkpoints:

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.errors import bad_input, require_finite, require_within
+from lunar_mjx.model.ambient import SYNODIC_DAY
 from lunar_mjx.terrain import Dem, Terrain, read_dem
 from lunar_mjx.terrain.sky import Horizon, Sun, fixed_sun
-from lunar_mjx.terrain.sky.ephemeris import SYNODIC_MONTH, sun_over
+from lunar_mjx.terrain.sky.ephemeris import sun_over
 from lunar_mjx.terrain.sky.horizon import compute_horizon
 from lunar_mjx.terrain.sky.sun import SOLAR_CONSTANT
 
@@ -119,7 +120,7 @@ def _track(settings: SunSettings) -> tuple[np.ndarray, np.ndarray, float]:
     """Directions in the terrain's frame, irradiances, and the sine of the highest elevation within a lunar day."""
     assert settings.date is not None and settings.latitude_deg is not None and settings.longitude_deg is not None
     kept = math.ceil(settings.days * 86400.0 / INTERVAL) + 1
-    count = max(kept, math.ceil(SYNODIC_MONTH / INTERVAL) + 1)
+    count = max(kept, math.ceil(SYNODIC_DAY / INTERVAL) + 1)
     seconds = np.arange(count) * INTERVAL
     local, distance = sun_over(settings.date, seconds, settings.latitude_deg, settings.longitude_deg)
     east, north, up = local.T

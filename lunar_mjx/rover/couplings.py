@@ -9,10 +9,7 @@ import numpy as np
 from lunar_mjx.errors import bad_input
 from lunar_mjx.rover.description import Description
 from lunar_mjx.rover.tree import Body, world_poses
-from lunar_mjx.rover.urdf import Urdf
-
-_PARALLEL = 0.999
-"""Least |cosine| between the axes of a differential's pivots."""
+from lunar_mjx.rover.urdf import URDF_LIMITS, Urdf
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
             for j in (pair.joint1, pair.joint2)
         ]
         cosine = float(axes[0] @ axes[1])
-        if abs(cosine) < _PARALLEL:
+        if abs(cosine) < URDF_LIMITS.parallel:
             raise bad_input(
                 path, f"differentials[{i}].joint2", pair.joint2, "is not parallel to joint1", "name the rockers' pivots"
             )

@@ -9,9 +9,7 @@ import numpy as np
 from lunar_mjx.errors import bad_input
 from lunar_mjx.rover.description import Description
 from lunar_mjx.rover.tree import Body, locate, world_poses
-from lunar_mjx.rover.urdf import Urdf
-
-CLOSED = 1e-3  # m; anchors farther apart than this at zero angles are a mistake, not rounding
+from lunar_mjx.rover.urdf import URDF_LIMITS, Urdf
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ def place_loops(urdf: Urdf, bodies: tuple[Body, ...], description: Description) 
             )
         # At zero angles both anchors must be one point: a solver would close a wrong gap by bending the rover.
         gap = float(np.linalg.norm(poses[body1].apply(anchor1) - poses[body2].apply(anchor2)))
-        if gap > CLOSED:
+        if gap > URDF_LIMITS.open_loop:
             raise bad_input(
                 path,
                 f"loops[{i}] anchors",

@@ -19,13 +19,17 @@ JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "floating")
 
 @dataclass(frozen=True)
 class UrdfLimits:
-    """What a URDF may hold."""
+    """What a URDF and its description may hold."""
 
     inertia_tolerance: float = 1e-6
     """Share by which a triangle inequality of moments of inertia may be missed, by rounding: URDFs are written by hand
     with a few digits."""
     longest_name: int = 200
     """Characters of a link's or joint's name, which becomes part of channel names."""
+    open_loop: float = 1e-3
+    """m; anchors of a loop farther apart than this at zero angles are a mistake, not rounding."""
+    parallel: float = 0.999
+    """Least |cosine| between the axes of a differential's pivots: 2.6 deg, more than roundings of a URDF's angles."""
 
 
 URDF_LIMITS = UrdfLimits()

@@ -35,6 +35,7 @@ SLIP_DEFINITIONS = ("wheel_frame", "travel_speed")
 """What the rim speed is compared with: v_x = V cos(beta) of the wheel's frame (eq. 8), or the travel speed V."""
 
 EARTH_GRAVITY = 9.80665
+"""m/s2; standard gravity (3rd CGPM 1901): test beds stand on the Earth."""
 
 SPEED = 1.0
 """Larger of rim and travel speed at which the bed runs, m/s. The steady force of the effects that ship does not depend

@@ -12,6 +12,7 @@ REFERENCE = 298.15
 """K; where the catalogue states resistance and torque constant."""
 
 STEFAN_BOLTZMANN = 5.670374419e-8
+"""W/m2/K4 (CODATA 2018)."""
 
 
 def controller(c: Context, p: SimpleNamespace) -> np.ndarray:

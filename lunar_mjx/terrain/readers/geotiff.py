@@ -15,7 +15,8 @@ from lunar_mjx.terrain.dem import Dem, require_cell, require_size, undeclared_no
 from lunar_mjx.terrain.readers.arrays import grid
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions, Window
 
-_SQUARE = 1e-4  # relative difference of pixel width and height that counts as square
+_SQUARE = 1e-4
+"""Relative difference of pixel width and height that counts as square: a metre over a map of ten kilometres."""
 
 
 def read_geotiff(path: Path, options: ReadOptions) -> Dem:

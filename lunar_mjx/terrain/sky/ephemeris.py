@@ -8,8 +8,6 @@ import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input
 
-SYNODIC_MONTH = 29.530588 * 86400.0
-"""From noon to noon on the Moon, s."""
 _ARGUMENTS = (
     (125.045, -0.0529921),
     (250.089, -0.1059842),
