@@ -8,181 +8,145 @@ from __future__ import annotations
 
 import argparse
 import functools
-import sys
-import threading
-import time
+import importlib
+import math
 import tomllib
-import types
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from harness import DURING, FINAL, Clock, episodes_of, percent, save, say, training_of
+import jax
+import jax.numpy as jnp
+import numpy as np
+from harness import DURING, FINAL, Clock, Judge, percent, reached, save, say, training_of
+from large import episodes_of
+
+from lunar_mjx.agents.run import unseen_params
+from lunar_mjx.envs import make
 
 SETTINGS = tomllib.loads(Path(__file__).with_name("brax_settings.toml").read_text(encoding="utf-8"))
-LAYERS = (512, 256, 128)
-
-
-def prepare() -> None:
-    """Lets brax's trainers run with a newer JAX, and where orbax is not whole: nothing is checkpointed here."""
-    import jax
-    import jax.numpy as jnp
-
-    if not hasattr(jax, "device_put_replicated"):
-
-        def replicate(tree: Any, devices: Any) -> Any:
-            return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
-
-        jax.device_put_replicated = replicate
-    try:
-        import orbax.checkpoint  # noqa: F401
-    except ImportError:
-        for name in ("", "agents.ppo.", "agents.sac."):
-            sys.modules[f"brax.training.{name}checkpoint"] = types.ModuleType("checkpoint")
+MOST_EPOCHS = 5000
 
 
 class OutOfTime(Exception):
     """Ends a training of brax, which has no end of its own but its steps."""
 
 
-class Watch:
-    """Takes the place of brax's evaluator: keeps the parameters, so that the judge of this benchmark scores them."""
+class Run:
+    """One training; takes the place of brax's evaluator, so that the judge of this benchmark scores the policy.
 
-    last: Any = None
+    Args:
+      name: `ppo` or `sac`. env, params, episodes: where policies are scored. target: success rate whose time is kept.
+      clock: ends the training. keep: called with the record after every epoch.
+    """
 
-    def __init__(self, eval_env: Any, eval_policy_fn: Any, **_: Any):
-        self.make, self.params = eval_policy_fn, None
-        Watch.last = self
+    def __init__(
+        self, name: str, scored: tuple[Any, Any, int], target: float, clock: Clock, keep: Callable[[dict], None]
+    ):
+        self.name, self.scored, self.target, self.clock, self.keep = name, scored, target, clock, keep
+        self.rows: list[dict[str, Any]] = []
+        self.walltimes = [0.0]
+        self.judge: Judge | None = None
+        self.ready: Future[None]
+
+    def evaluator(self, _: Any, make_policy: Any, **__: Any) -> Run:
+        """What brax takes for an evaluator of this training."""
+        self.make_policy = make_policy
+        return self
 
     def run_evaluation(self, policy_params: Any, training_metrics: Any, **_: Any) -> dict[str, Any]:
+        """What brax calls before the training and after every epoch."""
         self.params = policy_params
         return dict(training_metrics)
 
-    def act(self, params: Any, state: Any, key: Any) -> Any:
-        return self.make(params)(state.obs, key)[0]
-
-
-class Scores:
-    """One training: what is called after every epoch, and what it came to."""
-
-    def __init__(
-        self,
-        name: str,
-        task: tuple[Any, Any, int],
-        seconds: float,
-        target: float,
-        keep: Callable[[dict[str, Any]], None],
-    ):
-        self.name, self.task, self.target, self.keep = name, task, target, keep
-        self.clock, self.rows, self.seconds = Clock(seconds), [], []
-        self._walltime, self._judge, self._compiling = 0.0, None, None
-
     def progress(self, steps: int, metrics: dict[str, Any]) -> None:
         """Scores the policy; the first call, before any training, compiles the judge beside brax's own compiling."""
-        from lunar_mjx.agents.evaluate import Evaluator
-
-        env, unseen, episodes = self.task
-        if self._judge is None:
-            self._judge = Evaluator(env, Watch.last.act, episodes)
-            self._compiling = threading.Thread(target=self._judge.compile, args=(unseen, Watch.last.params))
-            self._compiling.start()
+        env, unseen, episodes = self.scored
+        if self.judge is None:
+            self.judge = Judge(env, episodes, {"policy": self.act})
+            self.ready = ThreadPoolExecutor(1).submit(self.judge.compile, unseen, self.params)
             return
-        walltime = float(metrics["training/walltime"])
-        self.seconds.append(walltime - self._walltime)
-        self._walltime = walltime
-        self._compiling.join()
-        score = self.score(DURING)
-        self.rows.append({"steps": int(steps), **score})
+        self.walltimes.append(float(metrics["training/walltime"]))
+        self.ready.result()
+        self.rows.append({"steps": int(steps), **self.score(DURING)})
         record = self.record()
-        say(f"{self.name}: {record['unseen'][-1]['elapsed_s']:.1f} s, {int(steps):,} steps, unseen {percent(score)}")
+        row = record["unseen"][-1]
+        say(f"{self.name}: {row['elapsed_s']:.1f} s, {row['steps']:,} steps, unseen {percent(row)}")
         self.keep(record)
         if self.clock.left < 0.0:
             raise OutOfTime
 
+    def act(self, params: Any, state: Any, key: Any) -> Any:
+        """Actions of brax's policy, for the judge."""
+        return self.make_policy(params)(state.obs, key)[0]
+
     def score(self, seed: int) -> dict[str, Any]:
         """Score of the last parameters."""
-        assert self._judge is not None
-        return self._judge(self.task[1], Watch.last.params, seed).record()
+        assert self.judge is not None
+        return self.judge(self.scored[1], self.params, seed)["policy"]
 
     def record(self) -> dict[str, Any]:
         """The scores; the first epoch, which compiles, counts like the quickest of the others."""
-        rest = self.seconds[1:]
-        times = [(min(rest) if rest else float("nan")) + sum(rest[:i]) for i in range(len(self.rows))]
+        first, *rest = [float(s) for s in np.diff(self.walltimes)] or [math.nan]
+        times = [min(rest, default=math.nan) + sum(rest[:i]) for i in range(len(self.rows))]
         rows = [{**row, "elapsed_s": t} for row, t in zip(self.rows, times, strict=True)]
-        reached = next((r for r in rows if r["success"] >= self.target), None)
-        return {
-            "unseen": rows,
-            "first_epoch_s": self.seconds[0] if self.seconds else None,
-            "seconds_to_target": reached and reached["elapsed_s"],
-            "steps_to_target": reached and reached["steps"],
-            "process_s": self.clock.spent,
-        }
+        about = {"first_epoch_s": first, "process_s": self.clock.spent}
+        return {"unseen": rows, **about, **reached(rows, self.target)}
 
+    def train(self, settings: dict[str, Any], seed: int, per_epoch: int) -> None:
+        """Trains with one of brax's learners until time is up."""
+        from brax.training import acting
 
-def run(name: str, env: Any, settings: dict[str, Any], seed: int, per_epoch: int, scores: Scores) -> None:
-    """Trains with one of brax's learners until time is up."""
-    from brax.training import acting
-    from brax.training.agents.ppo import networks as ppo_networks
-    from brax.training.agents.ppo import train as ppo
-    from brax.training.agents.sac import networks as sac_networks
-    from brax.training.agents.sac import train as sac
+        from lunar_mjx.envs.brax_env import BraxEnv, wrap
 
-    from lunar_mjx.envs.brax_env import BraxEnv, wrap
-
-    theirs, epochs = acting.Evaluator, 5000
-    if name == "ppo":
-        module, layers = ppo, {"policy_hidden_layer_sizes": LAYERS, "value_hidden_layer_sizes": LAYERS}
-        networks: Any = functools.partial(ppo_networks.make_ppo_networks, **layers)
-        step = settings["batch_size"] * settings["num_minibatches"] * settings["unroll_length"]
-    else:
-        module, norm = sac, {"policy_network_layer_norm": True, "q_network_layer_norm": True}
-        networks = functools.partial(sac_networks.make_sac_networks, hidden_layer_sizes=LAYERS, **norm)
-        step = settings["num_envs"]
-    acting.Evaluator = Watch  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        module.train(
-            BraxEnv(env),
-            num_timesteps=epochs * per_epoch * step,
-            num_evals=epochs + 1,
-            episode_length=env.episode_steps,
-            wrap_env_fn=wrap,
-            network_factory=networks,
-            seed=seed,
-            deterministic_eval=True,
-            max_devices_per_host=1,
-            progress_fn=scores.progress,
-            num_eval_envs=1,
-            **settings,
-        )
-    except OutOfTime:
-        pass
-    finally:
-        acting.Evaluator = theirs
+        agent = f"brax.training.agents.{self.name}"
+        learner, networks = (importlib.import_module(f"{agent}.{part}") for part in ("train", "networks"))
+        make_networks = getattr(networks, f"make_{self.name}_networks")
+        step = math.prod(settings[k] for k in SETTINGS["step"][self.name])
+        theirs, env = acting.Evaluator, self.scored[0]
+        acting.Evaluator = self.evaluator  # pyright: ignore[reportAttributeAccessIssue]
+        try:
+            learner.train(
+                BraxEnv(env),
+                num_timesteps=MOST_EPOCHS * per_epoch * step,
+                num_evals=MOST_EPOCHS + 1,
+                episode_length=env.episode_steps,
+                wrap_env_fn=wrap,
+                network_factory=functools.partial(make_networks, **SETTINGS["networks"][self.name]),
+                seed=seed,
+                deterministic_eval=True,
+                max_devices_per_host=1,
+                progress_fn=self.progress,
+                num_eval_envs=1,
+                **settings,
+            )
+        except OutOfTime:
+            pass
+        finally:
+            acting.Evaluator = theirs
 
 
 def brax(args: argparse.Namespace, clock: Clock) -> None:
     """PPO, then SAC, each for half of the time that is left."""
-    prepare()
-    from lunar_mjx.agents.run import unseen_params
-    from lunar_mjx.envs import make
-
-    training = training_of(args)
+    if not hasattr(jax, "device_put_replicated"):  # brax's trainers were written for an older JAX
+        jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda a: jnp.stack([a] * len(devices)), tree)
+    training = training_of(args, "large-td3")
     env = make(training.environment, **training.options)
-    task = (env, unseen_params(env, dict(training.unseen)), episodes_of(args))
-    runs: dict[str, Any] = {}
+    scored, runs = (env, unseen_params(env, training.unseen), episodes_of(args)), {}
     for i, name in enumerate(("ppo", "sac")):
         settings = {**SETTINGS[name], **(SETTINGS["tiny"][name] if args.tiny else {})}
 
         def keep(record: dict[str, Any], name: str = name, settings: dict[str, Any] = settings) -> None:
-            about = {"settings": settings, "layers": LAYERS, "seed": args.first_seed}
+            about = {"settings": settings, "networks": SETTINGS["networks"][name], "seed": args.first_seed}
             runs[name] = {**runs.get(name, {}), **about, **record}
             save(args.out, "brax", {"rover": args.rover, "target": args.target, "runs": runs})
 
-        scores, begin = Scores(name, task, clock.left / (2 - i) - 8.0, args.target, keep), time.monotonic()
+        run = Run(name, scored, args.target, Clock(clock.left / (2 - i) - 8.0), keep)
         try:
-            run(name, env, settings, args.first_seed, 3 if args.tiny else SETTINGS["per_epoch"][name], scores)
-            keep({**scores.record(), "final": scores.score(FINAL)})
-            say(f"{name}: at the end {percent(runs[name]['final'])}, {time.monotonic() - begin:.0f} s in all")
+            run.train(settings, args.first_seed, 3 if args.tiny else SETTINGS["per_epoch"][name])
+            keep({**run.record(), "final": run.score(FINAL)})
+            say(f"{name}: at the end {percent(runs[name]['final'])}, {run.clock.spent:.0f} s in all")
         except Exception as error:  # the other one still runs
             say(f"{name}: {type(error).__name__}: {error}")
-            keep({**scores.record(), "error": f"{type(error).__name__}: {error}"})
+            keep({**run.record(), "error": f"{type(error).__name__}: {error}"})

@@ -8,19 +8,15 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.export
 import numpy as np
+from harness import KEPT, save, say
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from benchmarks.provenance import commit
-from benchmarks.rl.harness import save, say
 from lunar_mjx.agents.export.write import NODE, export_policy
 from lunar_mjx.agents.play import shipped_policy
 from lunar_mjx.agents.policy import load_policy
@@ -51,22 +47,19 @@ def measure(rover: str) -> dict[str, Any]:
             times.append(1e3 * (time.perf_counter() - begin))
         read = jax.export.deserialize(bytearray((folder / "policy.stablehlo").read_bytes()))
         other = np.asarray(read.call(obs))
-    return {
-        "onnx_error": float(np.abs(np.stack(actions) - wanted).max()),
-        "stablehlo_error": float(np.abs(other - wanted).max()),
-        "median_ms": float(np.median(times)),
-        "p99_ms": float(np.quantile(times, 0.99)),
-    }
+    errors = {"onnx_error": np.stack(actions) - wanted, "stablehlo_error": other - wanted}
+    spent = {"median_ms": np.median(times), "p99_ms": np.quantile(times, 0.99)}
+    return {k: float(np.abs(v).max()) for k, v in errors.items()} | {k: float(v) for k, v in spent.items()}
 
 
 def main() -> None:
     """Measures and writes."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/rl/export.json"))
-    args = parser.parse_args()
+    parser.add_argument("--out", type=Path, default=KEPT / "export.json")
+    out = parser.parse_args().out
     rows = {rover: measure(rover) for rover in ("luvmi_x", "viper")}
     say(json.dumps(rows))
-    save(args.out.parent, args.out.stem, {"commit": commit(), "seed": SEED, "observations": COUNT, "rovers": rows})
+    save(out.parent, out.stem, {"seed": SEED, "observations": COUNT, "rovers": rows})
 
 
 if __name__ == "__main__":

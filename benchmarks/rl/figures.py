@@ -10,162 +10,145 @@ python benchmarks/rl/figures.py benchmarks/rl                      # figures and
 from __future__ import annotations
 
 import argparse
-import json
-import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tables as more
-from harness import digits, percent
+import tables
+from harness import KEPT, ROOT, read
+from kept import keep, read_large, ship_large
 
-from lunar_mjx.agents.curves import mean_interval, new_figure
-from lunar_mjx.agents.policy import load_policy
-from lunar_mjx.report.style import MUTED
+from lunar_mjx.agents.curves import mean_interval, moving_mean, new_figure
+from lunar_mjx.report.style import LINES, MUTED, styled
 
-ROOT = Path(__file__).parents[2]
-KEPT = ROOT / "benchmarks" / "rl"
-TABLES = {
-    "paper": more.table_paper,
-    "rates": more.table_rates,
-    "scaling": more.table_scaling,
-    "realism": more.table_realism,
-    "brax": more.table_brax,
-    "sb3": more.table_sb3,
-}
-PLOTS = {"paper": more.plot_paper, "rates": more.plot_rates, "realism": more.plot_realism}
-PARTS = tuple(TABLES)
-_LIMIT = 2_000_000
-"""Bytes that a shipped policy may have."""
+DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
+"""Variants of the paper's task that the figure shows; the table has all."""
+REASONS = ("stuck", "rolled_over", "time", "off_terrain", "diverged")
+"""For which drives fail, in the order of the figure's bars."""
+UNSEEN = {"ylabel": "success on unseen ground, %", "ylim": (-3, 103)}
+"""The axis of success."""
 
 
-def read(folder: Path, name: str) -> dict[str, Any] | None:
-    path = folder / f"{name}.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+def shares(scores: Sequence[Mapping[str, Any]], name: str = "success") -> list[float]:
+    """Shares of scores in percent."""
+    return [100 * s[name] for s in scores]
 
 
-def read_large(folders: list[Path]) -> dict[str, Any] | None:
-    """The record of part `large`; seeds of further runs of the same settings join those of the first."""
-    records = [r for r in (read(f, "large") for f in folders) if r]
-    if not records:
-        return None
-    first, *others = records
-    for other in others:
-        assert all(other[k] == first[k] for k in ("rover", "environment", "train", "agents", "about")), "not alike"
-        first["seeds"] += other["seeds"]
-    return first
-
-
-ROWS = ("steps", "elapsed_s", "steps_per_s", "episode_return", "success")
-"""Columns of a training's rows that figures read; the others are not kept."""
-
-
-def rounded(value: Any) -> Any:
-    """What is kept of a record: its numbers as of `digits`, of a training's rows `ROWS` alone."""
-    if isinstance(value, dict):
-        if "seed" in value and "rows" in value:
-            value = {**value, "rows": [{k: r[k] for k in ROWS if k in r} for r in value["rows"]]}
-        return {k: rounded(v) for k, v in value.items()}
-    return [rounded(v) for v in value] if isinstance(value, list) else digits(value)
-
-
-def plot_large(record: dict[str, Any], path: Path) -> None:
+def plot_large(record: dict[str, Any]) -> Any:
     """Success on unseen ground and return in training over wall time; the agents that learn nothing as lines."""
     figure, (left, right) = new_figure(2)
     for seed in record["seeds"]:
-        found = seed["unseen"]
-        left.plot(
-            [s["elapsed_s"] for s in found],
-            [100 * s["success"] for s in found],
-            "o-",
-            ms=3,
-            lw=1,
-            label=f"seed {seed['seed']}",
-        )
-        rows = [r for r in seed["rows"] if r.get("episode_return") is not None]
+        found, rows = seed["unseen"], [r for r in seed["rows"] if r.get("episode_return") is not None]
+        left.plot([s["elapsed_s"] for s in found], shares(found), "o-", ms=3, lw=1, label=f"seed {seed['seed']}")
         right.plot([r["elapsed_s"] for r in rows], [r["episode_return"] for r in rows], lw=1)
     for style, (name, score) in zip(("--", "-.", ":", (0, (1, 4))), record["agents"].items(), strict=False):
         left.axhline(100 * score["success"], color=MUTED, lw=0.8, ls=style, label=name)
     left.axhline(100 * record["target"], color=MUTED, lw=0.8)
-    left.set(xlabel="wall time of training, s", ylabel="success on unseen ground, %", ylim=(-3, 103))
+    left.set(xlabel="wall time of training, s", **UNSEEN)
     right.set(xlabel="wall time of training, s", ylabel="return of ended episodes in training")
     left.legend(frameon=False, fontsize=7)
-    figure.savefig(path, dpi=120)
+    return figure
 
 
-def table_large(record: dict[str, Any]) -> list[str]:
-    lines = [f"Large batch, {record['rover']}, {record['about']['device']}:"]
-    for name, score in record["agents"].items():
-        lines.append(f"  {name:10s} {percent(score)}")
-    for seed in record["seeds"]:
-        after = seed["seconds_to_target"]
-        said = f"{after:.0f} s, {seed['steps_to_target'] / 1e6:.1f} M steps" if after else "not reached"
-        lines.append(
-            f"  seed {seed['seed']}: final {percent(seed['final'])}; {100 * record['target']:.0f} % after "
-            f"{said} (training {seed['train_s']:.0f} s)"
-        )
-    times = [s["seconds_to_target"] for s in record["seeds"] if s["seconds_to_target"]]
-    if len(times) > 1:
-        mean, low, high = (float(a[0]) for a in mean_interval(np.array(times)[:, None].astype(float)))
-        lines.append(f"  time to target {mean:.0f} s ({low:.0f} to {high:.0f}, 95 %, n = {len(times)})")
-    if "updates_per_s" in record:
-        lines.append(f"  learner {record['updates_per_s']:,.0f} updates/s of {record['train']['batch']:,} transitions")
-    return lines
+def plot_paper(record: dict[str, Any]) -> Any:
+    """Return by episode on the axes of the paper's Fig. 6 (above) and success (below), a column per variant."""
+    groups = {v: found for v, found in tables.variants(record).items() if v in DRAWN or v == record["variant"]}
+    figure, above = new_figure(len(groups), 2.7, 5.0)
+    for axes in above:
+        axes.remove()
+    with styled():
+        rows = figure.subplots(2, len(groups), sharex="col", squeeze=False)
+    for column, (variant, algorithms) in enumerate(groups.items()):
+        for name, runs in algorithms.items():
+            colour, line = LINES[int(name == "DDPG")][:2]
+            label = f"{name}, {len(runs)} seed{'s' if len(runs) > 1 else ''}"
+            for row, (quantity, factor) in enumerate((("episode_return", 1.0), ("success", 100))):
+                curves = [factor * moving_mean(r["episodes"][quantity]) for r in runs]
+                count = min(len(c) for c in curves)
+                mean, low, high = mean_interval(np.stack([c[:count] for c in curves]))
+                x, axes = np.arange(1, count + 1), rows[row][column]
+                axes.plot(x, mean, color=colour, linestyle=line, label=label)
+                axes.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
+        rows[0][column].set_title(variant, fontsize=9)
+        rows[1][column].set(xlabel="episode", ylim=(-3, 103))
+        rows[0][column].legend(frameon=False, fontsize=7)
+    rows[0][0].set(ylabel="average return per episode")
+    rows[1][0].set(ylabel="success, %")
+    return figure
 
 
-def card(record: dict[str, Any], seed: dict[str, Any], size: int) -> str:
-    """The model card of a shipped policy."""
-    options = record["environment"]["options"]
-    agents = "\n".join(f"| {name} | {percent(score)} |" for name, score in record["agents"].items())
-    train, kept = record["train"], seed["kept"]
-    others = [str(s["seed"]) for s in record["seeds"] if s is not seed]
-    return f"""# Trained policy of {record["rover"]}
-
-`policy.npz` ({size / 1e6:.2f} MB): weights, observation statistics and the environment's options, without pickles.
-
-    lunar-mjx play {record["rover"]}
-    lunar-mjx evaluate {record["rover"]}
-
-**Task.** `{options.get("task")}`: drive 10 to 40 m to a goal over rough ground with rocks and craters; success is being
-within the goal's radius before the time is up. Options: `{json.dumps(options)}`.
-
-**Training.** TD3 with a distributional critic, {train["envs"]:,} rovers, batches of {train["batch"]:,}, seed
-{seed["seed"]}: {kept["steps"] / 1e6:.1f} M environment steps in {kept["elapsed_s"]:.0f} s on one
-{record["about"]["device"]} (without compilation, {record["compile_epoch_s"]:.0f} s). Script:
-`benchmarks/rl/measure.py`.
-Of the policies of this training and its other seeds ({", ".join(others) or "none"}), it scored best on the ground and
-soils of the training: {percent(kept["train_score"])}.
-
-**Score** on ground, goals and soil never trained on (`{json.dumps(record["environment"]["unseen"])}`),
-{seed["final"]["episodes"]} episodes, 95 % Wilson interval:
-
-| agent | success |
-|---|---|
-| this policy | {percent(seed["final"])} |
-{agents}
-
-Ends of this policy's episodes: {json.dumps({k: round(v, 4) for k, v in seed["final"]["ends"].items()})}.
-
-**Limits.** Trained in simulation only, with the model's effects and the spread of soils and motors of
-`lunar_mjx.envs.navigation.config.SOIL_RANGES`. It sees exact poses and a height map without noise. It has driven no
-real rover.
-"""
+def plot_rates(record: dict[str, Any]) -> Any:
+    """Environment steps per second against the bare physics, over the number of rovers, at decimation 5."""
+    rows = [r for r in record["rows"] if r["decimation"] == 5 and r["observation"] == "17 numbers"]
+    rows.sort(key=lambda r: r["rovers"])
+    figure, (left, right) = new_figure(2)
+    at = [r["rovers"] for r in rows]
+    left.loglog(at, [r["bare_steps_per_s"] / 1e6 for r in rows], "s--", ms=4, color=MUTED, label="bare physics")
+    left.loglog(at, [r["env_steps_per_s"] / 1e6 for r in rows], "o-", ms=4, label="environment")
+    left.axhline(30.0, color=MUTED, lw=0.8)
+    left.set(xlabel="rovers", ylabel="million steps/s at decimation 5", title=record["rover"])
+    left.legend(frameon=False)
+    ratios = [[min(r["bare_seconds"]) / s for s in r["seconds"]] for r in rows]
+    right.plot(at, [r["ratio"] for r in rows], "o-", ms=4)
+    right.vlines(at, [min(q) for q in ratios], [max(q) for q in ratios], lw=1.5)
+    right.axhline(0.7, color=MUTED, lw=0.8)
+    right.set(xlabel="rovers", xscale="log", ylabel="environment / bare physics", ylim=(0, 1))
+    return figure
 
 
-def ship(record: dict[str, Any], folders: list[Path], home: Path) -> Path:
-    """Copies the policy that scored best on the ground of its training, writes its card, and keeps the record."""
-    best = max(record["seeds"], key=lambda s: s["kept"]["train_score"]["success"])
-    found = [f / f"policy_{record['rover']}.npz" for f in folders]
-    policy = next(p for p in found if load_policy(p).notes["seed"] == best["seed"])
-    assert policy.stat().st_size < _LIMIT, "the policy is too large to ship"
-    shutil.copyfile(policy, home / "policy.npz")
-    (home / "POLICY.md").write_text(card(record, best, policy.stat().st_size), encoding="utf-8")
-    text = json.dumps(rounded(record), separators=(",", ":")) + "\n"
-    (KEPT / f"large_{record['rover']}.json").write_text(text, encoding="utf-8")
-    return home / "policy.npz"
+def plot_realism(record: dict[str, Any]) -> Any:
+    """Failures of policies trained with and without the thermal and soil effects, in both models."""
+    figure, (axes,) = new_figure(1, 5.6, 3.2)
+    cells = tables.realism_cells(record)
+    at, bottom = np.arange(len(cells)), np.zeros(len(cells))
+    for reason in REASONS:
+        share = np.array([100.0 * c["ends"][reason] for c in cells.values()])
+        if share.any():
+            axes.barh(at, share, left=bottom, height=0.55, label=reason.replace("_", " "))
+            bottom += share
+    middle, low, high = (100 - np.array(shares(list(cells.values()), k)) for k in ("success", "high", "low"))
+    axes.errorbar(middle, at, xerr=[middle - low, high - middle], fmt="none", ecolor="k", capsize=3, lw=1)
+    labels = [f"trained {trained},\ntested {tested} the effects" for trained, tested in cells]
+    axes.set_yticks(at, labels, fontsize=8)
+    axes.invert_yaxis()
+    axes.set(xlabel="episodes that fail, % (95 % interval)")
+    axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def plot_learners(large: dict[str, Any] | None, brax: dict[str, Any]) -> Any:
+    """Success on unseen ground over time of training: TD3's seeds and brax's learners."""
+    figure, both = new_figure(2)
+    lines = [(f"TD3, {large['about']['device']}", s["unseen"], LINES[0][0]) for s in large["seeds"]] if large else []
+    for look, (name, run) in zip(LINES[1:], brax["runs"].items(), strict=False):
+        lines.append((f"brax {name.upper()}, {brax['about']['device']}", run.get("unseen", []), look[0]))
+    for i, (label, found, colour) in enumerate(lines):
+        # a label stands once, whatever the number of its seeds
+        label = None if label in [line[0] for line in lines[:i]] else label
+        for axes, x, unit in zip(both, ("elapsed_s", "steps"), (1.0, 1e6), strict=True):
+            places = [s[x] / unit if s[x] is not None else np.nan for s in found]
+            axes.plot(places, shares(found), "o-", ms=2.5, lw=1, color=colour, label=label)
+            axes.fill_between(places, shares(found, "low"), shares(found, "high"), color=colour, alpha=0.15, lw=0)
+    both[0].set(xlabel="s of training", xscale="log", **UNSEEN)
+    both[1].set(xlabel="million environment steps", xscale="log", ylim=(-3, 103))
+    both[0].legend(frameon=False, fontsize=7)
+    return figure
+
+
+PLOTS = {"paper": plot_paper, "rates": plot_rates, "realism": plot_realism}
+TABLES = {
+    "paper": tables.table_paper,
+    "rates": tables.table_rates,
+    "scaling": tables.table_scaling,
+    "realism": tables.table_realism,
+    "brax": tables.table_brax,
+    "sb3": tables.table_sb3,
+}
 
 
 def main() -> None:
+    """Draws, prints and keeps what the folders hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "figures")
@@ -173,26 +156,24 @@ def main() -> None:
     parser.add_argument("--ship", help="rover whose policy goes to models/")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    lines: list[str] = []
-    large = read_large(args.folders)
+    lines, figures, large = [], {}, read_large(args.folders)
     if large and large["seeds"]:
-        plot_large(large, args.out / f"rl_large_{large['rover']}.png")
-        lines += table_large(large)
-    parts = {name: found for name in PARTS for folder in args.folders if (found := read(folder, name))}
+        figures[f"large_{large['rover']}"] = plot_large(large)
+        lines += tables.table_large(large)
+    parts = {name: found for name in TABLES for folder in args.folders if (found := read(folder / f"{name}.json"))}
     for name, record in parts.items():
         lines += TABLES[name](record)
         if name in PLOTS:
-            PLOTS[name](record, args.out / f"rl_{name}.png")
+            figures[name] = PLOTS[name](record)
         if args.keep:
-            text = json.dumps(rounded(record), separators=(",", ":")) + "\n"
-            (KEPT / f"{name}.json").write_text(text, encoding="utf-8")
-    if "brax" in parts:
-        kept = KEPT / f"large_{parts['brax']['rover']}.json"
-        compared = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else large
-        more.plot_learners(compared, parts["brax"], args.out / "rl_learners.png")
+            keep(name, record)
+    if brax := parts.get("brax"):
+        figures["learners"] = plot_learners(read(KEPT / f"large_{brax['rover']}.json") or large, brax)
+    for name, figure in figures.items():
+        figure.savefig(args.out / f"rl_{name}.png", dpi=110 if name == "paper" else 120)
     if args.ship:
         assert large is not None and large["rover"] == args.ship, "the folder holds another rover's training"
-        lines.append(f"shipped {ship(large, args.folders, ROOT / 'models' / args.ship)}")
+        lines.append(f"shipped {ship_large(large, args.folders)}")
     print("\n".join(lines))
 
 

@@ -8,7 +8,15 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from harness import SMALL_TASK, Clock, in_threads, save, say, training_of
+from jax.sharding import Mesh
+
+from lunar_mjx.agents.learner import AXIS, Learner
+from lunar_mjx.envs import make, make_navigation, split_keys
+from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION
 
 PLAN = (
     ("17 numbers", 5, (65536, 1024, 2048, 4096, 8192, 16384, 32768, 262144)),
@@ -21,22 +29,14 @@ PLAN = (
 
 def rates(args: argparse.Namespace, clock: Clock) -> None:
     """Compiles every row in threads, and measures."""
-    from lunar_mjx.envs import make_navigation
-    from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION
-
     few = {"observations": PAPER_OBSERVATION, "privileged": ()}
     plan = [(seen, every, size) for seen, every, sizes in PLAN for size in sizes]
     plan = [row for row in plan if args.rows is None or f"{row[0][:2]}/{row[1]}/{row[2]}" in args.rows]
     plan = [("17 numbers", 5, 8)] if args.tiny else plan
-    made = {
-        (seen, every): make_navigation(
-            "large",
-            args.rover,
-            decimation=every,
-            **{"places": 2048, **(few if seen == "17 numbers" else {}), **(SMALL_TASK if args.tiny else {})},
-        )
-        for seen, every in {row[:2] for row in plan}
-    }
+    made = {}
+    for seen, every in {row[:2] for row in plan}:
+        less = {**(few if seen == "17 numbers" else {}), **(SMALL_TASK["large"] if args.tiny else {})}
+        made[seen, every] = make_navigation("large", args.rover, decimation=every, **{"places": 2048, **less})
     with ThreadPoolExecutor(8) as pool:
         steps = {every: 4 if args.tiny else max(20, 1000 // every) for _, every, _ in plan}
         ready = list(pool.map(lambda row: Rate(made[row[:2]], row[2], steps[row[1]]), plan))
@@ -59,9 +59,6 @@ class Rate:
     """The environment under random actions, and its physics alone under the same changes; compiled when made."""
 
     def __init__(self, env: Any, size: int, steps: int):
-        import jax
-        import jax.numpy as jnp
-
         self.env, self.size, self.steps = env, size, steps
         decimation, key = env.config.decimation, jax.random.PRNGKey(0)
 
@@ -91,11 +88,6 @@ class Rate:
 
     def measure(self, repeats: int) -> dict[str, Any]:
         """Best of several repetitions, in turns."""
-        import jax
-        import jax.numpy as jnp
-
-        from lunar_mjx.envs import split_keys
-
         params = self.env.params
         state = jax.block_until_ready(self._reset(params, split_keys(jax.random.PRNGKey(0), self.size)))
         # episodes at every stage, so that as many end in one step as in the next
@@ -128,14 +120,7 @@ class Rate:
 
 def scaling(args: argparse.Namespace, clock: Clock) -> None:
     """Whole training epochs per second on more and more devices, the same rovers and transitions on each."""
-    import jax
-    import numpy as np
-    from jax.sharding import Mesh
-
-    from lunar_mjx.agents.learner import AXIS, Learner
-    from lunar_mjx.envs import make
-
-    training = training_of(args)
+    training = training_of(args, "large-td3")
     env, own = make(training.environment, **training.options), training.train
     learners = {}
     for count in [2**i for i in range(jax.device_count().bit_length())]:

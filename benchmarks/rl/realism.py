@@ -8,22 +8,14 @@ policy is then scored in both, on unseen ground and goals; in the whole one with
 from __future__ import annotations
 
 import argparse
-import functools
-import time
+import math
 from typing import Any
 
-from harness import (
-    FINAL,
-    Clock,
-    about_training,
-    compile_judge,
-    episodes_of,
-    in_threads,
-    percent,
-    save,
-    say,
-    training_of,
-)
+from harness import FINAL, Clock, Judge, Setup, in_threads, in_time, percent, save, say, trained, training_of
+from large import episodes_of
+
+from lunar_mjx.agents.train import RunConfig
+from lunar_mjx.envs import NavigationEnv
 
 THERMAL = (
     "thermal_cutoff",
@@ -47,46 +39,23 @@ def plainer(model: Any) -> Any:
 
 def realism(args: argparse.Namespace, clock: Clock) -> None:
     """Trains with and without the effects, seed after seed while time is left."""
-    import jax
-
-    from lunar_mjx.agents.evaluate import Evaluator
-    from lunar_mjx.agents.learner import Learner
-    from lunar_mjx.agents.run import learner_agent, unseen_params
-    from lunar_mjx.agents.train import RunConfig, train
-    from lunar_mjx.envs import NavigationEnv, make
-
-    training = training_of(args)
-    whole: Any = make(training.environment, **training.options)
-    envs: dict[str, Any] = {"without": NavigationEnv(plainer(whole.model), whole.config), "with": whole}
-    learners = {name: Learner(env, training.train) for name, env in envs.items()}
-    judges = {name: Evaluator(env, learner_agent(learners[name]), episodes_of(args)) for name, env in envs.items()}
-    params = {name: unseen_params(env, dict(training.unseen)) for name, env in envs.items()}
-    calls = [functools.partial(compile_judge, judges[name], learners[name], params[name]) for name in envs]
-    say(f"realism: compiled in {max(in_threads(*(x.compile for x in learners.values()), *calls)):.0f} s")
+    training = training_of(args, "large-td3")
+    whole = Setup(training)
+    setups = {"without": Setup(training, NavigationEnv(plainer(whole.env.model), whole.env.config)), "with": whole}
+    judges = {n: Judge(s.env, episodes_of(args), {"policy": s.policies()["policy"]}) for n, s in setups.items()}
+    took = in_threads(*(lambda n=n, s=s: s.compile(judges[n]) for n, s in setups.items()))
+    say(f"realism: compiled in {max(took):.0f} s")
     steps = 3200 if args.tiny else STEPS
-    record: dict[str, Any] = {
-        "rover": args.rover,
-        **about_training(training),
-        "effects": {n: e.model.effect_names for n, e in envs.items()},
-        "steps": steps,
-        "seeds": [],
-    }
-    longest = 0.0
-    for seed in range(args.first_seed, args.first_seed + args.seeds):
-        for name, learner in learners.items():
-            if args.only is not None and f"{seed}/{name}" not in args.only:
-                continue
-            if clock.left < 1.1 * longest:
-                say("realism: no time for more")
-                return
-            began = time.monotonic()
-            result = train(learner, RunConfig(steps, seed, None, float("inf"), quiet=True))
-            policy, last = jax.device_get(learner.policy(result.state)), result.rows[-1]
-            scores = {where: judge(params[where], policy, FINAL).record() for where, judge in judges.items()}
-            row = {"seed": seed, "trained": name, "scores": scores, "train_s": last["elapsed_s"]}
-            record["seeds"].append({**row, "steps": last["steps"], "episode_return": last["episode_return"]})
-            longest = max(longest, time.monotonic() - began)
-            told = ", ".join(f"tested {where} them {percent(s)}" for where, s in scores.items())
-            say(f"realism: seed {seed}, trained {name} the effects for {last['elapsed_s']:.0f} s: {told}")
-            save(args.out, "realism", record)
-            del result
+    effects = {n: s.env.model.effect_names for n, s in setups.items()}
+    record: dict[str, Any] = {"rover": args.rover, **whole.about, "effects": effects, "steps": steps, "seeds": []}
+    jobs = [f"{seed}/{name}" for seed in range(args.first_seed, args.first_seed + args.seeds) for name in setups]
+    for job in in_time(clock, [job for job in jobs if args.only is None or job in args.only]):
+        seed, _, name = job.partition("/")
+        run = RunConfig(steps, int(seed), None, math.inf, quiet=True)
+        _, policy, last = trained(setups[name], run, math.inf, lambda *_: 0.0)
+        scores = {n: judge(setups[n].unseen, policy, FINAL)["policy"] for n, judge in judges.items()}
+        row = {"seed": int(seed), "trained": name, "scores": scores, "train_s": last["elapsed_s"]}
+        record["seeds"].append({**row, "steps": last["steps"], "episode_return": last["episode_return"]})
+        told = ", ".join(f"tested {where} them {percent(s)}" for where, s in scores.items())
+        say(f"realism: seed {seed}, trained {name} the effects for {last['elapsed_s']:.0f} s: {told}")
+        save(args.out, "realism", record)

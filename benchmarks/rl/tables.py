@@ -1,28 +1,51 @@
-"""Tables and plots of the parts of measure.py other than `large`; called by figures.py."""
+"""Tables of what measure.py and sb3_bullet.py measured: lines of text from a part's record; called by figures.py."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import percent
+from harness import ends, percent
 
-from lunar_mjx.agents.curves import mean_interval, moving_mean, new_figure
-from lunar_mjx.report.style import LINES, MUTED, styled
+from lunar_mjx.agents.curves import mean_interval, moving_mean
+from lunar_mjx.agents.evaluate import wilson
 
 LAST = 50
 """Episodes that a training is judged by at its end."""
-DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
-"""Variants of the paper's task that the figure shows; the table has all."""
 
 
-# The paper's own task
+def measured(what: str, record: dict[str, Any], more: str = "") -> str:
+    """The first line of a table."""
+    return f"{what}, {record['rover']}, {record['about']['device']}{more}:"
+
+
+def target(record: dict[str, Any], run: dict[str, Any]) -> str:
+    """When a training first reached the success that was wanted."""
+    after = run["seconds_to_target"]
+    said = f"{after:.0f} s, {run['steps_to_target'] / 1e6:.1f} M steps" if after else "not reached"
+    return f"{100 * record['target']:.0f} % after {said}"
+
+
+def table_large(record: dict[str, Any]) -> list[str]:
+    """Agents that learn nothing, each seed, and how long seeds take to the target."""
+    lines = [measured("Large batch", record)]
+    lines += [f"  {name:10s} {percent(score)}" for name, score in record["agents"].items()]
+    for seed in record["seeds"]:
+        took = f"(training {seed['train_s']:.0f} s)"
+        lines.append(f"  seed {seed['seed']}: final {percent(seed['final'])}; {target(record, seed)} {took}")
+    times = [s["seconds_to_target"] for s in record["seeds"] if s["seconds_to_target"]]
+    if len(times) > 1:
+        mean, low, high = (float(a[0]) for a in mean_interval(np.array(times)[:, None].astype(float)))
+        lines.append(f"  time to target {mean:.0f} s ({low:.0f} to {high:.0f}, 95 %, n = {len(times)})")
+    if "updates_per_s" in record:
+        lines.append(f"  learner {record['updates_per_s']:,.0f} updates/s of {record['train']['batch']:,} transitions")
+    return lines
 
 
 def variants(record: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any]]]]:
-    """Runs by variant and algorithm, the main variant first."""
+    """Runs on the paper's own task by variant and algorithm, the main variant first."""
     found = {record["variant"]: record["runs"], **{v: other["runs"] for v, other in record["others"].items()}}
     return {
         v: {n.removeprefix("paper-").upper(): runs for n, runs in groups.items() if runs} for v, groups in found.items()
@@ -35,73 +58,25 @@ def first_good(run: dict[str, Any], share: float = 0.9) -> int | None:
     return int(at[0]) + 20 if at.size else None
 
 
-def plot_paper(record: dict[str, Any], path: Path) -> None:
-    """Return by episode on the axes of the paper's Fig. 6 (above) and success (below), a column per variant."""
-    groups = {v: found for v, found in variants(record).items() if v in DRAWN or v == record["variant"]}
-    figure, above = new_figure(len(groups), 2.7, 5.0)
-    for axes in above:
-        axes.remove()
-    with styled():
-        rows = figure.subplots(2, len(groups), sharex="col", squeeze=False)
-    for column, (variant, algorithms) in enumerate(groups.items()):
-        for name, runs in algorithms.items():
-            i = int(name == "DDPG")
-            for axes, quantity, factor in ((rows[0][column], "episode_return", 1.0), (rows[1][column], "success", 100)):
-                curves = [factor * moving_mean(r["episodes"][quantity]) for r in runs]
-                count = min(len(c) for c in curves)
-                mean, low, high = mean_interval(np.stack([c[:count] for c in curves]))
-                x = np.arange(1, count + 1)
-                label = f"{name}, {len(runs)} seed{'s' if len(runs) > 1 else ''}"
-                axes.plot(x, mean, color=LINES[i][0], linestyle=LINES[i][1], label=label)
-                axes.fill_between(x, low, high, color=LINES[i][0], alpha=0.2, lw=0)
-        rows[0][column].set_title(variant, fontsize=9)
-        rows[1][column].set(xlabel="episode", ylim=(-3, 103))
-        rows[0][column].legend(frameon=False, fontsize=7)
-    rows[0][0].set(ylabel="average return per episode")
-    rows[1][0].set(ylabel="success, %")
-    figure.savefig(path, dpi=110)
-
-
 def table_paper(record: dict[str, Any]) -> list[str]:
+    """What each variant and algorithm came to in each seed."""
     lines = ["The paper's own task:"]
     for variant, algorithms in variants(record).items():
         for name, runs in algorithms.items():
-            last = [round(float(np.mean(r["episodes"]["success"][-LAST:])), 2) for r in runs]
-            returns = [round(float(np.mean(r["episodes"]["episode_return"][-LAST:]))) for r in runs]
+            ended = [r["episodes"] for r in runs]
+            last = [round(float(np.mean(e["success"][-LAST:])), 2) for e in ended]
+            returns = [round(float(np.mean(e["episode_return"][-LAST:]))) for e in ended]
             lines.append(
                 f"  {variant}, {name}: steps {[r['steps'] for r in runs]}, episodes "
-                f"{[len(r['episodes']['success']) for r in runs]}, last {LAST}: success {last}, return "
+                f"{[len(e['success']) for e in ended]}, last {LAST}: success {last}, return "
                 f"{returns}; 90 % of 20 first at episode {[first_good(r) for r in runs]}"
             )
     return lines
 
 
-# Rates and scaling
-
-
-def plot_rates(record: dict[str, Any], path: Path) -> None:
-    """Environment steps per second against the bare physics, over the number of rovers, at decimation 5."""
-    rows = sorted(
-        (r for r in record["rows"] if r["decimation"] == 5 and r["observation"] == "17 numbers"),
-        key=lambda r: r["rovers"],
-    )
-    figure, (left, right) = new_figure(2)
-    at = [r["rovers"] for r in rows]
-    left.loglog(at, [r["bare_steps_per_s"] / 1e6 for r in rows], "s--", ms=4, color=MUTED, label="bare physics")
-    left.loglog(at, [r["env_steps_per_s"] / 1e6 for r in rows], "o-", ms=4, label="environment")
-    left.axhline(30.0, color=MUTED, lw=0.8)
-    left.set(xlabel="rovers", ylabel="million steps/s at decimation 5", title=record["rover"])
-    left.legend(frameon=False)
-    ratios = [[min(r["bare_seconds"]) / s for s in r["seconds"]] for r in rows]
-    right.plot(at, [r["ratio"] for r in rows], "o-", ms=4)
-    right.vlines(at, [min(q) for q in ratios], [max(q) for q in ratios], lw=1.5)
-    right.axhline(0.7, color=MUTED, lw=0.8)
-    right.set(xlabel="rovers", xscale="log", ylabel="environment / bare physics", ylim=(0, 1))
-    figure.savefig(path, dpi=120)
-
-
 def table_rates(record: dict[str, Any]) -> list[str]:
-    lines = [f"Environment steps per second, {record['rover']}, {record['about']['device']}:"]
+    """Rate, its ratio to the bare physics, and memory of each row."""
+    lines = [measured("Environment steps per second", record)]
     for r in record["rows"]:
         held = r["state_bytes_per_rover"] + r["temporary_bytes_per_rover"]
         lines.append(
@@ -114,30 +89,25 @@ def table_rates(record: dict[str, Any]) -> list[str]:
 
 
 def table_scaling(record: dict[str, Any]) -> list[str]:
-    lines = [f"Whole training on several devices, {record['rover']}, {record['about']['device']}:"]
-    return lines + [
+    """Rates of whole training by number of devices."""
+    return [measured("Whole training on several devices", record)] + [
         f"  {r['devices']} devices {r['steps_per_s']:,.0f} steps/s, {r['updates_per_s']:.0f} updates/s, "
         f"efficiency {r['efficiency']:.3f}"
         for r in record["rows"]
     ]
 
 
-# What realism is worth
-
-
 def pooled(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Success over the episodes of several seeds, with its interval."""
-    from lunar_mjx.agents.evaluate import wilson
-
     count = sum(r["episodes"] for r in records)
     won = sum(r["success"] * r["episodes"] for r in records)
     low, high = wilson(won, count)
-    ends = {k: float(np.mean([r["ends"][k] for r in records])) for k in records[0]["ends"]}
-    return {"success": won / count, "low": low, "high": high, "episodes": count, "ends": ends}
+    ended = {k: float(np.mean([r["ends"][k] for r in records])) for k in records[0]["ends"]}
+    return {"success": won / count, "low": low, "high": high, "episodes": count, "ends": ended}
 
 
 def realism_cells(record: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
-    """Pooled scores by (trained, tested)."""
+    """Pooled scores by (trained, tested), each with and without the thermal and soil effects."""
     kinds = ("with", "without")
     return {
         (trained, tested): pooled([s["scores"][tested] for s in record["seeds"] if s["trained"] == trained])
@@ -147,115 +117,40 @@ def realism_cells(record: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any
     }
 
 
-def plot_realism(record: dict[str, Any], path: Path) -> None:
-    """Failures of policies trained with and without the thermal and soil effects, in both models."""
-    figure, (axes,) = new_figure(1, 5.6, 3.2)
-    reasons = ("stuck", "rolled_over", "time", "off_terrain", "diverged")
-    labels, bottom = [], None
-    cells = realism_cells(record)
-    at = np.arange(len(cells))
-    bottom = np.zeros(len(cells))
-    for reason in reasons:
-        share = np.array([100.0 * c["ends"][reason] for c in cells.values()])
-        if share.any():
-            axes.barh(at, share, left=bottom, height=0.55, label=reason.replace("_", " "))
-            bottom += share
-    fails = np.array([[100 * (1 - c["success"]), 100 * (1 - c["high"]), 100 * (1 - c["low"])] for c in cells.values()])
-    axes.errorbar(
-        fails[:, 0],
-        at,
-        xerr=[fails[:, 0] - fails[:, 1], fails[:, 2] - fails[:, 0]],
-        fmt="none",
-        ecolor="k",
-        capsize=3,
-        lw=1,
-    )
-    labels = [f"trained {trained},\ntested {tested} the effects" for trained, tested in cells]
-    axes.set_yticks(at, labels, fontsize=8)
-    axes.invert_yaxis()
-    axes.set(xlabel="episodes that fail, % (95 % interval)")
-    axes.legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=120)
-
-
 def table_realism(record: dict[str, Any]) -> list[str]:
+    """Success and failures of each kind of training in each kind of model."""
     seeds = {t: sum(s["trained"] == t for s in record["seeds"]) for t in ("with", "without")}
-    lines = [f"Thermal and soil effects, {record['rover']}, {record['about']['device']}, seeds {seeds}:"]
+    lines = [measured("Thermal and soil effects", record, f", seeds {seeds}")]
     for (trained, tested), score in realism_cells(record).items():
-        ends = ", ".join(f"{k} {100 * v:.1f} %" for k, v in score["ends"].items() if k != "success" and v > 0)
-        lines.append(f"  trained {trained:7s} tested {tested:7s} {percent(score)} of {score['episodes']:,}: {ends}")
+        ended = ", ".join(f"{k} {100 * v:.1f} %" for k, v in score["ends"].items() if k != "success" and v > 0)
+        lines.append(f"  trained {trained:7s} tested {tested:7s} {percent(score)} of {score['episodes']:,}: {ended}")
     return lines
 
 
-# Other learners
-
-
 def table_brax(record: dict[str, Any]) -> list[str]:
-    lines = [f"brax on the same environment, {record['rover']}, {record['about']['device']}:"]
+    """Each of brax's learners: when it reached the target, its best and its last score."""
+    lines = [measured("brax on the same environment", record)]
     for name, run in record["runs"].items():
         if not run.get("unseen"):
             lines.append(f"  {name}: {run.get('error', 'no score')}")
             continue
-        best = max(run["unseen"], key=lambda s: s["success"])
-        after = run["seconds_to_target"]
-        said = f"{after:.0f} s, {run['steps_to_target'] / 1e6:.1f} M steps" if after else "not reached"
-        last = run["unseen"][-1]
-        lines.append(
-            f"  {name}: {100 * record['target']:.0f} % after {said}; best {percent(best)} after "
-            f"{best['elapsed_s']:.0f} s, {best['steps'] / 1e6:.1f} M steps; last "
-            f"{percent(run.get('final', last))} after {last['elapsed_s']:.0f} s, {last['steps'] / 1e6:.1f} M "
-            "steps"
-        )
+        best, last = max(run["unseen"], key=lambda s: s["success"]), run["unseen"][-1]
+        scores = {"best": (best, best), "last": (run.get("final", last), last)}
+        said = [
+            f"{word} {percent(score)} after {at['elapsed_s']:.0f} s, {at['steps'] / 1e6:.1f} M steps"
+            for word, (score, at) in scores.items()
+        ]
+        lines.append(f"  {name}: {'; '.join([target(record, run), *said])}")
     return lines
 
 
 def table_sb3(record: dict[str, Any]) -> list[str]:
-    episodes = record["episodes"]
-    ends: dict[str, int] = {}
-    for e in episodes:
-        ends[e["end"]] = ends.get(e["end"], 0) + 1
+    """What Stable-Baselines3's training came to."""
     lines = [
-        f"SB3 TD3 on PyBullet, one rover: {record['steps']:,} steps, {len(episodes)} episodes in "
-        f"{record['cpu_s'] / 60:.0f} min of CPU time, ends {ends}"
+        f"SB3 TD3 on PyBullet, one rover: {record['steps']:,} steps, {len(record['episodes'])} episodes in "
+        f"{record['cpu_s'] / 60:.0f} min of CPU time, ends {dict(Counter(e['end'] for e in record['episodes']))}"
     ]
     if "final" in record:
         final = record["final"]
-        ended = {k: round(v, 3) for k, v in final["ends"].items() if v}
-        lines.append(f"  its policy on unseen ground: {percent(final)} of {final['episodes']}, ends {ended}")
+        lines.append(f"  its policy on unseen ground: {percent(final)} of {final['episodes']}, ends {ends(final)}")
     return lines
-
-
-def plot_learners(large: dict[str, Any] | None, brax: dict[str, Any] | None, path: Path) -> None:
-    """Success on unseen ground over time of training: TD3's seeds and brax's learners."""
-    figure, (left, right) = new_figure(2)
-    lines = [(f"TD3, {large['about']['device']}", s["unseen"], LINES[0][0]) for s in large["seeds"]] if large else []
-    for i, (name, run) in enumerate((brax or {"runs": {}})["runs"].items()):
-        lines.append(
-            (f"brax {name.upper()}, {(brax or {})['about']['device']}", run.get("unseen", []), LINES[i + 1][0])
-        )
-    named = set()
-    for label, found, colour in lines:
-        for axes, x, unit in ((left, "elapsed_s", 1.0), (right, "steps", 1e6)):
-            places = [s[x] / unit if s[x] is not None else np.nan for s in found]
-            axes.plot(
-                places,
-                [100 * s["success"] for s in found],
-                "o-",
-                ms=2.5,
-                lw=1,
-                color=colour,
-                label=None if label in named else label,
-            )
-            axes.fill_between(
-                places,
-                [100 * s["low"] for s in found],
-                [100 * s["high"] for s in found],
-                color=colour,
-                alpha=0.15,
-                lw=0,
-            )
-        named.add(label)
-    left.set(xlabel="s of training", xscale="log", ylabel="success on unseen ground, %", ylim=(-3, 103))
-    right.set(xlabel="million environment steps", xscale="log", ylim=(-3, 103))
-    left.legend(frameon=False, fontsize=7)
-    figure.savefig(path, dpi=120)

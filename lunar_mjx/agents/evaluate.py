@@ -75,11 +75,15 @@ class Evaluator:
       env: the environment.
       agent: function of (agent's parameters, state, key) to actions.
       episodes: scored, one per environment: the first of each, so that short episodes do not count twice.
+      copies: how often the same episodes lie side by side, one copy after another, for agents that `agent` tells apart
+        by the environment's number.
     """
 
-    def __init__(self, env: Environment, agent: Any, episodes: int):
-        self.env, self.episodes = env, episodes
-        self._reset: Any = jax.jit(lambda params, key: env.reset(params, split_keys(key, episodes)))
+    def __init__(self, env: Environment, agent: Any, episodes: int, copies: int = 1):
+        self.env, self.episodes, self.copies = env, episodes, copies
+        self._reset: Any = jax.jit(
+            lambda params, key: env.reset(params, jnp.tile(split_keys(key, episodes), (copies, 1)))
+        )
 
         def piece(params: Any, agent_params: Any, carry: Any, key: Any) -> Any:
             def step(carry: Any, key: Any) -> Any:
@@ -106,12 +110,16 @@ class Evaluator:
 
     def _carry(self, state: Any) -> Any:
         """State, whether each first episode is over, and what it came to."""
-        zero = jnp.zeros(self.episodes)
+        zero = jnp.zeros(self.copies * self.episodes)
         seen = {k: zero for k in state.metrics if not k.startswith("reward_")}
-        return state, jnp.zeros(self.episodes, bool), seen
+        return state, zero.astype(bool), seen
 
     def __call__(self, env_params: Any, agent_params: Any, seed: int) -> Score:
-        """The score of one episode in each environment.
+        """The score of the first copy; arguments as of `scores`."""
+        return self.scores(env_params, agent_params, seed)[0]
+
+    def scores(self, env_params: Any, agent_params: Any, seed: int) -> list[Score]:
+        """The score of one episode in each environment, for every copy.
 
         Args:
           env_params: of the environment: other terrain, places and ranges than in training.
@@ -127,8 +135,8 @@ class Evaluator:
             # Looked at between pieces only: a test in every step would wait for the device.
             if bool(carry[1].all()):
                 break
-        result = jax.device_get(carry[2])
-        return score(result, self.env.control_interval)
+        result = {k: v.reshape(self.copies, self.episodes) for k, v in jax.device_get(carry[2]).items()}
+        return [score({k: v[i] for k, v in result.items()}, self.env.control_interval) for i in range(self.copies)]
 
 
 def score(result: dict[str, np.ndarray], interval: float) -> Score:

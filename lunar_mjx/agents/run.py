@@ -112,12 +112,13 @@ class Scorer:
         return self._evaluator(self.params, params, seed)
 
 
-def _told(training: Training) -> dict[str, Any]:
-    """The options of a training's environment, its preset among them: defaults change, policies stay."""
+def environment_of(training: Training) -> dict[str, Any]:
+    """How a training's environment is made, for policies and records; the preset among its options, since defaults
+    change and policies stay."""
     options = dict(training.options)
     if training.environment == "navigation" and "model" not in options:
         options.setdefault("preset", default_preset(options.get("task", "consistent")))
-    return options
+    return {"name": training.environment, "options": plain(options), "unseen": plain(dict(training.unseen))}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -156,7 +157,7 @@ def run_training(
     """
     begin = time.monotonic()
     env = make(training.environment, **training.options)
-    environment = {"name": training.environment, "options": plain(_told(training)), "unseen": dict(training.unseen)}
+    environment = environment_of(training)
     learner = Learner(env, training.train)
     scorer = Scorer(env, training.unseen, eval_episodes, eval_every, target, folder, environment)
     result = train(learner, run, folder, environment, scorer)

@@ -104,16 +104,16 @@ def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypa
 
     scored, compiled = [], []
 
-    class Rows:
+    class Judge:
         """Scores every policy as arriving, in no time."""
 
         def __init__(self, *_):
             pass
 
-        def compile(self, _):
+        def compile(self, *_):
             compiled.append(1)
 
-        def __call__(self, policy, seed):
+        def __call__(self, params, policy, seed):
             scored.append(seed)
             one = {
                 "success": 1.0,
@@ -125,7 +125,8 @@ def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypa
             }
             return {"policy": one}
 
-    monkeypatch.setattr(rung, "Rows", Rows)
+    monkeypatch.setattr(rung, "Judge", Judge)
+    monkeypatch.setattr(rung, "rules", lambda env: {})
     words = ["rung.py", "point", "--seeds", "3", "4", "--steps", "300", "--every", "inf", "--out", str(tmp_path)]
     settings = ["--set", "envs=4", "epoch_steps=8", "batch=8", "buffer_steps=64", "random_steps=4", "updates=1"]
     monkeypatch.setattr(sys, "argv", [*words, *settings])
@@ -147,7 +148,7 @@ def _leaves(policy):
 
 
 def test_seeds_of_further_runs_join_the_kept_record_unless_settings_differ(tmp_path):
-    from rung import keep
+    from kept import keep_rung as keep
 
     def run(folder, seeds, steps, rate=1.0, **more):
         found = [{"seed": n, "epochs": [{"steps": 1, "kl": 2.0}], "final": {"steps": steps}} for n in seeds]

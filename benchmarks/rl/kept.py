@@ -1,0 +1,148 @@
+"""What the repository keeps of measurements: their records here, and policies with their cards in `models`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from harness import KEPT, percent, read, write
+
+from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.envs.ladder.rungs import get_rung
+from lunar_mjx.resources import shipped
+
+EPOCHS, COLUMNS = ("rows", "epochs"), ("steps", "elapsed_s", "steps_per_s", "episode_return", "success", "stuck")
+"""What a seed's epochs are called, and which of their numbers are kept: those that figures read."""
+SAME = {"large": ("rover", "environment", "train", "agents", "about"), "rung": ("training", "environment", "train")}
+"""What runs have alike whose seeds stand side by side."""
+MOST_BYTES = 2_000_000
+"""Of a shipped policy."""
+
+
+def rounded(value: Any) -> Any:
+    """What is kept of a record: numbers with five digits, more than one seed tells, and of its epochs `COLUMNS`."""
+    if isinstance(value, dict):
+        few = [k for k in EPOCHS if "seed" in value and isinstance(value.get(k), list)]
+        value = {**value, **{k: [{c: r[c] for c in COLUMNS if c in r} for r in value[k]] for k in few}}
+        return {k: rounded(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [rounded(v) for v in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def require_alike(kind: str, records: Iterable[dict[str, Any]]) -> None:
+    """Raises ValueError for runs of different trainings, environments or settings."""
+    first, *others = records
+    for same in SAME[kind]:
+        for other in others:
+            if other[same] != first[same]:
+                raise ValueError(f"{kind}: {same} is not the same in all runs: {first[same]}; {other[same]}")
+
+
+def keep(name: str, record: dict[str, Any], home: Path = KEPT) -> Path:
+    """Writes what is kept of a record; returns the file."""
+    write(home / f"{name}.json", rounded(record), separators=(",", ":"))
+    return home / f"{name}.json"
+
+
+def read_large(folders: Iterable[Path]) -> dict[str, Any] | None:
+    """The record of part `large`; seeds of further runs join those of the first."""
+    records = [r for r in (read(folder / "large.json") for folder in folders) if r]
+    if not records:
+        return None
+    require_alike("large", records)
+    return {**records[0], "seeds": [seed for record in records for seed in record["seeds"]]}
+
+
+def keep_rung(paths: Iterable[Path], home: Path = KEPT) -> Path:
+    """The kept record of a training on a rung, with finished seeds of further runs; a seed told twice is the later's.
+
+    Raises:
+      ValueError: runs of different trainings, environments or settings.
+    """
+    records = [read(path) for path in paths]
+    name = records[0]["training"]
+    if before := read(home / f"{name}.json"):
+        records.insert(0, before)
+    require_alike("rung", records)
+    seeds = {}
+    for record in records:
+        about = {k: record[k] for k in ("commit", "tree", "worlds_s", "compile_s") if k in record}
+        about["device"] = record["about"]["device"]
+        seeds |= {run["seed"]: {**about, **run} for run in record["seeds"] if "final" in run}
+    shared = {k: records[0][k] for k in ("about", "training", "environment", "train", "learner")}
+    return keep(name, {**shared, "seeds": [seeds[n] for n in sorted(seeds)]}, home)
+
+
+def ship(path: Path, to: Path, card: str, record: dict[str, Any], final: dict[str, Any], **words: Any) -> Path:
+    """Copies a policy into its rover's folder and writes its card; returns the copy.
+
+    Args:
+      path: of the policy. to: the copy. card: name of the text `card_NAME.txt`. record: of the policy's training.
+      final: the policy's last score. words: more that the text names.
+    """
+    assert path.stat().st_size < MOST_BYTES, "the policy is too large to ship"
+    shutil.copyfile(path, to)
+    policy = load_policy(path)
+    text = Path(__file__).with_name(f"card_{card}.txt").read_text(encoding="utf-8")
+    told = text.format(
+        **words,
+        record=record,
+        policy=policy,
+        size=to.stat().st_size / 1e6,
+        options=json.dumps(policy.environment["options"]),
+        unseen=json.dumps(record["environment"]["unseen"]),
+        ends=json.dumps({k: round(v, 4) for k, v in final["ends"].items()}),
+    )
+    to.with_name("POLICY.md" if to.stem == "policy" else f"{to.stem}.md").write_text(told, encoding="utf-8")
+    return to
+
+
+def ship_large(record: dict[str, Any], folders: Iterable[Path]) -> Path:
+    """Ships the policy of part `large` that scored best on the ground of its training, and keeps the record."""
+    best = max(record["seeds"], key=lambda s: s["kept"]["train_score"]["success"])
+    found = (folder / f"policy_{record['rover']}.npz" for folder in folders)
+    path = next(p for p in found if load_policy(p).notes["seed"] == best["seed"])
+    to, rows = shipped("models") / record["rover"] / "policy.npz", {"this policy": best["final"], **record["agents"]}
+    keep(f"large_{record['rover']}", record)
+    words = {
+        "run": best,
+        "steps": best["kept"]["steps"] / 1e6,
+        "others": ", ".join(str(s["seed"]) for s in record["seeds"] if s is not best) or "none",
+        "trained": percent(best["kept"]["train_score"]),
+        "rows": "\n".join(f"| {name} | {percent(score)} |" for name, score in rows.items()),
+    }
+    return ship(path, to, "large", record, best["final"], **words)
+
+
+def ship_rung(path: Path) -> Path:
+    """Ships a policy whose training's record is kept."""
+    policy, training = load_policy(path), path.stem.partition("_")[0]
+    options, record = policy.environment["options"], read(KEPT / f"{training}.json")
+    run = next(r for r in record["seeds"] if r["seed"] == policy.notes["seed"])
+    final, number = run["final"], int(options["task"].rpartition("/")[2])
+    assert final["steps"] == policy.notes["steps"], f"{path}: not the policy that the kept record scores"
+    rover = options.get("rover", "luvmi_x")
+    rows = {"this policy": final["rows"]["policy"], **final["rows"]}
+    lines = [
+        f"| {name} | {percent(r)} | {r['spl']:.2f} | {r['collisions_per_km']:.0f} | {r['wh_per_km']:.0f} "
+        f"| {r['slip']:.2f} |"
+        for name, r in rows.items()
+        if name != "policy"
+    ]
+    words = {
+        "run": run,
+        "rover": rover,
+        "training": training,
+        "number": number,
+        "rung": get_rung(number),
+        "learner": record["learner"].removesuffix("Config"),
+        "steps": final["steps"] / 1e6,
+        "compile_s": max(run["compile_s"]),
+        "rows": "\n".join(lines),
+    }
+    to = shipped("models") / rover / f"{training}.npz"
+    return ship(path, to, "rung", record, final["rows"]["policy"], **words)

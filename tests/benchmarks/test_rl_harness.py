@@ -1,0 +1,81 @@
+"""What the learning benchmarks share: agents side by side, the best policy of a training, and what is kept."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import pytest
+
+from lunar_mjx.agents.evaluate import evaluate
+from lunar_mjx.agents.train import RunConfig
+from lunar_mjx.envs import make, make_agent
+
+SMALL = ["envs=4", "epoch_steps=8", "batch=8", "buffer_steps=64", "random_steps=4", "updates=1"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def harness():
+    folder = str(Path(__file__).parents[2] / "benchmarks" / "rl")
+    sys.path.insert(0, folder)
+    import harness
+
+    yield harness
+    sys.path.remove(folder)
+
+
+@pytest.fixture(scope="module")
+def setup(harness):
+    args = argparse.Namespace(rover=None, tiny=False, set=SMALL, env=[])
+    return harness.Setup(harness.training_of(args, "point"))
+
+
+def test_agents_side_by_side_score_as_each_alone(harness):
+    env = make("point")
+    rules = {name: make_agent(name, env) for name in ("zero", "scripted")}
+    found = harness.Judge(env, 8, {}, rules)(env.params, (), 3)
+    assert found == {name: evaluate(env, rule, 8, 3).record() for name, rule in rules.items()}
+    assert found["zero"]["success"] < found["scripted"]["success"]
+
+
+def test_the_best_policy_of_a_training_is_chosen_and_a_good_one_ends_it(harness, setup):
+    told, run = iter((0.2, 0.9, 0.5)), RunConfig(96, quiet=True)
+    result, policy, row = harness.trained(setup, run, 0.0, lambda *_: next(told))
+    assert [r["steps"] for r in result.rows] == [32, 64, 96] and row["steps"] == 64 and policy is not None
+    told = iter((0.2, 0.9, 0.5))
+    result, _, row = harness.trained(setup, run, 0.0, lambda *_: next(told), target=0.9)
+    assert row["steps"] == result.rows[-1]["steps"] == 64
+    result, _, row = harness.trained(setup, run, math.inf, lambda *_: pytest.fail("nothing is looked at"))
+    assert row is result.rows[-1]
+
+
+def test_a_job_that_would_be_cut_short_is_not_begun(harness, capsys):
+    class Clock:
+        spent, left = 0.0, 10.0
+
+    done = []
+    for job in harness.in_time(Clock, ("a", "b", "c")):
+        done.append(job)
+        Clock.spent += 4.0
+        Clock.left -= 4.0
+    assert done == ["a", "b"] and "no time for c: 2 s left" in capsys.readouterr().out
+
+
+def test_what_is_kept_of_a_record_has_few_digits_and_few_columns():
+    from kept import rounded
+
+    epoch = {"steps": 1, "elapsed_s": 1.23456789, "loss": 3.0}
+    final = {"seed": 1, "rows": {"policy": {"success": 1.0 / 3.0}}}
+    record = {"rows": [{"loss": 1.0}], "seeds": [{"seed": 0, "epochs": [epoch], "final": final}]}
+    assert rounded(record) == {
+        "rows": [{"loss": 1.0}],
+        "seeds": [
+            {
+                "seed": 0,
+                "epochs": [{"steps": 1, "elapsed_s": 1.2346}],
+                "final": {"seed": 1, "rows": {"policy": {"success": 0.33333}}},
+            }
+        ],
+    }
