@@ -18,7 +18,7 @@ from lunar_mjx.envs.ladder.ground import make_world
 from lunar_mjx.envs.ladder.planner import Planner, length
 from lunar_mjx.envs.ladder.pool import make_pool, way_left
 from lunar_mjx.envs.ladder.rungs import RUNGS, get_rung
-from lunar_mjx.envs.ladder.ways import STEEPEST, distances
+from lunar_mjx.envs.ladder.ways import WAY_LIMITS, distances
 from lunar_mjx.envs.navigation import rewards
 from lunar_mjx.envs.navigation.tally import METRICS, start, update
 from lunar_mjx.errors import UserError
@@ -91,7 +91,7 @@ def test_places_are_as_far_apart_as_asked_and_an_independent_planner_solves_them
         assert (np.abs(points - middles[world]) < 0.5 * SMALL.size - 3.0).all()
     solved = total = 0
     for number in range(len(middles)):
-        planner = Planner(pool.terrain, middles[number], SMALL.size, 0.9 * HALF, 1.1 * STEEPEST, 0.25, 0.0)
+        planner = Planner(pool.terrain, middles[number], SMALL.size, 0.9 * HALF, 1.1 * WAY_LIMITS.steepest, 0.25, 0.0)
         for way in np.unique(np.asarray(at.way)[world == number]):
             mine = np.asarray(at.way) == way
             found = planner.ways(goals[mine][0], starts[mine])

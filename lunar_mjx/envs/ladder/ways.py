@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -11,11 +12,24 @@ import jax.numpy as jnp
 from lunar_mjx.envs.ladder.ground import RIM, World, near_boulders, nodes, steepness
 from lunar_mjx.envs.ladder.rungs import Rung
 
-STEEPEST = math.radians(12.0)
-"""Slope up to which ways are planned: LUVMI-X in the preset `consistent` still climbs 12 deg (slip 0.83) and slides
-back on 15 deg."""
-ROOM = 0.9
-"""m around a start or goal that are free of boulders, for a rover as wide as LUVMI-X: enough to turn."""
+
+@dataclasses.dataclass(frozen=True)
+class WayLimits:
+    """Where ways, starts and goals may lie."""
+
+    steepest: float = math.radians(12.0)
+    """Slope up to which ways are planned, rad: LUVMI-X in the preset `consistent` still climbs 12 deg (slip 0.83) and
+    slides back on 15 deg."""
+    level: float = 0.7
+    """Share of it up to which a rover may start or arrive."""
+    room: float = 0.9
+    """m around a start or goal that are free of boulders, for a rover as wide as LUVMI-X: enough to turn."""
+    half_width: float = 0.4
+    """m; half of LUVMI-X's width with a margin, for which `room` was chosen."""
+
+
+WAY_LIMITS = WayLimits()
+
 _STEPS = tuple((j, i, math.hypot(i, j)) for j in (-1, 0, 1) for i in (-1, 0, 1) if i or j)
 
 
@@ -38,10 +52,10 @@ def passable(rung: Rung, world: World, half_width: float) -> tuple[Any, Any]:
     slope = slope_grid(rung, world.heights)
     inside = jnp.abs(at) < 0.5 * rung.size - RIM
     inside = inside[:, None] & inside[None, :]
-    # Lengths were chosen for LUVMI-X, whose half width with margin is 0.4 m.
-    room = ROOM * half_width / 0.4
-    free = inside & (gap > half_width) & (slope < math.tan(STEEPEST))
-    return free, free & (gap > room) & (slope < math.tan(0.7 * STEEPEST))
+    # Wider rovers need more of it, in proportion.
+    room = WAY_LIMITS.room * half_width / WAY_LIMITS.half_width
+    free = inside & (gap > half_width) & (slope < math.tan(WAY_LIMITS.steepest))
+    return free, free & (gap > room) & (slope < math.tan(WAY_LIMITS.level * WAY_LIMITS.steepest))
 
 
 def distances(free: Any, row: Any, column: Any, cell: float, price: Any = 1.0) -> Any:

@@ -20,8 +20,22 @@ ACTION_MODES = ("paper", "velocity", "joint_torque", "joint_current", "joint_vel
 """`paper`: drive torque, steering torque, one torque per suspension motor (section V). `velocity`: the same six
 numbers as wheel speed, steering angle and suspension angles. The others: one number per motor."""
 
-STEER_TIME = 0.5
-"""s in which full steering torque turns a steering motor's own inertia from straight to its limit."""
+
+@dataclasses.dataclass(frozen=True)
+class ActionSpans:
+    """What an action of 1 asks of the joints that do not drive; choices, with which policies were trained."""
+
+    steer_time: float = 0.5
+    """s in which full steering torque turns a steering motor's own inertia from straight to its limit."""
+    lift_share: float = 0.5
+    """Share of a wheel's load that full torque of a suspension joint bears."""
+    lift_span: float = 0.4
+    """Share of a suspension joint's span that is commanded."""
+    endless: float = 0.5
+    """rad; span of a joint without limits."""
+
+
+ACTION_SPANS = ActionSpans()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -153,12 +167,16 @@ def _limits(model: Model, mode: str, top_speed: float, load_share: float) -> np.
         elif group.name == "steer":
             inertia = group.rotor_inertia * ratio[i] ** 2
             # From rest through the span: s = a t^2/2.
-            speed, torque, angle = span / STEER_TIME, 2 * inertia * span / STEER_TIME**2, span
+            speed, torque, angle = span / ACTION_SPANS.steer_time, 2 * inertia * span / ACTION_SPANS.steer_time**2, span
         else:
             body = compiled.body(wheel.body).id if wheel else compiled.body(rover.chassis).id
             # In plan, as the load is vertical.
             arm = np.linalg.norm((data.xpos[body] - data.xanchor[joint.id])[:2])
-            speed, torque, angle = span / STEER_TIME, 0.5 * load * arm, 0.4 * span
+            speed, torque, angle = (
+                span / ACTION_SPANS.steer_time,
+                ACTION_SPANS.lift_share * load * arm,
+                ACTION_SPANS.lift_span * span,
+            )
         if mode == "joint_current":
             # The current that gives this torque at 25 degC.
             values.append(torque / (ratio[i] * efficiency[i] * constant[i]))
@@ -172,4 +190,4 @@ def _limits(model: Model, mode: str, top_speed: float, load_share: float) -> np.
 def _span(rover: Rover, name: str) -> float:
     low, high = rover.joint_limits[name]
     span = min(-low, high)
-    return span if 0 < span < np.inf else 0.5
+    return span if 0 < span < np.inf else ACTION_SPANS.endless

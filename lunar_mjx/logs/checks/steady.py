@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from scipy import stats
 
@@ -12,6 +14,34 @@ from lunar_mjx.logs.log import SteadyLog
 from lunar_mjx.logs.schema import STEADY_CHANNELS
 from lunar_mjx.wheel_bed.scatter import grows
 from lunar_mjx.wheel_bed.table import QUANTITIES, average, replicate_groups
+
+
+@dataclasses.dataclass(frozen=True)
+class SteadyLimits:
+    """From where a table of a single wheel is refused: far beyond what soil, scatter and instruments do."""
+
+    bearable: float = 3.0
+    """Median pull or side force over the median load: no soil's coefficient of friction comes near it."""
+    fewest: int = 8
+    """Rows below which nothing is said of how a quantity goes with slip, nor of a value that many of them share."""
+    span: float = 0.3
+    """Range of slip ratios that shows how a quantity goes with slip."""
+    rank: float = 0.7
+    """Rank correlation with slip that counts as sure: eight rows of chance pass it in fewer than three of a hundred
+    tables."""
+    over_noise: float = 10.0
+    """Range of a quantity over its noise: what varies less has a sign by chance."""
+    upward: float = 5.0
+    """Median sinkage below zero over its noise that shows another sign."""
+    side_over_pull: float = 5.0
+    """Scatter of the side force over that of the pull at zero slip angle from which the two are swapped."""
+    at_limit: float = 0.05
+    """Share of the rows at one extreme value from which a channel is saturated."""
+    over_others: float = 4.0
+    """Rows at the extreme value over those at the most frequent other one: instruments of few digits repeat all."""
+
+
+STEADY_LIMITS = SteadyLimits()
 
 
 def check_steady(log: SteadyLog) -> list[Finding]:
@@ -99,7 +129,7 @@ def _ranges(log: SteadyLog) -> list[Finding]:
     load = log.table.test["normal_load_N"]
     for quantity in ("drawbar_pull", "side_force"):
         values = log.table.measured.get(quantity)
-        if values is not None and np.median(np.abs(values)) > 3.0 * np.median(load):
+        if values is not None and np.median(np.abs(values)) > STEADY_LIMITS.bearable * np.median(load):
             findings.append(
                 _finding(
                     log,
@@ -132,12 +162,12 @@ def _signs(log: SteadyLog) -> list[Finding]:
     slip = log.table.test["slip_ratio"]
     for quantity in ("drawbar_pull", "driving_torque"):
         values = log.table.measured.get(quantity)
-        if values is None or len(values) < 8 or np.ptp(slip) < 0.3:
+        if values is None or len(values) < STEADY_LIMITS.fewest or np.ptp(slip) < STEADY_LIMITS.span:
             continue
         # By rank, since pull saturates with slip.
         rank = float(np.asarray(stats.spearmanr(slip, values))[0])
         noise = log.table.sigma.get(quantity, 0.0)
-        if rank < -0.7 and np.ptp(values) > 10.0 * noise:
+        if rank < -STEADY_LIMITS.rank and np.ptp(values) > STEADY_LIMITS.over_noise * noise:
             findings.append(
                 _finding(
                     log,
@@ -150,7 +180,7 @@ def _signs(log: SteadyLog) -> list[Finding]:
                 )
             )
     sinkage = log.table.measured.get("sinkage")
-    if sinkage is not None and np.median(sinkage) < -5.0 * log.table.sigma.get("sinkage", 1e-4):
+    if sinkage is not None and np.median(sinkage) < -STEADY_LIMITS.upward * log.table.sigma.get("sinkage", 1e-4):
         findings.append(
             _finding(
                 log,
@@ -168,18 +198,14 @@ def _swapped(log: SteadyLog) -> list[Finding]:
     side, pull = log.table.measured.get("side_force"), log.table.measured.get("drawbar_pull")
     straight = np.abs(log.table.test["slip_angle_deg"]) < 1.0
     slip = log.table.test["slip_ratio"][straight]
-    if side is None or pull is None or straight.sum() < 8 or np.ptp(slip) < 0.3:
+    if side is None or pull is None or straight.sum() < STEADY_LIMITS.fewest or np.ptp(slip) < STEADY_LIMITS.span:
         return []
     side, pull = side[straight], pull[straight]
     rank = float(np.asarray(stats.spearmanr(slip, side))[0])
-    if rank < 0.7 or np.std(side) < 5.0 * np.std(pull):
+    if rank < STEADY_LIMITS.rank or np.std(side) < STEADY_LIMITS.side_over_pull * np.std(pull):
         return []
     message = f"follows the slip at zero slip angle (rank correlation {rank:.2f}), and the drawbar pull does not"
     return [_finding(log, None, "side_force_N", "frame", f"{message}: the two columns are swapped")]
-
-
-_AT_LIMIT = 0.05
-"""Share of the rows at one extreme value from which a channel is saturated."""
 
 
 def _clipped(log: SteadyLog) -> list[Finding]:
@@ -189,7 +215,11 @@ def _clipped(log: SteadyLog) -> list[Finding]:
         count = np.unique(values, return_counts=True)[1]
         for at, extreme in ((-1, values.max()), (0, values.min())):
             other_counts = np.delete(count, at)
-            often = max(8.0, _AT_LIMIT * len(values), 4.0 * float(other_counts.max(initial=1)))
+            often = max(
+                STEADY_LIMITS.fewest,
+                STEADY_LIMITS.at_limit * len(values),
+                STEADY_LIMITS.over_others * float(other_counts.max(initial=1)),
+            )
             # Zero is what many quantities honestly are.
             if len(count) > 2 and extreme != 0.0 and count[at] >= often:
                 row = int(np.argmax(values == extreme))
