@@ -20,12 +20,12 @@ from harness import KEPT, ROOT, read
 from kept import keep, read_large, ship_large
 
 from lunar_mjx.agents.curves import mean_interval, moving_mean, new_figure
-from lunar_mjx.report.style import LINES, MUTED, styled
+from lunar_mjx.report.style import LINES, LIT, MUTED, styled
 
 DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
 """Variants of the paper's task that the figure shows; the table has all."""
-REASONS = ("stuck", "rolled_over", "time", "off_terrain", "diverged")
-"""For which drives fail, in the order of the figure's bars."""
+REASONS = {"stuck": "", "rolled_over": "///", "time": "xxx", "off_terrain": "...", "diverged": "---"}
+"""For which drives fail, in the order of the figure's bars, with what tells a bar apart without colour."""
 UNSEEN = {"ylabel": "success on unseen ground, %", "ylim": (-3, 103)}
 """The axis of success."""
 
@@ -40,8 +40,10 @@ def plot_large(record: dict[str, Any]) -> Any:
     figure, (left, right) = new_figure(2)
     for seed in record["seeds"]:
         found, rows = seed["unseen"], [r for r in seed["rows"] if r.get("episode_return") is not None]
-        left.plot([s["elapsed_s"] for s in found], shares(found), "o-", ms=3, lw=1, label=f"seed {seed['seed']}")
-        right.plot([r["elapsed_s"] for r in rows], [r["episode_return"] for r in rows], lw=1)
+        left.plot(
+            [s["elapsed_s"] for s in found], shares(found), marker="o", ms=3, lw=1.2, label=f"seed {seed['seed']}"
+        )
+        right.plot([r["elapsed_s"] for r in rows], [r["episode_return"] for r in rows], lw=1.2)
     for style, (name, score) in zip(("--", "-.", ":", (0, (1, 4))), record["agents"].items(), strict=False):
         left.axhline(100 * score["success"], color=MUTED, lw=0.8, ls=style, label=name)
     left.axhline(100 * record["target"], color=MUTED, lw=0.8)
@@ -87,7 +89,8 @@ def plot_rates(record: dict[str, Any]) -> Any:
     left.loglog(at, [r["bare_steps_per_s"] / 1e6 for r in rows], "s--", ms=4, color=MUTED, label="bare physics")
     left.loglog(at, [r["env_steps_per_s"] / 1e6 for r in rows], "o-", ms=4, label="environment")
     left.axhline(30.0, color=MUTED, lw=0.8)
-    left.set(xlabel="rovers", ylabel="million steps/s at decimation 5", title=record["rover"])
+    left.set(xlabel="rovers", ylabel="million steps/s at decimation 5")
+    left.set_title(record["rover"], loc="left")
     left.legend(frameon=False)
     ratios = [[min(r["bare_seconds"]) / s for s in r["seconds"]] for r in rows]
     right.plot(at, [r["ratio"] for r in rows], "o-", ms=4)
@@ -102,10 +105,10 @@ def plot_realism(record: dict[str, Any]) -> Any:
     figure, (axes,) = new_figure(1, 5.6, 3.2)
     cells = tables.realism_cells(record)
     at, bottom = np.arange(len(cells)), np.zeros(len(cells))
-    for reason in REASONS:
+    for reason, hatch in REASONS.items():
         share = np.array([100.0 * c["ends"][reason] for c in cells.values()])
         if share.any():
-            axes.barh(at, share, left=bottom, height=0.55, label=reason.replace("_", " "))
+            axes.barh(at, share, left=bottom, height=0.55, hatch=hatch, edgecolor=LIT, label=reason.replace("_", " "))
             bottom += share
     middle, low, high = (100 - np.array(shares(list(cells.values()), k)) for k in ("success", "high", "low"))
     axes.errorbar(middle, at, xerr=[middle - low, high - middle], fmt="none", ecolor="k", capsize=3, lw=1)
@@ -120,15 +123,15 @@ def plot_realism(record: dict[str, Any]) -> Any:
 def plot_learners(large: dict[str, Any] | None, brax: dict[str, Any]) -> Any:
     """Success on unseen ground over time of training: TD3's seeds and brax's learners."""
     figure, both = new_figure(2)
-    lines = [(f"TD3, {large['about']['device']}", s["unseen"], LINES[0][0]) for s in large["seeds"]] if large else []
+    lines = [(f"TD3, {large['about']['device']}", s["unseen"], LINES[0]) for s in large["seeds"]] if large else []
     for look, (name, run) in zip(LINES[1:], brax["runs"].items(), strict=False):
-        lines.append((f"brax {name.upper()}, {brax['about']['device']}", run.get("unseen", []), look[0]))
-    for i, (label, found, colour) in enumerate(lines):
+        lines.append((f"brax {name.upper()}, {brax['about']['device']}", run.get("unseen", []), look))
+    for i, (label, found, (colour, line)) in enumerate(lines):
         # a label stands once, whatever the number of its seeds
-        label = None if label in [line[0] for line in lines[:i]] else label
+        label = None if label in [other[0] for other in lines[:i]] else label
         for axes, x, unit in zip(both, ("elapsed_s", "steps"), (1.0, 1e6), strict=True):
             places = [s[x] / unit if s[x] is not None else np.nan for s in found]
-            axes.plot(places, shares(found), "o-", ms=2.5, lw=1, color=colour, label=label)
+            axes.plot(places, shares(found), marker="o", ms=2.5, lw=1.2, color=colour, linestyle=line, label=label)
             axes.fill_between(places, shares(found, "low"), shares(found, "high"), color=colour, alpha=0.15, lw=0)
     both[0].set(xlabel="s of training", xscale="log", **UNSEEN)
     both[1].set(xlabel="million environment steps", xscale="log", ylim=(-3, 103))
@@ -157,9 +160,11 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     lines, figures, large = [], {}, read_large(args.folders)
-    if large and large["seeds"]:
-        figures[f"large_{large['rover']}"] = plot_large(large)
-        lines += tables.table_large(large)
+    # trainings just measured, or the one that the guide shows of those kept
+    kept = read(KEPT / "large_luvmi_x.json") if KEPT in [f.resolve() for f in args.folders] else None
+    for record in [r for r in (large, kept) if r and r["seeds"]]:
+        figures[f"large_{record['rover']}"] = plot_large(record)
+        lines += tables.table_large(record)
     parts = {name: found for name in TABLES for folder in args.folders if (found := read(folder / f"{name}.json"))}
     for name, record in parts.items():
         lines += TABLES[name](record)

@@ -235,6 +235,7 @@ def figures(
         list[Path] | None,
         typer.Option(help="Folder that `train` wrote, for Fig. 6; may be repeated. Kept records if left out."),
     ] = None,
+    dark: Annotated[bool, typer.Option(help="Each also as NAME_dark.png, for dark pages.")] = False,
     device: DeviceOption = "auto",
 ) -> None:
     """Make the counterparts of the paper's Figs. 1 to 6, and the slope check."""
@@ -246,7 +247,7 @@ def figures(
     for name in names:
         if name not in FIGURES:
             raise bad_input("figures", "--only", name, "does not exist", f"use all or some of {', '.join(FIGURES)}")
-    for path in make_figures(names, make_folder(out), training or ()):
+    for path in make_figures(names, make_folder(out), training or (), dark):
         print(path)
 
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from lunar_mjx.effects.presets import UNSAID
 from lunar_mjx.files import replacing, write_text
 from lunar_mjx.paper import hot_motor, slope_runs, soft_ground
-from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, VERMILION, styled
+from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, VERMILION, darkened, styled
 
 PRESET_NAMES = ("paper", "consistent")
 SLOPES_DEG = (0.0, 5.0, 10.0, 12.5, 15.0, 17.5, 20.0, 22.5, 25.0)
@@ -23,11 +23,12 @@ STALL_SLIP = 0.95
 """Slip of the whole rover at which it is called stalled."""
 
 
-def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()) -> list[Path]:
+def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = (), dark: bool = False) -> list[Path]:
     """Runs and draws figures; returns the files written (PNG and JSON for each name).
 
     Args:
       names: of `FIGURES`. out: folder. trainings: what Fig. 6 draws; see `training_figure.read_trainings`.
+      dark: each also as `NAME_dark.png`, for dark pages.
     """
     written = []
     for name in names:
@@ -38,8 +39,14 @@ def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()
             FigureCanvasAgg(figure)
             with replacing(image) as part:
                 figure.savefig(part, dpi=120)
+            written.append(image)
+            if dark:
+                written.append(out / f"{_FILES[name]}_dark.png")
+                darkened(figure)
+                with replacing(written[-1]) as part:
+                    figure.savefig(part, dpi=120, facecolor=figure.get_facecolor())
         write_text(data, json.dumps(numbers, indent=1))
-        written += [image, data]
+        written.append(data)
     return written
 
 

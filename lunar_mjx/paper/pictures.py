@@ -94,7 +94,7 @@ def figure_1() -> tuple[Figure, dict[str, Any]]:
     paint = _trodden(rovers)
     ahead = np.array([math.cos(_PLACE[2]), math.sin(_PLACE[2]), 0.0])
     pose = orbit(qpos[:3] + 1.9 * ahead + np.array([0.0, 0.0, 0.2]), *_ONLOOKER)
-    wide = _taken(terrain, rovers, pose, Pinhole(960, 572, 38.0), light, paint, detail=True)
+    wide = _taken(terrain, rovers, pose, Pinhole(1440, 960, 42.0), light, paint, detail=True)
     optics = Pinhole(320, 240)
     place, turn = mounted(front_mount(model.rover), jnp.asarray(qpos, jnp.float32))
     front = Pose(np.asarray(place, float), np.asarray(turn, float))

@@ -111,6 +111,27 @@ def styled(dark: bool = False) -> Iterator[None]:
         yield
 
 
+def darkened(figure: Any) -> Any:
+    """A Matplotlib figure as it looks on a dark page; it is changed, and returned.
+
+    Every colour of `DARK_FIGURES` gives way to what takes its place; pictures and colour maps stay.
+    """
+    from matplotlib.colors import to_hex, to_rgba, to_rgba_array
+
+    swap = {to_hex(light): dark for light, dark in DARK_FIGURES.items()}
+    for artist in figure.findobj():
+        mapped = getattr(artist, "get_array", lambda: None)() is not None
+        for name in ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"):
+            get, put = getattr(artist, f"get_{name}", None), getattr(artist, f"set_{name}", None)
+            if get is None or put is None or mapped:
+                continue
+            found = to_rgba_array(get())
+            new = [to_rgba(swap[to_hex(c)], c[3]) if to_hex(c) in swap else tuple(c) for c in found]
+            if any(a != tuple(b) for a, b in zip(new, found, strict=True)):
+                put(new if len(new) > 1 else new[0])
+    return figure
+
+
 def faded(colour: str, alpha: float) -> str:
     """The colour with an opacity, for bands."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))

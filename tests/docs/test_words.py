@@ -15,7 +15,7 @@ LONG = 40
 
 
 def prose(text: str) -> list[str]:
-    """Paragraphs and list items of a page of Markdown, without code, tables, headings and the targets of links."""
+    """Paragraphs, list items and cells of a page of Markdown, without code, headings and the targets of links."""
     text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r"!\[[^\]]*\]\([^)]*\)", "", text)
@@ -23,9 +23,11 @@ def prose(text: str) -> list[str]:
     blocks: list[list[str]] = [[]]
     for line in text.splitlines():
         stripped = line.lstrip("> ").strip()
-        if (
+        if stripped.startswith("|"):
+            blocks += [[cell.strip()] for cell in re.split(r"(?<!\\)\|", stripped)] + [[]]
+        elif (
             not stripped
-            or stripped.startswith(("|", "#", ":::", "options:"))
+            or stripped.startswith(("#", ":::", "options:"))
             or (line.startswith("    ") and not blocks[-1])
         ):
             blocks.append([])
@@ -70,5 +72,17 @@ def test_sentences_are_counted() -> None:
     page = (
         "# Title\n\nOne two three. Four\nfive `a b c` six? [Seven](x.md) eight.\n\n    a b\n\n| a |\n\n- nine ten\n- 11"
     )
-    assert [words(s) for s in sentences(page)] == [3, 4, 2, 2, 1]
+    assert [words(s) for s in sentences(page)] == [3, 4, 2, 1, 2, 1]
     assert [s for s in sentences("A " + "word " * 40 + "end.") if words(s) >= LONG]
+
+
+def test_every_picture_is_there_and_none_lies_about() -> None:
+    shown = set()
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        targets = re.findall(r"!\[[^\]]*\]\(([^)#\s]+)|(?:src|srcset)=\"([^\"]+)\"", text)
+        local = [name for pair in targets for name in pair if name and "://" not in name]
+        shown |= {(page.parent / name).resolve() for name in local}
+    assert [p for p in shown if not p.is_file()] == []
+    kept = {p for p in (ROOT / "docs" / "figures").iterdir() if p.suffix in (".png", ".svg", ".gif")}
+    assert kept - shown == set()

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from lunar_mjx.paper import training_figure
 from lunar_mjx.paper.figures import FIGURES, available_figures, make_figures
 from lunar_mjx.paper.training_figure import figure_6
+from lunar_mjx.report.style import DARK, PAPER
 
 
 def test_all_figures_have_a_counterpart(monkeypatch, capsys, tmp_path):
@@ -118,3 +120,17 @@ def test_display_shows_what_the_front_camera_sees():
     position = np.linalg.inv(view)[:3, 3]
     assert position == pytest.approx(numbers["camera_position_m"])
     assert len(figure.axes) >= 4
+
+
+def test_a_figure_for_dark_pages_comes_beside_the_light_one(tmp_path):
+    light, dark, numbers = make_figures(["2"], tmp_path, dark=True)
+    assert [p.name for p in (light, dark, numbers)] == [
+        "fig2_workflow.png",
+        "fig2_workflow_dark.png",
+        "fig2_workflow.json",
+    ]
+    corners = []
+    for path in (light, dark):
+        with Image.open(path) as picture:
+            corners.append("#{:02x}{:02x}{:02x}".format(*picture.convert("RGB").getpixel((0, 0))))
+    assert corners == [PAPER, DARK[PAPER]]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lunar_mjx.report import style
 from lunar_mjx.report.style import DARK, LINES, SERIES, figure_style, styled
 
 ROOT = Path(__file__).parents[2]
@@ -99,3 +100,35 @@ def test_a_dark_page_has_no_light_paper() -> None:
     assert _lab(_linear(to_hex(axes.get_facecolor())))[0] < 10
     assert _lab(_linear(to_hex(line.get_color())))[0] > 40
     assert not axes.spines["top"].get_visible()
+
+
+def test_a_figure_is_darkened_by_the_table_that_pages_use() -> None:
+    from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
+
+    from lunar_mjx.paper.pictures import figure_2
+
+    with style.styled():
+        figure = Figure()
+        axes = figure.subplots()
+        (line,) = axes.plot([0, 1], [1, 2], color=style.INK, marker="o", markerfacecolor=style.PAPER)
+        (blue,) = axes.plot([0, 1], [2, 1], color=style.BLUE)
+        band = axes.fill_between([0, 1], [0, 1], color=style.PURPLE, alpha=0.2)
+        dots = axes.scatter([0, 1], [0, 1], c=[0.0, 1.0], cmap=style.HEIGHTS)
+        title = axes.set_title("title")
+        before = dots.get_facecolor().tolist()
+        assert style.darkened(figure) is figure
+        diagram = style.darkened(figure_2()[0])
+    assert line.get_color()[:3] == pytest.approx([int(style.DARK[style.INK][i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    assert to_hex(line.get_markerfacecolor()) == to_hex(style.DARK[style.PAPER])
+    assert to_hex(blue.get_color()) == to_hex(style.SKY)
+    assert to_hex(band.get_facecolor()[0]) == to_hex(style.DARK_SERIES[style.PURPLE])
+    assert band.get_facecolor()[0][3] == pytest.approx(0.2)
+    assert to_hex(title.get_color()) == to_hex(style.DARK[style.INK])
+    assert dots.get_facecolor().tolist() == before
+    # nothing of the light page is left in a figure that is shipped
+    light = {to_hex(c) for c in style.DARK}
+    for artist in diagram.findobj():
+        for name in ("color", "facecolor", "edgecolor"):
+            found = getattr(artist, f"get_{name}", lambda: "none")()
+            assert (isinstance(found, str) and found == "none") or to_hex(found) not in light

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -53,3 +55,22 @@ def test_a_page_from_elsewhere_can_neither_read_nor_drive(live_viewer, browser):
         ask = f"fetch('{live_viewer.address}{path}', {options}).then(r => r.text(), () => '')"
         assert browser.value(ask) == ""
     assert live_viewer.drive.pilot.throttle == 0.0
+
+
+@pytest.mark.parametrize("size", [(360, 740), (740, 360), (1280, 760)], ids=["phone", "phone, lying", "desk"])
+def test_panels_stay_in_the_window_and_off_each_other(live_viewer, browser, size):
+    browser.resize(*size)
+    browser.open(live_viewer.address)
+    browser.wait("Number(document.body?.dataset.pictures) > 3")
+    boxes = browser.value(
+        "[...document.querySelectorAll('section')].filter(s => s.checkVisibility() && s.getClientRects().length)"
+        ".map(s => { const b = s.getBoundingClientRect(); return [s.id, b.left, b.top, b.right, b.bottom]; })"
+    )
+    assert len(boxes) >= 2
+    for name, left, top, right, bottom in boxes:
+        assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1], name
+    for (a, *one), (b, *other) in itertools.combinations(boxes, 2):
+        wide = min(one[2], other[2]) - max(one[0], other[0])
+        high = min(one[3], other[3]) - max(one[1], other[1])
+        assert wide <= 0 or high <= 0, (a, b)
+    assert browser.asked() and all(r.startswith(live_viewer.address) for r in browser.asked())
