@@ -25,7 +25,7 @@ from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError
 from lunar_mjx.files import write_text
 from lunar_mjx.report.page import packed
-from lunar_mjx.report.style import BLUE, DARK, FONT, INK, MUTED, ORANGE, PAPER, RULE
+from lunar_mjx.report.style import BLUE, DARK_FIGURES, FONT, INK, MUTED, ORANGE, PAPER, RULE, SHADES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +50,8 @@ _STYLE = {
     "paper": PAPER,
     "blue": BLUE,
     "orange": ORANGE,
-    "dark": DARK,
+    "dark": DARK_FIGURES,
+    "shades": [colour for _, colour in SHADES],
 }
 """What the figures of the page look like."""
 _REST = "others"

@@ -3,8 +3,10 @@
 const $ = id => document.getElementById(id);
 const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const isDark = matchMedia("(prefers-color-scheme: dark)").matches;
-const SHADES = isDark ? ["#15202b", "#173a56", "#1b5f8f", "#3f94c9", "#a8d8f5"] : ["#f7fbff", "#c6dbef", "#6baed6", "#2171b5", "#08306b"];
-let data, model, other, row = 0, column = 0;
+let data, shades, model, other, row = 0, column = 0;
+
+// A colour of the light page as this page shows it.
+const of = colour => isDark && data.style.dark[colour] || colour;
 
 async function unpacked(id) {
   const packed = Uint8Array.from(atob($(id).textContent), c => c.charCodeAt(0));
@@ -27,8 +29,8 @@ function mix(from, to, share) {
 // One hue from the noise to the worst error of any model, on a logarithmic scale.
 function shade(value, most) {
   if (value === null) return null;
-  const depth = Math.min(1, Math.max(0, Math.log(Math.max(value, 0.7) / 0.7) / Math.log(Math.max(3, most) / 0.7))) * (SHADES.length - 1);
-  const low = Math.min(Math.floor(depth), SHADES.length - 2), colour = mix(SHADES[low], SHADES[low + 1], depth - low);
+  const depth = Math.min(1, Math.max(0, Math.log(Math.max(value, 0.7) / 0.7) / Math.log(Math.max(3, most) / 0.7))) * (shades.length - 1);
+  const low = Math.min(Math.floor(depth), shades.length - 2), colour = mix(shades[low], shades[low + 1], depth - low);
   const bright = 0.299 * colour[0] + 0.587 * colour[1] + 0.114 * colour[2];
   return ["rgb(" + colour.join(",") + ")", bright > 140 ? "#111" : "#fff"];
 }
@@ -172,8 +174,7 @@ function showHeat() {
   }
 }
 function showPanel() {
-  const panel = data.panels[row][column], s = data.style, swap = isDark ? s.dark : {};
-  const of = colour => swap[colour] || colour;
+  const panel = data.panels[row][column], s = data.style;
   const same = model === data.base, marks = data.table;
   const mode = marks ? "markers" : "lines", size = marks ? 10 : 4;
   const axis = {gridcolor: of(s.rule), linecolor: of(s.muted), zeroline: false, ticks: "outside", tickcolor: of(s.rule)};
@@ -182,8 +183,8 @@ function showPanel() {
     if (panel.predicted[index]) traces.push({x: panel.x, y: panel.predicted[index], name: name, mode: mode, marker: {color: colour, symbol: symbol, size: size}, line: {color: colour, dash: dash, width: 2}});
     traces.push({x: panel.x, y: panel.residual[index], name: name + ", residual", showlegend: !panel.predicted[index], mode: marks ? "markers" : "lines", marker: {color: colour, symbol: symbol, size: size}, line: {color: colour, dash: dash, width: 1.5}, yaxis: "y2"});
   };
-  if (!same) draw(data.base, s.orange, "triangle-up", "dot", "refitted");
-  draw(model, s.blue, "square", "solid", same ? "refitted" : model === 0 ? "as given" : "chosen model");
+  if (!same) draw(data.base, of(s.orange), "triangle-up", "dot", "refitted");
+  draw(model, of(s.blue), "square", "solid", same ? "refitted" : model === 0 ? "as given" : "chosen model");
   traces.push(measured);  // on top: models may lie on it
   const base = {paper_bgcolor: of(s.paper), plot_bgcolor: of(s.paper), font: {family: s.font, size: 13, color: of(s.ink)}, hovermode: "closest"};
   const layout = Object.assign({}, base, {
@@ -205,7 +206,7 @@ function showPanel() {
   const top = Math.max(Math.log10(3), ...map.error[data.base].map(v => Math.log10(Math.max(v || 0.3, 0.3))));
   const inside = map.unit.map(u => u === column);
   const points = {x: map.x, y: map.y, mode: "markers", hovertemplate: "%{text} sigma<extra></extra>", text: map.error[model].map(shown), showlegend: false,
-    marker: {color: error, colorscale: SHADES.map((colour, i) => [i / (SHADES.length - 1), colour]), cmin: Math.log10(0.7), cmax: top,
+    marker: {color: error, colorscale: shades.map((colour, i) => [i / (shades.length - 1), colour]), cmin: Math.log10(0.7), cmax: top,
       size: inside.map(v => v ? 12 : 7), line: {color: of(s.ink), width: inside.map(v => v ? 2 : 0.5)},
       colorbar: {title: {text: "sigma"}, tickvals: [0, 0.30103, 0.69897, 1, 1.30103, 2], ticktext: ["1", "2", "5", "10", "20", "100"], thickness: 12}}};
   const square = map.equal ? {scaleanchor: "x", scaleratio: 1} : {};
@@ -231,6 +232,7 @@ function chooseCell(r, c) { row = r; column = c; show(); }
 (async () => {
   try {
     data = JSON.parse(await unpacked("data"));
+    shades = data.style.shades.map(of);
     const script = document.createElement("script");
     script.textContent = await unpacked("plotly");
     document.head.appendChild(script);

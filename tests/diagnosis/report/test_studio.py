@@ -16,6 +16,7 @@ from lunar_mjx.diagnosis.report.read import read_result
 from lunar_mjx.diagnosis.report.reasons import reason
 from lunar_mjx.diagnosis.report.steps import chain, judged
 from lunar_mjx.errors import UserError
+from lunar_mjx.report.style import BLUE, DARK_FIGURES, DARK_SHADES, SHADES
 
 
 def page_data(folder: Path) -> dict:
@@ -109,6 +110,26 @@ def test_a_run_without_series_says_what_to_do(tmp_path):
     (folder / "series.npz").unlink()
     with pytest.raises(UserError, match="lunar-mjx compare"):
         studio.write_studio(folder, tmp_path / "studio.html")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_all_that_is_drawn_follows_the_page_into_the_dark(tmp_path, browser, dark):
+    page = studio.write_studio(write_run(tmp_path / "run", True), tmp_path / "studio.html")
+    browser.dark(dark)
+    browser.open(page.as_uri())
+    browser.wait("document.body?.dataset.ready")
+    browser.wait("document.querySelectorAll('#traces .main-svg').length > 0")
+    paper = browser.value("getComputedStyle(document.body).backgroundColor")
+    assert paper == ("rgb(13, 17, 23)" if dark else "rgb(255, 255, 255)")
+    assert browser.value("document.querySelector('#traces .main-svg').style.background") == paper
+    models = browser.value("document.getElementById('traces').data.filter(t => t.name !== 'measured')")
+    blue = DARK_FIGURES[BLUE] if dark else BLUE
+    assert blue in {t["line"]["color"] for t in models}
+    shades = browser.value("document.getElementById('place').data[0].marker.colorscale.map(step => step[1])")
+    assert shades == list(DARK_SHADES if dark else (c for _, c in SHADES))
+    assert browser.collisions() == []
+    assert not browser.problems
 
 
 @pytest.mark.slow
