@@ -155,11 +155,12 @@ def noise(
         }
         print(json.dumps(plain, indent=2))
         return
-    table = make_table("channel", "kind", "std", "coloured", "time, s", "std of log")
+    table = make_table("channel", "kind", "std", "coloured", "time, s", "log std")
     for channel, kinds in found.items():
         for kind, n in kinds.items():
-            # Where the drive's noise was taken from something else, say from what.
-            label = kind if kind in (n.source, "rest") else f"{kind}: {n.source}"
+            # what a drive itself shows needs no more than its own word, so that rows fit into 80 columns
+            shows = kind == "drive" and n.source in ("vibration", "ripple", "estimate")
+            label = n.source if shows else kind if kind in (n.source, "rest") else f"{kind}: {n.source}"
             table.add_row(
                 channel, label, f"{n.std:.3g}", f"{n.share:.2g}", f"{n.correlation_time_s:.2g}", f"{n.log_std:.2g}"
             )

@@ -99,3 +99,16 @@ def test_what_is_stated_counts_and_says_how_well(tmp_path: Path, run: Run) -> No
     assert noise_of(log, "joint_left_drive_speed_rad_s") is None, "a wheel that turns evenly shows none"
     result = run("log", "noise", tmp_path / "a")
     assert result.status == 0 and "gyro_x_rad_s" in result.out and "vibration" in result.out
+    assert [line.split()[:2] for line in result.out.splitlines() if line.startswith(" gyro_y")] == [
+        ["gyro_y_rad_s", "stated:"],
+        ["gyro_y_rad_s", "vibration"],
+        ["gyro_y_rad_s", "rest"],
+    ]
+
+
+def test_a_row_of_the_noise_fits_into_80_columns(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    make(tmp_path / "a", {name: rng.normal(size=len(TIME)) for name in ("gyro_x_rad_s", "accelerometer_x_m_s2")})
+    monkeypatch.setenv("COLUMNS", "80")  # after the fixture's own
+    lines = run("log", "noise", tmp_path / "a").out.rstrip().splitlines()
+    assert len(lines) == 1 + 2 * 2 and all(len(line.split()) == 6 for line in lines[1:])
