@@ -19,6 +19,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from lunar_mjx.report.style import styled
+
 HERE = Path(__file__).parent
 NAMES = (
     "drive_a_rover",
@@ -52,7 +54,7 @@ def run(name: str) -> list[dict[str, Any]]:
     """
     scope: dict[str, Any] = {"__name__": "__tutorial__"}
     made, before = [], os.getcwd()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, styled():
         os.chdir(folder)
         try:
             for count, (kind, text) in enumerate(cells(name)):
@@ -87,7 +89,7 @@ def _shown(value: Any) -> dict[str, str]:
 
         FigureCanvasAgg(value)
         file = io.BytesIO()
-        value.savefig(file, dpi=55)
+        value.savefig(file, dpi=80)
         return {"image/png": base64.b64encode(file.getvalue()).decode("ascii"), "text/plain": "<Figure>"}
     return {"text/plain": str(value)}
 

@@ -132,8 +132,8 @@ def picture(time, measured, **models):
     figure = Figure(figsize=(7, 3.2), layout="constrained")
     axes = figure.subplots()
     axes.plot(time, measured, ".", color="black", markersize=3, label="measured")
-    for (name, values), colour in zip(models.items(), ("#E69F00", "#0072B2"), strict=True):
-        axes.plot(time, values, color=colour, label=name.replace("_", " "))
+    for (name, values), (colour, line) in zip(models.items(), (("#E69F00", "--"), ("#0072B2", "-")), strict=True):
+        axes.plot(time, values, line, color=colour, label=name.replace("_", " "))
     axes.set_xlabel("time, s")
     axes.set_ylabel("current of the left motor, A")
     axes.legend(frameon=False)

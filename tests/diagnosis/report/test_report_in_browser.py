@@ -43,6 +43,9 @@ def test_by_mouse_and_by_keyboard(page: Path, browser: Browser) -> None:
     browser.value(f"{CHOICE}.value = {next(i for i in names if i != key)!r}")
     browser.click(*field)
     browser.wait(f"{CHOICE}.value === {key!r}")
+    # and marks it in every map
+    marked = "document.getElementById('figure-1').layout.shapes.map(s => [s.xref, s.x0, s.y0])"
+    assert browser.value(marked) == [["x", -0.5, -0.5], ["x2", -0.5, -0.5], ["x3", -0.5, -0.5]]
     before = browser.value(f"{DRAWN}.data[0].y.length && JSON.stringify({DRAWN}.data[1].y)")
     assert before
     # the list does the same by keyboard
