@@ -21,6 +21,8 @@ from lunar_mjx.envs import make_agent
 
 RULES = ("zero", "random", "scripted", "reactive")
 """Agents that learn nothing."""
+SCORING, TRAINING, RATING = 25.0, 20.0, 15.0
+"""s kept for a seed's last scores, least s of its training, and s for the rate of updates; --tiny takes a tenth."""
 
 
 def episodes_of(args: argparse.Namespace) -> int:
@@ -46,14 +48,14 @@ def large(args: argparse.Namespace, clock: Clock) -> None:
     for agent, found in record["agents"].items():
         say(f"large: {agent} agent {percent(found)} on unseen ground, ends {ends(found)}")
     save(args.out, "large", record)
-    kept, state = -1.0, None
+    kept, state, share = -1.0, None, 0.1 if args.tiny else 1.0
     for seed in range(args.first_seed, args.first_seed + args.seeds):
-        if clock.left < (5.0 if args.tiny else 45.0):
+        if clock.left < share * (SCORING + TRAINING):
             break
         del state  # two replay buffers at once would not be needed
         kept, state = one_run(args, clock, record, setup, (alone, beside), seed, kept)
         save(args.out, "large", record)
-    if state is not None and clock.left > (1.0 if args.tiny else 15.0):
+    if state is not None and clock.left > share * RATING:
         record |= update_rate(setup.learner, state)
     save(args.out, "large", record)
 
@@ -63,7 +65,7 @@ def one_run(
 ) -> tuple[float, Any]:
     """Trains one seed; keeps its best policy if none before was better; returns the best score and the last state."""
     (alone, beside), begin, scores = judges, time.monotonic(), []
-    limit = max(1.0, min(args.seed_seconds, clock.left - (0.0 if args.tiny else 25.0)))
+    limit = min(args.seed_seconds, clock.left - (0.1 if args.tiny else 1.0) * SCORING)
 
     def look(policy: Any, state: Any, epochs: list[dict[str, Any]]) -> float:
         nonlocal kept

@@ -36,6 +36,10 @@ PARTS = {
     "realism": (realism, 300.0),
 }
 """What measures a part, and s that it may take."""
+LARGE = 0.7
+"""Share of what is left that `large` takes of `all`; `rates` takes the rest."""
+SPARE = 20.0
+"""s before the end at which the last part of `all` and the runs on CPU cores stop."""
 
 
 def words() -> argparse.Namespace:
@@ -66,13 +70,13 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     measure, period = PARTS[args.part]
     clock = Clock(args.seconds or period)
-    pool, pending = paper.start(args, clock.left - 25.0) if args.part in ("all", "paper") else (None, [])
+    pool, pending = paper.start(args, clock.left - SPARE) if args.part in ("all", "paper") else (None, [])
     try:
         if measure is not None:
             measure(args, clock)
         if args.part == "all":
-            large(args, Clock(0.7 * clock.left))
-            rates(args, Clock(clock.left - 15.0))
+            large(args, Clock(LARGE * clock.left))
+            rates(args, Clock(clock.left - SPARE))
     finally:
         if pool is not None:
             save(args.out, "paper", paper.merged(pending, clock.left))

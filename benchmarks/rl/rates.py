@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import SMALL_TASK, Clock, in_threads, save, say, training_of
+from harness import SMALL_TASK, Clock, in_threads, in_time, save, say, training_of
 from jax.sharding import Mesh
 
 from lunar_mjx.agents.learner import AXIS, Learner
@@ -42,11 +42,9 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
         ready = list(pool.map(lambda row: Rate(made[row[:2]], row[2], steps[row[1]]), plan))
     say(f"rates: {len(ready)} rows compiled after {clock.spent:.0f} s")
     rows: list[dict[str, Any]] = []
-    for (seen, every, size), rate in zip(plan, ready, strict=True):
-        if clock.left < 2.0:
-            say("rates: no time for more")
-            return
-        row = rate.measure(1 if args.tiny else 5)
+    waiting = dict(zip(plan, ready, strict=True))
+    for seen, every, size in in_time(clock, plan):
+        row = waiting.pop((seen, every, size)).measure(1 if args.tiny else 5)
         rows.append({"observation": seen, "decimation": every, "rovers": size, **row})
         say(
             f"rates: {seen}, decimation {every}, {size:,} rovers: {row['env_steps_per_s']:,.0f} environment steps/s, "
