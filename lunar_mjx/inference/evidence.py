@@ -113,6 +113,72 @@ class Gram:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Levels:
+    """Statistics of measurements whose slow errors have an unknown size, for each of some sizes.
+
+    What a model leaves out beyond its ports shows as slow errors of whole groups of measurements.
+
+    Attributes:
+      count: (groups,) number of measurements.
+      matrix: (levels, groups, k + 1, k + 1) as that of `Gram`, whitened with each size.
+      log_scale: (levels, groups) sum of the logarithms of what whitening divides by.
+      log_prior: (levels,) log prior density of each size.
+      start: (groups,) level of each group to begin at.
+    """
+
+    count: np.ndarray
+    matrix: np.ndarray
+    log_scale: np.ndarray
+    log_prior: np.ndarray
+    start: np.ndarray
+
+    def gram(self, levels: np.ndarray) -> Gram:
+        """The statistics at a level (groups,) of each group."""
+        return Gram(self.count, self.matrix[levels, np.arange(len(levels))])
+
+    def log_weight(self, levels: np.ndarray) -> float:
+        """What is added to the log evidence of measurements whitened at a level (groups,) of each group."""
+        return float(np.sum(self.log_prior[levels] - self.log_scale[levels, np.arange(len(levels))]))
+
+    def improved(self, found: Evidence, noises: Sequence[NoiseSize]) -> tuple[np.ndarray, np.ndarray]:
+        """Most probable levels and factors on the noise, (groups,) each, if the amplitudes are as found (a step of EM).
+
+        The two go together: errors that are too large make the noise seem too small, and would never be left alone.
+        """
+        place = np.append(-found.mean, 1.0)
+        square = np.einsum("i,lgij,j->lg", place, self.matrix, place)
+        square = square + np.einsum("lgij,ij->lg", self.matrix[..., :-1, :-1], found.covariance)
+        x, log_prior = np.empty_like(square), np.empty_like(square)
+        for g, prior in enumerate(noises):
+            x[:, g], log_prior[:, g] = _most_probable_noise(square[:, g], float(self.count[g]), prior)
+        value = -0.5 * square * np.exp(-2.0 * x) - self.count * x + log_prior - self.log_scale + self.log_prior[:, None]
+        at = np.argmax(value, axis=0)
+        return at, np.exp(x[at, np.arange(len(at))])
+
+
+def _most_probable_noise(square: np.ndarray, count: float, prior: NoiseSize) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithm of the most probable factor on the noise for (levels,) sums of squares, and its log prior density."""
+    if prior.freedom > 0.0:
+        x = 0.5 * np.log((square + prior.freedom) / (count + prior.freedom))
+        return x, -prior.freedom * x - 0.5 * prior.freedom * np.exp(-2.0 * x)
+    x = 0.5 * np.log(np.maximum(square, 1e-300) / max(count, 1.0))
+    for _ in range(20):
+        power = square * np.exp(-2.0 * x)
+        x = x + (power - count - x / prior.log_std**2) / (2.0 * power + prior.log_std**-2)
+    return x, -0.5 * (x / prior.log_std) ** 2
+
+
+def moved(matrix: np.ndarray, amounts: np.ndarray) -> np.ndarray:
+    """Statistics (..., k + 1, k + 1) after amplitudes have been moved by (k,) amounts: those times columns are gone."""
+    out = matrix.copy()
+    change = matrix[..., :-1, :-1] @ amounts
+    out[..., -1, -1] += change @ amounts - 2.0 * (matrix[..., :-1, -1] @ amounts)
+    out[..., :-1, -1] -= change
+    out[..., -1, :-1] -= change
+    return out
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Amplitudes:
     """Prior of the amplitudes of the columns.
 
@@ -193,6 +259,7 @@ class Evidence:
       noise: (groups,) most probable factors on the stated noise.
       mean, covariance: (k,), (k, k) posterior of the amplitudes at these sizes.
       settled: of the sizes: gain of log density that a further Newton step promises.
+      levels: (groups,) most probable level of slow errors, where their size is unknown.
     """
 
     log_evidence: float
@@ -204,6 +271,7 @@ class Evidence:
     settled: float
     gram: Gram
     amplitudes: Amplitudes
+    levels: np.ndarray | None = None
 
     def log_score(self, held_out: Gram) -> float:
         """Log predictive density of further measurements of the same columns, at the sizes found.
@@ -362,6 +430,41 @@ def infer(
         gram,
         amplitudes,
     )
+
+
+_MOST_LEVEL_STEPS = 8
+"""Steps of EM from level to level; each makes the measurements more probable, and 2 or 3 are needed."""
+
+
+def infer_levels(
+    levels: Levels,
+    amplitudes: Amplitudes,
+    fields: Sequence[Field] = (),
+    noises: Sequence[NoiseSize] = (),
+    start: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Evidence:
+    """As `infer`, for measurements whose slow errors have an unknown size: at the most probable one of each group.
+
+    Args:
+      levels: statistics of the hypothesis' columns by size. amplitudes, fields, noises, start: as for `infer`.
+
+    Raises:
+      EvidenceError: see `infer`.
+    """
+    at, best = levels.start, None
+    for _ in range(_MOST_LEVEL_STEPS):
+        found = infer(levels.gram(at), amplitudes, fields, noises, start)
+        found = dataclasses.replace(found, log_evidence=found.log_evidence + levels.log_weight(at), levels=at)
+        # sizes of discrepancy settle anew at each level, which EM knows nothing of: a step may lose a little
+        if best is not None and found.log_evidence <= best.log_evidence:
+            break
+        best = found
+        new, noise = levels.improved(found, noises)
+        if np.array_equal(new, at):
+            break
+        at, start = new, (found.tau, noise)
+    assert best is not None
+    return best
 
 
 def _newton_step(here: _At) -> np.ndarray:

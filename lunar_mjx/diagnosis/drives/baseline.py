@@ -26,6 +26,7 @@ BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
         "resistance": (0.05, 2.0),
         "torque_constant": (0.05, 2.0),
         "gear_efficiency": (0.1, 1.0),
+        "rotor_inertia": (0.1, 2.0),
         "winding_capacity": (0.2, 2.0),
         "housing_capacity": (0.2, 2.0),
         "R_th1": (0.2, 2.0),

@@ -8,80 +8,73 @@ follow it. As an Ornstein-Uhlenbeck process beside the noise it is as many as it
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.observations import with_discrepancy
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
-from lunar_mjx.inference.evidence import Amplitudes, Gram, NoiseSize, infer
+from lunar_mjx.inference.evidence import Gram, Levels
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.logs.schema import parse_name
 
 
-def chosen_errors(
-    observations: Observations,
-    whole: np.ndarray,
-    std: np.ndarray,
-    group: np.ndarray,
-    kinds: int,
-    settings: DriveSettings,
-) -> tuple[Observations, Mapping[str, float]]:
-    """Observations with the most probable errors of the channels, and these by channel, as shares of what it does.
+class ChannelErrors:
+    """Observations with each size that the slow errors of their channels may have.
 
-    The size is that of greatest evidence where all candidates and all unknown inputs are free together, so that nothing
-    which one of them explains is put down to it.
-
-    Args:
-      observations: with noise alone.
-      whole: (n, k + 1) derivatives by everything that may be the matter, SI units, and the residual beside them.
-      std: (k,) prior standard deviations. group: (n,) noise group. kinds: number of groups.
-      settings: sizes that are tried, and their prior.
+    Attributes:
+      log_scale: (levels, groups) sum of the logarithms of what whitening divides the fitted ones by.
+      log_prior: (levels,) of the sizes: half-Cauchy, for nobody knows the order of what a model leaves out
+        (Gelman 2006).
     """
-    fit = observations.in_split("fit")
-    sizes = spread(observations)
-    grams, log_det = [], []
-    tried = [with_errors(observations, sizes, size) for size in settings.errors]
-    for one in tried:
-        white = one.whiten(whole)[fit]
-        grams.append(Gram.of(white[:, :-1], white[:, -1], group[fit], kinds))
-        log_det.append(np.bincount(group[fit], one.log_widths()[fit], minlength=kinds))
-    # heavy tails, for nobody knows the order of what a model leaves out (half-Cauchy: Gelman 2006)
-    prior = -np.log1p((np.array(settings.errors) / settings.usual_error) ** 2)
-    amplitudes = Amplitudes.of(std)
-    noises = [NoiseSize(str(g), settings.stated_spread) for g in range(kinds)]
 
-    def value(levels: np.ndarray) -> float:
-        gram = Gram(grams[0].count, np.stack([grams[level].matrix[g] for g, level in enumerate(levels)]))
-        inferred = infer(gram, amplitudes, (), noises)
-        return (
-            inferred.log_evidence
-            - sum(log_det[level][g] for g, level in enumerate(levels))
-            + float(prior[levels].sum())
-        )
+    def __init__(self, observations: Observations, group: np.ndarray, kinds: int, settings: DriveSettings):
+        """Makes them.
 
-    levels = np.zeros(kinds, int)
-    best = value(levels)
-    for _ in range(3):
-        before = levels.copy()
-        for g in range(kinds):
-            for level in range(len(settings.errors)):
-                other = levels.copy()
-                other[g] = level
-                if level != levels[g] and (reached := value(other)) > best:
-                    levels, best = other, reached
-        if np.array_equal(before, levels):
-            break
-    shares = {s.channel: settings.errors[levels[group[s.start]]] for s in observations.series}
-    chosen = {c: share * sizes[c] for c, share in shares.items() if share > 0.0}
-    return with_discrepancy(observations, chosen), shares
+        Args:
+          observations: with noise alone. group: (n,) noise group of each. kinds: number of groups.
+          settings: sizes that are tried, and their prior.
+        """
+        self._observations, self._group, self._kinds = observations, group, kinds
+        self._sizes, self._spread = settings.errors, spread(observations)
+        self._fit = observations.in_split("fit")
+        self._made: dict[tuple[int, ...], Observations] = {}
+        self.log_prior = -np.log1p((np.array(settings.errors) / settings.usual_error) ** 2)
+        scales = [self.at(np.full(kinds, level)).log_widths()[self._fit] for level in range(len(self._sizes))]
+        self.log_scale = np.array([np.bincount(group[self._fit], s, minlength=kinds) for s in scales])
+        self.usual = np.full(kinds, int(np.argmin(np.abs(np.array(settings.errors) - settings.usual_error))))
 
+    def shares(self, levels: np.ndarray) -> dict[str, float]:
+        """The size of a channel's errors, as a share of what it does, at a level (groups,) of each group."""
+        return {s.channel: self._sizes[levels[self._group[s.start]]] for s in self._observations.series}
 
-def with_errors(observations: Observations, sizes: Mapping[str, float], share: float) -> Observations:
-    """Observations whose channels all err by a share of what they do."""
-    if share == 0.0:
-        return observations
-    return with_discrepancy(observations, {c: share * size for c, size in sizes.items()})
+    def at(self, levels: np.ndarray) -> Observations:
+        """The observations with errors of a level (groups,) of each group."""
+        key = tuple(int(level) for level in levels)
+        if key not in self._made:
+            chosen = {c: share * self._spread[c] for c, share in self.shares(levels).items() if share > 0.0}
+            self._made[key] = with_discrepancy(self._observations, chosen)
+        return self._made[key]
+
+    def levels(self, columns: np.ndarray, residual: np.ndarray) -> Levels:
+        """Statistics of the fitted observations at every size; the usual one is where to begin.
+
+        Args:
+          columns: (n, k) derivatives of the predictions, SI units. residual: (n,) measured less predicted.
+        """
+        return self._levels(np.column_stack([columns, residual]), range(len(self._sizes)), self.usual)
+
+    def usual_level(self, columns: np.ndarray, residual: np.ndarray) -> Levels:
+        """As `levels`, of the usual size alone."""
+        return self._levels(np.column_stack([columns, residual]), [int(self.usual[0])], np.zeros_like(self.usual))
+
+    def _levels(self, whole: np.ndarray, tried: Sequence[int], start: np.ndarray) -> Levels:
+        number, grams = self._group[self._fit], []
+        for level in tried:
+            white = self.at(np.full(self._kinds, level)).whiten(whole)[self._fit]
+            grams.append(Gram.of(white[:, :-1], white[:, -1], number, self._kinds))
+        matrix = np.stack([g.matrix for g in grams])
+        return Levels(grams[0].count, matrix, self.log_scale[list(tried)], self.log_prior[list(tried)], start)
 
 
 def spread(observations: Observations) -> dict[str, float]:

@@ -12,30 +12,48 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import linalg
 
-from lunar_mjx.diagnosis.drives.channel_errors import chosen_errors, spread, with_errors
-from lunar_mjx.diagnosis.drives.instruments import usual_kind
+from lunar_mjx.diagnosis.drives.channel_errors import ChannelErrors
+from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS, usual_kind
+from lunar_mjx.diagnosis.drives.observations import with_jitter
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.simulation.program import cores
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
-from lunar_mjx.diagnosis.unknown_inputs.port_fields import SHARES, WORDS, Usual, rotated
+from lunar_mjx.diagnosis.unknown_inputs.port_fields import SHARES, WORDS, Usual, rotation
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
 from lunar_mjx.effects.sensor.channels import family
 from lunar_mjx.inference.deadline import TimeUp
-from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
+from lunar_mjx.inference.evidence import (
+    Amplitudes,
+    Evidence,
+    EvidenceError,
+    Field,
+    Gram,
+    Levels,
+    NoiseSize,
+    infer_levels,
+)
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Refit, Term
 
 OWN_FORM = "the model"
+USUAL_EFFECTS = "effects of usual size"
+"""The field of all effects that no hypothesis names: every rover has a little of each."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DriveRefit:
     """How refits of drives are tried."""
 
-    shares: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)
-    """Shares of a step that are simulated side by side, as far as they fit into one batch."""
+    factors: tuple[float, ...] = (1.0, 10.0, 100.0, 1000.0)
+    """1; dampings of steps that are simulated side by side, over the present one, as far as they fit into one batch."""
+    damping: float = 1e-3
+    """1; least damping, over the diagonal of the normal matrix: nearly a Gauss-Newton step (Marquardt 1963)."""
+    stiffer: float = 1e3
+    """1; factor on the damping where no step gained."""
+    most_damping: float = 1e6
+    """1; damping beyond which steps are too short to tell, and slopes are taken anew."""
     together: int = 8
     """Candidates whose signatures one program simulates: fewer are faster per rover, more are fewer programs to
     make."""
@@ -90,7 +108,8 @@ class DriveForm(MeasuredForm):
             self._group[s.start : s.stop] = self.noise_names.index(name)
         self._fit = self.observations.in_split("fit")
         self._seen: np.ndarray | None = None  # (n, coordinates + inputs) derivatives at the base, SI
-        self._fields: tuple[np.ndarray, np.ndarray] | None = None
+        self._fields: tuple[np.ndarray, np.ndarray] | None = None  # (n, m) SI columns at size 1, (m,) field of each
+        self.jitter_s = USUAL_ERRORS.jitter_s
         kinds = [usual_kind(c) for c in self.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
         self._slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}
@@ -166,24 +185,44 @@ class DriveForm(MeasuredForm):
         change[~np.isfinite(change).all(axis=1)] = 0.0
         return change.T
 
-    def _field_columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened columns (n, m) of all fields at size 1, and the field (m,) of each: in common, and of every log."""
+    def _field_columns(self, observations: Observations) -> tuple[np.ndarray, np.ndarray]:
+        """Columns (n, m) of all fields at size 1, SI units, and the field (m,) of each: in common, and of every log.
+
+        They are turned so that few are left which the observations' noise does not hide.
+        """
         assert self._seen is not None
-        settings, observations = self.settings, self.observations
-        white = observations.whiten(self._seen[:, len(self.coordinates) :])
+        settings = self.settings
+        seen = self._seen[:, len(self.coordinates) :]
         common, own = math.sqrt(1.0 - settings.own_share), math.sqrt(settings.own_share)
         columns, number = [np.zeros((len(observations), 0))], [np.zeros(0, int)]
         for k in range(len(self.words)):
-            mine = white[:, self._label == k]
+            mine = seen[:, self._label == k]
             parts = [common * mine]
             for part in observations.of_log.values():
                 alone = np.zeros_like(mine)
                 alone[part] = own * mine[part]
                 parts.append(alone)
-            turned = rotated(np.column_stack(parts), settings.least_length / settings.unlisted_discrepancy)
+            whole = np.column_stack(parts)
+            turned = whole @ rotation(observations.whiten(whole), settings.least_length / settings.unlisted_discrepancy)
             columns.append(turned)
             number.append(np.full(turned.shape[1], k))
+        small = [i for own in self.candidates.values() for i in own if self.coordinates[i].amplitude]
+        whole = self._seen[:, small] * self._std[small]
+        turned = whole @ rotation(observations.whiten(whole), settings.least_length / settings.usual_effect)
+        columns.append(turned)
+        number.append(np.full(turned.shape[1], len(self.words)))
         return np.column_stack(columns), np.concatenate(number)
+
+    def _columns(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives (n, k) by all that hypotheses hold, and residuals (n,), SI units, around a place (coordinates,).
+
+        Args:
+          u: the place. free: coordinates whose derivatives (n, free) there are the `slopes`; others keep signatures.
+        """
+        assert self._seen is not None and self._fields is not None
+        seen = self._seen[:, : len(self.coordinates)].copy()
+        seen[:, free] = slopes
+        return np.column_stack([seen, self._fields[0]]), self.observations.value - self.predicted(u)
 
     def _linear(self, u: np.ndarray, effects: frozenset[str], slopes: np.ndarray) -> Linear:
         """Everything that hypotheses need around a place (coordinates,) with some effects.
@@ -191,15 +230,9 @@ class DriveForm(MeasuredForm):
         Args:
           u: the place. effects: those of the refit. slopes: (n, free) derivatives there.
         """
-        assert self._seen is not None and self._fields is not None
-        settings, count = self.settings, len(self.coordinates)
-        free, value = self._free(effects), self.predicted(u)
-        whiten = self.observations.whiten
-        columns = whiten(self._seen[:, :count])
-        columns[:, free] = whiten(slopes)
-        fields, field_of = self._fields
-        columns = np.column_stack([columns, fields])
-        residual = whiten(self.observations.value - value)
+        assert self._fields is not None
+        settings, count, field_of = self.settings, len(self.coordinates), self._fields[1]
+        columns, residual = map(self.observations.whiten, self._columns(u, self._free(effects), slopes))
         std = np.concatenate([self._std, np.ones(len(field_of))])
         low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
         at, mean = np.zeros(len(std)), np.zeros(len(std))
@@ -225,8 +258,8 @@ class DriveForm(MeasuredForm):
             at=at,
             calibration=self._instruments,
             following={},
-            fields=tuple(Field(label, settings.usual_discrepancy) for label in self.words),
-            noises=tuple(NoiseSize(name, settings.stated_spread) for name in self.noise_names),
+            fields=self._usual_fields(),
+            noises=self._noise_sizes(),
             wide=settings.unlisted_discrepancy,
             far=1.0,
         )
@@ -254,7 +287,7 @@ class DriveForm(MeasuredForm):
         self.drives.bench.deadline.until = until
 
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
-        """See `Form`; Gauss-Newton under the covariance of noise and discrepancy, by steps of a shared length.
+        """See `Form`; Levenberg-Marquardt under the covariance of noise and discrepancy.
 
         Raises:
           TimeUp: before the refit had ended; that of the model as it is counts from wherever it has come.
@@ -272,18 +305,60 @@ class DriveForm(MeasuredForm):
             u = self._prepare(free)
         slopes = self._guess(free, near)
         terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
-        u, slopes = self._descend(u, free, sizes, slopes, guessed=bool(effects))
+        u, slopes = self._descend(u, free, self.observations, sizes, slopes, guessed=bool(effects))
+        if not effects:
+            self._choose_errors(u, free, slopes)
         linear = self._linear(u, effects, slopes)
         value, found, _ = linear.evidence(terms, sizes)
         for _ in range(self.settings.most_rounds - 1):
-            before = value
-            u, slopes = self._descend(u, free, (found.tau, found.noise), slopes)
+            before, sizes = value, (found.tau, found.noise)
+            u, slopes = self._descend(u, free, self.observations, sizes, slopes)
             linear = self._linear(u, effects, slopes)
-            value, found, _ = linear.evidence(terms, (found.tau, found.noise))
+            value, found, _ = linear.evidence(terms, sizes)
             if abs(value - before) < self.settings.settled:
                 break
         self._slopes[effects] = free, slopes
         return Refit(self.name, effects, u, linear)
+
+    def _choose_errors(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> None:
+        """Takes scatter of times, then errors of channels, of the most probable size: by the model with what is usual.
+
+        Args:
+          u, free, slopes: as for `_columns`.
+        """
+        assert self._fields is not None
+        columns, residual = self._columns(u, free, slopes)
+        count, number = len(self.coordinates), self._fields[1]
+        always = np.concatenate([self.baseline, np.arange(count, columns.shape[1])]).astype(int)
+        std = np.concatenate([self._std, np.ones(len(number))])[always]
+        field = np.concatenate([np.full(count, -1), number])[always]
+        mean = np.zeros(len(always))
+        mean[: len(self.baseline)] = [self.coordinates[i].centre - u[i] for i in self.baseline]
+        prior, columns = Amplitudes(std, field, mean), columns[:, always]
+
+        def found(levels: Levels) -> Evidence:
+            return infer_levels(levels, prior, self._usual_fields(), self._noise_sizes(), self._sizes)
+
+        made = {s: self._errors_with(s) for s in self.settings.jitters_s}
+        value = {s: found(e.usual_level(columns, residual)).log_evidence for s, e in made.items()}
+        self.jitter_s = max(value, key=lambda s: value[s])
+        errors = made[self.jitter_s]
+        levels = found(errors.levels(columns, residual)).levels
+        assert levels is not None
+        self.observations, self.channel_errors = errors.at(levels), errors.shares(levels)
+
+    def _errors_with(self, jitter_s: float) -> ChannelErrors:
+        """Observations whose times scatter by so many seconds, with each size of their channels' errors."""
+        seen = with_jitter(self.drives.observations, self.drives.rate, jitter_s)
+        return ChannelErrors(seen, self._group, len(self.noise_names), self.settings)
+
+    def _usual_fields(self) -> tuple[Field, ...]:
+        """What is usual: discrepancy at every port, and a little of every effect."""
+        ports = (Field(label, self.settings.usual_discrepancy) for label in self.words)
+        return *ports, Field(USUAL_EFFECTS, self.settings.usual_effect)
+
+    def _noise_sizes(self) -> tuple[NoiseSize, ...]:
+        return tuple(NoiseSize(name, self.settings.stated_spread) for name in self.noise_names)
 
     def _guess(self, free: np.ndarray, near: Refit | None) -> np.ndarray:
         """(n, free) derivatives as far as they are known: those of a similar refit, and signatures of what is new."""
@@ -298,54 +373,47 @@ class DriveForm(MeasuredForm):
         return found.tau, found.noise
 
     def _prepare(self, free: np.ndarray) -> np.ndarray:
-        """Refits the model as it is, takes all signatures there, and chooses the size of the channels' errors.
+        """Refits the model as it is with noise and the channels' usual errors, and takes all signatures there.
 
         Returns:
-          (coordinates,) the refit, with noise alone.
+          (coordinates,) the refit.
         """
-        drives, usual = self.drives, self.settings.usual_error
-        self.observations = with_errors(drives.observations, spread(drives.observations), usual)
+        drives, usual_jitter = self.drives, USUAL_ERRORS.jitter_s
+        errors = self._errors_with(usual_jitter)
+        noisy = errors.at(errors.usual)
         # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after it,
         # and a descent that moves everything at once follows them into soil that nothing brings it back from.
         nuisances = free[[self.coordinates[i].nuisance for i in free]]
-        u, _ = self._descend(self.start, nuisances)
-        u, slopes = self._descend(u, free)
+        u, _ = self._descend(self.start, nuisances, noisy)
+        u, slopes = self._descend(u, free, noisy)
         if drives.noise_unlearnt:
             drives.learn_noise(self._whole(u))
         self._see(u)
-        value = self.predicted(u)
-        assert self._seen is not None
-        columns = self._seen.copy()
-        columns[:, free] = slopes
-        held = self.drives.observations
-        unlisted = np.full(len(self._inputs), self.settings.unlisted_discrepancy)
-        self.observations, self.channel_errors = chosen_errors(
-            held,
-            np.column_stack([columns, held.value - value]),
-            np.concatenate([self._std, unlisted]),
-            self._group,
-            len(self.noise_names),
-            self.settings,
-        )
-        self._fields = self._field_columns()
+        # what is learnt of the noise is in what the drives hold from now on
+        errors = self._errors_with(usual_jitter)
+        self.observations = errors.at(errors.usual)
+        self._fields = self._field_columns(self.observations)
         self._slopes[frozenset()] = free, slopes
-        self._sizes = np.full(len(self.words), self.settings.usual_discrepancy), np.ones(len(self.noise_names))
+        usual = [self.settings.usual_discrepancy] * len(self.words)
+        self._sizes = np.array([*usual, self.settings.usual_effect]), np.ones(len(self.noise_names))
         return u
 
     def _descend(
         self,
         u: np.ndarray,
         free: np.ndarray,
+        observations: Observations,
         sizes: tuple[np.ndarray, np.ndarray] | None = None,
         slopes: np.ndarray | None = None,
         guessed: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
         """The most probable coordinates at given sizes of discrepancy and noise, and the derivatives near them.
 
-        Gauss-Newton; derivatives serve for further steps as long as these keep what they promise.
+        Levenberg-Marquardt with bounds; derivatives serve for further steps as long as these keep what they promise.
 
         Args:
-          u: (coordinates,) where from. free: places of what moves. sizes: None for noise alone.
+          u: (coordinates,) where from. free: places of what moves. observations: with the channels' errors.
+          sizes: None for noise alone.
           slopes: (n, free) derivatives, if known. guessed: whether these are to be taken anew before the end.
 
         Raises:
@@ -358,14 +426,14 @@ class DriveForm(MeasuredForm):
         misfit = np.zeros((int(fit.sum()), 0))
         if sizes is not None and self._fields is not None:
             columns, number = self._fields
-            misfit = columns[fit] * sizes[0][number] * weight[:, None]
+            misfit = observations.whiten(columns)[fit] * sizes[0][number] * weight[:, None]
         factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
         std = self._std[free]
         centre = np.array([self.coordinates[i].centre for i in free])
         low, high = self.drives.bounds(free)
 
         def white(columns: np.ndarray) -> np.ndarray:
-            found = self.observations.whiten(columns)[fit]
+            found = observations.whiten(columns)[fit]
             return found * (weight if found.ndim == 1 else weight[:, None])
 
         def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -384,44 +452,51 @@ class DriveForm(MeasuredForm):
         residual = white(self.observations.value - value)
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
-        trial_count = min(len(DRIVE_REFIT.shares), self.drives.together)
         present_chi2 = chi2(residual, u[free])
-        for _ in range(settings.most_jacobians):
-            jacobian, first = white(slopes), present_chi2
-            normal = inner(jacobian, jacobian) + np.diag(std**-2)
-            while True:
-                downhill = inner(jacobian, residual) - (u[free] - centre) / std**2
-                step = _bounded_step(normal, downhill, u[free], low, high)
-                promised = float(2.0 * step @ downhill - step @ normal @ step)
-                if promised < settings.settled:
+        damping, trials = DRIVE_REFIT.damping, min(len(DRIVE_REFIT.factors), self.drives.together)
+        try:
+            for _ in range(settings.most_jacobians):
+                jacobian, first = white(slopes), present_chi2
+                normal = inner(jacobian, jacobian) + np.diag(std**-2)
+                while True:
+                    downhill = inner(jacobian, residual) - (u[free] - centre) / std**2
+                    whole = _bounded_step(normal, downhill, u[free], low, high)
+                    promised = _promised(whole, normal, downhill)
+                    if promised < settings.settled or damping > DRIVE_REFIT.most_damping:
+                        break
+                    dampings = damping * np.array(DRIVE_REFIT.factors[:trials])
+                    steps = [
+                        _bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], low, high)
+                        for d in dampings
+                    ]
+                    steps = [s * min(1.0, settings.longest_step / float(np.abs(s).max())) for s in steps]
+                    rows = np.repeat(u[None], trials, axis=0)
+                    rows[:, free] = np.clip(u[free] + steps, low, high)
+                    residuals = [white(self.observations.value - v) for v in self.drives.predict(self._whole(rows))]
+                    reached = [chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
+                    best = int(np.argmin(reached))
+                    gained = present_chi2 - reached[best]
+                    if not gained > 0.0:
+                        damping *= DRIVE_REFIT.stiffer
+                        continue
+                    damping = max(dampings[best], DRIVE_REFIT.damping)
+                    u, residual, present_chi2 = rows[best], residuals[best], reached[best]
+                    if gained < 0.3 * _promised(steps[best], normal, downhill):
+                        break
+                if not guessed and (promised < settings.settled or first - present_chi2 < settings.settled):
                     break
-                step *= min(1.0, settings.longest_step / float(np.abs(step).max()))
-                rows = np.repeat(u[None], trial_count, axis=0)
-                rows[:, free] = np.clip(u[free] + np.outer(DRIVE_REFIT.shares[:trial_count], step), low, high)
-                try:
-                    values = self.drives.predict(self._whole(rows))
-                except TimeUp:
-                    if not set(self.baseline) >= set(free):
-                        raise
-                    return u, slopes
-                residuals = [white(self.observations.value - v) for v in values]
-                reached = [chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
-                best = int(np.argmin(reached))
-                gained = present_chi2 - reached[best]
-                if not gained > 0.0:
-                    break
-                u, residual, present_chi2 = rows[best], residuals[best], reached[best]
-                if gained < 0.3 * promised:
-                    break
-            if not guessed and (promised < settings.settled or first - present_chi2 < settings.settled):
-                break
-            try:
+                # slopes that are new earn new trust
+                damping = min(damping, 1.0)
                 slopes, guessed = self.jacobian(u, free)[1], False
-            except TimeUp:
-                if not set(self.baseline) >= set(free):
-                    raise
-                return u, slopes
+        except TimeUp:
+            if not set(self.baseline) >= set(free):
+                raise
         return u, slopes
+
+
+def _promised(step: np.ndarray, normal: np.ndarray, downhill: np.ndarray) -> float:
+    """Decrease of chi-square that the linear model promises of a step."""
+    return float(2.0 * step @ downhill - step @ normal @ step)
 
 
 def held_out_pieces(observations: Observations, seconds: float) -> dict[str, np.ndarray]:

@@ -34,6 +34,8 @@ class UsualErrors:
     """A mounting less well known than this is no small angle: its axis tells nothing, and has no nuisance."""
     usual_clock_s: float = 0.005
     """Usual error between the clocks of kinds of channels, s: a quarter of a sampling interval of 50 Hz."""
+    jitter_s: float = 0.005
+    """Usual scatter of the times of single readings and commands, s: a period of a control loop of 200 Hz."""
     usual_scale: float = 0.01
     """Usual error of the scale of inertial sensors, currents, voltages and torques."""
 
@@ -74,19 +76,22 @@ def is_instrument(c: Coordinate) -> bool:
     return c.nuisance and c.name.startswith((CLOCK, MOUNTING, USUAL))
 
 
-def instrument_direction(c: Coordinate, log: Log, observations: Observations, predicted: np.ndarray) -> np.ndarray:
+def instrument_direction(
+    c: Coordinate, log: Log, observations: Observations, predicted: np.ndarray, rate: np.ndarray
+) -> np.ndarray:
     """(n,) what one unit (s, rad) of such a nuisance adds to the predictions.
 
     Args:
-      c: the nuisance. log: that it belongs to. observations: of the campaign. predicted: (n,) by the model as given.
+      c: the nuisance. log: that it belongs to. observations: of the campaign.
+      predicted: (n,) by the model as given. rate: (n,) its change by time, per second.
     """
     out = np.zeros(len(observations))
     series = [s for s in observations.series if s.log == c.log_index]
     if c.name.startswith(CLOCK):
         table = log.tables[c.name.removeprefix(CLOCK)]
         for s in series:
-            if s.channel in table.channels and s.time is not None and len(s.time) > 2:
-                out[s.start : s.stop] = np.gradient(predicted[s.start : s.stop], s.time)
+            if s.channel in table.channels:
+                out[s.start : s.stop] = rate[s.start : s.stop]
         return out
     axis = "xyz".index(c.name.removeprefix(MOUNTING))
     for s in series:
@@ -117,7 +122,7 @@ def _turned(kind: str, one: Series, series: list[Series], log: Log, axis: int, p
 
 def usual_nuisances(observations: Observations) -> list[Coordinate]:
     """Coordinates of what instruments get wrong as much as is usual, in units of that, shared by all logs."""
-    names = usual_errors(observations, observations.value)
+    names = usual_errors(observations, observations.value, np.zeros(len(observations)))
     return [
         Coordinate(NUISANCE, USUAL + name, 0.0, 1.0, -USUAL_ERRORS.farthest, USUAL_ERRORS.farthest, prior=1.0)
         for name in names
@@ -129,11 +134,13 @@ def usual_kind(c: Coordinate) -> str:
     return c.name.removeprefix(USUAL).partition(": ")[0] if c.nuisance and c.name.startswith(USUAL) else ""
 
 
-def usual_errors(observations: Observations, predicted: np.ndarray) -> dict[str, np.ndarray]:
+def usual_errors(observations: Observations, predicted: np.ndarray, rate: np.ndarray) -> dict[str, np.ndarray]:
     """What instruments add that err as much as is usual, the same in all logs.
 
     Args:
       observations: of the campaign. predicted: (n,) by the model.
+      rate: (n,) its change by time, per second. From one sample of 20 Hz to the next a wheel has reached its command:
+        differences of `predicted` would not tell it.
 
     Returns:
       (n,) by "kind of instrument: error", in the channels' units.
@@ -151,6 +158,5 @@ def usual_errors(observations: Observations, predicted: np.ndarray) -> dict[str,
             kind = word if word in USUAL_ZERO else f"{word} {s.channel.rpartition('_')[2]}"
             add(f"{kind}: scale", part, USUAL_ERRORS.usual_scale * predicted[part])
         if s.time is not None and s.stop - s.start > 2:
-            late = USUAL_ERRORS.usual_clock_s * np.gradient(predicted[part], np.asarray(s.time))
-            add(f"clock {family(s.channel) or word}: late", part, late)
+            add(f"clock {family(s.channel) or word}: late", part, -USUAL_ERRORS.usual_clock_s * rate[part])
     return columns

@@ -94,3 +94,16 @@ def with_discrepancy(observations: Observations, discrepancy: Mapping[str, float
         return dataclasses.replace(s, coloured=float(np.hypot(s.coloured, added)), correlation_time=time)
 
     return dataclasses.replace(observations, series=tuple(map(widened, observations.series)))
+
+
+def with_jitter(observations: Observations, rate: np.ndarray, jitter_s: float) -> Observations:
+    """Observations whose white noise holds what times that scatter make of signals that change.
+
+    Args:
+      observations: of drives. rate: (n,) change by time, per second. jitter_s: standard deviation of the times.
+    """
+
+    def widened(s: Series) -> Series:
+        return dataclasses.replace(s, white=np.hypot(s.white, jitter_s * rate[s.start : s.stop]))
+
+    return dataclasses.replace(observations, series=tuple(map(widened, observations.series)))

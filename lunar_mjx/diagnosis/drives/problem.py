@@ -6,6 +6,7 @@ one batch, so that a Jacobian costs no program of its own (`jacfwd` through the 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -104,6 +105,7 @@ class DriveProblem:
         coordinates = baseline_coordinates(model, baseline)
         self._noises = Noises(self.logs)
         self._noise_alone = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
+        self._rate: np.ndarray | None = None
         self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
         self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self._noise_alone.series)
         shows = self._standing_shows()
@@ -213,11 +215,36 @@ class DriveProblem:
         if c.key not in self._instruments:
             predicted = self._simulations(self.bench, self.origin()[None], silent)[0]
             if c.name.startswith(USUAL):
-                direction = usual_errors(self.observations, predicted)[c.name.removeprefix(USUAL)]
+                direction = usual_errors(self.observations, predicted, self.rate)[c.name.removeprefix(USUAL)]
             else:
-                direction = instrument_direction(c, self.logs[c.log_index], self.observations, predicted)
+                log = self.logs[c.log_index]
+                direction = instrument_direction(c, log, self.observations, predicted, self.rate)
             self._instruments[c.key] = np.where(np.isfinite(direction), direction, 0.0)
         return self._instruments[c.key]
+
+    @property
+    def rate(self) -> np.ndarray:
+        """(n,) change by time of what the model as given predicts, per second, over a simulated sample each way."""
+        if self._rate is None:
+            found = self._rate_as_given()
+            self._rate = np.where(np.isfinite(found), found, 0.0)
+        return self._rate
+
+    def _rate_as_given(self) -> np.ndarray:
+        sides = []
+        interval = [run.every * run.model.timestep for run in self.bench.runs]
+        for side in (-1.0, 1.0):
+            series = [
+                dataclasses.replace(s, time=np.asarray(s.time) + side * interval[s.log])
+                for s in self.observations.series
+            ]
+            at = dataclasses.replace(self.observations, series=tuple(series))
+            simulated = self._run(self.bench, 1, self._values(self.origin()[None]), silent, at)
+            sides.append(from_first(simulated, self.observations)[0])
+        apart = np.empty(len(self.observations))
+        for s in self.observations.series:
+            apart[s.start : s.stop] = 2.0 * interval[s.log]
+        return (sides[1] - sides[0]) / apart
 
     @property
     def step_error(self) -> np.ndarray:
@@ -248,10 +275,12 @@ class DriveProblem:
                 known_rows[k] = row
         return np.stack([known_rows[k] for k in keys])
 
-    def _run(self, bench: Bench, rows: int, values: Rows, progress: Progress) -> np.ndarray:
-        """(rows, n) what a bench simulates."""
+    def _run(
+        self, bench: Bench, rows: int, values: Rows, progress: Progress, at: Observations | None = None
+    ) -> np.ndarray:
+        """(rows, n) what a bench simulates, at the times of other observations if these are given."""
         out = np.full((rows, len(self.observations)), np.nan)
-        for number, k, sampled in bench.run(rows, values, self.observations, progress):
+        for number, k, sampled in bench.run(rows, values, self.observations if at is None else at, progress):
             out[k, self._of_log(number)] = sampled
         return out
 

@@ -88,8 +88,8 @@ class Usual:
         return SHARES.get(label, 1.0) * amounts.get(label, 1.0) * follows
 
 
-def rotated(columns: np.ndarray, least: float) -> np.ndarray:
-    """Columns (n, m) turned so that few (n, k) are left: those at least `least` long."""
+def rotation(columns: np.ndarray, least: float) -> np.ndarray:
+    """What turns columns (n, m) so that few are left, (m, k): those at least `least` long."""
     values, vectors = np.linalg.eigh(columns.T @ columns)
     # squared lengths along principal axes; an axis shorter than that cannot be told from noise
-    return columns @ vectors[:, values > least**2]
+    return vectors[:, values > least**2]

@@ -208,7 +208,8 @@ def _discrepancy(
 ) -> dict[str, dict[str, Any]]:
     """Size of every field of which the data can tell something."""
     found = {}
-    for (field, words), size, spread in zip(form.words.items(), tau, log_std, strict=True):
+    # sizes of fields without words, such as that of effects of usual size, come last
+    for (field, words), size, spread in zip(form.words.items(), tau, log_std, strict=False):
         if felt[field] < least_signal:
             continue  # its size would be the prior's, told as if it had been measured
         size = size * form.shares.get(field, 1.0)

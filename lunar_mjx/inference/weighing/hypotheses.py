@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lunar_mjx.inference.evidence import Amplitudes, Evidence, Field, Gram, NoiseSize, infer
+from lunar_mjx.inference.evidence import Amplitudes, Evidence, Field, Gram, NoiseSize, infer, moved
 
 EFFECT, UNLISTED, CALIBRATION = "effect", "unlisted", "calibration"
 
@@ -149,9 +149,7 @@ class Linear:
 
 def shifted(gram: Gram, amounts: np.ndarray) -> Gram:
     """Statistics after the model's amplitudes have been moved by (k,) amounts: residual less columns times amounts."""
-    change = np.eye(gram.width + 1)
-    change[:-1, -1] = -amounts
-    return Gram(gram.count, change.T @ gram.matrix @ change)
+    return Gram(gram.count, moved(gram.matrix, amounts))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

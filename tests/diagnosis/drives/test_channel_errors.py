@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lunar_mjx.diagnosis.drives.channel_errors import chosen_errors
+from lunar_mjx.diagnosis.drives.channel_errors import ChannelErrors
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.inference.evidence import Amplitudes, Evidence, NoiseSize, infer_levels
 from tests.inference.toy_problem import manoeuvres
 
 LOGS, SAMPLES, NOISE = 4, 300, 0.01
@@ -28,31 +29,44 @@ def _slow(rng, share):
     return share * SPREAD * out
 
 
+def _found(residual: np.ndarray, columns: np.ndarray, std: np.ndarray) -> tuple[Evidence, float]:
+    """What a hypothesis with some columns finds, and the share of what the channel does that its errors have."""
+    observations = dataclasses.replace(manoeuvres(LOGS, SAMPLES, white=NOISE), value=SIGNAL)
+    errors = ChannelErrors(observations, np.zeros(len(SIGNAL), int), 1, DriveSettings())
+    levels = errors.levels(columns, residual)
+    found = infer_levels(levels, Amplitudes.of(std), (), [NoiseSize("y", 0.3)])
+    assert found.levels is not None
+    return found, errors.shares(found.levels)["y"]
+
+
 @pytest.mark.parametrize(
     ("share", "amount", "low", "high"),
     [(0.0, 0.0, 0.0, 0.0), (0.03, 0.0, 0.01, 0.1), (0.0, 0.2, 0.0, 0.0), (0.03, 0.2, 0.01, 0.1)],
 )
-def test_the_size_is_found_and_nothing_that_a_candidate_explains_is_put_down_to_it(share, amount, low, high):
+def test_who_has_the_right_effect_puts_nothing_that_it_explains_down_to_slow_errors(share, amount, low, high):
     rng = np.random.default_rng(2)
-    observations = dataclasses.replace(manoeuvres(LOGS, SAMPLES, white=NOISE), value=SIGNAL)
     residual = amount * EFFECT + _slow(rng, share) + NOISE * rng.standard_normal(len(SIGNAL))
-    whole = np.column_stack([BASE, EFFECT, residual])
-    found, shares = chosen_errors(
-        observations, whole, np.array([2.0, 1.0]), np.zeros(len(SIGNAL), int), 1, DriveSettings()
-    )
-    assert low <= shares["y"] <= high
-    assert (found.series[0].coloured > 0.0) == (share > 0.0)
+    found, errs = _found(residual, np.column_stack([BASE, EFFECT]), np.array([2.0, 1.0]))
+    assert low <= errs <= high
+    assert found.mean[1] == pytest.approx(amount, abs=0.05)
 
 
-def test_a_wrong_candidate_explains_no_slow_error():
-    """With white noise alone some amount of the effect would be sure; beside slow errors it is not."""
+def test_who_lacks_an_effect_has_larger_errors_and_is_less_probable():
+    rng = np.random.default_rng(4)
+    residual = 0.2 * EFFECT + NOISE * rng.standard_normal(len(SIGNAL))
+    right, none = _found(residual, np.column_stack([BASE, EFFECT]), np.array([2.0, 1.0]))
+    wrong, some = _found(residual, BASE[:, None], np.array([2.0]))
+    assert (none, some > 0.03) == (0.0, True)
+    assert right.log_evidence > wrong.log_evidence + 100.0
+
+
+def test_a_wrong_candidate_gains_nothing_from_slow_errors():
+    """With the size of a model that leaves no errors, it would be named; with the size that each finds, it is not."""
     rng = np.random.default_rng(3)
-    observations = dataclasses.replace(manoeuvres(LOGS, SAMPLES, white=NOISE), value=SIGNAL)
     residual = _slow(rng, 0.03) + NOISE * rng.standard_normal(len(SIGNAL))
-    whole = np.column_stack([BASE, EFFECT, residual])
-    found, _ = chosen_errors(observations, whole, np.ones(2), np.zeros(len(SIGNAL), int), 1, DriveSettings())
-    sigma = {}
-    for name, one in (("white", observations), ("slow", found)):
-        column, left = one.whiten(EFFECT), one.whiten(residual)
-        sigma[name] = abs(column @ left) / np.linalg.norm(column)
-    assert sigma["white"] > 5.0 > 3.0 > sigma["slow"]
+    with_it, _ = _found(residual, np.column_stack([BASE, EFFECT]), np.ones(2))
+    without, _ = _found(residual, BASE[:, None], np.ones(1))
+    assert with_it.log_evidence - without.log_evidence < 1.0
+    plain = dataclasses.replace(manoeuvres(LOGS, SAMPLES, white=NOISE), value=SIGNAL)
+    column, left = plain.whiten(EFFECT), plain.whiten(residual)
+    assert abs(column @ left) / np.linalg.norm(column) > 5.0, "white noise alone would make it sure"

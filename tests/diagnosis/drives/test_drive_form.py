@@ -11,7 +11,7 @@ from lunar_mjx.diagnosis.drives import form as module
 from lunar_mjx.diagnosis.drives.form import DriveForm, _bounded_step
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
-from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotated
+from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotation
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import _held_to_account, _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
@@ -39,6 +39,7 @@ class Toy:
         self.candidates = {c.effect: np.array([2 + k]) for k, c in enumerate(shown)}
         self.inputs = {LABEL: np.arange(5, len(self.coordinates))}
         self.rows = 0
+        self.rate = np.zeros(LOGS * SAMPLES)
         u = np.zeros(len(self.coordinates))
         for c, value in truth.items():
             u[[x.effect if x.amplitude else x.name for x in self.coordinates].index(c)] = value
@@ -141,7 +142,7 @@ def test_a_step_ends_at_a_bound_and_the_others_do_their_best():
 
 def test_columns_are_turned_so_that_few_are_left():
     columns = RNG.standard_normal((50, 2)) @ RNG.standard_normal((2, 6))
-    turned = rotated(columns, 1e-6)
+    turned = columns @ rotation(columns, 1e-6)
     assert turned.shape == (50, 2)
     np.testing.assert_allclose(turned @ turned.T, columns @ columns.T, atol=1e-8)
 
@@ -218,3 +219,13 @@ def test_a_deadline_ends_what_needs_longer():
         Deadline(60.0).check(61.0)
     with pytest.raises(TimeUp):
         Deadline(-1e-3).check()
+
+
+def test_a_little_of_everything_is_no_name():
+    """Every rover has some of each effect; sixty sigma of it are explained and not named, however few the logs."""
+    toy = Toy({"a": 0.4, "drag": 0.06, "lag": 0.05})
+    _, found, said = asked(toy)
+    assert said.verdict is Verdict.NOISE_ONLY, said.sentence
+    base = found.base("the model")
+    (field,) = [i for i, f in enumerate(base.refit.linear.fields) if f.name == module.USUAL_EFFECTS]
+    assert 0.01 < base.evidence.tau[field] < 0.3

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS, USUAL_ZERO, usual_errors, usual_kind, usual_nuisances
+from lunar_mjx.diagnosis.drives.observations import with_jitter
 from tests.inference.toy_problem import manoeuvres
 
 
@@ -19,7 +20,7 @@ def test_each_kind_of_instrument_errs_in_its_own_way():
     )
     observations = dataclasses.replace(seen, series=series)
     rise = np.tile(np.arange(50) * 0.02, 4) * np.repeat([1.0, 2.0, 3.0, 4.0], 50)
-    found = usual_errors(observations, rise)
+    found = usual_errors(observations, rise, np.repeat([1.0, 2.0, 3.0, 4.0], 50))
     kinds = [usual_kind(c) for c in usual_nuisances(observations)]
     assert len(kinds) == len(found)
     assert set(kinds) == {"gyro", "motor A", "clock imu", "clock electrical", "clock odometry"}
@@ -30,5 +31,17 @@ def test_each_kind_of_instrument_errs_in_its_own_way():
     current = found["motor A: scale"]
     np.testing.assert_allclose(current[50:150], USUAL_ERRORS.usual_scale * rise[50:150])  # one scale of all motors
     np.testing.assert_allclose(
-        found["clock electrical: late"], USUAL_ERRORS.usual_clock_s * np.repeat([0.0, 2.0, 3.0, 0.0], 50)
+        found["clock electrical: late"], -USUAL_ERRORS.usual_clock_s * np.repeat([0.0, 2.0, 3.0, 0.0], 50)
     )
+
+
+def test_times_that_scatter_count_where_a_signal_changes():
+    observations = manoeuvres(2, 100, white=0.01)
+    rate = np.zeros(200)
+    rate[40:45] = 8.0
+    rng = np.random.default_rng(5)
+    seen = with_jitter(observations, rate, 0.005)
+    error = rate * 0.005 * rng.standard_normal(200) + 0.01 * rng.standard_normal(200)
+    weighed, taken_for_noise = (np.sqrt(np.mean(o.whiten(error)[40:45] ** 2)) for o in (seen, observations))
+    assert weighed < 2.0 < taken_for_noise
+    np.testing.assert_array_equal(seen.whiten(error)[50:], observations.whiten(error)[50:])
