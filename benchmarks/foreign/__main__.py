@@ -94,7 +94,7 @@ def campaign(folder: Path, which: str, seed: int | None) -> dict[str, Any]:
         return about
     head, dirty = commit()
     if which == "report" and seed is None and not head:
-        raise SystemExit("The report set is drawn from the commit, and there is no git here: set FOREIGN_COMMIT to it.")
+        raise SystemExit("The report set is drawn from the commit, and git tells none: set LUNAR_MJX_COMMIT to it.")
     drawn = TUNE_SEED if which == "tune" else int.from_bytes(hashlib.sha256(head.encode()).digest()[:6], "big")
     about = {
         "set": which,

@@ -19,31 +19,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.provenance import checkout as commit
+
 ROOT = Path(__file__).resolve().parents[2]
 RESULT = "result.json"
 CASES_PER_WORKER = 40
 """A worker is replaced after so many cases, so that what it keeps in memory stays bounded."""
-
-
-def commit() -> tuple[str, bool]:
-    """The commit of this checkout and whether tracked files of tool or bench differ from it; "" without git.
-
-    FOREIGN_COMMIT, where it is set, is the commit of a copy that has no history of its own.
-    """
-    if told := os.environ.get("FOREIGN_COMMIT"):
-        return told, False
-    try:
-        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True)
-        changed = subprocess.run(
-            ["git", "status", "--porcelain", "--", "lunar_mjx", "benchmarks/foreign"],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "", False
-    return head.stdout.strip(), bool(changed.stdout.strip())
 
 
 class _Worker:
