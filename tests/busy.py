@@ -1,11 +1,13 @@
 """Runs the fast suite in a machine without idle time: pairs of processors, each shared with eight busy processes.
 
-    python -m tests.busy [--runs 3] [--busy 8] [--pairs N] [--seed 0] [--out build/busy.json] [-- PYTEST ARGUMENTS]
+    python -m tests.busy [--runs 3] [--busy 8] [--workers 2] [--pairs N] [--seed 0] [--out build/busy.json]
+                         [-- PYTEST ARGUMENTS]
 
 Two test processes are bound to each pair of processors, as `make test` has two on a machine of two. The busy ones are
 bound to the same pair, so that each test process gets about a fifth of a processor. More pairs share the files, and
-make it faster, not easier. Each run has a random order of its own, from `--seed` on. `--out` gets the runs: what
-passed, failed and was skipped with the reasons, seconds, and the share of the processors that the busy processes took.
+make it faster, not easier. With more `--workers` each gets less, and the whole is sooner done.
+Each run has a random order of its own, from `--seed` on. `--out` gets the runs: what passed, failed and was skipped
+with the reasons, seconds, and the share of the processors that the busy processes took.
 The exit status is 1 if a test failed or none passed. Linux alone binds processes.
 """
 
@@ -30,9 +32,9 @@ from tests import proofs
 
 ROOT = proofs.ROOT
 WORKERS = 2
-"""Test processes per pair of processors."""
-PAIRS = "LUNAR_MJX_BUSY_PAIRS"
-"""The environment variable that tells test processes their pairs: 0,1;2,3;..."""
+"""Test processes per pair of processors, if not told otherwise: as `make test` has."""
+PAIRS, PER_PAIR = "LUNAR_MJX_BUSY_PAIRS", "LUNAR_MJX_BUSY_WORKERS"
+"""Environment variables that tell test processes their pairs (0,1;2,3;...), and how many share one."""
 SPIN = "while True: pass"
 FAST_COMPILE = {
     "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
@@ -46,9 +48,9 @@ def pairs_of(processors: Sequence[int]) -> list[tuple[int, int]]:
     return list(zip(processors[::2], processors[1::2], strict=False))
 
 
-def pair_of(worker: str, pairs: Sequence[tuple[int, int]]) -> tuple[int, int]:
+def pair_of(worker: str, pairs: Sequence[tuple[int, int]], workers: int = WORKERS) -> tuple[int, int]:
     """The pair of a test process named gw0, gw1, ...: as many on each."""
-    return pairs[int(worker.removeprefix("gw")) // WORKERS % len(pairs)]
+    return pairs[int(worker.removeprefix("gw")) // workers % len(pairs)]
 
 
 def pytest_configure(config: Any) -> None:
@@ -56,7 +58,7 @@ def pytest_configure(config: Any) -> None:
     if hasattr(config, "workerinput"):
         os.environ.pop("PYTEST_PLUGINS", None)  # no concern of the processes that tests start
         pairs = [tuple(map(int, pair.split(","))) for pair in os.environ[PAIRS].split(";")]
-        os.sched_setaffinity(0, pair_of(config.workerinput["workerid"], pairs))
+        os.sched_setaffinity(0, pair_of(config.workerinput["workerid"], pairs, int(os.environ[PER_PAIR])))
 
 
 def outcome(report: Path) -> dict[str, Any]:
@@ -77,8 +79,10 @@ def outcome(report: Path) -> dict[str, Any]:
     }
 
 
-def run_once(pairs: Sequence[tuple[int, int]], busy: int, seed: int, more: Sequence[str]) -> dict[str, Any]:
-    """Runs the suite once beside `busy` busy processes on each pair; returns what it came to."""
+def run_once(
+    pairs: Sequence[tuple[int, int]], busy: int, seed: int, more: Sequence[str], workers: int = WORKERS
+) -> dict[str, Any]:
+    """Runs the suite once, `workers` test processes beside `busy` busy ones on each pair; returns what it came to."""
     report = ROOT / "build" / f"busy-{seed}.xml"
     report.parent.mkdir(exist_ok=True)
     report.unlink(missing_ok=True)
@@ -89,7 +93,7 @@ def run_once(pairs: Sequence[tuple[int, int]], busy: int, seed: int, more: Seque
         for _ in range(busy):
             spinning.append(subprocess.Popen([sys.executable, "-S", "-c", SPIN]))
             os.sched_setaffinity(spinning[-1].pid, pair)
-    line = [sys.executable, "-m", "pytest", "-q", "-n", str(WORKERS * len(pairs)), "--dist", "loadfile"]
+    line = [sys.executable, "-m", "pytest", "-q", "-n", str(workers * len(pairs)), "--dist", "loadfile"]
     line += ["-m", "not slow", "-p", "no:cacheprovider"]
     line += [f"--randomly-seed={seed}", f"--junit-xml={report}", *more]
     environment = {
@@ -97,6 +101,7 @@ def run_once(pairs: Sequence[tuple[int, int]], busy: int, seed: int, more: Seque
         **FAST_COMPILE,
         "PYTEST_PLUGINS": "tests.busy",
         PAIRS: ";".join(f"{a},{b}" for a, b in pairs),
+        PER_PAIR: str(workers),
     }
     try:
         status = subprocess.run(line, cwd=ROOT, env=environment, check=False).returncode
@@ -125,6 +130,7 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--busy", type=int, default=8, help="busy processes on each pair of processors")
+    parser.add_argument("--workers", type=int, default=WORKERS, help="test processes on each pair of processors")
     parser.add_argument("--pairs", type=int, help="pairs of processors; all that there are if left out")
     parser.add_argument("--seed", type=int, default=0, help="of the first order; each run has the next one")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "busy.json")
@@ -140,10 +146,11 @@ def main() -> int:
         "jax": importlib.metadata.version("jax"),
         "pairs_of_processors": len(pairs),
         "busy_processes_on_each_pair": args.busy,
+        "test_processes_on_each_pair": args.workers,
         "runs": [],
     }
     for seed in range(args.seed, args.seed + args.runs):
-        found["runs"].append(run_once(pairs, args.busy, seed, args.more))
+        found["runs"].append(run_once(pairs, args.busy, seed, args.more, args.workers))
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(found, indent=1))
