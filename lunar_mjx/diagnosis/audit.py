@@ -105,6 +105,7 @@ def audit(folder: str | Path | Run, seconds: float, progress: Progress = silent)
         # numbered on from the stored ones, so that no case is drawn twice
         cases.append(one(len(cases)))
         summary = _summary(cases)
+        # After each case, so that an audit that is broken off keeps what it has found.
         run.save(AUDIT_FILE, {"key": key, "version": __version__, **summary.to_dict()})
     return _summary(cases)
 
@@ -115,6 +116,7 @@ def _key(run: Run) -> str:
     for log in run.logs:
         digest.update(folder_hash(log).encode())
     digest.update(repr((run.candidates, sorted(run.splits.items()), sorted(run.discrepancy.items()))).encode())
+    # Another version is another method: its cases must not be counted into the same rates.
     digest.update(repr((__version__, run.seed, sorted(run.settings.items()))).encode())
     return digest.hexdigest()
 
@@ -132,6 +134,7 @@ def _sizes(form: DriveForm, base: Refit) -> dict[str, float]:
 
 
 def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, seed: int) -> dict[str, Any]:
+    # Seeded by its number, a case is the same whichever call of the audit comes to it.
     rng = np.random.default_rng([seed, number])
     truth, u, amount = NULL, base.u.copy(), 0.0
     if number % 2 and sizes:
@@ -141,6 +144,7 @@ def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, se
         places = [i for i in form.candidates[truth] if form.coordinates[i].amplitude]
         low, high = form.drives.bounds(np.array(places))
         sign = rng.choice([-1.0, 1.0], size=len(places))
+        # An amplitude that its bounds keep to one side takes that side, whatever the coin says.
         u[places] = np.clip(np.where((sign > 0.0) & (high > 0.0) | (low >= 0.0), amount, -amount), low, high)
     clean = form.predicted(u)
     case: dict[str, Any] = {"truth": truth, "amount": amount}
@@ -151,6 +155,7 @@ def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, se
     try:
         model_search = search([drawn], settings.most_refits, settings.most_terms, settings.window)
     except EvidenceError:
+        # A failed solver is an answer that users get, too: it is counted and not drawn again.
         return {
             **case,
             "verdict": Verdict.BAD_FIT.label,
@@ -197,6 +202,7 @@ def _outcome(truth: str, verdict: Verdict, effects: tuple[str, ...]) -> str:
         return "in its class"
     if verdict is Verdict.NOISE_ONLY:
         return "missed"
+    # Several effects named where one acts are wrong, even if that one is among them.
     return "unknown" if verdict is Verdict.UNKNOWN else "wrongly named"
 
 
@@ -204,6 +210,7 @@ def wilson(count: int, of: int, z: float = 1.96) -> tuple[float, float]:
     """Wilson's 95 % interval of a rate (Wilson 1927)."""
     if of == 0:
         return 0.0, 1.0
+    # The normal interval has no width at 0 of n, which is the very count that is hoped for.
     p = count / of
     middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
     half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
@@ -211,6 +218,7 @@ def wilson(count: int, of: int, z: float = 1.96) -> tuple[float, float]:
 
 
 def _summary(cases: list[dict[str, Any]]) -> Audit:
+    # A log that could not be simulated was never diagnosed: it says nothing for or against the method.
     used = [c for c in cases if c["outcome"] != "diverged"]
     nulls = [c for c in used if c["truth"] == NULL]
     singles = [c for c in used if c["truth"] != NULL]

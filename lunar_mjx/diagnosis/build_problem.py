@@ -105,4 +105,5 @@ def table_problem(run: Run, logs: Sequence[SteadyLog], candidates: Mapping[str, 
 
 def _single(values: Mapping[str, Any]) -> dict[str, float]:
     """One value per parameter: the first where a model has one per wheel or joint."""
+    # A test bed holds one wheel, and its tables do not say which one of the rover's it is.
     return {k: float(v[0]) if isinstance(v, tuple | list) else v for k, v in values.items()}

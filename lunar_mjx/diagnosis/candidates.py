@@ -25,6 +25,7 @@ def usable(
         needed = ", ".join(n for n in effect.requires if n not in present and n not in candidates)
         reason = unfit(name, effect) or (f"would replace {replaced}" if replaced else "")
         reason = reason or (f"needs {needed}, which the model lacks" if needed else "")
+        # Without a null there is no place in the joint model at which the effect is absent.
         if not reason and all(p.null is None for p in effect.parameters.values()):
             reason = "has no null value"
         if reason:

@@ -30,6 +30,7 @@ def fitted_model(
             continue
         value = float(c.value(u[i]))
         old = model.parameters[c.effect][c.name]
+        # A factor keeps the differences between wheels that the model holds; a plain value is one for all of them.
         if c.factor:
             new: Any = tuple(v * value for v in old) if isinstance(old, tuple) else float(old) * value
         else:

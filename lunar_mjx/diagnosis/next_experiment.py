@@ -179,6 +179,7 @@ class _Knowledge:
         own = np.array([form.coordinates[i].nuisance for i in free])
         self.keys = [form.coordinates[i].key for i, mine in zip(free, own, strict=True) if not mine]
         across = hessian[np.ix_(~own, own)]
+        # Offsets and starts of the earlier logs are integrated out (Schur's complement): a new log has its own.
         inner = np.linalg.pinv(hessian[np.ix_(own, own)], hermitian=True)
         self.precision = hessian[np.ix_(~own, ~own)] - across @ inner @ across.T
 
@@ -211,6 +212,7 @@ def _rank(
             (a, b): min(_left(problem, known, white[i, keep] - white[k, keep], j, free, effects, n) for n in (a, b))
             for (i, a), (k, b) in itertools.combinations(enumerate(names), 2)
         }
+        # A plan is worth what it does for the pair that it tells apart least.
         worst = min(pairs, key=lambda p: pairs[p])
         ranked.append(Plan(name, text, float(np.sqrt(max(pairs[worst], 0.0))), worst))
     return sorted(ranked, key=lambda p: -p.separation)
@@ -233,6 +235,7 @@ def _left(
     index = {key: k for k, key in enumerate(known.keys)}
     shared = [k for k, i in enumerate(places) if problem.coordinates[i].key in index]
     at = [index[problem.coordinates[places[k]].key] for k in shared]
+    # In place of the prior and not beside it: what earlier logs know holds the prior already.
     precision[np.ix_(shared, shared)] = known.precision[np.ix_(at, at)]
     downhill = columns.T @ difference
     return float(

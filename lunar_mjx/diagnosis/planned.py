@@ -53,6 +53,7 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
         except UserError:
             continue  # not a manoeuvre for this rover
         time = moves.interval * np.arange(len(moves.values))
+        # The best instrumented drive: what was measured once can be measured again.
         template = max(logs, key=lambda log: len(log.channel_names))
         ambient = template.environment.get("ambient_temperature_degC")
         environment = {"ambient_temperature_degC": ambient} if isinstance(ambient, float | int) else {}
@@ -105,6 +106,7 @@ def planned_sweeps(logs: Sequence[SteadyLog]) -> list[tuple[str, str, SteadyLog]
     table = average(template.table)
     load = float(np.median(table.test["normal_load_N"]))
     sigma = {q: s for q in table.measured if (s := _sigma(template, table, q)) > 0.0}
+    # What was never measured has no noise yet: force sensors are taken to be alike, and torque is force times radius.
     reference = sigma.get("drawbar_pull", sigma.get("side_force", 0.01 * load))
     typical = {
         "drawbar_pull": reference,
@@ -151,6 +153,7 @@ def _sweep(template: SteadyLog, name: str, angle: float, load: float, sigma: dic
         template.table,
         name=name,
         test={"slip_ratio": SLIPS, "slip_angle_deg": np.full(count, angle), "normal_load_N": np.full(count, load)},
+        # No values: a plan is judged by predictions and noise alone.
         measured={q: np.zeros(count) for q in sigma},
         replicates=np.ones(count, int),
         sigma={},

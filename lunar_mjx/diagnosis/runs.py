@@ -177,7 +177,9 @@ def folder_hash(path: Path) -> str:
     digest = hashlib.sha256()
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
     for file in files:
+        # Relative names with forward slashes: a log that is moved, or read on another system, stays the same log.
         digest.update(file.relative_to(path).as_posix().encode() if path.is_dir() else file.name.encode())
+        # The digest of each file has one length, so that no byte can pass from one file's end to the next one's name.
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 

@@ -219,6 +219,7 @@ class _Watch:
             number=self.count,
             onset_s=self.seen[change.onset],
             first_s=self.seen[change.first],
+            # Windows are known by their beginning, and what began may have begun anywhere within the last one.
             last_s=self.seen[change.last] + length,
             raised_s=self.seen[change.seen] + length + CUTTING.levelling_s,
             differences={k: p for k, p in change.kinds.items() if p >= 0.01},

@@ -76,10 +76,13 @@ def _step(residual: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.nda
     if damping:
         matrix = np.vstack([matrix, np.sqrt(damping) * np.eye(len(size))])
         right_side = np.concatenate([right_side, np.zeros(len(size))])
+    # The free solution is the bounded one wherever it lies inside, and costs one solve.
     step = np.linalg.lstsq(matrix, right_side, rcond=None)[0]
+    # SciPy refuses bounds that coincide.
     room = 1e-12
     if np.any(step * size < low) or np.any(step * size > high):
         step = optimize.lsq_linear(matrix, right_side, ((low - room) / size, (high + room) / size), "bvls").x
+    # The room above, and rounding, may have led past a bound.
     return np.clip(step * size, low, high)
 
 

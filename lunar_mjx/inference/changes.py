@@ -154,6 +154,7 @@ class ChangeDetector:
         self._mean, self._cov = self._mean[kept_columns], self._cov[kept_columns]
         self._log_ratio, self._begun, self._kind = self._log_ratio[keep], self._begun[keep], self._kind[keep]
         # Shiryaev and Roberts: the sum over beginnings of likelihood ratios, each against the filter without a jump
+        # A mean over the kinds: as a sum, R would grow by their number in every step and not by one.
         self.log_statistic = float(np.logaddexp.reduce(self._log_ratio)) - math.log(kinds)
         self.count += 1
         if self.log_statistic < self._threshold:
@@ -210,6 +211,7 @@ def _update(
     logs, means, covs = [], [], []
     cases = ((1.0 - usual.rare, usual.scatter, usual.noise), (usual.rare, usual.outlying, CHANGE.louder * usual.noise))
     for chance, scatter, noise in cases:
+        # What a step scatters ends with it: noise along the columns, and no part of the state.
         own = (h * scatter**2) @ h.T + noise**2 * np.eye(len(h))
         whole = h @ crossed + own
         factor = np.linalg.cholesky(whole)
@@ -301,6 +303,7 @@ def learn(series: Sequence[tuple[Amounts, Sequence[Step]]], usual: Restlessness 
         prior = 0.5 * float(np.sum(((place - centre) / CHANGE.log_std) ** 2))
         return prior - sum(log_density(law.of(amounts), steps) for amounts, steps in series)
 
+    # Clipped numbers have no slope, and there are five of them: a simplex needs none.
     simplex = centre + np.vstack([np.zeros(5), np.diag([1.0, 1.0, 0.3, 0.7, 1.0])])
     optimum = optimize.minimize(
         cost,
@@ -314,6 +317,7 @@ def learn(series: Sequence[tuple[Amounts, Sequence[Step]]], usual: Restlessness 
 def _tempered(restless: Restlessness, series: Sequence[tuple[Amounts, Sequence[Step]]]) -> Restlessness:
     """A restlessness with the largest power at which these series raise no alarm at the threshold of their length."""
     length = float(sum(len(steps) for _, steps in series))
+    # They fall, so that the first that raises no alarm is the largest.
     for power in CHANGE.powers[:-1]:
         tempered = dataclasses.replace(restless, power=power)
         if not any(_raises(tempered.of(amounts), amounts, steps, length) for amounts, steps in series):

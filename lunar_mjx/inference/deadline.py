@@ -19,6 +19,7 @@ class Deadline:
 
     def __init__(self, seconds: float = math.inf):
         """A deadline in some seconds from now."""
+        # Not the time of day, which may be set while the work is under way.
         self.until = time.monotonic() + seconds
 
     def left(self) -> float:

@@ -63,6 +63,7 @@ def descend(goal: Objective, start: np.ndarray, iterations: int = DESCENT.iterat
     for _ in range(iterations):
         downhill, hessian = goal.quadratic(present.u, present.residual, present.jacobian)
         promise = goal.promise(present.u, downhill, hessian)
+        # Judged by what chi-square can still fall: lengths of gradients and steps depend on units.
         if promise < DESCENT.small_promise:
             break
         dampings = damping * _DAMPINGS

@@ -138,6 +138,7 @@ class Levels:
 
     def log_weight(self, levels: np.ndarray) -> float:
         """What is added to the log evidence of measurements whitened at a level (groups,) of each group."""
+        # Every size whitens into units of its own; their Jacobian makes evidences at different sizes comparable.
         return float(np.sum(self.log_prior[levels] - self.log_scale[levels, np.arange(len(levels))]))
 
     def improved(self, found: Evidence, noises: Sequence[NoiseSize]) -> tuple[np.ndarray, np.ndarray]:
@@ -147,11 +148,13 @@ class Levels:
         """
         place = np.append(-found.mean, 1.0)
         square = np.einsum("i,lgij,j->lg", place, self.matrix, place)
+        # The expected square, not the one at the mean: what the amplitudes may still be adds its trace (the E step).
         square = square + np.einsum("lgij,ij->lg", self.matrix[..., :-1, :-1], found.covariance)
         x, log_prior = np.empty_like(square), np.empty_like(square)
         for g, prior in enumerate(noises):
             x[:, g], log_prior[:, g] = _most_probable_noise(square[:, g], float(self.count[g]), prior)
         value = -0.5 * square * np.exp(-2.0 * x) - self.count * x + log_prior - self.log_scale + self.log_prior[:, None]
+        # Given the amplitudes, groups are independent: each takes its best level without regard to the others.
         at = np.argmax(value, axis=0)
         return at, np.exp(x[at, np.arange(len(at))])
 
@@ -159,9 +162,11 @@ class Levels:
 def _most_probable_noise(square: np.ndarray, count: float, prior: NoiseSize) -> tuple[np.ndarray, np.ndarray]:
     """Logarithm of the most probable factor on the noise for (levels,) sums of squares, and its log prior density."""
     if prior.freedom > 0.0:
+        # The derivative by x vanishes here: this prior acts like further measurements of that number.
         x = 0.5 * np.log((square + prior.freedom) / (count + prior.freedom))
         return x, -prior.freedom * x - 0.5 * prior.freedom * np.exp(-2.0 * x)
     x = 0.5 * np.log(np.maximum(square, 1e-300) / max(count, 1.0))
+    # The slope in x is convex and falls, so that Newton's steps converge from either side without a line search.
     for _ in range(20):
         power = square * np.exp(-2.0 * x)
         x = x + (power - count - x / prior.log_std**2) / (2.0 * power + prior.log_std**-2)
@@ -312,6 +317,7 @@ def log_box(mean: np.ndarray, covariance: np.ndarray, low: np.ndarray, high: np.
     below, above = (low - mean) / std, (high - mean) / std
     alone = np.array([_log_between(a, b) for a, b in zip(below, above, strict=True)])
     binding = np.flatnonzero(alone < -_BINDS)
+    # A single bound that binds has none to be taken together with: its marginal probability will do.
     if len(binding) < 2:
         return float(alone.sum())
     below, above = below[binding], above[binding]
@@ -323,17 +329,22 @@ def log_box(mean: np.ndarray, covariance: np.ndarray, low: np.ndarray, high: np.
     for _ in range(_MOST_SWEEPS):
         total = 0.0
         for i in range(len(binding)):
+            # The marginal distribution without this bound's own factor, or the bound would be counted twice.
             rest = max(1.0 / spread[i, i] - stiff[i], 1e-12)
             place, width = (centre[i] / spread[i, i] - pull[i]) / rest, 1.0 / math.sqrt(rest)
             log_inside, inner, narrow = _truncated((below[i] - place) / width, (above[i] - place) / width)
+            # A truncated normal is never wider than the normal itself, so that a negative stiffness is rounding.
             new = max(1.0 / (narrow * width**2) - rest, 0.0)
             added = new - stiff[i]
             stiff[i], pull[i] = new, (place + width * inner) * (new + rest) - rest * place
             column = spread[:, i]
+            # Sherman and Morrison: one stiffness has changed, so no new inverse is needed.
             spread = spread - np.outer(column, column) * (added / (1.0 + added * column[i]))
             centre = spread @ pull
             joint = (rest * place + pull[i]) ** 2 / (rest + stiff[i]) - rest * place**2
             total += log_inside + 0.5 * math.log1p(stiff[i] / rest) - 0.5 * joint
+        # Roots of the stiffnesses on both sides, after Rasmussen & Williams 2006: their reciprocals have no end where a
+        # bound hardly binds.
         root = np.sqrt(stiff)
         inner_matrix = np.eye(len(binding)) + root[:, None] * whole * root
         total += 0.5 * float(pull @ centre) - 0.5 * float(np.linalg.slogdet(inner_matrix)[1])
@@ -368,6 +379,7 @@ def _log_between(low: float, high: float) -> float:
     if low > 0.0:
         # the difference of two numbers near 1 has no digits left; in the other tail it has all of them
         low, high = -high, -low
+    # An interval that rounding closes keeps a tiny probability: a logarithm of zero would spoil every sum it enters.
     upper, lower = special.log_ndtr(high), special.log_ndtr(low)
     return float(upper + math.log(-math.expm1(min(lower - upper, -1e-300)))) if high > low else -math.inf
 
@@ -396,6 +408,7 @@ def infer(
     promised = np.inf
     for _ in range(SIZE_DESCENT.most_steps):
         step = _newton_step(here)
+        # What the quadratic model gains: gradient times step, less the half of it that the curvature takes back.
         promised = 0.5 * float(here.gradient @ step)
         if promised < SIZE_DESCENT.settled:
             break
@@ -547,12 +560,15 @@ def _density(
     quadratic[:many, :many] = weight.T @ absorbed @ weight
     quadratic[:many, many:] = weight.T @ back
     quadratic[many:, many:] = np.diag(power[many:]) - own.T @ back
+    # The trace of a product of two blocks of a symmetric matrix is the sum of its squared entries between them.
     traces[:many, :many] = member @ absorbed**2 @ member.T
     for c in range(groups):
         traces[:many, many + c] = member @ np.einsum("ij,ji->i", filtered[c], inverse)
         for d in range(c, groups):
             both = float(np.sum(filtered[c] * filtered[d].T))
             traces[many + c, many + d] = traces[many + d, many + c] = both
+        # V^-1 V_c is the identity less the filter; squared, it leaves the count less twice the filter's trace, beside
+        # the above.
         traces[many + c, many + c] += gram.count[c] - 2.0 * np.trace(filtered[c])
     quadratic[many:, :many], traces[many:, :many] = quadratic[:many, many:].T, traces[:many, many:].T
     gradient = power - trace
@@ -572,6 +588,7 @@ def _density(
     for c, prior in enumerate(noises):
         i = many + c
         if prior.freedom > 0.0:
+            # freedom / s^2 is chi-square of that freedom; this is its density in x = log s, the Jacobian within.
             half = 0.5 * prior.freedom
             value += math.log(2.0) + half * math.log(half) - math.lgamma(half) - 2.0 * half * x[i]
             value -= half * math.exp(-2.0 * x[i])

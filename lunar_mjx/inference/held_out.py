@@ -46,6 +46,7 @@ def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
     size = np.sqrt(np.diag(hessian))
     size = np.where(size > 0.0, size, 1.0)
     known, axes = np.linalg.eigh(hessian / np.outer(size, size))
+    # Below this is rounding: neither data nor priors know the direction, and nothing can be taken from it.
     kept = known > 1e-13
     unit = axes[:, kept] / np.sqrt(known[kept]) / size[:, None]  # in which all that is known weighs one
     for part in _left_out(problem, fit):
@@ -63,6 +64,7 @@ def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
 def _left_out(problem: Problem, fit: Fit) -> list[np.ndarray]:
     observations = problem.observations
     parts = [np.flatnonzero(fit.fitted & (observations.unit == u)) for u in np.unique(observations.unit[fit.fitted])]
+    # Of one or two manoeuvres, leaving one out would leave nothing, or half of what is known; pieces stand in for them.
     if len(parts) >= 3:
         return parts
     number = blocks(observations, fit.residual, fit.fitted)
@@ -107,11 +109,13 @@ def predictive_gain(
     difference = np.where(np.isfinite(difference), difference, 0.0)
     block = blocks(problem.observations, after.residual, keep)
     inside = (block >= 0) & np.isfinite(old) & np.isfinite(new)
+    # One block has no spread: its error is unknown, and not zero.
     if block.max(initial=-1) < 1:
         return float(difference.sum()), float("inf")
     # With the change d of the residual given, the gain is d^2 / 2 + d e; only the residual e is random.
     change = np.where(inside, old - new, 0.0)
     per = np.bincount(block[inside], weights=(change * new)[inside])
+    # Unit white noise alone gives the second sum; few blocks may fall below it by chance.
     noise = max(float(np.sum(per**2)), float(np.sum(change**2)))
     return float(difference.sum()), float(np.sqrt(noise))
 
@@ -152,11 +156,13 @@ def noise_test(problem: Problem, fit: Fit, splits: tuple[str, ...] = ("fit", "se
         row = np.array([squares[part].sum(), count, 0.5 * s.dependence * count + (count * s.level) ** 2])
         channels[s.channel] = channels.get(s.channel, np.zeros(3)) + row
     spread = float(sum(row[2] for row in channels.values()))
+    # Of half the sum, since the root of a mean square near 1 moves by half as much as the mean square.
     limit = HELD_OUT.at_noise + HELD_OUT.sampling * np.sqrt(spread) / max(n, 1)
     by_channel, worst, ratio = {}, "", 0.0
     for channel, (total, count, variance) in channels.items():
         if count < 1:
             continue
+        # Which channel paid for the fitted parameters cannot be told: all pay by their number of observations.
         value = float(np.sqrt(total / count * n / freedom))
         by_channel[channel] = value
         share = value / (HELD_OUT.channel_at_noise + HELD_OUT.sampling * np.sqrt(variance) / count)

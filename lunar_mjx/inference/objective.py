@@ -40,12 +40,14 @@ class Objective:
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """(n, free) whitened derivatives of the predictions; zero where they are not finite."""
         j = self.problem.observations.whiten(self.problem.jacobian(u, self.free))
+        # A zero leaves one coordinate out of a step; a NaN would spoil the step of all of them.
         return np.where(np.isfinite(j), j, 0.0)
 
     def covariance(self, u: np.ndarray, j: np.ndarray) -> np.ndarray:
         """(free, free) covariance of the free coordinates, by the Gauss-Newton Hessian with the priors."""
         j = j[self.fitted]
         _, scale = self.problem.prior_rows(u, self.free)
+        # A direction that neither data nor prior hold has no finite variance: the pseudo-inverse leaves it out.
         return np.linalg.pinv(j.T @ j + np.diag(scale**2), hermitian=True)
 
     def quadratic(self, u: np.ndarray, r: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,6 +115,7 @@ def _within(hessian: np.ndarray, downhill: np.ndarray, low: np.ndarray, high: np
     # one unit for all coordinates, or the bounded solver's tolerance would hold for the stiffest alone
     size = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     values, axes = np.linalg.eigh(hessian * np.outer(size, size))
+    # Rounding makes eigenvalues of unknown directions negative, and a zero one would be divided by.
     root = np.sqrt(np.maximum(values, 1e-14 * max(float(values[-1]), 1e-30)))
     # a square root of the matrix as rows: the quadratic model becomes a least-squares problem, which takes bounds
     rows = root[:, None] * axes.T

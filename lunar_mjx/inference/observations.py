@@ -143,6 +143,7 @@ class Observations:
             if s.time is None or s.coloured <= 0.0 or s.correlation_time <= 0.0:
                 out[s.start : s.stop] = 0.5 * np.log(white + s.coloured**2)
                 continue
+            # The filter's variances alone, as in `_innovations`: they do not depend on what was measured.
             keep = np.exp(-np.diff(np.asarray(s.time)) / s.correlation_time) ** 2
             variance = s.coloured**2
             for i, own in enumerate(white):

@@ -73,6 +73,7 @@ class Problem(abc.ABC):
 
     def prior_rows(self, u: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residual and diagonal Jacobian of the priors of some coordinates, in sigma."""
+        # An infinite prior becomes a row of zeros, which holds nothing: no case of its own is needed.
         scale = np.array([1.0 / self.coordinates[i].prior for i in which])
         return (u[which] - np.array([self.coordinates[i].centre for i in which])) * scale, scale
 

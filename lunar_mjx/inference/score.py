@@ -64,6 +64,7 @@ def _table_blocks(observations: Observations, mine: list, keep: np.ndarray, numb
 
 def _correlation_time(residual: np.ndarray, time: np.ndarray) -> float:
     """Time over which the residual's autocorrelation falls to 1/e; 0 for white noise, at most an eighth of the log."""
+    # An eighth of fewer samples is the lag of zero alone, where every autocorrelation is one.
     if len(residual) < 16:
         return 0.0
     r = residual - residual.mean()
@@ -77,6 +78,7 @@ def _correlation_time(residual: np.ndarray, time: np.ndarray) -> float:
     auto = np.fft.irfft(spectrum, size)[: len(r) // 8] / power
     below = np.flatnonzero(auto < np.exp(-1.0))
     lag = int(below[0]) if len(below) else len(auto)
+    # Gone within one sample: at this rate the noise is white.
     return 0.0 if lag <= 1 else lag * step
 
 

@@ -65,7 +65,9 @@ def baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple
         for name, (relative, prior) in baseline.get(effect.name, {}).items():
             value = np.atleast_1d(np.asarray(model.parameters[effect.name][name], float))
             p = effect.parameters[name]
+            # A factor moves no zero, and its logarithm needs a positive value.
             if np.all(value > 0.0):
+                # The factor ends where the first of the wheels or joints reaches a bound of its own.
                 low, high = max(p.bounds[0] / value.min(), 1e-3), min(p.bounds[1] / value.max(), 1e3)
                 coordinates.append(Coordinate(effect.name, name, 1.0, relative, low, high, True, prior, factor=True))
         # Effects beyond the preset were added to explain measurements; they are refitted with the rest.

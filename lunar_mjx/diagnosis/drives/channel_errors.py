@@ -82,6 +82,7 @@ def spread(observations: Observations) -> dict[str, float]:
     by_kind: dict[str, list[float]] = {}
     for s in observations.series:
         v = observations.value[s.start : s.stop]
+        # Axes together, since one of them may stand still in these drives and would be left without any error.
         by_kind.setdefault(_kind(s.channel), []).append(float(np.mean((v - v[0]) ** 2)))
     return {s.channel: float(np.sqrt(np.mean(by_kind[_kind(s.channel)]))) for s in observations.series}
 

@@ -193,6 +193,7 @@ class DriveForm(MeasuredForm):
         assert self._seen is not None
         settings = self.settings
         seen = self._seen[:, len(self.coordinates) :]
+        # Variances add up to one, so that a field's size means the same whatever share of it is a log's own.
         common, own = math.sqrt(1.0 - settings.own_share), math.sqrt(settings.own_share)
         columns, number = [np.zeros((len(observations), 0))], [np.zeros(0, int)]
         for k in range(len(self.words)):
@@ -237,6 +238,7 @@ class DriveForm(MeasuredForm):
         low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
         at, mean = np.zeros(len(std)), np.zeros(len(std))
         mean[:count] = [c.centre for c in self.coordinates]
+        # Amplitudes are counted from the refit: the prior's centre lies at its distance from there.
         mean[:count] -= u
         for places in self.candidates.values():
             at[places] = u[places]
@@ -340,6 +342,7 @@ class DriveForm(MeasuredForm):
             return infer_levels(levels, prior, self._usual_fields(), self._noise_sizes(), self._sizes)
 
         made = {s: self._errors_with(s) for s in self.settings.jitters_s}
+        # Scatters are compared at the usual errors alone: each pair of the two would whiten all columns once more.
         value = {s: found(e.usual_level(columns, residual)).log_evidence for s, e in made.items()}
         self.jitter_s = max(value, key=lambda s: value[s])
         errors = made[self.jitter_s]
@@ -438,6 +441,7 @@ class DriveForm(MeasuredForm):
 
         def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             """Products of whitened columns under the covariance of noise and discrepancy."""
+            # Woodbury's identity: the covariance of the data is as large as they are, and is never made.
             return a.T @ b - (misfit.T @ a).T @ linalg.cho_solve(factor, misfit.T @ b)
 
         def chi2(residual: np.ndarray, x: np.ndarray) -> float:

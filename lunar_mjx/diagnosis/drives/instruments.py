@@ -111,6 +111,7 @@ def _turned(kind: str, one: Series, series: list[Series], log: Log, axis: int, p
     assert one.time is not None
     mounting = Rotation.from_quat(log.imu.quaternion, scalar_first=True)
     up = mounting.inv().apply([0.0, 0.0, log.gravity_m_s2]) if kind == "accelerometer" else np.zeros(3)
+    # Axes that no channel gives are taken to be at rest, where gravity alone is read.
     vector = np.tile(up, (len(one.time), 1))
     for k, letter in enumerate("xyz"):
         other = next((s for s in series if s.channel == _VECTORS[kind].format(letter)), None)
@@ -156,7 +157,9 @@ def usual_errors(observations: Observations, predicted: np.ndarray, rate: np.nda
             add(f"{word}: zero {s.channel}", part, USUAL_ZERO[word])
         if word in _SCALED:
             kind = word if word in USUAL_ZERO else f"{word} {s.channel.rpartition('_')[2]}"
+            # Of the prediction: measured values would bring their noise into the column, and it would fit that.
             add(f"{kind}: scale", part, USUAL_ERRORS.usual_scale * predicted[part])
         if s.time is not None and s.stop - s.start > 2:
+            # A late reading shows what was there before, hence the sign.
             add(f"clock {family(s.channel) or word}: late", part, -USUAL_ERRORS.usual_clock_s * rate[part])
     return columns

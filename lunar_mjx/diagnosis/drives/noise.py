@@ -192,6 +192,7 @@ class Noises:
             )
             for i in range(0, len(time) - size + 1 if step < s.correlation_time else 0, size):
                 t, v = time[i : i + size], values[i : i + size] / key[1]
+                # A window with a gap, one that is flat and one that holds a misfit tell nothing of the noise's colour.
                 if t[-1] - t[0] < 1.5 * step * size and NOISE_COLOURS.quiet < _about_line(t, v) < NOISE_COLOURS.loud:
                     segments.setdefault(key, []).append((t, v))
         if segments:
@@ -272,6 +273,7 @@ def colours(
     likelihood = {}
     for kind, parts in segments.items():
         groups = _by_times(parts)
+        # White noise may have any size here: a size that is stated wrongly must not pass for a colour.
         likelihood[kind] = np.array([_likelihood(groups, c, size if c.share else np.inf) for c in tried])
 
     def most_likely(rows: Sequence[np.ndarray]) -> int:
@@ -311,6 +313,7 @@ def _by_times(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.n
     """
     groups: dict[bytes, tuple[np.ndarray, list[np.ndarray]]] = {}
     for t, v in parts:
+        # Two digits: clocks that jitter agree in these, and equal times share one factorisation.
         step = float(f"{np.median(np.diff(t)):.2g}")
         even = step * np.arange(len(t))
         since = (
@@ -327,6 +330,7 @@ def _likelihood(groups: Sequence[tuple[np.ndarray, np.ndarray]], c: Colour, most
     for since, v in groups:
         weight, determinant = _about_a_line(since.tobytes(), c)
         square += float(np.sum(v * (weight @ v)))
+        # Two of a segment's freedoms have gone into its line.
         freedom += v.shape[1] * (len(since) - 2)
         logarithms += v.shape[1] * determinant
     size = float(np.clip(square / freedom, 1.0 / most, most))
@@ -349,4 +353,5 @@ def _about_a_line(times: bytes, c: Colour) -> tuple[np.ndarray, float]:
     solved = cho_solve(factor, line)
     inner = line.T @ solved
     weight = cho_solve(factor, np.eye(len(since))) - solved @ np.linalg.solve(inner, solved.T)
+    # The second determinant is what restricted likelihood adds for the line having been fitted.
     return weight, 2.0 * float(np.sum(np.log(np.diag(factor[0])))) + float(np.linalg.slogdet(inner)[1])

@@ -54,6 +54,7 @@ def standing_shows(change: np.ndarray, number: int, observations: Observations) 
     total, sigma = 0.0, observations.sigma()
     for s in observations.series:
         if s.log == number:
+            # The mean of a counted channel is what another pose at the start takes up.
             own = change[s.start : s.stop] / sigma[s.start : s.stop]
             total += float(np.sum((own - own.mean() if _COUNTED.search(s.channel) else own) ** 2))
     return total > STOOD_TIME.shows

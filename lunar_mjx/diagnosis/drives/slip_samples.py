@@ -40,6 +40,7 @@ def least(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """(n,) least |speed| within `SLIP_TIME` of every sample; zero where it changes its sign."""
     size = np.abs(speed)
     turns = np.flatnonzero(speed[:-1] * speed[1:] < 0.0)
+    # Between two samples of opposite sign the speed was zero, which no sample need show.
     size[turns] = size[turns + 1] = 0.0
     reach = int(np.ceil(SLIP_TIME / max(float(np.median(np.diff(time))), 1e-6)))
     return minimum_filter1d(size, 2 * reach + 1, mode="nearest")

@@ -315,6 +315,7 @@ class _Search:
         done = []
         for t in ordered[: FORMULA_SEARCH.finished]:
             refitted = fit(t.slots.problem, t.slots.free, t.fit.u, starts=1)
+            # A longer descent that ends higher has gone to another minimum: the shorter one's place stays.
             done.append(self._judged(t.choices, t.slots, refitted) if refitted.chi2 <= t.fit.chi2 else t)
         return done + ordered[FORMULA_SEARCH.finished :]
 

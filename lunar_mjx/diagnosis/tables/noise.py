@@ -63,6 +63,8 @@ def scatter(log: SteadyLog) -> dict[str, Scatter]:
         # around each group's own mean: replicates tell the noise whatever the law of the wheel is
         mean = np.bincount(group, weights=values) / np.bincount(group)
         estimate = Scatter(0.0, *_neighbours(log, values - mean[group]))
+        # A standard deviation from n squares is uncertain by 1/sqrt(2 n) of itself; dependent neighbours count for
+        # fewer.
         out[quantity] = dataclasses.replace(estimate, level=float(np.sqrt(0.5 * estimate.dependence / freedom)))
     return out
 

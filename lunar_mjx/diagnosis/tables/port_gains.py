@@ -40,6 +40,7 @@ class Gain:
 
 
 def _stiffness(ctx: Any, a: Any, soil: Any) -> Any:
+    # Both moduli: pressure is proportional to their sum over one width, and the gain is on the pressure.
     return dataclasses.replace(soil, k_c=soil.k_c * (1.0 + a), k_phi=soil.k_phi * (1.0 + a))
 
 
@@ -48,6 +49,7 @@ def _strength(ctx: Any, a: Any, soil: Any) -> Any:
 
 
 def _resistance(ctx: Any, a: Any, wheel: Any) -> Any:
+    # Resistance opposes the motion whichever way the wheel drives.
     push = wheel.direction * a * ctx.normal.resistance
     return dataclasses.replace(wheel, force=wheel.force._replace(x=wheel.force.x - push))
 
@@ -57,6 +59,7 @@ def _drag(ctx: Any, a: Any, wheel: Any) -> Any:
 
 
 def _thrust(ctx: Any, a: Any, wheel: Any) -> Any:
+    # The force is thrust less resistance; put back, it leaves the shear stress alone, which also makes the moment.
     thrust = wheel.force.x + wheel.direction * ctx.normal.resistance
     force = wheel.force._replace(x=wheel.force.x + a * thrust)
     return dataclasses.replace(wheel, force=force, moment=wheel.moment._replace(y=wheel.moment.y * (1.0 + a)))

@@ -191,6 +191,7 @@ class TableProblem(Problem):
 
     def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
         with jax.enable_x64(True):
+            # All derivatives, of which some are taken: every other choice would be another program to compile.
             return np.asarray(self._slope(jnp.asarray(u, float), *self._given))[:, which]
 
 

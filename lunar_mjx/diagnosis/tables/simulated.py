@@ -69,6 +69,7 @@ class SimulatedTables:
                     u[i] = min(max(sign * amount, low), high)
         observations = own.data.observations
         sigma = observations.sigma()
+        # Half-normal, as the prior of every field's size is.
         size = np.abs(rng.normal(size=len(self._fields))) * [f.usual for f in self._fields]
         scale = self._amplitudes.std * np.append(size, 1.0)[self._amplitudes.field]
         usual = self._usual

@@ -84,6 +84,7 @@ def rank_sweeps(
                 rows[s.start : s.stop] = True
         pairs = {}
         for a, b in itertools.combinations(names, 2):
+            # Either may be the truth: a plan has to convince the one that expects the larger covariance.
             pairs[a, b] = min(_separation(expected[a], expected[b], rows), _separation(expected[b], expected[a], rows))
         worst = min(pairs, key=lambda p: pairs[p])
         ranked.append(Sweep(name, text, pairs[worst], worst))

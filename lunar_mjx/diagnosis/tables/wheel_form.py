@@ -79,6 +79,7 @@ def table_data(
     stacked = jax.tree.map(lambda *a: np.concatenate([np.atleast_1d(np.asarray(x, float)) for x in a]), *tests)
     lever = np.concatenate(
         [
+            # Bounded: 1/cos has no end where a wheel is dragged sideways.
             1.0 / np.cos(np.minimum(np.abs(np.asarray(t.slip_angle, float)), settings.steepest_lever))
             if log.table.slip_definition == "wheel_frame"
             else np.ones(len(np.atleast_1d(np.asarray(t.slip_angle))))
@@ -93,6 +94,7 @@ def table_data(
     # an error of the load's zero is a share of the mean load, the same for all points of a load cell
     imposed = Imposed(stacked, slip, lever, np.full(first, load.mean()), np.concatenate(gravity))
     speed = np.concatenate([_speed(log) for log in logs])
+    # Loads and speeds by their ratios, so that one length scale serves light and heavy wheels.
     features = np.column_stack(
         [
             slip / settings.slip_length,
@@ -114,6 +116,7 @@ def table_data(
         for name, own in scatter(log).items():
             noise_spread = np.hypot(settings.replicate_spread, own.level) if own.level else settings.stated_spread
             i = _NAMES.index(name)
+            # Tables share a quantity's noise factor: the least known of them says how far it may go.
             std[i] = max(std.get(i, 0.0), float(noise_spread))
     return TableData(
         observations, imposed, point, quantity, _modes(usual, settings), following, dict(sorted(std.items()))
@@ -442,6 +445,7 @@ class WheelForm(MeasuredForm):
 
         low, high = self._bounds(free)
         out = u.copy()
+        # A sum of squares is twice a log density, in which the threshold is given.
         out[free] = minimise(at, u[free], low, high, 2.0 * self.settings.fit_settled, self.settings.most_evaluations)
         return out
 

@@ -127,7 +127,9 @@ _READ: Mapping[str, Callable[[Any, Any], Any]] = {
     "constant": lambda ctx, value: 1.0,
     "current": lambda ctx, value: value.current,
     "joint speed": lambda ctx, value: ctx.joint_speed,
+    # Signed, so that such a drag opposes the motion both ways.
     "squared joint speed": lambda ctx, value: ctx.joint_speed * jnp.abs(ctx.joint_speed),
+    # A sign that has a derivative where the joint stands still.
     "direction": lambda ctx, value: jnp.tanh(ctx.joint_speed / _AT_REST),
     "wheel speed": lambda ctx, value: _wheel_speed(ctx),
     "slip": lambda ctx, value: ctx.contact.soil_slip,

@@ -152,6 +152,8 @@ class MeasuredForm(Form):
         for i in self.candidates[effect]:
             c = self.coordinates[i]
             low, high = c.bounds()
+            # At its null an effect's shape parameters change nothing: a refit that began there would have no slope
+            # along them.
             if c.amplitude and abs(out[i]) < 0.5 * (size := self.effect_size(c)):
                 out[i] = min(max(0.5 * size * (1.0 if high > 0.0 else -1.0), low), high)
         return out
