@@ -125,6 +125,7 @@ def drive(
     """
     model = make_model(rover, terrain)
     system = build(model)
+    # A stream for each kind of rover: leaving one out does not move the others.
     rng = np.random.default_rng([seed, *rover.encode()])
     starts = _starts(terrain, count, rng, shift * DEMO_DRIVE.spacing)
     steps_per_record = round(1.0 / DEMO_DRIVE.records_per_second / system.dt)
@@ -154,6 +155,7 @@ def _starts(
     places = []
     for cx, cy in cells[:count]:
         x = y = 0.0
+        # A cell without a good place keeps the last one that was tried: rovers are never fewer than asked for.
         for _ in range(200):
             x, y = np.array([cx, cy]) + rng.uniform(-2.0, 2.0, 2)
             if _good(terrain, x, y):
@@ -198,6 +200,7 @@ def _controls(
         controls[:, :, at] = rate
         if wheel.steer is not None:
             at = system.joint_names.index(wheel.steer)
+            # Short of the limits, so that no wheel is driven against its stop.
             low, high = 0.9 * np.array(rover.joint_limits[wheel.steer])
             controls[:, :, at] = np.clip(wave if wheel.corner.endswith("f") else -wave, low, high)
     return controls, speed

@@ -59,6 +59,7 @@ def paths_figure(drives: Sequence[Drive], terrain: Terrain) -> go.Figure:
         name, colour = ROVERS.get(d.rover, (d.rover, INK))
         for i in range(d.x.shape[1]):
             figure.add_scatter(
+                # Twice a second and to a millimetre: more is not seen, and every number makes the page larger.
                 x=d.x[::5, i].round(3),
                 y=d.y[::5, i].round(3),
                 mode="lines",
@@ -96,6 +97,7 @@ def _relief(
     low, high = (np.array([x[i], y[i]]) + margin for i, margin in ((0, -_MARGIN), (1, _MARGIN)))
     ground = relief(terrain, low, high)
     file = io.BytesIO()
+    # A picture begins with its top row, the ground with its south.
     Image.fromarray((255 * ground.grey[::-1]).astype(np.uint8)).save(file, "PNG", optimize=True)
     uri = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
     return uri, (ground.west, ground.east, ground.south, ground.north)

@@ -52,6 +52,7 @@ def origins(model: Model, effect: Effect, key: str) -> tuple[str, ...]:
     for label, layer_values in layers:
         layer_values = layer_values if isinstance(layer_values, tuple) else (layer_values,) * len(values)
         if len(layer_values) != len(values):  # one value for all where the preset has several
+            # NaN equals nothing: several values where there was one count as a change, whatever they are.
             layer_values = (layer_values[0] if len(set(layer_values)) == 1 else float("nan"),) * len(values)
         sources = [
             label if new != old else known for known, new, old in zip(sources, layer_values, before, strict=True)

@@ -120,12 +120,14 @@ def _track(settings: SunSettings) -> tuple[np.ndarray, np.ndarray, float]:
     """Directions in the terrain's frame, irradiances, and the sine of the highest elevation within a lunar day."""
     assert settings.date is not None and settings.latitude_deg is not None and settings.longitude_deg is not None
     kept = math.ceil(settings.days * 86400.0 / INTERVAL) + 1
+    # A whole lunar day even where less is kept: the ambient temperature is scaled by the day's highest Sun.
     count = max(kept, math.ceil(SYNODIC_DAY / INTERVAL) + 1)
     seconds = np.arange(count) * INTERVAL
     local, distance = sun_over(settings.date, seconds, settings.latitude_deg, settings.longitude_deg)
     east, north, up = local.T
     cos, sin = math.cos(math.radians(settings.north_deg)), math.sin(math.radians(settings.north_deg))
     towards = np.stack([cos * east - sin * north, sin * east + cos * north, up], axis=-1)
+    # The solar constant holds at 1 AU, in which the distance is given.
     return towards[:kept], SOLAR_CONSTANT / distance[:kept] ** 2, max(float(up.max()), 1e-6)
 
 
@@ -135,6 +137,7 @@ _known: dict[tuple[int, str | None], tuple[Terrain, Horizon]] = {}
 def _horizon(terrain: Terrain, around: str | None) -> Horizon:
     """The horizon of a terrain, kept while it is asked for again: it takes seconds."""
     key = (id(terrain), around)
+    # The terrain is kept beside its horizon, for an id may be given to another once its owner is gone.
     if key not in _known or _known[key][0] is not terrain:
         field = terrain.field
         own = Dem(np.asarray(field.heights), float(field.cell), float(field.x0), float(field.y0), terrain.name)
@@ -164,4 +167,5 @@ def camera_sun(settings: SunSettings | None, time: float = 0.0) -> cameras.Sun:
     towards = _track(settings)[0]
     at = np.clip(time / INTERVAL, 0.0, len(towards) - 1.0)
     x, y, z = (float(np.interp(at, np.arange(len(towards)), towards[:, k])) for k in range(3))
+    # A compass counts from north and clockwise: east comes first.
     return cameras.Sun(math.degrees(math.atan2(x, y)) % 360.0, math.degrees(math.atan2(z, math.hypot(x, y))))

@@ -95,6 +95,7 @@ def figure_5() -> tuple[Figure, dict]:
             hard = run.ground == "hard"
             colour = MUTED if hard else (BLUE if run.side > 0 else VERMILION)
             label = "hard" if hard else f"soft, softer to the {'left' if run.side > 0 else 'right'}"
+            # The gradient does not act on hard ground: both of its sides would be one line.
             if hard and run.side < 0:
                 continue
             line = "--" if hard else ("-" if run.side > 0 else "-.")

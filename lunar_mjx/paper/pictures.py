@@ -104,6 +104,7 @@ def figure_1() -> tuple[Figure, dict[str, Any]]:
     title = f"VIPER and LUVMI-X on a rocky lunar plain, Sun {_LOW_SUN[1]:g}° high"
     _picture(figure.add_subplot(grid[:, 0]), np.asarray(wide.rgb), title)
     depth = np.asarray(seen.depth)
+    # The sky has no distance, and a logarithm takes no infinity.
     near = np.where(np.isfinite(depth), depth, np.nan)
     _picture(figure.add_subplot(grid[0, 1]), np.asarray(seen.rgb), "its front camera: colour")
     axes = figure.add_subplot(grid[1, 1])
@@ -183,6 +184,7 @@ def _trodden(rovers: Sequence[tuple[Rover, np.ndarray]]) -> HeightField:
         tracks += wheel_tracks(rover, way)
     low = rovers[0][1][:2] - 0.5 * side
     trodden = TrackPainter(regolith(4096, side), low.tolist(), [side, side], tracks).paint(_ROWS)
+    # Over the mean albedo, since paint is a factor on the ground's own.
     shade = np.asarray(trodden, np.float32).mean(axis=-1) / (255.0 * float(ALBEDO.mean()))
     rows = np.linspace(0.0, 1.0, len(shade), dtype=np.float32)
     inner = np.clip(np.minimum(rows, 1.0 - rows) / _EDGE, 0.0, 1.0)
@@ -248,6 +250,7 @@ def figure_4() -> tuple[Figure, dict[str, Any]]:
     part = heights[::step, ::step]
     x, y = np.meshgrid(x0 + cell * step * np.arange(part.shape[1]), y0 + cell * step * np.arange(part.shape[0]))
     surface: Any = figure.add_subplot(2, 2, 4, projection="3d")
+    # From the north-west, as on maps: lit from below, hills look like pits.
     lit = LightSource(315, 20).hillshade(part, dx=cell * step, dy=cell * step)
     grey = np.repeat(lit[..., None], 3, axis=-1)
     surface.plot_surface(

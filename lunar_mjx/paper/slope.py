@@ -68,6 +68,7 @@ def slope_runs(
     def mean(values: jax.Array) -> np.ndarray:
         return np.asarray(values)[:, last].mean(axis=1)
 
+    # Along the slope: the horizontal part alone falls short by the cosine.
     speed = np.asarray(np.hypot(seen.velocity.x, seen.velocity.z) * np.sign(seen.velocity.x))[:, last].mean(axis=1)
     wheels = len(model.rover.wheels)
     rims = mean(seen.joint_speed)[:, :wheels] * radius

@@ -119,6 +119,7 @@ def _script() -> str:
 
 def packed(text: str) -> str:
     """Text as gzip in base64, which a page unpacks without any request."""
+    # Without a time inside, so that the same report is the same bytes.
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode("ascii")
 
 
@@ -142,6 +143,7 @@ def write_page(
     Returns:
       The path.
     """
+    # Names come from users' files and are escaped; a name that a template lacks is an error and no silent gap.
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("lunar_mjx.report", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
     )
@@ -173,6 +175,7 @@ def _block(block: Block, figures: list[str]) -> dict[str, Any]:
             "caption": block.caption,
             "map": _placed(block.figure, figures, block.least),
             "detail": _placed(block.detail, figures),
+            # NaN is no JSON: a browser would refuse all panels for one of them.
             "panels": packed(json.dumps(block.panels, allow_nan=False)),
             "choices": [(key, panel["label"]) for key, panel in block.panels.items()],
         }

@@ -53,6 +53,7 @@ def _lines(console: Console) -> Reporter:
         if what == stage and elapsed_s - last < _LINE_EVERY:
             return
         last, stage = elapsed_s, what
+        # The first hundredths are mostly compilation and say nothing of the pace.
         left = f", about {elapsed_s * (1.0 - done) / done:.0f} s left" if done > 0.02 else ""
         share = f"{100 * done:3.0f} %" if math.isfinite(done) else "  ..."
         console.print(f"{share}  {what} ({elapsed_s:.0f} s{left})", highlight=False, markup=False)

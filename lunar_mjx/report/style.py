@@ -97,6 +97,7 @@ def figure_style(dark: bool = False) -> dict[str, Any]:
         "legend.frameon": False,
         "legend.fontsize": 8,
         "image.cmap": HEIGHTS,
+        # Letters stay letters, which a reader can search and copy.
         "svg.fonttype": "none",
     }
 
@@ -128,6 +129,7 @@ def darkened(figure: Any) -> Any:
             found = to_rgba_array(get())
             new = [to_rgba(swap[to_hex(c)], c[3]) if to_hex(c) in swap else tuple(c) for c in found]
             if any(a != tuple(b) for a, b in zip(new, found, strict=True)):
+                # Lines take one colour alone, collections a list of them.
                 put(new if len(new) > 1 else new[0])
     return figure
 

@@ -92,6 +92,7 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray,
     """Draws shaded ground with rocks, and contours of height, whose spacing stands in the corner."""
     ground = relief(terrain, low, high)
     extent = (ground.west, ground.east, ground.south, ground.north)
+    # A few shadows and edges of rocks would take up the whole range of shades.
     dark, bright = (float(v) for v in np.percentile(ground.grey, (1.0, 99.0)))
     spare = max(0.0, 0.5 * (LAYOUT.least_contrast - (bright - dark)))
     # gentle ground is stretched to most of the shades, so that its shape shows
@@ -218,6 +219,7 @@ def _outline(drive: RecordedDrive, row: int) -> np.ndarray:
 def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
     """The path, coloured by mean slip and outlined so that it shows in grey; start and end."""
     place = drive.position[:, :2]
+    # Absolute, or a braked wheel would cancel a driving one.
     slip = np.nanmean(np.abs(drive.per_wheel("wheel_{}_slip_ratio")), axis=1)
     for n, track in enumerate(drive.tracks()):
         axes.plot(
@@ -315,6 +317,7 @@ def terrain_preview(terrain: Terrain) -> Figure:
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 0.8))
     draw_relief(left, terrain, low, high, contours=False)
     left.set_title("shaded relief with rocks, light from the north-west", loc="left", fontsize=9)
+    # No more cells than the map has pixels; its title says over which length slopes are then taken.
     step = max(1, round(max(heights.shape) / 600))
     north, east = np.gradient(heights[::step, ::step], cell * step)
     slope = np.degrees(np.arctan(np.hypot(north, east)))

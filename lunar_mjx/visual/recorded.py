@@ -105,12 +105,14 @@ class RecordedDrive:
     def qpos(self) -> np.ndarray:
         """Coordinates of the rover's MJCF, (time, nq), with its loops closed."""
         model = self.model.rover.compile()
+        # The loops' Jacobian is read as a full matrix below, whatever MuJoCo would choose by size.
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         joints = self.model.rover.joints
         adr = [int(model.joint(j).qposadr[0]) for j in joints]
         out = np.tile(np.asarray(model.qpos0), (len(self.table), 1))
         out[:, :3] = self.position
         turned = self.columns([f"quaternion_{c}" for c in "wxyz"])
+        # The digits of a table leave a quaternion not quite of length one.
         out[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         out[:, adr] = self.per_motor("joint_{}_angle_rad")
         if self.model.rover.loops:
@@ -119,6 +121,7 @@ class RecordedDrive:
             passive_qpos = np.array([int(model.jnt_qposadr[model.dof_jntid[d]]) for d in passive])
             data = mujoco.MjData(model)
             for row in range(len(out)):
+                # From where the last row closed: a few iterations suffice, and a linkage stays on its branch.
                 if row:
                     out[row, passive_qpos] = out[row - 1, passive_qpos]
                 _close(model, data, out[row], passive, passive_qpos)

@@ -107,8 +107,10 @@ class _Follow:
         self._optics = Pinhole(camera.camera.width, camera.camera.height, 42.0)
         reach = float(np.abs(drive.model.rover.chassis_points).max())
         self._away, self._up = 5.5 * reach, 1.9 * reach
+        # Unwrapped, since a mean across 180 degrees would turn the camera around.
         yaw = np.unwrap(np.radians(drive.columns(["yaw_deg"])[:, 0]))
         interval = float(np.median(np.diff(drive.time)))
+        # The camera follows slowly: at the rover's own pace every rock would shake the picture.
         self._yaw = smooth(yaw, 2.0 / interval)
         self._side = brightest_side(float(np.mean(yaw)), camera.sun.direction)
         self._at = np.stack([smooth(p, 0.5 / interval) for p in drive.position.T], axis=-1)

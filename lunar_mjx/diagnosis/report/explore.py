@@ -90,6 +90,7 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     figure.update_yaxes(autorange="reversed", showgrid=False, type="category", automargin=True)
     figure.update_xaxes(tickangle=0 if level else -45, showgrid=False, type="category", automargin=True)
     figure.update_annotations(x=0.0, xanchor="left")
+    # Five numbers an observation: measured, and of two models what each says and leaves.
     thin = max(1, int(np.ceil(len(o) * 5 / EXPLORE.most_values)))
     worst = sorted(places, key=lambda key: -(rms[0][key] or 0.0))
     models = _compared(steps)
@@ -127,6 +128,7 @@ def _unit_label(o: Observations, unit: int) -> str:
 
 def _compared(steps: Sequence[Step]) -> list[Step]:
     """The two models whose traces are drawn: the first refit of the chain, and its last model."""
+    # Not the model as given: what an effect adds shows beside the best that the model can do without it.
     refits = [s for s in steps if s.short == "refitted"]
     first = refits[0] if refits else steps[0]
     return [first] if first is steps[-1] else [first, steps[-1]]
@@ -300,6 +302,7 @@ def broken(x: ArrayLike, *values: ArrayLike) -> tuple[np.ndarray, list[np.ndarra
 
 
 def _plain(values: np.ndarray | list) -> list[float | None]:
+    # More digits than a picture shows would only make the page larger.
     return [float(f"{v:.5g}") if np.isfinite(v) else None for v in values]
 
 
@@ -386,6 +389,7 @@ def _binned(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float], lis
     keep = np.isfinite(x) & np.isfinite(y)
     x, y = x[keep], y[keep]
     rows = []
+    # Bins of equal width would hold hardly any observations at the ends.
     for part in np.array_split(np.argsort(x, kind="stable"), min(EXPLORE.bins, max(1, len(x) // EXPLORE.least))):
         if len(part) >= 2:
             rows.append((x[part].mean(), y[part].mean(), 1.96 * y[part].std(ddof=1) / np.sqrt(len(part))))

@@ -88,6 +88,7 @@ def _course(models: int) -> list[float]:
     ease = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, FILM.move + 1) / (FILM.move + 1))
     course: list[float] = []
     for i in range(models):
+        # The last stands twice as long: it is the result, and after it the film begins anew.
         course += [float(i)] * (FILM.hold if i < models - 1 else 2 * FILM.hold)
         if i < models - 1:
             course += [i + float(e) for e in ease]
@@ -141,6 +142,7 @@ def _picture(
         x, at = x[order], at[order]
         measured = traces.observations.value[at]
         predicted = (1.0 - share) * steps[low].predicted[at] + share * steps[high].predicted[at]
+        # Over all models, so that the axis stands still while the curve moves.
         all_values = np.concatenate([measured, *(s.predicted[at] for s in steps)])
         margin = 0.06 * max(float(np.nanmax(all_values) - np.nanmin(all_values)), 1e-12)
         axes.set_ylim(float(np.nanmin(all_values)) - margin, float(np.nanmax(all_values)) + margin)

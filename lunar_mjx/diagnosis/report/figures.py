@@ -20,6 +20,7 @@ def waterfall(
     value = [e.value for e in judged]
     known = [(name, e) for name, e in zip(names, fitted, strict=True) if e is not None and measure != "fitted"]
     highest = max(e.high if np.isfinite(e.high) else e.value for e in (*judged, *(e for _, e in known)))
+    # A linear axis would shrink the better models' bars to nothing beside a bad one's.
     logarithmic = bool(max(value) > 15.0 * max(min(value), 0.5))
     figure = go.Figure()
     figure.add_bar(
