@@ -300,6 +300,7 @@ def watch(
     status = count = 0
     with console_progress() as progress:
         for alarm in watching.watch(log, run, hours, once, out, idle, progress):
+            # At once: whoever reads a pipe is to hear of an alarm when it is raised.
             print(json.dumps(alarm.to_dict()) if as_json else alarm.sentence, flush=True)
             count = max(count, alarm.number)
             if alarm.diagnosis is not None:
@@ -370,6 +371,7 @@ def _number(option: str, given: str, text: str) -> float:
 def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
     out = {}
     for item in given or ():
+        # From the right, since a log's name may hold an equals sign itself.
         name, mark, value = item.rpartition("=")
         if not mark or not name:
             raise bad_input("lunar-mjx", option, item, "is not NAME=VALUE", "give both")
@@ -474,6 +476,7 @@ def _finish(diagnosis: Diagnosis, as_json: bool) -> NoReturn:
     elif tested:
         table = make_table("effect", "status", "separable", "chi2", "p", "gain", names=6)
         for e in tested[:15]:
+            # NaN alone is unlike itself: the effect was not refitted.
             gain = "-" if e.held_out_gain != e.held_out_gain else f"{e.held_out_gain:.0f} +- {e.held_out_se:.0f}"
             table.add_row(e.effect, e.status, f"{e.separable_sigma:.1f}", f"{e.chi2:.0f}", f"{e.p:.2g}", gain)
         console.print(table)

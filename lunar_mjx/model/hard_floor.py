@@ -71,6 +71,7 @@ def hard_floor(rover: str | Path | Rover, gravity: float | None = None) -> Model
     load = model.rover.mass * model.gravity / len(wheels)
     # In proportion to weight and wheel, so that any rover stands on its tyres like the one that was measured.
     stiffness = load / (TYRES.tyre_sinkage * radius)
+    # 2 sqrt(k m) is critical, here with a wheel's share of the mass.
     damping = 2.0 * TYRES.tyre_damping * (stiffness * model.rover.mass / len(wheels)) ** 0.5
     model = model.set(
         "hard_ground",

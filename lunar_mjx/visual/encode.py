@@ -73,11 +73,13 @@ def _mp4(path: Path, fps: int) -> Iterator[Sink]:
             if stream is None:
                 stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": QUALITY})
                 stream.height, stream.width = picture.shape[:2]
+                # The format of H.264 that browsers and players decode everywhere.
                 stream.pix_fmt = "yuv420p"
             for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")):
                 container.mux(packet)
 
         yield put
         if stream is not None:
+            # An encoder holds pictures back until it is told that none follow.
             for packet in stream.encode():
                 container.mux(packet)

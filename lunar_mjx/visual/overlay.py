@@ -32,6 +32,7 @@ def wheel_colour(corner: str) -> tuple[int, int, int]:
     """RGB of a wheel's line on a dark ground: sides differ in colour as in the plots, rear wheels are dimmer."""
     colour = WHEEL_STYLES.get(corner, (MUTED,))[0]
     bright = 0.62 if corner in ("lr", "rr") else 1.0
+    # Brighter than in the plots, whose colours are made for white paper.
     red, green, blue = (round(bright * min(255, int(colour[i : i + 2], 16) + 60)) for i in (1, 3, 5))
     return red, green, blue
 
@@ -108,6 +109,7 @@ class Overlay:
             (0.49 * width + 5.0 * self._line, width - 14, top, bottom),
         ]
         slip = np.clip(np.nan_to_num(self._slip), -1.0, 1.0)
+        # A few spikes, as at a start, would flatten all else.
         low, high = min(0.0, float(np.percentile(slip, 1))), max(0.5, float(np.percentile(slip, 99)))
         colours = [wheel_colour(c) for c in self._drive.corners]
         self._plot(draw, frames[0], slip, low, high, colours, "slip ratio")
@@ -121,6 +123,7 @@ class Overlay:
             frames[1],
             hot,
             float(hot.min()),
+            # One degree at least, or a motor at rest would have an axis without a length.
             max(float(hot.max()), float(hot.min()) + 1.0),
             [COLOURS.hot],
             "hottest winding, °C",

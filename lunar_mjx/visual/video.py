@@ -59,6 +59,7 @@ def render_video(
     """
     if view not in VIEWS:
         raise bad_input("render", "view", view, "does not exist", f"use one of {', '.join(VIEWS)}")
+    # Even, since yuv420p has one colour for two by two pixels.
     width, height = (int(v) // 2 * 2 for v in size)
     if not (160 <= width <= 3840 and 120 <= height <= 2160):
         raise bad_input("render", "size", f"{size[0]}x{size[1]}", "is outside 160x120 to 3840x2160", "use 960x540")

@@ -39,6 +39,7 @@ class Differences:
         return rows
 
     def _step(self, u: np.ndarray, i: int) -> float:
+        # Backward at an upper bound, beyond which the model need not make sense.
         return STEP if u[i] + STEP <= self._coordinates[i].bounds()[1] else -STEP
 
     def jacobian(

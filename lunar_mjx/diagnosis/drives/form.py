@@ -485,6 +485,7 @@ class DriveForm(MeasuredForm):
                         continue
                     damping = max(dampings[best], DRIVE_REFIT.damping)
                     u, residual, present_chi2 = rows[best], residuals[best], reached[best]
+                    # A step that keeps less than a third of its promise has left where these slopes hold.
                     if gained < 0.3 * _promised(steps[best], normal, downhill):
                         break
                 if not guessed and (promised < settings.settled or first - present_chi2 < settings.settled):
@@ -540,6 +541,8 @@ def _bounded_step(
         if not outside.any():
             break
         step[outside] = np.clip(step[outside], (low - x)[outside], (high - x)[outside])
+        # Never let go again: at most one solve for each coordinate, at the price of a step that may not be the very
+        # best.
         held |= outside
     return step
 

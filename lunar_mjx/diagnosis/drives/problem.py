@@ -194,6 +194,7 @@ class DriveProblem:
     def _keys(self, bench: Bench, rows: np.ndarray) -> list[Key]:
         """What a bench's simulation of each row depends on."""
         acting = frozenset(e for params in bench.params for e in params.effects) | {NUISANCE}
+        # Linear nuisances are added afterwards: rows that differ in them alone share a simulation.
         nonlinear = [i for i, c in enumerate(self.coordinates) if c.effect in acting and not is_linear(c)]
         names = [(c.effect, c.name, c.log_index, c.factor) for c in (self.coordinates[i] for i in nonlinear)]
         columns = [np.asarray(self.coordinates[i].value(rows[:, i]), float) for i in nonlinear]

@@ -168,6 +168,7 @@ def discover(
     if port not in FORMULA_PORTS:
         problem = "has no formulas" if port in PORTS else "does not exist"
         raise bad_input("unknown", "port", port, problem, f"use one of {', '.join(FORMULA_PORTS)}")
+    # A suggestion may be made anew, but a file that the user wrote is never written over.
     if out is not None and Path(out).exists() and not Path(out).read_text(encoding="utf-8").startswith(SUGGESTED):
         raise bad_input("unknown", "--out", str(out), "exists, and is none of these suggestions", "name another file")
     logs = run.campaign()

@@ -95,6 +95,7 @@ def distinct(expressions: Iterable[Expr]) -> list[Expr]:
 
 def _print_of(expression: Expr, symbols: Sequence[Any]) -> bytes:
     """Values at random arguments on a scale of their own, rounded: alike for what is algebraically equal."""
+    # A fixed seed: what is printed in one call is compared with what was printed in another.
     rng = np.random.default_rng(7)
     size = 24
     arguments = [
@@ -103,6 +104,7 @@ def _print_of(expression: Expr, symbols: Sequence[Any]) -> bytes:
     values = np.broadcast_to(np.asarray(function(expression, symbols)(*arguments), float), (size,))
     largest = values[np.argmax(np.abs(values))]
     values = values / largest if largest else values
+    # Adding zero makes -0.0 into 0.0, whose bytes differ.
     return (np.round(values, 9) + 0.0).tobytes()
 
 

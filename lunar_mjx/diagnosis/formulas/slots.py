@@ -137,6 +137,7 @@ def _act(port: str, mine: Sequence[tuple[int, Target]]) -> Any:
                 f"carrier = jnp.where({_any(k for k, t in mine if t.carrier == carrier)}, carrier_{n}, carrier)"
             )
         lines.append("changed = whole * carrier")
+        # An exponential keeps a factor positive whatever the amount; 1 + x has to be held there.
         if any(t.multiplies for _, t in mine):
             lines.append(
                 f"grown = jnp.where(p.linear_{slot} > 0.5, jnp.maximum(1.0 + changed, 0.01), jnp.exp(changed))"
@@ -174,6 +175,7 @@ class Slots:
 
     def holding(self, held: Mapping[int, tuple[Choice, float]]) -> Slots:
         """This table's problem with other formulas in its slots; no program compiles anew."""
+        # Past the constructor, which would make the problem and its programs anew.
         other = object.__new__(Slots)
         other.empty, other.held = self.empty, dict(held)
         other.problem = self.empty.with_constants(other._numbers())
@@ -226,6 +228,7 @@ class Slots:
             rim, beta = np.asarray(test.rim_speed), np.asarray(test.slip_angle)
             v_x = np.asarray(test.travel_speed) * np.cos(beta)
             values = {
+                # Over the larger speed, so that slip lies between -1 and 1 for driven and braked wheels alike.
                 "s": (rim - v_x) / np.maximum(np.maximum(rim, np.abs(v_x)), 1e-9),
                 "z": sinkage,
                 "beta": beta,

@@ -24,6 +24,7 @@ _FORCES = (
     Quantity("F_y", "value.force.y", "N", "lateral force"),
     Quantity("M_y", "value.moment.y", "N m", "moment about the axle"),
     Quantity("d", "value.direction", "1", "direction of rolling"),
+    # A smooth sign: forces have a derivative where the wheel does not slide aside.
     Quantity("side", "jnp.tanh(20.0 * value.slip_y)", "1", "side to which the wheel slides"),
     Quantity(
         "q",
@@ -148,6 +149,7 @@ def _force(axis: str) -> str:
 
 _TORQUE = "dataclasses.replace(value, moment=value.moment._replace(y=value.moment.y - extra))"
 _GRIP = "dataclasses.replace(value, grip=factor if value.grip is None else value.grip * factor)"
+# The moduli go along, so that the pressure at a sinkage of one radius stays as it was.
 _EXPONENT = (
     "dataclasses.replace(value, n=value.n + extra, k_c=value.k_c * ctx.geometry.radius ** -extra, "
     "k_phi=value.k_phi * ctx.geometry.radius ** -extra)"

@@ -113,6 +113,8 @@ def error(step: Step, splits: Sequence[str]) -> Error | None:
     value = float(np.sqrt(squares.sum() / sizes.sum()))
     if len(squares) < 2:
         return Error(value, float("nan"), float("nan"), count, len(squares))
+    # A fixed seed, so that a run always shows the same interval; blocks and not single observations are drawn, since
+    # neighbours repeat each other.
     rng = np.random.default_rng(0)
     pick = rng.integers(0, len(squares), (_DRAWS, len(squares)))
     draws = np.sqrt(squares[pick].sum(axis=1) / sizes[pick].sum(axis=1))
@@ -122,5 +124,6 @@ def error(step: Step, splits: Sequence[str]) -> Error | None:
 
 def judged(steps: Sequence[Step]) -> tuple[tuple[str, ...], str]:
     """The splits on which the chain is judged, and what they are: those held out, else those fitted."""
+    # All or none: models of one chain must not be judged on unlike points.
     held = all(s.observations.in_split("select", "test").any() for s in steps)
     return (("select", "test"), "held-out") if held else (("fit",), "fitted")

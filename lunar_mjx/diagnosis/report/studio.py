@@ -102,6 +102,7 @@ def write_studio(run: str | Path, out: str | Path) -> Path:
         title=f"Studio: {result.name}",
         lead=lead([result], result),
         program=program,
+        # By their digests, no other script can run in the page, whatever the texts of a run hold.
         allowed=" ".join(f"'sha256-{_digest(text)}'" for text in (program, plotly)),
         data=packed(json.dumps(_page_data(result, result.traces), allow_nan=False)),
         plotly=packed(plotly),
@@ -256,6 +257,7 @@ def _map(traces: Traces, models: Sequence[_Model]) -> dict[str, Any] | None:
     known = np.isfinite(slip_and_angle).all(axis=1)
     if not known.any():
         return None
+    # Places of a drive never repeat and are gathered in cells; those of a table do repeat.
     cell = 0.02 * max(float(np.ptp(slip_and_angle[known], axis=0).max()), 1e-9)
     grid = np.round(slip_and_angle[known] / (cell if o.place is None else 1e-9)).astype(np.int64)
     _, first, number = np.unique(np.column_stack([grid, o.unit[known]]), axis=0, return_index=True, return_inverse=True)
@@ -288,6 +290,7 @@ def _hypotheses(verdict: Mapping[str, Any]) -> list[dict[str, Any]]:
     if not isinstance(listed, Mapping):
         return []
     rows = [(str(n)[:120], float(p)) for n, p in listed.items() if isinstance(p, int | float) and 0.0 <= p <= 1.0]
+    # The rest stands last however probable it is: it is no hypothesis.
     rows.sort(key=lambda row: (row[0] == _REST, -row[1]))
     return [{"name": n.replace("_", " "), "p": _short(p)} for n, p in rows]
 

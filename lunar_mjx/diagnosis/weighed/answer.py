@@ -424,6 +424,7 @@ def _evidence(
             for k, i in enumerate(holding.places):
                 if i < len(form.coordinates) and form.coordinates[i].effect == name:
                     c = form.coordinates[i]
+                    # A refit stands where its effects fit; a linear estimate has yet to be moved there.
                     values[c.name] = float(c.value(holding.refit.u[i] + (0.0 if holding.refitted else moved[k])))
                     std[c.name] = c.std(
                         holding.refit.u[i], math.sqrt(max(float(holding.evidence.covariance[k, k]), 0.0))
@@ -446,6 +447,7 @@ def _evidence(
                 separable_sigma=length,
                 separable_share=float("nan"),
                 chi2=float("nan"),
+                # Twice a log ratio is about a chi-square of one degree, whose root is a z (Wilks 1938).
                 z=math.copysign(math.sqrt(2.0 * abs(log_ratio)), log_ratio) if math.isfinite(log_ratio) else -99.0,
                 p=1.0 - p,
                 values=values,
@@ -492,6 +494,7 @@ def _cosines(refit: Refit, least_signal: float) -> dict[str, dict[str, float]]:
 def _root(matrix: np.ndarray) -> np.ndarray:
     """Inverse square root of what is felt of a symmetric matrix."""
     values, vectors = np.linalg.eigh(matrix)
+    # A direction of which nothing is felt has no cosine with any other.
     keep = values > 1e-6 * max(values.max(initial=0.0), 1e-300)
     return (vectors[:, keep] / np.sqrt(values[keep])) @ vectors[:, keep].T
 

@@ -86,6 +86,7 @@ def log_run(log: Log, model: Model) -> LogRun:
     steps_per_command = round(given.interval / own.timestep)
     values = given.values
     finest = max(LOG_START.finest, min(float(np.median(np.diff(t.time_s))) for t in log.tables.values() if len(t) > 2))
+    # Commands are repeated until telemetry, which comes once a command, is as fine as the finest table.
     split = next(
         (
             k

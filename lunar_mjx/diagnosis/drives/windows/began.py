@@ -124,6 +124,7 @@ def began(
     after = np.arange(last + (first != last), len(found))[: ONSET.most_after]
     part = found.part(np.append(before, after))
     later = np.arange(len(part)) >= len(before)
+    # Of the later windows alone: in the earlier ones no suspect acts, and they could judge none.
     held = later & ((np.arange(len(part)) - len(before)) % ONSET.held_out == ONSET.held_out - 1)
     made: dict[str | None, WindowProblem] = {}
 
@@ -136,6 +137,7 @@ def began(
     suspects = suspects_of(follower.model, part.channels)
     observations = observe(problem(None), follower.noise, [log.name], np.where(held, "test", "fit"))
     base = baseline(follower.model, part.channels, [log])
+    # A random walk goes as far as the root of its steps.
     moved = max(restless.walk * math.sqrt(len(part)), restless.scatter)
     form = BeganForm(problem, base, suspects, observations, settings, later, moved)
     effects = {name: catalogue.CATALOGUE[name] for name in form.candidates if name in catalogue.CATALOGUE}

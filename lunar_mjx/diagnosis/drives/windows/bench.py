@@ -101,6 +101,7 @@ class Bench:
             return [Noise(**n) for n in kept["noise"]]
         form = self.form(self.ripple())
         best, left = -math.inf, None
+        # Where soft ground is no candidate the two sets are one, which is then refitted once.
         for effects in dict.fromkeys((frozenset[str](), frozenset({SOFT} & set(form.candidates)))):
             try:
                 value, rest = form.explained(form.refit(effects, None, None))

@@ -298,6 +298,7 @@ def with_prior(unknown: Unknown, given: Mapping[str, tuple[float, float]]) -> Un
         return unknown
     value, std = found
     if unknown.factor:
+        # The standard deviation of a logarithm is the relative one, to first order.
         return dataclasses.replace(unknown, std=max(std / value, 1e-6))
     return dataclasses.replace(unknown, std=max(std, 1e-9))
 
@@ -328,6 +329,7 @@ def with_knowledge(model: Model, known: Mapping[str, tuple[float, float]]) -> Mo
         if q.effect != CALIBRATION:
             old = model.parameters[q.effect][q.name]
             mean = float(np.mean(old))
+            # What is known is the mean: wheels and joints keep their ratios.
             new = tuple(v * value / mean for v in old) if isinstance(old, tuple) and mean != 0.0 else value
             model = model.set(q.effect, "--prior or --fix", **{q.name: new})
     return dataclasses.replace(model, priors={**model.priors, **known})

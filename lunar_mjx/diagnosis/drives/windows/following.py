@@ -88,6 +88,7 @@ class Follower:
         Raises:
           UserError: the drive has none.
         """
+        # Without a limit: what is followed must not be sampled.
         found = cut([log], self._joints, self._radius, 10**9, 0, self._track, self.interval_s)
         return found.part(np.argsort(found.start_s, kind="stable"))
 
@@ -180,6 +181,7 @@ class Follower:
             except UserError:
                 continue  # a log too short for a window
             progress("following the run's own logs", 0.5 * number / len(logs))
+            # What short logs leave of the windows goes to those that follow.
             found = found.part(np.arange(min(max(left // (len(logs) - number), 1), len(found))))
             left -= len(found)
             form = self.form(found, log)
@@ -231,6 +233,7 @@ def _proportions(drives: Sequence[tuple[WindowForm, np.ndarray, np.ndarray]]) ->
         usual = form.usual_differences()
         std = np.array([usual.get(c.name, c.prior) for c in form.coordinates])
         columns = white[:, :-1] * std
+        # Each drive has amounts of its own within their priors, or the noise would be told with them in it.
         own = std * np.linalg.solve(np.eye(len(std)) + columns.T @ columns, columns.T @ white[:, -1])
         there = form.problem(None).there
         whole = np.zeros(there.shape)

@@ -182,6 +182,7 @@ class WindowProblem:
         while at < len(jobs):
             size = PROGRAM.sizes[1] if len(jobs) - at > PROGRAM.few * PROGRAM.sizes[0] else PROGRAM.sizes[0]
             part = jobs[at : at + size]
+            # Filled up, since another number of windows would be another program.
             part = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
             row, window = part[:, 0], part[:, 1]
             x, y, z = (np.asarray(a)[window] for a in (imposed.up_x, imposed.up_y, imposed.up_z))
@@ -191,6 +192,7 @@ class WindowProblem:
                     np.asarray(a, np.float32)
                     for a in (
                         np.asarray(imposed.speed)[window],
+                        # Small turns about the rover's axes: products of two tilts are left out.
                         x - p * z,
                         y + r * z,
                         z + p * x - r * y,
@@ -215,6 +217,7 @@ class WindowProblem:
 
         def late(series: np.ndarray, delay: np.ndarray) -> np.ndarray:
             rate = np.gradient(series, 0.5 * self.cut.interval_s, axis=-1)
+            # To first order: a clock's usual error is a third of a sample.
             return series - delay * rate
 
         def whole(series: np.ndarray) -> np.ndarray:
@@ -230,6 +233,7 @@ class WindowProblem:
         for side, channel in enumerate(CURRENTS):
             series = whole(scale[side] * (late(current[:, side], of("current_clock")) + friction[side]))
             if channel in floor:
+                # Where magnitudes alone are logged, an ammeter's own floor adds to them by squares.
                 series = np.hypot(series, floor[channel] * np.maximum(1.0 + of("current_floor"), 0.0))
             out.append(series)
         yaw = np.asarray(seen.yaw_rate)
@@ -361,6 +365,7 @@ def proportion(residual: np.ndarray, there: np.ndarray, size: np.ndarray) -> Pro
     for share in PROGRAM.shares:
         tried = Proportion(share, whole)
         grown = tried.scale(size[mine]) ** 2
+        # Minus twice the log-likelihood by sample, up to a constant, with the overall size at its best.
         score = np.log(np.mean(power[usual] / grown[usual])) + np.mean(np.log(grown[usual]))
         if score < best - 1e-9:
             best, found = score, tried
@@ -395,6 +400,7 @@ def learn_noise(residual: np.ndarray, there: np.ndarray, interval_s: float) -> l
                     block = residual[c][rows][:, kind]
                     square += float(np.sum(linalg.solve_triangular(factor, block.T, lower=True) ** 2))
                     logs += len(rows) * float(np.sum(np.log(np.diag(factor))))
+                # For every colour the best size follows in closed form: only share and time are left to try.
                 std = float(np.sqrt(max(square / samples, 1e-300)))
                 score = -samples * np.log(std) - logs
                 if score > best[0]:
@@ -414,5 +420,6 @@ def student_weights(residual: np.ndarray, there: np.ndarray, noise: Sequence[Noi
             factor = noise[c].factor(kind, interval_s)
             white = linalg.solve_triangular(factor, residual[c][rows][:, kind].T, lower=True)
             share = (PROGRAM.freedom + kind.sum()) / (PROGRAM.freedom + np.sum(white**2, axis=0))
+            # Never above one: that a window happens to be quiet makes it no better witness.
             weight[c, rows] = np.minimum(share, 1.0)
     return weight
