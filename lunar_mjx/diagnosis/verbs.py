@@ -135,6 +135,7 @@ def _record_opening(
     prints = {}
     for label, u in rows.items():
         moved = [
+            # Nine digits: the same fit made again differs by rounding alone, and is no new opening.
             f"{c.key} {c.value(v):.9g}"
             for i, (c, v) in enumerate(zip(coordinates, u, strict=True))
             if v != 0.0 or i in baseline

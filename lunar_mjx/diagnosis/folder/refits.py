@@ -38,6 +38,7 @@ def write_refits(folder: Path, found: Mapping[Sequence[str], tuple[np.ndarray, n
     if not found:
         return
     names = [_BETWEEN.join(sorted(effects)) for effects in found]
+    # Single precision: seven digits are more than any page shows.
     residual = np.array([r for r, _ in found.values()], np.float32)
     predicted = [np.full(len(r), np.nan) if p is None else p for r, p in found.values()]
     with replacing(folder / REFITS_FILE) as part:

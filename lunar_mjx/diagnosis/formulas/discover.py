@@ -238,6 +238,7 @@ def _in_drives(
         name: base.linear.evidence(form.listed(frozenset([name])), (nothing.tau, nothing.noise))[0] - before
         for name in form.candidates
     }
+    # Twice a log evidence is on the scale of chi-square, in which the penalty is given.
     order = sorted(gains, key=lambda n: -(2.0 * gains[n] - FORMULA_SEARCH.penalty * library[n].length))
     scored = [(f"{library[n].target}: {library[n].formula}", max(2.0 * gains[n], 0.0)) for n in order]
     rows: list[Row] = []

@@ -210,6 +210,7 @@ _HEAVY = "log(Max(W/W_1, 1/1000))"
 
 def _soil() -> Iterator[Term]:
     for target in (STIFFNESS, STRENGTH, MODULUS):
+        # Without the constant: soil that is stiffer everywhere is what a refit of the soil takes up.
         yield from (term(target, factor) for factor in _FEW[1:])
 
 

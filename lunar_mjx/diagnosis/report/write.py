@@ -31,6 +31,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
     if not runs:
         raise UserError("report: no run is given; give at least one run folder.")
     results = [read_result(Path(run)) for run in runs]
+    # The last that was diagnosed: a chain may end in a comparison of which nobody has asked why.
     judge = next((r for r in reversed(results) if r.verdict), results[-1])
     steps = chain(results)
     sections = []

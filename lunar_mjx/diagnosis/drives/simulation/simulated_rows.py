@@ -56,6 +56,7 @@ class Simulated:
         with self._lock:
             if key in self._rows:
                 return
+            # A view would keep the whole batch in memory, uncounted.
             self._rows[key] = row.copy()
             self._bytes += row.nbytes
             while self._bytes > self._most:
@@ -70,7 +71,9 @@ def stamp(*given: Any) -> bytes:
     digest.update(repr(tree).encode())
     for leaf in leaves:
         array = np.asarray(leaf)
+        # Bytes alone do not tell a row from a column, nor whole numbers from real ones.
         digest.update(f"{array.dtype} {array.shape} ".encode())
+        # Bytes of objects are addresses, which say nothing of what lies there.
         digest.update(array.tobytes() if array.dtype.kind in "biuf" else repr(leaf).encode())
     return digest.digest()
 

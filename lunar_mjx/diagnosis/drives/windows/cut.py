@@ -294,14 +294,17 @@ def imu_clock(
         if ok.mean() < 0.5:
             left_over[k] = np.inf
             continue
+        # Scale and zero are free, since only the times are asked for.
         columns = np.column_stack([turn[ok], np.ones(ok.sum())])
         fitted = columns @ np.linalg.lstsq(columns, seen[ok], rcond=None)[0]
         left_over[k] = np.mean((seen[ok] - fitted) ** 2)
     count = len(grid) * CUTTING.lag_step_s / CUTTING.independent_s
+    # For each lag the likelihood at its best scale, zero and noise.
     score = -0.5 * count * np.log(np.maximum(left_over, 1e-12)) - 0.5 * (lags / stated) ** 2
     weight = np.exp(score - score.max())
     weight /= weight.sum()
     mean = float(weight @ lags)
+    # No lag is known better than to half a step of the grid.
     return mean, float(max(np.sqrt(weight @ (lags - mean) ** 2), 0.5 * CUTTING.lag_step_s))
 
 
@@ -322,6 +325,7 @@ def _windows(
     if slow:
         start = start + 0.5 * interval
     half = 0.5 * interval
+    # A sample stands for the mean over an interval about it: the first edge lies half of one ahead.
     edges = start[:, None] - half + half * np.arange(2 * count + 1)
     speed = np.stack([np.interp(edges, *s) for s in speeds], axis=-1)
     up = _up(log, edges, (left, right), radius, clock_s)

@@ -428,6 +428,7 @@ class WindowForm(MeasuredForm):
         low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
         low[:count], high[:count] = self._low - u, self._high - u
         if self.instead >= 0:
+            # Exchanging the ground is a whole step: its amount is held there by a narrow prior, and not fitted.
             mean[self.instead] = 0.0 if soft else 1.0
             low[self.instead], high[self.instead] = -np.inf, np.inf
         own_field = np.array([self._field.get(i, -1) for i in range(count)])
@@ -479,6 +480,7 @@ class WindowForm(MeasuredForm):
             _, found, chosen = linear.evidence(terms, sizes)
             sizes = found.tau, found.noise
             where = {int(p): k for k, p in enumerate(chosen)}
+            # The posterior mean of the linear model, relative to where it was taken, is the Gauss-Newton step.
             step = np.array([found.mean[where[int(i)]] for i in free])
             step *= min(1.0, WINDOW_REFIT.longest_step / max(float(np.abs(step).max()), 1e-12))
             cost = self._cost(linear, columns, sizes, free)

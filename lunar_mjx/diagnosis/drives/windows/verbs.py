@@ -208,6 +208,7 @@ def at_edge(form: WindowForm, refit: Refit) -> list[str]:
         q, c = form.unknowns[i], form.coordinates[i]
         value = float(c.value(refit.u[i]))
         span = 1e-3 * (abs(q.low) + abs(q.high)) if math.isfinite(q.low + q.high) else 1e-9
+        # A range that begins at zero is left out: to end there is physics, such as ground without resistance.
         if not q.low + span < value < q.high - span and q.low != 0.0 and q.name != INSTEAD:
             out.append(q.key)
     return out
@@ -244,6 +245,7 @@ def fitted_model(form: WindowForm, refit: Refit) -> Model:
         wide = math.hypot(std * q.std, DRIFT * full[key].std)
         priors[key] = (value, wide * value if q.factor else wide)
     cut = form.problem(None).cut
+    # Two recordings have one difference, which hardly tells the size of differences.
     if len(np.unique(cut.recordings[np.unique(form.observations.window[form.fit])])) > 2:
         _, found, _ = refit.linear.evidence(form.listed(refit.effects))
         priors |= between(found.tau, found.tau_log_std, form.shares)
