@@ -57,6 +57,7 @@ def husky_case(seed: int = 0, progress: Callable[[float], None] | None = None) -
         import_drives(copy_example(log_folder / "recordings"), log_folder / "logs", MAP)
         floor = compare([log_folder / "logs" / FLOOR], hard_floor("husky"), log_folder / FLOOR, seed=seed)
         tell(0.5)
+        # From what the floor taught of motors and gears, so that the ground alone is new.
         sand = compare(
             [log_folder / "logs" / SAND], load_model(floor.folder / "fitted.toml"), log_folder / SAND, seed=seed
         )

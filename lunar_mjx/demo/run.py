@@ -69,6 +69,7 @@ def run_demo(
         for i, (name, share) in enumerate(_SHARES.items()):
             activity = f"driving {rovers} {ROVERS[name][0]}s"
             report(f"{activity} (compiling)", done)
+            # Compiling takes most of the share and tells nothing of its progress.
             tell = _part(report, activity, done + 0.85 * share, 0.15 * share)
             drives.append(drive(name, rovers, seconds, seed, terrain, tell, shift=0.5 * i))
             done += share

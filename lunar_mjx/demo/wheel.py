@@ -68,6 +68,7 @@ def wheel_cases(starts: int = 8, seed: int = 0, progress: Callable[[float], None
     for i, (name, soil) in enumerate((("paper", PAPER_SOIL), ("consistent", LUNAR_SOIL))):
         cases.append(Case(name, soil, compare(beds[name], table, name), None))
         tell(0.1 * (i + 1))
+    # The paper's wheel also stands on a spring of contact, which no parameter of its soil moves.
     for i, (name, free) in enumerate((("paper", SOIL + PAPER_CONTACT), ("consistent", SOIL))):
         fitted = fit(
             beds[name],

@@ -35,6 +35,7 @@ def _amplitude(effect: str, name: str, p: Parameter) -> Coordinate:
     size = abs(p.nominal - p.null) or 0.1 * min(abs(high - p.null) or math.inf, abs(p.null - low) or math.inf)
     if not math.isfinite(size):
         size = 1.0
+    # Where the null is a bound, resting on it is the effect's absence and no failed fit.
     one_sided = p.null in (low, high)
     return Coordinate(effect, name, p.null, size, low, high, physical=one_sided, unit=p.unit, amplitude=True)
 

@@ -209,6 +209,7 @@ def _rank(
         if not keep.any() or not np.isfinite(white[:, keep]).all() or not np.isfinite(j).all():
             continue  # a rover that cannot drive this here
         pairs = {
+            # Told apart only where neither can be refitted so that it looks like the other.
             (a, b): min(_left(problem, known, white[i, keep] - white[k, keep], j, free, effects, n) for n in (a, b))
             for (i, a), (k, b) in itertools.combinations(enumerate(names), 2)
         }
@@ -237,6 +238,7 @@ def _left(
     at = [index[problem.coordinates[places[k]].key] for k in shared]
     # In place of the prior and not beside it: what earlier logs know holds the prior already.
     precision[np.ix_(shared, shared)] = known.precision[np.ix_(at, at)]
+    # The least of |d - J x|^2 + x P x over x, in closed form.
     downhill = columns.T @ difference
     return float(
         difference @ difference - downhill @ np.linalg.pinv(columns.T @ columns + precision, hermitian=True) @ downhill

@@ -176,6 +176,7 @@ def _most_probable_noise(square: np.ndarray, count: float, prior: NoiseSize) -> 
 def moved(matrix: np.ndarray, amounts: np.ndarray) -> np.ndarray:
     """Statistics (..., k + 1, k + 1) after amplitudes have been moved by (k,) amounts: those times columns are gone."""
     out = matrix.copy()
+    # The square of (residual - columns amounts), expanded: no measurement is seen again.
     change = matrix[..., :-1, :-1] @ amounts
     out[..., -1, -1] += change @ amounts - 2.0 * (matrix[..., :-1, -1] @ amounts)
     out[..., :-1, -1] -= change
@@ -296,6 +297,7 @@ class Evidence:
         bounded = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
         prior, centre = self.amplitudes.std, self.amplitudes.mean
         before = sum(_log_between((low[i] - centre[i]) / prior[i], (high[i] - centre[i]) / prior[i]) for i in bounded)
+        # Coordinates without bounds integrate to one: the marginal of the others is all that is needed.
         covariance = self.covariance[np.ix_(bounded, bounded)]
         return log_box(self.mean[bounded], covariance, low[bounded], high[bounded]) - before
 

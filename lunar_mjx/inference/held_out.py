@@ -53,6 +53,7 @@ def predictive_residual(problem: Problem, fit: Fit) -> np.ndarray:
         jb, rb = fit.jacobian[part], fit.residual[part]
         # What this manoeuvre alone says, in units of what all of them say together.
         mine = jb @ unit
+        # Leaving the manoeuvre out takes its own part from the Hessian, which is the identity in these units.
         values, vectors = np.linalg.eigh(np.eye(mine.shape[1]) - mine.T @ mine)
         # A direction of which the other manoeuvres know next to nothing stays where the fit put it.
         live = values > HELD_OUT.known

@@ -97,6 +97,7 @@ def load_model(path: str | Path) -> Model:
         gains={**model.gains, **gains},
     )
     check_settings(model, path)
+    # A gain that the file states is kept, be it zero.
     model = with_position_gains(model, [g for g, entry in data.get("control", {}).items() if GAINS[0] in entry])
     model = _effects(path, data, model)
     model = dataclasses.replace(model, priors=_priors(path, _table(path, "priors", data.get("priors", {}))))

@@ -418,6 +418,7 @@ def make_model(
     # The preset after the rover: a preset may state another gear.
     model = preset_values(rover_motors(model))
     model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded))
+    # Last, since gains that are given are meant as they are, whatever the gear.
     return model.replace(**changes, gains=given_gains)
 
 

@@ -48,6 +48,7 @@ def hot_motor(preset: str, duration: float = 14.0, rover: str = "luvmi_x") -> Ho
     model = model.set("motor", **PRESET_PARAMETERS["paper"]["motor"])
     model = model.set("joint_control", **PRESET_PARAMETERS["paper"]["joint_control"])
     if preset != "paper":
+        # Gains go with the gear, and the gear is the paper's here.
         paper = make_model(rover, "flat", "paper")
         model = model.replace(gains=paper.gains)
     system = build(model)

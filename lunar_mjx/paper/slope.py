@@ -52,6 +52,7 @@ def slope_runs(
     model = make_model("viper", "flat") if model is None else model
     system = build(model)
     radius = model.rover.wheels[0].radius
+    # The ground is a parameter, too: all slopes are one batch of one program.
     terrain = stack([inclined(np.deg2rad(s)) for s in slopes_deg])
     terrain = jax.tree.map(jnp.asarray, terrain)
     control = jnp.zeros(len(system.joint_names)).at[: len(model.rover.wheels)].set(rim_speed / radius)

@@ -72,6 +72,7 @@ def _soft_ground(preset: str, duration: float, rover: str, torque: float) -> lis
     )
 
     def run(hard: jax.Array, north: jax.Array):
+        # Ground and soft side are parameters, so that all four runs are one program.
         effects = dict(system.params.effects)
         effects["hard_surface"] = {"fraction": hard}
         effects["soil_gradient"] = {**effects["soil_gradient"], "north": north}

@@ -36,6 +36,7 @@ def writer(path: Path, fps: int) -> Iterator[Sink]:
         with replacing(path) as part:
             yield from _mp4(part, fps)
         return
+    # All are kept, since Pillow writes an animation in one go.
     pictures: list[Image.Image] = []
     yield lambda picture: pictures.append(Image.fromarray(picture))
     if pictures:
@@ -70,6 +71,7 @@ def _mp4(path: Path, fps: int) -> Iterator[Sink]:
 
         def put(picture: np.ndarray) -> None:
             nonlocal stream
+            # The first picture tells the size.
             if stream is None:
                 stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": QUALITY})
                 stream.height, stream.width = picture.shape[:2]

@@ -562,5 +562,6 @@ def usual_of(drives: DriveProblem) -> Usual:
     current = torque / (own("gear_ratio") * own("gear_efficiency") * own("torque_constant"))
     commands = np.concatenate([r.commands[:, driven].ravel() for r in drives.bench.runs])
     moving = np.abs(commands[np.abs(commands) > 1e-6])
+    # Not the largest, which may be a single jerk.
     speed = float(np.quantile(moving, 0.9)) if len(moving) else 1.0
     return Usual(load, radius, speed, torque, current, own("resistance"), weight, 2.0 * radius)

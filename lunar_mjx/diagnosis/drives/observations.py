@@ -104,6 +104,7 @@ def with_jitter(observations: Observations, rate: np.ndarray, jitter_s: float) -
     """
 
     def widened(s: Series) -> Series:
+        # To first order an error of time is one of the signal, times its rate.
         return dataclasses.replace(s, white=np.hypot(s.white, jitter_s * rate[s.start : s.stop]))
 
     return dataclasses.replace(observations, series=tuple(map(widened, observations.series)))

@@ -21,6 +21,7 @@ Split = Literal["fit", "select", "test", "apart"]
 class _Stored(BaseModel):
     """Fields that are read; what else stands there is for the reader of the file."""
 
+    # Strict: a text where a number belongs is damage, and nothing to be converted.
     model_config = ConfigDict(extra="allow", strict=True)
 
 

@@ -135,6 +135,7 @@ def _modes(features: np.ndarray, settings: TableSettings) -> np.ndarray:
     # once a place: replicates share their discrepancy, and the eigenproblem stays small
     unique, inverse = np.unique(np.round(features, 6), axis=0, return_inverse=True)
     centred = unique - unique.mean(axis=0)
+    # To a mean variance of one, as the constant and the smooth part have: shares then are shares.
     plane = centred @ centred.T / max(float(np.mean(np.sum(centred**2, axis=1))), 1e-12)
     distance = np.sum((unique[:, None] - unique[None]) ** 2, axis=-1)
     constant, straight, curved = settings.shape_shares

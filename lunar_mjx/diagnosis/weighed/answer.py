@@ -213,6 +213,7 @@ def _discrepancy(
         if felt[field] < least_signal:
             continue  # its size would be the prior's, told as if it had been measured
         size = size * form.shares.get(field, 1.0)
+        # Alike in the logarithm, in which the size was inferred.
         low, high = size * math.exp(-spread), size * math.exp(spread)
         found[field] = {
             "size": float(size),

@@ -131,6 +131,7 @@ class Linear:
             across = scale[own, None] * whole[np.ix_(own, places)] * scale[places]
             length = scale[places] ** 2 * np.diag(whole)[places]
             length = length - np.einsum("ij,ij->j", across, np.linalg.solve(inner, across))
+            # Its strongest amplitude: one that shows is enough to tell of the effect.
             shown_sigma[name] = float(np.sqrt(max(length.max(), 0.0))) if len(places) else 0.0
         return shown_sigma
 

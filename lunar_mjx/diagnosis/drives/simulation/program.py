@@ -98,6 +98,8 @@ class Program:
     def _in_motion(self, state: Any, motion: Mapping[str, Any]) -> Any:
         """A standing rover's state with the velocities of a log that begins in motion."""
         spin = motion["joint_speed"]
+        # Of a free joint MuJoCo counts velocity in the world and turning about the body's own axes: the sixth is the
+        # yaw rate.
         moving = state.qvel.at[:2].set(motion["velocity"]).at[5].set(motion["yaw_rate"])
         moving = moving.at[self._joint_dofs].set(jnp.where(jnp.isnan(spin), moving[self._joint_dofs], spin))
         return dataclasses.replace(state, qvel=jnp.where(motion["moves"], moving, state.qvel))

@@ -427,6 +427,7 @@ def _over_ground(log: Log) -> tuple[np.ndarray, np.ndarray] | None:
     if len(first) < 2:
         return None
     step = x[0][last] - x[0][first]
+    # There a difference quotient is right to second order.
     middle = x[0][first] + 0.5 * step
     heading = np.interp(middle, yaw[0], np.unwrap(np.radians(yaw[1])))
     ahead, aside = x[1][last] - x[1][first], y[1][last] - y[1][first]
@@ -448,7 +449,9 @@ def _covered(time: np.ndarray, wanted: np.ndarray, interval: float) -> bool:
 
 def _means(time: np.ndarray, value: np.ndarray, wanted: np.ndarray, width: float) -> np.ndarray:
     """Means of the samples within half a width of every wanted time; NaN where there are none."""
+    # By differences of a running total: what is asked for overlaps, and logs are long.
     total = np.concatenate([[0.0], np.cumsum(value)])
+    # Both ends are moved alike, so that a sample on a border counts for one of two neighbours.
     low = np.searchsorted(time, wanted - 0.5 * width - 1e-6)
     high = np.searchsorted(time, wanted + 0.5 * width - 1e-6)
     many = high - low
@@ -486,10 +489,13 @@ def _up(
         level = np.array([0.0, 0.0, g])
         up = np.where(np.isfinite(up).all(axis=-1, keepdims=True), up, level)
         size = np.linalg.norm(up, axis=-1, keepdims=True)
+        # Its direction alone: the size is the sensor's scale, and bumps.
         return up * g / size
     roll, pitch = (log.channel(c) for c in LEANS_BY[1])
     if roll is not None and pitch is not None:
         r, p = (np.radians(np.interp(edges, *f)) for f in (roll, pitch))
+        # The world's up in the chassis's axes: last row of the rotation by yaw, pitch and roll, in which the yaw drops
+        # out.
         return g * np.stack([-np.sin(p), np.sin(r) * np.cos(p), np.cos(r) * np.cos(p)], axis=-1)
     return np.broadcast_to(np.array([0.0, 0.0, g]), (*edges.shape, 3)).copy()
 
