@@ -137,8 +137,10 @@ def load_run(folder: str | Path) -> Run:
     for log in logs:
         if not log.exists():
             raise bad_input(path, "logs", str(log), "is missing", "put the log back, or compare anew")
+        # What was found belongs to the very bytes that were compared.
         if folder_hash(log) != hashes.get(str(log)):
             raise bad_input(path, "logs", str(log), "has changed since the comparison", "compare anew")
+    # A run that was received names files of code, which the next verbs would run.
     for candidate in data.get("candidates", ()):
         require_trust(path, "candidates", candidate)
     model = load_model(folder / MODEL_FILE)
@@ -165,6 +167,7 @@ def log_folders(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     paths = without_answers(paths)
     if not paths:
         raise UserError("compare: no log is given; give at least one log folder.")
+    # Absolute, since a run is read from other folders than the one in which it was made.
     folders = tuple(Path(p).resolve() for p in paths)
     for path in folders:
         if not path.exists():

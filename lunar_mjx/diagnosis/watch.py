@@ -173,6 +173,7 @@ class _Watch:
         while True:
             try:
                 log = _read(self.path, self.follower)
+                # A log that still grows may well look damaged at its end.
                 if once and is_bad(findings := check([log])):
                     bad = next(f for f in findings if f.severity == "bad_data")
                     raise UserError(f"{bad.where}: {bad.message}; mend the log before it is watched.")
@@ -221,6 +222,7 @@ class _Watch:
             first_s=self.seen[change.first],
             # Windows are known by their beginning, and what began may have begun anywhere within the last one.
             last_s=self.seen[change.last] + length,
+            # A window's slope is known when the accelerometer's mean about its end is complete.
             raised_s=self.seen[change.seen] + length + CUTTING.levelling_s,
             differences={k: p for k, p in change.kinds.items() if p >= 0.01},
             size=self._size(kind, float(change.amount[list(steps.names).index(kind)])),

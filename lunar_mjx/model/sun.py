@@ -128,6 +128,7 @@ def _track(settings: SunSettings) -> tuple[np.ndarray, np.ndarray, float]:
     cos, sin = math.cos(math.radians(settings.north_deg)), math.sin(math.radians(settings.north_deg))
     towards = np.stack([cos * east - sin * north, sin * east + cos * north, up], axis=-1)
     # The solar constant holds at 1 AU, in which the distance is given.
+    # Where the Sun does not rise its highest is held above zero, since the ambient temperature divides by it.
     return towards[:kept], SOLAR_CONSTANT / distance[:kept] ** 2, max(float(up.max()), 1e-6)
 
 

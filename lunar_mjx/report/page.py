@@ -184,4 +184,5 @@ def _block(block: Block, figures: list[str]) -> dict[str, Any]:
 
 def _placed(figure: go.Figure, figures: list[str], least: int = 0) -> dict[str, int]:
     figures.append(_json(str(figure.to_json())))
+    # Plotly's own height where a figure states none.
     return {"height": figure.layout.height or 450, "least": least, "index": len(figures) - 1}

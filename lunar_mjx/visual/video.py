@@ -29,6 +29,7 @@ def frame_rows(drive: RecordedDrive, fps: int, speed: float) -> tuple[np.ndarray
     if speed == 0.0:
         speed = max(1.0, math.ceil(length / LONGEST))
     at = drive.time[0] + np.arange(0.0, length + 1e-9, speed / fps)
+    # A picture at a row's very time shows that row, whatever the last digits are.
     return np.clip(np.searchsorted(drive.time, at + 1e-9) - 1, 0, len(drive.time) - 1), speed
 
 

@@ -242,6 +242,7 @@ def matching(unit: tuple[int, int], quantities: Sequence[tuple[Quantity, tuple[i
     for q, (newton, metre) in quantities:
         if newton == unit[0] and newton:
             power = unit[1] - metre
+            # By its size: the sense is the target's own, and a force that changes its sign would turn that around.
             shown = q.name if q.positive else f"Abs({q.name})"
             matches.append(
                 shown if not power else f"{shown}*{arm.name}" if power == 1 else f"{shown}*{arm.name}**{power}"

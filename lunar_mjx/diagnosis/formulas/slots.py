@@ -81,6 +81,7 @@ def library(ports: tuple[str, ...]) -> tuple[Choice, ...]:
             continue
         shapes, plain = shaped(target.port), features(target.port)[0]
         for i, j in _pairs(target.port):
+            # At the soil a bare constant is a parameter, which every refit moves anyway.
             one = plain == 1 and (i, j) == (0, 0)
             if not (shapes[i] and shapes[j]) and not (one and target.port == "soil"):
                 functions.append(Choice(k, i, j))

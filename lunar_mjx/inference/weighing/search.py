@@ -310,9 +310,11 @@ class _Search:
         """
         refitted = terms.issuperset(own) and not any(t.kind == EFFECT for t in terms - own)
         old = self.known.get((form.name, terms))
+        # What a set's own refit says is not replaced by an estimate from another's.
         if len(terms) > self.most_terms or (old is not None and old.refitted):
             return old
         named = frozenset(t.name for t in terms if t.kind == EFFECT)
+        # These effects have had their refit: an estimate from elsewhere comes too late, even where that refit failed.
         if not refitted and (form.name, named) in self.done:
             return old
         try:

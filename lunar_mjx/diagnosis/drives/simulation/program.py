@@ -68,6 +68,7 @@ class Program:
 
     def _axes(self, params: Params, shared: bool) -> Any:
         axes = jax.tree.map(lambda _: 0, params)
+        # One ground for all rovers is not copied for each of them.
         return dataclasses.replace(axes, terrain=None) if shared else axes
 
     def _reset_all(self, params: Params, start: Mapping[str, Any], terrain: Any, log: Any) -> tuple[Params, Any]:

@@ -140,6 +140,7 @@ class WindowProblem:
         # What stands at the model's own value is the same simulation whether it is among the unknowns or not.
         keys = [
             tuple(
+                # Rounded, so that a value that is reached in two ways is one simulation.
                 (n, round(float(v[k]), 9))
                 for n, v, i in zip(names, values, moves, strict=True)
                 if abs(v[k] - self.begin(unknowns[i])) > 1e-12
