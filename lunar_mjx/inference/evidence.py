@@ -52,13 +52,17 @@ class SizeDescent:
     """Longest Newton step of the logarithm of a size."""
     settled: float = 1e-6
     """Gain of log density by a further Newton step below which sizes have settled."""
+    rounding: float = 1e-6
+    """1; share of the measurements' sum of squares that rounding may take from a chi-square."""
+    most_levels: int = 8
+    """Steps from level to level of slow errors at most."""
 
 
 SIZE_DESCENT = SizeDescent()
 
 
 class EvidenceError(ArithmeticError):
-    """The sizes did not settle, or the input is not finite: the solver failed, and nothing is said about a model."""
+    """Sizes did not settle, or numbers are not finite or too large: the solver failed and says nothing of a model."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -401,7 +405,7 @@ def infer(
       start: (tau, noise) to begin from, such as those of a similar hypothesis; the usual sizes if None.
 
     Raises:
-      EvidenceError: sizes did not settle in 60 Newton steps.
+      EvidenceError: sizes did not settle in 60 Newton steps, or derivatives are too steep to compute with.
     """
     usual = np.array([f.usual for f in fields])
     # sizes are positive, and their posterior is nearer to a normal one in the logarithm: Laplace's method is used there
@@ -447,10 +451,6 @@ def infer(
     )
 
 
-_MOST_LEVEL_STEPS = 8
-"""Steps of EM from level to level; each makes the measurements more probable, and 2 or 3 are needed."""
-
-
 def infer_levels(
     levels: Levels,
     amplitudes: Amplitudes,
@@ -458,16 +458,19 @@ def infer_levels(
     noises: Sequence[NoiseSize] = (),
     start: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Evidence:
-    """As `infer`, for measurements whose slow errors have an unknown size: at the most probable one of each group.
+    """Evidence and posterior of one hypothesis where slow errors have an unknown size: at the most probable one.
 
     Args:
-      levels: statistics of the hypothesis' columns by size. amplitudes, fields, noises, start: as for `infer`.
+      levels: statistics of its columns by size. amplitudes, fields, noises, start: as for `infer`.
+
+    Returns:
+      What was found, with the level of each group; the log evidence is that of measurements in their units.
 
     Raises:
       EvidenceError: see `infer`.
     """
     at, best = levels.start, None
-    for _ in range(_MOST_LEVEL_STEPS):
+    for _ in range(SIZE_DESCENT.most_levels):
         found = infer(levels.gram(at), amplitudes, fields, noises, start)
         found = dataclasses.replace(found, log_evidence=found.log_evidence + levels.log_weight(at), levels=at)
         # sizes of discrepancy settle anew at each level, which EM knows nothing of: a step may lose a little
@@ -503,6 +506,9 @@ def _condition(
     Returns:
       The log density; (k,) standardised posterior mean; (k, k) standardised posterior covariance; (k,) prior standard
       deviations that standardise.
+
+    Raises:
+      EvidenceError: rounding spoils it.
     """
     k = gram.width
     scale = amplitudes.std * np.append(tau, 1.0)[amplitudes.field]  # field -1 picks the 1 at the end
@@ -521,7 +527,12 @@ def _condition(
     # log |V| by Sylvester's identity: the determinant of the small matrix in place of one as large as the data.
     log_det = 2.0 * float(np.sum(np.log(np.diag(factor))))
     size = float(np.sum(gram.count * (_LOG_2PI + 2.0 * np.log(noise))))
-    return -0.5 * (size + square - float(downhill @ mean) + log_det), mean, covariance, scale
+    chi_square = square - float(downhill @ mean)
+    # No chi-square is negative. Slopes taken across a jump can be so steep that rounding makes it so, and the
+    # hypothesis would win by any number.
+    if chi_square < -SIZE_DESCENT.rounding * (1.0 + abs(square)):
+        raise EvidenceError(f"derivatives are too steep to compute with: chi-square comes out as {chi_square:.2g}")
+    return -0.5 * (size + chi_square + log_det), mean, covariance, scale
 
 
 def _density(

@@ -52,7 +52,7 @@ HEIGHTS, HEIGHTS_DOWN, RELIEF, SHARES = "cividis", "cividis_r", "gray", "Greys"
 SHADES = ((0.0, "#f7fbff"), (0.25, "#c6dbef"), (0.5, "#6baed6"), (0.75, "#2171b5"), (1.0, "#08306b"))
 """From none to much, in one hue: how far the darkness goes is what counts."""
 DARK_SHADES = ("#15202b", "#173a56", "#1b5f8f", "#3f94c9", "#a8d8f5")
-"""The same from none to much on a dark page: there it is lightness that counts."""
+"""Shades from none to much on a dark page, where more is lighter."""
 DARK_SERIES = {BLUE: SKY, PURPLE: "#CC79A7", SKY: BLUE}
 """What takes the place of colours that sink into a dark page."""
 DARK_FIGURES = {**DARK, **DARK_SERIES, **{light: dark for (_, light), dark in zip(SHADES, DARK_SHADES, strict=True)}}

@@ -9,7 +9,17 @@ import pytest
 from scipy import integrate, special, stats
 
 from lunar_mjx.inference import evidence
-from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize, infer, log_box
+from lunar_mjx.inference.evidence import (
+    Amplitudes,
+    EvidenceError,
+    Field,
+    Gram,
+    Levels,
+    NoiseSize,
+    infer,
+    infer_levels,
+    log_box,
+)
 
 N, OWN, EACH = 60, 3, 8
 FIELDS = (Field("a", 0.5), Field("b", 0.2, log_std=0.4))
@@ -220,3 +230,34 @@ def test_many_bounds_agree_with_samples():
     drawn = rng.multivariate_normal(mean, covariance, 1_000_000)
     wanted = math.log(np.mean(np.all(drawn > low, axis=1)))
     assert log_box(mean, covariance, low, high) == pytest.approx(wanted, abs=0.15)
+
+
+def test_derivatives_that_rounding_spoils_are_no_proof():
+    """More is explained than there is: no measurements have such sums, and the gain would be of any size."""
+    gram = Gram(np.array([50]), np.array([[[1e30, 3e15], [3e15, 1.0]]]))
+    with pytest.raises(EvidenceError, match="too steep"):
+        infer(gram, Amplitudes.of(np.ones(1)), (), [NoiseSize("x")])
+
+
+def test_the_most_probable_level_of_slow_errors_is_taken(drawn):
+    """Each level in turn tells what the search over levels has to find."""
+    columns, residual, group, amplitudes = drawn
+    rng = np.random.default_rng(8)
+    extra = rng.normal(size=N)
+    stretches = [np.ones(N), np.sqrt(1.0 + 4.0 * extra**2), np.full(N, 3.0)]
+    grams = [Gram.of(columns / s[:, None], residual / s, group, 2) for s in stretches]
+    scale = np.array([np.bincount(group, np.log(s), minlength=2) for s in stretches])
+    log_prior = np.array([0.0, -1.0, -2.0])
+    matrix = np.stack([g.matrix for g in grams])
+    alone = {}
+    for first in range(3):
+        for second in range(3):
+            at = np.array([first, second])
+            levels = Levels(grams[0].count, matrix, scale, log_prior, at)
+            alone[first, second] = infer(levels.gram(at), amplitudes, FIELDS, NOISES).log_evidence + levels.log_weight(
+                at
+            )
+    from_afar = Levels(grams[0].count, matrix, scale, log_prior, np.array([2, 2]))
+    found = infer_levels(from_afar, amplitudes, FIELDS, NOISES)
+    assert tuple(found.levels) == max(alone, key=lambda k: alone[k])
+    assert found.log_evidence == pytest.approx(max(alone.values()), abs=1e-4)

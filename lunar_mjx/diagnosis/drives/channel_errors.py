@@ -65,7 +65,7 @@ class ChannelErrors:
         return self._levels(np.column_stack([columns, residual]), range(len(self._sizes)), self.usual)
 
     def usual_level(self, columns: np.ndarray, residual: np.ndarray) -> Levels:
-        """As `levels`, of the usual size alone."""
+        """Statistics of the fitted observations at the usual size alone; arguments as for `levels`."""
         return self._levels(np.column_stack([columns, residual]), [int(self.usual[0])], np.zeros_like(self.usual))
 
     def _levels(self, whole: np.ndarray, tried: Sequence[int], start: np.ndarray) -> Levels:

@@ -20,10 +20,11 @@ class Differences:
 
     Args:
       coordinates: of the problem. which: (m,) places of those that the Jacobian is of.
+      side: 1 for steps upwards where bounds allow, -1 for steps downwards.
     """
 
-    def __init__(self, coordinates: Sequence[Coordinate], which: np.ndarray):
-        self._coordinates, self._which = coordinates, which
+    def __init__(self, coordinates: Sequence[Coordinate], which: np.ndarray, side: int = 1):
+        self._coordinates, self._which, self._side = coordinates, which, side
         self._own = [int(i) for i in which if coordinates[i].log_index >= 0 and not is_linear(coordinates[i])]
         self._shared = [int(i) for i in which if coordinates[i].log_index < 0 and not is_linear(coordinates[i])]
         self._kinds = sorted({coordinates[i].name for i in self._own})
@@ -39,8 +40,10 @@ class Differences:
         return rows
 
     def _step(self, u: np.ndarray, i: int) -> float:
-        # Backward at an upper bound, beyond which the model need not make sense.
-        return STEP if u[i] + STEP <= self._coordinates[i].bounds()[1] else -STEP
+        # Inwards at a bound, beyond which the model need not make sense.
+        low, high = self._coordinates[i].bounds()
+        step = self._side * STEP
+        return step if low <= u[i] + step <= high else -step
 
     def jacobian(
         self,

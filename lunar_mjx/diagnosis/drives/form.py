@@ -8,6 +8,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -52,8 +53,12 @@ class DriveRefit:
     """1; least damping, over the diagonal of the normal matrix: nearly a Gauss-Newton step (Marquardt 1963)."""
     stiffer: float = 1e3
     """1; factor on the damping where no step gained."""
+    softer: float = 1e-2
+    """1; factor on the damping of a step that gained: what held it back may lie behind it."""
     most_damping: float = 1e6
     """1; damping beyond which steps are too short to tell, and slopes are taken anew."""
+    steep: float = 1e4
+    """sigma; change of one reading within a coordinate's prior from which a slope is taken to the other side, too."""
     together: int = 8
     """Candidates whose signatures one program simulates: fewer are faster per rover, more are fewer programs to
     make."""
@@ -133,9 +138,21 @@ class DriveForm(MeasuredForm):
         return self.drives.predict(self._whole(u)[None])[0]
 
     def jacobian(self, u: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predictions (n,) at (coordinates,) and their derivatives (n, free)."""
+        """Predictions (n,) at (coordinates,) and their derivatives (n, free).
+
+        A jump of a hundredth of a sigma within a difference quotient's step would be a slope of a hundred thousand, and
+        stand in it as knowledge. Where a slope says so much, the one to the other side is taken as well, and of each
+        reading's two the flatter: the other has the jump.
+        """
         value, slopes = self.drives.jacobian(self._whole(u), free)
-        return value, np.where(np.isfinite(slopes), slopes, 0.0)
+        slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        reach = np.abs(slopes) * self._std[free] / self.observations.sigma()[:, None]
+        steep = np.flatnonzero(reach.max(axis=0, initial=0.0) > DRIVE_REFIT.steep)
+        if len(steep):
+            other = self.drives.jacobian(self._whole(u), free[steep], side=-1)[1]
+            first = slopes[:, steep]
+            slopes[:, steep] = np.where(np.isfinite(other) & (np.abs(other) < np.abs(first)), other, first)
+        return value, slopes
 
     def _see(self, u: np.ndarray) -> None:
         """Takes the signatures of all candidates and unknown inputs at a refit of the model as it is.
@@ -283,6 +300,21 @@ class DriveForm(MeasuredForm):
         return other
 
     # --- refits ------------------------------------------------------------------------------------------------------
+
+    def learnt(self, refit: Refit) -> dict[str, Any]:
+        """Log evidence of a refit, and the errors beside the noise that it was found with.
+
+        The evidence is that of the fitted measurements in their units, so that runs with other settings compare.
+
+        Args:
+          refit: of this form.
+
+        Returns:
+          `log_evidence`; `jitter_s`, scatter of times, s; `channel_errors`, shares of what a channel does.
+        """
+        value = refit.linear.evidence(self.listed(refit.effects))[0]
+        widths = float(np.sum(self.observations.log_widths()[self._fit]))
+        return {"log_evidence": value - widths, "jitter_s": self.jitter_s, "channel_errors": dict(self.channel_errors)}
 
     def limit(self, until: float) -> None:
         """See `MeasuredForm`."""
@@ -473,7 +505,7 @@ class DriveForm(MeasuredForm):
                         _bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], low, high)
                         for d in dampings
                     ]
-                    steps = [s * min(1.0, settings.longest_step / float(np.abs(s).max())) for s in steps]
+                    steps = [s * min(1.0, settings.longest_step / max(float(np.abs(s).max()), 1e-300)) for s in steps]
                     rows = np.repeat(u[None], trials, axis=0)
                     rows[:, free] = np.clip(u[free] + steps, low, high)
                     residuals = [white(self.observations.value - v) for v in self.drives.predict(self._whole(rows))]
@@ -483,7 +515,7 @@ class DriveForm(MeasuredForm):
                     if not gained > 0.0:
                         damping *= DRIVE_REFIT.stiffer
                         continue
-                    damping = max(dampings[best], DRIVE_REFIT.damping)
+                    damping = max(DRIVE_REFIT.softer * dampings[best], DRIVE_REFIT.damping)
                     u, residual, present_chi2 = rows[best], residuals[best], reached[best]
                     # A step that keeps less than a third of its promise has left where these slopes hold.
                     if gained < 0.3 * _promised(steps[best], normal, downhill):

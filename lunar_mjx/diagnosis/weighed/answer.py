@@ -172,6 +172,7 @@ def comparison(problem: Problem, start: np.ndarray, refit: Refit, alone: np.ndar
             form, found.tau, found.tau_log_std, refit.linear.felt(), problem.settings.least_signal
         ),
         "noise": {n.name: float(s) for n, s in zip(refit.linear.noises, found.noise, strict=True)},
+        **form.learnt(refit),
         "solver": refit.failed or "ended",
         "observations": len(observations),
         "logs": list(observations.logs),

@@ -122,6 +122,11 @@ class MeasuredForm(Form):
     def predicted(self, u: np.ndarray) -> np.ndarray:
         """(n,) predictions in SI units at (coordinates,)."""
 
+    def learnt(self, refit: Refit) -> dict[str, Any]:
+        """What a form has learnt beside its parameters, for the record of a comparison; nothing by itself."""
+        del refit
+        return {}
+
     def limit(self, until: float) -> None:
         """Ends simulations by a time of the monotonic clock, where they last: refits then raise `TimeUp`."""
         del until

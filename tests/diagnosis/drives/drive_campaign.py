@@ -32,10 +32,12 @@ def drive_campaign(
     seed: int = 0,
     noise: float = 1.0,
     forms: Sequence[str] = (),
+    encoders_every: int = 1,
 ) -> Path:
     """Writes one log per profile under `folder`: commands, motion, motors, with white noise; returns the folder.
 
-    `forms` names effects that take the place of some of the model's.
+    `forms` names effects that take the place of some of the model's. Wheels are read at every so many rows, in a table
+    of their own where that is not each.
     """
     rng = np.random.default_rng(seed)
     model = make_model("luvmi_x", terrain="flat", timestep=STEP)
@@ -48,9 +50,14 @@ def drive_campaign(
             std = noise * SIGMA[channel.partition("_")[0]]
             stated[channel] = Noise(std, "datasheet")
             frame[channel] += rng.normal(0.0, std, len(frame))
+        tables = {"drive": frame}
+        if encoders_every > 1:
+            joints = [c for c in frame if c.startswith("joint")]
+            slow = frame[["time_s", *joints]].iloc[::encoders_every]
+            tables = {"drive": frame.drop(columns=joints), "encoders": slow}
         write_log(
             folder / f"drive{number}",
-            {"drive": frame},
+            tables,
             rover="luvmi_x",
             noise=stated,
             manoeuvre=f"drive{number}",

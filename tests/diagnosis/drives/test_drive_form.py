@@ -57,8 +57,8 @@ class Toy:
         u[:, 5:] *= 20.0
         return u @ SHAPES
 
-    def jacobian(self, u, which):
-        step = 1e-6
+    def jacobian(self, u, which, side=1):
+        step = side * 1e-6
         rows = np.concatenate([u[None], u + step * np.eye(len(u))[which]])
         values = self.predict(rows)
         return values[0], ((values[1:] - values[0]) / step).T
@@ -166,10 +166,10 @@ class Hurried(Toy):
             raise TimeUp
         return super().predict(u)
 
-    def jacobian(self, u, which):
+    def jacobian(self, u, which, side=1):
         if self.refits_too and len(which) > len(self.baseline):
             raise TimeUp
-        return super().jacobian(u, which)
+        return super().jacobian(u, which, side)
 
 
 def test_candidates_without_time_are_skipped_and_told(monkeypatch):
@@ -229,3 +229,55 @@ def test_a_little_of_everything_is_no_name():
     base = found.base("the model")
     (field,) = [i for i, f in enumerate(base.refit.linear.fields) if f.name == module.USUAL_EFFECTS]
     assert 0.01 < base.evidence.tau[field] < 0.3
+
+
+@pytest.mark.parametrize("start", [{"a": -6.0, "lag": 9.0}, {"a": 4.0, "drag": 20.0}])
+def test_a_refit_from_afar_ends_no_worse_than_without_the_effect(start):
+    """The effect's null is within reach: a refit that stops above it has not arrived."""
+    toy = Toy({"a": 0.8, "b": -0.4})
+    settings = DriveSettings()
+    form = DriveForm(toy, settings)  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    effect = next(e for e in start if e in form.candidates)
+    u = base.u.copy()
+    for name, value in start.items():
+        u[[c.effect if c.amplitude else c.name for c in form.coordinates].index(name)] = value
+    refit = form.refit(frozenset({effect}), base, u)
+    assert form.learnt(refit)["log_evidence"] > form.learnt(base)["log_evidence"] - 1.0
+
+
+def test_what_is_learnt_beside_the_parameters_can_be_compared_between_settings():
+    """Times that scatter are found where they do; saying that none does costs evidence."""
+    toy = Toy({"a": 0.4})
+    toy.rate = np.where(np.arange(LOGS * SAMPLES) % 10 == 0, 1000.0, 0.0)
+    jolts = toy.rate * 0.005 * np.random.default_rng(9).standard_normal(LOGS * SAMPLES)
+    toy.observations = dataclasses.replace(toy.observations, value=toy.observations.value + jolts)
+    found = {}
+    for jitters in (DriveSettings().jitters_s, (0.0,)):
+        form = DriveForm(toy, dataclasses.replace(DriveSettings(), jitters_s=jitters))  # type: ignore[arg-type]
+        found[jitters] = form.learnt(form.refit(frozenset(), None, None))
+    some, none = found.values()
+    assert (some["jitter_s"], none["jitter_s"]) == (0.005, 0.0)
+    assert set(some["channel_errors"]) == {"y"}
+    assert some["log_evidence"] > none["log_evidence"] + 10.0
+
+
+class Jumping(Toy):
+    """A toy of which one reading jumps by a tenth of a sigma just above a place, as where a wheel at rest slips."""
+
+    edge = np.inf
+
+    def predict(self, u):
+        out = super().predict(u)
+        out[:, 7] += 0.1 * (np.atleast_2d(u)[:, 0] > self.edge)
+        return out
+
+
+def test_a_jump_within_the_step_of_a_derivative_is_no_slope():
+    toy = Jumping({"a": 0.3})
+    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    place, free = form.origin(), form.baseline
+    smooth = form.jacobian(place, free)[1]
+    toy.edge = place[0] + 1e-9
+    assert abs(toy.jacobian(form._whole(place), free)[1][7, 0] - smooth[7, 0]) > 1e4
+    np.testing.assert_allclose(form.jacobian(place, free)[1], smooth, atol=1e-3)

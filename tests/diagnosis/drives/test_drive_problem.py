@@ -7,6 +7,7 @@ import pytest
 
 from lunar_mjx.backends import Hook
 from lunar_mjx.diagnosis.drives.form import DriveForm
+from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.verdict import Verdict
@@ -111,3 +112,20 @@ def test_friction_hidden_in_a_drive_is_named_and_sized(rubbing_logs, engine):
     assert said.effects == ("coulomb_friction",)
     assert _torque(form, found.best) == pytest.approx(FRICTION, rel=0.1)
     assert _rms(form, found.best) < 1.05 < 1.2 < _rms(form, found.base(form.name))
+
+
+def test_a_usual_error_of_a_clock_is_what_a_late_stamp_does(tmp_path):
+    """Wheels are read at every second simulated sample: from reading to reading they have reached their commands."""
+    logs = read_campaign([drive_campaign(tmp_path, encoders_every=2)])
+    candidates = {"clock_offset": catalogue.get("clock_offset")}
+    problem = DriveProblem(logs, make_model("luvmi_x", terrain="flat", timestep=0.0025), candidates, baseline=BASELINE)
+    names = [c.name for c in problem.coordinates]
+    late, usual = names.index("joint"), names.index("usual clock joint: late")
+    rows = np.repeat(problem.origin()[None], 3, axis=0)
+    rows[1, late], rows[2, usual] = 1e-3 / problem.coordinates[late].scale, 1.0
+    plain, stamped, erring = problem.predict(rows)
+    joints = np.concatenate([np.arange(s.start, s.stop) for s in problem.observations.series if "speed" in s.channel])
+    change, wanted = (erring - plain)[joints], (stamped - plain)[joints] * USUAL_ERRORS.usual_clock_s / 1e-3
+    assert np.abs(wanted).max() > 0.01
+    # a shift by a millisecond is the derivative but for its square
+    np.testing.assert_allclose(change, wanted, atol=0.03 * float(np.abs(wanted).max()))
