@@ -277,8 +277,8 @@ def test_the_moment_errs_with_the_shear_stress_and_little_beyond(folder):
 
 
 def test_effects_on_sensors_of_drives_are_not_used_and_that_is_said(folder):
+    assert not tables(folder, "plain").unused
     path = folder / "plain"
     model = make_model("luvmi_x", terrain="flat", preset="consistent").add("channel_scale")
     problem = build_tables(Run(folder / "run", (path,), model), read_campaign([path]), only=())
     assert "channel_scale" in problem.unused and "calibration" in problem.unused
-    assert not tables(folder, "plain").unused
