@@ -168,7 +168,8 @@ def headline_figure(cases: Sequence[Case]) -> go.Figure:
         range=[-0.12, 1.9],
         tickvals=[1, 2, 5, 10, 20, 50],
     )
-    figure.update_yaxes(type="category", autorange="reversed", automargin=True, showgrid=False)
+    # Half a row of room at both ends, for the numbers above the first and below the last.
+    figure.update_yaxes(type="category", range=[len(names) - 0.4, -0.6], automargin=True, showgrid=False)
     return figure
 
 

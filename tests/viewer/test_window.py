@@ -59,4 +59,4 @@ def test_opens_drives_and_ends_with_control_c(screen):
     out, err = process.communicate()
     assert process.returncode == 0 and "Traceback" not in err
     assert "luvmi_x drove 0.0 m in" in out and "http" not in out  # a window, not the page
-    assert float(out.split(" in ")[1].split()[0]) > 0.5
+    assert float(out.split(" in ")[1].split()[0]) >= 0.5  # told to one decimal: 0.51 s is "0.5 s"
