@@ -64,7 +64,7 @@ def test_a_killed_command_leaves_every_file_old_or_new(name, tmp_path):
     before, after = _contents(old), _contents(new)
     assert before.keys() == after.keys() and any(before[k] != after[k] for k in before)
     places = _places(_touches(done), 5)
-    assert len(places) >= 3
+    assert len(places) == min(5, _touches(done)) >= 3, "a mesh alone is opened, renamed and looked for"
     for at in places:
         folder = tmp_path / f"killed{at}"
         shutil.copytree(old, folder)
@@ -96,10 +96,14 @@ def test_why_that_is_killed_ten_times_ends_alike(compared, tmp_path):
     assert done.returncode == verdict["exit_status"] == 20 and verdict["effects"] == ["slip_sinkage"]
     shutil.copytree(compared, broken)
     places = _places(_touches(done), 10)
+    assert len(places) == 10
     for at in places:
         killed = _command(broken, at, *ask)
-        # what was kept before an earlier kill may spare it the touch that it was to die at
-        assert killed.returncode in (-signal.SIGKILL, verdict["exit_status"]), killed.stderr[-2000:]
+        if killed.returncode == verdict["exit_status"]:  # what was kept spared it the touch that it was to die at
+            shutil.rmtree(broken)
+            shutil.copytree(compared, broken)
+            killed = _command(broken, at, *ask)
+        assert killed.returncode == -signal.SIGKILL, killed.stderr[-2000:]
         for name, data in _contents(broken).items():
             if name.endswith(".json"):
                 json.loads(data)

@@ -82,6 +82,12 @@ def learner_name(training: Training) -> str:
     return next(name for name, kind in ALGORITHMS.items() if isinstance(training.train.algorithm, kind))
 
 
+MOST_STEPS = 10**15
+"""Environment steps: a million a second for thirty years."""
+UNSEEN = ("terrain", "ranges", "hardness")
+"""What a file may say of the ground and soil of its evaluation."""
+
+
 def _with_learner(training: Training, learner: str) -> Training:
     if learner not in ALGORITHMS:
         raise bad_input("train", "--learner", learner, "does not exist", f"use one of {', '.join(ALGORITHMS)}")
@@ -126,7 +132,10 @@ def read_training(path: Path) -> Training:
     else:
         algorithm = _settings(ALGORITHMS[named[0]](), fields.table(named[0]))
         train = _settings(TrainConfig(algorithm), fields.table("train"), _unused(algorithm))
-    steps = fields.positive("steps")
+    steps = fields.positive("steps", most=MOST_STEPS)
+    if steps != int(steps):
+        raise bad_input(path, "steps", steps, "is no whole number", "give a number of environment steps")
+    fields.table("unseen").known(UNSEEN)
     return Training(
         fields.text("environment"),
         _tuples(fields.table("options").values),
@@ -191,6 +200,8 @@ def _like(old: Any, name: str, value: Any) -> Any:
     if not isinstance(value, str):
         return tuple(value) if isinstance(old, tuple) else value
     try:
+        if "_" in value:  # Python reads 1_0 as 10
+            raise ValueError
         if isinstance(old, bool):
             return {"true": True, "false": False}[value.lower()]
         if isinstance(old, tuple):

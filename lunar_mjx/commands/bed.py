@@ -178,10 +178,10 @@ def _points(
                 "has no steady state",
                 f"give {1 - BOX_SIZE.slowest:g} at most",
             )
-        if slip.min() < -1.0 or np.abs(angle).max() > 85.0 or load.min() <= 0.0:
+        if slip.min() < -1.0 or np.abs(angle).max() > 85.0 or load.min() <= 0.0 or load.max() > 1e5:
             raise UserError(
                 "lunar-mjx bed simulate: --slips lie within [-1, 0.95], --slip-angles within [-85, 85] deg, and "
-                "--loads are positive; correct them."
+                "--loads are positive, 100000 N at most; correct them."
             )
         test = {"slip_ratio": slip, "slip_angle_deg": angle, "normal_load_N": load}
         points = points_of_table(Table("", test, {}, np.ones(len(slip), int), {}, 1.0, 1.0, "wheel_frame"))

@@ -363,9 +363,15 @@ def _with_priors(model: Model, prior: Sequence[str] | None, fix: Sequence[str] |
 
 def _number(option: str, given: str, text: str) -> float:
     try:
-        return float(text)
+        return _plain(text)
     except ValueError:
         raise bad_input("lunar-mjx", option, given, "is not NAME=VALUE+-STD", "give two numbers") from None
+
+
+def _plain(text: str) -> float:
+    if "_" in text:  # Python reads 1_0 as 10
+        raise ValueError
+    return float(text)
 
 
 def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
@@ -386,7 +392,7 @@ def _numbers(option: str, given: Sequence[str] | None) -> dict[str, float]:
     out = {}
     for name, value in _pairs(option, given).items():
         try:
-            out[name] = float(value)
+            out[name] = _plain(value)
         except ValueError:
             raise bad_input("lunar-mjx", option, f"{name}={value}", "is not a number", "give a number") from None
     return out

@@ -97,18 +97,31 @@ def _settings(changes: list[str] | None) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for pair in changes or []:
         key, equals, text = pair.partition("=")
-        if not equals or not re.fullmatch(r"[\w.]+", key.strip()):
+        if not equals or not re.fullmatch(r"[\w*]+(\.[\w*]+)*", key.strip()):
             raise bad_input("lunar-mjx log import", "--set", pair, "is not key=value", "write it as ground=snow")
-        try:
-            value = tomllib.loads(f"value = {text.strip()}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = text.strip()
         *parents, last = key.strip().split(".")
         place = tree
         for parent in parents:
             place = place.setdefault(parent, {})
-        place[last] = value
+            if not isinstance(place, dict):
+                break
+        if not isinstance(place, dict) or last in place:
+            raise bad_input("lunar-mjx log import", "--set", pair, "is given a value twice", "give one of them")
+        place[last] = _toml_value(pair, text.strip())
     return tree
+
+
+def _toml_value(pair: str, text: str) -> Any:
+    try:
+        read = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    except (ValueError, RecursionError):  # thousands of digits, thousands of brackets
+        raise bad_input(
+            "lunar-mjx log import", "--set", pair, "is no value of TOML", "write it as ground=snow"
+        ) from None
+    # A value of several lines may hold keys of its own.
+    return read["value"] if len(read) == 1 else text
 
 
 def channels() -> None:
@@ -304,6 +317,8 @@ def _numbers(option: str, pairs: list[str] | None) -> dict[str, float]:
         try:
             values[name.strip()] = float(number)
         except ValueError:
+            equals = ""
+        if "_" in number:  # Python reads 1_0 as 10
             equals = ""
         if not equals or not name.strip():
             raise bad_input("lunar-mjx log", option, pair, "is not name=number", "write it as in stiffness=0.5")

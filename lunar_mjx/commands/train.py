@@ -55,7 +55,9 @@ def train(
         str | None, typer.Option(help="td3, ddpg, sac or ppo instead of the training's own, with settings to match.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 0,
-    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; the training's own if left out.")] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, max=10**15, help="Environment steps; the training's own if left out.")
+    ] = None,
     time_limit: Annotated[float | None, typer.Option(help="s after which it saves and stops, to be resumed.")] = None,
     target: Annotated[float | None, typer.Option(help="Success rate on unseen ground at which it stops.")] = None,
     environment: Annotated[

@@ -41,6 +41,8 @@ class PointEnv:
     control_interval = 0.1
 
     def __init__(self, episode_steps: int = 40, poison: int = 0):
+        if isinstance(episode_steps, bool) or not isinstance(episode_steps, int):
+            raise bad_input("PointEnv", "episode_steps", episode_steps, "is no whole number", "give at least one step")
         if episode_steps < 1:
             raise bad_input("PointEnv", "episode_steps", episode_steps, "is below 1", "give at least one step")
         self.episode_steps = episode_steps

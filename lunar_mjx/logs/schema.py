@@ -120,6 +120,8 @@ CHANNELS: tuple[Channel, ...] = (
 
 GREATEST_GRAVITY = 100.0
 """m/s2: of a centrifuge with a test bed in it; no rover meets more."""
+LATEST = 1e11
+"""s: no clock counts 3000 years."""
 ANGLE_LIMIT = 2.0 * 3.141592653589793
 """Steering and suspension joints do not turn further, rad; wheels do."""
 

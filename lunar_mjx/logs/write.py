@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import re
+import shutil
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -73,7 +75,7 @@ def write_log(
     top["tables"] = entries
     top["noise"] = noise_tables(noise or {})
     write_text(folder / LOG_FILE, tomli_w.dumps(top))
-    read_log(folder)
+    _read_back(folder)
     return folder
 
 
@@ -106,8 +108,17 @@ def write_steady_log(
     new_folder(folder)
     write_frame(frame, folder / "points.csv")
     write_text(folder / LOG_FILE, tomli_w.dumps(top))
-    read_log(folder)
+    _read_back(folder)
     return folder
+
+
+def _read_back(folder: Path) -> None:
+    """Reads what was just written; takes it away where it is refused, so that a better one can be written there."""
+    try:
+        read_log(folder)
+    except UserError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def noise_tables(noise: Mapping[str, Noise]) -> dict[str, dict[str, Any]]:
@@ -151,6 +162,10 @@ def write_frame(frame: pd.DataFrame, path: Path) -> None:
 
 
 def _check_frame(name: str, frame: pd.DataFrame) -> None:
+    # It becomes the name of a file in the log's folder, and of no other place.
+    if not re.fullmatch(r"\w[\w .-]{0,99}", name):
+        remedy = "use 100 letters, digits and underscores at most"
+        raise bad_input("write_log", "name of a table", name, "is no name of a file", remedy)
     if "time_s" not in frame.columns:
         raise bad_input("write_log", f"tables.{name}", list(frame.columns)[:4], "lacks time_s", "add the time in s")
     for column in map(str, frame.columns):

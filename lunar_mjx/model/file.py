@@ -100,7 +100,7 @@ def load_model(path: str | Path) -> Model:
     # A gain that the file states is kept, be it zero.
     model = with_position_gains(model, [g for g, entry in data.get("control", {}).items() if GAINS[0] in entry])
     model = _effects(path, data, model)
-    model = dataclasses.replace(model, priors=_priors(path, _table(path, "priors", data.get("priors", {}))))
+    model = dataclasses.replace(model, priors=_priors(path, _table(path, "priors", data.get("priors", {})), model))
     check_effects(model, path)
     return model
 
@@ -219,12 +219,18 @@ def _grounds(path: Path, names: Any) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _priors(path: Path, table: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+def _priors(path: Path, table: Mapping[str, Any], model: Model) -> dict[str, tuple[float, float]]:
     """Value and standard deviation by `effect.parameter` or `calibration.name`, in the parameter's SI unit."""
     priors = {}
     for key, entry in table.items():
         field = f"priors.{key}"
         _known(path, field, _table(path, field, entry), ("value", "std"))
+        effect, _, parameter = key.partition(".")
+        known = {**catalogue.CATALOGUE, **{e.name: e for e in model.effects}}.get(effect)
+        # Calibrations belong to the logs' instruments, which a model does not know.
+        if effect != "calibration" and (known is None or parameter not in known.parameters):
+            remedy = "write effect.parameter, as effect show prints them, or calibration.name"
+            raise bad_input(path, "priors", key, "is no parameter of an effect", remedy)
         value, std = (_number(path, f"{field}.{k}", entry.get(k)) for k in ("value", "std"))
         if std < 0.0:
             raise bad_input(path, f"{field}.std", std, "is negative", "give a standard deviation, or 0 to fix it")

@@ -288,6 +288,8 @@ def check_settings(model: Model, source: str | Path) -> None:
     """
     if require_finite(source, "gravity_m_s2", model.gravity) < 0.0:
         raise bad_input(source, "gravity_m_s2", model.gravity, "is negative", "give the magnitude; it points down")
+    if model.gravity > 100.0:  # of a centrifuge; as in logs
+        raise bad_input(source, "gravity_m_s2", model.gravity, "is above 100", "check its unit")
     # Beyond, explicit contact forces are unstable; below, a drive takes days.
     if not 1e-5 <= require_finite(source, "timestep_s", model.timestep) <= 0.02:
         raise bad_input(source, "timestep_s", model.timestep, "is outside [1e-5, 0.02] s", "use about 0.002 s")

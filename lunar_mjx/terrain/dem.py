@@ -196,6 +196,8 @@ def require_cell(source: str, field: str, value: float) -> float:
     """Returns a grid spacing, or raises `UserError` if it is not a positive number."""
     if require_finite(source, field, value) <= 0:
         raise bad_input(source, field, value, "is not positive", "give the grid spacing in m")
+    if not 1e-6 <= value <= 1e6:  # slopes between heights would overflow
+        raise bad_input(source, field, value, "is no spacing of heights", "give the grid spacing in m")
     return float(value)
 
 

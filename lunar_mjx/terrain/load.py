@@ -58,7 +58,7 @@ def load_terrain(
         return build_terrain(parse_config(spec, "terrain"), "terrain", Path(), dem=dem, seed=seed, dtype=dtype)
     path = Path(spec)
     if path.suffix.lower() in SUFFIXES:
-        return terrain_from_dem(read_dem(path), path.stem, dtype)
+        return terrain_from_dem(_told(read_dem(path), path.name), path.stem, dtype)
     if path.suffix and path.suffix != ".toml" and not path.is_dir():
         if path.is_file():
             read_dem(path)  # which says that this format is not read, and which ones are
@@ -99,7 +99,7 @@ def load_dem(config: TerrainConfig, name: str, folder: Path, dem: str | Path | N
                 "dequantise": table.dequantise,
             }
         )
-        ground = read_dem(file, crop=crop, **options)
+        ground = _told(read_dem(file, crop=crop, **options), name)
     elif config.surface is not None:
         s = config.surface
         if config.dem is not None:
@@ -119,6 +119,13 @@ def load_dem(config: TerrainConfig, name: str, folder: Path, dem: str | Path | N
         d = config.detail
         ground = add_detail(ground, d.cell, seed, roughness=d.roughness, craters=d.craters)
     return ground
+
+
+def _told(dem: Dem, name: str) -> Dem:
+    """The DEM, of which the user is told what reading has changed: cells taken for nodata, holes filled."""
+    for note in dem.notes:
+        _LOG.warning("%s: %s.", name, note)
+    return dem
 
 
 def build_terrain(

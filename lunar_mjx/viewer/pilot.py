@@ -53,6 +53,8 @@ class Pilot:
     def __init__(self, model: Model, top_speed: float) -> None:
         if require_finite("view", "--speed", top_speed) <= 0:
             raise bad_input("view", "--speed", top_speed, "is not positive", "give m/s, such as 0.5")
+        if top_speed > 10.0:  # as for the channels of a log: rovers drive below 5 m/s
+            raise bad_input("view", "--speed", top_speed, "is no speed of a rover", "give m/s, such as 0.5")
         rover = model.rover
         self.top_speed = top_speed
         self._joints = len(rover.joints)

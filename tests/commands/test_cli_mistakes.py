@@ -43,6 +43,10 @@ CONVERT = ["convert", "FILES/rover.urdf", "--out", "OUT"]
 MODEL = ["simulate", "--model", "FILES/model.toml", "--out", "OUT"]
 TABLE = [*LUVMI, "--commands", "FILES/commands.csv"]
 SHOW = ["effect", "show", "FILES/mine.py"]
+TRAINING = ["train", "FILES/t.toml", "--out", "OUT"]
+POINT = 'environment = "point"\nsteps = 10\n[td3]\n'
+BED = ["bed", "simulate", "OUT", "--radius", "0.1", "--width", "0.1", "--slips", "0.1", "--loads", "40"]
+RECORDED = ["log", "simulate", "OUT/log", "--rover", "luvmi_x"]
 
 STEADY: dict[str, object] = {
     "bed/log.toml": """format = "lunar-mjx-log/1"
@@ -180,6 +184,11 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {"model.toml": toml("[effects.soil]", "n = -1.0")},
         ["model.toml: effects.soil.n = -1", "outside [0.1, 3]"],
     ),
+    "model that knows of nothing": (
+        MODEL,
+        {"model.toml": toml('[priors."sail.area"]', "value = 1.0", "std = 0.1")},
+        ["model.toml", "priors = 'sail.area'", "is no parameter of an effect"],
+    ),
     "model with a received effect file": (
         MODEL,
         {"model.toml": toml('effect_list = ["motor", "mine.py"]'), "mine.py": "raise SystemExit\n"},
@@ -316,6 +325,56 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         STEADY,
         ["--slowest heat = -1", "give above 0"],
     ),
+    "distance of no range": (
+        ["evaluate", "zero", "--task", "large", "--env", "goal_distance=nan"],
+        {},
+        ["goal_distance = 'nan'", "is not a range"],
+    ),
+    "steps by halves": (TRAINING, {"t.toml": POINT.replace("10", "1.5")}, ["t.toml", "steps = 1.5", "no whole number"]),
+    "unseen ground of an unknown key": (
+        TRAINING,
+        {"t.toml": f"{POINT}[unseen]\nfoo = 1\n"},
+        ["unseen.foo = 1", "unknown"],
+    ),
+    "steps of thirty digits": (["train", "point", "--steps", "9" * 30, "--out", "OUT"], {}, ["--steps", "is above 1"]),
+    "setting with an underscore": (
+        ["train", "point", "--set", "envs=1_0", "--out", "OUT"],
+        {},
+        ["envs = '1_0'", "not like"],
+    ),
+    "episode of yes": (
+        ["train", "point", "--env", "episode_steps=true", "--out", "OUT"],
+        {},
+        ["= True", "no whole number"],
+    ),
+    "Sun in no direction": (["view", "--web", "--sun", "1e300,5"], {}, ["--sun = 1e+300", "360 at most"]),
+    "Sun with an underscore": (["view", "--web", "--sun", "1_0,5"], {}, ["--sun = '1_0,5'", "not two numbers"]),
+    "top speed of no rover": (
+        ["view", "--web", "--rover", "luvmi_x", "--terrain", "flat", "--port", "0", "--speed", "1e300"],
+        {},
+        ["--speed = 1e+300", "no speed of a rover"],
+    ),
+    "bed with a wheel of a planet": ([*BED, "--radius", "1e9"], {}, ["radius = 1000000000.0", "5 at most"]),
+    "bed under a planet": ([*BED, "--loads", "1e300"], {}, ["--loads are positive, 100000 N at most"]),
+    "bed without a way": ([*BED, "--path", "1e-9"], {}, ["path = 1e-09", "give 0.01 or more"]),
+    "grid with an underscore": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n1_0 3\n"},
+        ["a.asc", "underscore"],
+    ),
+    "grid of no spacing": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1e-300\n1 2\n10 3\n"},
+        ["a.asc", "= 1e-300", "no spacing"],
+    ),
+    "model in a centrifuge": (
+        MODEL,
+        {"model.toml": toml("gravity_m_s2 = 1e9")},
+        ["gravity_m_s2 = 1000000000.0", "above 100"],
+    ),
+    "log in a split of no name": ([*RECORDED, "--split", "x"], {}, ["--split = 'x'", "fit, select, test"]),
+    "bias of no channel": ([*RECORDED, "--bias", "foo=1"], {}, ["--bias = 'foo'", "is no channel"]),
+    "bias with an underscore": ([*RECORDED, "--bias", "gyro_z_rad_s=1_0"], {}, ["--bias", "is not name=number"]),
     "bias beyond the channel": (
         ["log", "simulate", "OUT/log", "--rover", "luvmi_x", "--bias", "gyro_z_rad_s=1e300"],
         {},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -67,4 +69,13 @@ def test_damaged_refits_are_refused(tmp_path):
     for text in ("{", "[]", '{"the model": {"u": {"soil.n": "x"}}}', '{"the model": 3}', "\x00"):
         path.write_text(text)
         with pytest.raises(UserError, match=r"hypotheses\.json: is damaged"):
+            read_stored(path)
+
+
+def test_damaged_settings_of_a_run_are_refused(tmp_path):
+    path = tmp_path / "run.json"
+    good = {"format": "lunar-mjx-run/1", "logs": [], "hashes": {}}
+    for settings in (5, [1], "effect_odds"):
+        path.write_text(json.dumps({**good, "settings": settings}))
+        with pytest.raises(UserError, match=r"run\.json: is damaged \(settings: .*\); make it anew"):
             read_stored(path)

@@ -38,6 +38,7 @@ def test_what_no_rover_can_do_is_not_plausible(name):
 
 
 def test_values_are_bounded():
+    assert PLAUSIBLE.most_value <= 1e4
     found = bounded(jnp.array([1.0, -1e30, 1e30, np.nan, np.inf, -np.inf]))
     np.testing.assert_array_equal(found, [1.0, -PLAUSIBLE.most_value, PLAUSIBLE.most_value, 0.0, 0.0, 0.0])
 

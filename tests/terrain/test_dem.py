@@ -144,7 +144,7 @@ def test_nine_million_heights_with_a_third_missing_are_filled_in_ten_seconds_and
     assert peak < 1e9
 
 
-@pytest.mark.parametrize("mark", [-9999.0, -32768.0, 32767.0])
+@pytest.mark.parametrize("mark", [-9999.0, -99999.0, -32768.0, -32767.0, 32767.0])
 def test_usual_marks_of_nodata_are_taken_out_where_they_stand_alone(mark, tmp_path):
     heights = ramp().heights.copy()
     heights[3:5, 4:6] = mark
@@ -162,3 +162,11 @@ def test_undeclared_marks_of_nodata_are_refused():
     heights[3, 4] = np.finfo(np.float32).min
     with pytest.raises(UserError, match=r"-3\.40282e\+38 m' is no height"):
         Dem(heights, 1.0)
+
+
+def test_the_user_is_told_of_cells_that_are_taken_for_nodata(tmp_path, run, caplog):
+    cells = "1 2 3\n4 -9999 6\n7 8 32767\n"
+    head = "ncols 3\nnrows 3\nxllcorner 0\nyllcorner 0\ncellsize 1\nNODATA_value -1\n"
+    (tmp_path / "a.asc").write_text(head + cells)
+    assert run("terrain", "info", tmp_path / "a.asc").status == 0
+    assert "a.asc: 1 cells of -9999 taken for nodata" in caplog.text and "a.asc: 2 of 9 nodata cells" in caplog.text

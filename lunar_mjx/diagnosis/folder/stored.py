@@ -36,6 +36,7 @@ class _Run(_Stored):
     parent: str | None = None
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
     discrepancy: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = {}
+    settings: dict[str, Any] = {}
     test_opened: list[dict[str, Any]] = []
 
 

@@ -148,8 +148,10 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", name, getattr(c, name), "is not positive", "give a number above zero")
     for name in ("success", "failure", "edge", "start_yaw"):
         require_finite("navigation", name, getattr(c, name))
-    low, high = c.goal_distance
-    if not c.goal_radius < low <= high < np.inf:
+    distance = c.goal_distance
+    pair = isinstance(distance, list | tuple) and len(distance) == 2
+    low, high = (require_finite("navigation", "goal_distance", v) for v in distance) if pair else (0.0, 0.0)
+    if not c.goal_radius < low <= high:
         raise bad_input(
             "navigation",
             "goal_distance",

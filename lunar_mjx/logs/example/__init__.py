@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from lunar_mjx.files import replacing
 from lunar_mjx.logs.write import new_folder
 
 RECORDINGS = Path(__file__).resolve().parent
@@ -24,5 +25,6 @@ def copy_example(folder: str | Path) -> Path:
     folder = Path(folder)
     new_folder(folder)
     for file in (*sorted(RECORDINGS.glob("*.csv")), RECORDINGS / "LICENSE"):
-        shutil.copyfile(file, folder / file.name)
+        with replacing(folder / file.name) as part:
+            shutil.copyfile(file, part)
     return folder

@@ -55,8 +55,7 @@ def _need_topics(path: Path, wanted: Collection[str], there: Collection[str]) ->
 
 def _rosbag(path: Path, topics: Collection[str]) -> Iterator[Message]:
     _need("rosbags", path, "a bag of ROS")
-    from rosbags.highlevel import AnyReader, AnyReaderError  # pyright: ignore[reportMissingImports]
-    from rosbags.rosbag2 import ReaderError  # pyright: ignore[reportMissingImports]
+    from rosbags.highlevel import AnyReader  # pyright: ignore[reportMissingImports]
     from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
 
     try:
@@ -66,13 +65,14 @@ def _rosbag(path: Path, topics: Collection[str]) -> Iterator[Message]:
             wanted = [c for c in reader.connections if c.topic in topics]
             for connection, time, raw in reader.messages(wanted):
                 yield connection.topic, time, reader.deserialize(raw, connection.msgtype)
-    except (AnyReaderError, ReaderError, OSError) as error:
+    except UserError:
+        raise
+    except Exception as error:  # SQLite, YAML, unpacking and decoding raise a dozen kinds at damaged bytes
         raise UserError(f"{path}: is not a readable bag ({_first(error)}); record or copy it again.") from None
 
 
 def _mcap(path: Path, topics: Collection[str]) -> Iterator[Message]:
     _need("mcap", path, "an MCAP file")
-    from mcap.exceptions import McapError  # pyright: ignore[reportMissingImports]
     from mcap.reader import make_reader  # pyright: ignore[reportMissingImports]
 
     with path.open("rb") as stream:
@@ -85,9 +85,9 @@ def _mcap(path: Path, topics: Collection[str]) -> Iterator[Message]:
             for schema, channel, record in reader.iter_messages(topics=list(topics)):
                 decode = decoders.of(channel, schema)
                 yield channel.topic, record.log_time, decode(record.data)
-        except (McapError, EOFError, ValueError) as error:
-            if isinstance(error, UserError):
-                raise
+        except UserError:
+            raise
+        except Exception as error:  # records, their compression and decoders raise a dozen kinds at damaged bytes
             raise UserError(
                 f"{path}: is not a readable MCAP file ({_first(error)}); record or copy it again."
             ) from None
@@ -127,7 +127,7 @@ class _Decoders:
 
 
 def _first(error: Exception) -> str:
-    return str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
+    return str(error).strip().split("\n")[0].rstrip(".")[:200] or type(error).__name__
 
 
 _STEP = re.compile(r"(?P<name>[A-Za-z]\w*)(?:\[(?P<key>[^\[\]]+)\])?")

@@ -9,10 +9,12 @@ import numpy as np
 import pandas as pd
 
 from lunar_mjx.errors import bad_input
+from lunar_mjx.logs.readers.table import GAPS
+from lunar_mjx.logs.schema import LATEST
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
-LATEST = 1e11
-"""s: no clock counts 3000 years."""
+FASTEST_HZ = 1e9
+"""Times are kept to the nanosecond."""
 DAY = 86400.0
 """Length of a day, s."""
 
@@ -41,6 +43,9 @@ def seconds(frame: pd.DataFrame, time: TimeColumn, path: Path) -> np.ndarray:
       UserError: the column is missing, or a cell is no time.
     """
     if not time.column:
+        if len(frame) > LATEST * time.rate_hz:
+            remedy = "state the rate in samples a second"
+            raise bad_input(path, "rate_hz", time.rate_hz, "makes it thousands of years", remedy)
         # Divided and not summed up, so that no rounding adds up over an hour.
         return np.arange(len(frame)) / time.rate_hz
     if time.column not in frame.columns:
@@ -67,8 +72,15 @@ def seconds(frame: pd.DataFrame, time: TimeColumn, path: Path) -> np.ndarray:
 
 
 def _clock(cells: pd.Series, path: Path) -> np.ndarray:
+    empty = cells.isna().to_numpy() | cells.astype(str).str.strip().str.lower().isin((*GAPS, "nat")).to_numpy(bool)
+    if empty.all():
+        return np.full(len(cells), np.nan)
+    if empty.any():
+        times = np.full(len(cells), np.nan)
+        times[~empty] = _clock(cells[~empty], path)
+        return times
     text = cells.astype(str).str.strip()
-    parts = text.str.fullmatch(r"\d{1,2}:\d{1,2}(:\d{1,2}([.,]\d*)?)?")
+    parts = text.str.fullmatch(r"([01]?\d|2[0-3]):[0-5]?\d(:([0-5]?\d|60)([.,]\d*)?)?")
     if parts.all():
         split = text.str.replace(",", ".").str.split(":", expand=True).astype(float).to_numpy()
         split = np.concatenate([split, np.zeros((len(split), 3 - split.shape[1]))], axis=1)
@@ -77,14 +89,15 @@ def _clock(cells: pd.Series, path: Path) -> np.ndarray:
         return day + DAY * np.concatenate([[0.0], np.cumsum(np.diff(day) < -0.5 * DAY)])
     try:
         stamps = pd.to_datetime(text, errors="raise", utc=True, format="ISO8601")
+        stamps = stamps.astype("datetime64[ns, UTC]")
     except (ValueError, TypeError):
         row = int(np.argmin(parts.to_numpy()))
         raise bad_input(
             path,
-            f"{cells.name}, row {row}",
+            f"{cells.name}, row {cells.index[row]}",
             str(cells.iloc[row]),
             "is neither a time of day nor a date",
             "write it as 14:31:06.15 or 2020-11-03T11:41:07.57",
         ) from None
-    nanoseconds = stamps.astype("datetime64[ns, UTC]").astype("int64").to_numpy()
+    nanoseconds = stamps.astype("int64").to_numpy()
     return 1e-9 * (nanoseconds - nanoseconds[0]) + 1e-9 * float(nanoseconds[0])

@@ -61,7 +61,7 @@ def drive_of_bag(recording: Path, mapping: ImportMap) -> RecordedDrive:
         frame.insert(0, TIME, [1e-9 * (t - origin) for t in times[name]])
         geodetic = mapping.tables[name].geodetic
         if geodetic is not None:
-            frame, place = positions(frame, geodetic)
+            frame, place = positions(frame, geodetic, recording)
             if place:
                 settings["geodetic_origin"] = place
         tables[name] = frame

@@ -118,7 +118,7 @@ def _read(name: str, files: Files, mapping: ImportMap) -> Iterator[RecordedDrive
             copies += left
         for key, part in found.items():
             if table.geodetic is not None and LATITUDE in part:
-                found[key], origin = positions(part, table.geodetic)
+                found[key], origin = positions(part, table.geodetic, path)
                 settings |= {"geodetic_origin": origin} if origin else {}
         parts |= {f"{t}_{k}" if k else t: (t, part) for k, part in found.items()}
     source = {"files": ", ".join(sorted({p.name for p in files.values()}))}

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, require_within
 from lunar_mjx.logs.attitude import body_attitude, with_angles
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Imu, Log, LogTable, Noise, SteadyLog
@@ -20,6 +20,7 @@ from lunar_mjx.logs.schema import (
     FORMAT,
     GREATEST_GRAVITY,
     IMPOSED,
+    LATEST,
     NOISE_SOURCES,
     SPLITS,
     find_channel,
@@ -35,6 +36,9 @@ LEAST_NOISE = 1e-12
 ANSWER = ".answer.toml"
 """How the answer to a sealed log is called, after the log."""
 ENVIRONMENT = ("ambient_temperature_degC", "sun_azimuth_deg", "sun_elevation_deg")
+FARTHEST_M = 2e7
+"""Half of the Earth's circumference: no place on a grid lies beyond."""
+GREATEST_ANGLE = {"sun_azimuth_deg": 360.0, "sun_elevation_deg": 90.0}
 ROVER_CHANGES = ("payload_kg", "payload_position_m", "com_offset_m", "wheel_radius_offset_m")
 INITIAL = {
     "position_m": 3,
@@ -158,6 +162,8 @@ def _read_drive(folder: Path, top: Fields) -> Log:
     tables = body_attitude(tables, imu)
     names = tuple(c for t in tables.values() for c in t.channels)
     origin = top.vector("terrain_origin_m", 2, (0.0, 0.0))
+    for value in origin:
+        require_within(top.path, "terrain_origin_m", value, -FARTHEST_M, FARTHEST_M)
     return Log(
         folder=folder,
         name=folder.resolve().name,
@@ -224,9 +230,13 @@ def _geodetic_origin(fields: Fields) -> dict[str, float | str]:
     fields.known(("latitude_deg", "longitude_deg", "projection"))
     if not fields.values:
         return {}
+    latitude, longitude = (
+        require_within(fields.path, fields.field(key), fields.number(key), -most, most)
+        for key, most in (("latitude_deg", 90.0), ("longitude_deg", 360.0))
+    )
     return {
-        "latitude_deg": fields.number("latitude_deg"),
-        "longitude_deg": fields.number("longitude_deg"),
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
         "projection": fields.choice("projection", ("tangent", "utm")) or "tangent",
     }
 
@@ -272,6 +282,8 @@ def _environment(fields: Fields) -> tuple[dict[str, float | str], dict[str, str]
             values[key], columns[key] = key, value
         else:
             values[key] = fields.number(key)
+            if most := GREATEST_ANGLE.get(key):
+                require_within(fields.path, fields.field(key), values[key], -most, most)
     ambient = values.get("ambient_temperature_degC")
     if isinstance(ambient, float) and not -273.15 < ambient < 1000.0:
         raise bad_input(
@@ -315,16 +327,24 @@ def _initial(fields: Fields) -> dict[str, Any]:
         if (numbers < low).any() or (numbers > high).any():
             problem = f"is outside [{low:g}, {high:g}] ({why})"
             raise bad_input(fields.path, fields.field(key), value, problem, "check its unit")
+        if key == "quaternion":
+            _norm(fields, key, initial[key])
     return initial
+
+
+def _norm(fields: Fields, key: str, quaternion: Sequence[float]) -> float:
+    """Norm of a quaternion, which is one."""
+    norm = sum(v * v for v in quaternion) ** 0.5
+    # Quaternions are written with four digits or more; more than that is no rounding.
+    if abs(norm - 1.0) > 1e-3:
+        raise bad_input(fields.path, fields.field(key), list(quaternion), f"has the norm {norm:.4g}", "normalise it")
+    return norm
 
 
 def _imu(fields: Fields) -> Imu:
     fields.known(("position_m", "quaternion", "mounting_std_deg", "attitude"))
     p, q = fields.vector("position_m", 3, (0.0,) * 3), fields.vector("quaternion", 4, (1.0, 0.0, 0.0, 0.0))
-    norm = sum(v * v for v in q) ** 0.5
-    # Quaternions are written with four digits or more; more than that is no rounding.
-    if abs(norm - 1.0) > 1e-3:
-        raise bad_input(fields.path, fields.field("quaternion"), list(q), f"has the norm {norm:.4g}", "normalise it")
+    norm = _norm(fields, "quaternion", q)
     std = fields.vector("mounting_std_deg", 3, (0.0,) * 3)
     if min(std) < 0.0:
         raise bad_input(
@@ -356,6 +376,7 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
         entry.known(("std", "source", "correlation_time_s"))
         source = entry.choice("source", NOISE_SOURCES) or "datasheet"
         std, correlation = entry.number("std"), entry.number("correlation_time_s", 0.0)
+        require_within(fields.path, f"{fields.field(key)}.correlation_time_s", abs(correlation), 0.0, LATEST)
         if std < 0.0 or correlation < 0.0:
             raise bad_input(fields.path, fields.field(key), entry.values, "has a negative entry", "give zero or more")
         if std < LEAST_NOISE:
@@ -366,6 +387,9 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
             patterns.append((key, Noise(std, source, correlation)))
             continue
         column = parse_column(key, str(fields.path)) if channels is not None else None
+        if channels is not None and column is None and key not in channels:
+            remedy = "list the names with lunar-mjx log channels"
+            raise bad_input(fields.path, fields.field(key), entry.values, "is the noise of no channel", remedy)
         if column is not None and column.problem:
             raise bad_input(fields.path, fields.field(key), key, column.problem, "state the noise in that unit")
         name, scale = (column.name, column.scale) if column is not None else (key, 1.0)

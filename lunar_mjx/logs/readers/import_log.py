@@ -11,7 +11,7 @@ from typing import Any
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs.readers.drives_from_bags import drive_of_bag
 from lunar_mjx.logs.readers.drives_from_files import drives_of_files
-from lunar_mjx.logs.readers.import_map import ImportMap, read_map
+from lunar_mjx.logs.readers.import_map import ImportMap, changed, merged, read_map
 from lunar_mjx.logs.readers.recorded_drive import Copies, RecordedDrive, cut
 from lunar_mjx.logs.schema import find_channel, is_quantity
 from lunar_mjx.logs.write import refuse_used, write_log
@@ -82,6 +82,7 @@ def import_drives(
       UserError: as `import_log`.
     """
     mapping = mapping if isinstance(mapping, ImportMap) else read_map(mapping)
+    mapping = changed(mapping, changes or {})
     paths = [Path(p) for p in ([recording] if isinstance(recording, str | Path) else recording)]
     folder = Path(folder)
     if not paths:
@@ -106,7 +107,7 @@ def import_drives(
             write_log(
                 place,
                 drive.tables,
-                rover=_rover(mapping, changes),
+                rover=mapping.rover,
                 noise=mapping.noise,
                 clock_offsets_s=_offsets(drive, mapping),
                 on_change=drive.on_change,
@@ -135,15 +136,11 @@ def _told(copies: Sequence[Copies], drives: int) -> tuple[str, ...]:
     return tuple(told)
 
 
-def _rover(mapping: ImportMap, changes: Mapping[str, Any] | None) -> str:
-    return str((changes or {}).get("rover", mapping.rover))
-
-
 def _settings(drive: RecordedDrive, mapping: ImportMap, changes: Mapping[str, Any] | None) -> dict[str, Any]:
     """Keys of `log.toml`: the map's, what reading found, and the user's own over both."""
     # The nearer to the user the later: map, then what the recording says, then the call.
-    settings = _merged(mapping.settings, drive.settings)
-    settings = _merged(settings, {k: v for k, v in (changes or {}).items() if k != "rover"})
+    settings = merged(mapping.settings, drive.settings)
+    settings = merged(settings, {k: v for k, v in (changes or {}).items() if k not in ("rover", "noise")})
     channels = {c for frame in drive.tables.values() for c in frame.columns}
     if "magnitudes" in settings:
         stated = settings["magnitudes"]
@@ -160,15 +157,6 @@ def _names(magnitude: str, channels: Collection[str]) -> bool:
     if "*" in magnitude:
         return any(fnmatchcase(c, magnitude) for c in channels)
     return magnitude in channels or find_channel(magnitude) is None
-
-
-def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Two trees of settings as one; the second's values count."""
-    out = dict(first)
-    for key, value in second.items():
-        old = out.get(key)
-        out[key] = _merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
-    return out
 
 
 def _offsets(drive: RecordedDrive, mapping: ImportMap) -> dict[str, tuple[float, float]]:

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, require_within
 from lunar_mjx.logs.log import Noise
-from lunar_mjx.logs.readers.clocks import UNITS, TimeColumn
-from lunar_mjx.logs.readers.folder import TOP
+from lunar_mjx.logs.readers.clocks import FASTEST_HZ, UNITS, TimeColumn
+from lunar_mjx.logs.readers.folder import FARTHEST_M, TOP
 from lunar_mjx.logs.readers.table_files import SEPARATORS, Layout
 from lunar_mjx.logs.schema import NOISE_SOURCES, parse_column
 from lunar_mjx.toml_fields import Fields
@@ -24,6 +24,8 @@ FOLDER = "{folder}"
 """What `log.ground` may be: the name of the folder that a drive's files lie in."""
 PROJECTIONS = ("tangent", "utm")
 HELD = ("auto", "never")
+MOST_SKIPPED = 100_000
+"""Rows before a header: pandas keeps a list of those that it skips."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +161,7 @@ def read_map(path: str | Path) -> ImportMap:
     top = Fields.read(path, "the map")
     top.known(("log", "tables"))
     log, stated = top.table("log"), top.table("tables")
-    log.known([k for k in TOP if k not in ("format", "kind", "tables", "commitment")])
+    _check_settings(log)
     if not stated.values:
         raise UserError(f"{path}: the table [tables.NAME] is missing; name a topic or a file, and the channels in it.")
     tables = {name: _table(stated.table(name)) for name in stated.values}
@@ -184,9 +186,54 @@ def read_map(path: str | Path) -> ImportMap:
             "is missing where another table has one",
             "state the grouping column of every table",
         )
-    noise = {name: _noise(log.table("noise").table(name)) for name in log.table("noise").values}
-    settings = {k: v for k, v in log.values.items() if k not in ("rover", "noise")}
-    return ImportMap(path, tables, log.text("rover"), settings, noise)
+    return ImportMap(path, tables, log.text("rover"), _others(log), _noises(log))
+
+
+def changed(mapping: ImportMap, changes: Mapping[str, Any], source: str = "log import: --set") -> ImportMap:
+    """The map with keys of `log.toml` over its own.
+
+    Args:
+      changes: tree of keys. source: whose they are, for a sentence that refuses one.
+
+    Raises:
+      UserError: a key is unknown, or a value of the wrong kind.
+    """
+    log = Fields(Path(source), changes)
+    _check_settings(log)
+    return dataclasses.replace(
+        mapping,
+        rover=log.text("rover", mapping.rover),
+        settings=merged(mapping.settings, _others(log)),
+        noise={**mapping.noise, **_noises(log)},
+    )
+
+
+def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Two trees of settings as one; the second's values count."""
+    out = dict(first)
+    for key, value in second.items():
+        old = out.get(key)
+        out[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return out
+
+
+def _check_settings(log: Fields) -> None:
+    """Refuses keys that are not for a map, and what no reader of `log.toml` could tell by the file that is to come."""
+    log.known([k for k in TOP if k not in ("format", "kind", "tables", "commitment")])
+    log.table("source")
+    magnitudes = log.values.get("magnitudes", [])
+    if not isinstance(magnitudes, Mapping | list) or not all(isinstance(name, str) for name in magnitudes):
+        remedy = 'write magnitudes = ["motor_left_drive_current_A"]'
+        raise bad_input(log.path, log.field("magnitudes"), magnitudes, "is no list of channels", remedy)
+
+
+def _noises(log: Fields) -> dict[str, Noise]:
+    stated = log.table("noise")
+    return {name: _noise(stated.table(name)) for name in stated.values}
+
+
+def _others(log: Fields) -> dict[str, Any]:
+    return {k: v for k, v in log.values.items() if k not in ("rover", "noise")}
 
 
 _OF_FILES = ("file", "header", "separator", "decimal", "skip_rows", "comment", "missing", "start", "group")
@@ -225,10 +272,14 @@ def _table(entry: Fields) -> TableMap:
         group=_column(entry, "group") if "group" in entry.values else "",
         held=entry.choice("held", HELD) or "auto",
         clock_offset_s=entry.number("clock_offset_s", 0.0),
-        clock_offset_std_s=entry.number("clock_offset_std_s", 0.0),
+        clock_offset_std_s=_no_less_than_zero(entry, "clock_offset_std_s"),
         channels=channels,
         geodetic=geodetic,
     )
+
+
+def _no_less_than_zero(entry: Fields, key: str) -> float:
+    return require_within(entry.path, entry.field(key), entry.number(key, 0.0), 0.0)
 
 
 def _layout(entry: Fields) -> Layout:
@@ -242,8 +293,8 @@ def _layout(entry: Fields) -> Layout:
             "write header = false where the first row holds numbers",
         )
     skip = entry.number("skip_rows", 0)
-    if skip < 0 or skip != int(skip):
-        raise bad_input(entry.path, entry.field("skip_rows"), skip, "is no number of rows", "give 0 or more")
+    if not 0 <= skip <= MOST_SKIPPED or skip != int(skip):
+        raise bad_input(entry.path, entry.field("skip_rows"), skip, "is no number of rows", f"give 0 to {MOST_SKIPPED}")
     comment = entry.text("comment", "")
     if len(comment) > 1:
         raise bad_input(entry.path, entry.field("comment"), comment, "is more than one sign", 'give one, such as "#"')
@@ -298,7 +349,7 @@ def _clock(entry: Fields) -> TimeColumn:
     if "rate_hz" in value:
         if len(value) > 1:
             raise bad_input(entry.path, time.prefix, dict(value), "states a rate and more", "give one of the two")
-        return TimeColumn(rate_hz=time.positive("rate_hz"))
+        return TimeColumn(rate_hz=time.positive("rate_hz", most=FASTEST_HZ))
     return TimeColumn(_column(time, "column"), time.choice("unit", tuple(UNITS)) or "s", clock)
 
 
@@ -320,6 +371,12 @@ def _source(source: Fields) -> Source:
     source.known(("field", "column", "scale", "offset", "missing", "sum"))
     offset, missing = source.number("offset", 0.0), _missing(source)
     terms = source.values.get("sum")
+    beside = [k for k in ("sum", "field", "column") if k in source.values][1:]
+    beside += ["scale"] if terms is not None and "scale" in source.values else []
+    if beside:
+        # One of them would be left out without a word.
+        remedy = "give one column, or a sum whose terms have their own scale"
+        raise bad_input(source.path, source.field(beside[0]), source.values[beside[0]], "is one too many", remedy)
     if terms is None:
         key = "field" if "field" in source.values else "column"
         return Source((Term(_column(source, key), _scale(source)),), offset, missing)
@@ -353,6 +410,10 @@ def _geodetic(entry: Fields) -> Geodetic | None:
             'write projection = "utm" and leave origin_deg out',
         )
     degrees, metres = (_pair(entry, key) for key in ("origin_deg", "origin_m"))
+    for value, most in zip(degrees or (), (90.0, 360.0), strict=False):
+        require_within(entry.path, entry.field("origin_deg"), value, -most, most)
+    for value in metres or ():
+        require_within(entry.path, entry.field("origin_m"), value, -FARTHEST_M, FARTHEST_M)
     return Geodetic(
         _column(entry, "latitude"), _column(entry, "longitude"), projection, degrees, metres, _missing(entry)
     )

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from lunar_mjx.errors import bad_input
 from lunar_mjx.logs.noise import NOISE_ESTIMATE
 from lunar_mjx.logs.readers.geodesy import tangent_plane, utm, utm_zone
 from lunar_mjx.logs.readers.held import held_samples
@@ -57,10 +59,16 @@ class RecordedDrive:
         return max(float(np.max(t)) for t in times) - min(float(np.min(t)) for t in times) if times else 0.0
 
 
-def positions(frame: pd.DataFrame, geodetic: Geodetic) -> tuple[pd.DataFrame, dict[str, float | str]]:
+def positions(frame: pd.DataFrame, geodetic: Geodetic, source: Path) -> tuple[pd.DataFrame, dict[str, float | str]]:
     """Latitude and longitude columns as `position_x_m` east and `position_y_m` north, and the origin they count from.
 
     The origin is empty where there is no fix at all.
+
+    Args:
+      source: file or folder of the recording, for a sentence that refuses it.
+
+    Raises:
+      UserError: an angle is none.
     """
     latitude, longitude = (frame[c].to_numpy(float) for c in (LATITUDE, LONGITUDE))
     # a receiver without a fix writes zeros
@@ -68,6 +76,18 @@ def positions(frame: pd.DataFrame, geodetic: Geodetic) -> tuple[pd.DataFrame, di
     out = frame.drop(columns=[LATITUDE, LONGITUDE])
     if not there.any():
         return out, {}
+    for name, values, most in ((LATITUDE, latitude, 90.0), (LONGITUDE, longitude, 360.0)):
+        beyond = there & (np.abs(values) > most)
+        if beyond.any():
+            row = int(np.argmax(beyond))
+            # Receivers write degrees and minutes as one number (NMEA 0183: ddmm.mmmm), which no angle shows.
+            raise bad_input(
+                source,
+                f"{name}, row {row}",
+                float(values[row]),
+                f"is outside [-{most:g}, {most:g}]",
+                "record degrees, not degrees and minutes (ddmm.mmmm)",
+            )
     first = int(np.argmax(there))
     # The first fix: local metres near zero keep their digits in float32.
     origin = geodetic.origin_deg or (float(latitude[first]), float(longitude[first]))

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.errors import UserError, bad_input, one_line, require_file
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file, require_within
 from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import LogTable
-from lunar_mjx.logs.schema import limits, parse_column
+from lunar_mjx.logs.schema import LATEST, limits, parse_column
 from lunar_mjx.toml_fields import Fields
 
 TIME = "time_s"
@@ -158,8 +158,12 @@ def read_log_table(
         time_s=time,
         channels=channels,
         rate_hz=entry.positive("rate_hz", _rate(time)),
-        clock_offset_s=entry.number("clock_offset_s", 0.0),
-        clock_offset_std_s=entry.number("clock_offset_std_s", 0.0),
+        clock_offset_s=require_within(
+            entry.path, entry.field("clock_offset_s"), entry.number("clock_offset_s", 0.0), -LATEST, LATEST
+        ),
+        clock_offset_std_s=require_within(
+            entry.path, entry.field("clock_offset_std_s"), entry.number("clock_offset_std_s", 0.0), 0.0
+        ),
         columns=columns,
         ignored=tuple(ignored),
         on_change=_flag(entry, "on_change"),

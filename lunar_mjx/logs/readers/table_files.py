@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file
 
 SEPARATORS: Mapping[str, str] = {"comma": ",", "semicolon": ";", "tab": "\t", "blank": r"\s+", ",": ",", ";": ";"}
 """Names of separators in a map, and what pandas calls them; `blank` is any run of blanks and tabs."""
@@ -67,7 +67,7 @@ def read_table_file(path: Path, layout: Layout, wanted: Sequence[str] = ()) -> p
     elif suffix == ".mat":
         frame = _matlab(path, wanted)
     else:
-        frame = _text(path, layout)
+        frame = _text(path, layout, wanted)
     frame.columns = [str(c).strip() for c in frame.columns]
     twice = frame.columns[frame.columns.duplicated()]
     if len(twice):
@@ -75,7 +75,7 @@ def read_table_file(path: Path, layout: Layout, wanted: Sequence[str] = ()) -> p
     return frame
 
 
-def _text(path: Path, layout: Layout) -> pd.DataFrame:
+def _text(path: Path, layout: Layout, wanted: Sequence[str]) -> pd.DataFrame:
     try:
         # Spreadsheets write a byte order mark, which would become part of the first name.
         with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -89,18 +89,20 @@ def _text(path: Path, layout: Layout) -> pd.DataFrame:
         with warnings.catch_warnings():
             # rows longer than the header: pandas would drop what no name stands above
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            return pd.read_csv(
-                path,
-                sep=separator,
-                header=0 if layout.header else None,
-                decimal=layout.decimal,
-                skiprows=layout.skip_rows,
-                comment=layout.comment or None,
-                index_col=False,
-                skipinitialspace=True,
-                encoding="utf-8-sig",
-                low_memory=False,
-            )
+            options: dict[str, Any] = {
+                "sep": separator,
+                "decimal": layout.decimal,
+                "skiprows": layout.skip_rows,
+                "comment": layout.comment or None,
+                "index_col": False,
+                "skipinitialspace": True,
+                "encoding": "utf-8-sig",
+                "low_memory": False,
+            }
+            frame = pd.read_csv(path, header=0 if layout.header else None, **options)
+            if any(str(c).endswith(".1") for c in frame.columns) and layout.header:
+                _refuse_one_name(path, pd.read_csv(path, header=None, nrows=1, dtype=str, **options), wanted)
+            return frame
     except pd.errors.ParserWarning:
         lines = [line for line in start.splitlines()[layout.skip_rows :] if line.strip()]
         raise bad_input(
@@ -110,9 +112,20 @@ def _text(path: Path, layout: Layout) -> pd.DataFrame:
             "has fewer names than the rows below it have cells",
             'state skip_rows = 1 (rows before the header), comment = "#" or header = false in the map\'s table',
         ) from None
+    except UserError:
+        raise
     except (ValueError, pd.errors.ParserError) as error:
         shown = str(error).strip().split("\n")[0]
         raise UserError(f"{path}: is not a table of even rows ({shown}); state its separator and skip_rows.") from None
+
+
+def _refuse_one_name(path: Path, header: pd.DataFrame, wanted: Sequence[str]) -> None:
+    """Refuses a wanted column whose name occurs twice, by the header as it stands: pandas calls the second "name.1"."""
+    names = [str(name).strip() for name in header.iloc[0]]
+    for name in wanted:
+        if names.count(name) > 1 or (name not in names and names.count(name.rpartition(".")[0]) > 1):
+            remedy = "rename one of them, or read the file without header"
+            raise bad_input(path, "column", name, "occurs twice", remedy)
 
 
 def guess_separator(start: str, decimal: str = ".") -> str:
@@ -150,7 +163,6 @@ def _matlab(path: Path, wanted: Sequence[str]) -> pd.DataFrame:
     Those as long as the wanted ones, else of the most frequent length, are the columns of one table.
     """
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     try:
         loaded = loadmat(path, squeeze_me=True, struct_as_record=False)
@@ -158,8 +170,9 @@ def _matlab(path: Path, wanted: Sequence[str]) -> pd.DataFrame:
         raise UserError(
             f"{path}: is a MATLAB file of version 7.3; save it with save(file, '-v7'), or as CSV."
         ) from None
-    except (MatReadError, ValueError, OSError, TypeError) as error:
-        raise UserError(f"{path}: is not a MATLAB file ({error}); save it again, or as CSV.") from None
+    except Exception as error:  # headers, compression and types raise a dozen kinds at damaged bytes
+        told = one_line(error)[:200] or type(error).__name__
+        raise UserError(f"{path}: is not a MATLAB file ({told}); save it again, or as CSV.") from None
     columns: dict[str, np.ndarray] = {}
     for name, value in loaded.items():
         if not name.startswith("__"):

@@ -17,6 +17,7 @@ from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.logs.apply import log_model
 from lunar_mjx.logs.log import Imu, Log, LogTable
 from lunar_mjx.logs.recorder.instruments import Recording, record
+from lunar_mjx.logs.schema import SPLITS, find_channel
 from lunar_mjx.logs.seal import Answer, answer_path, hash_tables, write_answer
 from lunar_mjx.logs.write import refuse_used, write_log
 from lunar_mjx.manoeuvres import Manoeuvre, commands, load_manoeuvre
@@ -88,6 +89,13 @@ def simulate_log(
         gravity_m_s2 = base.gravity if model is not None else LUNAR_GRAVITY
     spec = terrain or plan.terrain
     _check_new(out)
+    # Before minutes of driving.
+    if split is not None and split not in SPLITS:
+        raise bad_input("log simulate", "--split", split, "does not exist", f"use one of {', '.join(SPLITS)}")
+    for channel in recording.bias:
+        if find_channel(channel) is None:
+            remedy = "list the names with lunar-mjx log channels"
+            raise bad_input("log simulate", "--bias", channel, "is no channel", remedy)
     scale = 1.0 if seconds is None else seconds / plan.duration_s
     hidden, answers = _hide(base, effects)
     settings: dict[str, Any] = {

@@ -66,7 +66,10 @@ def read_asc(path: Path, options: ReadOptions) -> Dem:
     require_size(str(path), rows, cols)
     try:
         # Line breaks mean nothing: writers wrap rows at any width.
-        numbers = np.array(" ".join(body).split(), np.float64)
+        text = " ".join(body)
+        if "_" in text:  # Python reads 1_0 as 10
+            raise ValueError("an underscore")
+        numbers = np.array(text.split(), np.float64)
     except ValueError as error:
         raise UserError(f"{path}: heights hold something else than numbers ({error}); repair the file.") from None
     if numbers.size != rows * cols:

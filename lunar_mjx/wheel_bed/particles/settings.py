@@ -32,6 +32,8 @@ class BoxSize:
 
 
 BOX_SIZE = BoxSize()
+SMALLEST_WHEEL, LARGEST_WHEEL = 1e-3, 5.0
+"""m: what a log of a test bed may state, and a millimetre."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +46,8 @@ class ParticleWheel:
     grouser_height: float = 0.0
 
     def __post_init__(self) -> None:
-        require_within("wheel", "radius", self.radius, 0.0, above=True)
-        require_within("wheel", "width", self.width, 0.0, above=True)
+        for name in ("radius", "width"):
+            require_within("wheel", name, getattr(self, name), SMALLEST_WHEEL, LARGEST_WHEEL)
         require_within("wheel", "grouser_height", self.grouser_height, 0.0, self.radius)
         require_within("wheel", "grouser_count", self.grouser_count, 0, 100)
         if (self.grouser_count > 0) != (self.grouser_height > 0.0):
@@ -99,7 +101,7 @@ class Point:
     travel: float
 
     def __post_init__(self) -> None:
-        require_within("point", "normal_load_N", self.load, 0.0, above=True)
+        require_within("point", "normal_load_N", self.load, 1e-3, 1e5)
         require_within("point", "slip_angle_deg", self.slip_angle, -90.0, 90.0)
         if self.travel < BOX_SIZE.slowest:
             raise bad_input(
@@ -141,9 +143,10 @@ class Numerics:
 
     def __post_init__(self) -> None:
         require_within("numerics", "voxel", self.voxel, 0.0, above=True)
-        require_within("numerics", "step_share", self.step_share, 0.0, 1.0, above=True)
-        require_within("numerics", "froude", self.froude, 0.0, 1.0, above=True)
-        require_within("numerics", "path", self.path, 0.0, 100.0, above=True)
+        # Below, a run takes years, or ends before the wheel has moved.
+        require_within("numerics", "step_share", self.step_share, 1e-4, 1.0)
+        require_within("numerics", "froude", self.froude, 1e-8, 1.0)
+        require_within("numerics", "path", self.path, 0.01, 100.0)
         if self.contact not in CONTACTS:
             raise bad_input("numerics", "contact", self.contact, "does not exist", f"use {' or '.join(CONTACTS)}")
 
