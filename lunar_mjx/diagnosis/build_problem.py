@@ -66,6 +66,10 @@ def require_splits(splits: Mapping[str, str], logs: Sequence[Any]) -> None:
             )
 
 
+MOST_DISCREPANCY = 1e9
+"""SI: beyond every channel's range, and its square is a number."""
+
+
 def require_discrepancy(discrepancy: Mapping[str, float], logs: Sequence[Any]) -> None:
     """Raises `UserError` for a known error of the model that is negative, or of a quantity that no table holds.
 
@@ -75,7 +79,7 @@ def require_discrepancy(discrepancy: Mapping[str, float], logs: Sequence[Any]) -
     for name, size in discrepancy.items():
         if known and name not in known:
             raise bad_input("--discrepancy", "quantity", name, "was not measured", f"use one of {', '.join(known)}")
-        require_within("--discrepancy", name, size, 0.0)
+        require_within("--discrepancy", name, size, 0.0, MOST_DISCREPANCY)
 
 
 def candidates_of(run: Run, only: Sequence[str] | None = None) -> dict[str, Effect]:

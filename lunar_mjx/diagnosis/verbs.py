@@ -68,9 +68,14 @@ def compare(
     Raises:
       UserError: a mistake of the user's. BadData: the logs do not pass the gate.
     """
+    folders = log_folders(logs)
+    for log in folders:
+        # The run's files would change the log, which is known by its bytes.
+        if Path(out).resolve().is_relative_to(log):
+            raise bad_input("compare", "--out", str(out), f"lies in the log {log}", "name a folder beside it")
     run = Run(
         Path(out),
-        log_folders(logs),
+        folders,
         model,
         tuple(effects),
         dict(splits or {}),

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +98,8 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
     if record["mass"] > HEAVIEST:
         remedy = "correct the masses of the links, which are in kg"
         raise bad_input(source.path, "mass", record["mass"], f"is above {HEAVIEST:g} kg", remedy)
+    # Before anything is written, since a rover that lies there is to stay whole.
+    _require_numbers(source, "", record)
     out = Path(out)
     title = f"# Written by `lunar-mjx convert` from {source.path.name}; edit that and convert again.\n"
     try:
@@ -113,6 +117,19 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
         raise UserError(f"{out}: cannot be written ({error.strerror}); give another output folder.") from None
     # Loaded as users will: what was just written must pass every check of a foreign file.
     return load_rover(out.resolve())
+
+
+def _require_numbers(source: Urdf, field: str, value: Any) -> None:
+    """Raises `UserError` for a number of the record that is not finite."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            _require_numbers(source, f"{field}.{key}".lstrip("."), inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            _require_numbers(source, field, inner)
+    elif isinstance(value, float) and not math.isfinite(value):
+        remedy = "correct the sizes, masses and origins of the links, which are in m and kg"
+        raise bad_input(source.path, field, value, "is what the rover would come out with", remedy)
 
 
 def _compact(text: str) -> str:

@@ -43,6 +43,7 @@ CONVERT = ["convert", "FILES/rover.urdf", "--out", "OUT"]
 MODEL = ["simulate", "--model", "FILES/model.toml", "--out", "OUT"]
 TABLE = [*LUVMI, "--commands", "FILES/commands.csv"]
 SHOW = ["effect", "show", "FILES/mine.py"]
+ZERO = ["evaluate", "zero", "--task", "large", "--env"]
 TRAINING = ["train", "FILES/t.toml", "--out", "OUT"]
 POINT = 'environment = "point"\nsteps = 10\n[td3]\n'
 BED = ["bed", "simulate", "OUT", "--radius", "0.1", "--width", "0.1", "--slips", "0.1", "--loads", "40"]
@@ -268,6 +269,11 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {"rover.urdf": '<?xml version="1.0" encoding="klingon"?>\n' + urdf("steered", "steered")},
         ["rover.urdf", "encoding"],
     ),
+    "URDF with a wheel beyond all numbers": (
+        CONVERT,
+        {"rover.urdf": urdf('radius="0.12"', 'radius="1e300"')},
+        ["rover.urdf", "is what the rover would come out with", "in m and kg"],
+    ),
     "URDF nested too deep": (CONVERT, {"rover.urdf": "<a>" * 20_000}, ["rover.urdf"]),
     "URDF whose name breaks the line": (
         CONVERT,
@@ -314,6 +320,13 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
     "option nested too deep": (["evaluate", "zero", "--env", "x=" + "[" * 3000], {}, ["x"]),
     "episodes without number": (["evaluate", "zero", "--episodes", "9" * 11], {}, ["--episodes", "above 1000000"]),
     "discrepancy below zero": ([*TABLE_RUN, "--discrepancy", "drawbar_pull=-1"], STEADY, ["drawbar_pull = -1", "0 or"]),
+    "discrepancy without end": (
+        [*TABLE_RUN, "--discrepancy", "drawbar_pull=1e300"],
+        STEADY,
+        ["drawbar_pull", "1e+09 at"],
+    ),
+    "discrepancy with an underscore": ([*TABLE_RUN, "--discrepancy", "drawbar_pull=1_0"], STEADY, ["is not a number"]),
+    "run into its own log": (["compare", "FILES/bed", "--out", "FILES/bed"], STEADY, ["--out", "lies in the log"]),
     "discrepancy of nothing": ([*TABLE_RUN, "--discrepancy", "lift=1"], STEADY, ["'lift'", "drawbar_pull"]),
     "odds below zero": ([*TABLE_RUN, "--setting", "effect_odds=-1"], STEADY, ["effect_odds", "give above 0"]),
     "prior where none is read": ([*TABLE_RUN, "--prior", "soil.n=1+-0.1"], STEADY, ["--prior", "imposed wheel"]),
@@ -330,6 +343,10 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {},
         ["goal_distance = 'nan'", "is not a range"],
     ),
+    "weights without names": ([*ZERO, "weights=5"], {}, ["weights = 5", "are no weights by name"]),
+    "ranges that are none": ([*ZERO, 'randomise=["x"]'], {}, ["randomise = ('x',)", "are no ranges"]),
+    "tally of five": ([*ZERO, "tally=5"], {}, ["tally = 5", "neither true nor false"]),
+    "seed by halves": ([*ZERO, "place_seed=1.5"], {}, ["place_seed = 1.5", "is not a whole number"]),
     "steps by halves": (TRAINING, {"t.toml": POINT.replace("10", "1.5")}, ["t.toml", "steps = 1.5", "no whole number"]),
     "unseen ground of an unknown key": (
         TRAINING,

@@ -79,3 +79,41 @@ def test_damaged_settings_of_a_run_are_refused(tmp_path):
         path.write_text(json.dumps({**good, "settings": settings}))
         with pytest.raises(UserError, match=r"run\.json: is damaged \(settings: .*\); make it anew"):
             read_stored(path)
+
+
+COMPARISON = {"as_given": {}, "refitted": {}, "by_channel": []}
+VERDICT = {"verdict": "KNOWN", "sentence": "it is known", "effects": []}
+EVIDENCE = {"effect": "slip", "status": "accepted", "separable_sigma": 3.0}
+GOOD_RESULTS = {
+    "comparison.json": {**COMPARISON, "parameters": {"soil": {"value": {"n": 1.0}, "std": {"n": None}}}},
+    "verdict.json": {
+        **VERDICT,
+        "evidence": [EVIDENCE],
+        "probabilities": {"nothing": 1.0},
+        "discrepancy": {"force": {"text": "within 1 %", "size": 0.01, "low": 0.005, "high": 0.02}},
+        "details": {"held_out": {"manoeuvres": 0}},
+    },
+}
+BAD_RESULTS = [
+    ("comparison.json", {"parameters": 5}),
+    ("comparison.json", {"parameters": {"soil": 5}}),
+    ("comparison.json", {"parameters": {"soil": {"value": 5}}}),
+    ("verdict.json", {"evidence": [{}]}),
+    ("verdict.json", {"evidence": [{**EVIDENCE, "separable_sigma": "x"}]}),
+    ("verdict.json", {"details": {"held_out": 5}}),
+    ("verdict.json", {"details": {"parameters": 5}}),
+    ("verdict.json", {"probabilities": 5}),
+    ("verdict.json", {"probabilities": {"nothing": "x"}}),
+    ("verdict.json", {"forms": 5}),
+    ("verdict.json", {"discrepancy": {"force": {}}}),
+]
+
+
+@pytest.mark.parametrize(("name", "change"), BAD_RESULTS)
+def test_results_of_another_shape_are_refused_before_a_page_is_made_of_them(name, change, tmp_path):
+    path = tmp_path / name
+    path.write_text(json.dumps(GOOD_RESULTS[name]))
+    assert read_stored(path) == GOOD_RESULTS[name]
+    path.write_text(json.dumps({**GOOD_RESULTS[name], **change}))
+    with pytest.raises(UserError, match=rf"{name}: is damaged \({next(iter(change))}.*\); make it anew"):
+        read_stored(path)

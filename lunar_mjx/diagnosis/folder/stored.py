@@ -57,14 +57,40 @@ class _Comparison(_Stored):
     refitted: dict[str, Number | None]
     by_channel: list[_Channel]
     certificate: _Certificate | None = None
+    parameters: dict[str, dict[str, dict[str, Any] | None]] | None = None
+
+
+class _Evidence(_Stored):
+    effect: str
+    status: str
+    separable_sigma: Number | None = None
+    z: Number | None = None
+    values: dict[str, Any] = {}
+    std: dict[str, Any] = {}
+
+
+class _Remains(_Stored):
+    text: str
+    low: Number
+    high: Number
+
+
+class _Details(_Stored):
+    held_out: dict[str, Any] | None = None
+    parameters: dict[str, dict[str, dict[str, Any] | None]] | None = None
+    findings: list[dict[str, Any]] | None = None
 
 
 class _Verdict(_Stored):
     verdict: str
     sentence: str
     effects: list[str]
-    evidence: list[dict[str, Any]] = []
-    details: dict[str, Any] = {}
+    evidence: list[_Evidence] = []
+    details: _Details | None = None
+    probabilities: dict[str, Number] | None = None
+    inclusion: dict[str, Number | None] | None = None
+    forms: dict[str, Number] | None = None
+    discrepancy: dict[str, _Remains] | None = None
 
 
 class _Refit(_Stored):

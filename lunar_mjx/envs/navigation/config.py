@@ -164,6 +164,15 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", name, getattr(c, name), "does not exist", f"use one of {', '.join(allowed)}")
     # the optics and the light refuse values that make no sense, in words of their own
     _ = c.camera, c.sun
+    for name in ("tally", "four_wheel_steering"):
+        if not isinstance(getattr(c, name), bool):
+            raise bad_input("navigation", name, getattr(c, name), "is neither true nor false", "give one of them")
+    if not all(isinstance(r, Range) for r in c.randomise):
+        raise bad_input(
+            "navigation", "randomise", c.randomise, "are no ranges", "give some Range(parameter, low, high)"
+        )
+    if not isinstance(c.weights, Mapping):
+        raise bad_input("navigation", "weights", c.weights, "are no weights by name", f"use some of {', '.join(TERMS)}")
     check_blocks(c.observations, "observations")
     check_blocks(c.privileged, "privileged")
     if not c.observations:
@@ -178,7 +187,7 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", "weights", name, "is only known on the ladder", "leave it out")
     if c.collisions != "free" and not c.tally:
         raise bad_input("navigation", "tally", c.tally, f"does not go with collisions = {c.collisions}", "give true")
-    for name in ("rung", "worlds"):
+    for name in ("rung", "worlds", "place_seed"):
         value = getattr(c, name)
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
             raise bad_input("navigation", name, value, "is not a whole number of at least 0", "give one")
