@@ -77,7 +77,7 @@ def _clock(cells: pd.Series, path: Path) -> np.ndarray:
         return np.full(len(cells), np.nan)
     if empty.any():
         times = np.full(len(cells), np.nan)
-        times[~empty] = _clock(cells[~empty], path)
+        times[~empty] = _clock(pd.Series(cells[~empty]), path)
         return times
     text = cells.astype(str).str.strip()
     parts = text.str.fullmatch(r"([01]?\d|2[0-3]):[0-5]?\d(:([0-5]?\d|60)([.,]\d*)?)?")
