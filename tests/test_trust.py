@@ -138,8 +138,21 @@ def test_a_policy(mine, run, tmp_path):
     assert _ran(mine)
 
 
-def test_arrays_with_pickles_run_nothing(tmp_path):
-    path = tmp_path / "policy.npz"
-    np.savez(path, record=np.array([print], dtype=object))
+class _Mark:
+    """Leaves a file where it is unpickled."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("name", ["record", "mean"])
+def test_arrays_with_pickles_run_nothing(name, tmp_path):
+    path, mark = tmp_path / "policy.npz", tmp_path / "it ran"
+    whole = dict(np.load(shipped("models") / "luvmi_x" / "policy.npz"))
+    np.savez(path, **{**whole, name: np.array([_Mark(mark)], dtype=object)})
     with pytest.raises(UserError, match="is no policy"):
         load_policy(path)
+    assert not mark.exists()

@@ -104,6 +104,8 @@ def test_wheels_and_gravity_of_no_test_bed_are_refused(old: str, new: str, said:
     [
         ("rate_hz = 20.0", f"rate_hz = {'9' * 400}", "rate_hz = 9+... is too large"),
         ("gravity_m_s2 = 1.625", "gravity_m_s2 = 1e9", "gravity_m_s2 = 1000000000.0 is above 100"),
+        ("std = 0.1", "std = 0.0", "std = 0.0 is less than any instrument's noise"),
+        ("std = 0.1", "std = 1e-300", "std = 1e-300 is less than any instrument's noise"),
         ("std = 0.1", "std = 1e9", r"noise.*std = 1000000000.0 is more than the channel's whole range"),
         ("[noise", "[initial]\nposition_m = [0.0, 0.0, 1e30]\n[noise", "initial.position_m = .* is outside"),
         ("[noise", "[initial]\nyaw_deg = 1e9\n[noise", "initial.yaw_deg = .* is outside"),
