@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from . import bed_effects, bed_logs
-from .bed_logs import QUANTITIES, Truth
+from .bed import effects as bed_effects
+from .bed import logs as bed_logs
+from .bed.logs import QUANTITIES, Truth
 from .noise import NOISES, Recipe
 from .separable import SEPARABLE, left_over, nearest
 

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from . import bed_effects
-from .bed import Soil, measure
-from .bed_logs import Truth
+from .bed import effects as bed_effects
+from .bed.bench import Soil, measure
+from .bed.logs import Truth
 
 SEPARABLE = 10.0
 """Least length in sigma of what no refit of the soil explains, for an effect to count as separable by a table."""

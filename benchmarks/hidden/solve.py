@@ -22,7 +22,9 @@ from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
 
-from . import bed_effects, bed_logs, cases, drive_effects, drives
+from . import cases, drive_effects, drives
+from .bed import effects as bed_effects
+from .bed import logs as bed_logs
 from .judge import outcome
 from .separable import left_over
 from .told import Observed, told, true_values

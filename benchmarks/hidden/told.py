@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from . import bed_effects
-from .bed import Points, measure
-from .bed_logs import DECAY, Truth
+from .bed import effects as bed_effects
+from .bed.bench import Points, measure
+from .bed.logs import DECAY, Truth
 from .noise import Recipe
 
 _SOIL = ("k_phi", "n", "cohesion", "friction_angle", "modulus_x", "modulus_y")

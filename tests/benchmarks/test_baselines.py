@@ -162,7 +162,7 @@ def test_where_a_formula_points(monkeypatch: pytest.MonkeyPatch, channel: str, t
 
 
 def test_every_hidden_effect_has_its_quantities() -> None:
-    from benchmarks.hidden import bed_effects
+    from benchmarks.hidden.bed import effects as bed_effects
 
     assert set(baselines.QUANTITIES_OF) == {*bed_effects.KNOWN, *bed_effects.OUTSIDE}
     assert set().union(*baselines.QUANTITIES_OF.values()) == {*tools.FEATURES, "1"}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.hidden import bed_effects
+from benchmarks.hidden.bed import effects as bed_effects
 from benchmarks.hidden.solve import table_row
 
 SEED = 20261

@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.hidden import bed_effects, cases, drive_effects, drives, runner
+from benchmarks.hidden import cases, drive_effects, drives, runner
+from benchmarks.hidden.bed import effects as bed_effects
 from benchmarks.hidden.judge import outcome
 from benchmarks.hidden.solve import table_row
 from benchmarks.hidden.summary import GROUPS, summarise, wilson

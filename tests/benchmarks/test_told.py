@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from benchmarks.hidden import bed_logs
+from benchmarks.hidden.bed import logs as bed_logs
 from benchmarks.hidden.noise import Recipe
 from benchmarks.hidden.told import Observed, _correlation, told, true_values
 

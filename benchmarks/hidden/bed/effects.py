@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from .bed import Act, Hidden, Values
+from .bench import Act, Hidden, Values
 
 Rng = np.random.Generator
 Numbers = dict[str, float]

@@ -12,9 +12,9 @@ import pandas as pd
 from lunar_mjx.logs import write_steady_log
 from lunar_mjx.logs.log import Noise
 
-from . import bed_effects
-from .bed import Points, Soil, measure
-from .noise import Recipe, ar1, rounded, smooth
+from ..noise import Recipe, ar1, rounded, smooth
+from . import effects as bed_effects
+from .bench import Points, Soil, measure
 
 QUANTITIES = ("drawbar_pull_N", "side_force_N", "driving_torque_Nm", "sinkage_m")
 DECAY = 0.8
