@@ -45,7 +45,7 @@ def _rollout(system: Any, terrains: list[Any], commands: np.ndarray, every: int,
 
     ground = jax.tree.map(jnp.asarray, stack([dataclasses.replace(t, name="plane") for t in terrains]))
     params = dataclasses.replace(system.params, terrain=ground)
-    each = Params(gravity=None, ambient=None, effects=None, terrain=0)  # type: ignore[arg-type]
+    each = Params(gravity=None, ambient=None, effects=None, terrain=0)
     start = jax.vmap(lambda g: system.reset(dataclasses.replace(system.params, terrain=g)))(ground)
     run = jax.jit(lambda p, s, c: system.rollout_batch(p, s, c, every, each, report=keep, one_body=True)[1])
     return jax.device_get(run(params, start, jnp.asarray(commands)))

@@ -126,7 +126,7 @@ def at_noise(problem: Any, residual: np.ndarray, free: np.ndarray, *splits: str)
     from lunar_mjx.inference.held_out import noise_test
 
     fit = types.SimpleNamespace(residual=residual, free=free, fitted=problem.observations.in_split("fit"))
-    return noise_test(problem, fit, splits).passes  # type: ignore[arg-type]
+    return noise_test(problem, fit, splits).passes
 
 
 def answers(problem: Any, found: Sequence[Refit]) -> dict[str, dict[str, Any]]:

@@ -61,10 +61,7 @@ def drive(model: Model, variants: list[dict[str, dict[str, float]]]) -> Any:
     kinds = [*CLIMBS_DEG, "down", "steep", "across", "level"]
     rows = [(v, kind) for v in variants for kind in kinds]
     slopes = {"down": DOWNHILL_DEG, "steep": TOO_STEEP_DEG, "across": ACROSS_DEG, "level": 0.0}
-    planes = {
-        k: inclined(np.deg2rad(slopes.get(k, k)), 200.0, np.pi / 2 if k == "across" else 0.0)  # type: ignore[call-overload]
-        for k in kinds
-    }
+    planes = {k: inclined(np.deg2rad(slopes.get(k, k)), 200.0, np.pi / 2 if k == "across" else 0.0) for k in kinds}
     ground = jax.tree.map(jnp.asarray, stack([dataclasses.replace(planes[k], name="plane") for _, k in rows]))
     changed = {(effect, name) for v in variants for effect, values in v.items() for name in values}
     effects = {name: dict(values) for name, values in system.params.effects.items()}
@@ -74,7 +71,7 @@ def drive(model: Model, variants: list[dict[str, dict[str, float]]]) -> Any:
         effects[effect][name] = jnp.stack([own * 0.0 + v.get(effect, {}).get(name, own) for v, _ in rows])
         axes[effect][name] = 0
     params = dataclasses.replace(system.params, effects=effects, terrain=ground)
-    each = Params(gravity=None, ambient=None, effects=axes, terrain=0)  # type: ignore[arg-type]
+    each = Params(gravity=None, ambient=None, effects=axes, terrain=0)
     drives = np.array([1.0 if g.name == "drive" else 0.0 for g in model.rover.groups for _ in g.joints])
     go = np.tile(drives * RIM_SPEED / model.rover.wheels[0].radius, (len(rows), INTERVALS, 1))
     for i, (_, kind) in enumerate(rows):

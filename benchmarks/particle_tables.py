@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lunar_mjx.wheel_bed.particles.settings import Run
+    from lunar_mjx.wheel_bed.particles.settings import BedRun
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -74,7 +74,7 @@ def make_plan() -> dict[str, list[dict]]:
     return {name: [{**r.inputs(), "variant": r.variant} for r in listed] for name, listed in runs.items()}
 
 
-def stages(runs: dict[str, list[Run]]) -> list[tuple[str, list[Run]]]:
+def stages(runs: dict[str, list[BedRun]]) -> list[tuple[str, list[BedRun]]]:
     """Names of campaigns and parts of their runs, in the order in which they are computed."""
     earth = runs["cmu_earth"]
     table, controls = [r for r in earth if r.variant == "table"], [r for r in earth if r.variant != "table"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -24,3 +25,9 @@ def pytree(cls: type[T]) -> type[T]:
     """Makes `cls` a frozen dataclass that JAX transformations accept; change a field with `dataclasses.replace`."""
     frozen = dataclasses.dataclass(frozen=True)(cls)
     return jax.tree_util.register_dataclass(frozen)
+
+
+def tree_of(cls: Callable[..., T], **leaves: Any) -> T:
+    """A tree of class `cls` that holds no values but something about each: axes of `vmap`, how devices share it."""
+    # JAX reads such trees where it reads values, so that one class serves both; the fields' types speak of values.
+    return cls(**leaves)

@@ -20,7 +20,7 @@ from jaxtyping import TypeCheckError, install_import_hook
 
 # The hook takes its checker by name. The numeric tower lets a whole number stand for a float.
 CHECKER = types.ModuleType("strict_checker")
-CHECKER.check = beartype(conf=BeartypeConf(is_pep484_tower=True))  # type: ignore[attr-defined]
+CHECKER.check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 sys.modules["strict_checker"] = CHECKER
 install_import_hook("lunar_mjx", "strict_checker.check")
 

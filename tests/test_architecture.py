@@ -68,7 +68,6 @@ CROWDED = 15
 """Modules of one folder that a reader still takes in."""
 REPEATED = 3
 """Modules of one folder with a first word in common from which that word is a folder."""
-PREFIXES_BORNE = {("benchmarks/hidden", "bed"): "to become a folder beside drives"}
 
 
 def modules() -> dict[str, Path]:
@@ -204,7 +203,7 @@ def test_a_repeated_prefix_is_a_folder() -> None:
             for word, count in first.items():
                 if count >= REPEATED:
                     repeated[str(folder.relative_to(ROOT)), word] = count
-    assert set(repeated) == set(PREFIXES_BORNE), repeated
+    assert not repeated, repeated
 
 
 def bound_names(path: Path) -> set[str]:
@@ -268,3 +267,35 @@ def test_the_formatter_has_no_more_exceptions() -> None:
         for _ in range(path.read_text(encoding="utf-8").count(mark))
     ]
     assert found == ["lunar_mjx/dynamics/batching/batch_last.py"]
+
+
+OPTIONAL = "an optional package, which need not be installed where types are checked"
+SUMS = "sums of vectors: a NamedTuple is a tuple, whose + and * are of sequences"
+UNCHECKED = {
+    "backends/pybullet.py": (1, OPTIONAL),
+    "diagnosis/drives/simulation/program.py": (1, "parameters without their ground"),
+    "diagnosis/drives/windows/coordinates.py": (1, "MuJoCo's names, from before its stub"),
+    "diagnosis/drives/windows/form.py": (1, "the problem of a form of windows is narrower than that of any form"),
+    "dynamics/spatial_algebra.py": (6, SUMS),
+    "envs/sb3.py": (1, OPTIONAL),
+    "inference/coordinates.py": (1, "a sorted pair is a list to the type checker"),
+    "logs/readers/bags.py": (6, OPTIONAL),
+    "spatial.py": (2, SUMS),
+    "terrain/sky/ephemeris.py": (4, OPTIONAL),
+    "wheel_bed/particles/kernels.py": (2, "Warp compiles these functions, with types of its own"),
+    "wheel_bed/particles/sand_box.py": (1, OPTIONAL),
+    "wheel_bed/particles/slump.py": (1, OPTIONAL),
+}
+"""Lines and files that the type checker is told to pass over: how many, and why. It checks the package alone."""
+
+
+def test_what_types_do_not_check_is_listed() -> None:
+    """None more than these; whoever mends one takes it from the list."""
+    mark = re.compile(r"# *(?:type: *ignore|pyright: *(?:ignore|basic|report))")
+    found = {
+        str(path.relative_to(ROOT / PACKAGE)): count
+        for path in sorted((ROOT / PACKAGE).rglob("*.py"))
+        if (count := len(mark.findall(path.read_text(encoding="utf-8"))))
+    }
+    more = {name: count for name, count in found.items() if count > UNCHECKED.get(name, (0, ""))[0]}
+    assert not more, f"say it in types, or list it with its reason: {more}"

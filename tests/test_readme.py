@@ -22,7 +22,7 @@ def test_first_steps(capsys: pytest.CaptureFixture[str]) -> None:
     shown: dict[str, object] = {}
     exec(compile(FIRST_STEPS, "README.md", "exec"), shown)
     seen = shown["seen"]
-    assert np.isfinite(np.asarray(seen.slip)).all()  # type: ignore[attr-defined]
+    assert np.isfinite(np.asarray(seen.slip)).all()
     assert float(capsys.readouterr().out.split()[0]) > 1.0, "10 s at 0.8 rad/s on wheels of 0.25 m"
 
 

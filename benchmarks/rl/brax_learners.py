@@ -105,7 +105,7 @@ class Run:
         make_networks = getattr(networks, f"make_{self.name}_networks")
         step = math.prod(settings[k] for k in SETTINGS["step"][self.name])
         theirs, env = acting.Evaluator, self.scored[0]
-        acting.Evaluator = self.evaluator  # pyright: ignore[reportAttributeAccessIssue]
+        acting.Evaluator = self.evaluator
         try:
             learner.train(
                 BraxEnv(env),

@@ -120,6 +120,7 @@ class Checkpoints:
                 raise _OtherSettings(str(bad_input(self.folder, name, current.get(name), problem, remedy)))
 
     def close(self) -> None:
+        """Waits for saves that are under way, and frees what the manager holds."""
         self._manager.close()
 
 

@@ -92,6 +92,7 @@ def _with_learner(training: Training, learner: str) -> Training:
     if learner not in ALGORITHMS:
         raise bad_input("train", "--learner", learner, "does not exist", f"use one of {', '.join(ALGORITHMS)}")
     own = learner_name(training)
+    # Asked for by name: what the user's own file says of its learner still holds.
     if learner == own:
         return training
     # The shipped files are named family-learner; the family's own name stands for its usual learner.
@@ -126,6 +127,7 @@ def read_training(path: Path) -> Training:
             raise bad_input(path, "learner", fields.text("learner"), f"stands beside [{table}]", "give one of them")
         other = get_training(fields.text("learner"))
         train, settings = other.train, other.settings
+    # The table names the algorithm: two of them would be two trainings.
     elif len(named) != 1:
         tables = " or ".join(f"[{a}]" for a in ALGORITHMS)
         raise bad_input(path, "algorithm", " and ".join(named) or "none", "is not one table", f"give one of {tables}")
@@ -162,6 +164,7 @@ def _settings(defaults: Any, table: Fields, unused: tuple[str, ...] = ()) -> Any
 def _as(old: Any, table: Fields, key: str) -> Any:
     """A value of the kind that the setting has: a whole number serves for a number, a list for a tuple."""
     value = table.values[key]
+    # Whoever writes 1 for 1.0 means the number; true for 1.0 is a mistake.
     if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(old, tuple) and isinstance(value, list):

@@ -89,6 +89,7 @@ class DDPG:
         self.actor_optimiser, self.critic_optimiser = optax.adam(c.actor_rate), optax.adam(c.critic_rate)
 
     def init(self, key: Any) -> DDPGState:
+        """Networks and optimisers before the first update, drawn from a key of `jax.random`."""
         key_actor, key_critic = jax.random.split(key)
         actor, critic = self.actor.init(key_actor), self.critic.init(key_critic)
         return DDPGState(

@@ -23,7 +23,7 @@ from lunar_mjx.agents.replay import Batch, ReplayBuffer, ReplayState, Transition
 from lunar_mjx.agents.td3 import TD3, TD3Config
 from lunar_mjx.envs.core import Environment, State
 from lunar_mjx.errors import bad_input, require_within
-from lunar_mjx.pytree import pytree
+from lunar_mjx.pytree import pytree, tree_of
 
 with without_warp_notices():
     from brax.training.acme import running_statistics
@@ -147,8 +147,18 @@ class Learner:
                 raise bad_input("TrainConfig", "envs", config.envs, problem, "give a multiple")
         else:
             self.buffer = ReplayBuffer(config.buffer_steps, algorithm.n_step, algorithm.gamma)
-            buffer = ReplayState(own, shared, shared)  # type: ignore[arg-type]
-        self.specs = TrainState(shared, shared, shared, own, buffer, own, own, own)  # type: ignore[arg-type]
+            buffer = tree_of(ReplayState, storage=own, head=shared, filled=shared)
+        self.specs = tree_of(
+            TrainState,
+            agent=shared,
+            statistics=shared,
+            iterations=shared,
+            env=own,
+            buffer=buffer,
+            noise=own,
+            key=own,
+            guard=own,
+        )
         self._init = self._over_devices(self._init_share, (shared, shared), self.specs)
         reports = (shared, own) if config.episodes else (shared, shared)
         self._epoch = self._over_devices(self._epoch_share, (shared, self.specs), (self.specs, reports), donate=(1,))

@@ -96,14 +96,14 @@ class _Record(BaseModel):
 
 def save_policy(policy: Policy, path: Path) -> Path:
     """Writes a policy as an .npz file without pickles; returns the path."""
-    leaves = {
+    leaves: dict[str, Any] = {
         f"params{jax.tree_util.keystr(p)}": np.asarray(a) for p, a in jax.tree_util.tree_leaves_with_path(policy.params)
     }
     if policy.mean is not None:
         leaves |= {"mean": np.asarray(policy.mean), "deviation": np.asarray(policy.deviation)}
     record = {"format": FORMAT, "network": policy.network, "environment": policy.environment, "notes": policy.notes}
     with replacing(path) as part:
-        np.savez_compressed(part, record=np.array(json.dumps(record)), **leaves)  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(part, record=np.array(json.dumps(record)), **leaves)
     return path
 
 

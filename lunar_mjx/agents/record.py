@@ -56,6 +56,7 @@ class Record:
             writer.writerows(self.rows if whole else [row])
 
     def close(self) -> None:
+        """Writes out what the event file still holds."""
         self._events.close()
 
 

@@ -15,7 +15,7 @@ from lunar_mjx.agents.configs import Training
 from lunar_mjx.agents.curves import plot_episodes, plot_progress
 from lunar_mjx.agents.evaluate import Evaluator, Score
 from lunar_mjx.agents.learner import Learner, TrainState, normalised
-from lunar_mjx.agents.policy import Policy, policy_of, save_policy
+from lunar_mjx.agents.policy import policy_of, save_policy
 from lunar_mjx.agents.train import Result, RunConfig, plain, train
 from lunar_mjx.envs import NavigationEnv, make
 from lunar_mjx.envs.navigation.config import UNSEEN_SOIL
@@ -183,8 +183,3 @@ def run_training(
     if result.episodes["step"]:
         plot_episodes({name: [record]}, folder / "episodes.png")
     return Report(result, score, record)
-
-
-def agent_of(policy: Policy) -> Any:
-    """The policy as an agent of `Evaluator`, which takes no parameters."""
-    return lambda _, state, key: policy.act(state.obs)

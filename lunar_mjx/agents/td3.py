@@ -106,6 +106,7 @@ class TD3:
         self.support = jnp.linspace(*c.value_range, c.atoms) if c.atoms > 1 else None
 
     def init(self, key: Any) -> TD3State:
+        """Networks and optimisers before the first update, drawn from a key of `jax.random`."""
         key_actor, key_critic = jax.random.split(key)
         actor, critic = self.actor.init(key_actor), self.critics.init(key_critic)
         return TD3State(
@@ -221,13 +222,13 @@ class TD3:
         return -jnp.mean(value)
 
 
-def _with_params(optimiser: optax.GradientTransformation, params: Any) -> optax.GradientTransformation:
+def _with_params(optimiser: optax.GradientTransformation, held: Any) -> optax.GradientTransformation:
     """The optimiser with the parameters at hand, which decay needs and brax's update does not pass on."""
 
-    def update(updates: Any, state: Any, _: Any = None, **extra: Any) -> Any:
-        return optimiser.update(updates, state, params)
+    def update(updates: Any, state: Any, params: Any = None) -> Any:
+        return optimiser.update(updates, state, held)
 
-    return optax.GradientTransformation(optimiser.init, update)  # pyright: ignore[reportArgumentType]
+    return optax.GradientTransformation(optimiser.init, update)
 
 
 def polyak(target: Any, new: Any, tau: float) -> Any:

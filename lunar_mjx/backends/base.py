@@ -99,6 +99,7 @@ class Backend(abc.ABC):
             raise bad_input(
                 f"{self.name}.step", "control", values.shape, "has another shape", f"give ({wanted[1]},) or {wanted}"
             )
+        # One control drives all rovers alike.
         return np.broadcast_to(values, wanted)
 
     def stages(self, control: Any) -> dict[str, Observation]:
@@ -107,6 +108,8 @@ class Backend(abc.ABC):
         before = self.state()
         self.step(control)
         seen = self.observe()
+        # Engines integrate velocities semi-implicitly: the difference quotient is the acceleration of the step, to
+        # rounding.
         seen["acceleration"] = (self.state().qvel - before.qvel) / self.model.timestep
         self.set_state(before)
         return {stage: {name: seen[name] for name in names} for stage, names in STAGES.items()}
@@ -133,6 +136,7 @@ class Backend(abc.ABC):
                     self.step(control)
                     if i == 0:
                         rows.append(self.observe())
+                # Once a command and not once a step: NaN stays, and checks cost.
                 self._check_finite(rows[-1])
         return telemetry(rows)
 

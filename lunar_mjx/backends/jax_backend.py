@@ -21,12 +21,13 @@ from lunar_mjx.dynamics.state import Temperature
 from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
 from lunar_mjx.errors import bad_input
 from lunar_mjx.model import Model
+from lunar_mjx.pytree import tree_of
 from lunar_mjx.simulate import Commands
 from lunar_mjx.terrain import Terrain
 
 PRECISIONS = ("float64", "float32")
 
-_EACH_TERRAIN: Any = Params(gravity=None, ambient=None, effects=None, terrain=0)  # type: ignore[arg-type]
+_EACH_TERRAIN = tree_of(Params, gravity=None, ambient=None, effects=None, terrain=0)
 
 
 class JaxBackend(Backend):

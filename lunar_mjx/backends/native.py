@@ -4,9 +4,6 @@ MuJoCo steps all rovers of a backend in one call, on as many threads as asked fo
 NumPy over (rover, wheel) arrays on one thread. Four-bar loops are MuJoCo's equality constraints.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 from collections.abc import Iterable
@@ -103,6 +100,7 @@ class NativeBackend(NumpyBackend):
         """Gives one rover's loops `share` times the compliance that its MJCF gives them."""
         if self._impedance is None:
             self._impedance = self._batch.expand("eq_solimp")
+        assert self._impedance is not None
         impedance = self._impedance[rover, :, :2]
         # MuJoCo's impedance d means a compliance of (1 - d)/d.
         impedance[:] = 1.0 / (1.0 + share * (1.0 / impedance - 1.0))

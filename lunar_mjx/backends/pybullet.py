@@ -6,8 +6,8 @@ from (1 + W A) u = u0, where W is the inverse joint-space inertia under the loop
 makes Bullet's own step yield u. Dampers enter A as dt d, which is MuJoCo's implicit Euler step.
 """
 
-# pyright: reportAttributeAccessIssue=false, reportMissingModuleSource=false, reportMissingImports=false
-# (MuJoCo and PyBullet are compiled modules without type stubs)
+# pyright: reportMissingModuleSource=false, reportMissingImports=false, reportAttributeAccessIssue=false
+# (PyBullet is a compiled module, and need not be installed where types are checked)
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 """Pictures of a rover on its terrain: the front camera and any free camera, in colour, depth and segmentation."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,8 +1,5 @@
 """A camera that follows a rover from behind, with its goal; and the tracks that its wheels leave."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import math

@@ -1,8 +1,5 @@
 """OpenGL without a window: EGL or OSMesa, whichever is there, and MuJoCo's renderer on it."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import importlib

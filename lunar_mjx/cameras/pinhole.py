@@ -105,6 +105,7 @@ def look_at(position: object, target: object, up: object = (0.0, 0.0, 1.0)) -> P
     eye, to, above = (np.asarray(v, float) for v in (position, target, up))
     ahead = to - eye
     right = np.cross(ahead, above)
+    # Relative to the distance: two places may be near each other and still give a direction.
     if np.linalg.norm(right) < 1e-9 * max(1.0, float(np.linalg.norm(ahead))):
         raise bad_input(
             "camera",
@@ -113,6 +114,7 @@ def look_at(position: object, target: object, up: object = (0.0, 0.0, 1.0)) -> P
             f"gives no picture from {eye.tolist()}",
             "look elsewhere, or give another up",
         )
+    # Columns right, up and back: cameras of OpenGL and MuJoCo look along their own -z.
     ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
     return Pose(eye, np.stack([right, np.cross(right, ahead), -ahead], axis=1))
 

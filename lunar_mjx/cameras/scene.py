@@ -1,8 +1,5 @@
 """A rover on its terrain as MuJoCo draws it: ground near and far, boulders, regolith, black sky, one hard Sun."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses
@@ -90,6 +87,7 @@ def cut(terrain: Terrain, low: np.ndarray, high: np.ndarray, most: int) -> Patch
         count = heights.shape[axis]
         first = int(np.clip(math.floor((low[1 - axis] - origin) / cell), 0, count - 2))
         end = int(np.clip(math.ceil((high[1 - axis] - origin) / cell), first + 1, count - 1))
+        # Every so many nodes and no means: nodes that are drawn lie on the ground that the wheels touch.
         step = max(1, math.ceil((end - first) / (most - 1)))
         nodes = np.arange(first, end + 1, step)
         at.append(nodes)
@@ -119,6 +117,7 @@ def build_scene(
     Returns:
       The compiled `MjModel`, with untrodden ground, and what paints the tracks into its texture.
     """
+    # MuJoCo reads arrays of the host; a terrain of a batch lies on the device.
     terrain = jax.device_get(terrain)
     spec = seen_spec(rover)
     spec.stat.extent = 1.0

@@ -1,8 +1,5 @@
 """Rovers as boxes, cylinders, capsules and ellipsoids, placed by their joints, in pure JAX."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import functools

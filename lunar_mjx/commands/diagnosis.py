@@ -97,6 +97,7 @@ def compare(
     from lunar_mjx.diagnosis import verbs
     from lunar_mjx.report.progress import console_progress
 
+    # Before the model is made and anything compiles: a mistake in an option is told within a second.
     _require_imposed("--prior", prior, logs)
     _require_imposed("--fix", fix, logs)
     keep_compiled()
@@ -113,6 +114,7 @@ def compare(
                 progress,
                 _pairs("--setting", setting),
             )
+    # Bad data is an answer with an exit status of its own, and no mistake of the command line's.
     except verbs.BadData as bad:
         _finish(bad.diagnosis, False)
     _print_comparison(run)
@@ -138,6 +140,7 @@ def why(
     keep_compiled()
     with console_progress() as progress:
         diagnosis = verbs.why(run, only, progress=progress, seconds=seconds)
+        # The verdict is written by now: an audit that is broken off loses nothing of it.
         if audit > 0:
             from lunar_mjx.diagnosis.audit import audit as run_audit
 
@@ -182,6 +185,7 @@ def add(
     except verbs.BadData as bad:
         _finish(bad.diagnosis, False)
     _print_comparison(grown)
+    # Both runs, so that the page shows the error fall from one to the other.
     _write_report([run, out], out / "report.html")
 
 
@@ -274,6 +278,7 @@ def improve(
         )
     if runs:
         _write_report([r.folder for r in runs], out / "report.html")
+        # JSON stays one document: whoever parses it reads the steps in the run folders.
         if not as_json:
             _print_steps(runs)
     _finish(diagnosis, as_json)
@@ -307,6 +312,7 @@ def watch(
                 status = alarm.diagnosis.verdict.exit_status
     if not count and not as_json:
         print("No alarm: nothing began that is larger than what these drives do anyway.")
+    # Of the last alarm, as the verdict of `why` is one: scripts branch on it.
     raise typer.Exit(status)
 
 
@@ -329,9 +335,11 @@ def _model(path: Path | None, preset: str | None, logs: Sequence[Path]) -> Model
 
     if path is not None:
         return load_model(path)
+    # A run compares one model, so that its logs are of one rover: the first speaks for all.
     first = read_campaign(logs)[0]
     if isinstance(first, Log) and first.imposed is not None and preset is None:
         return hard_floor(first.rover, first.gravity_m_s2)
+    # A table names a wheel and no rover: any rover's soil and wheel effects serve to compare it.
     rover = first.rover if isinstance(first, Log) else "luvmi_x"
     return make_model(rover, terrain="flat", preset="consistent" if preset is None else preset)
 
@@ -357,6 +365,7 @@ def _with_priors(model: Model, prior: Sequence[str] | None, fix: Sequence[str] |
             _number("--prior", f"{name}={text}", std if mark else ""),
         )
     for name, value in _numbers("--fix", fix).items():
+        # Known without error is held: a standard deviation of zero takes it out of the fit.
         known[name] = (value, 0.0)
     return with_knowledge(model, known)
 
@@ -382,6 +391,7 @@ def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
         if not mark or not name:
             raise bad_input("lunar-mjx", option, item, "is not NAME=VALUE", "give both")
         out[name] = value
+    # Checked here, where the option can be named; a run folder would only say that it holds an unknown split.
     for value in out.values() if option == "--split" else ():
         if value not in ("fit", "select", "test", "apart"):
             raise bad_input("lunar-mjx", option, value, "is no split", "use fit, select, test or apart")
@@ -410,6 +420,7 @@ def _print_comparison(run: Any) -> None:
     console.print(table)
     if found.get("unused"):
         console.print(found["unused"], highlight=False)
+    # Eight rows fit a screen; `comparison.json` has all.
     worst = sorted(found["by_channel"], key=lambda row: -(row["refitted"] or 0.0))[:8]
     table = make_table("manoeuvre", "split", "channel", "as given", "refitted")
     for row in worst:
@@ -444,6 +455,7 @@ def _print_steps(runs: Sequence[Run]) -> None:
         left = ", ".join(f"{split} {_shown(value)}" for split, value in error.items())
         new = [f"{n} ({probability[n]:.0%})" if n in probability else n for n in run.added[before:]]
         added = ", ".join(new) or "the model as given"
+        # `added` grows from run to run: what stands behind the last run's is what this one added.
         before = len(run.added)
         probability = {**(said.get("inclusion") or {}), **(said.get("forms") or {})}
         console.print(f"{run.folder.name}: {added}; sigma after a refit: {left}", style="bold", highlight=False)
@@ -455,6 +467,7 @@ def _print_steps(runs: Sequence[Run]) -> None:
                     f"{_shown(held_out)} in place of {_shown(foreseen)} sigma.",
                     highlight=False,
                 )
+            # Against the run before and not the best so far: the line tells what the last step did.
             foreseen = held_out
         if said:
             console.print(f"  {said.get('verdict')}: {said.get('sentence')}", highlight=False)
@@ -467,7 +480,7 @@ def _shown(value: float | None) -> str:
 def _finish(diagnosis: Diagnosis, as_json: bool) -> NoReturn:
     """Prints a diagnosis and ends with its exit status."""
     from lunar_mjx.diagnosis.runs import plain
-    from lunar_mjx.model.describe import make_console, make_table
+    from lunar_mjx.model.describe import make_console
 
     if as_json:
         print(json.dumps(plain(diagnosis.to_dict()), indent=1))
@@ -479,14 +492,8 @@ def _finish(diagnosis: Diagnosis, as_json: bool) -> NoReturn:
     tested = [e for e in diagnosis.evidence if e.status != "not tested"]
     if diagnosis.probabilities:
         print_probabilities(diagnosis, console)
-    elif tested:
-        table = make_table("effect", "status", "separable", "chi2", "p", "gain", names=6)
-        for e in tested[:15]:
-            # NaN alone is unlike itself: the effect was not refitted.
-            gain = "-" if e.held_out_gain != e.held_out_gain else f"{e.held_out_gain:.0f} +- {e.held_out_se:.0f}"
-            table.add_row(e.effect, e.status, f"{e.separable_sigma:.1f}", f"{e.chi2:.0f}", f"{e.p:.2g}", gain)
-        console.print(table)
     for e in tested:
+        # Values of what is nearly excluded would be read as findings.
         if e.values and (not diagnosis.probabilities or e.probability >= WORTH_PRINTING):
             fitted = ", ".join(f"{k} {v:.3g} +- {e.std.get(k, 0.0):.1g}" for k, v in e.values.items())
             near = f"; nearest {e.nearest[0]}, cosine {e.nearest[1]:.2f}" if e.nearest[0] else ""

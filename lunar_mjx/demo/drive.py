@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from lunar_mjx.dynamics import System, Telemetry, build
 from lunar_mjx.effects.joint.motor import VELOCITY
-from lunar_mjx.model import make_model
+from lunar_mjx.model import ZERO_CELSIUS, make_model
 from lunar_mjx.terrain import Terrain, sample
 
 RIM_SPEEDS = {"viper": (0.12, 0.25), "luvmi_x": (0.08, 0.15)}
@@ -130,6 +130,7 @@ def drive(
     starts = _starts(terrain, count, rng, shift * DEMO_DRIVE.spacing)
     steps_per_record = round(1.0 / DEMO_DRIVE.records_per_second / system.dt)
     controls, speed = _controls(system, count, seconds, rng)
+    # All rovers are one batch: one program is compiled for all of them.
     state = jax.jit(jax.vmap(system.reset, in_axes=(None, 0, 0, 0)))(system.params, *map(jnp.asarray, starts))
 
     run = jax.jit(lambda params, state, controls: system.rollout_batch(params, state, controls, steps_per_record))
@@ -138,6 +139,7 @@ def drive(
     for first in range(0, controls.shape[1], chunk):
         part = controls[:, first : first + chunk]
         state, telemetry = run(system.params, state, jnp.asarray(part))
+        # Off the device at once: a minute of telemetry need not lie there.
         records.append(jax.device_get(telemetry))
         if progress is not None:
             progress(min(1.0, (first + chunk) / controls.shape[1]))
@@ -166,6 +168,7 @@ def _starts(
 
 
 def _good(terrain: Terrain, x: float, y: float) -> bool:
+    # As wide as a rover stands: a gentle place in its middle may have a crater's wall under a wheel.
     near = np.stack(np.meshgrid(x + np.linspace(-1, 1, 5), y + np.linspace(-1, 1, 5)))
     _, slope_x, slope_y = sample(terrain.field, jnp.asarray(near[0]), jnp.asarray(near[1]))
     if float(jnp.max(jnp.hypot(slope_x, slope_y))) > _STEEPEST:
@@ -196,6 +199,7 @@ def _controls(
     for wheel in rover.wheels:
         rate = speed[:, None] / wheel.radius * ramp
         at = system.joint_names.index(wheel.drive)
+        # Another mode would take the rates for angles or torques without a word.
         assert int(system.info.mode[at]) == VELOCITY
         controls[:, :, at] = rate
         if wheel.steer is not None:
@@ -230,7 +234,7 @@ def _record(system: System, t: Telemetry, speed: np.ndarray) -> Drive:
         slip=turned(t.slip),
         rolling=np.abs(rim) > 0.02,
         sinkage=turned(t.sinkage),
-        winding_degC=winding.max(axis=-1) - 273.15,
+        winding_degC=winding.max(axis=-1) - ZERO_CELSIUS,
         hottest=tuple(system.joint_names[i] for i in winding.max(axis=0).argmax(axis=-1)),
         power=power,
         energy=power.sum(axis=0) / DEMO_DRIVE.records_per_second,

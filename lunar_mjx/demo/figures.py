@@ -99,6 +99,7 @@ def _relief(
     file = io.BytesIO()
     # A picture begins with its top row, the ground with its south.
     Image.fromarray((255 * ground.grey[::-1]).astype(np.uint8)).save(file, "PNG", optimize=True)
+    # Within the page, which must open without a network and travel as one file.
     uri = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
     return uri, (ground.west, ground.east, ground.south, ground.north)
 

@@ -71,6 +71,7 @@ def run_demo(
             report(f"{activity} (compiling)", done)
             # Compiling takes most of the share and tells nothing of its progress.
             tell = _part(report, activity, done + 0.85 * share, 0.15 * share)
+            # Half a spacing apart, so that the two kinds do not start on each other's places.
             drives.append(drive(name, rovers, seconds, seed, terrain, tell, shift=0.5 * i))
             done += share
         share = 0.5 * (0.95 - done)
@@ -106,6 +107,7 @@ def _write(
         "versions": versions(),
         "seconds_wall_clock": round(time.monotonic() - begun, 1),
     }
+    # NaN is no JSON: numbers that do not exist have become null before.
     write_text(out / "summary.json", json.dumps(numbers, indent=1, allow_nan=False))
     return page
 
@@ -114,6 +116,7 @@ def summary(d: Drive) -> dict[str, Any]:
     """The numbers of a drive, one entry per rover, units in the names."""
 
     def numbers(values: np.ndarray) -> list[float | None]:
+        # Six digits: below the micrometre float32 tells nothing of a drive.
         return [round(float(v), 6) if np.isfinite(v) else None for v in values]
 
     return {

@@ -47,6 +47,7 @@ _UPSET = 60.0
 def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
     """What was found, a sentence each."""
     count = sum(d.x.shape[1] for d in drives)
+    # A state that is not finite never comes back, so that its place tells of the whole rover.
     bad = sum(int((~np.isfinite(d.x)).any(axis=0).sum()) for d in drives)
     upset = sum(
         int((np.degrees(np.maximum(np.abs(d.roll), np.abs(d.pitch))).max(axis=0) > _UPSET).sum()) for d in drives
@@ -55,6 +56,7 @@ def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
     named = {c.name: c for c in cases}
     plain, paper, fitted = named["consistent"], named["paper"], named["consistent, refitted"]
     assert fitted.fit is not None
+    # The worst quantity where nothing was fitted: there missing physics shows, and not a bad compromise.
     quantity = max(QUANTITIES.keys() & fitted.comparison.rms.keys(), key=lambda q: held_out_rms(fitted.comparison, q))
     return [
         f"{count} rovers drove {drives[0].time[-1]:.0f} s on true-scale terrain: {drove}. "
@@ -87,6 +89,7 @@ def husky_section(case: HuskyCase) -> Section:
     )
     split_words = {"fit": "fitted windows", "held_out": "held-out windows"}
     steps = (case.error_before, case.error_refitted, case.error_after)
+    # A short drive may hold no window back.
     rows = [[split_words[k], *(f"{s[k]:.2f}" for s in steps)] for k in split_words if k in case.error_before]
     header = ["", "as fitted on the floor", "refitted", "with soft ground"]
     table = Table("Error in standard deviations of the noise, all channels", header, rows)
@@ -126,6 +129,7 @@ def driving_section(drives: Sequence[Drive], terrain: Terrain) -> Section:
     """Paths, histories and a table of the batch."""
     rows = []
     for d in drives:
+        # Over the wheels that roll: a wheel at rest has no slip, and its zero would flatter the mean.
         slip = d.rover_slip
         for label, statistic in (("median", np.median), ("least", np.min), ("most", np.max)):
             pick = functools.partial(of_finite, statistic)
@@ -248,6 +252,7 @@ def _fit_table(cases: Sequence[Case]) -> Table:
         for effect, values in case.fit.values.items():
             for name, value in values.items():
                 edge = "at the edge of its range" if f"{effect}.{name}" in case.fit.at_bound else ""
+                # Meaning and unit stand where the parameter is declared, so that page and catalogue cannot differ.
                 known = next(e.parameters[name] for e in case.fit.bed.effects if e.name == effect)
                 # a value that its range's width dwarfs is zero: a fit ends at 1e-30 where it would end at 0
                 low, high = known.bounds

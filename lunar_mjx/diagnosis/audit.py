@@ -18,7 +18,7 @@ from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.drives.form import DriveForm
 from lunar_mjx.diagnosis.drives.loop import build_drives
 from lunar_mjx.diagnosis.runs import MODEL_FILE, Run, folder_hash, load_run
-from lunar_mjx.diagnosis.tables.simulated import SimulatedTables
+from lunar_mjx.diagnosis.tables.simulated import VISIBLE, SimulatedTables
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.errors import bad_input
@@ -27,12 +27,10 @@ from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.weighing.hypotheses import Refit
 from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, search
-from lunar_mjx.logs import SteadyLog
+from lunar_mjx.logs import Log, SteadyLog
 
 AUDIT_FILE = "audit.json"
 NULL = "nothing"
-_VISIBLE = 15.0
-"""Length in sigma, at least, of the signature of a simulated effect that is to be found."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,8 +72,9 @@ def audit(folder: str | Path | Run, seconds: float, progress: Progress = silent)
     cases: list[dict[str, Any]] = list(stored.get("cases", [])) if stored.get("key") == key else []
     end = time.monotonic() + seconds
     logs = run.campaign()
-    if isinstance(logs[0], SteadyLog):
-        simulated = SimulatedTables(run, logs)  # type: ignore[arg-type]
+    tables = [log for log in logs if isinstance(log, SteadyLog)]
+    if tables:
+        simulated = SimulatedTables(run, tables)
 
         def one(number: int) -> dict[str, Any]:
             truth, amount, said = simulated.case(number)
@@ -87,8 +86,8 @@ def audit(folder: str | Path | Run, seconds: float, progress: Progress = silent)
                 "outcome": _outcome(truth or NULL, said.verdict, said.effects),
             }
     else:
-        problem = build_drives(run, logs, None, progress)  # type: ignore[arg-type]
-        form = problem.own
+        drives = [log for log in logs if isinstance(log, Log)]
+        form = build_drives(run, drives, None, progress).own
         assert isinstance(form, DriveForm)
         base = form.refit(frozenset(), None, None)
         sizes = _sizes(form, base)
@@ -129,7 +128,7 @@ def _sizes(form: DriveForm, base: Refit) -> dict[str, float]:
             low, high = form.drives.bounds(form.candidates[name])
             # effects that would drown at their nominal size are made visible: an audit of what cannot be seen says
             # nothing
-            sizes[name] = float(np.clip(max(1.0, _VISIBLE / length), 0.0, np.min(np.maximum(high, -low))))
+            sizes[name] = float(np.clip(max(1.0, VISIBLE / length), 0.0, np.min(np.maximum(high, -low))))
     return sizes
 
 

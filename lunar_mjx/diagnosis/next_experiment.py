@@ -24,7 +24,7 @@ from lunar_mjx.diagnosis.tables.sweeps import rank_sweeps
 from lunar_mjx.diagnosis.weighed.answer import kept_start
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.fitting import Progress, silent
-from lunar_mjx.logs import SteadyLog
+from lunar_mjx.logs import Log, SteadyLog
 
 NEXT_FILE = "next.json"
 NOTHING = "no further effect"
@@ -100,17 +100,19 @@ def next_experiment(
     names = _hypotheses(verdict, between, set(candidate_effects(run)))
     effects = [n for n in names if n != NOTHING]
     logs = run.campaign()
-    if isinstance(logs[0], SteadyLog):
+    tables = [log for log in logs if isinstance(log, SteadyLog)]
+    if tables:
         held = set(run.model.effect_names)
         usable = [n for n in names if n not in held]
         if len(usable) < 2:
             raise UserError(f"{run.folder}: no two hypotheses are left to tell apart; name effects with --between.")
-        sweeps = rank_sweeps(run, logs, verdict, usable, NOTHING, progress)  # type: ignore[arg-type]
+        sweeps = rank_sweeps(run, tables, verdict, usable, NOTHING, progress)
         ranked = [Plan(*sweep) for sweep in sweeps]
         experiment = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
         run.save(NEXT_FILE, experiment.to_dict())
         return experiment
-    form = build_drives(run, logs, effects, progress).own  # type: ignore[arg-type]
+    drives = [log for log in logs if isinstance(log, Log)]
+    form = build_drives(run, drives, effects, progress).own
     assert isinstance(form, DriveForm)
     usable = [n for n in names if n == NOTHING or n in form.candidates]
     if len(usable) < 2:
@@ -118,9 +120,9 @@ def next_experiment(
     form.drives.progress = silent
     progress("what the logs say so far", 0.0)
     known = _Knowledge(form, run, usable)
-    plans = planned_drives(logs, run.model, seconds)  # type: ignore[arg-type]
+    plans = planned_drives(drives, run.model, seconds)
     effects_by_name = {n: form.drives.effects[n] for n in usable if n != NOTHING}
-    new = DriveProblem([p[2] for p in plans], run.model, effects_by_name, progress=progress)  # type: ignore[arg-type]
+    new = DriveProblem([p[2] for p in plans], run.model, effects_by_name, progress=progress)
     ranked = _rank(new, known, usable, [(name, text) for name, text, _ in plans])
     experiment = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
     run.save(NEXT_FILE, experiment.to_dict())

@@ -90,11 +90,14 @@ def _compare(run: Run, progress: Progress) -> Run:
     campaign = gate(run)
     require_splits(run.splits, campaign)
     require_discrepancy(run.discrepancy, campaign)
+    # Logs whose wheels moved as measured are compared in windows, each from its measured start.
     if windows.imposed(campaign):
         return windows.compare(run, campaign, progress)
     run.write()
+    # Without candidates: what may be missing is the business of `why`, and would cost compiling here.
     problem = _problem(run, campaign, (), progress)
     own, refit = problem.own, answer.compare(run, problem, progress)
+    # Kept beside the errors, since a report must tell who chose what was held out.
     stated = {log.name: log.split for log in campaign if isinstance(log, Log) and log.split}
     run.save(COMPARISON_FILE, {**run.load(COMPARISON_FILE), "log_splits": stated})
     rows = {"as given": own.origin(), "refitted": refit.u}
@@ -120,6 +123,7 @@ def gate(run: Run) -> list[Any]:
         bad = [f for f in findings if f.severity == "bad_data"]
         sentence = f"{bad[0].where}: {bad[0].message}" + (f" ({len(bad) - 1} more)" if len(bad) > 1 else "")
         diagnosis = Diagnosis(Verdict.BAD_DATA, (), sentence, details={"findings": [f.to_dict() for f in findings]})
+        # A refused log leaves a verdict, too: `report` can show the findings without reading the logs again.
         run.folder.mkdir(parents=True, exist_ok=True)
         run.save(VERDICT_FILE, diagnosis.to_dict())
         raise BadData(diagnosis)
@@ -135,6 +139,7 @@ def _record_opening(
     rows: Mapping[str, np.ndarray],
 ) -> None:
     """Puts on record which places' errors on the test split have been computed, by label."""
+    # Without a test split nothing was opened, and a record of it would only alarm.
     if not observations.in_split("test").any():
         return
     prints = {}
@@ -143,6 +148,7 @@ def _record_opening(
             # Nine digits: the same fit made again differs by rounding alone, and is no new opening.
             f"{c.key} {c.value(v):.9g}"
             for i, (c, v) in enumerate(zip(coordinates, u, strict=True))
+            # Candidates at rest at zero are no part of the model: the print is that of the model that was judged.
             if v != 0.0 or i in baseline
         ]
         prints[label] = hashlib.sha256("\n".join(moved).encode()).hexdigest()[:16]
@@ -174,12 +180,15 @@ def why(
     if windows.imposed(campaign):
         return windows.why(run, campaign, only, windows.TELLING.seconds if seconds is None else seconds, progress)
     problem = _problem(run, campaign, only, progress)
+    # Reading and checking count, too: the user's clock began with the command.
     left = math.inf if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
     diagnosis, model_search = answer.diagnose(run, problem, progress, left)
     if model_search is not None:
         own = problem.own
         rows = {"refitted": model_search.base(own.name).refit.u}
+        # Hypotheses come by falling probability: the first that was refitted is the best that was seen.
         best = next(h for h in model_search.hypotheses if h.refitted)
+        # Another contact law has other coordinates, whose values would mean nothing to this problem.
         if best.form == own.name:
             rows[", ".join(sorted(best.effects)) or "refitted"] = best.refit.u
         if not isinstance(campaign[0], SteadyLog):  # those of tables are made by `studio`, a second each
@@ -205,6 +214,7 @@ def explain(diagnosis: Diagnosis, effect: str) -> Diagnosis:
     evidence = next((e for e in diagnosis.evidence if e.effect == effect), None)
     if evidence is None:
         refused = {n["effect"]: n["reason"] for n in diagnosis.details.get("not_tested", [])}
+        # No typing error: the effect exists, and the logs cannot tell it.
         if effect in refused:
             sentence = f"{effect} cannot be tested here: it {refused[effect]}."
             return dataclasses.replace(diagnosis, verdict=Verdict.UNDECIDABLE, effects=(effect,), sentence=sentence)
@@ -244,6 +254,7 @@ def add(folder: str | Path | Run, effect: str, out: str | Path, progress: Progre
       UserError: no such effect, or it is in the model already.
     """
     run = folder if isinstance(folder, Run) else load_run(folder)
+    # Before the gate reads hours of logs.
     if Path(out).resolve() == run.folder.resolve():
         raise bad_input("add", "--out", out, "is the run itself, which would be lost", "name another folder")
     campaign = gate(run)
@@ -296,6 +307,7 @@ def improve(
         names = _next_to_add(diagnosis, run, keep_going)
         if not names or len(runs) > most:
             return diagnosis, runs
+        # A verdict calls the user's own effects by their bare names; to be added again they need their file.
         specs = {s.rpartition(":")[2]: s for s in effects}
         names, place = [specs.get(n, n) for n in names], out / f"run{len(runs) + 1}"
         campaign = gate(run)
@@ -317,6 +329,7 @@ def _add(
     """Adds effects to the model of a run, all at once, and compares anew in another folder."""
     from lunar_mjx.effects import catalogue
 
+    # The user's files stay with the run, so that later verbs find the effect without being told of it.
     specs = tuple(n for n in names if ".py" in n and n not in run.candidates)
     grown = dataclasses.replace(run, candidates=(*run.candidates, *specs))
     grow = grown_model if isinstance(logs[0], SteadyLog) else grown_drives
@@ -335,6 +348,7 @@ def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> list[str]:
     like any other. A law alone is exchanged where it is surely better. Beside something unlisted what is sure in itself
     is added, or with `keep_going` all that helps.
     """
+    # Calibration belongs to the instruments of these logs, and not into a model for other drives.
     names = [n for n in diagnosis.effects if not n.startswith("calibration: ")]
     sure = float(run.settings.get("sure", SearchSettings().sure))
     if diagnosis.verdict is Verdict.UNKNOWN and not keep_going:
@@ -344,5 +358,6 @@ def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> list[str]:
         names = list(dict.fromkeys([*names, *probable]))
     elif diagnosis.verdict is not Verdict.UNKNOWN:
         names = []
+    # Beside an effect any likelier law is taken; alone it must be sure, or rounds would swap laws to and fro.
     law = better_law(diagnosis.forms, run.model, 0.0 if names else sure)
     return [*([law] if law else []), *names]

@@ -1,8 +1,5 @@
 """What every engine tells the effects, and how it is asked to end a step."""
 
-# MuJoCo ships no type stubs for its compiled module.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from collections.abc import Callable

@@ -9,9 +9,6 @@ reference acceleration of a `connect`: it is added here. Matrix products keep al
 Kinematics run once per step and are fresh when the effects read them.
 """
 
-# MuJoCo ships no type stubs for its compiled module.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from typing import Any
@@ -146,7 +143,7 @@ class MjxEngine:
             + _point_inertia(geometry.payload_mass, payload - about)
         )
         cinert: Any = d._impl.cinert
-        return d.tree_replace({"_impl.cinert": cinert.at[chassis].add(change)})  # type: ignore[return-value]
+        return _with_private(d, cinert=cinert.at[chassis].add(change))
 
     def _apply(self, m: mjx.Model, d: mjx.Data, forces: Forces) -> mjx.Data:
         """Forces at the wheels' centres and the chassis frame, moved to the centres of mass where xfrc_applied acts."""
@@ -205,6 +202,12 @@ def _anchor(model: mujoco.MjModel, pin: Any, end: int) -> tuple[int, np.ndarray]
     return int(object_ids), np.array(model.eq_data[pin, 3 * end : 3 * end + 3])
 
 
+def _with_private(d: mjx.Data, **fields: Any) -> mjx.Data:
+    """MJX's data with other values in fields that it keeps to itself."""
+    replaced: Any = d.tree_replace({f"_impl.{name}": value for name, value in fields.items()})
+    return replaced
+
+
 def _hold_equalities(m: mjx.Model, d: mjx.Data, pins: _Pins) -> mjx.Data:
     """What `mjx.solve` converges to for equality constraints alone: (J M^-1 J^T + R) f = a_ref - J' v - J a_smooth."""
     implementation: Any = d._impl
@@ -214,8 +217,9 @@ def _hold_equalities(m: mjx.Model, d: mjx.Data, pins: _Pins) -> mjx.Data:
     matrix = jacobian @ moved.T + jnp.diag(1.0 / implementation.efc_D)
     wanted = implementation.efc_aref.at[: pins.rows].add(-pins.bias(d))
     force = _solve_positive(matrix, wanted - jacobian @ d.qacc_smooth)
-    d = d.tree_replace({"_impl.efc_force": force})  # type: ignore[assignment]
-    return d.replace(qacc=d.qacc_smooth + force @ moved, qfrc_constraint=force @ jacobian)
+    return _with_private(d, efc_force=force).replace(
+        qacc=d.qacc_smooth + force @ moved, qfrc_constraint=force @ jacobian
+    )
 
 
 def _solve_positive(a: Any, b: Any) -> Any:

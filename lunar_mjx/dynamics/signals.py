@@ -27,6 +27,7 @@ from lunar_mjx.effects.sensor.channels import (
     wrapped_degrees,
 )
 from lunar_mjx.errors import bad_input
+from lunar_mjx.model import ZERO_CELSIUS
 from lunar_mjx.pytree import AnyArray
 from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Frame, Vec3
@@ -45,8 +46,6 @@ __all__ = [
     "sensor_context",
 ]
 
-_ZERO_CELSIUS = 273.15
-"""K; 0 degC, by definition."""
 _RAD_TO_DEG = 57.29577951308232
 """deg; one radian, 180/pi."""
 
@@ -114,8 +113,8 @@ def observe(
         "motor_{}_torque_Nm": seen.joint_torque,
         "motor_{}_current_A": seen.current,
         "motor_{}_voltage_V": seen.voltage,
-        "winding_{}_temperature_degC": seen.winding_temperature - _ZERO_CELSIUS,
-        "housing_{}_temperature_degC": seen.housing_temperature - _ZERO_CELSIUS,
+        "winding_{}_temperature_degC": seen.winding_temperature - ZERO_CELSIUS,
+        "housing_{}_temperature_degC": seen.housing_temperature - ZERO_CELSIUS,
     }
     _entries(out, per_joint, joint_channels(system.model.rover))
     per_wheel = {
@@ -134,7 +133,7 @@ def observe(
             "bus_solar_W": supply.solar,
             "battery_charge_ratio": supply.charge,
             "bus_voltage_V": supply.voltage,
-            "chassis_temperature_degC": None if kelvin is None else kelvin - _ZERO_CELSIUS,
+            "chassis_temperature_degC": None if kelvin is None else kelvin - ZERO_CELSIUS,
         }
         out |= {name: value for name, value in other_channels.items() if value is not None}
     return Signals(jnp.asarray(seen.time), {k: jnp.asarray(v) for k, v in out.items()})

@@ -15,8 +15,10 @@ from lunar_mjx.spatial import Frame, Vec3, add, mul, neg, sub, total
 def uniform(values: Any, unit: float = 1.0) -> Any:
     """One float where all legs agree, else an array; numbers that are 0 or 1 but for rounding become so."""
     v = np.array(values, float)
+    # Exact zeros and ones vanish while a step is traced; those that a rotation left at 1e-17 would be computed.
     v[np.abs(v) < 1e-14 * unit] = 0.0
     v[np.abs(np.abs(v) - 1.0) < 1e-14] = np.sign(v[np.abs(np.abs(v) - 1.0) < 1e-14])
+    # One number for all legs is a constant of the program; an array would be read and multiplied at every step.
     return float(v[0]) if np.all(np.abs(v - v[0]) <= 4e-16 * np.abs(v[0])) else v
 
 
@@ -62,6 +64,7 @@ class Symmetric(NamedTuple):
     @classmethod
     def of_point(cls, mass: Any, c: Vec3) -> Symmetric:
         """Moments of inertia about the origin of a point mass at `c`: m (|c|^2 1 - c c^T)."""
+        # By components, so that a centre on an axis leaves most of the products out.
         mx, my, mz = c * mass
         xx, yy, zz = mul(mx, c.x), mul(my, c.y), mul(mz, c.z)
         return cls(add(yy, zz), add(xx, zz), add(xx, yy), neg(mul(mx, c.y)), neg(mul(mx, c.z)), neg(mul(my, c.z)))
@@ -145,6 +148,8 @@ class Body(NamedTuple):
 def solve_positive(a: list[list[Any]], columns: list[list[Any]]) -> list[list[Any]]:
     """Solves A x = b for several b by an unrolled L D L^T, A symmetric and positive definite (lower half is read)."""
     n = len(a)
+    # Unrolled: a leg has a few joints, and scalars fuse with their neighbours where a batched solver is a call of its
+    # own.
     low: list[list[Any]] = [[0.0] * n for _ in range(n)]
     inverse: list[Any] = [0.0] * n
     scaled: list[list[Any]] = [[0.0] * n for _ in range(n)]

@@ -308,7 +308,7 @@ def default_params(model: Model) -> Params:
 
 def _telemetry(ctx: Context, k: Kinematics, heat: Heat, effects: EffectState) -> Telemetry:
     contact, wheel = ctx.contact, ctx.wheel
-    assert contact is not None and wheel is not None and ctx.command is not None
+    assert contact is not None and wheel is not None and ctx.command is not None and ctx.torque is not None
     motor = ctx.parameters.get("motor")
     if motor is None:
         current = voltage = joule = jnp.zeros_like(ctx.joint_angle)
@@ -326,7 +326,7 @@ def _telemetry(ctx: Context, k: Kinematics, heat: Heat, effects: EffectState) ->
         angular_velocity=k.angular_velocity,
         joint_angle=k.joint_angle,
         joint_speed=k.joint_speed,
-        joint_torque=ctx.torque,  # type: ignore[arg-type]
+        joint_torque=ctx.torque,
         current=current,
         voltage=voltage,
         winding_temperature=ctx.winding_temperature,

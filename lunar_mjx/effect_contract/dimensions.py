@@ -276,6 +276,7 @@ class Rescaling:
             return {k: v * self.of(channel_unit(k)) for k, v in value.items()}
         if unit == "control":
             by_mode = [self.of(u) for u in MODE_UNITS]
+            # Each joint has the unit of its own mode: rad, rad/s, N m or A side by side in one array.
             return value * sum(jnp.where(mode == i, f, 0.0) for i, f in enumerate(by_mode))
         if dataclasses.is_dataclass(value):
             return self._fields(value, mode)
@@ -302,6 +303,7 @@ class Rescaling:
 
     def state(self, effect: Effect, values: Mapping[str, Any], rates: bool = False) -> dict[str, Any]:
         """An effect's state in the other units, or (`rates`) what it returns for it."""
+        # What a port returns for such a state is its derivative by time, and so has another unit than the state.
         per_second = {k: self.of("s") if rates and v.rate else 1.0 for k, v in effect.state.items()}
         scaled = vars(self._named(effect.state, SimpleNamespace(**values)))
         return {k: v / per_second.get(k, 1.0) for k, v in scaled.items()}

@@ -250,7 +250,7 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
     settings = {base: {base: factor} for base, factor in _FACTORS.items()} | {"all": _FACTORS}
     scales = {label: Rescaling(factors, effects) for label, factors in settings.items()}
 
-    def errors(s: Any) -> list[tuple[str, str, Any, Any]]:
+    def errors(s: Any) -> list[tuple[Any, Any]]:
         differences: list[tuple[str, str, Any, Any]] = []
         watched = _watched(effect, scales, differences)
         if on_sensors:
@@ -258,7 +258,7 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
         else:
             probe.act([watched if e is effect else e for e in effects], probe.terrain(), {}, s)
         names[:] = [(label, port) for label, port, _, _ in differences]
-        return [(error, size) for _, _, error, size in differences]  # type: ignore[misc]
+        return [(error, size) for _, _, error, size in differences]
 
     names: list[tuple[str, str]] = []
     runs = channel_states(rovers, seed) if on_sensors else probe.states(rovers, 4, seed)

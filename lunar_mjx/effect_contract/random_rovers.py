@@ -48,6 +48,7 @@ Memory = dict[str, dict[str, Any]]
 def terrain() -> Terrain:
     """A slope with rock and ever firmer soil in the east, under some of the wheels, and boulders beside two of them."""
     dtype = jnp.result_type(float)
+    # Inclined, so that an effect which mixes up the vertical with the ground's normal shows.
     plane = inclined(RANDOM_ROVERS.slope, 20.0, dtype=dtype)
     bounds = (-10.0, -10.0, 10.0, 10.0)
     centers = np.array([[1.0, 0.5, 0.1], [-1.0, -0.5, -0.1], [5.0, 5.0, 0.5]])
@@ -58,6 +59,7 @@ def terrain() -> Terrain:
     ground = SoilMap(rock, *(jnp.asarray(v, float) for v in (-10.0, -10.0, cell)))
     east = jnp.asarray(np.tile(np.linspace(0.5, 1.5, 5), (5, 1)), float)
     at = (jnp.asarray(v, float) for v in (-10.0, -10.0, 5.0))
+    # Soil that changes with the place: effects that read it at a wrong wheel give other forces.
     firmer = SoilGrids(*at, k_phi=8e5 * east, n=0.0 * east + 1.1, cohesion=170.0 * east, tan_phi=0.7 * east)
     return dataclasses.replace(plane, rocks=rocks, soil=ground, grids=firmer)
 
@@ -99,6 +101,7 @@ def states(count: int, wheels: int, seed: int = 0) -> dict[str, np.ndarray]:
         return scale * rng.normal(size=(count, moments, *shape))
 
     wheel_places = np.array([[0.5 - i // 2 * (2.0 / wheels), 0.5 - i % 2] for i in range(wheels)])
+    # What a state remembers of a place is met by another wheel, as behind each other in a rut.
     lane = np.stack([np.roll(wheel_places, moment, axis=0) for moment in range(moments)])
     airborne = rng.uniform(size=(count, moments, wheels)) < 0.2
     s = {
@@ -121,6 +124,7 @@ def states(count: int, wheels: int, seed: int = 0) -> dict[str, np.ndarray]:
     moving = {"velocity", "spin", "chassis_velocity", "chassis_spin", "speed", "angle", "target", "slip", "steering"}
     for still in range(min(3, count)):
         for name in moving:
+            # Exactly at rest: the place at which quotients and roots lose their derivatives.
             s[name][still, -1] = 0.0
         s["axle"][still, -1] = [0.0, 1.0, 0.0]
     for i, sinkage in enumerate((0.02, -0.1, 0.0, 0.3)[:count]):

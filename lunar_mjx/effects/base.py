@@ -209,7 +209,19 @@ class Effect:
             if parameter.axis == "rover":
                 raise UserError(f"{source}: {field} = {value} has several values; {self.name} takes one number here.")
             # Each entry is checked by itself: one wheel out of bounds is named like a single number.
-            return tuple(float(self.check(name, v, source)) for v in value)  # type: ignore[arg-type]
+            return tuple(self.check_number(name, v, source) for v in value)
+        return self.check_number(name, value, source)
+
+    def check_number(self, name: str, value: Any, source: str) -> float:
+        """Returns one number of a parameter if it is finite and within its bounds.
+
+        Args:
+          name: of a parameter that the effect has. value: of it, in its unit. source: file or function to name.
+
+        Raises:
+          UserError: not a number, not finite, or out of bounds.
+        """
+        field, parameter = f"effects.{self.name}.{name}", self.parameters[name]
         number = require_finite(source, field, value)
         low, high = parameter.bounds
         if not low <= number <= high:

@@ -50,6 +50,7 @@ class Geometry:
     payload_mass: Any
     payload_position: Vec3
     com_offset: Vec3
+    # None, and not neutral numbers: a model without such effects compiles no operation for them.
     gravity: Any = None
     rim_share: Any = None
     relief: Any = None

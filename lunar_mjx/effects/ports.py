@@ -25,7 +25,7 @@ from lunar_mjx.effects.context import (
 from lunar_mjx.effects.wheel.closed_form import lateral_slip_speed
 from lunar_mjx.effects.wheel.rim_contact import fitted_plane
 from lunar_mjx.pytree import pytree
-from lunar_mjx.spatial import Vec3
+from lunar_mjx.spatial import Frame, Vec3
 from lunar_mjx.terrain import inside, sample
 
 # The same floor for slip, for direction and for the lateral slip, so that all three fade together at rest.
@@ -114,8 +114,8 @@ def wheel_contact(ctx: Context) -> Contact:
     along its rim where an effect says so. Slip and slip angle are taken in the direction of travel, so that both keep
     their meaning when backing up.
     """
-    geometry: Geometry = ctx.geometry  # type: ignore[assignment]
-    place = ctx.wheel_position
+    geometry, place = ctx.geometry, ctx.wheel_position
+    assert geometry is not None
     height, slope_x, slope_y = _ground_below(ctx, geometry)
     # A wheel is shorter than a terrain's cell is wide, so the plane below its centre stands for the ground that it
     # meets.
@@ -210,7 +210,8 @@ def initial_wheel(contact: Contact) -> WheelForce:
 
 def wheel_ports(pipeline: Pipeline, ctx: Context, state: EffectState) -> tuple[Context, EffectState]:
     """The ports soil, wheel_normal and wheel_shear, for a context that already has its contact."""
-    contact: Contact = pipeline.recall(ctx.contact, state)  # type: ignore[arg-type]
+    assert ctx.contact is not None
+    contact = pipeline.recall(ctx.contact, state)
     ctx = dataclasses.replace(ctx, contact=contact)
     soil, state = pipeline.run("soil", ctx, state, initial_soil(contact.sinkage))
     ctx = dataclasses.replace(ctx, soil=soil)
@@ -245,14 +246,12 @@ def apply_effects(
         ctx = dataclasses.replace(ctx, power=power)
     # Forces are found in the wheel's frame, where the laws are stated, and turned into the world once, for all laws.
     contact, wheel = ctx.contact, ctx.wheel
-
-    def to_world(v: Vec3) -> Vec3:
-        return contact.forward * v.x + contact.left * v.y + contact.normal * v.z  # type: ignore[union-attr]
-
+    assert contact is not None and wheel is not None
+    wheel_frame = Frame(contact.forward, contact.left, contact.normal)
     forces = Forces(
         joint_torque=torque + wrench.joint_torque,
-        wheel_force=to_world(wheel.force),  # type: ignore[union-attr]
-        wheel_moment=to_world(wheel.moment),  # type: ignore[union-attr]
+        wheel_force=wheel_frame.to_world(wheel.force),
+        wheel_moment=wheel_frame.to_world(wheel.moment),
         chassis_force=wrench.force,
         chassis_moment=wrench.moment,
         geometry=geometry,

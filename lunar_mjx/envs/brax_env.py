@@ -7,6 +7,7 @@ ppo.train(env, wrap_env_fn=wrap, episode_length=env.env.episode_steps, num_envs=
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from typing import Any
 
@@ -46,7 +47,7 @@ class BraxEnv(Env):
         own = jax.tree.map(lambda leaf: leaf[None], state.pipeline_state)
         new = _single(self.env.step(self.env.params, own, action[None]))
         # Brax's wrappers keep their own counters in info.
-        return new.replace(info={**state.info, **new.info})  # pyright: ignore[reportAttributeAccessIssue]
+        return dataclasses.replace(new, info={**state.info, **new.info})
 
     @property
     def observation_size(self) -> int:
@@ -73,11 +74,8 @@ def _single(state: Any) -> BraxState:
     return BraxState(one, one.final_obs, one.reward, one.terminated.astype(one.reward.dtype), _metrics(one), {})
 
 
-class _Batch(Env):
+class _Batch(BraxEnv):
     """A batch that resets itself, with what brax's wrappers would have added."""
-
-    def __init__(self, env: BraxEnv):
-        self.env = env.env
 
     def reset(self, rng: jax.Array) -> BraxState:
         state: Any = self.env.reset(self.env.params, rng)
@@ -111,18 +109,6 @@ class _Batch(Env):
         # Here the next episode's observation: a native batch has reset itself.
         return BraxState(own, own.obs, reward, done, metrics, new)
 
-    @property
-    def observation_size(self) -> int:
-        return self.env.observation_size
-
-    @property
-    def action_size(self) -> int:
-        return self.env.action_size
-
-    @property
-    def backend(self) -> str:
-        return "lunar_mjx"
-
 
 def wrap(env: BraxEnv, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Any = None) -> Env:
     """A native batch for brax's trainers, as their argument `wrap_env_fn`.
@@ -142,4 +128,4 @@ def wrap(env: BraxEnv, episode_length: int = 1000, action_repeat: int = 1, rando
         raise bad_input("brax", "action_repeat", action_repeat, "is not 1", "set the environment's decimation")
     if randomization_fn is not None:
         raise bad_input("brax", "randomization_fn", "a function", "does not fit", "set the environment's randomise")
-    return _Batch(env)
+    return _Batch(env.env)

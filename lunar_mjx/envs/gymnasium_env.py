@@ -75,6 +75,7 @@ class SingleEnv(gym.Env):
         modes = list(RENDER_MODES) if Picture.fits(self.env) else []
         self.metadata = {"render_modes": modes, "render_fps": max(1, round(1.0 / self.env.control_interval))}
         self.observation_space, self.action_space = _spaces(self.env)
+        # Compiled with the first call and not here: an environment may be made for its spaces alone.
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
         self._state: Any = None
         self._picture = Picture(self.env, view) if render_mode else None
@@ -82,6 +83,7 @@ class SingleEnv(gym.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Begins an episode; the same seed gives the same start, goal and soil."""
         super().reset(seed=seed)
+        # From Gymnasium's own generator: without a seed the next episode differs, with one it is the same again.
         key = jax.random.PRNGKey(int(self.np_random.integers(2**31)))
         self._state = self._reset(self.env.params, split_keys(key, 1))
         if self._picture:
@@ -98,6 +100,7 @@ class SingleEnv(gym.Env):
         done = bool(state.done[0])
         if self._picture:
             self._picture.add(self._state, done)
+        # Metrics are sums over an episode: they mean something when it has ended.
         info = _info(state, 0) | ({k: float(v[0]) for k, v in state.metrics.items()} if done else {})
         return (
             # Gymnasium's single environment does not reset itself.
@@ -193,6 +196,7 @@ class VectorEnv(gym.vector.VectorEnv):
         render_mode: str | None = None,
         **options: Any,
     ):
+        # True is an int in Python.
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise bad_input("gym.make_vec", "num_envs", num_envs, "is not a whole number of at least 1", "give one")
         if render_mode is not None:
@@ -268,6 +272,7 @@ def _point_vector(num_envs: int = 1, **options: Any) -> VectorEnv:
 def register() -> None:
     """Registers the environments with Gymnasium, once."""
     for name, single, vector in ((NAVIGATION, NavigationGymEnv, VectorEnv), (POINT, _point, _point_vector)):
+        # This module may be imported by several names, and Gymnasium warns of a second registration.
         if name not in gym.registry:
             gym.register(name, entry_point=single, vector_entry_point=vector)
     for rung in RUNGS:

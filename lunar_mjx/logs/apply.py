@@ -225,13 +225,11 @@ def _changed_rover(log: Log, model: Model) -> Model:
 def _with_payload(model: Model, mass: float, position: Any, source: str) -> Model:
     """The payload added to one that the model carries already, as one point mass at their common centre."""
     if "payload" in model.effect_names:
-        old = model.parameters["payload"]
-        total_mass = float(old["mass"]) + mass  # type: ignore[arg-type]
+        # A payload is one for the rover: none of its parameters has several values.
+        old = {k: float(np.asarray(v)) for k, v in model.parameters["payload"].items()}
+        total_mass = old["mass"] + mass
         # The effect knows one point mass: the inertia of the two about their common centre is left out.
-        position = [
-            (float(old[k]) * float(old["mass"]) + p * mass) / total_mass  # type: ignore[arg-type]
-            for k, p in zip("xyz", position, strict=True)
-        ]
+        position = [(old[k] * old["mass"] + p * mass) / total_mass for k, p in zip("xyz", position, strict=True)]
         mass = total_mass
     return _set(model, "payload", source, mass=mass, **dict(zip("xyz", position, strict=True)))
 

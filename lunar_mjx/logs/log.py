@@ -57,7 +57,7 @@ class LogTable:
       rate_hz: stated; the median one of `time_s` if nothing is stated.
       clock_offset_s: add it to `time_s` to get the log's common time. clock_offset_std_s: its standard deviation.
       on_change: rows were written when a reading was new, and not at a rate; then none can be missed.
-      columns: name in the file by channel. ignored: columns that are no channel.
+      columns: name in the file by channel.
     """
 
     name: str
@@ -68,7 +68,6 @@ class LogTable:
     clock_offset_s: float = 0.0
     clock_offset_std_s: float = 0.0
     columns: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    ignored: tuple[str, ...] = ()
     on_change: bool = False
 
     @property

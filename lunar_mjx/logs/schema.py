@@ -54,6 +54,7 @@ class Channel:
 
     @functools.cached_property
     def pattern(self) -> re.Pattern[str]:
+        """Matches a name without its unit, with the groups `corner`, `joint` and `axis` where the stem has them."""
         joint = f"(?P<joint>{'|'.join(KINDS)})"
         # Sides only where joints are driven: no rover steers a side as one.
         side = f"(?:{'|'.join(SIDES)})(?=_drive)" if "{c}_{j}" in self.stem else ""
@@ -178,11 +179,6 @@ class ChannelName:
         return {"l": "left", "r": "right"}.get(self.corner[:1], "")
 
     @property
-    def whole_side(self) -> bool:
-        """Whether one reading stands for all wheels of a side."""
-        return self.corner in SIDES
-
-    @property
     def kind(self) -> str:
         """The name without its corner: one kind of sensor, wherever on the rover it sits."""
         return str(dataclasses.replace(self, corner=""))
@@ -217,6 +213,7 @@ def parse_name(name: str) -> ChannelName | None:
         return None
     channel, match = found
     parts = match.groupdict()
+    # The stem without its places: `joint_{c}_{j}_speed` is the quantity `joint_speed`.
     quantity = re.sub(r"_?\{.\}", "", channel.stem)
     return ChannelName(
         quantity, parts.get("corner") or "", parts.get("joint") or "", parts.get("axis") or "", channel.suffix
@@ -243,6 +240,7 @@ def channel_kind(name: str) -> str:
 def find_channel(name: str) -> tuple[Channel, re.Match[str]] | None:
     """The channel that a name of the schema belongs to, with the match that holds its corner, joint and axis."""
     for channel in CHANNELS:
+        # The unit belongs to the name: `position_x` alone is no channel, for nobody could say in what it counts.
         stem = name.removesuffix("_" + channel.suffix) if channel.suffix else name
         match = channel.pattern.fullmatch(stem)
         if match and (not channel.suffix or stem != name):
@@ -278,9 +276,11 @@ def parse_column(column: str, source: str) -> Column | None:
     for channel in CHANNELS:
         match = channel.pattern.match(column)
         rest = column[match.end() :] if match else ""
+        # `pitching_m` is no pitch: the stem must end where a word ends.
         if match is None or (rest and not rest.startswith("_")):
             continue
         name = column[: match.end()] + (f"_{channel.suffix}" if channel.suffix else "")
+        # Refused with the full name, and not taken to be SI: a guess at a unit would be a thousandfold error.
         if not rest:
             return Column(name, channel, problem=f"does not say its unit; call it {name} if it is in {channel.unit}")
         scale, offset, problem = conversion(rest[1:], channel.unit, source, column)

@@ -26,6 +26,13 @@ def continuous(log: Log, name: str) -> tuple[np.ndarray, np.ndarray] | None:
     return time, values if period is None else np.unwrap(values, period=period)
 
 
+def known(log: Log, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times, s, and values of a channel that has been seen to be there (by `span`): as `continuous`, and never None."""
+    samples = continuous(log, name)
+    assert samples is not None, name
+    return samples
+
+
 def sigma(log: Log, name: str) -> float:
     """Stated noise of a channel; 0 if none is stated."""
     return log.noise[name].std if name in log.noise else 0.0
@@ -34,15 +41,24 @@ def sigma(log: Log, name: str) -> float:
 def at(log: Log, name: str, time: np.ndarray) -> np.ndarray | None:
     """A channel at other times, by straight lines; NaN outside its span."""
     samples = continuous(log, name)
-    return None if samples is None else np.interp(time, samples[0], samples[1], left=np.nan, right=np.nan)
+    return None if samples is None else _straight(samples, time)
+
+
+def known_at(log: Log, name: str, time: np.ndarray) -> np.ndarray:
+    """As `at`, of a channel that has been seen to be there."""
+    return _straight(known(log, name), time)
+
+
+def _straight(samples: tuple[np.ndarray, np.ndarray], time: np.ndarray) -> np.ndarray:
+    return np.interp(time, samples[0], samples[1], left=np.nan, right=np.nan)
 
 
 def span(log: Log, names: Sequence[str]) -> tuple[float, float] | None:
     """Times that all channels cover; None if one is missing or they share none."""
-    series = [continuous(log, n) for n in names]
-    if any(s is None for s in series):
+    series = [s for n in names if (s := continuous(log, n)) is not None]
+    if len(series) < len(names):
         return None
-    low, high = max(s[0][0] for s in series), min(s[0][-1] for s in series)  # type: ignore[index]
+    low, high = max(s[0][0] for s in series), min(s[0][-1] for s in series)
     return (float(low), float(high)) if high > low else None
 
 
@@ -54,17 +70,17 @@ def edges(low: float, high: float, count: int = 40, shortest: float = 0.5) -> np
 
 def increments(log: Log, name: str, windows: np.ndarray) -> np.ndarray:
     """Change of a channel over each window, from the mean of five samples about each edge: less noise than two."""
-    time, values = continuous(log, name)  # type: ignore[misc]
+    time, values = known(log, name)
     return np.diff(np.interp(windows, time, smooth(values)))
 
 
 def integrals(log: Log, name: str, windows: np.ndarray, like: str | None = None) -> np.ndarray:
     """Integral of a channel over each window, its edges smoothed as `increments` smooths those of `like`."""
-    time, values = continuous(log, name)  # type: ignore[misc]
+    time, values = known(log, name)
     # Trapezoids over the samples' own times: rates need not be regular.
     total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
     if like is not None:
-        length = SMOOTHED * np.median(np.diff(continuous(log, like)[0]))  # type: ignore[index]
+        length = SMOOTHED * np.median(np.diff(known(log, like)[0]))
         # The same smoothing on both sides, or a difference of filters would look like one of channels.
         total = smooth(total, max(1, round(float(length / np.median(np.diff(time))))))
     return np.diff(np.interp(windows, time, total))
@@ -98,11 +114,6 @@ class Agreement:
     cosine: float
     series: float
     reference: float
-
-    @property
-    def excited(self) -> bool:
-        """Whether the compared signal moved at all."""
-        return self.reference > 0.0
 
 
 def agreement(series: np.ndarray, reference: np.ndarray, noise: float, least: float = 0.0) -> Agreement | None:

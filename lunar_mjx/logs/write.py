@@ -56,6 +56,7 @@ def write_log(
     for key in settings:
         if key not in TOP or key in ("format", "kind", "tables", "noise"):
             raise bad_input("write_log", key, settings[key], "is unknown", f"use one of {', '.join(TOP[2:])}")
+    # All checks before the folder is made: a refused log leaves nothing behind.
     for name, frame in tables.items():
         _check_frame(name, frame)
     top: dict[str, Any] = {"format": FORMAT, "rover": rover}
@@ -69,12 +70,13 @@ def write_log(
         entries[name] = {"file": file, **({"rate_hz": round(rate, 6)} if rate else {})}
         if name in on_change:
             entries[name]["on_change"] = True
-        if name in (clock_offsets_s or {}):
-            offset, std = clock_offsets_s[name]  # type: ignore[index]
+        if clock_offsets_s is not None and name in clock_offsets_s:
+            offset, std = clock_offsets_s[name]
             entries[name] |= {"clock_offset_s": float(offset), "clock_offset_std_s": float(std)}
     top["tables"] = entries
     top["noise"] = noise_tables(noise or {})
     write_text(folder / LOG_FILE, tomli_w.dumps(top))
+    # What was written must read back: settings are checked by the reader's rules, and not by a second set of them.
     _read_back(folder)
     return folder
 
@@ -126,6 +128,7 @@ def noise_tables(noise: Mapping[str, Noise]) -> dict[str, dict[str, Any]]:
     tables = {}
     for name, entry in noise.items():
         tables[name] = {"std": float(entry.std), "source": entry.source}
+        # White noise is what the field's absence means.
         if entry.correlation_time_s:
             tables[name]["correlation_time_s"] = float(entry.correlation_time_s)
     return tables

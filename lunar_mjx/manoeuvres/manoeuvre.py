@@ -269,7 +269,8 @@ def wheel_places(rover: Rover) -> Mapping[str, tuple[float, float]]:
     import mujoco
 
     model = rover.compile()
-    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    mujoco.mj_forward(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
     base = data.body(rover.chassis).xpos
-    return {w.corner: tuple(map(float, (data.body(w.body).xpos - base)[:2])) for w in rover.wheels}  # type: ignore[misc]
+    centres = {w.corner: data.body(w.body).xpos - base for w in rover.wheels}
+    return {corner: (float(centre[0]), float(centre[1])) for corner, centre in centres.items()}

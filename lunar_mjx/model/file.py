@@ -241,6 +241,7 @@ def _priors(path: Path, table: Mapping[str, Any], model: Model) -> dict[str, tup
 def _effects(path: Path, data: Mapping[str, Any], model: Model) -> Model:
     """Puts the file's list of effects into the model, and the file's values into the effects."""
     tables = _table(path, "effects", data.get("effects", {}))
+    # The list first: values may then be given to effects that the preset lacks.
     if "effect_list" in data:
         model = _list_effects(path, data["effect_list"], model)
     for name, values in tables.items():
@@ -270,10 +271,12 @@ def _list_effects(path: Path, names: Any, model: Model) -> Model:
         if effect.name in parameters:
             raise bad_input(path, "effect_list", effect.name, "stands there twice", "name every effect once")
         effects.append(effect)
+        # An effect that the preset has, too, keeps its values there; others begin at their nominal ones.
         parameters[effect.name] = model.parameters.get(effect.name, effect.nominal())
         files[effect.name] = near
     for effect in effects:
         for other in effect.replaces:
+            # After all are read: which of the two comes first in the file must not matter.
             if other in parameters:
                 raise bad_input(path, "effect_list", other, f"is replaced by {effect.name}", "keep only one of the two")
     return dataclasses.replace(model, effects=tuple(effects), parameters=parameters, effect_files=files)
@@ -285,6 +288,7 @@ def _value(path: Path, effect: Effect, key: str, value: Any) -> Any:
         return 0.0  # refused by name where it is set
     field, parameter = f"effects.{effect.name}.{key}", effect.parameters[key]
     unit, inner = parameter.unit, value
+    # A table with these keys is a number with its unit; any other one names groups of joints.
     if isinstance(value, dict) and ("value" in value or "unit" in value):
         _known(path, field, value, ("value", "unit"))
         if "value" not in value:
@@ -317,6 +321,7 @@ def _ambient(path: Path, table: Mapping[str, Any], default: tuple[float, ...]) -
         return round(celsius + ZERO_CELSIUS, 9)  # so that what was saved, rounded likewise, is the same again
 
     if "temperature_degC" in table:
+        # A constant beside a lunar day says two things about one moment.
         if len(table) > 1:
             raise bad_input(
                 path,
@@ -342,6 +347,7 @@ def _named(path: Path, field: str, value: str, load: Callable[[str], T], spec: s
     try:
         return load(spec)
     except UserError as error:
+        # The inner sentence knows what is wrong, and not which model asked for it.
         raise UserError(f"{path}: {field} = {value!r} cannot be loaded: {error}") from error
 
 

@@ -204,8 +204,7 @@ class Model:
             if isinstance(number, list | tuple | Mapping):
                 raise bad_input(source, f"{field}.{group}", number, "is not a number", "give one number per group")
         return tuple(
-            float(effect.check(key, value[n], source)) if n in value else o  # type: ignore[arg-type]
-            for n, o in zip(names, old, strict=True)
+            effect.check_number(key, value[n], source) if n in value else o for n, o in zip(names, old, strict=True)
         )
 
 

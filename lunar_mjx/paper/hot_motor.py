@@ -10,7 +10,7 @@ import numpy as np
 
 from lunar_mjx.dynamics import build
 from lunar_mjx.effects.presets import PRESET_PARAMETERS
-from lunar_mjx.model import make_model
+from lunar_mjx.model import ZERO_CELSIUS, make_model
 
 DESIRED_TORQUE = 15.0
 """N m, the seed paper's."""
@@ -58,14 +58,14 @@ def hot_motor(preset: str, duration: float = 14.0, rover: str = "luvmi_x") -> Ho
     samples = round(duration / (steps_per_record * model.timestep))
     run = jax.jit(lambda p, s: system.rollout(p, s, jnp.tile(control, (samples, 1)), every=steps_per_record)[1])
     seen = jax.device_get(run(system.params, system.reset(system.params)))
-    winding = np.asarray(seen.winding_temperature)[:, 0] - 273.15
+    winding = np.asarray(seen.winding_temperature)[:, 0] - ZERO_CELSIUS
     off = np.flatnonzero(np.asarray(seen.joint_torque)[:, 0] == 0.0)
     time = np.asarray(seen.time)
     return HotMotor(
         preset=preset,
         time=time,
         winding=winding,
-        housing=np.asarray(seen.housing_temperature)[:, 0] - 273.15,
+        housing=np.asarray(seen.housing_temperature)[:, 0] - ZERO_CELSIUS,
         torque=np.asarray(seen.joint_torque)[:, 0],
         desired=DESIRED_TORQUE,
         cutoff_time=float(time[off[0]]) if off.size else float("nan"),

@@ -1,8 +1,5 @@
 """Converts a URDF into a rover folder: MJCF with a free base, motors and closed loops, and `rover.toml` beside it."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import contextlib

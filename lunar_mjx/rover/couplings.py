@@ -35,13 +35,18 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
     written = {j.name: j for j in urdf.joints}
     couplings: list[Coupling] = []
 
-    def sense(joint: str) -> float:
-        """-1 where the conversion has reversed the joint's axis, which also turns frames; told by the limits' axis."""
+    poses = world_poses(bodies)
+
+    def made_axis(joint: str) -> np.ndarray:
+        """Direction (3,) of a moving joint's axis at zero angles as the MJCF has it, in the root's frame."""
         body = moving[joint]
         assert body.joint is not None
+        return poses[body.name].rotation @ body.joint.axis
+
+    def sense(joint: str) -> float:
+        """-1 where the conversion has reversed the joint's axis, which also turns frames; told by the limits' axis."""
         # In the root's frame at zero angles, where both descriptions can be compared.
-        pose = world_poses(bodies)[body.name].rotation @ body.joint.axis
-        return 1.0 if _drawn_axis(urdf, joint) @ pose > 0.0 else -1.0
+        return 1.0 if _drawn_axis(urdf, joint) @ made_axis(joint) > 0.0 else -1.0
 
     for joint in urdf.joints:
         if joint.mimic is None:
@@ -64,12 +69,7 @@ def place_couplings(urdf: Urdf, bodies: tuple[Body, ...], description: Descripti
                 raise bad_input(
                     path, f"differentials[{i}].{key}", getattr(pair, key), "is no moving joint", "correct the name"
                 )
-        poses = world_poses(bodies)
-        axes = [
-            poses[moving[j].name].rotation @ moving[j].joint.axis  # type: ignore[union-attr]
-            for j in (pair.joint1, pair.joint2)
-        ]
-        cosine = float(axes[0] @ axes[1])
+        cosine = float(made_axis(pair.joint1) @ made_axis(pair.joint2))
         if abs(cosine) < URDF_LIMITS.parallel:
             raise bad_input(
                 path, f"differentials[{i}].joint2", pair.joint2, "is not parallel to joint1", "name the rockers' pivots"

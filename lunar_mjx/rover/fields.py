@@ -3,9 +3,6 @@
 MuJoCo alone would honour them. A model that meant them would move otherwise here, and nobody would be told.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -1,8 +1,5 @@
 """Loads a converted rover by name or path and checks that its files agree."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses

@@ -4,9 +4,6 @@ Physics never reads this file: masses, inertias, collision shapes and the points
 MJCF. A rover without the file is seen as its plain shapes.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses
@@ -65,6 +62,7 @@ def seen_spec(rover: Rover) -> mujoco.MjSpec:
     bodies = {b.name: b for b in spec.bodies}
     for name in _names(path, "plain", data.get("plain", []), bodies):
         for geom in bodies[name].geoms:
+            # Hidden and not deleted: the physics may use the plain shape, and the eye sees the parts in its place.
             geom.group = LOOK.hidden
     count = 0
     for i, part in enumerate(tables(path, "parts", data)):
@@ -82,6 +80,7 @@ def _add(path: Path, where: str, part: Any, bodies: dict[str, Any], colours: dic
     check_keys(path, where, part, known, {"bodies", "kind", "size", "colour"})
     kind, lengths = _KINDS[one_of(path, f"{where}.kind", part["kind"], tuple(_KINDS))]
     size = np.array([at_least(path, f"{where}.size", v, 0.0, strict=True) for v in _list(path, where, part, lengths)])
+    # MuJoCo counts half sides and half lengths; the file has whole ones, as drawings do.
     half = 0.5 * size if lengths == 3 else np.array([size[0], 0.5 * size[1], 0.0])
     at = np.array(numbers(path, f"{where}.at", part.get("at", [0.0, 0.0, 0.0]), 3))
     tilt = np.radians(numbers(path, f"{where}.tilt_deg", part.get("tilt_deg", [0.0, 0.0, 0.0]), 3))
@@ -108,6 +107,7 @@ def _add(path: Path, where: str, part: Any, bodies: dict[str, Any], colours: dic
                 quat=quaternion,
                 rgba=[*colours[colour], 1.0],
                 group=LOOK.detail if part.get("detail") is True else 1,
+                # Paint: a part of the look changes neither inertia nor contact.
                 mass=0.0,
                 contype=0,
                 conaffinity=0,

@@ -1,8 +1,5 @@
 """Builds the MJCF through `mujoco.MjSpec` and writes it with full precision."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET

@@ -149,18 +149,18 @@ def _rim(body: Body) -> tuple[Geometry, float, float] | None:
 def _candidates(bodies: tuple[Body, ...], poses: dict[str, Pose]) -> list[Body]:
     """Bodies at the end of a chain that turn about y and carry a round shape, unless they hang above the others."""
     parents = {b.parent for b in bodies}
-    bottoms: dict[str, float] = {}
-    candidates = []
+    candidates: list[tuple[Body, float, float]] = []
     for body in bodies:
         if body.joint is None or body.joint.kind not in _HINGES or body.name in parents:
             continue
         rim = _rim(body)
         if rim is None or abs(_world_axis(body, poses)[1]) < ROLE_RULES.across:
             continue
-        candidates.append(body)
-        bottoms[body.name] = (poses[body.name] @ rim[0].pose).position[2] - rim[1]
-    lowest = min(bottoms.values(), default=0.0)
-    return [b for b in candidates if bottoms[b.name] - lowest < ROLE_RULES.hanging * _rim(b)[1]]  # type: ignore[index]
+        shape, radius, _ = rim
+        bottom = (poses[body.name] @ shape.pose).position[2] - radius
+        candidates.append((body, bottom, radius))
+    lowest = min((bottom for _, bottom, _ in candidates), default=0.0)
+    return [body for body, bottom, radius in candidates if bottom - lowest < ROLE_RULES.hanging * radius]
 
 
 def _described(

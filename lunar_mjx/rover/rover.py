@@ -1,8 +1,5 @@
 """A rover as the rest of the library sees it: where its MJCF lies, and which joint does what."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -130,6 +127,7 @@ class Rover:
     @property
     def joints(self) -> tuple[str, ...]:
         """Actuated joints (and actuators) in the order of the controls: drive, steer, suspension."""
+        # One order for controls, telemetry and parameters by joint: nothing in the package keeps another.
         return tuple(joint for group in self.groups for joint in group.joints)
 
     def group(self, name: str) -> JointGroup | None:
@@ -142,6 +140,7 @@ class Rover:
 
     def spec(self) -> mujoco.MjSpec:
         """A fresh `MjSpec` of the rover, free to be edited."""
+        # Read anew each time: an edited spec must not reach the next caller.
         return mujoco.MjSpec.from_file(str(self.mjcf))
 
     def compile(self) -> mujoco.MjModel:

@@ -1,8 +1,5 @@
 """What the converter works out from the compiled model: springs that hold the rover level, and stable gains."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses

@@ -175,7 +175,7 @@ class _Reader:
 
     def numbers(self, element: ET.Element | None, name: str, default: str, where: str, count: int = 3) -> np.ndarray:
         text = default if element is None else element.get(name, default)
-        values = np.array([require_finite(self.path, f"{where} {name}", v) for v in text.split()])  # type: ignore[arg-type]
+        values = np.array([require_finite(self.path, f"{where} {name}", v) for v in text.split()])
         if len(values) != count:
             raise bad_input(self.path, f"{where} {name}", text, f"has {len(values)} numbers", f"give {count} numbers")
         return values
@@ -184,7 +184,7 @@ class _Reader:
         text = None if element is None else element.get(name)
         if text is None:
             raise bad_input(self.path, f"{where} {name}", "", "is missing", "give a number")
-        return require_finite(self.path, f"{where} {name}", text)  # type: ignore[arg-type]
+        return require_finite(self.path, f"{where} {name}", text)
 
     def name_of(self, element: ET.Element, what: str) -> str:
         name = element.get("name", "").strip()

@@ -161,8 +161,8 @@ def _convert(hint: Any, value: Any, source: str, where: str) -> Any:
     if isinstance(hint, types.UnionType):
         # Optional fields are written by leaving them out, so a value is never None.
         hint = next(h for h in typing.get_args(hint) if h is not type(None))
-    if dataclasses.is_dataclass(hint):
-        return _build(hint, value, source, where)  # pyright: ignore[reportArgumentType]
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        return _build(hint, value, source, where)
     # TOML tells 1 from 1.0; nobody who writes a length does.
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = require_finite(source, where, value)

@@ -85,7 +85,7 @@ def _closed(vertices: np.ndarray, faces: np.ndarray, node: np.ndarray, floor: fl
     return np.vstack([vertices, foot, middle]), np.concatenate([faces, walls, fan])
 
 
-def export_mesh(terrain: Terrain, path: str | Path, **options: bool | float) -> Path:
+def export_mesh(terrain: Terrain, path: str | Path, **options: Any) -> Path:
     """Writes a terrain as STL, OBJ or PLY by the path's suffix; options as for `to_mesh`.
 
     Raises:
@@ -97,6 +97,6 @@ def export_mesh(terrain: Terrain, path: str | Path, **options: bool | float) -> 
     if not path.parent.is_dir():
         raise UserError(f"{path}: the folder is not there; make it first.")
     with replacing(path) as part:
-        data: Any = to_mesh(terrain, **options).export(file_type=path.suffix[1:].lower())  # pyright: ignore[reportArgumentType]
+        data: Any = to_mesh(terrain, **options).export(file_type=path.suffix[1:].lower())
         part.write_bytes(data.encode() if isinstance(data, str) else data)
     return path

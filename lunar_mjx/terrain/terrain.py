@@ -64,6 +64,7 @@ def stack(terrains: Sequence[Terrain]) -> Terrain:
                 "crop or resample the terrains to one shape before stacking",
             )
     _require_same_grids(terrains)
+    # The name is static: trees of different names would not stack.
     names = sorted({t.name for t in terrains})
     alike = [dataclasses.replace(t, name="+".join(names)) for t in _with_soil(_with_rocks(terrains))]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)
@@ -94,6 +95,7 @@ def _with_rocks(terrains: Sequence[Terrain]) -> Sequence[Terrain]:
             "differ in shape",
             "use one extent and one rock cell for all terrains",
         )
+    # Spheres become ellipsoids of equal axes, since a batch has one shape of arrays.
     if any(r.forms is not None for r in given):
         given = [with_forms(r) for r in given]
         terrains = [t if t.rocks is None else dataclasses.replace(t, rocks=with_forms(t.rocks)) for t in terrains]

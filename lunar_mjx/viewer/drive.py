@@ -1,8 +1,5 @@
 """A simulation that goes on in real time while somebody drives."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses
@@ -75,7 +72,9 @@ def open_engine(model: Model, engine: str) -> Backend:
 class Driver(Protocol):
     """Something that the viewer's keys can steer."""
 
-    def hold(self, keys: Iterable[str]) -> None: ...
+    def hold(self, keys: Iterable[str]) -> None:
+        """Takes the keys that are held down now."""
+        ...
 
 
 class Drive(Protocol):
@@ -92,11 +91,25 @@ class Drive(Protocol):
     rate: float
 
     @property
-    def pilot(self) -> Driver: ...
-    def reset(self) -> None: ...
-    def advance(self, duration: float) -> float: ...
-    def bodies(self) -> np.ndarray: ...
-    def readings(self) -> dict[str, Any]: ...
+    def pilot(self) -> Driver:
+        """Who takes the keys."""
+        ...
+
+    def reset(self) -> None:
+        """Begins anew."""
+        ...
+
+    def advance(self, duration: float) -> float:
+        """Goes on by about a duration, s; returns by how much it did."""
+        ...
+
+    def bodies(self) -> np.ndarray:
+        """Position, m, and quaternion of every body, (body, 7), in the world."""
+        ...
+
+    def readings(self) -> dict[str, Any]:
+        """What the panel shows, ready for JSON."""
+        ...
 
 
 class LiveDrive:

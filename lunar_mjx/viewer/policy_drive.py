@@ -1,8 +1,5 @@
 """A rover that a trained policy drives from goal to goal, in real time, for somebody who looks on."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,8 +1,5 @@
 """A measured drive beside what a model predicts of it: two rovers on one ground, for a page that plays them back."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import base64

@@ -1,8 +1,5 @@
 """What the web page draws: the rover's shapes, once, and the ground around a place, whenever it is asked for."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import base64

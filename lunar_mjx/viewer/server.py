@@ -216,10 +216,14 @@ class Viewer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: Viewer  # pyright: ignore[reportIncompatibleVariableOverride]
     server_version, sys_version = "lunar-mjx", ""
     protocol_version = "HTTP/1.1"
     timeout = 30.0
+
+    @property
+    def _viewer(self) -> Viewer:
+        assert isinstance(self.server, Viewer)
+        return self.server
 
     def do_GET(self) -> None:
         if not self._welcome():
@@ -229,7 +233,7 @@ class _Handler(BaseHTTPRequestHandler):
             name, kind = _FILES[url.path]
             self._answer(200, (resources.files("lunar_mjx.viewer") / "page" / name).read_bytes(), kind)
         elif url.path == "/scene":
-            self._answer(200, self.server.scene.encode(), "application/json")
+            self._answer(200, self._viewer.scene.encode(), "application/json")
         elif url.path == "/ground":
             self._ground(url.query)
         elif url.path == "/pictures":
@@ -255,9 +259,9 @@ class _Handler(BaseHTTPRequestHandler):
             return
         held = message.get("held") if isinstance(message, dict) else None
         if self.path == "/keys" and isinstance(held, list) and all(k in KEYS for k in held):
-            self.server.hold(held)
+            self._viewer.hold(held)
         elif self.path == "/reset":
-            self.server.reset()
+            self._viewer.reset()
         else:
             self._refuse(400, f"send held = some of {', '.join(KEYS)} to /keys, or anything to /reset")
             return
@@ -265,13 +269,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _welcome(self) -> bool:
         """Whether a request comes from this page, this machine's programs or the address bar."""
-        self.server.heard_of(self.connection)
+        self._viewer.heard_of(self.connection)
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         # A foreign name that points here would otherwise make its page ours.
-        if host not in self.server.hosts:
-            self._refuse(403, f"open this page as {self.server.address}")
+        if host not in self._viewer.hosts:
+            self._refuse(403, f"open this page as {self._viewer.address}")
             return False
-        if origin is not None and origin not in {f"http://{name}" for name in self.server.hosts}:
+        if origin is not None and origin not in {f"http://{name}" for name in self._viewer.hosts}:
             self._refuse(403, "pages of another origin may not do this")
             return False
         # A link elsewhere may open the page; it may not act through it.
@@ -291,7 +295,7 @@ class _Handler(BaseHTTPRequestHandler):
         except (KeyError, ValueError):
             self._refuse(400, "ask as /ground?x=0&y=0")
             return
-        self._answer(200, self.server.ground(x, y).encode(), "application/json")
+        self._answer(200, self._viewer.ground(x, y).encode(), "application/json")
 
     def _pictures(self) -> None:
         """Server-sent events, one per picture, until the page or the drive ends."""
@@ -304,11 +308,11 @@ class _Handler(BaseHTTPRequestHandler):
         count = 0
         try:
             while True:
-                count, text = self.server.next_picture(count)
+                count, text = self._viewer.next_picture(count)
                 if not text:
                     return
                 self.wfile.write(f"data: {text}\n\n".encode())
-                self.server.heard_of(self.connection)
+                self._viewer.heard_of(self.connection)
         except OSError:
             return
 

@@ -1,8 +1,5 @@
 """The drive in MuJoCo's own window."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses
@@ -25,7 +22,7 @@ _KEYS = {265: "forward", 264: "back", 263: "left", 262: "right", 32: "brake"}
 
 
 @dataclasses.dataclass(frozen=True)
-class WindowSettings:
+class ViewSettings:
     """The window of MuJoCo's viewer."""
 
     reset_key: int = 259
@@ -34,7 +31,7 @@ class WindowSettings:
     """How far the ground is drawn finely around the start, m."""
 
 
-WINDOW = WindowSettings()
+WINDOW = ViewSettings()
 
 
 def has_screen() -> bool:

@@ -1,8 +1,5 @@
 """A drive that `simulate` wrote, read back: its table, its model, and the rover's coordinates at every row."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses
@@ -21,7 +18,7 @@ from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError, bad_input, one_line
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model
-from lunar_mjx.terrain import Terrain, gradient, inside
+from lunar_mjx.terrain import Terrain, gradient
 
 TABLE, MODEL = "drive.csv", "model.toml"
 
@@ -179,9 +176,3 @@ def read_drive(folder: str | Path) -> RecordedDrive:
             "give two rows or more, sorted by time",
         )
     return drive
-
-
-def on_terrain(drive: RecordedDrive) -> np.ndarray:
-    """Whether the chassis is over the terrain's grid, (time,)."""
-    x, y = drive.position[:, 0], drive.position[:, 1]
-    return np.asarray(inside(drive.model.terrain.field, x, y))

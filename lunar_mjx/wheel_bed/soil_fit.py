@@ -127,16 +127,18 @@ def _solve(
     """Least squares from every start; arguments as for `fit`. Best first."""
     with jax.enable_x64(True):
         evaluate, jacobian = _functions(bed, table, free)
+        # SciPy's annotations know no function for `jac`.
+        least_squares: Any = optimize.least_squares
         # Starts spread evenly over the box: residuals of a sinkage exponent have several minima.
         points = qmc.Sobol(len(free), rng=np.random.default_rng(seed)).random(starts)
         solutions = []
         for i, start in enumerate(points):
             # The middle of the range keeps starts away from its edges, where an exponent of 2.5 carries no load.
             x0 = 0.1 + 0.8 * start
-            solution = optimize.least_squares(
+            solution = least_squares(
                 evaluate,
                 x0,
-                jac=jacobian,  # pyright: ignore[reportArgumentType]
+                jac=jacobian,
                 bounds=(0.0, 1.0),
                 # Steps of a tenth of each range: parameters are places in [0, 1], of like size.
                 x_scale=0.1,

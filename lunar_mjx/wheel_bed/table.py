@@ -80,7 +80,7 @@ class SteadyStateTable:
         # Scaled to the bed's speed in proportion: slow tests would meet the floors that regularise standstill.
         scale = SPEED / np.maximum(rim, travel)
         radius, width = np.full(len(self), self.radius), np.full(len(self), self.width)
-        return WheelTest(scale * rim, scale * travel, angle, load, radius, width)  # type: ignore[arg-type]
+        return WheelTest(scale * rim, scale * travel, angle, load, radius, width)
 
 
 def at_angles(slip_angle_deg: np.ndarray, wanted_deg: tuple[float, ...]) -> np.ndarray:
@@ -150,6 +150,7 @@ def _check_columns(file: Path, frame: pd.DataFrame) -> None:
     twice = [c for c in frame if re.fullmatch(r"(.+)\.\d+", str(c)) and str(c).rsplit(".", 1)[0] in frame]
     if twice:
         raise bad_input(file, "column", str(twice[0]).rsplit(".", 1)[0], "occurs twice", "keep one of them")
+    # Units stand in names: `sinkage_mm` is no unknown column to be passed over but a wrong unit to be told.
     stems = {re.sub(r"_(N|Nm|m|deg|m_s)$", "", column): column for column in _COLUMNS}
     for column in map(str, frame.columns):
         for stem, wanted in stems.items():
@@ -175,6 +176,7 @@ def _numbers(file: Path, frame: pd.DataFrame) -> dict[str, np.ndarray]:
         values = np.asarray(pd.to_numeric(frame[column], errors="coerce"), float)
         bad = ~np.isfinite(values)
         if bad.any():
+            # The first: whoever mends a table goes from top to bottom.
             row = int(np.argmax(bad))
             raise bad_input(
                 file,
@@ -199,6 +201,7 @@ def _check_values(file: Path, numbers: Mapping[str, np.ndarray], slip_definition
     speeds = [c for c in _SPEEDS if c in numbers]
     for column in speeds:
         refuse(numbers[column] < 0.0, column, "is negative", "give the magnitude in m/s")
+    # With one speed alone the other follows from the slip ratio, whose definition then counts.
     if len(speeds) == 2:
         still = np.maximum(numbers[speeds[0]], numbers[speeds[1]]) <= 0.0
         refuse(still, speeds[0], "is zero, and so is the travel speed", "drop the row")
@@ -211,6 +214,7 @@ def _check_values(file: Path, numbers: Mapping[str, np.ndarray], slip_definition
         )
     rows = np.column_stack(list(numbers.values()))
     first = np.unique(rows, axis=0, return_index=True)[1]
+    # To the last digit in every column: instruments do not repeat themselves, spreadsheets do.
     copied = ~np.isin(np.arange(len(rows)), first)
     refuse(copied, "slip_ratio", "begins a row that occurs twice", "remove the copy")
 
@@ -228,6 +232,7 @@ def replicate_groups(table: SteadyStateTable) -> np.ndarray:
     Returns:
       Group number of each row, counted by rising slip angle, then speeds or slip, then load.
     """
+    # Rounded, since planned values have been through a spreadsheet's arithmetic.
     keys = [np.round(table.test["slip_angle_deg"], 2)]
     keys += [np.round(table.test[c], 4) for c in _SPEEDS if c in table.test]
     if not all(c in table.test for c in _SPEEDS):
@@ -270,6 +275,7 @@ def average(table: SteadyStateTable) -> SteadyStateTable:
     # One mean is taken from each point.
     freedom = len(table) - len(count)
     sigma = {}
+    # Points of one run each tell nothing of their scatter: no number is better than a made-up one.
     if freedom > 0:
         for q, values in table.measured.items():
             sigma[q] = float(np.sqrt(np.sum((values - measured[q][group]) ** 2) / freedom))

@@ -207,7 +207,7 @@ def test_the_node_observes_as_the_environment(env, exported, drive):
         driver.take("joint_states", joint_states(env, view), 0.1 * k)
         driver.look()
         for name in names:
-            wanted = np.asarray(observe((name,), view, Scene(None, {})))[0]  # type: ignore[arg-type]
+            wanted = np.asarray(observe((name,), view, Scene(None, {})))[0]
             found = np.asarray(getattr(driver, f"block_{name}")(), float)
             scale = max(1.0, float(np.abs(wanted).max()))
             assert np.abs(found - wanted).max() <= 3e-5 * scale, (name, k)
@@ -349,8 +349,8 @@ def test_the_exported_folder_acts_within_a_millisecond(policy, tmp_path):
     written = export_policy(save_policy(policy, tmp_path / "policy.npz"), tmp_path)
     assert [p.name for p in written] == ["policy.onnx", "policy.stablehlo", "contract.json", "ros2_node.py"]
     # the copy in the folder, not the package's module
-    spec: Any = importlib.util.spec_from_file_location("exported_node", tmp_path / "ros2_node.py")  # type: ignore[attr-defined]
-    node = importlib.util.module_from_spec(spec)  # type: ignore[attr-defined]
+    spec: Any = importlib.util.spec_from_file_location("exported_node", tmp_path / "ros2_node.py")
+    node = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(node)
     taken = node.Policy(str(tmp_path))
     obs = observations(policy)

@@ -1,8 +1,5 @@
 """Ellipsoids as cameras, maps and the web page see them: the shape that wheels meet."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,7 +1,5 @@
 """Rovers' shapes in JAX against MuJoCo: where bodies are, and where rays meet them."""
 
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import jax

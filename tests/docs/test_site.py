@@ -77,7 +77,7 @@ def test_commands_and_options_on_the_pages_exist():
         command, context = typer.main.get_command(app), click.Context(click.Command("lunar-mjx"))
         words = line.split()[1:]
         while words and hasattr(command, "get_command"):
-            inner = command.get_command(context, words.pop(0))  # type: ignore[attr-defined]
+            inner = command.get_command(context, words.pop(0))
             assert inner is not None, f"{page}: {line}"
             command = inner
         known = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}

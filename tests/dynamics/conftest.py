@@ -70,7 +70,7 @@ class Bench:
         return jax.tree.map(lambda a: np.asarray(a)[:n], states), whole
 
     def _compile(self, every: int):
-        each = Params(gravity=None, ambient=None, effects=None, terrain=0)  # type: ignore[arg-type]
+        each = Params(gravity=None, ambient=None, effects=None, terrain=0)
 
         @jax.jit
         def run(ground, state, controls, engaged, gravity):

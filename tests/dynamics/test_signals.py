@@ -31,12 +31,7 @@ def rover() -> Rover:
 
 def system_of(rover: Rover, *effects: Effect) -> Any:
     """What `observe` and `measure` read of a system, without building one."""
-    params = Params(
-        jnp.asarray(GRAVITY),
-        Ambient(300.0, 300.0, 0.0, 1.0),
-        {e.name: e.nominal() for e in effects},
-        None,  # type: ignore[arg-type]
-    )
+    params = Params(jnp.asarray(GRAVITY), Ambient(300.0, 300.0, 0.0, 1.0), {e.name: e.nominal() for e in effects}, None)
     model = SimpleNamespace(rover=rover, effects=effects)
     return SimpleNamespace(model=model, params=params, info=None)
 
@@ -139,7 +134,7 @@ def test_channels_name_quantities_and_units(rover: Rover) -> None:
             wheel_force=Vec3(wheel, -wheel, wheel),
         )
         found = {k: np.asarray(v) for k, v in observe(system_of(rover), seen).channels.items()}
-    number = rover.joints.index(rover.wheels[1].steer)  # type: ignore[arg-type]
+    number = rover.joints.index(rover.wheels[1].steer)
     corner = rover.wheels[1].corner
     np.testing.assert_array_equal(found[f"joint_{corner}_steer_angle_rad"], joint[:, number])
     np.testing.assert_allclose(found[f"winding_{corner}_steer_temperature_degC"], joint[:, number], atol=1e-10)

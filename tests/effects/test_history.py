@@ -131,7 +131,7 @@ def _passes(slip, field=True, compacted_depth=1.5, count=4):
     soil, deep, out = fresh, 0.0, []
     for _ in range(count):
         rut = soil.get("rut", 0.0)
-        z = float(brentq(lambda z, soil=soil: _pull(z, slip, soil, field)[0] - LOAD, 1e-5, 0.2))  # type: ignore[arg-type]
+        z = float(brentq(lambda z, soil=soil: _pull(z, slip, soil, field)[0] - LOAD, 1e-5, 0.2))
         deep = rut + z
         out.append((deep, _pull(z, slip, soil, field)[1] / LOAD))
         # as if the wheel had left many places here: it stands fully in the rut

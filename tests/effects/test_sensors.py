@@ -54,7 +54,7 @@ def sense(name: str, values: Any, channels: Any, times: Array = TIMES) -> dict[s
     """The channels after one effect; values not given are at their null."""
     effect = catalogue.get(name)
     own = SimpleNamespace(**{**effect.null(), **values})
-    ctx = SensorContext(times, G, 300.0, None, {name: own}, JOINTS, ("lf",))  # type: ignore[arg-type]
+    ctx = SensorContext(times, G, 300.0, None, {name: own}, JOINTS, ("lf",))
     return effect.ports["sensor"](ctx, own, SimpleNamespace(), Signals(times, dict(channels))).channels
 
 

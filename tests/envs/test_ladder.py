@@ -15,7 +15,6 @@ from lunar_mjx.envs import TASKS, make_navigation, split_keys
 from lunar_mjx.envs.contract import check_environment
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
 from lunar_mjx.envs.ladder.ground import make_world
-from lunar_mjx.envs.ladder.planner import Planner, length
 from lunar_mjx.envs.ladder.pool import make_pool, way_left
 from lunar_mjx.envs.ladder.rungs import RUNGS, get_rung
 from lunar_mjx.envs.ladder.ways import WAY_LIMITS, distances
@@ -23,6 +22,7 @@ from lunar_mjx.envs.navigation import rewards
 from lunar_mjx.envs.navigation.tally import METRICS, start, update
 from lunar_mjx.errors import UserError
 from lunar_mjx.terrain import nearest_rock
+from tests.envs.independent_planner import Planner, length
 
 HALF = 0.4
 SMALL = dataclasses.replace(get_rung(3), size=40.0, goal_distance=(8.0, 20.0), detour=1.1)

@@ -119,7 +119,7 @@ def make_log(
         "environment": {"ambient_temperature_degC": -20.0},
         **settings,
     }
-    write_log(folder, tables, rover="luvmi_x", **given)  # type: ignore[arg-type]
+    write_log(folder, tables, rover="luvmi_x", **given)
     log = read_log(folder)
     assert isinstance(log, Log)
     return log

@@ -30,7 +30,7 @@ def frame(rotation: Rotation, quaternion: bool, angles: bool) -> pd.DataFrame:
 
 
 def read(folder: Path, table: pd.DataFrame, **settings: object) -> Log:
-    write_log(folder, {"pose": table}, rover="luvmi_x", **settings)  # type: ignore[arg-type]
+    write_log(folder, {"pose": table}, rover="luvmi_x", **settings)
     log = read_log(folder)
     assert isinstance(log, Log)
     return log

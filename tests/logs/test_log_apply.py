@@ -23,7 +23,7 @@ def base() -> Model:
 def small(folder: Path, columns: dict[str, list[float]], step: float = 0.05, **settings: object) -> Log:
     count = len(next(iter(columns.values())))
     frame = pd.DataFrame({"time_s": step * np.arange(count), **columns})
-    write_log(folder, {"drive": frame}, rover="luvmi_x", **settings)  # type: ignore[arg-type]
+    write_log(folder, {"drive": frame}, rover="luvmi_x", **settings)
     log = read_log(folder)
     assert isinstance(log, Log)
     return log

@@ -156,8 +156,8 @@ def write_ros_mcap(path: Path) -> None:
 def write_ros_bag(path: Path) -> None:
     """A folder with metadata.yaml and SQLite, as `ros2 bag record` writes it; or a file of ROS 1."""
     pytest.importorskip("rosbags")
-    from rosbags import rosbag1, rosbag2  # pyright: ignore[reportMissingImports]
-    from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
 
     old = path.suffix == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)

@@ -98,7 +98,7 @@ HIDDEN = [("com_offset", {"x": 0.123456}), ("rotor_stator_path", {"share": 0.753
 
 
 def sealed(folder: Path, name: str = "sealed", effects: object = HIDDEN, **settings: object) -> Path:
-    return simulate_log(folder / name, "luvmi_x", effects=effects, seconds=SECONDS, seal=True, **settings)  # type: ignore[arg-type]
+    return simulate_log(folder / name, "luvmi_x", effects=effects, seconds=SECONDS, seal=True, **settings)
 
 
 def test_a_seal_opens_with_its_answer_only(fast: None, tmp_path: Path) -> None:
@@ -227,4 +227,4 @@ def test_nothing_is_overwritten(fast: None, tmp_path: Path) -> None:
 @pytest.mark.parametrize("settings", [{"scale": -1.0}, {"dropouts": 0.9}, {"scale": float("nan")}])
 def test_refused_recordings(settings: dict[str, float]) -> None:
     with pytest.raises(UserError):
-        Recording(**settings)  # type: ignore[arg-type]
+        Recording(**settings)

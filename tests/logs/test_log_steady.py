@@ -130,7 +130,7 @@ CASES: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str, str, int | N
         None,
     ),
     "unit": (lambda f: f.rename(columns={"sinkage_m": "sinkage_degC"}), "unit", "sinkage_degC", None),
-    "text": (lambda f: f.astype(object).pipe(cell("drawbar_pull_N", 3, "strong")), "number", "drawbar_pull_N", 5),  # type: ignore[arg-type]
+    "text": (lambda f: f.astype(object).pipe(cell("drawbar_pull_N", 3, "strong")), "number", "drawbar_pull_N", 5),
     "gap in what was imposed": (cell("slip_angle_deg", 7, float("nan")), "gap", "slip_angle_deg", 9),
 }
 

@@ -28,7 +28,7 @@ def coloured(rng: np.random.Generator, tau: float) -> np.ndarray:
 
 def make(folder: Path, columns: dict[str, np.ndarray], **settings: object) -> Log:
     frame = {"time_s": TIME, "joint_left_drive_speed_rad_s": 1.0 * MOVES, **columns}
-    write_log(folder, {"drive": pd.DataFrame(frame)}, rover="luvmi_x", **settings)  # type: ignore[arg-type]
+    write_log(folder, {"drive": pd.DataFrame(frame)}, rover="luvmi_x", **settings)
     log = read_log(folder)
     assert isinstance(log, Log)
     return log

@@ -110,8 +110,8 @@ def test_inertias_are_those_of_uniform_primitives(rover: Rover) -> None:
     for link in ET.parse(rover.folder / f"{rover.name}.urdf").getroot().iter("link"):
         inertial, shape = link.find("inertial"), link.find("collision/geometry/*")
         assert inertial is not None and shape is not None
-        mass = float(inertial.find("mass").get("value"))  # type: ignore[union-attr,arg-type]
-        found = [float(inertial.find("inertia").get(k)) for k in ("ixx", "iyy", "izz")]  # type: ignore[union-attr,arg-type]
+        mass = float(inertial.find("mass").get("value"))
+        found = [float(inertial.find("inertia").get(k)) for k in ("ixx", "iyy", "izz")]
         if shape.tag == "box":
             x, y, z = (float(v) for v in shape.get("size", "").split())
             expected = [mass / 12 * s for s in (y * y + z * z, x * x + z * z, x * x + y * y)]

@@ -159,7 +159,7 @@ def test_pace_goes_on_in_its_thread_until_stopped(model):
 def test_pace_shows_what_ended_it(model):
     shown = threading.Event()
     drive = LiveDrive(model, "native")
-    drive.advance = None  # type: ignore[assignment]
+    drive.advance = None
     pace = Pace(drive, shown.set)
     pace.start()
     shown.wait()

@@ -18,7 +18,8 @@ from lunar_mjx.envs.navigation.labels import Label, labels
 from lunar_mjx.envs.navigation.observations import BLOCKS
 
 FORMAT = "lunar-mjx-contract/1"
-MODES = {
+Mode = Literal["position", "velocity", "torque", "current"]
+MODES: dict[int, tuple[Mode, str]] = {
     POSITION: ("position", "rad"),
     VELOCITY: ("velocity", "rad/s"),
     TORQUE: ("torque", "N m"),
@@ -61,7 +62,7 @@ class Joint(_Part):
     """A motor's target is `scale` times action number `action`, in `unit`; `low` and `high` limit the joint's angle."""
 
     name: str
-    mode: Literal["position", "velocity", "torque", "current"]
+    mode: Mode
     unit: str
     action: Annotated[int, Field(ge=0)]
     scale: float
@@ -207,6 +208,6 @@ def _joints(env: NavigationEnv) -> list[Joint]:
         # JSON has no infinity.
         low, high = (value if math.isfinite(value) else None for value in map(float, rover.joint_limits[name]))
         joints.append(
-            Joint(name=name, mode=word, unit=unit, action=int(source), scale=float(scale), low=low, high=high)  # type: ignore[arg-type]
+            Joint(name=name, mode=word, unit=unit, action=int(source), scale=float(scale), low=low, high=high)
         )
     return joints

@@ -138,6 +138,7 @@ class PPO:
         )
 
     def init(self, key: Any) -> PPOState:
+        """Networks and optimisers before the first update, drawn from a key of `jax.random`."""
         key_policy, key_value = jax.random.split(key)
         params = PPONetworkParams(policy=self.network.init(key_policy), value=self.value.init(key_value))
         return PPOState(params, self.optimiser.init(params))

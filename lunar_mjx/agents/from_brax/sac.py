@@ -113,6 +113,7 @@ class SAC:
         self.optimisers = tuple(optax.adam(rate) for rate in rates)
 
     def init(self, key: Any) -> SACState:
+        """Networks and optimisers before the first update, drawn from a key of `jax.random`."""
         key_actor, key_critic = jax.random.split(key)
         actor, critic = self.network.init(key_actor), self.critics.init(key_critic)
         temperature = jnp.log(jnp.float32(self.config.temperature))

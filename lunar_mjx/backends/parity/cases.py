@@ -10,6 +10,7 @@ import numpy as np
 
 from lunar_mjx.dynamics.kinematics import wheel_feet
 from lunar_mjx.model import Model
+from lunar_mjx.pytree import tree_of
 from lunar_mjx.rover import Rover
 from lunar_mjx.simulate import Commands, constant_commands
 from lunar_mjx.terrain import HeightField, SoilMap, Terrain, stack
@@ -93,14 +94,14 @@ def _stones(rover: Rover) -> np.ndarray:
 
 
 def _terrain(name: str, at: np.ndarray, heights: np.ndarray, hard: float, stones: np.ndarray | None) -> Terrain:
-    x0, cell = np.float32(at[0]), np.float32(PARITY_GRID.cell)
+    x0, cell, wide = (np.asarray(v, np.float32) for v in (at[0], PARITY_GRID.cell, PARITY_GRID.half))
     placed = np.zeros((0, 4)) if stones is None else stones
     rocks = build_rocks(
         placed[:, :3], placed[:, 3], (-PARITY_GRID.half, -PARITY_GRID.half, PARITY_GRID.half, PARITY_GRID.half)
     )
-    field = HeightField(*(np.asarray(v, np.float32) for v in (heights, x0, x0, cell)))  # type: ignore[arg-type]
-    soil = SoilMap(*(np.asarray(v, np.float32) for v in (np.full((3, 3), hard), x0, x0, PARITY_GRID.half)))  # type: ignore[arg-type]
-    return Terrain(field, rocks, soil, np.zeros(3, np.float32), name)  # type: ignore[arg-type]
+    field = tree_of(HeightField, heights=np.asarray(heights, np.float32), x0=x0, y0=x0, cell=cell)
+    soil = tree_of(SoilMap, rock=np.full((3, 3), hard, np.float32), x0=x0, y0=x0, cell=wide)
+    return tree_of(Terrain, field=field, rocks=rocks, soil=soil, origin=np.zeros(3, np.float32), name=name)
 
 
 def drive(model: Model, duration: float) -> Commands:

@@ -76,6 +76,7 @@ def verdict(study: Study, pair: Pair) -> str:
             f"{who} agree in all {len(pair.results)} checks; the largest error is {worst.error:.2g} of its tolerance "
             f"({worst.quantity}, {worst.case}), {distance}."
         )
+    # Stages depend on those before them: the first that fails is where to look, and not the worst.
     first = first_failure(pair.results) or max(pair.failed, key=lambda r: r.error)
     return (
         f"{who} disagree in {len(pair.failed)} of {len(pair.results)} checks, first in the stage {first.stage} "
@@ -122,6 +123,7 @@ def _errors(pair: Pair) -> go.Figure:
         style = SERIES[k % len(SERIES)]
         labels = [f"{r.level}  {r.quantity}" for r in own]
         figure.add_scatter(
+            # Engines may agree to the bit, and zero has no place on a logarithmic axis.
             x=[max(r.error, 1e-12) for r in own],
             y=labels,
             mode="markers",

@@ -25,7 +25,7 @@ DEFAULT_ENGINES = ("structured", "mjx", "structured:float32", "pybullet", "pybul
 
 
 @dataclasses.dataclass
-class Run:
+class EngineRun:
     """One engine over all grounds: stages and next states from the samples, and drives, by ground."""
 
     name: str
@@ -61,7 +61,7 @@ class Study:
     model: Model
     grounds: list[Case]
     pairs: list[Pair]
-    runs: dict[str, Run]
+    runs: dict[str, EngineRun]
     noise: dict[str, Noise]
 
     def floor(self, pair: Pair, ground: str) -> Telemetry:
@@ -78,6 +78,7 @@ def make_runner(engine: str, model: Model) -> Runner:
     if engine not in ENGINES:
         raise bad_input("parity", "engine", engine, "does not exist", f"use some of {', '.join(ENGINES)}")
     name, _, option = engine.partition(":")
+    # Options of JAX's engines are precisions, those of PyBullet its kinds of contact.
     if name != "pybullet":
         return JaxRunner(name, model, option or "float64")
     import_pybullet()
@@ -130,7 +131,7 @@ def run_study(
     for i, case in enumerate(used):
         report(f"{preset}: native, {case.name}", 2 * i / parts)
         recorded[case.name] = record(model, case, commands, samples)
-    reference = Run(
+    reference = EngineRun(
         NativeBackend.name,
         {k: (r[0].stages, r[0].after) for k, r in recorded.items()},
         {k: r[1] for k, r in recorded.items()},
@@ -148,18 +149,20 @@ def run_study(
         )
     noise = {k: r[2] for k, r in recorded.items()}
     pairs = [_pair(model, used, reference, runs[r.name], of, noise) for r in runners]
+    # Against each other, too: they share the effects, so that what differs is rigid-body dynamics alone.
     if "structured" in runs and "mjx" in runs:
         pairs.append(_pair(model, used, runs["structured"], runs["mjx"], of, noise))
     return Study(model, used, pairs, runs, noise)
 
 
-def _run(runner: Runner, used: list[Case], of: dict[str, Samples], commands: Commands, report: Reporter) -> Run:
+def _run(runner: Runner, used: list[Case], of: dict[str, Samples], commands: Commands, report: Reporter) -> EngineRun:
     """One engine over all grounds; what it holds is freed before the next."""
     steps, drives = {}, {}
     with contextlib.closing(runner):
         for i, case in enumerate(used):
             report(f"{runner.name}, states on {case.name}", i / (3 * len(used)))
             steps[case.name] = runner.step_from(case, of[case.name])
+        # All grounds in one batch where the engine can: one program in place of one a ground.
         if isinstance(runner, JaxRunner):
             report(f"{runner.name}, drives", 1 / 3)
             drives = dict(zip((c.name for c in used), runner.drives(used, commands), strict=True))
@@ -167,7 +170,7 @@ def _run(runner: Runner, used: list[Case], of: dict[str, Samples], commands: Com
             for i, case in enumerate(used):
                 report(f"{runner.name}, drive on {case.name}", (1 + 2 * i / len(used)) / 3)
                 drives[case.name] = runner.drive(case, commands)
-    return Run(runner.name, steps, drives)
+    return EngineRun(runner.name, steps, drives)
 
 
 def kind_of(names: tuple[str, str], model: Model) -> str:
@@ -195,7 +198,9 @@ def floor_of(names: tuple[str, str], kind: str, noise: Noise) -> Telemetry:
     return noise.floor(single, SOFT_LOOP in kind)
 
 
-def _pair(model: Model, used: list[Case], a: Run, b: Run, of: dict[str, Samples], noise: dict[str, Noise]) -> Pair:
+def _pair(
+    model: Model, used: list[Case], a: EngineRun, b: EngineRun, of: dict[str, Samples], noise: dict[str, Noise]
+) -> Pair:
     kind = kind_of((a.name, b.name), model)
     results = []
     for case in used:

@@ -241,10 +241,12 @@ class ForceModel:
 
     def wheel_world(self, c: Context) -> tuple[np.ndarray, np.ndarray]:
         """Force and moment on the wheels in world coordinates, (rover, wheel, 3)."""
-        axes = [c.contact[k] for k in ("forward", "left", "normal")]
-        force, moment = c.wheel["force"], c.wheel["moment"]
-        world = [sum(a * v[..., i : i + 1] for i, a in enumerate(axes)) for v in (force, moment)]
-        return world[0], world[1]  # type: ignore[return-value]
+        forward, left, normal = (c.contact[k] for k in ("forward", "left", "normal"))
+
+        def to_world(v: np.ndarray) -> np.ndarray:
+            return forward * v[..., 0:1] + left * v[..., 1:2] + normal * v[..., 2:3]
+
+        return to_world(c.wheel["force"]), to_world(c.wheel["moment"])
 
     def heat(self, c: Context) -> tuple[np.ndarray, np.ndarray]:
         """Temperatures of windings and housings at the end of the step, K; fills `heat`, averaged over the step."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from lunar_mjx.backends.physics.vectors import clamp
@@ -11,12 +13,12 @@ from lunar_mjx.terrain import Terrain
 class Grid:
     """Values at the nodes of a square grid, continued flat beyond its edge."""
 
-    def __init__(self, values: object, x0: object, y0: object, cell: object) -> None:
+    def __init__(self, values: Any, x0: Any, y0: Any, cell: Any) -> None:
         grid = np.asarray(values, float)
         self.rows, self.cols = grid.shape
         # One index per corner: `take` of a flat array is NumPy's fastest gather.
         self.flat = np.ascontiguousarray(grid).ravel()
-        self.x0, self.y0, self.cell = float(x0), float(y0), float(cell)  # type: ignore[arg-type]
+        self.x0, self.y0, self.cell = float(x0), float(y0), float(cell)
 
     def value(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Bilinear value at points, its derivatives by x and y, and whether the points lie on the grid."""
@@ -52,8 +54,9 @@ class Ground:
         soil = terrain.soil
         self.hard = None if soil is None else Grid(soil.rock, soil.x0, soil.y0, soil.cell)
         grids = terrain.grids
-        given = {} if grids is None else grids.layers
-        self.layers = {k: Grid(v, grids.x0, grids.y0, grids.cell) for k, v in given.items()}  # type: ignore[union-attr]
+        self.layers: dict[str, Grid] = {}
+        if grids is not None:
+            self.layers = {k: Grid(v, grids.x0, grids.y0, grids.cell) for k, v in grids.layers.items()}
         rocks = terrain.rocks
         self.has_rocks = rocks is not None and bool((np.asarray(rocks.radii) > 0).any())
         self.has_forms = rocks is not None and rocks.forms is not None

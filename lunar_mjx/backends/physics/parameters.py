@@ -1,8 +1,5 @@
 """Reads a model's parameters as plain numbers, and refuses the effects that this physics does not have."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses
@@ -149,13 +146,14 @@ def read_numbers(model: Model, backend: str = "backend") -> Numbers:
     limits = np.array([rover.joint_limits[j] for j in rover.joints], float)
     compiled = rover.compile()
     center, half = _boxes(compiled, rover.chassis)
+    noon, night, noon_time, period = model.ambient
     return Numbers(
         effects={e.name: SimpleNamespace(**_values(model.parameters[e.name])) for e in model.effects},
         order=tuple(e.name for e in sorted(model.effects, key=lambda e: e.order)),
         gravity=float(model.gravity),
         dt=float(model.timestep),
         integrator=model.thermal_integrator,
-        ambient=tuple(float(v) for v in model.ambient),  # type: ignore[arg-type]
+        ambient=(float(noon), float(night), float(noon_time), float(period)),
         radius=np.array([w.radius for w in rover.wheels]),
         width=np.array([w.width for w in rover.wheels]),
         steer=np.array([rover.joints.index(w.steer) if w.steer else -1 for w in rover.wheels]),

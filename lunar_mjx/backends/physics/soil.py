@@ -112,7 +112,8 @@ def shear_stress(c: Context, strength: np.ndarray, q_x: np.ndarray, q_y: np.ndar
         return alone
     q = np.sqrt(q_x * q_x + q_y * q_y + 1e-24)
     common = strength * -np.expm1(-q) / q
-    return tuple(t + circle.share * (common * x - t) for t, x in zip(alone, (q_x, q_y), strict=True))  # type: ignore[return-value]
+    along, across = (t + circle.share * (common * x - t) for t, x in zip(alone, (q_x, q_y), strict=True))
+    return along, across
 
 
 def area_damping(c: Context, coefficient: float, theta_1: np.ndarray, load: np.ndarray) -> np.ndarray:

@@ -86,6 +86,7 @@ class Suggestion:
 
     def pays(self, chi2: float) -> bool:
         """Whether its gain on manoeuvres left out exceeds its standard error, and half of the gain when fitted."""
+        # Formulas are chosen out of hundreds: what noise gave one in the fit, held-out data do not repeat.
         return self.held_out_gain > self.held_out_se and self.held_out_gain > 0.5 * chi2
 
 
@@ -162,6 +163,7 @@ def discover(
     """
     run = folder if isinstance(folder, Run) else load_run(folder)
     verdict = run.load(VERDICT_FILE) or {}
+    # What was asked for decides where tables are searched; the verdict's port is only where the evidence is.
     asked, port = port, port or verdict.get("port")
     if port is None:
         raise UserError(f"{run.folder}: no port shows anything unknown; run lunar-mjx why first, or give --port.")
@@ -180,6 +182,7 @@ def discover(
         before, suggested, scored = _in_drives(run, logs, port, progress)
         number = len(scored)
     files: list[str] = []
+    # The first that pays: the best-scored may have fitted noise.
     best = next((row for row in suggested if row[0].pays(Settings().chi2)), None)
     if best is not None:
         provenance = f"lunar-mjx unknown on {', '.join(p.name for p in run.logs)}"
@@ -198,6 +201,7 @@ def _write(run: Run, out: Path | None, port: str, part: int, text: Callable[...,
         name = f"suggested_{port}" + (f"_{k}" if k > 1 else "")
         path = run.folder / f"{name}.py" if out is None else out.with_stem(f"{out.stem}_{part + 1}") if part else out
         made = text(name=name)
+        # A model may refer to the file of an earlier suggestion: another text takes another name.
         kept = out is None and path.is_file() and path.read_text(encoding="utf-8") != made
         if name not in run.model.effect_names and not kept:
             write_text(path, made)
@@ -215,6 +219,7 @@ def _in_tables(
     """Errors of the model as it is, suggestions, the best scores, and how many formulas of a wheel were scored."""
     empty = Slots(table_problem(run, logs, {}))
     settings = Settings(seed=run.seed)
+    # Without any slot filled: what formulas are scored against is the refitted model, and not the model as given.
     base = fit(empty.problem, empty.problem.free(), starts=settings.starts, seed=settings.seed, progress=progress)
     found = search_formulas(empty, base, ports, settings, progress)
     rows = [_of_trial(t, base) for t in found.trials[:REFITS]]
@@ -258,10 +263,12 @@ def _in_drives(
             posterior.log_score(gram.select(own)) - nothing.log_score(base.linear.held_out[n].select(places))
             for n, gram in refit.linear.held_out.items()
         ]
+        # Of the sum over manoeuvres: their spread is what another campaign would show.
         se = math.sqrt(len(held)) * float(np.std(held, ddof=1)) if len(held) > 1 else 0.0
         # without manoeuvres left out the evidence itself judges: it is what each measurement predicts of the next
         gained = (sum(held), se) if held else (after - before, 0.0)
         residual = form.residual(refit.u)
+        # At the noise where the fit asks for no more of it than the stated size is uncertain.
         quiet = bool(np.max(posterior.noise) < 1.0 + DriveSettings().stated_spread)
         suggestion = _suggestion([part], 2.0 * (after - before), gained, answer.errors(form, residual), quiet, t.length)
         rows.append((suggestion, (t,)))

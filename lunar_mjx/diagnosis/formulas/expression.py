@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -79,18 +79,6 @@ def same(a: Expr, b: Expr) -> bool:
         return True
     symbols = sorted(a.free_symbols | b.free_symbols, key=str)
     return _print_of(a, symbols) == _print_of(b, symbols)
-
-
-def distinct(expressions: Iterable[Expr]) -> list[Expr]:
-    """The expressions without those that are another up to a constant factor; of each kind the shortest, in order."""
-    expressions = list(dict.fromkeys(expressions))
-    symbols = sorted(set().union(*(e.free_symbols for e in expressions)), key=str)
-    kinds: dict[bytes, Expr] = {}
-    for e in expressions:
-        key = _print_of(e, symbols)
-        if key not in kinds or length(e) < length(kinds[key]):
-            kinds[key] = e
-    return list(kinds.values())
 
 
 def _print_of(expression: Expr, symbols: Sequence[Any]) -> bytes:

@@ -111,6 +111,7 @@ def slots_effect(early: bool) -> Effect:
         parameters[f"shape_{n}"] = Parameter(1.0, None, (0.1, 8.0), "1", "constant over its nominal", "a search")
         for name in _NUMBERS:
             parameters[f"{name}_{n}"] = Parameter(0.0, None, (-1e9, 1e9), "1", "which formula", "a search")
+    # Two effects, since a formula acts before or after the law that it corrects, and order belongs to an effect.
     name, order = ("slots_early", -5) if early else ("slots", 500)
     return Effect(name, ports, parameters, order=order, doc="any formulas, chosen by numbers")
 
@@ -193,6 +194,7 @@ class Slots:
     def own(self, number: int) -> list[int]:
         """Places of a slot's amount, and of its constant where its formula has one."""
         choice = self.held[number][0]
+        # Amounts come first among the parameters, and then constants, each by slot.
         places = [int(i) for i in self.problem.candidates[_name(choice)]]
         return [places[number], places[SLOTS + number]] if choice.shape else [places[number]]
 
@@ -216,6 +218,7 @@ class Slots:
         Args:
           u: (coordinates,) where. which: numbers of targets.
         """
+        # In a slot of its own: what is held keeps its numbers, and the derivatives are beside it.
         probe_rows, number = {}, self.spare
         for k in which:
             other = self.holding({**self.held, number: (Choice(k, 0, 0), targets()[k].size)})

@@ -78,6 +78,7 @@ def effect_of(term: Term) -> Effect:
     module = types.ModuleType(term.name)
     # The text is our own, made below.
     exec(compile(term.source, f"<{term.name}>", "exec"), module.__dict__)
+    # The decorator has put an effect where the function was; a file holds one.
     return next(v for v in vars(module).values() if isinstance(v, Effect))
 
 
@@ -88,6 +89,7 @@ def with_amount(
     text = term.source.replace(f"def {term.name}(", f"def {name}(")
     for key, value in {"amount": amount, **(constants or {})}.items():
         declared = re.search(rf"\b{key}=Parameter\(([^,]+), ([^,]+), \(([^,]+), ([^)]+)\)", text)
+        # A constant that the formula does not hold has no declaration.
         if declared is None:
             continue
         # a search may end beyond the bounds that a term is given at first
@@ -95,6 +97,7 @@ def with_amount(
             b(float(declared[n]), value * s)
             for b, n, s in ((min, 3, 0.1 if value > 0.0 else 10.0), (max, 4, 10.0 if value > 0.0 else 0.1))
         )
+        # An amount about a null of zero may take either sign, in the next search as in this one.
         low, high = (min(low, -high), max(high, -low)) if declared[2] == "0.0" else (low, high)
         text = text.replace(declared[0], f"{key}=Parameter({value:.6g}, {declared[2]}, ({low!r}, {high!r})", 1)
     return text.replace('source="suggested"', f"source={provenance!r}")
@@ -129,17 +132,20 @@ def term(target: Target, factor: str | Expr, linear: bool = False) -> Term:
     names = known(target.port)
     own = f.parsed(factor, names) if isinstance(factor, str) else factor
     product = f.parsed(target.carrier, names) * own
+    # The index 0 keeps the old value apart in `k = k_0 exp(...)`; sums write `+=` and need none.
     amount, old = f.symbol("a"), f.symbol(target.symbol + ("_0" if target.multiplies else ""))
     by = _factor(amount * product, linear) if target.multiplies else amount * product
     whole = old * by if target.multiplies else by
     unit = f.per(target.unit, f.unit_of(own, names))
     used = [q for q in names if q.symbol in product.free_symbols]
     if target.multiplies:
+        # exp stays positive by itself; 1 + x does not, and a negative stiffness has no meaning.
         body = _LEAST.format(f.code(by)) if linear else f.code(by)
         lines = [f"factor = {body}"]
     else:
         lines = [f"extra = {f.code(by)}"]
     sign = "=" if target.multiplies else "+="
+    # Floors keep code finite; in a formula that people read they would hide the law.
     whole = f.without_floors(whole)
     shown, latex = f"{target.symbol} {sign} {f.text(whole)}", f"{target.symbol} {sign} {f.latex(whole)}"
     made = Term(target.port, target.words, shown, unit, target.size, "", latex, f.length(whole), f.text(own))
@@ -155,6 +161,7 @@ def _factor(grown: Expr, linear: bool) -> Expr:
         return 1 + grown
     logs = [a for a in sympy.Mul.make_args(grown) if isinstance(a, sympy.log)]
     if len(logs) == 1:
+        # exp(a log x) is the power law that people know as x^a.
         return logs[0].args[0] ** (grown / logs[0])
     return sympy.exp(grown)
 
@@ -167,6 +174,7 @@ def _file(made: Term, lines: Sequence[str], change: str, bound: float = 1e3, ord
         for name, (n, b, u, m, _) in CONSTANTS.items()
         if re.search(rf"\bp\.{name}\b", body)
     )
+    # Wide bounds: they guard against overflow, while priors hold the fit.
     limit = bound * made.size
     source = f'''{SUGGESTED}: {made.target}, {made.formula}."""
 
@@ -256,6 +264,7 @@ def _motor() -> Iterator[Term]:
         "I*Abs(omega)",
         "1",
     ):
+        # Per ampere, or in newton metres: sizes that a drive motor would show.
         yield term(dataclasses.replace(target, size=3.0 if "I" in factor else 0.3), factor)
 
 
@@ -317,6 +326,7 @@ def _sensor(kinds: Sequence[str]) -> Iterator[Term]:
     for kind in kinds:
         first, unit = kind.split("_")[0], _unit_of(kind)
         words = list(kind.split("_")[1:])
+        # By words and not by whole names: a kind stands for the channels of all corners.
         test = " and ".join([f"name.startswith({first!r} + '_')", *(f"{('_' + w)!r} in name" for w in words)])
         pick = [f"chosen = [name for name in value.channels if {test}]"]
         for shown, code, per, size in (

@@ -85,6 +85,7 @@ def _course(label: str, traces: Traces, log: int, row: int | None) -> Course:
     heading = _series(traces, log, "yaw_deg")
     if heading is not None:
         heading_time, degrees = _values(traces, heading, row)
+        # Without jumps: halfway between 179 and -179 degrees lies 180, and not 0.
         yaw = np.interp(time, heading_time, np.unwrap(np.radians(degrees)))
     else:
         yaw = _direction(x, y)
@@ -98,6 +99,7 @@ def _direction(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         yaw[i] = yaw[i - 1]
         if np.hypot(x[i] - x[last], y[i] - y[last]) >= _LEAST_STEP:
             yaw[i], last = np.arctan2(y[i] - y[last], x[i] - x[last]), i
+            # Before it moved it stood as it set off.
             if not has_direction:
                 yaw[:i], has_direction = yaw[i], True
     return np.unwrap(yaw)

@@ -56,6 +56,7 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     channels, units = list(dict.fromkeys(c for c, _ in places)), sorted({u for _, u in places})
     shown_steps = [*steps[: EXPLORE.maps - 1], steps[-1]] if len(steps) > EXPLORE.maps else list(steps)
     rms = [{key: _rms(s.residual[at]) for key, at in places.items()} for s in shown_steps]
+    # One scale of shades for all maps: a field that fades from one to the next is an error that fell.
     most = max(v for row in rms for v in row.values() if v is not None)
     titles = [f"{_number(steps, s)}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for s in shown_steps]
     height = 24 * len(channels)
@@ -92,6 +93,7 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     figure.update_annotations(x=0.0, xanchor="left")
     # Five numbers an observation: measured, and of two models what each says and leaves.
     thin = max(1, int(np.ceil(len(o) * 5 / EXPLORE.most_values)))
+    # The worst first: the list opens with what there is to be explained.
     worst = sorted(places, key=lambda key: -(rms[0][key] or 0.0))
     models = _compared(steps)
     channel_rms = {_key(*key): _panel(models, *key, places[key][::thin]) for key in worst}
@@ -193,6 +195,7 @@ def gallery(result: Result) -> list[Block]:
         if e.get("status") != "not tested" and signature is not None and len(signature) == len(fitted):
             shapes[e["effect"]] = np.zeros(len(o))
             shapes[e["effect"]][fitted] = signature
+    # Long signatures are those that these logs show best, whether or not anything is missing.
     chosen = sorted(shapes, key=lambda e: -float(np.linalg.norm(shapes[e])))[: EXPLORE.shapes]
     drawn = {e: largest for e in chosen if (largest := _largest(o, shapes[e])) is not None}
     if not drawn:
@@ -277,6 +280,7 @@ def _panel(models: Sequence[Step], channel: str, unit: int, at: np.ndarray) -> d
     o = traces.observations
     x, drawn = broken(x, o.value[at], *(m.predicted[at] for m in models), *(m.residual[at] for m in models))
     measured, said, left = drawn[0], drawn[1 : 1 + len(models)], drawn[1 + len(models) :]
+    # The page's figure has places for two models; a run of one leaves the second empty.
     none = [np.zeros(0)] * (2 - len(models))
     y = [measured, *said, *none, *left, *none]
     name = f"{channel_label(channel)}: {o.unit_names[unit]}"
@@ -374,6 +378,7 @@ def covariate_along(o: Observations, begin: str, end: str) -> np.ndarray:
         mine = [s for s in o.series if s.log == log and s.time is not None and len(s.time)]
         kind = [s for s in mine if s.channel.startswith(begin) and s.channel.endswith(end)]
         for s in mine if kind else ():
+            # Channels have clocks of their own.
             values = [np.interp(np.asarray(s.time), np.asarray(k.time), o.value[k.start : k.stop]) for k in kind]
             out[s.start : s.stop] = np.mean(values, axis=0)
     return out

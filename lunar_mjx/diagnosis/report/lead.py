@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lunar_mjx.diagnosis.report.read import Result
-from lunar_mjx.diagnosis.report.words import and_list
+from lunar_mjx.diagnosis.report.words import SURE, and_list
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.report.page import Lead
 
@@ -37,6 +37,7 @@ def lead(results: Sequence[Result], judge: Result) -> Lead:
     badge, tone = _TONES.get(name, (name, "open"))
     sentence = _sentence(name, named, str(judge.verdict.get("port") or ""), added)
     steps = _next(name, named, judge)
+    # The verdict is on an earlier model: its badge must not stand over one that nobody has judged.
     if judge is not last:
         new = [e for e in added if e not in (judge.run.get("added") or [])]
         now = f"The model now has {_and(new)}." if new else "The model was compared again."
@@ -93,17 +94,13 @@ def _searched(judge: Result) -> bool:
     return bool(search.get("complete", True))
 
 
-_SURE = 0.95
-"""Probability from which a rival contact law is to be added: what `why` calls sure, too."""
-
-
 def _law(judge: Result) -> list[str]:
     """The contact law that explains the measurements better than the model's own, if one surely does."""
     forms = (judge.verdict or {}).get("forms") or {}
     best = max(forms, key=lambda n: float(forms[n]), default="")
     model = judge.model
     present = {*(judge.run.get("added") or []), *((e.name for e in model.effects) if model is not None else ())}
-    return [best] if best in CATALOGUE and best not in present and float(forms[best]) >= _SURE else []
+    return [best] if best in CATALOGUE and best not in present and float(forms[best]) >= SURE else []
 
 
 def _adding(run: str, names: Sequence[str]) -> list[str]:

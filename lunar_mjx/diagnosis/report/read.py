@@ -111,6 +111,7 @@ def read_result(folder: Path) -> Result:
     run = read_stored(path)
     if run is None or run.get("format") != FORMAT:
         raise bad_input(path, "format", (run or {}).get("format"), "is not known", f"give a run of format {FORMAT}")
+    # A run grows from verb to verb: what has not been asked yet is no mistake.
     names = (COMPARISON_FILE, VERDICT_FILE, AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE)
     comparison, verdict, audit, unknown, following = (read_stored(folder / name) for name in names)
     traces, signatures = _traces(folder / SERIES_FILE), _signatures(folder / SIGNATURES_FILE)
@@ -135,7 +136,9 @@ def _traces(path: Path) -> Traces | None:
         return None
     try:
         _check_shapes(arrays)
+        # Series lie one behind the other: where the next begins the last one ends.
         starts = [*arrays["series_start"].tolist(), len(arrays["measured"])]
+        # Points of tables follow no clock: their time is stored as NaN.
         independent = np.isnan(arrays["time"])
         series = []
         for i, (channel, log) in enumerate(zip(arrays["series_channel"], arrays["series_log"], strict=True)):
@@ -173,6 +176,7 @@ def _check_shapes(found: Mapping[str, np.ndarray]) -> None:
         "place": (n if len(found["place"]) else 0, 3),
     }
     for name, shape in shapes.items():
+        # Text in place of numbers would pass as an array and end a report with a traceback.
         if found[name].shape != shape or found[name].dtype.kind not in "fiu":
             raise ValueError(f"{name} is {found[name].dtype} of shape {found[name].shape}, not numbers of {shape}")
     start, units = found["series_start"], found["unit"]

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lunar_mjx.diagnosis.report.words import and_list, percent, shown
+from lunar_mjx.diagnosis.report.words import SURE, and_list, percent, shown
 
 ALIKE = 0.9
 """|cos| between two traces from which a reader is told that they look alike; the report's isolability says the same."""
-_SURE = 0.95
-"""Probability that a statement needs."""
 
 
 def reason(
@@ -71,9 +69,9 @@ def reason(
 def _probable(probability: float | None) -> list[str]:
     if probability is None:
         return []
-    if probability >= _SURE:
+    if probability >= SURE:
         return [f"Its probability is {percent(probability)}."]
-    words = "more than the 5 % that would rule it out" if probability > 1.0 - _SURE else "so it is ruled out"
+    words = "more than the 5 % that would rule it out" if probability > 1.0 - SURE else "so it is ruled out"
     return [f"Its probability is {percent(probability)}, {words}."]
 
 

@@ -127,10 +127,13 @@ def _page_data(result: Result, traces: Traces) -> dict[str, Any]:
     shown_cells = {(c, u): at for c, u, at in cells(o) if np.isfinite(models[0].residual[at]).any()}
     channels = list(dict.fromkeys(c for c, _ in shown_cells))
     units = sorted({u for _, u in shown_cells})
+    # Every model draws a prediction and a residual beside the measurement: the page grows with their number.
     thin = max(1, int(np.ceil(len(o) * (2 + 2 * len(models)) / STUDIO_SIZES.most_values)))
     held = o.in_split("select", "test")
     fitted = o.in_split("fit")
     verdict = result.verdict or {}
+    # Effects are judged against the refitted model: against the one as given they would earn what a refit gives for
+    # nothing.
     base = next((i for i, m in enumerate(models) if m.kind == "refit"), 0)
     grid = [[shown_cells.get((c, u)) for u in units] for c in channels]
     remains = [(k, d) for k, d in (verdict.get("discrepancy") or {}).items() if isinstance(d, Mapping)]
@@ -176,6 +179,7 @@ def _models(result: Result, traces: Traces) -> list[_Model]:
         kind = "given" if label == "as given" else "refit"
         models.append(_Model(words, effects, kind, traces.residual[row], traces.predicted[row]))
     base = next((m for m in models if m.kind == "refit"), models[-1])
+    # A set has no order: `drag + toe` of one file is `toe + drag` of another.
     known = {frozenset(m.effects) for m in models}
     refits = read_refits(result.folder, len(o)) if result.folder is not None else {}
     more = [
@@ -187,9 +191,11 @@ def _models(result: Result, traces: Traces) -> list[_Model]:
     fitted = np.flatnonzero(o.in_split("fit"))
     for name, signature in result.signatures.items():
         if frozenset((name,)) not in known and (left := _estimate(base.residual[fitted], signature)) is not None:
+            # Signatures are kept of fitted observations alone; what was held out is not estimated but left open.
             residual = np.full(len(o), np.nan)
             residual[fitted] = left
             more.append(_Model("+ " + _words((name,)), (name,), "estimate", residual, None))
+    # Refits before estimates, which are to first order and would win where they are too good to be true.
     more.sort(key=lambda m: (m.kind != "refit", _rms(m.residual[fitted]) or np.inf))
     return [*models, *more][: STUDIO_SIZES.most_models]
 
@@ -203,6 +209,7 @@ def _estimate(residual: np.ndarray, signature: np.ndarray) -> np.ndarray | None:
     length = float(np.sum(columns[keep] ** 2))
     if length <= 0.0:
         return None
+    # Not below zero: most effects exist with one sign only.
     amount = max(float(np.sum(columns[keep] * residual[keep])) / length, 0.0)
     return residual - amount * columns
 
@@ -228,6 +235,7 @@ def _panel(traces: Traces, models: Sequence[_Model], at: np.ndarray, thin: int, 
     """Abscissa, measurements, and predictions and residuals by model, of one channel of one manoeuvre."""
     o = traces.observations
     x = o.place[at, 0] if o.place is not None else traces.time[at]
+    # By abscissa first: thinning an unsorted series would leave holes in the line.
     order = np.argsort(x, kind="stable")[::thin]
     at, x = at[order], x[order]
     said = [m.predicted[at] for m in models if m.predicted is not None]
@@ -304,6 +312,7 @@ def _effects(
     index = {m.effects: i for i, m in enumerate(models) if m.effects}
     sets = {frozenset(k): i for k, i in index.items()}
     whole = sets.get(frozenset(named), -1) if named else -1
+    # One measure for all effects, or the table would compare held-out errors with fitted ones.
     on_held = bool(held.any()) and all(_rms(models[i].residual[held]) is not None for i in [base, *index.values()])
     part, measure = (held, "held-out") if on_held else (fitted, "fitted")
     errors: dict[str, float] = {}

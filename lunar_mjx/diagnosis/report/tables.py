@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import metadata
 from typing import Any
 
@@ -90,75 +90,8 @@ def hypotheses(result: Result) -> list[Block]:
 
 
 def effects(result: Result) -> list[Block]:
-    """What the logs say for and against every effect of the catalogue."""
+    """What the logs say for and against every effect of the catalogue; nothing where no hypotheses were weighed."""
     verdict = result.verdict or {}
-    if verdict.get("probabilities"):
-        return _weighed(verdict)
-    tested, silent = [], []
-    for e in verdict.get("evidence") or []:
-        near = e.get("nearest") or ("", 0.0)
-        nearest = f"{near[0]} ({near[1]:.2f})" if near[0] else "-"
-        if e.get("status") == "not tested":
-            silent.append([e["effect"], f"cannot be tested with these logs: {e.get('reason', '')}"])
-            continue
-        values = "; ".join(
-            f"{k} {plus_minus(v, (e.get('std') or {}).get(k))}" for k, v in (e.get("values") or {}).items()
-        )
-        gain = e.get("held_out_gain")
-        share = e.get("separable_share")
-        tested.append(
-            [
-                e["effect"],
-                e.get("status", ""),
-                e.get("reason", ""),
-                shown(e.get("separable_sigma")),
-                "-" if share is None else f"{100.0 * share:.1f}",
-                shown(e.get("z")),
-                shown(e.get("chi2")),
-                shown(e.get("p"), 2),
-                "-" if gain is None else plus_minus(gain, e.get("held_out_se")),
-                values or "-",
-                nearest,
-            ]
-        )
-    blocks: list[Block] = []
-    if tested:
-        blocks.append(
-            Table(
-                "Every effect that these logs can test",
-                [
-                    "effect",
-                    "status",
-                    "because",
-                    "separable, sigma",
-                    "of its signal, %",
-                    "score z",
-                    "chi-square taken off",
-                    "family-wise p",
-                    "held-out gain",
-                    "parameters, SI",
-                    "nearest confounder (|cos|)",
-                ],
-                tested,
-                "Separable: length of the effect's signature at nominal size that a refit of the model cannot absorb. "
-                "Score and p: robust score test, the largest over all effects by bootstrap. Held-out gain: expected "
-                "log density on manoeuvres left out, with its standard error. Parameters with one standard deviation.",
-                texts=3,
-            )
-        )
-    by_reason: dict[str, list[str]] = {}
-    for n in (verdict.get("details") or {}).get("not_tested") or []:
-        by_reason.setdefault(str(n.get("reason", "")), []).append(str(n.get("effect", "")))
-    silent += [[", ".join(names), f"cannot be tested with these logs: {reason}"] for reason, names in by_reason.items()]
-    if silent:
-        blocks.append(
-            Table("Effects that these logs cannot test, and why", ["effect", "why"], silent, texts=2, folded=True)
-        )
-    return blocks
-
-
-def _weighed(verdict: Mapping[str, Any]) -> list[Block]:
-    """The table of effects where hypotheses were weighed."""
     rows = []
     for e in verdict.get("evidence") or []:
         near = e.get("nearest") or ("", 0.0)

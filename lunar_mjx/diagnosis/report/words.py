@@ -16,6 +16,8 @@ SPLIT_NAMES = {
     "apart": "set apart",
     "held_out": "held out",
 }
+SURE = 0.95
+"""Probability that a statement needs, and from which a rival contact law is to be added: what `why` calls sure, too."""
 
 
 def shown(value: Any, digits: int = 3) -> str:

@@ -45,12 +45,11 @@ class Tables(Problem):
     """The tables of a run as a problem.
 
     Attributes:
-      forms: contact laws. beds: of each form without candidates, by name.
+      forms: contact laws.
     """
 
     forms: Sequence[WheelForm]
     settings: TableSettings
-    beds: Mapping[str, WheelBed] = dataclasses.field(default_factory=dict)
 
     @property
     def own(self) -> WheelForm:
@@ -84,7 +83,7 @@ def build_tables(
     observations, tests = tables._observations(logs, run.splits, run.discrepancy)
     data = table_data(logs, observations, [t for t, _ in tests], settings)
     gravity = float(data.imposed.gravity[0])  # of `next` and of formulas; the forms take every point's own
-    forms, beds, all_effects, refused = [], {}, {}, ()
+    forms, all_effects, refused = [], {}, ()
     laws = contact_laws(run.model, settings.laws if rivals else ())
     for number, (name, model) in enumerate(laws.items()):
         bed = WheelBed(model.effects, {n: _single(v) for n, v in model.parameters.items()}, gravity)
@@ -100,9 +99,8 @@ def build_tables(
         # prior probability: the model's own law has half of it, its rivals share the other half
         share = 1.0 if len(laws) == 1 else 0.5 if number == 0 else 0.5 / (len(laws) - 1)
         forms.append(WheelForm(name, data, union, coordinates, baseline, places, settings, math.log(share)))
-        beds[name] = bed
         all_effects |= effects
-    return Tables(tuple(forms), all_effects, refused, settings, _not_used(run.model), beds)
+    return Tables(tuple(forms), all_effects, refused, settings, _not_used(run.model))
 
 
 def _not_used(model: Model) -> str:

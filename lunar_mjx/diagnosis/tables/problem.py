@@ -184,12 +184,14 @@ class TableProblem(Problem):
         return other
 
     def predict(self, u: np.ndarray) -> np.ndarray:
+        """Predicted observations, (k, n) in SI units, for rows of coordinates (k, coordinates)."""
         with jax.enable_x64(True):
             # One row at a time: every number of rows would be another program.
             rows = [np.asarray(self._run(jnp.asarray(row, float), *self._given)) for row in np.atleast_2d(u)]
         return np.stack(rows)
 
     def jacobian(self, u: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Derivatives (n, which) of the predictions by some coordinates, at `u` (coordinates,)."""
         with jax.enable_x64(True):
             # All derivatives, of which some are taken: every other choice would be another program to compile.
             return np.asarray(self._slope(jnp.asarray(u, float), *self._given))[:, which]

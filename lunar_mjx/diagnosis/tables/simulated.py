@@ -21,7 +21,7 @@ from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude
 from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, search
 from lunar_mjx.logs import SteadyLog
 
-_VISIBLE = 15.0
+VISIBLE = 15.0
 """Length in sigma, at least, of the signature of a simulated effect that is to be found."""
 
 
@@ -42,7 +42,7 @@ class SimulatedTables:
             linear.always, np.arange(len(own.coordinates))
         )  # calibration and fields, none unlisted
         self._sizes = {
-            name: min(max(1.0, _VISIBLE / length), self._room(own, name))
+            name: min(max(1.0, VISIBLE / length), self._room(own, name))
             for name, length in linear.shows().items()
             if length >= LEAST_SIGNAL
         }

@@ -45,8 +45,6 @@ SHARES: Mapping[str, float] = {
     "body_wrench: pitching moment": ADDED,
 }
 """Of the fields whose size is not that of a gain; the others are gains."""
-DRAWBAR = 0.1
-"""Torque at the wheels that is usual, over load times radius: a drawbar pull of a tenth of the load."""
 
 
 @dataclasses.dataclass(frozen=True)

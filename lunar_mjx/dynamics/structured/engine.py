@@ -7,9 +7,6 @@ are closed exactly, so there is no constraint solver. Everything is in the coord
 axes and offsets are constant. The derivation is in docs/structured_engine.md.
 """
 
-# MuJoCo ships no type stubs for its compiled module.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import dataclasses
@@ -104,6 +101,7 @@ class StructuredEngine:
           qpos, qvel: MuJoCo's coordinates of shapes (nq,) and (nv,), or both as `split` gives them.
           dt: time step, s.
         """
+        # Loops over steps carry the pieces: joining and splitting them at each step would cost trigonometry.
         whole = not isinstance(qpos, Pieces)
         if whole:
             qpos, qvel = self.split(qpos, qvel)
@@ -236,6 +234,7 @@ class StructuredEngine:
     ) -> tuple[Pieces, Pieces, Any, Vec3]:
         dtype = forces.joint_torque.dtype
         armature = _reflected_inertia(params, self._joints, dtype)
+        # The motors' torques are what is sought: those that the effects ask for must not act beside them.
         unpowered = dataclasses.replace(forces, joint_torque=jnp.zeros_like(forces.joint_torque))
         blocks = [
             leg_block(n, leg, up, unpowered, base.frame, armature, dt) for n, leg in zip(numbers, legs, strict=True)
@@ -322,6 +321,7 @@ class StructuredEngine:
 def _reflected_inertia(params: Any, joints: int, dtype: Any) -> Any:
     """Rotor inertia times the square of the gear ratio at the actuated joints; None without motors."""
     motor = params.effects.get("motor")
+    # A model without motors moves its joints by what effects ask; their rotors then weigh nothing.
     if motor is None:
         return None
     return motor["rotor_inertia"] * motor["gear_ratio"] ** 2 * jnp.ones(joints, dtype)

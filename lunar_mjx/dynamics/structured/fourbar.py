@@ -14,7 +14,7 @@ phi_3 = phi_1 and phi_2 = -phi_1.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -62,13 +62,12 @@ class FourBar:
     @property
     def dependent(self) -> tuple[int, int]:
         """Numbers of the two links whose angles follow."""
-        first, second = (link for i, link in enumerate(self.links) if i != self.given)
-        return first, second
+        return self._dependent(self.links)
 
     def angles(self, n: LoopNumbers, angle: Any) -> tuple[Any, Any]:
         """Angles of the dependent joints, rad, in (-pi, pi]."""
         phi = self._solve(n, mul(n.senses[self.given], angle))
-        return tuple(mul(s, p) for i, (s, p) in enumerate(zip(n.senses, phi, strict=True)) if i != self.given)  # type: ignore[return-value]
+        return self._dependent(mul(s, p) for s, p in zip(n.senses, phi, strict=True))
 
     def rates(self, n: LoopNumbers, angle: Any, speed: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
         """Dependent speeds per independent speed, and the dependent accelerations at zero independent acceleration.
@@ -78,16 +77,14 @@ class FourBar:
         own = n.senses[self.given]
         if self.parallelogram:
             ratio = _PARALLELOGRAM[self.given]
-            gains = [mul(mul(s, own), r) for s, r in zip(n.senses, ratio, strict=True)]
-            gain = tuple(g for i, g in enumerate(gains) if i != self.given)
-            return gain, (0.0, 0.0)  # type: ignore[return-value]
+            return self._dependent(mul(mul(s, own), r) for s, r in zip(n.senses, ratio, strict=True)), (0.0, 0.0)
         phi = self._solve(n, mul(own, angle))
         # the closure r_1 + r_2 - r_3 = const is linear in the rates, so that no further trigonometry is needed
         r = _turn(n.d, phi[0]), _turn(n.e, add(phi[0], phi[1])), _turn(n.f, phi[2])
         # in the absolute angles x = (phi_1, phi_1 + phi_2, phi_3): r_1 x_1' + r_2 x_2' - r_3 x_3' = 0 (turned by J)
         columns = (add(r[0][0], r[1][0]), add(r[0][1], r[1][1])), r[1], (neg(r[2][0]), neg(r[2][1]))
         known = columns[self.given]
-        p, q = (c for i, c in enumerate(columns) if i != self.given)
+        p, q = self._dependent(columns)
         # Zero at a dead point, where the dependent links are parallel; `read_fourbar` refuses rovers that are assembled
         # there.
         determinant = 1.0 / _cross(p, q)
@@ -101,21 +98,28 @@ class FourBar:
         )
         perpendicular = (neg(along[1]), along[0])
         bias = mul(neg(_cross(perpendicular, q)), determinant), mul(neg(_cross(p, perpendicular)), determinant)
-        senses = [s for i, s in enumerate(n.senses) if i != self.given]
+        first, second = self._dependent(n.senses)
         return (
-            tuple(mul(mul(s, own), g) for s, g in zip(senses, gain, strict=True)),  # type: ignore[return-value]
-            tuple(mul(s, b) for s, b in zip(senses, bias, strict=True)),
+            (mul(mul(first, own), gain[0]), mul(mul(second, own), gain[1])),
+            (mul(first, bias[0]), mul(second, bias[1])),
         )
+
+    def _dependent(self, all_three: Iterable[Any]) -> tuple[Any, Any]:
+        """What of the three joints belongs to the two whose angles follow."""
+        first, second = (value for i, value in enumerate(all_three) if i != self.given)
+        return first, second
 
     def _all(self, pair: tuple[Any, Any], given: Any) -> tuple[Any, Any, Any]:
         values = list(pair)
         values.insert(self.given, given)
-        return tuple(values)  # type: ignore[return-value]
+        first, second, third = values
+        return first, second, third
 
     def _solve(self, n: LoopNumbers, phi: Any) -> tuple[Any, Any, Any]:
         """All three angles about n."""
         if self.parallelogram:
-            return tuple(mul(r, phi) for r in _PARALLELOGRAM[self.given])  # type: ignore[return-value]
+            first, second, third = _PARALLELOGRAM[self.given]
+            return mul(first, phi), mul(second, phi), mul(third, phi)
         if self.given == 0:
             # With the first link's direction known, coupler and third link close a triangle on its end.
             known = _minus(_turn(n.d, phi), n.b)
@@ -213,8 +217,12 @@ def read_fourbar(
     given = next((i for i in (0, 2, 1) if links[chosen[i]].actuated is not None), 0)
     if sum(links[i].actuated is not None for i in chosen) > 1:
         raise UnsuitableError(f"{name} has more than one actuated joint.")
+
+    def sense(joint: int) -> Any:
+        return uniform([leg.senses[joint] for leg in legs])
+
     numbers = LoopNumbers(
-        senses=tuple(uniform([leg.senses[i] for leg in legs]) for i in range(3)),  # type: ignore[arg-type]
+        senses=(sense(0), sense(1), sense(2)),
         **{k: tuple(uniform(c) for c in np.array([getattr(leg, k) for leg in legs]).T) for k in "defb"},
         branch=1.0,
     )
@@ -263,7 +271,7 @@ def _measure(links: list[Link], chosen: tuple[int, int, int], leg: int, anchors:
     poses = [_pose(links, i, leg) for i in chosen]
     axes = [turn[:, links[i].axis] for i, (turn, _) in zip(chosen, poses, strict=True)]
     normal = axes[0]
-    senses = tuple(float(np.sign(a @ normal)) for a in axes)
+    first, second, third = (float(np.sign(a @ normal)) for a in axes)
     pins = [poses[1][1] + poses[1][0] @ anchors[0], poses[2][1] + poses[2][0] @ anchors[1]]
     reach = float(np.linalg.norm(pins[0] - poses[0][1])) + 1e-9
     if any(np.linalg.norm(np.cross(a, normal)) > 1e-9 for a in axes):
@@ -277,7 +285,7 @@ def _measure(links: list[Link], chosen: tuple[int, int, int], leg: int, anchors:
     plane = np.stack([u, np.cross(normal, u)])
     a1, a2, b1 = (plane @ origin for _, origin in poses)
     pin = plane @ pins[0]
-    return _Measured(senses, a2 - a1, pin - a2, pin - b1, b1 - a1)  # type: ignore[arg-type]
+    return _Measured((first, second, third), a2 - a1, pin - a2, pin - b1, b1 - a1)
 
 
 def _branch(loop: FourBar, legs: list[_Measured], name: str) -> LoopNumbers:

@@ -1,8 +1,5 @@
 """Refuses, by name, every field of a compiled MuJoCo model that the structured engine would not honour."""
 
-# MuJoCo ships no type stubs for its compiled module.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import mujoco

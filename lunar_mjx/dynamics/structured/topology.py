@@ -5,9 +5,6 @@ two that a connect constraint ties together; legs of one pattern form a group wh
 arrays of shape (leg,), or as one float where all legs agree.
 """
 
-# MuJoCo ships no type stubs for its compiled module.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import dataclasses
@@ -251,8 +248,8 @@ def _pins(model: mujoco.MjModel, places: list[_Place]) -> list[_Pin]:
     for i in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT):
         on = places[model.eq_obj1id[i]], places[model.eq_obj2id[i]]
         given = model.eq_data[i, :3], model.eq_data[i, 3:6]
-        anchors = tuple(p.shift + p.turn @ a for p, a in zip(on, given, strict=True))
-        pins.append(_Pin(model.eq(i).name, (on[0].owner, on[1].owner), anchors))  # type: ignore[arg-type]
+        first, second = (p.shift + p.turn @ a for p, a in zip(on, given, strict=True))
+        pins.append(_Pin(model.eq(i).name, (on[0].owner, on[1].owner), (first, second)))
     return pins
 
 
@@ -360,12 +357,12 @@ def _ties(
     cluster = np.arange(len(legs))
     tied = False
     for i in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
-        ends = [own.get(int(joint)) for joint in (model.eq_obj1id[i], model.eq_obj2id[i])]
+        ends = [own[j] for joint in (model.eq_obj1id[i], model.eq_obj2id[i]) if (j := int(joint)) in own]
         # what ties legs of several joints, or not one to one, is a coupling (see `_couplings`)
-        if None in ends or loop is not None or len(links) > 1 or model.eq_data[i, 1] != 1.0:
+        if len(ends) < 2 or loop is not None or len(links) > 1 or model.eq_data[i, 1] != 1.0:
             continue
         # Union of the two clusters.
-        (first, _), (second, _) = ends  # type: ignore[misc]
+        (first, _), (second, _) = ends
         cluster[cluster == cluster[second]] = cluster[first]
         tied = True
     if not tied:

@@ -195,15 +195,15 @@ def shifted(signals: Signals, offset_of: dict[str, Any]) -> Signals:
     Returns:
       Signals at the same times.
     """
-    names = [name for name in signals.channels if family(name) in offset_of]
-    if not names:
+    families = {name: f for name in signals.channels if (f := family(name)) is not None and f in offset_of}
+    if not families:
         return signals
     whole = set(QUATERNION) <= signals.channels.keys()
     sign = quaternion_signs(signals) if whole else 1.0
     time = jnp.asarray(signals.time)
-    old = {name: jnp.asarray(signals.channels[name]) for name in names}
+    old = {name: jnp.asarray(signals.channels[name]) for name in families}
     smooth = jnp.stack([_smooth(name, value, sign) for name, value in old.items()], axis=-2)
-    late = [jnp.broadcast_to(jnp.asarray(offset_of[family(name)]), time.shape) for name in names]  # type: ignore[index]
+    late = [jnp.broadcast_to(jnp.asarray(offset_of[f]), time.shape) for f in families.values()]
     at = time[..., None, :] - jnp.stack(late, axis=-2)
     moved = shift_smoothly(time if time.ndim == 1 else time[..., None, :], smooth, at)
     change = moved - smooth

@@ -6,7 +6,6 @@ import dataclasses
 from types import SimpleNamespace
 
 import jax.numpy as jnp
-import numpy as np
 
 from lunar_mjx.effects.base import Effect, Parameter, effect
 
@@ -114,7 +113,7 @@ def _patch_parameters() -> dict[str, Parameter]:
             "choice: half as stiff at place 2",
         )
     for i in range(PATCHES):
-        patch_words = f"of place {i}; see `places_along` for those of a track"
+        patch_words = f"of place {i}; put it on the track of the log"
         parameters[f"x_{i}"] = Parameter(
             1.5 * i, None, (-1e6, 1e6), "m", "x " + patch_words, "choice: every 1.5 m along x"
         )
@@ -149,24 +148,5 @@ soil_patches = Effect(
     doc="""k exp(f) and c exp(q f) with f(x, y) = sum of a_i exp(-|x - x_i|^2/(2 w^2)): a smooth field of soil patches.
 
     Radial basis functions at eight fixed places (a Gaussian random field of length w, seen at the places; Rasmussen &
-    Williams 2006, ch. 2); `places_along` puts them along the track of a log, where alone they can be told.""",
+    Williams 2006, ch. 2); they can be told along the track of a log alone.""",
 )
-
-
-def places_along(x: np.ndarray, y: np.ndarray) -> dict[str, float]:
-    """Parameters of `soil_patches` that put its places evenly along a driven track.
-
-    Args:
-      x, y: (time,) positions of the rover in the order of driving, m.
-
-    Returns:
-      x_0 .. y_7 at equal distances along the track from its first to its last point, and a width of two thirds of the
-      distance between them, at least 0.05 m.
-    """
-    x, y = np.asarray(x, float), np.asarray(y, float)
-    gone = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    at = np.linspace(0.0, gone[-1], PATCHES)
-    out = {f"x_{i}": float(np.interp(s, gone, x)) for i, s in enumerate(at)}
-    out |= {f"y_{i}": float(np.interp(s, gone, y)) for i, s in enumerate(at)}
-    # Two thirds of the spacing: neighbours overlap, so that no stretch of the track is left to none of them.
-    return out | {"width": max(2.0 / 3.0 * float(gone[-1]) / (PATCHES - 1), 0.05)}

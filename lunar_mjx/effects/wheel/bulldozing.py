@@ -28,6 +28,16 @@ def passive_pressure(soil, weight, depth, depth_squared):
     return d_1 * (soil.cohesion * depth + 0.5 * d_2 * weight * depth_squared)
 
 
+BULK_DENSITY = Parameter(
+    1600.0,
+    None,
+    (500.0, 5000.0),
+    "kg/m3",
+    "bulk density of the soil",
+    "Lunar Sourcebook: 1500 to 1700 near the surface",
+)
+
+
 @effect(
     "wheel_shear",
     order=5,
@@ -37,14 +47,7 @@ def passive_pressure(soil, weight, depth, depth_squared):
     side=Parameter(
         1.0, 0.0, (0.0, 10.0), "1", "share of the bulldozing resistance beside the wheel", "Ishigami et al. 2007: 1"
     ),
-    density=Parameter(
-        1600.0,
-        None,
-        (500.0, 5000.0),
-        "kg/m3",
-        "bulk density of the soil",
-        "Lunar Sourcebook: 1500 to 1700 near the surface",
-    ),
+    density=BULK_DENSITY,
 )
 def bulldozing(ctx, p, x, wheel):
     """Passive earth pressure on the front and on the side wall: R = D_1 (c h + D_2 rho g h^2/2) per width (Hegedus).

@@ -89,6 +89,7 @@ def geometry_factors(theta_m):
 
 
 def airborne(contact):
+    """Whether each wheel touches no ground: it has not sunk below the surface."""
     return contact.sinkage <= 0.0
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.effects.base import Effect, Parameter, effect
+from lunar_mjx.effects.wheel.bulldozing import BULK_DENSITY
 from lunar_mjx.effects.wheel.closed_form import contact_with_soil, first_axis, grounded, mean_decay, sin_difference
 from lunar_mjx.spatial import Vec3
 
@@ -286,14 +287,7 @@ def wall_bearing(tan_phi, tan_delta):
         "sideways way over K_y at which 63 % of the pressure have built up",
         "choice: a wedge needs more way than a shear band",
     ),
-    density=Parameter(
-        1600.0,
-        None,
-        (500.0, 5000.0),
-        "kg/m3",
-        "bulk density of the soil",
-        "Lunar Sourcebook: 1500 to 1700 near the surface",
-    ),
+    density=BULK_DENSITY,
     speed_scale=Parameter(
         2e-3, None, (1e-5, 1.0), "m/s", "speed of full friction on the flank", "choice: well below driving speed"
     ),

@@ -147,8 +147,8 @@ def _limits(model: Model, mode: str, top_speed: float, load_share: float) -> np.
     """Target of every joint at an action of 1."""
     rover = model.rover
     compiled = rover.compile()
-    data = mujoco.MjData(compiled)  # type: ignore[attr-defined]
-    mujoco.mj_forward(compiled, data)  # type: ignore[attr-defined]
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
     # In the model's own gravity: torque that climbs on the Moon is a sixth of the Earth's.
     load = rover.mass * model.gravity / len(rover.wheels)
     wheel_of = {j: w for w in rover.wheels for j in (w.drive, w.steer, w.suspension) if j}

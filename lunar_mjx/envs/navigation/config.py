@@ -119,6 +119,7 @@ class NavigationConfig:
         Raises:
           UserError: unknown setting, or a value that makes no sense.
         """
+        # `dataclasses.replace` would refuse it, too, with a TypeError that names no remedy.
         known = [f.name for f in dataclasses.fields(self)]
         for key in changes:
             if key not in known:
@@ -129,6 +130,7 @@ class NavigationConfig:
 def _check(c: NavigationConfig) -> None:
     for name in ("decimation", "places"):
         value = getattr(c, name)
+        # True is an int in Python; from a command line's JSON it is a mistake.
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise bad_input("navigation", name, value, "is not a whole number of at least 1", "give one")
     for name in (
@@ -151,6 +153,7 @@ def _check(c: NavigationConfig) -> None:
     distance = c.goal_distance
     pair = isinstance(distance, list | tuple) and len(distance) == 2
     low, high = (require_finite("navigation", "goal_distance", v) for v in distance) if pair else (0.0, 0.0)
+    # A goal within its own radius is reached at the start: an episode of no step.
     if not c.goal_radius < low <= high:
         raise bad_input(
             "navigation",
@@ -181,6 +184,7 @@ def _check(c: NavigationConfig) -> None:
         if name not in TERMS:
             raise bad_input("navigation", "weights", name, "is no reward term", f"use some of {', '.join(TERMS)}")
         require_finite("navigation", f"weights.{name}", weight)
+        # Such terms read the tally's counts; without it they would be zero, and the reward another one without a word.
         if name in TOLD_BY_TALLY and not c.tally:
             raise bad_input("navigation", "tally", c.tally, f"does not go with the reward term {name}", "give true")
         if name == "way" and not c.rung:
@@ -192,6 +196,7 @@ def _check(c: NavigationConfig) -> None:
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
             raise bad_input("navigation", name, value, "is not a whole number of at least 0", "give one")
     if c.rung:
+        # Refuses a rung that does not exist, in words of its own.
         get_rung(c.rung)
     for name in ("arrival", "plan"):
         if name in c.observations and not c.rung:

@@ -269,8 +269,6 @@ BLOCKS: dict[str, Block] = {
 CAMERA = "camera/"
 """What the names of blocks begin with that are pictures."""
 
-SCAN_POINTS = len(VIEW.scan_ahead) * len(VIEW.scan_aside)
-
 
 def check_blocks(names: Sequence[str], field: str) -> None:
     """Refuses names that are no blocks."""

@@ -96,7 +96,8 @@ def draw_places(
             f"leaves too few places on {terrain.name} ({have} of {count} found)",
             "shorten it, or take a larger terrain",
         )
-    return tuple(np.concatenate(a)[:count].astype(np.float32) for a in (starts, goals))  # type: ignore[return-value]
+    taken = [np.concatenate(a)[:count].astype(np.float32) for a in (starts, goals)]
+    return taken[0], taken[1]
 
 
 def _rocks(terrain: Terrain) -> tuple[np.ndarray, KDTree | None]:

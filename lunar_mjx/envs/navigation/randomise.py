@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from lunar_mjx.dynamics import Params
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.model import Model
+from lunar_mjx.pytree import tree_of
 
 SCALES = ("uniform", "log")
 
@@ -145,4 +146,4 @@ def apply(params: Params, drawn: dict[str, Any]) -> tuple[Params, Any]:
             effects[effect][name] = value
             axes[effect][name] = 0
     new = dataclasses.replace(params, gravity=gravity, ambient=ambient, effects=effects)
-    return new, Params(gravity_axis, ambient_axis, axes, None)  # type: ignore[arg-type]
+    return new, tree_of(Params, gravity=gravity_axis, ambient=ambient_axis, effects=axes, terrain=None)

@@ -10,7 +10,19 @@ import numpy as np
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.schema import SIDES
-from lunar_mjx.logs.series import Agreement, agreement, at, edges, guess, increments, integrals, means, sigma, span
+from lunar_mjx.logs.series import (
+    Agreement,
+    agreement,
+    at,
+    edges,
+    guess,
+    increments,
+    integrals,
+    known_at,
+    means,
+    sigma,
+    span,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,9 +102,9 @@ def _quaternion(log: Log) -> list[Finding]:
 
 def attitude(log: Log, time: np.ndarray) -> np.ndarray | None:
     """(n, 3, 3) body-to-world rotations at some times, from the quaternion or the Euler angles; None without either."""
-    parts = [at(log, q, time) for q in QUATERNION]
-    if all(p is not None for p in parts):
-        q = np.stack(parts)  # type: ignore[arg-type]
+    parts = [p for q in QUATERNION if (p := at(log, q, time)) is not None]
+    if len(parts) == len(QUATERNION):
+        q = np.stack(parts)
         w, x, y, z = q / np.linalg.norm(q, axis=0)
         return _rotation(w, x, y, z)
     return _euler_rotation(log, time)
@@ -129,8 +141,9 @@ def _euler(log: Log) -> list[Finding]:
     # A fixed number of times, since the tables have rates of their own.
     time = np.linspace(*limits, 200)
     one, two = attitude(log, time), _euler_rotation(log, time)
+    assert one is not None and two is not None
     # The angle between two rotations from the trace of R_1^T R_2.
-    cosine = 0.5 * (np.einsum("nij,nij->n", one, two) - 1.0)  # type: ignore[arg-type]
+    cosine = 0.5 * (np.einsum("nij,nij->n", one, two) - 1.0)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     if np.median(angle) < 5.0:
         return []
@@ -152,7 +165,7 @@ def _gravity(log: Log) -> list[Finding]:
     if limits is None:
         return []
     time = np.linspace(*limits, 400)
-    measured = np.stack([at(log, n, time) for n in names], 1)  # type: ignore[type-var]
+    measured = np.stack([known_at(log, n, time) for n in names], 1)
     w, x, y, z = (np.full(1, v) for v in log.imu.quaternion)
     measured = measured @ _rotation(w, x, y, z)[0].T
     turn = attitude(log, time)
@@ -224,8 +237,8 @@ def _velocities(log: Log) -> list[Finding]:
     time = np.linspace(*limits, 300)
     speed = {}
     for frame in ("world", "body"):
-        x, y = (at(log, f"{frame}_velocity_{a}_m_s", time) for a in "xy")
-        speed[frame] = np.hypot(x, y)  # type: ignore[arg-type]
+        x, y = (known_at(log, f"{frame}_velocity_{a}_m_s", time) for a in "xy")
+        speed[frame] = np.hypot(x, y)
     noise = max(sigma(log, f"{k}_velocity_x_m_s") for k in ("world", "body"))
     shared = agreement(speed["body"], speed["world"], noise)
     if (

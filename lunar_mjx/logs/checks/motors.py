@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from lunar_mjx.logs.checks.frames import FRAME_LIMITS, _finding, rate_agreement
 from lunar_mjx.logs.findings import WARNING, Finding, is_bad
 from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.schema import CORNERS, SIDES
-from lunar_mjx.logs.series import agreement, at, continuous, edges, guess, means, sigma, span
+from lunar_mjx.logs.series import agreement, continuous, edges, guess, known, known_at, means, sigma, span
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,16 +87,16 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
     if limits is None:
         return []
     time = np.linspace(*limits, 500)
-    seen = {c: at(log, measured[c], time) for c in corners}
+    seen = {c: known_at(log, measured[c], time) for c in corners}
     wanted = {c: _held(log, commanded[c], time) for c in corners}
     findings = []
     for a in corners:
         noise = max(sigma(log, measured[a]), 1e-3)
         mine, other = wanted[a], seen[a]
         # A third of the noise: the agreement is taken over hundreds of samples.
-        pair = None if mine is None or other is None else agreement(other, mine, noise / 3.0)
+        pair = agreement(other, mine, noise / 3.0)
         # one command tells neither sign nor unit: a controller may scale it down, or trade the sides' speeds for a turn
-        if pair is None or mine is None or other is None or len(np.unique(mine[mine != 0.0])) < 2:
+        if pair is None or len(np.unique(mine[mine != 0.0])) < 2:
             continue
         if pair.cosine > 0.95 and (
             pair.factor > MOTOR_LIMITS.many or 0.01 < pair.factor < 1.0 / (4.0 * MOTOR_LIMITS.many)
@@ -119,7 +120,7 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
                     "positive drives forward, steers left, raises the chassis",
                 )
             )
-    return findings or _swapped(log, {c: measured[c] for c in corners}, seen, wanted, "command")  # type: ignore[arg-type]
+    return findings or _swapped(log, {c: measured[c] for c in corners}, seen, wanted, "command")
 
 
 def _together(one: np.ndarray, other: np.ndarray) -> float:
@@ -130,7 +131,9 @@ def _together(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _held(log: Log, name: str, time: np.ndarray) -> np.ndarray:
-    command_times, values = log.channel(name)  # type: ignore[misc]
+    samples = log.channel(name)
+    assert samples is not None, name
+    command_times, values = samples
     return values[np.maximum(np.searchsorted(command_times, time + 1e-6, side="right") - 1, 0)]
 
 
@@ -213,10 +216,10 @@ def _crossed_speeds(log: Log, kind: str, angles: dict[str, str], speeds: dict[st
     length = time[1] - time[0]
 
     def rate(name: str) -> np.ndarray:
-        return np.diff(at(log, name, time)) / length  # type: ignore[arg-type]
+        return np.diff(known_at(log, name, time)) / length
 
     def mean(name: str) -> np.ndarray:
-        sample_times, values = continuous(log, name)  # type: ignore[misc]
+        sample_times, values = known(log, name)
         total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(sample_times))])
         return np.diff(np.interp(time, sample_times, total)) / length
 
@@ -238,10 +241,10 @@ def _electric(log: Log, kind: str) -> list[Finding]:
     if limits is None:
         return []
     time = np.linspace(*limits, 500)
-    data = {c: tuple(at(log, d[c], time) for d in (voltage, current, speed)) for c in corners}
+    data = {c: _Motor(*(known_at(log, d[c], time) for d in (voltage, current, speed))) for c in corners}
     findings = []
     for c in corners:
-        fit = _circuit(*data[c])  # type: ignore[arg-type]
+        fit = _circuit(data[c])
         if fit is None:
             continue
         (resistance, back_emf), (error_r, error_k) = fit
@@ -266,13 +269,21 @@ def _electric(log: Log, kind: str) -> list[Finding]:
                     f"gives a motor of {resistance:.3g} ohm with {voltage[c]} (looks like mA for A); correct its unit",
                 )
             )
-    return findings or _crossed_currents(log, current, data)  # type: ignore[arg-type]
+    return findings or _crossed_currents(log, current, data)
 
 
-def _circuit(voltage: np.ndarray, current: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+class _Motor(NamedTuple):
+    """Voltage, V, current, A, and the joint's speed, rad/s, at common times."""
+
+    voltage: np.ndarray
+    current: np.ndarray
+    speed: np.ndarray
+
+
+def _circuit(motor: _Motor) -> tuple[np.ndarray, np.ndarray] | None:
     """Resistance and back-EMF constant with standard errors; None where current and speed do not tell them apart."""
     # Least squares of V = R I + k omega; where the columns are nearly parallel (a steady drive) nothing can be told.
-    design = np.stack([current, speed], 1)
+    design, voltage = np.stack([motor.current, motor.speed], 1), motor.voltage
     size = np.sqrt(np.mean(design**2, axis=0))
     if not (size > 0.0).all():
         return None
@@ -288,17 +299,17 @@ def _circuit(voltage: np.ndarray, current: np.ndarray, speed: np.ndarray) -> tup
     return coefficients / size, np.sqrt(variance) / size
 
 
-def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, tuple[np.ndarray, ...]]) -> list[Finding]:
+def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, _Motor]) -> list[Finding]:
     def miss(a: str, b: str) -> float:
-        design = np.stack([data[b][1], data[a][2]], 1)
-        return float(np.linalg.norm(data[a][0] - design @ np.linalg.lstsq(design, data[a][0], rcond=None)[0]))
+        design, voltage = np.stack([data[b].current, data[a].speed], 1), data[a].voltage
+        return float(np.linalg.norm(voltage - design @ np.linalg.lstsq(design, voltage, rcond=None)[0]))
 
     findings = []
     corners = list(data)
     for i, a in enumerate(corners):
         for b in corners[i + 1 :]:
             pairs = [(miss(a, a), miss(a, b)), (miss(b, b), miss(b, a))]
-            apart = float(np.sqrt(np.mean((data[a][1] - data[b][1]) ** 2)))
+            apart = float(np.sqrt(np.mean((data[a].current - data[b].current) ** 2)))
             if apart > 5.0 * sigma(log, names[a]) and all(
                 own > MOTOR_LIMITS.crossed * crossed for own, crossed in pairs
             ):
@@ -325,8 +336,8 @@ def _heat(log: Log, kind: str) -> list[Finding]:
             continue
         # Twice a second: heat moves in seconds.
         time = np.arange(*limits, 0.5)
-        power = _average(at(log, current[c], time), 0.5 / 10.0)  # type: ignore[arg-type]
-        apart = at(log, winding[c], time) - at(log, housing[c], time)  # type: ignore[operator]
+        power = _average(known_at(log, current[c], time), 0.5 / 10.0)
+        apart = known_at(log, winding[c], time) - known_at(log, housing[c], time)
         # Twenty seconds, about two time constants of a winding.
         if len(time) < 40:
             continue

@@ -154,7 +154,9 @@ def check_noise(log: Log) -> list[Finding]:
 
 
 def _contradiction(log: Log, name: str, noise: Noise, std: float, correlation: float, independent: float) -> str:
-    values = log.channel(name)[1]  # type: ignore[index]
+    samples = log.channel(name)
+    assert samples is not None, name
+    values = samples[1]
     step = quantum(values)
     # Rounding adds the variance of a uniform error.
     expected = float(np.hypot(noise.std, step / np.sqrt(12.0)))

@@ -14,6 +14,7 @@ from lunar_mjx.logs.log import Log, LogTable
 from lunar_mjx.logs.noise import NOISE_ESTIMATE
 from lunar_mjx.logs.schema import MIRROR, find_channel, is_command, is_quantity, limits
 from lunar_mjx.logs.series import sigma
+from lunar_mjx.model import ZERO_CELSIUS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +115,7 @@ def _kelvin(log: Log, values: np.ndarray) -> str:
     # At the start motors have their surroundings' temperature; later they may be hot.
     start = float(np.median(values[:5]))
     if ambient is not None and ambient < 150.0 and abs(start - ambient) > VALUE_LIMITS.far_from_ambient:
-        hint = " (looks like kelvin)" if abs(start - 273.15 - ambient) < 100.0 else ""
+        hint = " (looks like kelvin)" if abs(start - ZERO_CELSIUS - ambient) < 100.0 else ""
         return (
             f"starts at {start:.4g} degC where the surroundings have {ambient:g} degC{hint}; give degrees Celsius, "
             "or call the column by its unit"

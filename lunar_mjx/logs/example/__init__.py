@@ -10,7 +10,6 @@ from lunar_mjx.logs.write import new_folder
 
 RECORDINGS = Path(__file__).resolve().parent
 """Folder of the recordings, which the map `husky_borealtc` reads, with their licence."""
-DRIVES = ("floor", "sand")
 
 
 def copy_example(folder: str | Path) -> Path:

@@ -40,11 +40,13 @@ def drive_of_bag(recording: Path, mapping: ImportMap) -> RecordedDrive:
             if table.topic != topic:
                 continue
             if name not in clocks:
+                # By the first message and for all: a table that changed its clock half-way would jump.
                 clocks[name] = table.time or _clock(message)
             at = time if clocks[name] == RECORDED else _time(message, clocks[name], mapping, name)
             times[name].append(at)
             rows[name].append([_number(message, c, s, mapping, name) for c, s in wanted[name].items()])
     for name, found in rows.items():
+        # A rate needs two times.
         if len(found) < 2:
             topic = mapping.tables[name].topic
             raise bad_input(
@@ -58,6 +60,7 @@ def drive_of_bag(recording: Path, mapping: ImportMap) -> RecordedDrive:
     tables, settings = {}, {}
     for name, found in rows.items():
         frame = pd.DataFrame(np.array(found), columns=list(wanted[name]))
+        # In whole nanoseconds until here: seconds since 1970 leave a float 0.2 microseconds.
         frame.insert(0, TIME, [1e-9 * (t - origin) for t in times[name]])
         geodetic = mapping.tables[name].geodetic
         if geodetic is not None:
@@ -81,6 +84,7 @@ def _sources(mapping: ImportMap, name: str) -> dict[str, Source]:
 def _clock(message: Any) -> str:
     """The header's stamp where there is one that was set."""
     try:
+        # Drivers that set no stamp leave zero there, which would be 1970.
         return _HEADER if stamp(field(message, _HEADER)) > 0 else RECORDED
     except KeyError:
         return RECORDED
@@ -109,6 +113,7 @@ def _number(message: Any, channel: str, source: Source, mapping: ImportMap, tabl
             raise bad_input(
                 mapping.path, where, term.field, f"is not in the messages: {error.args[0]}", "mend the map"
             ) from None
+        # JSON's null is a gap.
         if value is None:
             return math.nan
         try:

@@ -28,6 +28,7 @@ from lunar_mjx.logs.schema import (
     limits,
     parse_column,
 )
+from lunar_mjx.model import ZERO_CELSIUS
 from lunar_mjx.toml_fields import Fields
 
 LOG_FILE = "log.toml"
@@ -285,7 +286,7 @@ def _environment(fields: Fields) -> tuple[dict[str, float | str], dict[str, str]
             if most := GREATEST_ANGLE.get(key):
                 require_within(fields.path, fields.field(key), values[key], -most, most)
     ambient = values.get("ambient_temperature_degC")
-    if isinstance(ambient, float) and not -273.15 < ambient < 1000.0:
+    if isinstance(ambient, float) and not -ZERO_CELSIUS < ambient < 1000.0:
         raise bad_input(
             fields.path,
             fields.field("ambient_temperature_degC"),

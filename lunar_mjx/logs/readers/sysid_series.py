@@ -52,6 +52,7 @@ def to_time_series(
         if not mine:
             continue
         data = np.column_stack([table.channels[c] for c in mine])
+        # Whole rows: a time series of sysid has one time for all its signals, and no gaps.
         keep = np.isfinite(data).all(axis=1) & np.isfinite(table.time_s)
         if not keep.any():
             raise UserError(f"{table.file}: no row holds all of {', '.join(mine)}; name fewer channels.")
@@ -126,6 +127,7 @@ def from_time_series(
                     )
                 columns[channel] = np.asarray(one.data, float)[:, place]
         tables[table] = pd.DataFrame(columns)
+    # A name that nothing bears is a typing error, by which a channel would be lost without a word.
     for signal in names or ():
         if signal not in used:
             raise bad_input("from_time_series", "names", signal, "is in no series", "leave it out")

@@ -31,7 +31,7 @@ def read_frame(path: Path, what: str) -> pd.DataFrame:
     """
     require_file(path, what)
     if path.suffix.lower() in (".parquet", ".pq"):
-        return _read_parquet(path)
+        return read_parquet(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)  # rows longer than the header
@@ -64,7 +64,12 @@ def cut_row(path: Path, frame: pd.DataFrame) -> tuple[int, str] | None:
     return len(frame) - 1, "is not ended by a new line: it may be half written, and is left out"
 
 
-def _read_parquet(path: Path) -> pd.DataFrame:
+def read_parquet(path: Path) -> pd.DataFrame:
+    """The table of a Parquet file.
+
+    Raises:
+      UserError: pyarrow is not installed, or the file cannot be read.
+    """
     if importlib.util.find_spec("pyarrow") is None:
         raise UserError(f"{path}: a Parquet file needs the package pyarrow; install lunar-mjx[parquet] or save as CSV.")
     try:
@@ -117,7 +122,6 @@ def read_log_table(
     wanted = {column: key for key, column in extra.items()}
     channels: dict[str, np.ndarray] = {}
     columns: dict[str, str] = {}
-    ignored = []
     for column in frame.columns:
         if column == TIME:
             continue
@@ -127,7 +131,6 @@ def read_log_table(
         else:
             found = parse_column(column, str(path))
             if found is None:
-                ignored.append(column)
                 problems.append(
                     Finding(
                         log,
@@ -165,7 +168,6 @@ def read_log_table(
             entry.path, entry.field("clock_offset_std_s"), entry.number("clock_offset_std_s", 0.0), 0.0
         ),
         columns=columns,
-        ignored=tuple(ignored),
         on_change=_flag(entry, "on_change"),
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib.util
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from lunar_mjx.errors import UserError, bad_input, one_line, require_file
+from lunar_mjx.logs.readers.table import read_parquet
 
 SEPARATORS: Mapping[str, str] = {"comma": ",", "semicolon": ";", "tab": "\t", "blank": r"\s+", ",": ",", ";": ";"}
 """Names of separators in a map, and what pandas calls them; `blank` is any run of blanks and tabs."""
@@ -63,7 +63,7 @@ def read_table_file(path: Path, layout: Layout, wanted: Sequence[str] = ()) -> p
     require_file(path, "the recording")
     suffix = path.suffix.lower()
     if suffix in (".parquet", ".pq"):
-        frame = _parquet(path)
+        frame = read_parquet(path)
     elif suffix == ".mat":
         frame = _matlab(path, wanted)
     else:
@@ -146,15 +146,6 @@ def guess_separator(start: str, decimal: str = ".") -> str:
         if typical > most and np.mean(np.array(counts) == typical) > SNIFFING.most_rows:
             best, most = sign, typical
     return best
-
-
-def _parquet(path: Path) -> pd.DataFrame:
-    if importlib.util.find_spec("pyarrow") is None:
-        raise UserError(f"{path}: a Parquet file needs the package pyarrow; install lunar-mjx[parquet] or save as CSV.")
-    try:
-        return pd.read_parquet(path, engine="pyarrow")
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: is not a Parquet table ({error}); save it again, or as CSV.") from None
 
 
 def _matlab(path: Path, wanted: Sequence[str]) -> pd.DataFrame:

@@ -90,6 +90,7 @@ class Recording:
 
     @property
     def instruments(self) -> tuple[Instrument, ...]:
+        """The sensors aboard; those of wheel forces, which few rovers have, where they are asked for."""
         return INSTRUMENTS + (FORCE_SENSORS if self.forces else ())
 
     def noise(self, channels: list[str]) -> dict[str, Noise]:

@@ -91,7 +91,7 @@ def _grid(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> t
 def _pixels(raster: rasterio.DatasetReader, crop: Window | None, west: float, north: float, cell: float) -> PixelWindow:
     """The pixels around a crop, so that a mosaic of gigabytes is not read whole; the exact crop follows later."""
     if crop is None or not (crop.width > 0 and crop.height > 0):
-        return PixelWindow(0, 0, raster.width, raster.height)  # pyright: ignore[reportCallIssue]
+        return PixelWindow.from_slices((0, raster.height), (0, raster.width))
     c0, c1 = ((crop.x + s * crop.width / 2 - west) / cell for s in (-1, 1))
     r0, r1 = ((north - crop.y + s * crop.height / 2) / cell for s in (-1, 1))
     if not (c0 >= -1 and r0 >= -1 and c1 <= raster.width + 1 and r1 <= raster.height + 1):
@@ -106,7 +106,7 @@ def _pixels(raster: rasterio.DatasetReader, crop: Window | None, west: float, no
     # A pixel more on every side, for the exact crop by nodes that follows.
     c0, r0 = max(0, int(c0) - 1), max(0, int(r0) - 1)
     c1, r1 = min(raster.width, int(np.ceil(c1)) + 1), min(raster.height, int(np.ceil(r1)) + 1)
-    return PixelWindow(c0, r0, c1 - c0, r1 - r0)  # pyright: ignore[reportCallIssue]
+    return PixelWindow.from_slices((r0, r1), (c0, c1))
 
 
 def _unit(path: Path, unit: str | None) -> float:

@@ -18,16 +18,12 @@ _WHITE = {"L": 255, "I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I": 65535}
 
 def read_image(path: Path, options: ReadOptions) -> Dem:
     """Reads a grey image of heights; see `read_dem`."""
-    for field, value, meaning in (
-        ("height_scale", options.height_scale, "the height of white above black in m"),
-        ("cell", options.cell, "the pixel's size in m"),
-    ):
-        if value is None:
-            raise bad_input(path, field, None, "leaves the image without a scale", f"{WHERE}, {meaning}")
-    scale = require_finite(path, "height_scale", options.height_scale)  # pyright: ignore[reportArgumentType]
+    scale = _stated(path, "height_scale", options.height_scale, "the height of white above black in m")
+    stated_cell = _stated(path, "cell", options.cell, "the pixel's size in m")
+    scale = require_finite(path, "height_scale", scale)
     if scale <= 0:
         raise bad_input(path, "height_scale", scale, "is not positive", "give the height of white above black in m")
-    cell = require_cell(str(path), "cell", options.cell)  # pyright: ignore[reportArgumentType]
+    cell = require_cell(str(path), "cell", stated_cell)
     levels, white = _levels(path)
     heights = levels * (scale / white)
     notes: tuple[str, ...] = ()
@@ -35,6 +31,12 @@ def read_image(path: Path, options: ReadOptions) -> Dem:
         heights = dequantise(heights, scale / white)
         notes = (f"grey levels of {scale / white:.3g} m smoothed within half a level",)
     return Dem(heights[::-1], cell, 0.0, 0.0, str(path), "black of the image", notes)
+
+
+def _stated(path: Path, field: str, value: float | None, meaning: str) -> float:
+    if value is None:
+        raise bad_input(path, field, None, "leaves the image without a scale", f"{WHERE}, {meaning}")
+    return value
 
 
 def _levels(path: Path) -> tuple[np.ndarray, int]:

@@ -15,7 +15,7 @@ from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.files import appending
 from lunar_mjx.wheel_bed.particles.results import VARIANTS, steady, variant_numerics
 from lunar_mjx.wheel_bed.particles.sand_box import SandBoxes, open_device
-from lunar_mjx.wheel_bed.particles.settings import Numerics, ParticleWheel, Point, Run, Sand, layout, work
+from lunar_mjx.wheel_bed.particles.settings import BedRun, Numerics, ParticleWheel, Point, Sand, layout, work
 
 RUNS_FILE = "runs.jsonl"
 MOST_PARTICLES = {"cpu": 1, "cuda": 4_000_000}
@@ -30,7 +30,7 @@ Progress = Callable[[str, float], None]
 
 def plan(
     wheel: ParticleWheel, sand: Sand, gravity: float, points: Sequence[Point], numerics: Numerics, controls: int = 4
-) -> list[Run]:
+) -> list[BedRun]:
     """All runs of a table: each point, and some of them again with each of `VARIANTS`.
 
     Args:
@@ -41,7 +41,7 @@ def plan(
     """
     if not 0 <= controls <= len(points):
         raise bad_input("particles", "--controls", controls, "is out of range", f"give 0 to {len(points)}")
-    table = [Run(wheel, sand, gravity, p, numerics) for p in points]
+    table = [BedRun(wheel, sand, gravity, p, numerics) for p in points]
     layout(table)  # refuses voxels that do not show the wheel
     # Middles of equal parts of the list, so that neither its first nor its last point stands for all.
     chosen = np.unique(np.round((np.arange(controls) + 0.5) * len(points) / max(controls, 1) - 0.5).astype(int))
@@ -53,10 +53,10 @@ def plan(
     return table + varied
 
 
-def read_plan(data: Sequence[dict[str, Any]]) -> list[Run]:
-    """Runs from plain data: `Run.inputs()` of each, and its `variant`."""
+def read_plan(data: Sequence[dict[str, Any]]) -> list[BedRun]:
+    """Runs from plain data: `BedRun.inputs()` of each, and its `variant`."""
     return [
-        Run(
+        BedRun(
             ParticleWheel(**d["wheel"]),
             Sand(**d["sand"]),
             d["gravity"],
@@ -68,17 +68,17 @@ def read_plan(data: Sequence[dict[str, Any]]) -> list[Run]:
     ]
 
 
-def missing(runs: Sequence[Run], folder: Path) -> list[Run]:
+def missing(runs: Sequence[BedRun], folder: Path) -> list[BedRun]:
     """Runs whose results a folder does not hold."""
     # By key and not by line number: a plan may have grown since.
     have = {r["key"] for r in read_results(folder)}
     return [r for r in runs if r.key not in have]
 
 
-def batches(runs: Sequence[Run], most_particles: int) -> list[list[Run]]:
+def batches(runs: Sequence[BedRun], most_particles: int) -> list[list[BedRun]]:
     """Runs that are computed together: same setting, alike in length, `most_particles` at most where there are two."""
-    out: list[list[Run]] = []
-    groups: dict[Any, list[Run]] = {}
+    out: list[list[BedRun]] = []
+    groups: dict[Any, list[BedRun]] = {}
     for r in runs:
         groups.setdefault(_setting(r), []).append(r)
     for group in groups.values():
@@ -93,7 +93,7 @@ def batches(runs: Sequence[Run], most_particles: int) -> list[list[Run]]:
     return out
 
 
-def _setting(run: Run) -> tuple[Any, ...]:
+def _setting(run: BedRun) -> tuple[Any, ...]:
     """What runs of one batch share."""
     return run.wheel, run.sand, run.gravity, run.numerics
 
@@ -127,7 +127,7 @@ class Outcome:
 
 
 def compute(
-    runs: Sequence[Run],
+    runs: Sequence[BedRun],
     folder: Path,
     device: str = "auto",
     seconds: float = float("inf"),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.wheel_bed.particles.sand_box import Series
-from lunar_mjx.wheel_bed.particles.settings import Numerics, Run
+from lunar_mjx.wheel_bed.particles.settings import BedRun, Numerics
 
 MEASURED = ("drawbar_pull", "side_force", "driving_torque", "sinkage")
 """What a run measures: names as in `wheel_bed.table.QUANTITIES`, and in `Series`."""
@@ -65,7 +65,7 @@ def error_share(variant: str) -> float:
     return 1.0 if variant == "contact" else float(np.sqrt(0.5))
 
 
-def steady(run: Run, series: Series) -> dict[str, Any]:
+def steady(run: BedRun, series: Series) -> dict[str, Any]:
     """Steady values of a run as plain data.
 
     Returns:

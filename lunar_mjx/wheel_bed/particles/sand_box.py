@@ -18,7 +18,7 @@ import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.wheel_bed.particles.mesh import wheel_mesh
-from lunar_mjx.wheel_bed.particles.settings import Layout, Run, Sand, layout
+from lunar_mjx.wheel_bed.particles.settings import BedRun, Layout, Sand, layout
 
 EXTRA = "pip install 'lunar-mjx[particles]'"
 DEVICES = ("auto", "cpu", "cuda")
@@ -195,7 +195,7 @@ class SandBoxes:
     Boxes share nothing but the solver's stopping test.
     """
 
-    def __init__(self, runs: list[Run], device: str):
+    def __init__(self, runs: list[BedRun], device: str):
         import newton
         import warp as wp
 
@@ -257,7 +257,7 @@ class SandBoxes:
         self.solver = self._solver(solver_class, imposed)
         self.start_momentum = self._momentum()
 
-    def _imposed(self, run: Run) -> list[float]:
+    def _imposed(self, run: BedRun) -> list[float]:
         angle = math.radians(run.point.slip_angle)
         mass = run.point.load / run.gravity
         # Of a spring m g/R: the stiffness of sand in which the wheel sinks by its radius under its weight.

@@ -50,6 +50,7 @@ class ParticleWheel:
             require_within("wheel", name, getattr(self, name), SMALLEST_WHEEL, LARGEST_WHEEL)
         require_within("wheel", "grouser_height", self.grouser_height, 0.0, self.radius)
         require_within("wheel", "grouser_count", self.grouser_count, 0, 100)
+        # A count without a height would run as a smooth wheel, and its result be kept as one of a wheel with grousers.
         if (self.grouser_count > 0) != (self.grouser_height > 0.0):
             raise bad_input(
                 "wheel", "grouser_count", self.grouser_count, "and grouser_height do not agree", "give both or neither"
@@ -103,6 +104,7 @@ class Point:
     def __post_init__(self) -> None:
         require_within("point", "normal_load_N", self.load, 1e-3, 1e5)
         require_within("point", "slip_angle_deg", self.slip_angle, -90.0, 90.0)
+        # Refused and not clipped: the digging wheel sinks as long as it is computed, and any number could come out.
         if self.travel < BOX_SIZE.slowest:
             raise bad_input(
                 "point",
@@ -152,7 +154,7 @@ class Numerics:
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
+class BedRun:
     """One wheel in one bed; `variant` says which of the numerics was changed to learn its error."""
 
     wheel: ParticleWheel
@@ -170,6 +172,7 @@ class Run:
     def inputs(self) -> dict[str, Any]:
         """All that decides the result, as plain data."""
         return {
+            # Without `variant`, which is a name: the same numbers under another name are the same run.
             "wheel": dataclasses.asdict(self.wheel),
             "sand": dataclasses.asdict(self.sand),
             "gravity": self.gravity,
@@ -180,6 +183,7 @@ class Run:
     @property
     def speed(self) -> float:
         """The faster of rim and travel speed, m/s."""
+        # From Froude's number and not given: slow enough that inertia does not carry the wheel, fast enough to end.
         return math.sqrt(self.numerics.froude * self.gravity * self.wheel.radius)
 
     @property
@@ -191,11 +195,13 @@ class Run:
     def drive_time(self) -> float:
         """Time for which the wheel moves, s."""
         fast = self.numerics.path * self.wheel.radius / self.speed
+        # A slipping wheel moves its rim far and itself little; the sand before it must be fresh all the same.
         return max(fast, self.numerics.least_travel * self.wheel.radius / (self.speed * self.point.travel))
 
     @property
     def time_step(self) -> float:
         """Time step of the solver, s."""
+        # The fastest surface stays within one voxel's neighbourhood a step, or particles would pass through it.
         return self.numerics.step_share * self.numerics.voxel / self.speed
 
     @property
@@ -211,6 +217,7 @@ class Run:
     @property
     def steps(self) -> int:
         """Time steps of the run."""
+        # Up, so that the last second of driving is whole.
         return math.ceil((self.settle_time + self.ramp_time + self.drive_time) / self.time_step)
 
 
@@ -246,7 +253,7 @@ class Layout:
         return (self.cells[1] + self.gap) * self.voxel
 
 
-def layout(runs: list[Run]) -> Layout:
+def layout(runs: list[BedRun]) -> Layout:
     """The box that serves every one of these runs.
 
     Raises:
@@ -271,14 +278,17 @@ def layout(runs: list[Run]) -> Layout:
             f"is coarser than the grousers' height of {wheel.grouser_height:g} m, which it does not show",
             f"give {wheel.grouser_height:g} m or less",
         )
+    # Grousers shear the sand as far out as they reach: margins count from their tips.
     outer = wheel.radius + wheel.grouser_height
+    # The longest way of all: boxes are alike, so that one grid holds them. The ramp's mean speed is half the full one.
     travel = max(r.speed * r.point.travel * (r.drive_time + 0.5 * r.ramp_time) for r in runs)
     length = travel + 2.0 * BOX_SIZE.margin * outer
     width = wheel.width + 2.0 * BOX_SIZE.margin * outer
+    # A whole number that rounding has pushed up by a digit gets no voxel more.
     cells = tuple(math.ceil(x / voxel - 1e-9) for x in (length, width, BOX_SIZE.margin * outer))
     return Layout((cells[0], cells[1], cells[2]), voxel, first.numerics.per_edge, BOX_SIZE.margin * outer)
 
 
-def work(runs: list[Run]) -> float:
+def work(runs: list[BedRun]) -> float:
     """Particles times time steps of runs that are computed together: what they cost, up to a factor."""
     return float(layout(runs).particles * len(runs) * max(r.steps for r in runs))

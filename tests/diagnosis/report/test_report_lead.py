@@ -35,11 +35,7 @@ def test_a_search_that_was_cut_short_is_to_be_asked_again():
 def test_probabilities_claim_no_more_digits_than_they_have():
     listed = {"slip_sinkage": 0.997, "grousers": 0.0025, "side_wall": 4e-4, "toe": 1e-9}
     table = tables.hypotheses(result("run1", {"probabilities": listed}))[0]
-    assert table.rows == [  # type: ignore[union-attr]
-        ["slip_sinkage", "99.7 %"],
-        ["grousers", "0.25 %"],
-        ["2 others together", "less than 0.1 %"],
-    ]
+    assert table.rows == [["slip_sinkage", "99.7 %"], ["grousers", "0.25 %"], ["2 others together", "less than 0.1 %"]]
 
 
 def test_what_was_named_is_added_by_the_command_that_follows():
@@ -82,7 +78,7 @@ class Named:
 def test_labels_of_the_waterfall_stand_in_places_of_their_own():
     steps = [Named("as given"), Named("refitted"), Named("+ slip_sinkage<br>(proposed)")]
     errors = [Error(v, 0.9 * v, 1.2 * v, 10, 5) for v in (12.8, 8.4, 1.2)]
-    figure = figures.waterfall(steps, errors, [None] * 3, "held-out")  # type: ignore[arg-type]
+    figure = figures.waterfall(steps, errors, [None] * 3, "held-out")
     bars = figure.data[0]
     assert list(bars.x) == [12.8, 8.4, 1.2] and len(set(bars.y)) == 3
     notes = [a for a in figure.layout.annotations if "sigma" in a.text]
@@ -145,7 +141,7 @@ def test_a_value_and_its_deviation_share_their_power_of_ten(value: float, std: f
 def test_what_was_held_against_no_measurement_is_not_told():
     def told(**held) -> list[str]:
         blocks = tables.hypotheses(result("run1", {"details": {"held_out": held}}))
-        return [line for block in blocks for line in block.paragraphs]  # type: ignore[union-attr]
+        return [line for block in blocks for line in block.paragraphs]
 
     assert told(manoeuvres=1, gain=0.0, se=0.0) == []
     (one,) = told(manoeuvres=1, gain=4.0, se=0.0)

@@ -31,7 +31,7 @@ def found(*pairs):
         SimpleNamespace(terms=frozenset(t), effects=frozenset(x.name for x in t if x.kind == EFFECT), **common)
         for t, _ in pairs
     ]
-    return ModelSearch(tuple(hypotheses), np.array([p for _, p in pairs]), 1, (), True)  # type: ignore[arg-type]
+    return ModelSearch(tuple(hypotheses), np.array([p for _, p in pairs]), 1, (), True)
 
 
 @pytest.mark.parametrize(

@@ -235,7 +235,7 @@ def test_tables_of_several_gravities_share_a_run(folder):
     path = folder / "moon" / "log.toml"
     path.write_text("gravity_m_s2 = 1.62\n" + path.read_text().replace("gravity_m_s2 = 9.80665\n", ""))
     run = Run(folder / "run", (folder / "earth", folder / "moon"), make_model("luvmi_x", terrain="flat"))
-    form = build_tables(run, run.campaign(), rivals=False).own  # type: ignore[arg-type]
+    form = build_tables(run, run.campaign(), rivals=False).own
     value, _ = form.predict(np.zeros(len(form.coordinates)))
     half = len(form.data.imposed.slip) // 2
     assert set(form.data.imposed.gravity[:half]) != set(form.data.imposed.gravity[half:])
@@ -258,7 +258,7 @@ def test_a_model_that_an_effect_was_added_to_shares_its_program(folder):
     model = make_model("luvmi_x", terrain="flat", preset="consistent")
     grown = model.add("rolling_resistance", "add", coefficient=0.05)
     first, second = (
-        build_tables(Run(folder / "run", (path,), m), Run(folder / "run", (path,), m).campaign(), rivals=False).own  # type: ignore[arg-type]
+        build_tables(Run(folder / "run", (path,), m), Run(folder / "run", (path,), m).campaign(), rivals=False).own
         for m in (model, grown)
     )
     assert first.program._run is second.program._run

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from lunar_mjx.wheel_bed.particles.sand_box import Series
-from lunar_mjx.wheel_bed.particles.settings import Numerics, ParticleWheel, Point, Run, Sand
+from lunar_mjx.wheel_bed.particles.settings import BedRun, Numerics, ParticleWheel, Point, Sand
 
 WHEEL, SAND, NUMERICS = ParticleWheel(0.1, 0.1), Sand(), Numerics(0.0125)
 POINT = Point(0.2, 0.0, 50.0, 1.0, 0.8)
-RUN = Run(WHEEL, SAND, 9.81, POINT, NUMERICS)
+RUN = BedRun(WHEEL, SAND, 9.81, POINT, NUMERICS)
 
 
-def fake_result(run: Run, **changes: object) -> dict:
+def fake_result(run: BedRun, **changes: object) -> dict:
     """A result as the campaign keeps it, with values that a test can foresee."""
     values = {"drawbar_pull": 5.0, "side_force": 1.0, "driving_torque": 2.0, "sinkage": 0.01}
     values |= {k: v for k, v in changes.items() if k in values}
@@ -26,7 +26,7 @@ def fake_result(run: Run, **changes: object) -> dict:
     return {"key": run.key, "variant": run.variant, **run.inputs(), "values": values, **rest, **timing}
 
 
-def series(run: Run, **values: float) -> Series:
+def series(run: BedRun, **values: float) -> Series:
     """A wheel that does the same in every step."""
     time = run.time_step * np.arange(1, run.steps + 1)
     constant = {"drawbar_pull": 3.0, "side_force": 0.0, "vertical_force": run.point.load, "driving_torque": 1.0}
