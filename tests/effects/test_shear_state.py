@@ -26,7 +26,9 @@ COUNT = 1000
 
 
 @jax.jit
-def _step(dt: Any, v_x: Any, v_y: Any, rim: Any, sinkage: Any, rock: Any, state: Any, damping_time: Any) -> Any:
+def _step(
+    dt: Any, v_x: Any, v_y: Any, rim: Any, sinkage: Any, rock: Any, state: Any, damping_time: Any, relaxation: Any
+) -> Any:
     zero = jnp.zeros_like(v_x)
     nil = Vec3(zero, zero, zero)
     contact = Contact(sinkage, zero, zero, zero, v_x, v_y, rim, nil, nil, nil, zero == 0, zero)
@@ -36,7 +38,7 @@ def _step(dt: Any, v_x: Any, v_y: Any, rim: Any, sinkage: Any, rock: Any, state:
     ctx = bare_context(
         dt=dt, contact=contact, normal=normal, soil=soil, geometry=nominal_geometry(rover_info(RADIUS + zero, zero))
     )
-    parameters = SimpleNamespace(**{**shear_state.nominal(), "damping_time": damping_time})
+    parameters = SimpleNamespace(**{**shear_state.nominal(), "damping_time": damping_time, "relaxation": relaxation})
     first = initial_wheel(contact)
     wheel, new = shear_state.ports["wheel_shear"](ctx, parameters, SimpleNamespace(**state), first)
     return new, (wheel.slip_x, wheel.slip_y, wheel.direction), (first.slip_x, first.slip_y, first.direction)
@@ -69,6 +71,7 @@ def step(
             cast(more.get("rock", 0.0)),
             {k: cast(v) for k, v in state.items()},
             jnp.asarray(more.get("damping_time", 0.1), dtype),
+            jnp.asarray(more.get("relaxation", 1.0), dtype),
         )
         return jax.tree.map(lambda a: np.asarray(a, float), out)
 
@@ -95,6 +98,16 @@ def test_steady_rolling_tends_to_eqs_8_and_11() -> None:
         assert state["direction"] == pytest.approx(np.ones(COUNT), rel=1e-12)
         assert seen[0] == pytest.approx(slip, rel=1e-10, abs=1e-10)
     assert (slip > 0).any() and (slip < 0).any()
+
+
+@pytest.mark.parametrize("relaxation", [0.1, 1.0, 3.0])
+def test_contact_renews_itself_over_its_length_times_the_relaxation(relaxation: float) -> None:
+    """From rest 1 - exp(-1) of the slip is there when a rolling wheel has come that far."""
+    v_x, rim = np.array([0.2]), np.array([0.25])
+    way = relaxation * LENGTH
+    state, _, _ = step(way / 0.25, v_x, 0.0 * v_x, rim, relaxation=relaxation)
+    assert state["slip_x"] == pytest.approx(0.2 * (1.0 - np.exp(-1.0)), rel=1e-9)
+    assert state["direction"] == pytest.approx(1.0 - np.exp(-1.0), rel=1e-9)
 
 
 def test_instantaneous_slip_is_that_of_eqs_8_and_11() -> None:

@@ -145,16 +145,17 @@ def pressure_sinkage(c: Context, p: SimpleNamespace) -> None:
 
 
 def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
-    """L dk/dt = v_slip - V_r k, L the contact length and V_r the larger of |r omega| and |v_x|, exact over a step.
+    """L dk/dt = v_slip - V_r k, exact over a step.
 
-    The force takes k plus `damping_time` times its mean rate, faded by exp(-V_r damping_time/L) when rolling.
+    L is the contact length times `relaxation`, and V_r the larger of |r omega| and |v_x|. The force
+    takes k plus `damping_time` times its mean rate, faded by exp(-V_r damping_time/L) when rolling.
     """
     contact, r = c.contact, c.geometry["radius"]
     theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
     # Plain differences: float64 has digits to spare, and the formula stays the source's.
     length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), CLOSED_FORM.shortest * r)
     # rock has no arc in the ground over which shear could build up: bristles take the place of soil
-    length = np.where(c.soil["rock"] > 0.5, p.rock_length, length)
+    length = np.where(c.soil["rock"] > 0.5, p.rock_length, p.relaxation * length)
     roll = faster(contact["rim_speed"], contact["v_x"])
     speed = np.abs(roll)
     share = speed / length

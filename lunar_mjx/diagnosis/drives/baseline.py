@@ -22,6 +22,11 @@ BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
         "shear_modulus_y": (0.3, 2.0),
     },
     "penalty_contact": {"stiffness": (0.3, 2.0)},
+    # How contact moves from one steady state to the next: choices, of which no test of steady wheels tells anything.
+    "pressure_sinkage": {"damping": (0.3, 2.0)},
+    "stress_integral": {"damping": (0.3, 2.0)},
+    "granular_resistance": {"damping": (0.3, 2.0)},
+    "shear_state": {"damping_time": (0.3, 2.0), "relaxation": (0.3, 2.0)},
     "motor": {
         "resistance": (0.05, 2.0),
         "torque_constant": (0.05, 2.0),

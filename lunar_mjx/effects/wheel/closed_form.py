@@ -198,19 +198,27 @@ def _remembered_slip(x, contact):
         "rolling distance over which contact on rock renews itself",
         "choice: order of the wheel's radius",
     ),
+    relaxation=Parameter(
+        1.0,
+        None,
+        (0.01, 10.0),
+        "1",
+        "rolling distance over which contact on soil renews itself, over the contact length",
+        "choice: one contact length brings fresh soil",
+    ),
 )
 def shear_state(ctx, p, x, wheel):
     """Shear displacement as a state: static friction at standstill, eqs. 8 and 9 when rolling (flaw 4).
 
-    L dk/dt = v_slip - V_r k with V_r = max(|r omega|, |v_x|) and L the contact length (relaxation length model,
-    Bernard & Clover 1995, SAE 950311): k tends to the slip of eq. 8 while rolling, and keeps the displacement of a
-    wheel that stands. The same for (1 - s) tan(beta) of eq. 11, and for the direction in which the contact leans.
-    Integrated exactly over a step, hence stable at any speed.
+    L dk/dt = v_slip - V_r k with V_r = max(|r omega|, |v_x|) and L the contact length times `relaxation` (relaxation
+    length model, Bernard & Clover 1995, SAE 950311): k tends to the slip of eq. 8 while rolling, and keeps the
+    displacement of a wheel that stands. The same for (1 - s) tan(beta) of eq. 11, and for the direction in which the
+    contact leans. Integrated exactly over a step, hence stable at any speed.
     """
     contact = ctx.contact
     rock = ctx.soil.rock > 0.5
     length = jnp.maximum(contact_length(ctx, ctx.normal), CONTACT.shortest * ctx.geometry.radius)
-    length = jnp.where(rock, p.rock_length, length)
+    length = jnp.where(rock, p.rock_length, p.relaxation * length)
     # eq. 8 divides by the faster of rim and hub
     roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
     # share of the way to the steady value, over the time that it would take at the first rate
