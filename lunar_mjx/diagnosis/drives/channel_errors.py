@@ -8,7 +8,6 @@ follow it. As an Ornstein-Uhlenbeck process beside the noise it is as many as it
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -62,19 +61,12 @@ class ChannelErrors:
         Args:
           columns: (n, k) derivatives of the predictions, SI units. residual: (n,) measured less predicted.
         """
-        return self._levels(np.column_stack([columns, residual]), range(len(self._sizes)), self.usual)
-
-    def usual_level(self, columns: np.ndarray, residual: np.ndarray) -> Levels:
-        """Statistics of the fitted observations at the usual size alone; arguments as for `levels`."""
-        return self._levels(np.column_stack([columns, residual]), [int(self.usual[0])], np.zeros_like(self.usual))
-
-    def _levels(self, whole: np.ndarray, tried: Sequence[int], start: np.ndarray) -> Levels:
-        number, grams = self._group[self._fit], []
-        for level in tried:
+        whole, number, grams = np.column_stack([columns, residual]), self._group[self._fit], []
+        for level in range(len(self._sizes)):
             white = self.at(np.full(self._kinds, level)).whiten(whole)[self._fit]
             grams.append(Gram.of(white[:, :-1], white[:, -1], number, self._kinds))
         matrix = np.stack([g.matrix for g in grams])
-        return Levels(grams[0].count, matrix, self.log_scale[list(tried)], self.log_prior[list(tried)], start)
+        return Levels(grams[0].count, matrix, self.log_scale, self.log_prior, self.usual)
 
 
 def spread(observations: Observations) -> dict[str, float]:

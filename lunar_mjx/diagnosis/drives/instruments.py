@@ -36,15 +36,23 @@ class UsualErrors:
     """Usual error between the clocks of kinds of channels, s: a quarter of a sampling interval of 50 Hz."""
     jitter_s: float = 0.005
     """Usual scatter of the times of single readings and commands, s: a period of a control loop of 200 Hz."""
-    usual_scale: float = 0.01
-    """Usual error of the scale of inertial sensors, currents, voltages and torques."""
 
 
 USUAL_ERRORS = UsualErrors()
 
 USUAL_ZERO = {"gyro": 0.002, "accelerometer": 0.02}
 """Usual bias of an inertial sensor by the first word of its channels, rad/s and m/s2: a MEMS unit's over a day."""
-_SCALED = ("gyro", "accelerometer", "motor")
+USUAL_SCALE = {
+    "gyro": 0.01,
+    "accelerometer": 0.01,
+    "motor": 0.01,
+    "position": 0.01,
+    "world": 0.01,
+    "body": 0.01,
+    "wheel": 0.05,
+}
+"""Usual error of an instrument's scale by the first word of its channels: 1 %, and 5 % of what a camera sees of a rim
+in the soil, whose surface is rough. Angles of joints are counted, and have none."""
 _VECTORS = {"gyro": "gyro_{}_rad_s", "accelerometer": "accelerometer_{}_m_s2"}
 
 
@@ -155,10 +163,13 @@ def usual_errors(observations: Observations, predicted: np.ndarray, rate: np.nda
         word, part = s.channel.partition("_")[0], slice(s.start, s.stop)
         if word in USUAL_ZERO:
             add(f"{word}: zero {s.channel}", part, USUAL_ZERO[word])
-        if word in _SCALED:
-            kind = word if word in USUAL_ZERO else f"{word} {s.channel.rpartition('_')[2]}"
-            # Of the prediction: measured values would bring their noise into the column, and it would fit that.
-            add(f"{kind}: scale", part, USUAL_ERRORS.usual_scale * predicted[part])
+        if word in USUAL_SCALE:
+            # motors and wheels have channels of several quantities, which their last word tells
+            kind = f"{word} {s.channel.rpartition('_')[2]}" if word in ("motor", "wheel") else word
+            # Of the prediction: measured values would bring their noise into the column, and it would fit that. Of a
+            # position it is the way from the start, which odometry measures.
+            since = predicted[part] - predicted[s.start] if word == "position" else predicted[part]
+            add(f"{kind}: scale", part, USUAL_SCALE[word] * since)
         if s.time is not None and s.stop - s.start > 2:
             # A late reading shows what was there before, hence the sign.
             add(f"clock {family(s.channel) or word}: late", part, -USUAL_ERRORS.usual_clock_s * rate[part])

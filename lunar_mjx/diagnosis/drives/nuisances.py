@@ -63,7 +63,7 @@ def standing_shows(change: np.ndarray, number: int, observations: Observations) 
 def step_error_share() -> Coordinate:
     """How much of the step's error all logs contain: all where a rover was measured, nothing where steps of the same
     length recorded it."""
-    return Coordinate(NUISANCE, STEP_ERROR, 0.0, 1.0, -2.0, 2.0, prior=0.5, centre=0.5, physical=True)
+    return Coordinate(NUISANCE, STEP_ERROR, 0.0, 1.0, 0.0, 1.0, prior=0.5, centre=0.5, physical=True)
 
 
 def reads_before_share() -> Coordinate:

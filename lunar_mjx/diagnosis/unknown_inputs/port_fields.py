@@ -47,6 +47,10 @@ SHARES: Mapping[str, float] = {
 """Of the fields whose size is not that of a gain; the others are gains."""
 
 
+DRAWBAR = 0.1
+"""Drawbar pull that is usual, over the load."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Usual:
     """What is usual on a rover, SI units: load of a wheel, its radius, its speed in rad/s, torque and current of its
@@ -60,6 +64,12 @@ class Usual:
     resistance: float
     weight: float
     half_base: float
+
+    @property
+    def amounts(self) -> Mapping[str, float]:
+        """What an effect of usual size amounts to on this rover, by its unit: a joint's friction takes the torque, or
+        at usual speed the damping, of a drawbar pull of a tenth of the load; forces are a tenth of a wheel's load."""
+        return {"N m": self.torque, "N m s/rad": self.torque / self.speed, "N": DRAWBAR * self.load}
 
     def size(self, label: str, quantity: str) -> float:
         """Amplitude, in the unit of an unknown input, of a field of size 1 that follows a quantity."""

@@ -6,7 +6,14 @@ import dataclasses
 
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS, USUAL_ZERO, usual_errors, usual_kind, usual_nuisances
+from lunar_mjx.diagnosis.drives.instruments import (
+    USUAL_ERRORS,
+    USUAL_SCALE,
+    USUAL_ZERO,
+    usual_errors,
+    usual_kind,
+    usual_nuisances,
+)
 from lunar_mjx.diagnosis.drives.observations import with_jitter
 from tests.inference.toy_problem import manoeuvres
 
@@ -23,13 +30,15 @@ def test_each_kind_of_instrument_errs_in_its_own_way():
     found = usual_errors(observations, rise, np.repeat([1.0, 2.0, 3.0, 4.0], 50))
     kinds = [usual_kind(c) for c in usual_nuisances(observations)]
     assert len(kinds) == len(found)
-    assert set(kinds) == {"gyro", "motor A", "clock imu", "clock electrical", "clock odometry"}
+    assert set(kinds) == {"gyro", "motor A", "position", "clock imu", "clock electrical", "clock odometry"}
     zero, scale = found["gyro: zero gyro_z_rad_s"], found["gyro: scale"]
     assert not zero[50:].any() and not scale[50:].any()
     np.testing.assert_allclose(zero[:50], USUAL_ZERO["gyro"])
-    np.testing.assert_allclose(scale[:50], USUAL_ERRORS.usual_scale * rise[:50])
+    np.testing.assert_allclose(scale[:50], USUAL_SCALE["gyro"] * rise[:50])
     current = found["motor A: scale"]
-    np.testing.assert_allclose(current[50:150], USUAL_ERRORS.usual_scale * rise[50:150])  # one scale of all motors
+    np.testing.assert_allclose(current[50:150], USUAL_SCALE["motor"] * rise[50:150])  # one scale of all motors
+    way = found["position: scale"]
+    np.testing.assert_allclose(way[150:], USUAL_SCALE["position"] * (rise[150:] - rise[150]))
     np.testing.assert_allclose(
         found["clock electrical: late"], -USUAL_ERRORS.usual_clock_s * np.repeat([0.0, 2.0, 3.0, 0.0], 50)
     )
