@@ -5,7 +5,7 @@ All of it is pure JAX, so that derivatives reach the measured channels. The time
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -61,6 +61,29 @@ def joint_channels(rover: Rover) -> list[str]:
             if joint is not None:
                 names[joint] = joint if joint in names else f"{wheel.corner}_{kind}"
     return [names.get(joint, joint) for joint in rover.joints]
+
+
+def side_channels(rover: Rover) -> dict[str, tuple[str, ...]]:
+    """Channels of sides that one motor drives, by name, and those of their wheels whose sum (currents) or mean
+    (speeds, angles) they are; none of a rover whose motors drive a wheel each."""
+    names, found = dict(zip(rover.joints, joint_channels(rover), strict=True)), {}
+    for group in rover.drive_groups:
+        wheels = [names[j] for j in group.joints]
+        side = {"l": "left", "r": "right"}.get(wheels[0][0])
+        if side is None or any(w[0] != wheels[0][0] for w in wheels):
+            continue
+        for pattern in ("motor_{}_drive_current_A", "joint_{}_drive_speed_rad_s", "joint_{}_drive_angle_rad"):
+            found[pattern.format(side)] = tuple(pattern.replace("_drive", "").format(w) for w in wheels)
+    return found
+
+
+def with_sides(rover: Rover, channels: Mapping[str, Any]) -> dict[str, Any]:
+    """Channels of all wheels, and of sides that one motor drives."""
+    out = dict(channels)
+    for name, wheels in side_channels(rover).items():
+        total = sum(channels[w] for w in wheels)
+        out[name] = total if name.startswith("motor") else total / len(wheels)  # one motor's currents add up
+    return out
 
 
 def observe(

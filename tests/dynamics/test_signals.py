@@ -11,7 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.dynamics.signals import Signals, apply_sensors, measure, observe, sample_signals, sensor_context
+from lunar_mjx.dynamics.signals import (
+    Signals,
+    apply_sensors,
+    measure,
+    observe,
+    sample_signals,
+    sensor_context,
+    side_channels,
+    with_sides,
+)
 from lunar_mjx.dynamics.state import Ambient, Params, Telemetry
 from lunar_mjx.effects import Parameter, StateVariable, effect
 from lunar_mjx.effects.base import Effect
@@ -234,3 +243,21 @@ def test_sampling_of_a_batch() -> None:
         signals = Signals(times, {"position_x_m": np.stack([TIMES**2, 3.0 * TIMES])})
         got = np.asarray(sample_signals(signals, "position_x_m", np.array([[1.0, 1.5], [2.5, 4.0]])))
     assert got == pytest.approx(np.array([[1.0, 2.25], [4.5, 9.0]]), abs=1e-3)
+
+
+def test_the_motor_of_a_side_draws_what_its_wheels_do_and_turns_as_they_do() -> None:
+    husky = load_rover("husky")
+    wheels = {
+        f"{kind}_{c}_drive_{unit}": np.array([value])
+        for kind, unit, values in (
+            ("motor", "current_A", (1.0, 10.0, 2.0, 20.0)),
+            ("joint", "speed_rad_s", (3.0, 5.0, 3.0, 5.0)),
+            ("joint", "angle_rad", (0.1, 0.2, 0.1, 0.2)),
+        )
+        for c, value in zip(("lf", "rf", "lr", "rr"), values, strict=True)
+    }
+    seen = with_sides(husky, wheels)
+    assert set(seen) - set(wheels) == set(side_channels(husky))
+    assert seen["motor_left_drive_current_A"] == 3.0 and seen["motor_right_drive_current_A"] == 30.0
+    assert seen["joint_left_drive_speed_rad_s"] == 3.0 and seen["joint_right_drive_angle_rad"] == 0.2
+    assert not side_channels(load_rover("viper"))

@@ -19,10 +19,12 @@ from lunar_mjx.diagnosis.drives.observations import with_jitter
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.simulation.program import cores
+from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import POSE
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
-from lunar_mjx.diagnosis.unknown_inputs.port_fields import SHARES, WORDS, Usual, rotation
+from lunar_mjx.diagnosis.unknown_inputs.port_fields import DRAWBAR, SHARES, WORDS, Usual, rotation
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
 from lunar_mjx.effects.sensor.channels import family
+from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import (
     Amplitudes,
@@ -32,6 +34,7 @@ from lunar_mjx.inference.evidence import (
     Gram,
     Levels,
     NoiseSize,
+    infer,
     infer_levels,
 )
 from lunar_mjx.inference.fitting import Progress, silent
@@ -41,6 +44,8 @@ from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Re
 OWN_FORM = "the model"
 USUAL_EFFECTS = "effects of usual size"
 """The field of all effects that no hypothesis names: every rover has a little of each."""
+GROUND = "height of the ground"
+"""The field of ground that nobody mapped, in wheel radii."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,11 +105,13 @@ class DriveForm(MeasuredForm):
             *(Term(e, EFFECT, settings.effect_log_odds) for e in self.candidates),
             *(Term(label, UNLISTED, settings.unlisted_log_odds) for label in labels),
         )
+        usual = self._usual = usual_of(drives)
         # (coordinates,) prior standard deviations: shapes of candidates keep their own
         self._std = np.array([c.prior for c in self.coordinates])
         for places in self.candidates.values():
-            self._std[[i for i in places if self.coordinates[i].amplitude]] = settings.effect_size
-        usual = usual_of(drives)
+            for i in places:
+                if self.coordinates[i].amplitude:
+                    self._std[i] = self.effect_size(self.coordinates[i])
         self._size = np.array([usual.size(label, q) for label in labels for q in FOLLOWS[label]])
         families = [family(s.channel) or s.channel for s in self.observations.series]
         self.noise_names = tuple(dict.fromkeys(families))
@@ -113,7 +120,8 @@ class DriveForm(MeasuredForm):
             self._group[s.start : s.stop] = self.noise_names.index(name)
         self._fit = self.observations.in_split("fit")
         self._seen: np.ndarray | None = None  # (n, coordinates + inputs) derivatives at the base, SI
-        self._fields: tuple[np.ndarray, np.ndarray] | None = None  # (n, m) SI columns at size 1, (m,) field of each
+        # (n, m) SI columns at size 1, (m,) field of each; the last ones are those of the ground
+        self._fields: tuple[np.ndarray, np.ndarray] | None = None
         self.jitter_s = USUAL_ERRORS.jitter_s
         kinds = [usual_kind(c) for c in self.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
@@ -121,6 +129,7 @@ class DriveForm(MeasuredForm):
         self._sizes: tuple[np.ndarray, np.ndarray] | None = None
         self.channel_errors: Mapping[str, float] = {}
         self.start = self.origin()  # where the first refit begins
+        self._ground = np.zeros(len(drives.ground))  # amounts of its modes, where the model as it is was refitted
 
     @property
     def parts(self) -> list[list[str]]:
@@ -164,7 +173,10 @@ class DriveForm(MeasuredForm):
         """
         count = len(self.coordinates)
         seen = np.zeros((len(self.observations), count + len(self._inputs)))
-        parts = self.parts
+        parts, ground = self.parts, self.drives.ground
+        if len(ground):
+            self.progress("signatures of unmapped ground", 0.0)
+            seen[:, ground] = self.jacobian(u, ground)[1]
         self.progress("signatures of unknown inputs", 0.0)
         # to first order in inputs of a hundredth of what is usual
         scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])
@@ -187,10 +199,14 @@ class DriveForm(MeasuredForm):
             self.skipped = tuple(name for late in pool.map(take, parts) for name in late)
         self._seen = seen
 
+    def effect_size(self, c: Coordinate) -> float:
+        """See `MeasuredForm`: nominal sizes are a small rover's; a larger one's forces and torques are larger."""
+        return self.settings.effect_size * max(1.0, self._usual.amounts.get(c.unit, 0.0) / abs(c.scale))
+
     def _secant(self, i: int) -> float:
         """Amount of a candidate's amplitude over which its signature is taken."""
         low, high = self.coordinates[i].bounds()
-        step = self.settings.secant if high > 0.0 else -self.settings.secant
+        step = self.settings.secant * self._std[i] * (1.0 if high > 0.0 else -1.0)
         return float(np.clip(step, 0.5 * low, 0.5 * high))
 
     def _changes(self, u: np.ndarray, which: Sequence[int] | np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -229,7 +245,17 @@ class DriveForm(MeasuredForm):
         turned = whole @ rotation(observations.whiten(whole), settings.least_length / settings.usual_effect)
         columns.append(turned)
         number.append(np.full(turned.shape[1], len(self.words)))
+        columns.append(self._seen[:, self.drives.ground])
+        number.append(np.full(len(self.drives.ground), len(self.words) + 1))
         return np.column_stack(columns), np.concatenate(number)
+
+    def _centre(self, u: np.ndarray) -> np.ndarray:
+        """(m,) prior mean of the amplitudes of all fields, relative to a place: the ground has been moved to there."""
+        assert self._fields is not None
+        ground = self.drives.ground
+        mean = np.zeros(len(self._fields[1]))
+        mean[len(mean) - len(ground) :] = -u[ground]
+        return mean
 
     def _columns(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives (n, k) by all that hypotheses hold, and residuals (n,), SI units, around a place (coordinates,).
@@ -257,6 +283,7 @@ class DriveForm(MeasuredForm):
         mean[:count] = [c.centre for c in self.coordinates]
         # Amplitudes are counted from the refit: the prior's centre lies at its distance from there.
         mean[:count] -= u
+        mean[count:] = self._centre(u)
         for places in self.candidates.values():
             at[places] = u[places]
             for i in places:
@@ -331,6 +358,7 @@ class DriveForm(MeasuredForm):
         given = start if start is not None else None if near is None else near.u
         if given is not None:
             u[free] = given[free]
+        u[self.drives.ground] = self._ground
         low, high = self.drives.bounds(free)
         u[free] = np.clip(u[free], low + 1e-9, high - 1e-9)
         if self._seen is None:
@@ -366,19 +394,17 @@ class DriveForm(MeasuredForm):
         always = np.concatenate([self.baseline, np.arange(count, columns.shape[1])]).astype(int)
         std = np.concatenate([self._std, np.ones(len(number))])[always]
         field = np.concatenate([np.full(count, -1), number])[always]
-        mean = np.zeros(len(always))
-        mean[: len(self.baseline)] = [self.coordinates[i].centre - u[i] for i in self.baseline]
-        prior, columns = Amplitudes(std, field, mean), columns[:, always]
+        own = [self.coordinates[i].centre - u[i] for i in self.baseline]
+        prior, columns = Amplitudes(std, field, np.concatenate([own, self._centre(u)])), columns[:, always]
 
         def found(levels: Levels) -> Evidence:
             return infer_levels(levels, prior, self._usual_fields(), self._noise_sizes(), self._sizes)
 
         made = {s: self._errors_with(s) for s in self.settings.jitters_s}
-        # Scatters are compared at the usual errors alone: each pair of the two would whiten all columns once more.
-        value = {s: found(e.usual_level(columns, residual)).log_evidence for s, e in made.items()}
-        self.jitter_s = max(value, key=lambda s: value[s])
-        errors = made[self.jitter_s]
-        levels = found(errors.levels(columns, residual)).levels
+        # Each scatter with the errors that go best with it: at the usual ones a scatter stands for their being larger.
+        tried = {s: found(e.levels(columns, residual)) for s, e in made.items()}
+        self.jitter_s = max(tried, key=lambda s: tried[s].log_evidence)
+        errors, levels = made[self.jitter_s], tried[self.jitter_s].levels
         assert levels is not None
         self.observations, self.channel_errors = errors.at(levels), errors.shares(levels)
 
@@ -388,9 +414,10 @@ class DriveForm(MeasuredForm):
         return ChannelErrors(seen, self._group, len(self.noise_names), self.settings)
 
     def _usual_fields(self) -> tuple[Field, ...]:
-        """What is usual: discrepancy at every port, and a little of every effect."""
+        """What is usual: discrepancy at every port, a little of every effect, and ground that nobody mapped."""
         ports = (Field(label, self.settings.usual_discrepancy) for label in self.words)
-        return *ports, Field(USUAL_EFFECTS, self.settings.usual_effect)
+        ground = [Field(GROUND, self.settings.usual_ground)] if len(self.drives.ground) else []
+        return *ports, Field(USUAL_EFFECTS, self.settings.usual_effect), *ground
 
     def _noise_sizes(self) -> tuple[NoiseSize, ...]:
         return tuple(NoiseSize(name, self.settings.stated_spread) for name in self.noise_names)
@@ -420,7 +447,11 @@ class DriveForm(MeasuredForm):
         # and a descent that moves everything at once follows them into soil that nothing brings it back from.
         nuisances = free[[self.coordinates[i].nuisance for i in free]]
         u, _ = self._descend(self.start, nuisances, noisy)
-        u, slopes = self._descend(u, free, noisy)
+        # Ground before soil: waves that nobody mapped cost a rover more torque than a few per cent of the soil's
+        # constants do, which would follow them.
+        u = self._find_ground(u, free, noisy)
+        u, slopes = self._descend(u, free, noisy, self._sizes)
+        u = self._find_ground(u, free, noisy)
         if drives.noise_unlearnt:
             drives.learn_noise(self._whole(u))
         self._see(u)
@@ -429,9 +460,43 @@ class DriveForm(MeasuredForm):
         self.observations = errors.at(errors.usual)
         self._fields = self._field_columns(self.observations)
         self._slopes[frozenset()] = free, slopes
-        usual = [self.settings.usual_discrepancy] * len(self.words)
-        self._sizes = np.array([*usual, self.settings.usual_effect]), np.ones(len(self.noise_names))
+        self._sizes = np.array([f.usual for f in self._usual_fields()]), np.ones(len(self.noise_names))
+        self._ground = u[drives.ground]
         return u
+
+    def _find_ground(self, u: np.ndarray, free: np.ndarray, observations: Observations) -> np.ndarray:
+        """A place (coordinates,) with the most probable ground by a linear model around it; its size is inferred.
+
+        Of drives that are held out nothing counts but pose: their ground is mapped, not fitted.
+
+        Args:
+          u: the place. free: what else may move, and is not moved. observations: with the channels' errors.
+        """
+        ground = self.drives.ground
+        if not len(ground):
+            return u
+        self.progress("ground that nobody mapped", 0.0)
+        value, slopes = self.jacobian(u, np.concatenate([free, ground]))
+        pose = np.zeros(len(observations), bool)
+        for s in observations.series:
+            pose[s.start : s.stop] = s.channel in POSE
+        rows, kinds = self._fit | pose, len(self.noise_names)
+        columns = observations.whiten(slopes)[rows]
+        residual = observations.whiten(observations.value - value)[rows]
+        field = np.concatenate([np.full(len(free), -1), np.zeros(len(ground), int)])
+        std = np.concatenate([self._std[free], np.ones(len(ground))])
+        mean = np.array([self.coordinates[i].centre - u[i] for i in [*free, *ground]])
+        usual = Field(GROUND, self.settings.usual_ground)
+        gram = Gram.of(columns, residual, self._group[rows], kinds)
+        found = infer(gram, Amplitudes(std, field, mean), (usual,), self._noise_sizes())
+        low, high = self.drives.bounds(ground)
+        out = u.copy()
+        out[ground] = np.clip(u[ground] + found.mean[len(free) :], low, high)
+        self._fields = slopes[:, len(free) :], np.full(len(ground), len(self.words) + 1)
+        sizes = np.array([f.usual for f in self._usual_fields()])
+        sizes[-1] = found.tau[0]
+        self._sizes = sizes, np.ones(len(self.noise_names))
+        return out
 
     def _descend(
         self,
@@ -458,10 +523,12 @@ class DriveForm(MeasuredForm):
         fit, settings = self._fit, self.settings
         noise = np.ones(len(self.noise_names)) if sizes is None else sizes[1]
         weight = 1.0 / noise[self._group[fit]]
-        misfit = np.zeros((int(fit.sum()), 0))
+        misfit, offset = np.zeros((int(fit.sum()), 0)), np.zeros(len(observations))
         if sizes is not None and self._fields is not None:
             columns, number = self._fields
             misfit = observations.whiten(columns)[fit] * sizes[0][number] * weight[:, None]
+            offset = columns @ self._centre(u)
+        wanted = observations.value - offset
         factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
         std = self._std[free]
         centre = np.array([self.coordinates[i].centre for i in free])
@@ -485,7 +552,7 @@ class DriveForm(MeasuredForm):
             value, slopes = self.jacobian(u, free)
         else:
             value = self.predicted(u)
-        residual = white(self.observations.value - value)
+        residual = white(wanted - value)
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
         present_chi2 = chi2(residual, u[free])
@@ -508,7 +575,7 @@ class DriveForm(MeasuredForm):
                     steps = [s * min(1.0, settings.longest_step / max(float(np.abs(s).max()), 1e-300)) for s in steps]
                     rows = np.repeat(u[None], trials, axis=0)
                     rows[:, free] = np.clip(u[free] + steps, low, high)
-                    residuals = [white(self.observations.value - v) for v in self.drives.predict(self._whole(rows))]
+                    residuals = [white(wanted - v) for v in self.drives.predict(self._whole(rows))]
                     reached = [chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
                     best = int(np.argmin(reached))
                     gained = present_chi2 - reached[best]
@@ -590,7 +657,7 @@ def usual_of(drives: DriveProblem) -> Usual:
 
     weight = float(rover.mass) * float(model.gravity)
     load, radius = weight / len(rover.wheels), float(np.mean([w.radius for w in rover.wheels]))
-    torque = 0.1 * load * radius
+    torque = DRAWBAR * load * radius
     current = torque / (own("gear_ratio") * own("gear_efficiency") * own("torque_constant"))
     commands = np.concatenate([r.commands[:, driven].ravel() for r in drives.bench.runs])
     moving = np.abs(commands[np.abs(commands) > 1e-6])

@@ -40,6 +40,7 @@ from lunar_mjx.diagnosis.drives.simulation.log_run import STOOD
 from lunar_mjx.diagnosis.drives.simulation.program import Rows
 from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench, at_once
 from lunar_mjx.diagnosis.drives.simulation.simulated_rows import Key, Simulated, keys_of_rows, stamp_of_observations
+from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import ground_coordinates
 from lunar_mjx.diagnosis.drives.unused import unused_sentence
 from lunar_mjx.diagnosis.effect_coordinates import of_candidate
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS, SMOOTH, amplitude, smooth_inputs
@@ -62,6 +63,7 @@ class DriveProblem:
     Attributes:
       observations: what was measured. coordinates: everything that may move; unknown inputs come last.
       baseline: places of those of the model as it is. candidates: places by effect that may be missing.
+      ground: places of the amounts of modes of ground that nobody mapped.
       effects: the candidates. not_tested: those that cannot enter.
       inputs: places of the amplitudes of unknown inputs that follow quantities of their ports, by label.
       noise_unlearnt: whether the noise's colour is known from rest alone, so that `learn_noise` is to be called.
@@ -117,6 +119,11 @@ class DriveProblem:
             coordinates += instrument_nuisances(number, self.logs[number], self.observations)
         coordinates += usual_nuisances(self.observations)
         self.baseline = np.arange(len(coordinates))
+        radius = float(np.mean([w.radius for w in model.rover.wheels]))
+        for number, run in enumerate(self.bench.runs):
+            if run.ground is not None:
+                coordinates += ground_coordinates(number, run.ground, radius)
+        self.ground = np.arange(len(self.baseline), len(coordinates))
         self.candidates: dict[str, np.ndarray] = {}
         for name, effect in self.effects.items():
             mine = of_candidate(effect)

@@ -18,6 +18,8 @@ class DriveSettings(SearchSettings):
     usual_effect: float = 0.05
     """1; scale of the half-normal prior of what every effect does on any rover, over its nominal size: no rover is free
     of friction, play, delay or a displaced centre of mass, and a name is for what goes beyond that."""
+    usual_ground: float = 0.05
+    """1; scale of the half-normal prior of the heights of ground that nobody mapped, over a wheel's radius."""
     usual_error: float = 0.02
     """1; scale of the half-Cauchy prior of the error that a model's channels have beyond its ports, as a share of what
     a channel does: ground that no map has, play, dynamics that are left out."""

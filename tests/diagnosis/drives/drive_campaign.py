@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from lunar_mjx.logs import write_log
 from lunar_mjx.logs.log import Noise
 from lunar_mjx.model import make_model
 from lunar_mjx.simulate import command_channels
+from lunar_mjx.terrain.heightfield import HeightField
 
-SIGMA = {"position": 0.003, "world": 0.005, "joint": 0.01, "motor": 0.02, "yaw": 0.1}
+SIGMA = {"position": 0.003, "world": 0.005, "joint": 0.01, "motor": 0.02, "yaw": 0.1, "roll": 0.1, "pitch": 0.1}
 INTERVAL, STEP = 0.1, 0.0025
 Profile = Callable[[float], float]
 PROFILES: tuple[Profile, ...] = (
@@ -33,18 +35,22 @@ def drive_campaign(
     noise: float = 1.0,
     forms: Sequence[str] = (),
     encoders_every: int = 1,
+    ground: HeightField | None = None,
 ) -> Path:
     """Writes one log per profile under `folder`: commands, motion, motors, with white noise; returns the folder.
 
     `forms` names effects that take the place of some of the model's. Wheels are read at every so many rows, in a table
-    of their own where that is not each.
+    of their own where that is not each. `ground` is what lies there in truth; the logs say that it is flat, and
+    hold roll and pitch.
     """
     rng = np.random.default_rng(seed)
     model = make_model("luvmi_x", terrain="flat", timestep=STEP)
     for form in forms:
         model = model.add(form)
+    if ground is not None:
+        model = model.replace(terrain=dataclasses.replace(model.terrain, field=ground))
     for number, profile in enumerate(PROFILES):
-        frame = _drive(model, hooks, profile, seconds)
+        frame = _drive(model, hooks, profile, seconds, ground is not None)
         stated = {}
         for channel in [c for c in frame if c != "time_s" and not c.startswith("command")]:
             std = noise * SIGMA[channel.partition("_")[0]]
@@ -69,7 +75,7 @@ def drive_campaign(
     return folder
 
 
-def _drive(model: Any, hooks: Sequence[Hook], profile: Profile, seconds: float) -> pd.DataFrame:
+def _drive(model: Any, hooks: Sequence[Hook], profile: Profile, seconds: float, tilt: bool) -> pd.DataFrame:
     backend = NativeBackend(model, hooks=list(hooks))
     backend.reset()
     names = command_channels(model)
@@ -87,7 +93,12 @@ def _drive(model: Any, hooks: Sequence[Hook], profile: Profile, seconds: float) 
         for k in range(round(INTERVAL / STEP)):
             backend.step(command)
             if k == 0:
-                rows.append(_row(model, names, i * INTERVAL, command[0], backend.observe()))
+                seen = backend.observe()
+                rows.append(_row(model, names, i * INTERVAL, command[0], seen))
+                if tilt:
+                    rows[-1] |= {
+                        f"{a}_deg": float(np.degrees(seen["euler"][0, k])) for k, a in enumerate(("roll", "pitch"))
+                    }
     return pd.DataFrame(rows)
 
 

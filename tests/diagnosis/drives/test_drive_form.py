@@ -15,6 +15,7 @@ from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotation
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import _held_to_account, _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
+from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.deadline import Deadline, TimeUp
 from lunar_mjx.inference.weighing.search import search
 from tests.inference.toy_problem import coordinate, manoeuvres
@@ -35,7 +36,7 @@ class Toy:
         own = [coordinate("base", "a", prior=2.0), coordinate("base", "b", prior=2.0)]
         shown = [coordinate(e, "amount", True, low=-1.0, high=30.0) for e in ("drag", "lag", "idle")]
         self.coordinates = (*own, *shown, *(coordinate("inputs", q, True) for q in FOLLOWS[LABEL]))
-        self.baseline = np.arange(2)
+        self.baseline, self.ground = np.arange(2), np.zeros(0, int)
         self.candidates = {c.effect: np.array([2 + k]) for k, c in enumerate(shown)}
         self.inputs = {LABEL: np.arange(5, len(self.coordinates))}
         self.rows = 0
@@ -152,6 +153,17 @@ def test_fields_are_relative_to_what_is_usual():
     assert USUAL.size("motor_torque", "direction") == pytest.approx(0.4)
     assert USUAL.size("motor_torque", "squared joint speed") == pytest.approx(0.4 * 4.0 / 2.0**2)
     assert USUAL.size("soil: stiffness", "slip") == pytest.approx(1.0)
+
+
+def test_an_effect_is_as_large_as_the_rover_asks_for():
+    """A friction that is usual for a small rover's drives is nothing to those of a large one."""
+    form = DriveForm(Toy({}), DriveSettings())  # type: ignore[arg-type]
+    torque = Coordinate("drag", "torque", 0.0, 0.1, 0.0, 50.0, unit="N m", amplitude=True)
+    assert form.effect_size(torque) == pytest.approx(USUAL.torque / 0.1)
+    assert form.effect_size(dataclasses.replace(torque, scale=10.0)) == 1.0  # never less than is nominal
+    damping = dataclasses.replace(torque, scale=0.01, unit="N m s/rad")
+    assert form.effect_size(damping) == pytest.approx(USUAL.torque / USUAL.speed / 0.01)
+    assert form.effect_size(dataclasses.replace(torque, unit="rad")) == 1.0
 
 
 class Hurried(Toy):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import UnmappedGround, unmapped_ground
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, log_model
@@ -62,6 +63,7 @@ class LogRun:
       motion: `moves`, whether the log begins in motion; then `velocity` (2,) world m/s, `yaw_rate` rad/s and
         `joint_speed` (joint,) rad/s, NaN where unknown.
       imu: how the IMU is mounted.
+      ground: what nobody knows of the ground, where the log names no map.
     """
 
     model: Model
@@ -73,6 +75,7 @@ class LogRun:
     unknown: tuple[str, ...]
     motion: Mapping[str, np.ndarray]
     imu: ImuMounting
+    ground: UnmappedGround | None = None
 
 
 def log_run(log: Log, model: Model) -> LogRun:
@@ -102,7 +105,8 @@ def log_run(log: Log, model: Model) -> LogRun:
     start, unknown = _start(log, own)
     motion = start_motion(log, own, begin, start["yaw"])
     imu = ImuMounting(log.imu.position_m, log.imu.quaternion)
-    return LogRun(own, values, steps_per_command, begin, end, start, unknown, motion, imu)
+    ground = unmapped_ground(log, own)
+    return LogRun(own, values, steps_per_command, begin, end, start, unknown, motion, imu, ground)
 
 
 def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.simulation.log_run import LOG_START, STOOD, ImuMounting, LogRun
+from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import UNMAPPED_GRID, mode_name
 from lunar_mjx.dynamics import System, build
-from lunar_mjx.dynamics.signals import measure
+from lunar_mjx.dynamics.signals import measure, with_sides
 from lunar_mjx.dynamics.state import Params
 from lunar_mjx.inference.coordinates import NUISANCE
 from lunar_mjx.inference.deadline import Deadline
@@ -71,11 +72,17 @@ class Program:
         # One ground for all rovers is not copied for each of them.
         return dataclasses.replace(axes, terrain=None) if shared else axes
 
-    def _reset_all(self, params: Params, start: Mapping[str, Any], terrain: Any, log: Any) -> tuple[Params, Any]:
+    def _reset_all(
+        self, params: Params, start: Mapping[str, Any], terrain: Any, modes: Any, log: Any
+    ) -> tuple[Params, Any]:
         """Parameters with their ground, and states at the start."""
         shared = log is None
         if not shared:
             terrain = jax.tree.map(lambda a: a[log], terrain)
+        if modes is not None:
+            amounts = jnp.stack([start[mode_name(k)] for k in range(modes.shape[1])], axis=-1)
+            heights = terrain.field.heights + jnp.einsum("rk,rkij->rij", amounts, modes[log])
+            terrain = dataclasses.replace(terrain, field=dataclasses.replace(terrain.field, heights=heights))
         params = dataclasses.replace(params, terrain=terrain)
         one = lambda p, s: self.system.reset(p, s["x"], s["y"], s["yaw"], s["temperature"])  # noqa: E731
         return params, jax.vmap(one, (self._axes(params, shared), 0))(params, start)
@@ -91,7 +98,7 @@ class Program:
         def channels(params: Params, seen: Any) -> Any:
             position = self.imu.position if any(self.imu.position) else None
             turn = self.imu.quaternion if any(self.imu.quaternion[1:]) else None
-            measured = measure(self.system, seen, params, position, turn).channels
+            measured = with_sides(self.model.rover, measure(self.system, seen, params, position, turn).channels)
             return jnp.stack([measured[c] for c in self.channels])
 
         return jax.vmap(channels, (self._axes(params, shared), 0))(params, seen)
@@ -122,7 +129,7 @@ class Program:
         self.compiled = True
         with jax.enable_x64(True):
             own, shared = (None, True) if logs.shared else (log, False)
-            full, state = self._reset(params, start, logs.terrain, own)
+            full, state = self._reset(params, start, logs.terrain, logs.modes, own)
             stood = self._stand(full, state, np.zeros_like(commands[:, : self.segment]), start[STOOD], shared)
             # The clock and the heat begin with the log.
             state = dataclasses.replace(stood, step=state.step, temperature=state.temperature)
@@ -182,6 +189,7 @@ class Logs:
       terrain: the ground, with a leading axis of logs unless `shared` by all of them.
       commands: (logs, time, joint), the last ones repeated up to whole pieces.
       motion: (logs, ...) velocities at the start, by name, as in `LogRun`.
+      modes: (logs, modes, rows, cols) of unmapped ground, whose amounts are in `start`; None where all is mapped.
     """
 
     program: Program
@@ -192,6 +200,7 @@ class Logs:
     shared: bool
     commands: np.ndarray
     motion: Mapping[str, np.ndarray]
+    modes: Any
 
     def rovers(self, log: np.ndarray, row: np.ndarray, values: Rows) -> tuple[Params, dict[str, np.ndarray]]:
         """Parameters (but for the ground) and starts of rovers: the logs' conditions with rows of values put in."""
@@ -217,18 +226,29 @@ def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun],
     leaves = [jax.tree.leaves(t) for t in terrains]
     shared = all(np.array_equal(a, b) for other in leaves[1:] for a, b in zip(leaves[0], other, strict=True))
     bare = [dataclasses.replace(p, terrain=None) for p in params]  # type: ignore[arg-type]
+    start = {n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature", STOOD)}
+    grounds = [r.ground.modes for r in runs if r.ground is not None]
+    modes = None
+    if grounds:
+        # all of one number, so that logs of any length share a program: those that a log lacks are level
+        modes = np.zeros((len(runs), UNMAPPED_GRID.modes, *grounds[0].shape[1:]))
+        for place, own in zip(modes, grounds, strict=True):
+            place[: len(own)] = own
+        start |= {mode_name(k): np.zeros(len(runs)) for k in range(UNMAPPED_GRID.modes)}
+        shared = False
     with jax.enable_x64(True):
         ground = terrains[0] if shared else jax.tree.map(lambda *a: np.stack(a), *terrains)
-        ground = jax.device_put(ground)
+        ground, modes = jax.device_put((ground, modes))
     return Logs(
         program=program,
         numbers=tuple(numbers),
         params=jax.tree.map(lambda *a: np.stack(a), *bare),
-        start={n: np.array([r.start[n] for r in runs], float) for n in ("x", "y", "yaw", "temperature", STOOD)},
+        start=start,
         terrain=ground,
         shared=shared,
         commands=np.stack([_padded(r.commands, length) for r in runs]),
         motion={name: np.stack([r.motion[name] for r in runs]) for name in runs[0].motion},
+        modes=modes,
     )
 
 

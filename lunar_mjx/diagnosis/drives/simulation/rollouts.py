@@ -58,7 +58,7 @@ class Bench:
         else:
             runs = [dataclasses.replace(r, model=log_model(log, model)) for r, log in zip(like.runs, logs, strict=True)]
         self.runs = _alike(runs)
-        self.params = [_params(run.model) for run in self.runs]
+        self.params = [_params(run) for run in self.runs]
         self._stacked: list[Logs] | None = None
         self.deadline = Deadline() if like is None else like.deadline
 
@@ -78,7 +78,10 @@ class Bench:
     @functools.cached_property
     def stamp(self) -> tuple[Any, ...]:
         """What all that it simulates depends on beside the rows: programs, and what the logs put into them."""
-        given = [(r.commands, dict(r.start), dict(r.motion), r.begin, r.end, r.every, r.imu) for r in self.runs]
+        given = [
+            (r.commands, dict(r.start), dict(r.motion), r.begin, r.end, r.every, r.imu, r.ground and r.ground.modes)
+            for r in self.runs
+        ]
         return *(logs.program.number for logs in self._groups()), stamp(self.params, given)
 
     def channels(self, number: int) -> list[str]:
@@ -101,6 +104,7 @@ class Bench:
             modes,
             gains,
             shapes,
+            run.ground is not None,
             run.every,
             run.imu,
             wanted,
@@ -263,13 +267,15 @@ def _alike(runs: Sequence[LogRun]) -> list[LogRun]:
     return out
 
 
-def _params(model: Model) -> Params:
+def _params(run: LogRun) -> Params:
     """As `default_params`, in NumPy: a thousand single numbers, none of which is worth a way to a GPU and back.
 
     The terrain has no name, which would make programs of their own.
     """
+    model = run.model
     effects = {e.name: {k: np.asarray(v, float) for k, v in model.parameters[e.name].items()} for e in model.effects}
-    terrain = jax.tree.map(_array, dataclasses.replace(model.terrain, name=""))
+    field = model.terrain.field if run.ground is None else run.ground.field
+    terrain = jax.tree.map(_array, dataclasses.replace(model.terrain, name="", field=field))
     ambient = Ambient(*(np.asarray(v, float) for v in model.ambient))
     sun = jax.tree.map(_array, make_sun(model.sun, model.terrain))
     return Params(np.asarray(model.gravity, float), ambient, effects, terrain, sun)
@@ -281,7 +287,7 @@ def _array(leaf: Any) -> np.ndarray:
 
 
 def _modelled(model: Model) -> frozenset[str]:
-    from lunar_mjx.dynamics.signals import joint_channels
+    from lunar_mjx.dynamics.signals import joint_channels, side_channels
 
     joints, corners = joint_channels(model.rover), [w.corner for w in model.rover.wheels]
     names = [f"position_{a}_m" for a in "xyz"]
@@ -293,6 +299,7 @@ def _modelled(model: Model) -> frozenset[str]:
     for c in corners:
         names += [f"wheel_{c}_sinkage_m", f"wheel_{c}_slip_ratio"]
         names += [f"wheel_{c}_force_{a}_N" for a in "xyz"] + [f"wheel_{c}_moment_{a}_Nm" for a in "xyz"]
+    names += side_channels(model.rover)
     if "bus_droop" in model.effect_names:
         names.append("bus_voltage_V")
     return frozenset(names)
