@@ -205,7 +205,7 @@ REFUSED = {
     "effect in the model": ({"effects": ["motor"]}, ["motor", "in the model already"]),
     "parameter": ({"effects": [("com_offset", {"w": 1.0})]}, ["com_offset.w", "unknown"]),
     "seconds": ({"seconds": -1.0}, ["scale", "positive"]),
-    "bias": ({"recording": Recording(bias={"gyro_q": 1.0})}, ["gyro_q", "not a channel"]),
+    "bias": ({"recording": Recording(bias={"gyro_q": 1.0})}, ["gyro_q", "is no channel"]),
 }
 
 
