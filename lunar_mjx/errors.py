@@ -42,12 +42,20 @@ def bad_input(source: str | Path, field: str, value: Any, problem: str, remedy: 
     return UserError(f"{source}: {field} = {shown} {problem}; {remedy}.")
 
 
+def plain_digits(text: str) -> str:
+    """Returns a text that is to be read as numbers, or raises `ValueError` if it holds an underscore.
+
+    Python reads 1_0 as 10, which is rarely what a hand or a file with a lost blank meant.
+    """
+    if "_" in text:
+        raise ValueError("an underscore")
+    return text
+
+
 def require_finite(source: str | Path, field: str, value: Any) -> float:
     """Returns `value` as a float, or raises `UserError` if it is not a finite number."""
-    if isinstance(value, str) and "_" in value:  # Python reads 1_0 as 10
-        raise bad_input(source, field, value, "is not a number", "write it without underscores")
     try:
-        number = float(value)
+        number = float(plain_digits(value) if isinstance(value, str) else value)
     except OverflowError:
         raise bad_input(source, field, value, "is too large", "give a finite number") from None
     except (TypeError, ValueError):

@@ -10,7 +10,7 @@ from typing import Any
 from lunar_mjx.agents import ddpg, td3
 from lunar_mjx.agents.from_brax import ppo, sac
 from lunar_mjx.agents.learner import TrainConfig
-from lunar_mjx.errors import bad_input
+from lunar_mjx.errors import bad_input, plain_digits
 from lunar_mjx.resources import shipped
 from lunar_mjx.toml_fields import Fields
 
@@ -203,13 +203,14 @@ def _like(old: Any, name: str, value: Any) -> Any:
     if not isinstance(value, str):
         return tuple(value) if isinstance(old, tuple) else value
     try:
-        if "_" in value:  # Python reads 1_0 as 10
-            raise ValueError
         if isinstance(old, bool):
             return {"true": True, "false": False}[value.lower()]
+        if isinstance(old, str):
+            return value
+        plain = plain_digits(value)
         if isinstance(old, tuple):
             kind = type(old[0])
-            return tuple(kind(part) for part in value.split(","))
-        return type(old)(value)
+            return tuple(kind(part) for part in plain.split(","))
+        return type(old)(plain)
     except (KeyError, ValueError):
         raise bad_input("train", name, value, f"is not like {old}", f"write it like {old}") from None

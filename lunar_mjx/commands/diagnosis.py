@@ -12,7 +12,7 @@ import typer
 
 from lunar_mjx.commands.compiled import keep_compiled
 from lunar_mjx.commands.options import MOST_SEED
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, plain_digits
 
 if TYPE_CHECKING:
     from lunar_mjx.diagnosis.runs import Run
@@ -372,15 +372,9 @@ def _with_priors(model: Model, prior: Sequence[str] | None, fix: Sequence[str] |
 
 def _number(option: str, given: str, text: str) -> float:
     try:
-        return _plain(text)
+        return float(plain_digits(text))
     except ValueError:
         raise bad_input("lunar-mjx", option, given, "is not NAME=VALUE+-STD", "give two numbers") from None
-
-
-def _plain(text: str) -> float:
-    if "_" in text:  # Python reads 1_0 as 10
-        raise ValueError
-    return float(text)
 
 
 def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
@@ -402,7 +396,7 @@ def _numbers(option: str, given: Sequence[str] | None) -> dict[str, float]:
     out = {}
     for name, value in _pairs(option, given).items():
         try:
-            out[name] = _plain(value)
+            out[name] = float(plain_digits(value))
         except ValueError:
             raise bad_input("lunar-mjx", option, f"{name}={value}", "is not a number", "give a number") from None
     return out

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from lunar_mjx.commands.options import MOST_SEED
-from lunar_mjx.errors import UserError, bad_input, require_within
+from lunar_mjx.errors import UserError, bad_input, plain_digits, require_within
 
 # Not 1 or 2, which a script could not tell from a crash or a mistake in the call.
 BAD_DATA_STATUS = 10
@@ -315,10 +315,8 @@ def _numbers(option: str, pairs: list[str] | None) -> dict[str, float]:
     for pair in pairs or []:
         name, equals, number = pair.partition("=")
         try:
-            values[name.strip()] = float(number)
+            values[name.strip()] = float(plain_digits(number))
         except ValueError:
-            equals = ""
-        if "_" in number:  # Python reads 1_0 as 10
             equals = ""
         if not equals or not name.strip():
             raise bad_input("lunar-mjx log", option, pair, "is not name=number", "write it as in stiffness=0.5")

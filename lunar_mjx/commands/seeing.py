@@ -11,7 +11,7 @@ import typer
 
 from lunar_mjx.commands.compiled import keep_compiled
 from lunar_mjx.commands.options import MOST_SEED, PresetOption
-from lunar_mjx.errors import bad_input, require_within
+from lunar_mjx.errors import bad_input, plain_digits, require_within
 
 if TYPE_CHECKING:
     from lunar_mjx.viewer.policy_drive import PolicyDrive
@@ -196,9 +196,7 @@ def _policy_drive(name: str, seed: int) -> PolicyDrive:
 def _numbers(option: str, text: str, between: str, kind: type) -> list:
     parts = text.split(between)
     try:
-        if "_" in text:  # Python reads 1_0 as 10
-            raise ValueError
-        return [kind(p) for p in parts] if len(parts) == 2 else _refuse(option, text, between)
+        return [kind(plain_digits(p)) for p in parts] if len(parts) == 2 else _refuse(option, text, between)
     except ValueError:
         return _refuse(option, text, between)
 

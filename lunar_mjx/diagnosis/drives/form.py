@@ -129,6 +129,7 @@ class DriveForm(MeasuredForm):
         self._sizes: tuple[np.ndarray, np.ndarray] | None = None
         self.channel_errors: Mapping[str, float] = {}
         self.start = self.origin()  # where the first refit begins
+        self._number = {f.name: k for k, f in enumerate(self._usual_fields())}  # of each field
         self._ground = np.zeros(len(drives.ground))  # amounts of its modes, where the model as it is was refitted
 
     @property
@@ -244,9 +245,9 @@ class DriveForm(MeasuredForm):
         whole = self._seen[:, small] * self._std[small]
         turned = whole @ rotation(observations.whiten(whole), settings.least_length / settings.usual_effect)
         columns.append(turned)
-        number.append(np.full(turned.shape[1], len(self.words)))
+        number.append(np.full(turned.shape[1], self._number[USUAL_EFFECTS]))
         columns.append(self._seen[:, self.drives.ground])
-        number.append(np.full(len(self.drives.ground), len(self.words) + 1))
+        number.append(np.full(len(self.drives.ground), self._number.get(GROUND, -1)))
         return np.column_stack(columns), np.concatenate(number)
 
     def _centre(self, u: np.ndarray) -> np.ndarray:
@@ -492,9 +493,9 @@ class DriveForm(MeasuredForm):
         low, high = self.drives.bounds(ground)
         out = u.copy()
         out[ground] = np.clip(u[ground] + found.mean[len(free) :], low, high)
-        self._fields = slopes[:, len(free) :], np.full(len(ground), len(self.words) + 1)
+        self._fields = slopes[:, len(free) :], np.full(len(ground), self._number[GROUND])
         sizes = np.array([f.usual for f in self._usual_fields()])
-        sizes[-1] = found.tau[0]
+        sizes[self._number[GROUND]] = found.tau[0]
         self._sizes = sizes, np.ones(len(self.noise_names))
         return out
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input, require_finite, require_within
+from lunar_mjx.errors import UserError, bad_input, plain_digits, require_finite, require_within
 from lunar_mjx.terrain.dem import DEM_LIMITS, Dem, fill_holes, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions
 
@@ -66,10 +66,7 @@ def read_asc(path: Path, options: ReadOptions) -> Dem:
     require_size(str(path), rows, cols)
     try:
         # Line breaks mean nothing: writers wrap rows at any width.
-        text = " ".join(body)
-        if "_" in text:  # Python reads 1_0 as 10
-            raise ValueError("an underscore")
-        numbers = np.array(text.split(), np.float64)
+        numbers = np.array(plain_digits(" ".join(body)).split(), np.float64)
     except ValueError as error:
         raise UserError(f"{path}: heights hold something else than numbers ({error}); repair the file.") from None
     if numbers.size != rows * cols:
