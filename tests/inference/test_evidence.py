@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -168,6 +169,30 @@ def test_sizes_are_found_again():
     )
     assert found.tau[0] == pytest.approx(0.07, rel=0.15)
     assert found.noise[0] == pytest.approx(1.3, rel=0.05)
+
+
+def test_sizes_that_creep_count_as_soon_as_little_is_left(drawn, monkeypatch):
+    columns, residual, group, amplitudes = drawn
+    gram = Gram.of(columns, residual, group, 2)
+    settled = infer(gram, amplitudes, FIELDS, NOISES)
+
+    def after(steps: int) -> evidence.Evidence:
+        fewer = dataclasses.replace(evidence.SIZE_DESCENT, most_steps=steps)
+        monkeypatch.setattr(evidence, "SIZE_DESCENT", fewer)
+        return infer(gram, amplitudes, FIELDS, NOISES)
+
+    with pytest.raises(EvidenceError, match="still promises"):
+        after(1)
+    answers = {}
+    for steps in range(2, 10):
+        try:
+            answers[steps] = after(steps)
+        except EvidenceError:
+            continue
+    first = answers[min(answers)]
+    # it was taken before the sizes had settled, and is what it would have become
+    assert first.settled > evidence.SIZE_DESCENT.settled
+    assert first.log_evidence == pytest.approx(settled.log_evidence, abs=0.02)
 
 
 def test_one_right_parameter_beats_a_field_of_many():
