@@ -16,6 +16,7 @@ from lunar_mjx import cli
 from lunar_mjx.cameras.gl import BACKENDS, context_class
 from lunar_mjx.errors import UserError
 from tests.cli_harness import Result, Run
+from tests.memory import give_back
 
 FAST_COMPILE = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0").lower() in ("1", "true", "yes", "on")
 
@@ -28,6 +29,13 @@ settings.load_profile("any machine")
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """`make test` compiles with few optimisations, which takes half the time; tests marked `optimised` do not."""
     jax.config.update("jax_disable_most_optimizations", FAST_COMPILE and not item.get_closest_marker("optimised"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory() -> Iterator[None]:
+    """Gives memory back between files."""
+    yield
+    give_back()
 
 
 @pytest.fixture
