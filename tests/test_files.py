@@ -4,26 +4,33 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import importlib.util
+import json
 import random
 import re
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 import pytest
 from matplotlib.figure import Figure as Drawing
 
+from lunar_mjx.agents.checkpoint import Checkpoints
 from lunar_mjx.agents.curves import plot_progress
 from lunar_mjx.agents.policy import Policy, save_policy
 from lunar_mjx.agents.record import Record
 from lunar_mjx.diagnosis.runs import save_json
 from lunar_mjx.errors import UserError
 from lunar_mjx.files import appending, replacing
+from lunar_mjx.logs.recorder.particle_bed import write_particle_log
 from lunar_mjx.logs.seal import Answer, write_answer
-from lunar_mjx.logs.write import write_frame
+from lunar_mjx.logs.write import write_frame, write_log
 from lunar_mjx.model import make_model
 from lunar_mjx.model.file import save_model
 from lunar_mjx.report import Figure, Section, write_page
@@ -31,6 +38,9 @@ from lunar_mjx.rover import convert
 from lunar_mjx.terrain import export_mesh, inclined
 from lunar_mjx.visual.encode import writer
 from lunar_mjx.visual.plots import save
+from lunar_mjx.wheel_bed.particles import campaign
+from lunar_mjx.wheel_bed.particles.settings import Point
+from tests.wheel_bed.particles.fakes import NUMERICS, POINT, RUN, SAND, WHEEL, fake_result, series
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "lunar_mjx"
@@ -84,6 +94,7 @@ SMALL_MODEL = make_model("luvmi_x", "flat")
 OUTPUTS: dict[str, Callable[[Path], object]] = {
     "model.toml": lambda p: save_model(SMALL_MODEL, p),
     "drive.csv": lambda p: write_frame(_frame(), p),
+    "drive.parquet": lambda p: write_frame(_frame(), p),
     "run.json": lambda p: save_json(p, {"numbers": list(range(500))}),
     "x.answer.toml": lambda p: write_answer(Answer("log", "0" * 64, 0, "paper", "slope", 1.0, [], {}, "0" * 64), p),
     "policy.npz": _policy,
@@ -100,11 +111,15 @@ OUTPUTS: dict[str, Callable[[Path], object]] = {
 }
 
 
+PARQUET = pytest.param(
+    "drive.parquet",
+    marks=pytest.mark.skipif(importlib.util.find_spec("pyarrow") is None, reason="pyarrow is not installed"),
+)
 LONG_TO_MAKE = [n for n in OUTPUTS if Path(n).suffix in (".png", ".svg", ".gif", ".html")]
 """A tenth of a second each: every fifth size in each run, the others in the slow proofs."""
 
 
-@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize("name", [PARQUET if n == "drive.parquet" else n for n in OUTPUTS])
 def test_a_disk_that_is_full_keeps_the_old_file(name, tmp_path):
     _full_disk(name, tmp_path, 5 if name in LONG_TO_MAKE else 1)
 
@@ -119,16 +134,113 @@ def _full_disk(name: str, tmp_path: Path, every: int) -> None:
     path = tmp_path / name
     OUTPUTS[name](path)
     size, old = path.stat().st_size, b"the old file"
-    draw = random.Random(name)
-    limits = sorted({0, size - 1, *(draw.randrange(size) for _ in range(LIMITS))})[::every]
     path.write_bytes(old)
-    for limit in limits:
+    for limit in _limits(name, size, every):
         with disk_for(limit), pytest.raises(UserError, match=r"cannot be written \(.*\); name a folder") as error:
             OUTPUTS[name](path)
         assert str(path) in str(error.value)
         assert path.read_bytes() == old and [p.name for p in tmp_path.iterdir()] == [name], limit
     OUTPUTS[name](path)
     assert path.stat().st_size >= 0.9 * size
+
+
+def _limits(name: str, size: int, every: int = 1) -> list[int]:
+    """Sizes at which the disk is full: of nothing, of all but the last byte, and between."""
+    draw = random.Random(name)
+    return sorted({0, size - 1, *(draw.randrange(size) for _ in range(LIMITS))})[::every]
+
+
+def _held(folder: Path) -> dict[str, bytes]:
+    """Contents of all files of a folder, by name."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def _bed_results(pull: float) -> list[dict]:
+    points = [Point(s, a, 50.0, 1.0, 1.0 - s) for s in (0.1, 0.3) for a in (0.0, 20.0)]
+    runs = campaign.plan(WHEEL, SAND, 9.81, points, NUMERICS, controls=1)
+    return [fake_result(r, drawbar_pull=pull + r.point.slip_ratio + 0.1 * len(r.variant)) for r in runs]
+
+
+def test_a_disk_that_is_full_keeps_the_old_table_of_a_bed(tmp_path):
+    log = write_particle_log(tmp_path, _bed_results(5.0), "wheel_frame")
+    old = _held(tmp_path)
+    for limit in _limits("table", max(map(len, old.values()))):
+        with disk_for(limit), pytest.raises(UserError, match=r"cannot be written \(.*\); name a folder"):
+            write_particle_log(tmp_path, _bed_results(7.0), "wheel_frame")
+        assert _held(tmp_path) == old and [p.name for p in tmp_path.iterdir()] == [log.name], limit
+    write_particle_log(tmp_path, _bed_results(7.0), "wheel_frame")
+    assert _held(tmp_path) != old
+
+
+def test_a_disk_that_is_full_keeps_the_runs_of_a_bed(tmp_path, monkeypatch):
+    class Boxes:
+        def __init__(self, batch, device):
+            self.batch = batch
+
+        def run(self, going_on):
+            return [series(r) for r in self.batch]
+
+    monkeypatch.setattr(campaign, "open_device", lambda device: "cpu")
+    monkeypatch.setattr(campaign, "SandBoxes", Boxes)
+    path = tmp_path / campaign.RUNS_FILE
+    path.write_text(json.dumps(fake_result(RUN)) + "\n")
+    runs, old = campaign.plan(WHEEL, SAND, 9.81, [POINT], NUMERICS, controls=1), path.read_bytes()
+    campaign.compute(runs, tmp_path)
+    size = path.stat().st_size
+    for limit in _limits("runs", size):
+        path.write_bytes(old)
+        with disk_for(limit), pytest.raises(UserError, match=r"runs\.jsonl: cannot be written"):
+            campaign.compute(runs, tmp_path)
+        kept = path.read_bytes()  # with the batches that still had room
+        assert kept.startswith(old) and kept.endswith(b"\n"), limit
+        assert all(json.loads(line)["key"] for line in kept.splitlines())
+
+
+@pytest.mark.parametrize("parquet", [False, pytest.param(True, marks=PARQUET.marks)])
+def test_a_log_without_room_leaves_nothing_that_stands_in_its_way(parquet, tmp_path):
+    frame = pd.DataFrame({"time_s": np.arange(200) * 0.05, "gyro_z_rad_s": np.sin(np.arange(200.0))})
+    tables = {"imu": frame, "late": frame.rename(columns={"gyro_z_rad_s": "gyro_x_rad_s"})}
+    write_log(tmp_path / "log", tables, rover="luvmi_x", parquet=parquet)
+    size = max(map(len, _held(tmp_path).values()))
+    for limit in _limits("log", size, 10):
+        shutil.rmtree(tmp_path / "log")
+        with disk_for(limit), pytest.raises(UserError, match="cannot be written"):
+            write_log(tmp_path / "log", tables, rover="luvmi_x", parquet=parquet)
+        assert not list(tmp_path.iterdir()), limit
+        write_log(tmp_path / "log", tables, rover="luvmi_x", parquet=parquet)
+
+
+STATE = {"w": jnp.zeros(2000), "b": jnp.zeros(7)}
+"""8 kB: larger than what orbax writes beside it."""
+
+
+def _full_disk_of_checkpoints(folder: Path, every: int) -> None:
+    like = {k: jax.ShapeDtypeStruct(v.shape, v.dtype) for k, v in STATE.items()}
+    value = np.random.default_rng(0).normal(size=2000).astype(np.float32)
+    checkpoints = Checkpoints(folder)
+    checkpoints.save(1, {**STATE, "w": jnp.asarray(value)}, {"epochs": 1})
+    old = _held(folder)
+    size, step = max(map(len, old.values())), 2
+    for limit in _limits("checkpoint", size, every):
+        with disk_for(limit), pytest.raises(UserError, match=f"checkpoint {step} cannot be written .*; make room"):
+            checkpoints.save(step, {**STATE, "w": jnp.asarray(value[::-1])}, {"epochs": step})
+        assert {k: v for k, v in _held(folder).items() if k.startswith("1/")} == old, limit
+        checkpoints.close()
+        checkpoints = Checkpoints(folder)
+        found, notes = checkpoints.newest(like)
+        assert notes["epochs"] == 1 and (np.asarray(found["w"]) == value).all(), limit
+    checkpoints.save(step, STATE, {"epochs": step})
+    assert checkpoints.newest(like)[1]["epochs"] == step
+    checkpoints.close()
+
+
+def test_a_disk_that_is_full_keeps_the_old_checkpoint(tmp_path):
+    _full_disk_of_checkpoints(tmp_path, 10)
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_at_fifty_sizes_keeps_the_old_checkpoint(tmp_path):
+    _full_disk_of_checkpoints(tmp_path, 1)
 
 
 def test_a_rover_is_written_with_all_its_files_or_with_none(tmp_path):

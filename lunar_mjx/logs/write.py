@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib.util
 import re
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +62,13 @@ def write_log(
         _check_frame(name, frame)
     top: dict[str, Any] = {"format": FORMAT, "rover": rover}
     top |= {k: _plain(v) for k, v in settings.items() if v is not None}
-    new_folder(folder)
-    entries = {}
+    entries: dict[str, dict[str, Any]] = {}
     for name, frame in tables.items():
-        file = f"{name}.{'parquet' if parquet else 'csv'}"
-        write_frame(frame, folder / file)
         rate = (rates_hz or {}).get(name) or _rate(frame)
-        entries[name] = {"file": file, **({"rate_hz": round(rate, 6)} if rate else {})}
+        entries[name] = {
+            "file": f"{name}.{'parquet' if parquet else 'csv'}",
+            **({"rate_hz": round(rate, 6)} if rate else {}),
+        }
         if name in on_change:
             entries[name]["on_change"] = True
         if clock_offsets_s is not None and name in clock_offsets_s:
@@ -75,9 +76,12 @@ def write_log(
             entries[name] |= {"clock_offset_s": float(offset), "clock_offset_std_s": float(std)}
     top["tables"] = entries
     top["noise"] = noise_tables(noise or {})
-    write_text(folder / LOG_FILE, tomli_w.dumps(top))
-    # What was written must read back: settings are checked by the reader's rules, and not by a second set of them.
-    _read_back(folder)
+    with _whole(folder):
+        for name, frame in tables.items():
+            write_frame(frame, folder / entries[name]["file"])
+        write_text(folder / LOG_FILE, tomli_w.dumps(top))
+        # What was written must read back: settings are checked by the reader's rules, and not by a second set of them.
+        read_log(folder)
     return folder
 
 
@@ -107,17 +111,19 @@ def write_steady_log(
     top: dict[str, Any] = {"format": FORMAT, "kind": "steady_state", "file": "points.csv"}
     top |= {"slip_definition": slip_definition} | {k: _plain(v) for k, v in settings.items() if v is not None}
     top |= {"wheel": {k: _plain(v) for k, v in wheel.items()}, "noise": noise_tables(noise or {})}
-    new_folder(folder)
-    write_frame(frame, folder / "points.csv")
-    write_text(folder / LOG_FILE, tomli_w.dumps(top))
-    _read_back(folder)
+    with _whole(folder):
+        write_frame(frame, folder / "points.csv")
+        write_text(folder / LOG_FILE, tomli_w.dumps(top))
+        read_log(folder)
     return folder
 
 
-def _read_back(folder: Path) -> None:
-    """Reads what was just written; takes it away where it is refused, so that a better one can be written there."""
+@contextmanager
+def _whole(folder: Path) -> Iterator[None]:
+    """Makes a folder; takes it away where its files are refused or have no room, so that they can be written anew."""
+    new_folder(folder)
     try:
-        read_log(folder)
+        yield
     except UserError:
         shutil.rmtree(folder, ignore_errors=True)
         raise

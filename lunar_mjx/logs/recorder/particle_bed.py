@@ -80,20 +80,14 @@ def write_particle_log(folder: str | Path, results: Sequence[Mapping[str, Any]],
     # Written beside and renamed: a reader never meets half a log.
     log, part = Path(folder) / LOG_FOLDER, Path(folder) / f".{LOG_FOLDER}.part"
     shutil.rmtree(part, ignore_errors=True)
-    write_steady_log(
-        part,
-        frame,
-        wheel={
-            "radius_m": wheel["radius"],
-            "width_m": wheel["width"],
-            "grouser_count": wheel["grouser_count"],
-            "grouser_height_m": wheel["grouser_height"],
-        },
-        slip_definition=slip_definition,
-        noise=noise,
-        gravity_m_s2=first["gravity"],
-        source=source,
-    )
+    sizes = {
+        "radius_m": wheel["radius"],
+        "width_m": wheel["width"],
+        "grouser_count": wheel["grouser_count"],
+        "grouser_height_m": wheel["grouser_height"],
+    }
+    settings = {"wheel": sizes, "slip_definition": slip_definition, "gravity_m_s2": first["gravity"], "source": source}
+    write_steady_log(part, frame, noise=noise, **settings)
     shutil.rmtree(log, ignore_errors=True)
     part.rename(log)
     return log
