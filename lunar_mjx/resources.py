@@ -32,7 +32,8 @@ def find(kind: str, name: str | Path, marker: str) -> Path:
     Raises:
       UserError: no such folder; the sentence lists the shipped names.
     """
-    for folder in (Path(name), shipped(kind) / str(name)):
+    named = isinstance(name, str | Path)
+    for folder in (Path(name), shipped(kind) / str(name)) if named else ():
         if (folder / marker).is_file():
             return folder
     known = ", ".join(sorted(p.parent.name for p in shipped(kind).glob(f"*/{marker}")))

@@ -7,6 +7,8 @@ parameters are the same everywhere, because gradients and observation statistics
 from __future__ import annotations
 
 import dataclasses
+import os
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -31,6 +33,8 @@ with without_warp_notices():
 AXIS = "device"
 EPISODE = ("episode_return", "episode_length", "success")
 """Metrics that every environment gives for episodes that ended."""
+LARGEST_COUNT = 2**31 - 1
+"""1; places in a buffer and steps are counted in 32 bits."""
 MOST_DEVIATIONS = 10.0
 """To which normalised observations are cut."""
 
@@ -74,6 +78,7 @@ class TrainConfig:
         for name in ("envs", "batch", "updates", "buffer_steps", "epoch_steps"):
             if getattr(self, name) < 1:
                 raise bad_input("TrainConfig", name, getattr(self, name), "is below 1", "give at least 1")
+            require_within("TrainConfig", name, getattr(self, name), 1, LARGEST_COUNT)
         for value in self.noise:
             require_within("TrainConfig", "noise", value, 0.0)
         if self.precision not in ("highest", "high", "default"):
@@ -108,6 +113,39 @@ class TrainState:
     guard: guard.Guard
 
 
+def least_memory(env: Environment, config: TrainConfig) -> int:
+    """Bytes that a training takes at least, over all devices: environments, buffer and one batch, in single precision.
+
+    What else a state holds, the networks and what a program needs while it runs come on top.
+    """
+    seen = 2 * (env.observation_size + env.privileged_size)  # of a step and of its successor
+    # Action and reward are numbers, the two ends of an episode truth values of one byte.
+    transition = 4 * (seen + env.action_size + 1) + 2
+    kept = 0 if isinstance(config.algorithm, PPOConfig) else config.buffer_steps
+    return config.envs * (4 * seen + kept * transition) + config.batch * transition
+
+
+def require_memory(env: Environment, config: TrainConfig, devices: Sequence[Any]) -> None:
+    """Raises `UserError` for a training that cannot fit into the memory of its devices, before anything compiles."""
+    mine = [d for d in devices if d.process_index == jax.process_index()]
+    limits: list[Any] = [(d.memory_stats() or {}).get("bytes_limit") for d in mine]
+    if None not in limits:
+        there = sum(limits)
+    elif hasattr(os, "sysconf"):  # devices of a host share its memory
+        there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    else:
+        return
+    needed = least_memory(env, config) * len(mine) / len(devices)
+    if needed > there:
+        raise bad_input(
+            "TrainConfig",
+            "envs, buffer_steps, batch",
+            f"{config.envs}, {config.buffer_steps}, {config.batch}",
+            f"take {needed / 1e9:.0f} GB at least, and there are {there / 1e9:.0f}",
+            "keep fewer steps, or lower the number of environments",
+        )
+
+
 class Learner:
     """Training of one algorithm in one environment over a mesh of devices.
 
@@ -117,8 +155,8 @@ class Learner:
       mesh: devices along the axis `AXIS`; all devices of all processes if None.
 
     Raises:
-      UserError: environments or batch that do not divide among the devices, or for PPO environments among minibatches
-        or an epoch among unrolls.
+      UserError: more than the devices' memory holds, environments or batch that do not divide among them, or for PPO
+        environments among minibatches or an epoch among unrolls.
     """
 
     def __init__(self, env: Environment, config: TrainConfig, mesh: Mesh | None = None):
@@ -134,6 +172,7 @@ class Learner:
                     f"does not divide among {self.devices} devices",
                     "give a multiple",
                 )
+        require_memory(env, config, list(self.mesh.devices.flat))
         algorithm = config.algorithm
         self.agent: Any = AGENTS[type(algorithm)](algorithm, env.observation_size, env.privileged_size, env.action_size)
         shared, own = Spec(), Spec(AXIS)

@@ -139,7 +139,7 @@ def why(
 
     keep_compiled()
     with console_progress() as progress:
-        diagnosis = verbs.why(run, only, progress=progress, seconds=seconds)
+        diagnosis = verbs.why(run, only, progress=progress, seconds=seconds, about=explain)
         # The verdict is written by now: an audit that is broken off loses nothing of it.
         if audit > 0:
             from lunar_mjx.diagnosis.audit import audit as run_audit
@@ -213,6 +213,7 @@ def report(
     dark: DarkOption = False,
 ) -> None:
     """Write one offline page: the error falls."""
+    _check_animation(animation)
     _write_report(runs, out)
     print(out)
     _write_animation(runs, animation, dark)
@@ -231,6 +232,7 @@ def studio(
     from lunar_mjx.diagnosis.studio import studio as make
     from lunar_mjx.report.progress import console_progress
 
+    _check_animation(animation)
     keep_compiled()
     with console_progress() as progress:
         path, left_out = make(run, out, refit, progress)
@@ -314,6 +316,14 @@ def watch(
         print("No alarm: nothing began that is larger than what these drives do anyway.")
     # Of the last alarm, as the verdict of `why` is one: scripts branch on it.
     raise typer.Exit(status)
+
+
+def _check_animation(animation: Path | None) -> None:
+    """Refuses, before a page is written, a file that no animation can be written to."""
+    if animation is not None:
+        from lunar_mjx.diagnosis.report.falling import require_kind
+
+        require_kind(animation)
 
 
 def _write_animation(runs: Sequence[Path], animation: Path | None, dark: bool) -> None:

@@ -190,6 +190,7 @@ def check(
     """Check logs before anything else uses them; exit status 10 where data are unusable."""
     from lunar_mjx.logs import check as check_logs
     from lunar_mjx.logs import read_campaign
+    from lunar_mjx.logs.checks.gate import require_named
     from lunar_mjx.logs.findings import is_bad
 
     # All before any is checked: whether a campaign is long enough is told by its longest log.
@@ -197,6 +198,7 @@ def check(
     constants = _numbers("--slowest", slowest)
     for name, seconds in constants.items():
         require_within("log check", f"--slowest {name}", seconds, 0.0, above=True)
+    require_named(read, constants)
     found = check_logs(read, constants)
     if as_json:
         print(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx._version import __version__
+from lunar_mjx.diagnosis.build_problem import known_logs
 from lunar_mjx.diagnosis.drives.form import DriveForm
 from lunar_mjx.diagnosis.drives.loop import build_drives
 from lunar_mjx.diagnosis.runs import MODEL_FILE, Run, folder_hash, load_run
@@ -71,7 +72,7 @@ def audit(folder: str | Path | Run, seconds: float, progress: Progress = silent)
     stored = run.load(AUDIT_FILE) or {}
     cases: list[dict[str, Any]] = list(stored.get("cases", [])) if stored.get("key") == key else []
     end = time.monotonic() + seconds
-    logs = run.campaign()
+    logs = known_logs(run)
     tables = [log for log in logs if isinstance(log, SteadyLog)]
     if tables:
         simulated = SimulatedTables(run, tables)

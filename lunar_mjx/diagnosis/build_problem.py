@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.drives.windows.coordinates import SUSPECTS
+from lunar_mjx.diagnosis.runs import RUN_FILE, Run
 from lunar_mjx.diagnosis.tables.problem import TableProblem, default_units, points
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
@@ -52,7 +54,26 @@ def candidate_effects(run: Run) -> dict[str, Effect]:
     return candidates
 
 
-def require_splits(splits: Mapping[str, str], logs: Sequence[Any]) -> None:
+def known_logs(run: Run) -> list[Log] | list[SteadyLog]:
+    """The logs of a run that was read back, once what its `run.json` says of logs and effects is found among them.
+
+    Raises:
+      UserError: a split or known error of what the logs do not hold, or an added effect that does not exist.
+    """
+    path, logs = run.folder / RUN_FILE, run.checked[0]
+    require_splits(run.splits, logs, path, "splits")
+    require_discrepancy(run.discrepancy, logs, f"{path}: discrepancy")
+    # What `add` may have added: effects, the user's own too, and what logs with imposed wheel speeds have instead.
+    known = {*candidate_effects(run), *catalogue.CATALOGUE, *run.model.effect_names, *(s.name for s in SUSPECTS)}
+    for name in run.added:
+        if name not in known:
+            raise bad_input(path, "added", name, "is no effect", "correct its name, or compare anew")
+    return logs
+
+
+def require_splits(
+    splits: Mapping[str, str], logs: Sequence[Any], source: str | Path = "compare", field: str = "--split"
+) -> None:
     """Raises `UserError` for a split of a log, or group of points, that is not there."""
     if not splits:
         return
@@ -61,16 +82,14 @@ def require_splits(splits: Mapping[str, str], logs: Sequence[Any]) -> None:
     for name, split in splits.items():
         if name not in names:
             known = ", ".join(dict.fromkeys(names))
-            raise bad_input(
-                "compare", "--split", f"{name}={split}", "names nothing of these logs", f"use one of {known}"
-            )
+            raise bad_input(source, field, f"{name}={split}", "names nothing of these logs", f"use one of {known}")
 
 
 MOST_DISCREPANCY = 1e9
 """SI: beyond every channel's range, and its square is a number."""
 
 
-def require_discrepancy(discrepancy: Mapping[str, float], logs: Sequence[Any]) -> None:
+def require_discrepancy(discrepancy: Mapping[str, float], logs: Sequence[Any], source: str = "--discrepancy") -> None:
     """Raises `UserError` for a known error of the model that is negative, or of a quantity that no table holds.
 
     Channels of drives are looked up where drives are compared: their names may hold `*`.
@@ -78,8 +97,8 @@ def require_discrepancy(discrepancy: Mapping[str, float], logs: Sequence[Any]) -
     known = dict.fromkeys(q for log in logs if isinstance(log, SteadyLog) for q in log.table.measured)
     for name, size in discrepancy.items():
         if known and name not in known:
-            raise bad_input("--discrepancy", "quantity", name, "was not measured", f"use one of {', '.join(known)}")
-        require_within("--discrepancy", name, size, 0.0, MOST_DISCREPANCY)
+            raise bad_input(source, "quantity", name, "was not measured", f"use one of {', '.join(known)}")
+        require_within(source, name, size, 0.0, MOST_DISCREPANCY)
 
 
 def candidates_of(run: Run, only: Sequence[str] | None = None) -> dict[str, Effect]:

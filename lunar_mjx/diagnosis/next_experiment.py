@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis.build_problem import candidate_effects
+from lunar_mjx.diagnosis.build_problem import candidate_effects, known_logs
 from lunar_mjx.diagnosis.drives.form import DriveForm
 from lunar_mjx.diagnosis.drives.loop import build_drives
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
@@ -99,7 +99,7 @@ def next_experiment(
         raise UserError(f"{run.folder}: the verdict is {verdict['verdict']}; mend that before planning a measurement.")
     names = _hypotheses(verdict, between, set(candidate_effects(run)))
     effects = [n for n in names if n != NOTHING]
-    logs = run.campaign()
+    logs = known_logs(run)
     tables = [log for log in logs if isinstance(log, SteadyLog)]
     if tables:
         held = set(run.model.effect_names)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lunar_mjx.diagnosis.build_problem import known_logs
 from lunar_mjx.diagnosis.folder.refits import REFITS_FILE
 from lunar_mjx.diagnosis.report.studio import write_studio
 from lunar_mjx.diagnosis.runs import RUN_FILE, SERIES_FILE, VERDICT_FILE, load_run
@@ -54,7 +55,7 @@ def _stale(folder: Path) -> bool:
 
 def _refit_tables(folder: Path, progress: Progress) -> None:
     run = load_run(folder)
-    logs, _ = run.checked
+    logs = known_logs(run)
     verdict = run.load(VERDICT_FILE)
     if not isinstance(logs[0], SteadyLog) or verdict is None:
         return

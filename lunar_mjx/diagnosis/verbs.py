@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis.build_problem import require_discrepancy, require_splits
+from lunar_mjx.diagnosis import build_problem
+from lunar_mjx.diagnosis.build_problem import candidates_of, known_logs, require_discrepancy, require_splits
 from lunar_mjx.diagnosis.drives.loop import build_drives, grown_drives
+from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.windows import verbs as windows
 from lunar_mjx.diagnosis.folder.refits import write_refits
 from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE, Run, load_run, log_folders
 from lunar_mjx.diagnosis.tables.loop import better_law, build_tables, grown_model
+from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.diagnosis.weighed.form import Problem, SearchSettings
@@ -92,7 +95,14 @@ def _compare(run: Run, progress: Progress) -> Run:
     require_discrepancy(run.discrepancy, campaign)
     # Logs whose wheels moved as measured are compared in windows, each from its measured start.
     if windows.imposed(campaign):
+        # Such fits have sizes of their own, and their errors are learnt: nothing reads what is given here.
+        for option, given in (("--setting", run.settings), ("--discrepancy", run.discrepancy)):
+            for name, value in given.items():
+                problem = "is not for logs with imposed wheel speeds"
+                raise bad_input("compare", option, f"{name}={value}", problem, "leave it out")
         return windows.compare(run, campaign, progress)
+    # Before the folder is made: a mistake leaves nothing behind.
+    (TableSettings if isinstance(campaign[0], SteadyLog) else DriveSettings).of(run.settings)
     run.write()
     # Without candidates: what may be missing is the business of `why`, and would cost compiling here.
     problem = _problem(run, campaign, (), progress)
@@ -160,6 +170,7 @@ def why(
     only: Sequence[str] | None = None,
     progress: Progress = silent,
     seconds: float | None = None,
+    about: str | None = None,
 ) -> Diagnosis:
     """Localises and attributes the misfit of a run; writes `verdict.json`.
 
@@ -167,9 +178,10 @@ def why(
       folder: of the run. only: candidates to consider; all if None. progress: told what is being done.
       seconds: after which the answer is to be there, as far as it is known by then; without, logs with imposed wheel
         speeds have `windows.TELLING.seconds` and others as long as it takes.
+      about: a candidate that the answer will be asked about, see `explain`.
 
     Raises:
-      UserError: the folder is no run.
+      UserError: the folder is no run, or a name is no candidate: before anything is fitted.
     """
     began = time.monotonic()
     run = folder if isinstance(folder, Run) else load_run(folder)
@@ -177,8 +189,12 @@ def why(
         campaign = gate(run)
     except BadData as bad:
         return bad.diagnosis
+    known_logs(run)
     if windows.imposed(campaign):
-        return windows.why(run, campaign, only, windows.TELLING.seconds if seconds is None else seconds, progress)
+        limit = windows.TELLING.seconds if seconds is None else seconds
+        return windows.why(run, campaign, only, limit, progress, about)
+    if about is not None:
+        _require_candidate(about, run, campaign, only)
     problem = _problem(run, campaign, only, progress)
     # Reading and checking count, too: the user's clock began with the command.
     left = math.inf if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
@@ -205,12 +221,30 @@ def why(
     return diagnosis
 
 
+def _require_candidate(name: str, run: Run, logs: Sequence[Any], only: Sequence[str] | None) -> None:
+    """Raises `UserError` for an effect that a verdict on these logs will not speak of."""
+    held = set(run.model.effect_names)
+    if name in held:
+        raise bad_input("why", "--explain", name, "is in the model already", "name an effect that may be missing")
+    if isinstance(logs[0], SteadyLog):
+        known = [n for n in build_problem.candidate_effects(run) if only is None or n in only]
+    else:
+        known = list(candidates_of(run, only))
+    if name not in known:
+        remedy = f"use one of {', '.join(n for n in known if n not in held)}"
+        raise bad_input("why", "--explain", name, "is no candidate here", remedy)
+
+
 def explain(diagnosis: Diagnosis, effect: str) -> Diagnosis:
     """The answer to "is it this effect?": the diagnosis narrowed to one effect.
+
+    Without a fit there is none, and the diagnosis itself says why.
 
     Raises:
       UserError: the diagnosis says nothing about it.
     """
+    if diagnosis.verdict in (Verdict.BAD_DATA, Verdict.BAD_FIT):
+        return diagnosis
     evidence = next((e for e in diagnosis.evidence if e.effect == effect), None)
     if evidence is None:
         refused = {n["effect"]: n["reason"] for n in diagnosis.details.get("not_tested", [])}
@@ -258,6 +292,7 @@ def add(folder: str | Path | Run, effect: str, out: str | Path, progress: Progre
     if Path(out).resolve() == run.folder.resolve():
         raise bad_input("add", "--out", out, "is the run itself, which would be lost", "name another folder")
     campaign = gate(run)
+    known_logs(run)
     if windows.imposed(campaign):
         return windows.add(run, campaign, effect, Path(out), progress)
     from lunar_mjx.effects import catalogue

@@ -86,6 +86,10 @@ def make(name: str, /, **options: Any) -> Environment:
     Raises:
       UserError: no such name, file or maker, options that it does not take, or an object that is no environment.
     """
+    if not isinstance(name, str):
+        raise bad_input(
+            "envs.make", "environment", name, "is no name", f"use {', '.join(names())}, or my_env.py:make_env"
+        )
     vouch(name)
     maker = _from_file(name) if ".py" in name else _by_name(name)
     try:

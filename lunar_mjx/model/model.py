@@ -427,7 +427,7 @@ def _ground(terrain: str | Path | dict[str, Any] | Terrain) -> dict[str, Any]:
     """The attributes `terrain` and `terrain_spec` of a model; a terrain made in Python has no name to save."""
     if isinstance(terrain, Terrain):
         return {"terrain": terrain, "terrain_spec": ""}
-    spec = "" if isinstance(terrain, dict) else settled("terrain", terrain, "terrain.toml")
+    spec = settled("terrain", terrain, "terrain.toml") if isinstance(terrain, str | Path) else ""
     return {"terrain": load_terrain(terrain), "terrain_spec": spec}
 
 

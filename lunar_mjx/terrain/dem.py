@@ -20,12 +20,15 @@ class DemLimits:
 
     most_nodata: float = 0.5
     """A DEM that misses more than this share of its heights is refused."""
-    usual_nodata: tuple[float, ...] = (-9999.0, -99999.0, -32768.0, -32767.0, 32767.0)
+    usual_nodata: tuple[float, ...] = (-9999.0, -99999.0, -32768.0, -32767.0, 32767.0, 9999.0, 99999.0)
     """What programs write where they have no height."""
     nodata_gap: float = 100.0
     """A mark of nodata that is as near as this to real heights, in the file's numbers, may be one itself."""
     highest: float = 1e7
     """m; radii of the Moon (1.7e6 m) pass for heights, marks of nodata such as -3.4e38 do not."""
+    most_relief: float = 35e3
+    """m between the lowest and the highest height: Mars has 30 km from Hellas to Olympus Mons, and no body that a rover
+    drives on has more."""
     largest: float = 1e12
     """Numbers other than heights that are larger count as marks of nodata; the stiffest soil has 1e9."""
     most_cells: int = 50_000_000
@@ -76,6 +79,16 @@ class Dem:
                 f"{worst:g} m",
                 "is no height but a mark of nodata, or not in m",
                 "declare it as nodata in the file, or correct the scale",
+            )
+        relief = float(np.nanmax(heights) - np.nanmin(heights)) if np.isfinite(heights).any() else 0.0
+        if np.isfinite(self.highest) and relief > DEM_LIMITS.most_relief:
+            extremes = f"{np.nanmin(heights):g} to {np.nanmax(heights):g} m"
+            raise bad_input(
+                self.source,
+                "heights",
+                extremes,
+                f"differ by more than {DEM_LIMITS.most_relief / 1e3:g} km, as on no planet",
+                "declare what is nodata in the file, or correct the scale",
             )
         if not np.isfinite(heights).all():
             count = int((~np.isfinite(heights)).sum())

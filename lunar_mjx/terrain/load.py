@@ -51,6 +51,8 @@ def load_terrain(
     Raises:
       UserError: the specification or a file that it names is wrong; the sentence says which, and the remedy.
     """
+    if not isinstance(spec, str | Path | dict):
+        raise bad_input("terrain", "spec", spec, "is no terrain", "give a name, a path or the tables of a terrain.toml")
     # First: "slope:10deg" could be the name of a folder as well.
     if isinstance(spec, str) and spec.startswith("slope"):
         return _slope(spec, dtype)

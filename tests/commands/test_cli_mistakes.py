@@ -338,6 +338,39 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         STEADY,
         ["--slowest heat = -1", "give above 0"],
     ),
+    "time constant of nothing": (
+        ["log", "check", "FILES/bed", "--slowest", "nope=5"],
+        STEADY,
+        ["--slowest = 'nope=5'", "names no effect", "effect list"],
+    ),
+    "probability beyond one": ([*TABLE_RUN, "--setting", "sure=2"], STEADY, ["sure = 2", "1 at most"]),
+    "share beyond one": ([*TABLE_RUN, "--setting", "mode_share=1.5"], STEADY, ["mode_share = 1.5", "1 at most"]),
+    "count below zero": ([*TABLE_RUN, "--setting", "most_refits=-1"], STEADY, ["most_refits = -1", "give 0 or more"]),
+    "size in a list below zero": (
+        [*TABLE_RUN, "--setting", "shape_shares=0.3,0.3,-0.4"],
+        STEADY,
+        ["shape_shares = -0.4", "give 0 or more"],
+    ),
+    "environments beyond the memory": (
+        ["train", "point", "--set", "envs=1000000000", "--out", "OUT"],
+        {},
+        ["envs, buffer_steps, batch = '1000000000, 1000, 256'", "GB at least", "keep fewer steps"],
+    ),
+    "buffer beyond all counts": (
+        ["train", "point", "--set", "buffer_steps=1000000000000", "--out", "OUT"],
+        {},
+        ["buffer_steps = 1000000000000", "give 1 or more"],
+    ),
+    "grid higher than any mountain": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n88888 3\n"},
+        ["a.asc", "heights = '1 to 88888 m'", "more than 35 km"],
+    ),
+    "animation of no kind": (
+        ["report", "OUT", "--out", "OUT/report.html", "--animation", "OUT/x.bmp"],
+        {},
+        ["x.bmp", "no known kind", ".webp"],
+    ),
     "distance of no range": (
         ["evaluate", "zero", "--task", "large", "--env", "goal_distance=nan"],
         {},

@@ -5,10 +5,16 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from lunar_mjx.diagnosis.runs import RUN_FILE, Run, load_run, log_folders, plain, save_json
+from lunar_mjx.criticism import audit, next_experiment
+from lunar_mjx.diagnosis import verbs
+from lunar_mjx.diagnosis.build_problem import known_logs
+from lunar_mjx.diagnosis.formulas.discover import discover
+from lunar_mjx.diagnosis.runs import RUN_FILE, VERDICT_FILE, Run, load_run, log_folders, plain, save_json
 from lunar_mjx.errors import UserError
+from lunar_mjx.logs import Noise, write_steady_log
 from lunar_mjx.model import make_model
 
 
@@ -71,6 +77,49 @@ def test_no_folder_is_a_sentence(tmp_path):
         log_folders([tmp_path / "nowhere"])
     with pytest.raises(UserError, match="no log is given"):
         log_folders([])
+
+
+@pytest.fixture
+def bed(tmp_path) -> Run:
+    """A run of a wheel's table, as `compare` leaves it."""
+    slip = np.arange(12) * 0.05
+    frame = pd.DataFrame({"slip_ratio": slip, "slip_angle_deg": 0.0, "normal_load_N": 60.0})
+    frame["drawbar_pull_N"] = 46.0 * slip - 5.0 + 0.7 * (np.arange(12) % 3)
+    noise = {"drawbar_pull_N": Noise(1.0, "datasheet")}
+    wheel = {"radius_m": 0.1, "width_m": 0.1}
+    write_steady_log(tmp_path / "bed", frame, wheel=wheel, slip_definition="wheel_frame", noise=noise)
+    model = make_model("luvmi_x", terrain="flat").add("slip_sinkage", "test", driving=0.4)
+    found = Run(tmp_path / "run", log_folders([tmp_path / "bed"]), model, added=("slip_sinkage",))
+    found.write()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"splits": {"nowhere": "test"}},
+            r"run\.json: splits = 'nowhere=test' names nothing of these logs; use one of",
+        ),
+        ({"discrepancy": {"lift": 1.0}}, r"run\.json: discrepancy: quantity = 'lift' was not measured; use one of"),
+        ({"discrepancy": {"drawbar_pull": 1e12}}, r"run\.json: discrepancy: drawbar_pull = .* is out of range"),
+        ({"added": ["warp"]}, r"run\.json: added = 'warp' is no effect; correct its name"),
+    ],
+)
+def test_what_a_run_says_of_other_logs_is_refused_before_anything_is_fitted(bed, change, said, monkeypatch):
+    monkeypatch.setattr(verbs, "_problem", lambda *_: pytest.fail("is fitted"))
+    assert known_logs(load_run(bed.folder))
+    bed.save(RUN_FILE, {**bed.load(RUN_FILE), **change})
+    bed.save(VERDICT_FILE, {"verdict": "UNKNOWN", "sentence": "", "effects": [], "port": "wheel_shear"})
+    for verb in (
+        verbs.why,
+        lambda f: verbs.add(f, "bulldozing", bed.folder / "next"),
+        next_experiment,
+        discover,
+        lambda f: audit(f, 1.0),
+    ):
+        with pytest.raises(UserError, match=said):
+            verb(bed.folder)
 
 
 def test_looks_at_the_test_split_stay_on_record(run):

@@ -15,8 +15,9 @@ from lunar_mjx.criticism import WheelBed, audit, wheel_test
 from lunar_mjx.diagnosis import build_problem, verbs
 from lunar_mjx.diagnosis.tables.port_gains import FIELDS
 from lunar_mjx.diagnosis.tables.wheel_form import WheelForm
-from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.effects import catalogue
+from lunar_mjx.errors import UserError
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.logs import Noise, write_steady_log
 
@@ -140,13 +141,22 @@ def test_nothing_hidden_is_noise(run, logs, work):
     assert run("why", work / "null").status == 0
 
 
-def test_why_can_be_asked_about_one_effect(run, logs, work):
+def test_why_can_be_asked_about_one_effect(run, logs, work, monkeypatch):
     null = _asked(run, logs / "null", work / "null")
     about = run("why", null, "--explain", "friction_circle", "--json")
     assert "friction_circle" in json.loads(about.out)["sentence"]
-    wrong = run("why", null, "--explain", "phlogiston")
-    assert wrong.status == 2
-    assert "phlogiston" in wrong.err
+    monkeypatch.setattr(WheelForm, "refit", lambda *_: pytest.fail("a name is refused before anything is fitted"))
+    for name, said in (("phlogiston", "is no candidate here; use one of friction_circle"), ("motor", "in the model")):
+        wrong = run("why", null, "--explain", name)
+        assert wrong.status == 2
+        assert f"--explain = '{name}'" in wrong.err and said in wrong.err
+
+
+def test_a_diagnosis_without_a_fit_answers_for_itself():
+    bad = Diagnosis(Verdict.BAD_FIT, (), "it could not be fitted")
+    assert verbs.explain(bad, "slip_sinkage") is bad
+    with pytest.raises(UserError, match="nothing is known about 'phlogiston'"):
+        verbs.explain(Diagnosis(Verdict.NOISE_ONLY, (), "nothing"), "phlogiston")
 
 
 def test_an_interrupt_leaves_a_usable_folder(run, logs, work, monkeypatch):

@@ -139,6 +139,21 @@ def test_straight_line_and_shipped_policy_reach_goals_on_flat_ground_in_every_so
             assert evaluator(params, jnp.array(trained), 0).success >= 0.8, trained
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"terrain": 5}, "terrain: spec = 5 is no terrain; give a name, a path"),
+        ({"terrain": ["flat"]}, r"terrain: spec = \['flat'\] is no terrain"),
+        ({"rover": 5}, "5: no folder of that path or name holds rover.toml"),
+        ({"task": 5}, "task = 5 does not exist; use one of paper, consistent"),
+        ({"model": 5}, "model = 5 is no model; give a Model"),
+    ],
+)
+def test_what_is_of_no_kind_is_refused(changes, said):
+    with pytest.raises(UserError, match=said):
+        make_navigation(**{"terrain": "flat", **changes})
+
+
 def test_episodes_are_long_enough_for_what_the_bus_voltage_allows():
     """A shipped task's time is for 1 m/s; 48 V allow LUVMI-X 48/(71.6e-3 * 243) rad/s at 0.1 m. A given time stays."""
     speed = 48.0 / (71.6e-3 * 243.0) * 0.1

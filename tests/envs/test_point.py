@@ -91,6 +91,8 @@ def test_environments_known_by_name(monkeypatch):
 def test_refuses_unknown_names():
     with pytest.raises(UserError, match="navigation, point"):
         make("nowhere")
+    with pytest.raises(UserError, match="environment = 5 is no name; use navigation, point"):
+        make(5)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="zero, random, scripted"):
         make_agent("clever", PointEnv())
     with pytest.raises(UserError, match="episode_steps"):

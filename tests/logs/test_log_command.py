@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from lunar_mjx.commands.log import _effect
 from lunar_mjx.logs import check, new_log, read_log
 from lunar_mjx.logs.recorder import simulate as module
+from lunar_mjx.resources import shipped
 from tests.cli_harness import Run
 from tests.logs.log_files import make_log
 
@@ -39,6 +41,43 @@ def test_check_asks_for_length(run: Run, tmp_path: Path) -> None:
     make_log(tmp_path / "a")
     assert run("log", "check", tmp_path / "a", "--slowest", "housing_radiation=600").status == 10
     assert run("log", "check", tmp_path / "a", "--slowest", "housing_radiation=6").status == 0
+
+
+ROVER = 'rover = "luvmi_x"'
+
+
+@pytest.mark.parametrize(
+    ("top", "table", "said"),
+    [
+        ('rover = "moonbuggy"', "", ["rover = 'moonbuggy' is not there", "name a shipped one"]),
+        ('rover = "../gone"', "", ["rover = '../gone' is not there", "rover.toml"]),
+        ('rover = "luvmi_x"\nterrain = "sea"', "", ["terrain = 'sea' is not there", "terrain.toml"]),
+        ('rover = "luvmi_x"\nterrain = "gone.tif"', "", ["terrain = 'gone.tif' is not there"]),
+        ('rover = "luvmi_x"\nterrain = "slope:95deg"', "", ["'slope:95deg'", "below 90"]),
+        (ROVER, "[rover_changes]\npayload_kg = 1e9", ["rover_changes.payload_kg = 1000000000.0", "10000 at"]),
+        (ROVER, "[rover_changes]\ncom_offset_m = [0, 9, 0]", ["rover_changes.com_offset_m = 9.0", "1 at most"]),
+        (ROVER, "[rover_changes]\nwheel_radius_offset_m = -3", ["wheel_radius_offset_m = -3.0", "-0.05 or"]),
+    ],
+)
+def test_check_refuses_what_is_not_there_and_no_rover_carries(top, table, said, run: Run, tmp_path: Path) -> None:
+    make_log(tmp_path / "a")
+    path = tmp_path / "a" / "log.toml"
+    text = path.read_text()
+    assert run("log", "check", tmp_path / "a").status == 0
+    path.write_text(text.replace(ROVER, top) + f"\n{table}\n")
+    result = run("log", "check", tmp_path / "a")
+    assert result.status == 2 and result.err.count("\n") == 1
+    for word in said:
+        assert word in result.err, result.err
+
+
+def test_a_log_may_bring_its_rover_and_ground(run: Run, tmp_path: Path) -> None:
+    make_log(tmp_path / "a")
+    shutil.copytree(shipped("models") / "luvmi_x", tmp_path / "a" / "mine")
+    (tmp_path / "a" / "ground.toml").write_text("[plane]\n")
+    path = tmp_path / "a" / "log.toml"
+    path.write_text(path.read_text().replace(ROVER, 'rover = "mine"\nterrain = "ground.toml"'))
+    assert run("log", "check", tmp_path / "a", "--slowest", "my_effects.py:heat=6").status == 0
 
 
 def test_a_template_that_is_filled_is_a_good_log(run: Run, tmp_path: Path) -> None:

@@ -144,7 +144,7 @@ def test_nine_million_heights_with_a_third_missing_are_filled_in_ten_seconds_and
     assert peak < 1e9
 
 
-@pytest.mark.parametrize("mark", [-9999.0, -99999.0, -32768.0, -32767.0, 32767.0])
+@pytest.mark.parametrize("mark", [-9999.0, -99999.0, -32768.0, -32767.0, 32767.0, 9999.0, 99999.0])
 def test_usual_marks_of_nodata_are_taken_out_where_they_stand_alone(mark, tmp_path):
     heights = ramp().heights.copy()
     heights[3:5, 4:6] = mark

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis.build_problem import table_problem
+from lunar_mjx.diagnosis.build_problem import known_logs, table_problem
 from lunar_mjx.diagnosis.drives.loop import build_drives
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.formulas.search import FORMULA_SEARCH, Settings, Trial, search_formulas
@@ -173,7 +173,7 @@ def discover(
     # A suggestion may be made anew, but a file that the user wrote is never written over.
     if out is not None and Path(out).exists() and not Path(out).read_text(encoding="utf-8").startswith(SUGGESTED):
         raise bad_input("unknown", "--out", str(out), "exists, and is none of these suggestions", "name another file")
-    logs = run.campaign()
+    logs = known_logs(run)
     if isinstance(logs[0], SteadyLog):
         if asked is not None and asked not in WHEEL_PORTS:
             raise bad_input("unknown", "port", asked, "is none of a wheel bed", f"use one of {', '.join(WHEEL_PORTS)}")

@@ -17,7 +17,7 @@ from lunar_mjx.diagnosis.report.steps import Step, chain, comparable, error, jud
 from lunar_mjx.diagnosis.report.words import channel_label, shown
 from lunar_mjx.errors import UserError
 from lunar_mjx.report.style import BLUE, DARK, INK, ORANGE, SKY, styled
-from lunar_mjx.visual.encode import writer
+from lunar_mjx.visual.encode import require_encoder, writer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +44,18 @@ class FallingFilm:
 FILM = FallingFilm()
 
 
+def require_kind(path: Path) -> Path:
+    """Returns the path of an animation that can be written.
+
+    Raises:
+      UserError: it ends in no known kind, or nothing here writes that kind.
+    """
+    if path.suffix.lower() not in (".gif", ".webp", ".mp4"):
+        raise UserError(f"{path}: is of no known kind; end it in .gif, .webp or .mp4.")
+    require_encoder(path)
+    return path
+
+
 def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark: bool = False) -> Path:
     """Writes an animation of a chain of models: as given, refitted, with effects added, and as the last run proposes.
 
@@ -59,6 +71,7 @@ def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark
     Raises:
       UserError: a folder is no run, holds no series yet, the runs are of other logs, or the file is of no known kind.
     """
+    path = require_kind(Path(out))
     results = [read_result(Path(r)) for r in ([runs] if isinstance(runs, str | Path) else runs)]
     for result in results:
         if result.traces is None:
@@ -71,9 +84,6 @@ def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark
     splits, measure = judged(steps)
     errors = [e.value for s in steps if (e := error(s, splits)) is not None]
     panels = _worst(steps, splits)
-    path = Path(out)
-    if path.suffix.lower() not in (".gif", ".webp", ".mp4"):
-        raise UserError(f"{path}: is of no known kind; end it in .gif, .webp or .mp4.")
     course = _course(len(steps))
     with styled(dark):
         drawn = {place: _picture(steps, errors, panels, place, measure, dark) for place in sorted(set(course))}

@@ -62,7 +62,7 @@ class SearchSettings:
         """The usual settings but for some, given by name as numbers, lists or text.
 
         Raises:
-          UserError: no such setting, or a value of another kind.
+          UserError: no such setting, a value of another kind, below zero, or a probability above one.
         """
         usual, values = dataclasses.asdict(cls()), {}
         for name, value in changed.items():
@@ -72,8 +72,11 @@ class SearchSettings:
                 values[name] = _like(usual[name], value)
             except (TypeError, ValueError):
                 raise bad_input("settings", name, value, "has another kind", f"give it like {usual[name]}") from None
-            if isinstance(values[name], float):  # a size, a share or odds, of which the logarithm is taken
-                require_within("settings", name, value, 0.0, above=name.endswith("_odds"))
+            # Sizes, shares, probabilities, odds (of which the logarithm is taken) and counts: none is below zero.
+            most = 1.0 if name.endswith(("sure", "_share")) else math.inf
+            for number in values[name] if isinstance(values[name], tuple) else (values[name],):
+                if not isinstance(number, str):
+                    require_within("settings", name, number, 0.0, most, above=name.endswith("_odds"))
         return cls(**values)
 
     @property

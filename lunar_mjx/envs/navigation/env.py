@@ -703,8 +703,10 @@ def make_navigation(
     Raises:
       UserError: unknown names, or settings that do not fit.
     """
-    if isinstance(task, str) and task not in TASKS:
+    if task not in TASKS if isinstance(task, str) else not isinstance(task, NavigationConfig):
         raise bad_input("navigation", "task", task, "does not exist", f"use one of {', '.join(TASKS)}")
+    if not isinstance(model, Model | str | Path | None):
+        raise bad_input("navigation", "model", model, "is no model", "give a Model, or the path of a model.toml")
     config = TASKS[task] if isinstance(task, str) else task
     if rover == "viper" and "goal_radius" not in settings and config.goal_radius == TASKS["large"].goal_radius:
         settings = {"goal_radius": 1.0, **settings}

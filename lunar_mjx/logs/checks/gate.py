@@ -7,7 +7,10 @@ found here is wrong by its own channels, before any model of the rover is asked.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+from lunar_mjx.effects.catalogue import CATALOGUE
+from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.logs.checks.clock import check_clock
 from lunar_mjx.logs.checks.frames import check_frames
 from lunar_mjx.logs.checks.motors import check_motors
@@ -16,6 +19,9 @@ from lunar_mjx.logs.checks.steady import check_steady
 from lunar_mjx.logs.checks.values import check_values
 from lunar_mjx.logs.findings import Finding, is_bad
 from lunar_mjx.logs.log import Log, SteadyLog
+from lunar_mjx.logs.readers.folder import LOG_FILE
+from lunar_mjx.resources import find
+from lunar_mjx.terrain import load_terrain
 
 Slowest = Mapping[str, float]
 
@@ -36,6 +42,33 @@ def check(logs: Log | SteadyLog | Sequence[Log | SteadyLog], slowest_s: Slowest 
     for log in log_list:
         findings += list(log.problems) + (check_steady(log) if isinstance(log, SteadyLog) else _check_drive(log))
     return findings + _check_length(log_list, slowest_s or {})
+
+
+def require_named(logs: Sequence[Log | SteadyLog], slowest_s: Slowest) -> None:
+    """Raises `UserError` where a log or a question names what is not there.
+
+    A rover or a terrain that is neither shipped nor where the log says, or an effect that the catalogue does not hold.
+    """
+    for log in logs:
+        if not isinstance(log, Log):
+            continue
+        for field, kind, marker, spec in (
+            ("rover", "models", "rover.toml", log.rover),
+            ("terrain", "terrain", "terrain.toml", log.terrain),
+        ):
+            if field == "terrain" and spec.startswith("slope"):
+                load_terrain(spec)
+            elif not Path(spec).is_file():  # a DEM, or a terrain.toml of another name
+                try:
+                    find(kind, spec, marker)
+                except UserError:
+                    remedy = f"name a shipped one, or a folder with a {marker}, counted from the log's"
+                    raise bad_input(log.folder / LOG_FILE, field, spec, "is not there", remedy) from None
+    for name, seconds in slowest_s.items():
+        # One's own effect is named by its file, which nothing here needs to run.
+        if name not in CATALOGUE and ".py:" not in name:
+            remedy = "use a name of lunar-mjx effect list, or my_effects.py:name"
+            raise bad_input("log check", "--slowest", f"{name}={seconds:g}", "names no effect", remedy)
 
 
 def _check_drive(log: Log) -> list[Finding]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError, bad_input, require_within
 from lunar_mjx.logs.attitude import body_attitude, with_angles
 from lunar_mjx.logs.findings import Finding
@@ -40,7 +41,13 @@ ENVIRONMENT = ("ambient_temperature_degC", "sun_azimuth_deg", "sun_elevation_deg
 FARTHEST_M = 2e7
 """Half of the Earth's circumference: no place on a grid lies beyond."""
 GREATEST_ANGLE = {"sun_azimuth_deg": 360.0, "sun_elevation_deg": 90.0}
-ROVER_CHANGES = ("payload_kg", "payload_position_m", "com_offset_m", "wheel_radius_offset_m")
+CHANGED = {
+    "payload_kg": ("payload", "mass"),
+    "payload_position_m": ("payload", "x"),
+    "com_offset_m": ("com_offset", "x"),
+    "wheel_radius_offset_m": ("wheel_radius_error", "offset"),
+}
+"""Effect and parameter whose bounds hold for a change of the rover, in all its axes."""
 INITIAL = {
     "position_m": 3,
     "quaternion": 4,
@@ -298,7 +305,7 @@ def _environment(fields: Fields) -> tuple[dict[str, float | str], dict[str, str]
 
 
 def _rover_changes(fields: Fields) -> dict[str, Any]:
-    fields.known(ROVER_CHANGES)
+    fields.known(tuple(CHANGED))
     changes: dict[str, Any] = {}
     for key in fields.values:
         changes[key] = fields.vector(key, 3) if key in ("payload_position_m", "com_offset_m") else fields.number(key)
@@ -306,6 +313,11 @@ def _rover_changes(fields: Fields) -> dict[str, Any]:
         raise bad_input(
             fields.path, fields.field("payload_kg"), changes["payload_kg"], "is negative", "give the mass in kg"
         )
+    for key, change in changes.items():
+        effect, parameter = CHANGED[key]
+        low, high = CATALOGUE[effect].parameters[parameter].bounds
+        for number in np.atleast_1d(change):
+            require_within(fields.path, fields.field(key), float(number), low, high)
     return changes
 
 

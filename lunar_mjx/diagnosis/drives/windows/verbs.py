@@ -23,7 +23,7 @@ from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.diagnosis.weighed.form import Problem
 from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, account, gains_on_held_out
-from lunar_mjx.errors import UserError
+from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.weighing.hypotheses import Refit
@@ -252,8 +252,19 @@ def fitted_model(form: WindowForm, refit: Refit) -> Model:
     return dataclasses.replace(model, priors=priors)
 
 
-def why(run: Run, logs: Sequence[Log], only: Sequence[str] | None, seconds: float, progress: Progress) -> Diagnosis:
-    """Weighs every explanation of what a model leaves of some logs; writes `verdict.json`, provisionally as it goes."""
+def why(
+    run: Run,
+    logs: Sequence[Log],
+    only: Sequence[str] | None,
+    seconds: float,
+    progress: Progress,
+    about: str | None = None,
+) -> Diagnosis:
+    """Weighs every explanation of what a model leaves of some logs; writes `verdict.json`, provisionally as it goes.
+
+    Raises:
+      UserError: a name in `only`, or `about`, is no suspect here.
+    """
     begin = time.monotonic()
     bench = Bench(run, logs)
     suspects = bench.suspects
@@ -263,6 +274,8 @@ def why(run: Run, logs: Sequence[Log], only: Sequence[str] | None, seconds: floa
             if name not in names:
                 raise UserError(f"effect {name!r} is no candidate here; use one of {', '.join(names)}.")
         suspects = tuple(s for s in suspects if s.name in only)
+    if about is not None and about not in (names := [s.name for s in suspects]):
+        raise bad_input("why", "--explain", about, "is no candidate here", f"use one of {', '.join(names)}")
     try:
         with threadpool_limits(1, "blas"):
             noise = bench.noise()
