@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import random
+import sqlite3
+import struct
 import types
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ import pytest
 
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import import_log, read_log
+from lunar_mjx.logs.readers import bags
 from lunar_mjx.logs.readers.bags import field, stamp
 from tests.cli_harness import Run
 
@@ -256,6 +261,105 @@ def test_what_is_no_recording_is_told(tmp_path: Path, map_file: Path) -> None:
     (tmp_path / "bag").mkdir()
     with pytest.raises(UserError, match="bag: is not a readable bag"):
         import_log(tmp_path / "bag", tmp_path / "log", map_file)
+
+
+@pytest.mark.parametrize("name", ["ros.mcap", "bag", "ros1.bag"])
+def test_bags_that_are_damaged_anywhere_are_refused_or_read(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path, rng, kinds, read = tmp_path / name, random.Random(name), set(), 0
+    RECORDINGS[name](path)
+    told = bags._first
+    monkeypatch.setattr(bags, "_first", lambda error: kinds.add(type(error)) or told(error))
+    whole = {f: f.read_bytes() for f in (sorted(path.iterdir()) if path.is_dir() else [path])}
+    for number in range(60):
+        for file, data in whole.items():
+            file.write_bytes(data)
+        file = rng.choice(list(whole))
+        data, at = whole[file], rng.randrange(len(whole[file]))
+        file.write_bytes(data[:at] if number % 4 == 0 else data[:at] + rng.randbytes(4) + data[at + 4 :])
+        try:
+            read += len(list(bags.messages(path, ["/joint_states", "/odom"]))) > 0
+        except UserError as error:
+            assert str(path) in str(error) and len(str(error)) < 1500 and "\n" not in str(error), number
+    assert read > 5 and len(kinds) >= 2, "damage shows in errors of several kinds"
+    assert not capfd.readouterr().out
+
+
+# What libraries under the readers have raised at damaged bytes, and kinds that others may.
+RAISED = (
+    AssertionError,
+    AttributeError,
+    EOFError,
+    IndexError,
+    KeyError,
+    LookupError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RecursionError,
+    RuntimeError,
+    StopIteration,
+    TypeError,
+    ValueError,
+    sqlite3.DatabaseError,
+    struct.error,
+    zlib.error,
+    type("TheirOwnError", (Exception,), {}),
+)
+
+
+@pytest.mark.parametrize("at", ["open", "messages", "decode"])
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag"])
+def test_whatever_a_reader_raises_is_a_refusal_and_an_interrupt_is_none(
+    name: str, at: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raised: BaseException
+
+    def fails(place: str, value: object = None) -> object:
+        if place == at:
+            raise raised
+        return value
+
+    channel = types.SimpleNamespace(topic="/a", id=0, message_encoding="json", msgtype="a")
+
+    class Reader:
+        connections = (channel,)
+
+        def __init__(self, *_: object, **__: object):
+            fails("open")
+
+        def __enter__(self) -> Reader:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def get_summary(self) -> None: ...
+
+        def messages(self, _: object) -> Iterator[tuple]:
+            yield fails("messages", channel), 0, b""
+
+        def iter_messages(self, topics: object) -> Iterator[tuple]:
+            yield None, fails("messages", channel), types.SimpleNamespace(log_time=0, data=b"")
+
+        def deserialize(self, *_: object) -> object:
+            return fails("decode", {})
+
+    library = "mcap.reader" if name == "a.mcap" else "rosbags.highlevel"
+    module = pytest.importorskip(library, reason="the extra lunar-mjx[ros] is not installed")
+    monkeypatch.setattr(module, "make_reader" if name == "a.mcap" else "AnyReader", Reader)
+    monkeypatch.setattr(bags, "json", types.SimpleNamespace(loads=lambda _: fails("decode", {})))
+    (tmp_path / name).write_bytes(b"")
+    for kind in RAISED:
+        raised = kind("at byte 7\nand more")
+        with pytest.raises(
+            UserError, match=r"is not a readable .*(byte 7|RuntimeError|generator).*; record or copy it"
+        ):
+            list(bags.messages(tmp_path / name, ["/a"]))
+    raised = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        list(bags.messages(tmp_path / name, ["/a"]))
 
 
 @pytest.mark.parametrize(("name", "package"), [("a.mcap", "mcap"), ("a.db3", "rosbags")])

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,9 @@ class _Decoders:
             from mcap_ros2.decoder import DecoderFactory  # pyright: ignore[reportMissingImports]
 
             self.ros = self.ros or DecoderFactory()
-            decode = self.ros.decoder_for(channel.message_encoding, schema)
+            # Its parser prints what it dislikes, and raises it as well.
+            with redirect_stdout(None):
+                decode = self.ros.decoder_for(channel.message_encoding, schema)
             if decode is not None:
                 return decode
         kind = f"{channel.message_encoding} with schema {schema.encoding if schema else 'none'}"
