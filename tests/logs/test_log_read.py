@@ -245,14 +245,17 @@ def test_refused_steady_tables(text: str, words: list[str], tmp_path: Path) -> N
         assert word in str(caught.value)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pyarrow") is not None, reason="pyarrow is installed")
-def test_parquet_without_pyarrow_says_what_to_install(tmp_path: Path) -> None:
+def test_parquet_without_pyarrow_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lunar_mjx.logs.readers.table.importlib.util.find_spec", lambda _: None)
     make_log(tmp_path / "a")
     (tmp_path / "a" / "thermal.parquet").write_bytes(b"PAR1")
     path = tmp_path / "a" / "log.toml"
     path.write_text(path.read_text().replace("thermal.csv", "thermal.parquet"))
     with pytest.raises(UserError, match=r"pyarrow; install lunar-mjx\[parquet\]"):
         read_log(tmp_path / "a")
+    with pytest.raises(UserError, match=r"pyarrow; install lunar-mjx\[parquet\]"):
+        make_log(tmp_path / "b", parquet=True)
+    assert not (tmp_path / "b").exists()
 
 
 @pytest.mark.skipif(importlib.util.find_spec("pyarrow") is None, reason="needs pyarrow")
