@@ -26,7 +26,7 @@ from lunar_mjx.rover.mjcf import build_spec, scene_of, ties, to_xml
 from lunar_mjx.rover.roles import Roles, assign_roles, without_followers
 from lunar_mjx.rover.rover import DriveGroup, Rover
 from lunar_mjx.rover.statics import gains, level_springs
-from lunar_mjx.rover.tree import Body, bodies_of
+from lunar_mjx.rover.tree import Body, bodies_of, world_poses
 from lunar_mjx.rover.urdf import Geometry, Urdf, read_urdf
 
 
@@ -36,6 +36,8 @@ class Conversion:
 
     most_chassis_points: int = 16
     """Points of the chassis that may touch the ground: each costs a height in every step."""
+    farthest_m: float = 1e3
+    """m between a link and the base: no rover is as long as that."""
     level: float = 1e-3
     """m; wheels whose lowest points differ by more do not stand level."""
 
@@ -67,6 +69,7 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
     described = _describe(source, description)
     name = _file_name(source, name or described.name or source.name)
     bodies = bodies_of(source)
+    _require_near(source, bodies)
     roles = without_followers(source, assign_roles(source, bodies, described))
     loops = place_loops(source, roles.bodies, described)
     driven = place_drive_groups(source, roles, described)
@@ -114,6 +117,15 @@ def convert(urdf: str | Path, out: str | Path, description: str | Path | None = 
         raise UserError(f"{out}: cannot be written ({error.strerror}); give another output folder.") from None
     # Loaded as users will: what was just written must pass every check of a foreign file.
     return load_rover(out.resolve())
+
+
+def _require_near(source: Urdf, bodies: tuple[Body, ...]) -> None:
+    """Raises `UserError` for a link so far away that weights on levers overflow."""
+    for link, pose in world_poses(bodies).items():
+        if not np.abs(pose.position).max() <= CONVERSION.farthest_m:
+            problem = f"is more than {CONVERSION.farthest_m:g} m from the base"
+            shown = np.array2string(pose.position, precision=3)
+            raise bad_input(source.path, f"link '{link}' position", shown, problem, "correct the origins, in m")
 
 
 def _require_numbers(source: Urdf, field: str, value: Any) -> None:

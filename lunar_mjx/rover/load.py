@@ -84,6 +84,10 @@ def load_rover(name_or_path: str | Path) -> Rover:
         raise bad_input(path, "mjcf", file, "is not the name of a file beside it", _CONVERT_AGAIN)
     mjcf = require_file(folder / file, "the rover's MJCF")
     try:
+        mjcf.read_bytes().decode("utf-8")  # MuJoCo takes any bytes for names, and gives them back as text
+    except UnicodeDecodeError:
+        raise UserError(f"{mjcf}: is not a text file in UTF-8; {_CONVERT_AGAIN}.") from None
+    try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # such as of inertia matrices that are next to singular
             model = mujoco.MjSpec.from_file(str(mjcf)).compile()

@@ -76,26 +76,31 @@ def assign_roles(urdf: Urdf, bodies: tuple[Body, ...], description: Description)
     """Takes the wheels from the description, or infers them from the tree.
 
     Raises:
-      UserError: fewer than three wheels, or a description that names something that is not there.
+      UserError: fewer than three wheels, inferred ones of one side alone, or a description that names something that
+        is not there.
     """
     poses = world_poses(bodies)
     if description.wheels:
         wheels = [_described(urdf, bodies, poses, description, w) for w in description.wheels]
     else:
         wheels = [_role(urdf, bodies, poses, b, WheelDescription(b.name)) for b in _candidates(bodies, poses)]
+    wheel_names = ", ".join(w.body for w in wheels) or "none"
+    remedy = (
+        "give each wheel a continuous joint with an axis along y at zero angles and a cylinder, "
+        "or name the wheels in the description beside the URDF ([[wheels]])"
+    )
     if len(wheels) < ROLE_RULES.fewest_wheels:
-        wheel_names = ", ".join(w.body for w in wheels) or "none"
-        raise bad_input(
-            urdf.path,
-            "wheels",
-            wheel_names,
-            f"are fewer than {ROLE_RULES.fewest_wheels}",
-            "give each wheel a continuous joint with an axis along y at zero angles and a cylinder, "
-            "or name the wheels in the description beside the URDF ([[wheels]])",
-        )
+        raise bad_input(urdf.path, "wheels", wheel_names, f"are fewer than {ROLE_RULES.fewest_wheels}", remedy)
     wheels = _name_corners(urdf, wheels, description)
     notes: list[str] = []
     if not description.wheels:
+        # A wheel whose joint is drawn askew is found by the one on the other side: a rover without it would be another.
+        corners = {w.corner for w in wheels}
+        for wheel in wheels:
+            other = {"l": "r", "r": "l"}.get(wheel.corner[0])
+            if other is not None and other + wheel.corner[1:] not in corners:
+                problem = f"have none on the other side of {wheel.body}"
+                raise bad_input(urdf.path, "wheels", wheel_names, problem, remedy)
         # Only inferred roles: who names a rocker as a suspension means it.
         wheels, notes = _drop_shared(bodies, wheels)
     # Signs before frames: aligning a wheel reads the mended axis.

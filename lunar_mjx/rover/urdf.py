@@ -6,6 +6,7 @@ Only the mechanics are read: links, inertias, joints and primitive geometry. Tag
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -273,7 +274,7 @@ class _Reader:
             ends.append(link)
         # x is URDF's default axis.
         axis = self.numbers(element.find("axis"), "xyz", "1 0 0", f"{field} axis")
-        length = float(np.linalg.norm(axis))
+        length = math.hypot(*axis)  # which squares nothing that would overflow
         if length < 1e-9 and kind not in ("fixed", "floating"):
             raise bad_input(self.path, f"{field} axis", axis, "has no length", "give a direction")
         limits = (-np.inf, np.inf)

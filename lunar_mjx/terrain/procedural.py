@@ -11,7 +11,7 @@ from scipy import ndimage
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.terrain import craters as cratering
 from lunar_mjx.terrain.craters import Craters
-from lunar_mjx.terrain.dem import Dem, require_cell, require_size, spline
+from lunar_mjx.terrain.dem import DEM_LIMITS, Dem, require_cell, require_size, spline
 from lunar_mjx.terrain.roughness import Roughness, fractal
 from lunar_mjx.terrain.soil.maps import SoilMap
 
@@ -75,6 +75,9 @@ def make_surface(
     for field, value in (("width", width), ("height", height)):
         if require_finite("terrain", field, value) < cell:
             raise bad_input("terrain", field, value, f"is less than one cell of {cell:g} m", "make it larger")
+        if value > DEM_LIMITS.most_cells * cell:
+            problem = f"is more than {DEM_LIMITS.most_cells} cells of {cell:g} m"
+            raise bad_input("terrain", field, value, problem, "make it smaller or use a larger cell")
     # One node more than cells: the extent asked for lies between the outermost nodes.
     rows, cols = round(height / cell) + 1, round(width / cell) + 1
     require_size("terrain", rows, cols)
@@ -182,6 +185,7 @@ def make_soil_patches(
         raise bad_input("soil", "rock_fraction", rock_fraction, "is not between 0 and 1", "give a share of the ground")
     if require_finite("soil", "patch", patch) <= 0:
         raise bad_input("soil", "patch", patch, "is not positive", "give the extent of a patch in m")
+    require_cell("soil", "patch", patch)
     west, south, east, north = dem.bounds
     # Eight cells show the outline of a patch; finer ones than the DEM's would show nothing more.
     cell = max(patch / 8, dem.cell)

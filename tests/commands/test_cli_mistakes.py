@@ -274,6 +274,31 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
         {"rover.urdf": urdf('radius="0.12"', 'radius="1e300"')},
         ["rover.urdf", "is what the rover would come out with", "in m and kg"],
     ),
+    "URDF with an arm of a light year": (
+        CONVERT,
+        {"rover.urdf": urdf('xyz="0 0 -0.05" rpy="-1.570796 0 0"', 'xyz="0 1e16 -0.05" rpy="-1.570796 0 0"', 1)},
+        ["rover.urdf", "link 'FrontLeftWheel' position", "more than 1000 m from the base"],
+    ),
+    "URDF with a wheel askew": (
+        CONVERT,
+        {
+            "rover.urdf": urdf(
+                '<child link="BackRightWheel"/>\n    <axis xyz="0 0 1"/>',
+                '<child link="BackRightWheel"/>\n    <axis xyz="0 -1 1"/>',
+            )
+        },
+        ["rover.urdf", "have none on the other side of BackLeftWheel", "name the wheels in the description"],
+    ),
+    "terrain without end": (
+        ["terrain", "info", "FILES/t.toml"],
+        {"t.toml": "[surface]\nwidth = 1e308\nheight = 8.0\ncell = 0.5\n"},
+        ["width = 1e+308", "is more than 50000000 cells"],
+    ),
+    "height beyond all numbers": (
+        ["terrain", "info", "FILES/a.asc"],
+        {"a.asc": "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n1e400 3\n"},
+        ["a.asc", "heights = 'inf' is not finite"],
+    ),
     "URDF nested too deep": (CONVERT, {"rover.urdf": "<a>" * 20_000}, ["rover.urdf"]),
     "URDF whose name breaks the line": (
         CONVERT,

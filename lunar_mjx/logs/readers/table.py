@@ -74,8 +74,9 @@ def read_parquet(path: Path) -> pd.DataFrame:
         raise UserError(f"{path}: a Parquet file needs the package pyarrow; install lunar-mjx[parquet] or save as CSV.")
     try:
         return pd.read_parquet(path, engine="pyarrow")
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: is not a Parquet table ({error}); save it again, or as CSV.") from None
+    except Exception as error:  # Arrow raises a dozen kinds at damaged bytes
+        told = one_line(error)[:200] or type(error).__name__
+        raise UserError(f"{path}: is not a Parquet table ({told}); save it again, or as CSV.") from None
 
 
 def numbers(frame: pd.DataFrame, column: str) -> tuple[np.ndarray, int | None]:

@@ -69,6 +69,8 @@ def read_asc(path: Path, options: ReadOptions) -> Dem:
         numbers = np.array(plain_digits(" ".join(body)).split(), np.float64)
     except ValueError as error:
         raise UserError(f"{path}: heights hold something else than numbers ({error}); repair the file.") from None
+    if np.isinf(numbers).any():  # NaN is a hole; what is too large for a number is a slip
+        raise bad_input(path, "heights", f"{numbers[np.isinf(numbers)][0]}", "is not finite", "repair the file")
     if numbers.size != rows * cols:
         raise bad_input(
             path, "heights", f"{numbers.size} numbers", f"are not nrows x ncols = {rows} x {cols}", "repair the file"

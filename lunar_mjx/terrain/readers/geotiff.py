@@ -10,7 +10,7 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as PixelWindow
 
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, one_line
 from lunar_mjx.terrain.dem import Dem, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.arrays import grid
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions, Window
@@ -28,8 +28,8 @@ def read_geotiff(path: Path, options: ReadOptions) -> Dem:
             # One driver only: others that GDAL would try (VRT, WMS) let a file name further files and hosts.
             with rasterio.open(path, driver="PDS4" if path.suffix.lower() == ".xml" else "GTiff") as raster:
                 return _read(path, raster, options)
-    except (RasterioError, OSError) as error:
-        reason = str(error).splitlines()[0]
+    except (RasterioError, OSError, UnicodeDecodeError) as error:  # the last of damaged names of units and projections
+        reason = one_line(error)[:200]
         raise UserError(f"{path}: the raster cannot be read ({reason}); fetch the file again.") from None
 
 
@@ -43,7 +43,9 @@ def _read(path: Path, raster: rasterio.DatasetReader, options: ReadOptions) -> D
     data = raster.read(band, window=window, masked=True)
     if not np.issubdtype(data.dtype, np.number) or np.issubdtype(data.dtype, np.complexfloating):
         raise bad_input(path, "data type", data.dtype, "is not a real number", "give a raster of heights")
-    heights, undeclared = undeclared_nodata(np.ma.filled(data.astype(np.float64), np.nan), str(path))
+    with np.errstate(invalid="ignore"):  # of a mark of nodata that is no number
+        known = np.ma.filled(data.astype(np.float64), np.nan)
+    heights, undeclared = undeclared_nodata(known, str(path))
     # Scale and offset after the marks of nodata were taken out: marks are written unscaled.
     heights = heights * raster.scales[band - 1] + raster.offsets[band - 1]
     if options.heights:

@@ -46,6 +46,8 @@ def _levels(path: Path) -> tuple[np.ndarray, int]:
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(path) as image:
                 require_size(str(path), image.height, image.width)
+                image.verify()  # its checksums, which reading the pixels passes over; the file is then used up
+            with Image.open(path) as image:
                 mode = image.mode
                 if mode not in _WHITE:
                     raise bad_input(
