@@ -16,7 +16,7 @@ from .wheel import DEEPEST, Result, Rows, World, run
 GROUPS: Mapping[str, float] = {"null": 0.25, "single": 0.45, "outside": 0.2, "pair": 0.1}
 """Shares of a set."""
 NOISES = ("gaussian", "ar1", "student", "proportional")
-FORCES, QUANTITIES = ("drawbar_pull", "side_force"), ("drawbar_pull", "side_force", "driving_torque", "sinkage")
+QUANTITIES = ("drawbar_pull", "side_force", "driving_torque", "sinkage")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,9 +35,7 @@ def _amplitude(effect: str, name: str, p: Parameter) -> Coordinate:
     size = abs(p.nominal - p.null) or 0.1 * min(abs(high - p.null) or math.inf, abs(p.null - low) or math.inf)
     if not math.isfinite(size):
         size = 1.0
-    # Where the null is a bound, resting on it is the effect's absence and no failed fit.
-    one_sided = p.null in (low, high)
-    return Coordinate(effect, name, p.null, size, low, high, physical=one_sided, unit=p.unit, amplitude=True)
+    return Coordinate(effect, name, p.null, size, low, high, unit=p.unit, amplitude=True)
 
 
 def default_coordinate(effect: Effect, name: str, value: float, relative: float, prior: float) -> Coordinate:
@@ -55,5 +53,4 @@ def default_coordinate(effect: Effect, name: str, value: float, relative: float,
     if low >= 0.0 and value > 0.0:
         return Coordinate(effect.name, name, value, relative, low, high, True, prior, unit=p.unit)
     scale = relative * (abs(value) or 0.1 * (high - low))
-    physical = p.null is not None and p.null in (low, high)
-    return Coordinate(effect.name, name, value, scale, low, high, False, prior, physical, p.unit)
+    return Coordinate(effect.name, name, value, scale, low, high, False, prior, unit=p.unit)

@@ -41,11 +41,7 @@ class EffectEvidence:
       effect: its name.
       separable_sigma: length of the effect's signature at its nominal size, after refitting of the baseline has been
         projected out, in sigma; below 5 the effect is not tested.
-      separable_share: share of the signature's length that a refit of the baseline leaves.
-      chi2: reduction of chi-square by the best amount of the effect, in linear approximation.
-      z: robust significance of its score in sigma (block variance), p: family-wise p value by multiplier bootstrap.
-      held_out_gain, held_out_se: gain of the expected log density on manoeuvres left out, and its standard error; NaN
-        where the effect was not refitted.
+      z: root of twice the log ratio of its evidence to that of nothing missing, with the ratio's sign, in sigma.
       values: fitted parameters by name; std: their standard deviations.
       probability: that the effect is missing, whatever else is; NaN where hypotheses were not weighed.
       nearest: the effect with the most similar projected signature, and |cos| between the two.
@@ -55,12 +51,7 @@ class EffectEvidence:
 
     effect: str
     separable_sigma: float
-    separable_share: float
-    chi2: float = 0.0
     z: float = 0.0
-    p: float = 1.0
-    held_out_gain: float = float("nan")
-    held_out_se: float = float("nan")
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
     std: Mapping[str, float] = dataclasses.field(default_factory=dict)
     nearest: tuple[str, float] = ("", 0.0)

@@ -80,7 +80,6 @@ class Seen:
     Attributes:
       current: of the motors, (batch, bin, joint), A. torque: at the joints, (batch, bin, joint), N m.
       yaw_rate: rad/s. speed_x, speed_y: of the chassis frame's origin along its own axes, m/s.
-      acceleration_x: of it, m/s2.
     """
 
     current: Any
@@ -88,7 +87,6 @@ class Seen:
     yaw_rate: Any
     speed_x: Any
     speed_y: Any
-    acceleration_x: Any
 
 
 def on_a_plane(model: Model) -> Model:
@@ -242,12 +240,12 @@ class KinematicDrive:
         forces, ctx, effects = apply_effects(system.pipeline, ctx, kinematics.joint_speed, effects)
         # The acceleration that brings every wheel to its imposed speed in exactly this step.
         acceleration = (speed - kinematics.joint_speed) / ctx.dt
-        q, v, torque, body = finish(forces, acceleration, up)
+        q, v, torque, _ = finish(forces, acceleration, up)
         beside = forces.joint_torque - ctx.torque  # of brakes and stops, which help the motor or load it
         current = self._current(ctx, effects, torque - beside)
         own = kinematics.frame.from_world(kinematics.velocity)
         spin = kinematics.frame.from_world(kinematics.angular_velocity)
-        return (q, v, effects), Seen(current, torque, spin.z, own.x, own.y, body.x)
+        return (q, v, effects), Seen(current, torque, spin.z, own.x, own.y)
 
     def _current(self, ctx: Context, effects: Any, torque: Any) -> Any:
         """(joint,) the motor currents that make the torques (joint,) at the joints, friction and losses included, A."""

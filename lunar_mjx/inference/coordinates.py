@@ -25,7 +25,6 @@ class Coordinate:
       low, high: bounds of the value.
       log: whether the logarithm moves.
       prior: standard deviation of u; infinite for none. centre: the value of u that it is centred on.
-      physical: whether resting on a bound is physics (such as zero friction) and not a failed fit.
       unit: of the value.
       log_index: the log that a nuisance belongs to, or -1 where all share it.
       amplitude: whether the value has a null at which its effect vanishes.
@@ -40,7 +39,6 @@ class Coordinate:
     high: float
     log: bool = False
     prior: float = WIDE
-    physical: bool = False
     unit: str = "1"
     log_index: int = -1
     amplitude: bool = False

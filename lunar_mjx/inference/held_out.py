@@ -127,7 +127,7 @@ class NoiseTest:
 
     Attributes:
       rms: over all kept observations, in sigma, corrected for the fitted parameters. limit: the most that passes.
-      channels: root mean square by channel. worst: the channel that passes least; its rms over its limit.
+      channels: root mean square by channel. worst: the channel that passes least.
       passes: whether all limits hold.
     """
 
@@ -135,7 +135,6 @@ class NoiseTest:
     limit: float
     channels: Mapping[str, float]
     worst: str
-    worst_ratio: float
     passes: bool
 
 
@@ -169,7 +168,7 @@ def noise_test(problem: Problem, fit: Fit, splits: tuple[str, ...] = ("fit", "se
         share = value / (HELD_OUT.channel_at_noise + HELD_OUT.sampling * np.sqrt(variance) / count)
         if share > ratio:
             worst, ratio = channel, float(share)
-    return NoiseTest(rms, float(limit), by_channel, worst, float(ratio), bool(rms <= limit and ratio <= 1.0))
+    return NoiseTest(rms, float(limit), by_channel, worst, bool(rms <= limit and ratio <= 1.0))
 
 
 def errors(problem: Problem, fit: Fit) -> dict[str, float]:

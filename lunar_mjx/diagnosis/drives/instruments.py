@@ -76,7 +76,7 @@ def instrument_nuisances(number: int, log: Log, observations: Observations) -> l
 
 def _coordinate(name: str, std: float, unit: str, number: int) -> Coordinate:
     far = USUAL_ERRORS.farthest * std
-    return Coordinate(NUISANCE, name, 0.0, std, -far, far, prior=1.0, physical=True, unit=unit, log_index=number)
+    return Coordinate(NUISANCE, name, 0.0, std, -far, far, prior=1.0, unit=unit, log_index=number)
 
 
 def is_instrument(c: Coordinate) -> bool:

@@ -63,7 +63,7 @@ def standing_shows(change: np.ndarray, number: int, observations: Observations) 
 def step_error_share() -> Coordinate:
     """How much of the step's error all logs contain: all where a rover was measured, nothing where steps of the same
     length recorded it."""
-    return Coordinate(NUISANCE, STEP_ERROR, 0.0, 1.0, 0.0, 1.0, prior=0.5, centre=0.5, physical=True)
+    return Coordinate(NUISANCE, STEP_ERROR, 0.0, 1.0, 0.0, 1.0, prior=0.5, centre=0.5)
 
 
 def reads_before_share() -> Coordinate:
@@ -72,7 +72,7 @@ def reads_before_share() -> Coordinate:
 
     The model's motors have no inductance: at the instant of a command's jump their current jumps, too.
     """
-    return Coordinate(NUISANCE, READS_BEFORE, 0.0, 1.0, 0.0, 1.0, prior=0.5, centre=0.5, physical=True)
+    return Coordinate(NUISANCE, READS_BEFORE, 0.0, 1.0, 0.0, 1.0, prior=0.5, centre=0.5)
 
 
 def nuisances(number: int, run: LogRun, observations: Observations, stood: bool) -> list[Coordinate]:
@@ -104,7 +104,6 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
                 LOG_START.settle,
                 STOOD_TIME.stood_most,
                 prior=10.0,
-                physical=True,
                 log_index=number,
             )
         )

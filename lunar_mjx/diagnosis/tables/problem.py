@@ -263,7 +263,7 @@ def _coordinates(
                 coordinates.append(Coordinate(effect.name, name, at, relative, low, high, True, prior, unit=p.unit))
             else:
                 scale = relative * (at or 0.1 * min(high, 1e4))
-                coordinates.append(Coordinate(effect.name, name, at, scale, low, high, False, prior, True, p.unit))
+                coordinates.append(Coordinate(effect.name, name, at, scale, low, high, False, prior, unit=p.unit))
         # Effects added earlier are refitted with the rest, their shapes within a third, as those of candidates are.
         amplitudes = [p for p in effect.parameters.values() if p.null is not None]
         if effect.name not in baseline and amplitudes and not _unfit(effect.name, effect):
@@ -271,10 +271,7 @@ def _coordinates(
                 at = float(bed.parameters[effect.name][name])
                 if p.null is not None:
                     scale = 0.3 * (abs(at) or abs(p.nominal) or 1.0)
-                    physical = p.null in p.bounds
-                    coordinates.append(
-                        Coordinate(effect.name, name, at, scale, *p.bounds, False, WIDE, physical, p.unit)
-                    )
+                    coordinates.append(Coordinate(effect.name, name, at, scale, *p.bounds, False, WIDE, unit=p.unit))
                 elif at > 0.0 and p.bounds[0] >= 0.0:
                     coordinates.append(Coordinate(effect.name, name, at, 0.3, *p.bounds, True, 1.0, unit=p.unit))
     count, places = len(coordinates), {}

@@ -447,11 +447,8 @@ def _evidence(
             EffectEvidence(
                 effect=name,
                 separable_sigma=length,
-                separable_share=float("nan"),
-                chi2=float("nan"),
                 # Twice a log ratio is about a chi-square of one degree, whose root is a z (Wilks 1938).
                 z=math.copysign(math.sqrt(2.0 * abs(log_ratio)), log_ratio) if math.isfinite(log_ratio) else -99.0,
-                p=1.0 - p,
                 values=values,
                 std=std,
                 nearest=nearest,

@@ -363,9 +363,3 @@ def _start(near: Hypothesis, form: Form) -> np.ndarray:
 
 def _sizes(h: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
     return h.evidence.tau, h.evidence.noise
-
-
-def log_sum(values: Sequence[float]) -> float:
-    """Log of the sum of exponentials."""
-    top = max(values)
-    return top + math.log(sum(math.exp(v - top) for v in values))
