@@ -290,10 +290,10 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
     if not found.complete:
         sentence += " The search ended by its time or its number of refits: what it did not refit is an estimate."
     skipped = problem.own.skipped
+    if not found.complete:
+        conclusion, sentence = _unrefitted(conclusion, sentence, [h.effects for h in found.hypotheses if h.refitted])
     if skipped:
         conclusion, sentence = _without(conclusion, sentence, skipped)
-    elif not found.complete:
-        conclusion, sentence = _unrefitted(conclusion, sentence, [h.effects for h in found.hypotheses if h.refitted])
     held = account(_held_out(found, best, own))
     conclusion, sentence, accounted = _held_to_account(conclusion, sentence, found, settings.held_out_sure)
     inclusion = found.inclusion()
@@ -355,11 +355,13 @@ def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[st
     named = {e for e in said.effects if not e.startswith("calibration: ")}
     if said.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE) or any(named <= effects for effects in refitted):
         return said, sentence
-    sentence = (
-        f"To first order: {sentence} No refit with {' and '.join(sorted(named))} was made, so nothing is named; give "
-        "more --seconds, or name the candidates with --only."
+    told = (
+        f"A first-order estimate points to {' and '.join(sorted(named))}. No refit bore it out, so nothing is named; "
+        "give more --seconds, or name the candidates with --only."
     )
-    return dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=()), sentence
+    # the probability of an estimate is none: it is left out of what is said
+    rest = sentence.removeprefix(said.sentence)
+    return dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=(), sentence=told), told + rest
 
 
 def _averaged(form: MeasuredForm, found: ModelSearch, least_signal: float) -> dict[str, dict[str, Any]]:

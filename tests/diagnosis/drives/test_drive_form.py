@@ -13,8 +13,10 @@ from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotation
 from lunar_mjx.diagnosis.verdict import Verdict
-from lunar_mjx.diagnosis.weighed.answer import _held_to_account, _unrefitted, _without
+from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
+from lunar_mjx.diagnosis.weighed.form import Problem
+from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.deadline import Deadline, TimeUp
 from lunar_mjx.inference.weighing.search import search
@@ -209,8 +211,21 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     refitted = [h.effects for h in found.hypotheses if h.refitted]
     told, sentence = _unrefitted(said, said.sentence, refitted)
     assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
-    assert sentence.startswith("To first order: drag is missing") and "No refit with drag" in sentence
+    assert sentence.startswith("A first-order estimate points to drag. No refit bore it out")
+    assert "%" not in sentence and "is missing" not in sentence
     assert _unrefitted(said, said.sentence, [*refitted, frozenset({"drag", "lag"})]) == (said, said.sentence)
+
+
+def test_an_estimate_is_no_name_where_candidates_were_skipped_as_well(monkeypatch):
+    monkeypatch.setattr(module, "DRIVE_REFIT", dataclasses.replace(module.DRIVE_REFIT, together=1))
+    toy = Hurried({"a": 0.5, "drag": 0.9})
+    toy.late, toy.refits_too = "lag", True
+    form, found, _ = asked(toy)
+    problem = Problem((form,), dict.fromkeys(form.candidates, CATALOGUE["slip_sinkage"]), (), form.settings)
+    said = _diagnosis(problem, found, found.best)
+    assert (said.verdict, said.effects) == (Verdict.UNDECIDABLE, ())
+    assert "A first-order estimate points to drag" in said.sentence and "lag; give more --seconds" in said.sentence
+    assert "is missing" not in said.sentence
 
 
 def test_without_time_for_the_model_as_it_is_nothing_is_said():
