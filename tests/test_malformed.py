@@ -440,8 +440,9 @@ def test_broken_files_are_refused_or_load_to_what_they_say(kind, tmp_path, capfd
                 warnings.simplefilter("error")
                 loaded = read(path)
             with contextlib.suppress(second_readers.Unreadable):
+                wrong = otherwise(loaded, second(path))
                 compared += 1
-                if wrong := otherwise(loaded, second(path)):
+                if wrong:
                     failed.append((number, f"read otherwise: {wrong}"))
         except second_readers.Damaged:
             failed.append((number, "read although its own checksums say that it is damaged"))

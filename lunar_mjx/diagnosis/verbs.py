@@ -12,8 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.diagnosis import build_problem
-from lunar_mjx.diagnosis.build_problem import candidates_of, known_logs, require_discrepancy, require_splits
+from lunar_mjx.diagnosis.build_problem import (
+    candidate_effects,
+    candidates_of,
+    known_logs,
+    require_discrepancy,
+    require_splits,
+)
 from lunar_mjx.diagnosis.drives.loop import build_drives, grown_drives
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.windows import verbs as windows
@@ -227,7 +232,7 @@ def _require_candidate(name: str, run: Run, logs: Sequence[Any], only: Sequence[
     if name in held:
         raise bad_input("why", "--explain", name, "is in the model already", "name an effect that may be missing")
     if isinstance(logs[0], SteadyLog):
-        known = [n for n in build_problem.candidate_effects(run) if only is None or n in only]
+        known = [n for n in candidate_effects(run) if only is None or n in only]
     else:
         known = list(candidates_of(run, only))
     if name not in known:
@@ -268,6 +273,9 @@ def explain(diagnosis: Diagnosis, effect: str) -> Diagnosis:
             effects=(effect,),
             sentence=f"{effect} leaves no separable signal in these logs: {evidence.reason}{nearest}.",
         )
+    if evidence.status == "not refitted":
+        said = f"No refit with {effect} was made, so nothing is said of it; give more --seconds, or --only {effect}."
+        return dataclasses.replace(diagnosis, verdict=Verdict.UNDECIDABLE, effects=(effect,), sentence=said)
     values = ", ".join(f"{k} {v:.3g} +- {evidence.std.get(k, 0.0):.1g}" for k, v in evidence.values.items())
     sentence = (
         f"{effect} is missing with probability {evidence.probability:.3f}; it would show with "

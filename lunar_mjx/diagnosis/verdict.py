@@ -41,11 +41,13 @@ class EffectEvidence:
       effect: its name.
       separable_sigma: length of the effect's signature at its nominal size, after refitting of the baseline has been
         projected out, in sigma; below 5 the effect is not tested.
-      z: root of twice the log ratio of its evidence to that of nothing missing, with the ratio's sign, in sigma.
+      z: root of twice the log ratio of the most probable hypothesis with it to the most probable one without, with the
+        ratio's sign, in sigma.
       values: fitted parameters by name; std: their standard deviations.
-      probability: that the effect is missing, whatever else is; NaN where hypotheses were not weighed.
+      probability: that the effect is missing, whatever else is; NaN where hypotheses were not weighed, and where the
+        search ended before a refit with it was made.
       nearest: the effect with the most similar projected signature, and |cos| between the two.
-      status: "accepted", "rejected", "confounded", "not tested" or "not significant".
+      status: "accepted", "rejected", "confounded", "not refitted", "not tested" or "not significant".
       reason: in a few words.
     """
 
@@ -75,8 +77,9 @@ class Diagnosis:
         with the effects named.
       isolability: |cos| between projected signatures, by pairs of effects.
       undecidable: effects that leave no separable signal in these logs.
-      probability: of the verdict as a statement. probabilities: by hypothesis, together 1. inclusion: by effect, that
-        it is missing whatever else is. forms: by form of the model, such as its contact law.
+      probability: of the verdict as a statement; 0 for UNDECIDABLE, which states nothing. probabilities: by hypothesis,
+        together 1. inclusion: by effect, that it is missing whatever else is, without those that no refit has held.
+        forms: by form of the model, such as its contact law.
       unlisted: whether something unlisted at `port` belongs to the statement.
       further: beside `effects`, one of these (or something unlisted, where `unlisted`) acts, too.
       discrepancy: what remains, by port: `size` (share of the force or stress there), its 68 % range `low` to `high`,

@@ -72,7 +72,8 @@ def few(monkeypatch):
         own = [catalogue.get(spec) for spec in run.candidates]
         return {e.name: e for e in (*map(catalogue.get, FEW), *own)}
 
-    monkeypatch.setattr(build_problem, "candidate_effects", candidates)
+    for module in (build_problem, verbs):
+        monkeypatch.setattr(module, "candidate_effects", candidates)
 
 
 @pytest.fixture(scope="module")

@@ -296,7 +296,7 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         conclusion, sentence = _without(conclusion, sentence, skipped)
     held = account(_held_out(found, best, own))
     conclusion, sentence, accounted = _held_to_account(conclusion, sentence, found, settings.held_out_sure)
-    inclusion = found.inclusion()
+    inclusion = {t: p for t, p in found.inclusion().items() if t.name not in _estimates(found)}
     evidence, undecidable = _evidence(problem, found, conclusion.effects)
     return Diagnosis(
         verdict=conclusion.verdict,
@@ -342,7 +342,7 @@ def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[C
     skipped_sentence = f" Not looked at in the time given: {', '.join(skipped)}; give more --seconds."
     if said.verdict is Verdict.NOISE_ONLY:
         return said, sentence + skipped_sentence
-    said = dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=())
+    said = dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=(), probability=0.0)
     return said, "Of what was looked at: " + sentence + skipped_sentence
 
 
@@ -356,12 +356,22 @@ def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[st
     if said.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE) or any(named <= effects for effects in refitted):
         return said, sentence
     told = (
-        f"A first-order estimate points to {' and '.join(sorted(named))}. No refit bore it out, so nothing is named; "
-        "give more --seconds, or name the candidates with --only."
+        f"A first-order estimate points to {' and '.join(sorted(named))}. No refit with it was made, so nothing is "
+        "named; give more --seconds, or name the candidates with --only."
     )
-    # the probability of an estimate is none: it is left out of what is said
-    rest = sentence.removeprefix(said.sentence)
-    return dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=(), sentence=told), told + rest
+    taken_back = {"verdict": Verdict.UNDECIDABLE, "effects": (), "further": (), "probability": 0.0, "sentence": told}
+    return dataclasses.replace(said, **taken_back), told + sentence.removeprefix(said.sentence)
+
+
+def _estimates(found: ModelSearch) -> frozenset[str]:
+    """Effects that no refit has held where a search ended early: what is said of them is an estimate, no probability.
+
+    A search that came to its end has refitted whatever comes near the best; what it left is improbable by far.
+    """
+    if found.complete:
+        return frozenset()
+    refitted = frozenset[str]().union(*(h.effects for h in found.hypotheses if h.refitted))
+    return frozenset[str]().union(*(h.effects for h in found.hypotheses)) - refitted
 
 
 def _averaged(form: MeasuredForm, found: ModelSearch, least_signal: float) -> dict[str, dict[str, Any]]:
@@ -394,8 +404,8 @@ def _held_to_account(
         f"{held.gain:+.1f} +- {held.se:.1f} over {held.units} pieces), so {names} is not named; drive more, and "
         "otherwise."
     )
-    said = dataclasses.replace(said, verdict=Verdict.UNDECIDABLE, effects=(), further=(), unlisted=False, port=None)
-    return said, sentence, details
+    taken_back = {"verdict": Verdict.UNDECIDABLE, "effects": (), "further": (), "unlisted": False, "port": None}
+    return dataclasses.replace(said, **taken_back, probability=0.0), sentence, details
 
 
 def _held_out(found: ModelSearch, best: Hypothesis, own: str) -> np.ndarray:
@@ -415,7 +425,7 @@ def _evidence(
     best_form = found.best.form
     shows = found.base(best_form).refit.linear.shows()
     cosines = _cosines(found.base(best_form).refit, problem.settings.least_signal)
-    rows = []
+    estimates, rows = _estimates(found), []
     for name, length in shows.items():
         p = inclusion.get(name, 0.0)
         holding = next((h for h in found.hypotheses if name in h.effects), None)
@@ -439,6 +449,8 @@ def _evidence(
             status, reason = "not tested", "the time did not suffice to look at it"
         elif length < problem.settings.least_signal:
             status, reason = "not tested", f"would show with {length:.2g} sigma after a refit"
+        elif name in estimates:
+            p, status, reason = float("nan"), "not refitted", "a first-order estimate, with which no refit was made"
         elif name in named:
             status, reason = "accepted", f"probability {p:.3f}"
         elif p > 0.5 * (1.0 - problem.settings.sure):
@@ -460,7 +472,7 @@ def _evidence(
             )
         )
     order = {name: i for i, name in enumerate(named)}
-    rows.sort(key=lambda e: (order.get(e.effect, len(order)), -e.probability, -e.z))
+    rows.sort(key=lambda e: (order.get(e.effect, len(order)), -np.nan_to_num(e.probability), -e.z))
     return tuple(rows), tuple(e.effect for e in rows if e.status == "not tested")
 
 

@@ -12,6 +12,7 @@ from lunar_mjx.diagnosis.drives.form import DriveForm, _bounded_step
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotation
+from lunar_mjx.diagnosis.verbs import explain
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
@@ -211,7 +212,7 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     refitted = [h.effects for h in found.hypotheses if h.refitted]
     told, sentence = _unrefitted(said, said.sentence, refitted)
     assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
-    assert sentence.startswith("A first-order estimate points to drag. No refit bore it out")
+    assert sentence.startswith("A first-order estimate points to drag. No refit with it was made")
     assert "%" not in sentence and "is missing" not in sentence
     assert _unrefitted(said, said.sentence, [*refitted, frozenset({"drag", "lag"})]) == (said, said.sentence)
 
@@ -226,6 +227,11 @@ def test_an_estimate_is_no_name_where_candidates_were_skipped_as_well(monkeypatc
     assert (said.verdict, said.effects) == (Verdict.UNDECIDABLE, ())
     assert "A first-order estimate points to drag" in said.sentence and "lag; give more --seconds" in said.sentence
     assert "is missing" not in said.sentence
+    assert said.probability == 0.0 and "drag" not in said.inclusion
+    drag = next(e for e in said.evidence if e.effect == "drag")
+    assert drag.status == "not refitted" and np.isnan(drag.probability)
+    about = explain(said, "drag")
+    assert about.verdict is Verdict.UNDECIDABLE and about.sentence.startswith("No refit with drag was made")
 
 
 def test_without_time_for_the_model_as_it_is_nothing_is_said():
