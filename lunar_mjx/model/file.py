@@ -53,6 +53,9 @@ _TOP = (
 )
 _AMBIENT = ("temperature_degC", "noon_temperature_degC", "night_temperature_degC", "noon_time_s", "period_s")
 _CONTROL = ("mode", *GAINS)
+OF_LOGS = ("calibration", "between_drives")
+"""First parts of the names of priors about logs and not about the model: errors of their instruments, and what differs
+from one recording to the next. Only those who read logs know their second parts."""
 
 T = TypeVar("T")
 
@@ -220,15 +223,14 @@ def _grounds(path: Path, names: Any) -> tuple[str, ...]:
 
 
 def _priors(path: Path, table: Mapping[str, Any], model: Model) -> dict[str, tuple[float, float]]:
-    """Value and standard deviation by `effect.parameter` or `calibration.name`, in the parameter's SI unit."""
+    """Value and standard deviation by `effect.parameter` or a name of `OF_LOGS`, in the parameter's SI unit."""
     priors = {}
     for key, entry in table.items():
         field = f"priors.{key}"
         _known(path, field, _table(path, field, entry), ("value", "std"))
         effect, _, parameter = key.partition(".")
         known = {**catalogue.CATALOGUE, **{e.name: e for e in model.effects}}.get(effect)
-        # Calibrations belong to the logs' instruments, which a model does not know.
-        if effect != "calibration" and (known is None or parameter not in known.parameters):
+        if effect not in OF_LOGS and (known is None or parameter not in known.parameters):
             remedy = "write effect.parameter, as effect show prints them, or calibration.name"
             raise bad_input(path, "priors", key, "is no parameter of an effect", remedy)
         value, std = (_number(path, f"{field}.{k}", entry.get(k)) for k in ("value", "std"))

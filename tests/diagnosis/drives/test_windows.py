@@ -178,7 +178,7 @@ def test_priors_survive_the_file(model, tmp_path):
     assert base["calibration.pitch"].std == pytest.approx(0.2)
 
 
-def test_a_fit_teaches_priors(model):
+def test_a_fit_teaches_priors(model, tmp_path):
     form = form_of(model, measured(drives(), model, {"hard_ground.mu": 0.6}, np.random.default_rng(4)))
     taught = fitted_model(form, form.refit(frozenset(), None, None))
     value, std = taught.priors["hard_ground.mu"]
@@ -186,6 +186,8 @@ def test_a_fit_teaches_priors(model):
     assert 0.0 < std < 0.35 * value
     size, spread = taught.priors["between_drives.resistance"]
     assert 0.0 < size < 0.02 and 0.0 < spread < 0.02
+    # what `compare` writes is what the next `compare --model` reads
+    assert load_model(save_model(taught, tmp_path / "fitted.toml")).priors == taught.priors
 
 
 def test_logs_are_cut_where_speeds_are(tmp_path):

@@ -7,7 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.windows.coordinates import Suspect, baseline, sizes, suspects_of
+from lunar_mjx.diagnosis.drives.windows.coordinates import (
+    CALIBRATION,
+    Suspect,
+    baseline,
+    catalogue_of,
+    data_sheet,
+    sizes,
+    suspects_of,
+)
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, Cut, cut
 from lunar_mjx.diagnosis.drives.windows.form import SOFT, WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import (
@@ -18,13 +26,15 @@ from lunar_mjx.diagnosis.drives.windows.problem import (
     proportions,
     student_weights,
 )
-from lunar_mjx.diagnosis.drives.windows.settings import WindowSettings
+from lunar_mjx.diagnosis.drives.windows.settings import BETWEEN, DIFFERENCES, WindowSettings
 from lunar_mjx.diagnosis.runs import Run
 from lunar_mjx.diagnosis.weighed.form import Problem
 from lunar_mjx.effects import catalogue
+from lunar_mjx.errors import bad_input
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import silent
 from lunar_mjx.logs import Log
+from lunar_mjx.model import Model
 
 WINDOWS_FILE = "windows.json"
 MOST_WINDOWS = 60
@@ -46,6 +56,7 @@ class Bench:
 
     def __init__(self, run: Run, logs: Sequence[Log]):
         self.run, self.logs, self.model = run, list(logs), run.model
+        _require_known(run.model)
         joints, size = corners(run.model), sizes(run.model)
         self.cut: Cut = cut(self.logs, joints, size["radius"], MOST_WINDOWS, run.seed, size["track"])
         alone = len({g.name for g in logs}) == len(logs)
@@ -141,6 +152,16 @@ class Bench:
         self.weight = weight
         for made in self._made.values():
             made.weight = weight
+
+
+def _require_known(model: Model) -> None:
+    """Refuses priors about logs that nothing here reads."""
+    known = {q.key for s in catalogue_of(model) for q in s.unknowns} | {q.key for q in data_sheet(model)}
+    known |= {f"{BETWEEN}.{d.key}" for d in DIFFERENCES.values()}
+    for key in model.priors:
+        if key.partition(".")[0] in (CALIBRATION, BETWEEN) and key not in known:
+            mine = ", ".join(sorted(k for k in known if k.partition(".")[0] == key.partition(".")[0]))
+            raise bad_input("the model", "priors", key, "is not known of drives", f"use one of {mine}")
 
 
 def _splits(run: Run, logs: Sequence[Log], names: Sequence[str], found: Cut) -> np.ndarray:
