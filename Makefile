@@ -17,7 +17,7 @@ export PIP_NO_COMPILE ?= 1
 
 # Tests compile far more than they run; these take half the time of the usual ones. (Tests marked `optimised` do not, and
 # test-all does not.)
-FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$(XLA_FLAGS) --xla_cpu_use_fusion_emitters=false"
+FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test fast-tests busy-test test-all for-proofs proofs all-proofs lint docs foreign-tune foreign-report hashes clean

@@ -36,10 +36,7 @@ WORKERS = 2
 PAIRS, PER_PAIR = "LUNAR_MJX_BUSY_PAIRS", "LUNAR_MJX_BUSY_WORKERS"
 """Environment variables that tell test processes their pairs (0,1;2,3;...), and how many share one."""
 SPIN = "while True: pass"
-FAST_COMPILE = {
-    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-    "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false",
-}
+FAST_COMPILE = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 """As the Makefile sets for `make test`."""
 
 

@@ -19,6 +19,10 @@ from tests.cli_harness import Result, Run
 from tests.memory import give_back
 
 FAST_COMPILE = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0").lower() in ("1", "true", "yes", "on")
+EMITTERS = "--xla_cpu_use_fusion_emitters=false"
+if FAST_COMPILE and jax.__version_info__ < (0, 11) and EMITTERS not in os.environ.get("XLA_FLAGS", ""):
+    # Before the first program is compiled. JAX 0.11 does not know this option, and would end the process.
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {EMITTERS}".strip()
 
 # A busy machine is no error, and the examples are the same in every run.
 settings.register_profile("any machine", deadline=None, derandomize=True)

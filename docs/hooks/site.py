@@ -122,9 +122,9 @@ def _share(score: dict[str, Any]) -> str:
     return f"{100 * score['success']:.1f} % ({100 * score['low']:.1f} to {100 * score['high']:.1f})"
 
 
-def ladder_3() -> str:
-    """Who arrives on rung 3: each trained policy, and those that learn nothing, on the same unseen episodes."""
-    kept = _rung(3)["seeds"]
+def _ladder(number: int) -> str:
+    """Who arrives on a rung: each trained policy, and those that learn nothing, on the same unseen episodes."""
+    kept = _rung(number)["seeds"]
     finals = {run["seed"]: run["final"]["rows"] for run in kept}
     rows = [(f"trained, seed {seed}", rows["policy"]) for seed, rows in finals.items()]
     rows += [(f"seed {seed}, its scans blanked", rows["policy, scans blanked"]) for seed, rows in finals.items()]
@@ -135,11 +135,12 @@ def ladder_3() -> str:
     return table(header, [[n, _share(r), *(text.format(r[k]) for k, text in numbers.items())] for n, r in rows])
 
 
-def ladder_3_trainings() -> str:
-    """What the trainings on rung 3 took."""
-    header = ["seed", "device", "commit", "worlds made in", "compiled in", "steps", "training", "steps/s"]
+def ladder_trainings() -> str:
+    """What the trainings on rungs took."""
+    header = ["rung", "seed", "device", "commit", "worlds made in", "compiled in", "steps", "training", "steps/s"]
     rows = [
         [
+            str(number),
             str(run["seed"]),
             cell(run["device"]),
             run["commit"],
@@ -149,7 +150,8 @@ def ladder_3_trainings() -> str:
             f"{run['final']['elapsed_s']:.0f} s",
             f"{run['final']['steps'] / run['final']['elapsed_s'] / 1e6:.2f} M",
         ]
-        for run in _rung(3)["seeds"]
+        for number in (2, 3)
+        for run in _rung(number)["seeds"]
     ]
     return table(header, rows)
 
@@ -179,8 +181,9 @@ TABLES = {
     "flaws": flaws,
     "field": field,
     "field_measured": field_measured,
-    "ladder_3": ladder_3,
-    "ladder_3_trainings": ladder_3_trainings,
+    "ladder_2": lambda: _ladder(2),
+    "ladder_3": lambda: _ladder(3),
+    "ladder_trainings": ladder_trainings,
     "unsaid": unsaid,
     "soils": soils,
     "windings": windings,
