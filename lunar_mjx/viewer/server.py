@@ -39,6 +39,8 @@ class ServerLimits:
     port: int = 8600
     dead_man: float = 1.0
     """Held keys are let go when the page has not repeated them for so long, s: it was closed, or hangs."""
+    repeat: float = 5.0
+    """A page gets the last picture again after so long without a new one, s: so a page that is gone is noticed."""
     longest: int = 4096
     """Bytes of a message from the page."""
     most_connections: int = 64
@@ -78,6 +80,9 @@ class Viewer(ThreadingHTTPServer):
       drive: what is shown: a drive that goes on, or one that is over. port: 0 for any that is free.
       sun: the light. clock: s, monotonic.
 
+    Attributes:
+      repeat: as in `ServerLimits`; None for never.
+
     Raises:
       UserError: a port that is no port, or taken.
     """
@@ -98,6 +103,7 @@ class Viewer(ThreadingHTTPServer):
         self.scene = json.dumps(rover_scene(drive.model, sun or Sun()) | drive.scene)
         self.pace = Pace(drive, self._show, clock)
         self._fresh = threading.Condition()
+        self.repeat: float | None = SERVER.repeat
         self._picture, self._count, self._closed = "", 0, False
         # Nobody holds a key yet.
         self._let_go = math.inf
@@ -157,9 +163,9 @@ class Viewer(ThreadingHTTPServer):
         return json.dumps(ground_scene(self.terrain, x, y))
 
     def next_picture(self, after: int) -> tuple[int, str]:
-        """The next picture that is newer than number `after`; an empty one when the drive has ended."""
+        """The next picture that is newer than number `after`, or the last one; an empty one when the drive has ended."""
         with self._fresh:
-            self._fresh.wait_for(lambda: self._count > after or self._closed, timeout=5.0)
+            self._fresh.wait_for(lambda: self._count > after or self._closed, timeout=self.repeat)
             return self._count, "" if self._closed else self._picture
 
     def _show(self) -> None:

@@ -22,6 +22,7 @@ def clock() -> Clock:
 def viewer(clock: Clock) -> Iterator[Viewer]:
     """Stands still until a test moves the clock and calls `viewer.pace.tick`."""
     served = Viewer(LiveDrive(make_model("luvmi_x", "lunar_plain"), "native"), port=0, clock=clock)
+    served.repeat = None  # or a page would get one picture twice where the machine is slow
     thread = threading.Thread(target=served.serve_forever, kwargs={"poll_interval": 0.1})
     thread.start()
     yield served
