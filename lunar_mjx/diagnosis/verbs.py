@@ -100,11 +100,6 @@ def _compare(run: Run, progress: Progress) -> Run:
     require_discrepancy(run.discrepancy, campaign)
     # Logs whose wheels moved as measured are compared in windows, each from its measured start.
     if windows.imposed(campaign):
-        # Such fits have sizes of their own, and their errors are learnt: nothing reads what is given here.
-        for option, given in (("--setting", run.settings), ("--discrepancy", run.discrepancy)):
-            for name, value in given.items():
-                problem = "is not for logs with imposed wheel speeds"
-                raise bad_input("compare", option, f"{name}={value}", problem, "leave it out")
         return windows.compare(run, campaign, progress)
     # Before the folder is made: a mistake leaves nothing behind.
     (TableSettings if isinstance(campaign[0], SteadyLog) else DriveSettings).of(run.settings)

@@ -163,7 +163,7 @@ class Viewer(ThreadingHTTPServer):
         return json.dumps(ground_scene(self.terrain, x, y))
 
     def next_picture(self, after: int) -> tuple[int, str]:
-        """The next picture that is newer than number `after`, or the last one; an empty one when the drive has ended."""
+        """The next picture newer than number `after`, or the last one again; an empty one when the drive has ended."""
         with self._fresh:
             self._fresh.wait_for(lambda: self._count > after or self._closed, timeout=self.repeat)
             return self._count, "" if self._closed else self._picture

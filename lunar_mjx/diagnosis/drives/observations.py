@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -69,25 +69,40 @@ DISCREPANCY_TIME_S = 1.0
 phases, which last about a second, and not from sample to sample."""
 
 
-def with_discrepancy(observations: Observations, discrepancy: Mapping[str, float]) -> Observations:
-    """Observations whose noise holds a known unexplained error of the model, as a coloured part.
+def discrepancy_of(discrepancy: Mapping[str, float], channels: Collection[str]) -> dict[str, float]:
+    """Known unexplained errors of the model by channel, in its unit; 0 where none is stated.
 
     Args:
-      observations: of drives. discrepancy: standard deviation by channel, in its unit; a name may hold `*`.
+      discrepancy: standard deviation by channel; a name may hold `*`. channels: that are compared.
 
     Raises:
       UserError: a name that matches no channel that is compared, or a negative size.
     """
-    names = {s.channel for s in observations.series}
     for pattern, size in discrepancy.items():
-        if not any(fnmatchcase(n, pattern) for n in names):
-            shown = ", ".join(sorted(names))
+        if not any(fnmatchcase(n, pattern) for n in channels):
+            shown = ", ".join(sorted(channels))
             raise bad_input("--discrepancy", "channel", pattern, "is not compared", f"use one of {shown}")
         if not 0.0 <= size < np.inf:
             raise bad_input("--discrepancy", pattern, size, "is no size of an error", "give a number from 0 on")
+    return {
+        n: float(np.sqrt(sum(size**2 for pattern, size in discrepancy.items() if fnmatchcase(n, pattern))))
+        for n in channels
+    }
+
+
+def with_discrepancy(observations: Observations, discrepancy: Mapping[str, float]) -> Observations:
+    """Observations whose noise holds a known unexplained error of the model, as a coloured part.
+
+    Args:
+      observations: of drives. discrepancy: see `discrepancy_of`.
+
+    Raises:
+      UserError: see `discrepancy_of`.
+    """
+    sizes = discrepancy_of(discrepancy, {s.channel for s in observations.series})
 
     def widened(s: Series) -> Series:
-        added = float(np.sqrt(sum(v * v for p, v in discrepancy.items() if fnmatchcase(s.channel, p))))
+        added = sizes[s.channel]
         if added == 0.0:
             return s
         time = s.correlation_time if s.coloured > 0.0 and s.correlation_time > 0.0 else DISCREPANCY_TIME_S

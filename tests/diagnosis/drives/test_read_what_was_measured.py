@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lunar_mjx.diagnosis import verbs
 from lunar_mjx.diagnosis.drives.observations import with_discrepancy
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.simulation.log_run import log_run
@@ -138,18 +137,6 @@ def test_what_nothing_reads_is_named(tmp_path: Path) -> None:
     log = make(tmp_path / "a", columns, imposed="wheel_speed")
     found = unused_channels(log, {"gyro_z_rad_s"})
     assert set(found) == {"drawbar_pull_N", "bus_voltage_V"} and "bus_droop" in found["bus_voltage_V"]
-
-
-@pytest.mark.parametrize(("option", "given"), [("setting", {"sure": "0.9"}), ("discrepancy", {"gyro_z_rad_s": 0.1})])
-def test_what_imposed_wheel_speeds_do_not_read_is_refused(option, given, tmp_path: Path, monkeypatch) -> None:
-    columns = {"gyro_z_rad_s": 0.0, "joint_left_drive_speed_rad_s": 1.0, "joint_right_drive_speed_rad_s": 1.0}
-    log = make(tmp_path / "a", columns, imposed="wheel_speed")
-    monkeypatch.setattr(verbs, "gate", lambda _: [log])
-    monkeypatch.setattr(verbs.windows, "compare", lambda *_: pytest.fail("is fitted"))
-    more = {"settings": given} if option == "setting" else {"discrepancy": given}
-    with pytest.raises(UserError, match=f"--{option} = .* is not for logs with imposed wheel speeds; leave it out"):
-        verbs.compare([tmp_path / "a"], make_model("luvmi_x", "flat"), tmp_path / "run", **more)
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_discrepancy_of_an_unknown_channel_is_refused() -> None:

@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from lunar_mjx.diagnosis import verbs as all_verbs
+from lunar_mjx.diagnosis.drives.observations import DISCREPANCY_TIME_S
 from lunar_mjx.diagnosis.drives.windows import coordinates, verbs
-from lunar_mjx.diagnosis.drives.windows.bench import held_out_parts
+from lunar_mjx.diagnosis.drives.windows.bench import Bench, held_out_parts
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, _held, cut, imu_clock
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, corners, learn_noise, proportions
@@ -190,27 +192,60 @@ def test_a_fit_teaches_priors(model, tmp_path):
     assert load_model(save_model(taught, tmp_path / "fitted.toml")).priors == taught.priors
 
 
-def test_logs_are_cut_where_speeds_are(tmp_path):
-    """A gap of a second ends a window, and the accelerometer tells the slope."""
-    log = tmp_path / "drive"
-    log.mkdir()
+def a_log(folder):
+    """A log folder with a gap of a second, on a slope that its accelerometer tells."""
+    folder.mkdir()
     time = np.concatenate([np.arange(40) * 0.1, 5.0 + np.arange(30) * 0.1])
     rows = [f"{t:.3f},{2.0},{2.0},{3.0},{3.1},{1.7},{0.0},{9.66},{0.01}" for t in time]
     header = (
         "time_s,joint_left_drive_speed_rad_s,joint_right_drive_speed_rad_s,motor_left_drive_current_A,"
         "motor_right_drive_current_A,accelerometer_x_m_s2,accelerometer_y_m_s2,accelerometer_z_m_s2,gyro_z_rad_s"
     )
-    (log / "drive.csv").write_text("\n".join([header, *rows]) + "\n")
-    (log / "log.toml").write_text(
+    (folder / "drive.csv").write_text("\n".join([header, *rows]) + "\n")
+    (folder / "log.toml").write_text(
         'format = "lunar-mjx-log/1"\nrover = "husky"\nmanoeuvre = "straight"\ngravity_m_s2 = 9.81\n'
         'imposed = "wheel_speed"\n[tables.drive]\nfile = "drive.csv"\nrate_hz = 10.0\n'
     )
+    return folder
+
+
+def test_logs_are_cut_where_speeds_are(tmp_path):
+    """A gap of a second ends a window, and the accelerometer tells the slope."""
     model = load_model(shipped("models") / "husky" / "hard_floor.toml")
-    found = cut(read_campaign([log]), corners(model), RADIUS, 10)
+    found = cut(read_campaign([a_log(tmp_path / "drive")]), corners(model), RADIUS, 10)
     np.testing.assert_allclose(found.start_s, [0.0, 2.0, 5.0], atol=1e-9)
     slope = np.arctan2(np.asarray(found.imposed.up_x), np.asarray(found.imposed.up_z))
     np.testing.assert_allclose(np.degrees(slope), 9.98, atol=0.1)
     np.testing.assert_allclose(found.measured[CHANNELS[0]], 3.0)
+
+
+def test_settings_and_a_known_error_of_the_model_are_honoured(tmp_path):
+    """The error is in the noise of its channels, and stays there in what a later verb reads."""
+    log, model = a_log(tmp_path / "drive"), load_model(shipped("models") / "husky" / "hard_floor.toml")
+    given = {"settings": {"most_terms": "2"}, "discrepancy": {"motor_*_current_A": 0.5}}
+    run = all_verbs.compare([log], model, tmp_path / "run", **given)
+    bench = Bench(run, run.campaign())
+    assert bench.settings.most_terms == 2
+    left, right, gyro, _ = bench.noise()
+    assert left.std > 0.5 and right.std > 0.5 and gyro.std < 0.1
+    wrong = {"settings": {"effect_size": 2.0}, "discrepancy": {"yaw_deg": 1.0}}
+    words = {
+        "settings": "is not read where wheel speeds are imposed",
+        "discrepancy": "is not compared; use one of gyro",
+    }
+    for option, value in wrong.items():
+        with pytest.raises(UserError, match=words[option]):
+            all_verbs.compare([log], model, tmp_path / "other", **{option: value})
+        assert not (tmp_path / "other").exists()
+
+
+def test_a_known_error_is_a_coloured_part_of_the_noise():
+    there = np.ones(4, bool)
+    for noise in (Noise(0.2, 0.4, 3.0), Noise(0.2, 0.0, 9.0)):
+        before, wider = noise.factor(there, 0.1), noise.with_discrepancy(0.3).factor(there, 0.1)
+        lag = 0.1 * np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
+        added = 0.09 * np.exp(-lag / (3.0 if noise.share else DISCREPANCY_TIME_S))
+        np.testing.assert_allclose(wider @ wider.T, before @ before.T + added)
 
 
 def test_a_channel_with_gaps_weighs_as_much_as_its_samples(model):

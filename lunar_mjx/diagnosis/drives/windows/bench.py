@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lunar_mjx.diagnosis.drives.observations import discrepancy_of
 from lunar_mjx.diagnosis.drives.windows.coordinates import (
     CALIBRATION,
     Suspect,
@@ -51,12 +52,14 @@ class Bench:
     Attributes:
       cut: the windows. names: of the logs. splits: (window,) of every window.
       base: the model's own unknowns. suspects: what may be missing of it.
+      settings: of the run. discrepancy: known unexplained error of the model by channel, in its unit.
       weight: (channel, window) of every window's measurements.
     """
 
     def __init__(self, run: Run, logs: Sequence[Log]):
         self.run, self.logs, self.model = run, list(logs), run.model
         _require_known(run.model)
+        self.settings = WindowSettings.of(run.settings)
         joints, size = corners(run.model), sizes(run.model)
         self.cut: Cut = cut(self.logs, joints, size["radius"], MOST_WINDOWS, run.seed, size["track"])
         alone = len({g.name for g in logs}) == len(logs)
@@ -64,6 +67,7 @@ class Bench:
         self.splits = _splits(run, self.logs, self.names, self.cut)
         self.held_out = np.isin(self.splits, ("select", "test"))
         self.fitted = self.splits == "fit"
+        self.discrepancy = discrepancy_of(run.discrepancy, self.cut.channels)
         self.base = baseline(self.model, self.cut.channels, self.logs)
         self.suspects = suspects_of(self.model, self.cut.channels)
         self.weight = np.ones((len(CHANNELS), len(self.cut)))
@@ -80,7 +84,7 @@ class Bench:
         """The model and what may be missing of it, against the windows with their noise."""
         observations = observe(self.problem(None), noise, self.names, self.splits)
         mine = self.suspects if suspects is None else suspects
-        return WindowForm(self.problem, self.base, mine, observations, WindowSettings(), self.other_ground)
+        return WindowForm(self.problem, self.base, mine, observations, self.settings, self.other_ground)
 
     @property
     def grounds(self) -> tuple[str, ...]:
@@ -130,7 +134,7 @@ class Bench:
         whole, mine = whole / scale[..., None], self.fitted
         found = learn_noise(whole[:, mine], problem.there[:, mine], self.cut.interval_s)
         self.use_weight(student_weights(whole, problem.there, found, self.cut.interval_s) / scale**2)
-        return found
+        return [n.with_discrepancy(self.discrepancy.get(c, 0.0)) for n, c in zip(found, CHANNELS, strict=True)]
 
     def ripple(self) -> list[Noise]:
         """Noise by what fluctuates within windows, whatever the model: a first guess."""

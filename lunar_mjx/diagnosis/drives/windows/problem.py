@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from scipy import linalg
 
+from lunar_mjx.diagnosis.drives.observations import DISCREPANCY_TIME_S
 from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, Unknown, start_of
 from lunar_mjx.diagnosis.drives.windows.cut import AHEAD, CHANNELS, CURRENTS, STANDING_M_S, Cut
 from lunar_mjx.dynamics.imposed import KinematicDrive, Seen, Windows, on_a_plane, require_drives_alone
@@ -70,6 +71,13 @@ class Noise:
         lag = np.abs(np.subtract.outer(at, at)) * interval_s
         whole = (1.0 - self.share) * np.eye(len(at)) + self.share * np.exp(-lag / self.time_s)
         return self.std * np.linalg.cholesky(whole)
+
+    def with_discrepancy(self, size: float) -> Noise:
+        """Noise that holds a known unexplained error of the model, of a standard deviation, in its coloured part."""
+        if size == 0.0:
+            return self
+        std, time_s = float(np.hypot(self.std, size)), self.time_s if self.share > 0.0 else DISCREPANCY_TIME_S
+        return Noise(std, (self.share * self.std**2 + size**2) / std**2, time_s)
 
 
 class WindowProblem:

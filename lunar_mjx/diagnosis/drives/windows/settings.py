@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.windows.cut import STANDING_M_S
-from lunar_mjx.diagnosis.weighed.form import SearchSettings
+from lunar_mjx.diagnosis.weighed.form import SearchSettings, SettingsKind
+from lunar_mjx.errors import bad_input
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,6 +23,15 @@ class WindowSettings(SearchSettings):
     other_ground_odds: float = 1.0
     """1; prior odds that something of the ground differs where the logs name another ground than the model's logs did:
     as likely as not. Else each suspect of the ground has `effect_odds`, as any other."""
+
+    @classmethod
+    def of(cls: type[SettingsKind], changed: Mapping[str, Any]) -> SettingsKind:
+        """See `SearchSettings`; sizes that nothing reads here are refused: `DIFFERENCES` has others."""
+        for name in ("usual_discrepancy", "effect_size"):
+            if name in changed:
+                problem = "is not read where wheel speeds are imposed"
+                raise bad_input("settings", name, changed[name], problem, "leave it out")
+        return super().of(changed)  # type: ignore[misc]
 
 
 @dataclasses.dataclass(frozen=True)

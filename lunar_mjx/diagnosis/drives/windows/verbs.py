@@ -81,11 +81,11 @@ def compare(run: Run, logs: Sequence[Log], progress: Progress = silent, like: Be
       like: of another run on the same windows, whose noise is taken over; None learns it.
     """
     begin = time.monotonic()
+    bench = Bench(run, logs)  # before the folder is made: a mistake leaves nothing behind
     run.write()
     (run.folder / VERDICT_FILE).unlink(missing_ok=True)  # an earlier verdict is not about this comparison
     if like is None:
         (run.folder / WINDOWS_FILE).unlink(missing_ok=True)
-    bench = Bench(run, logs)
     # how long a first simulation compiles on this machine, and how many steps a fit takes, is not known beforehand
     progress("compiling, and learning the noise", math.nan)
     with threadpool_limits(1, "blas"):
