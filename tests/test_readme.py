@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from lunar_mjx.model import make_model
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 FIRST_STEPS, OWN_EFFECT = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-COMMANDS = [shlex.split(c, comments=True)[1:] for c in re.findall(r"^    (lunar-mjx .*)$", README, re.MULTILINE)]
 
 
 @pytest.mark.slow
@@ -31,14 +29,3 @@ def test_own_effect(tmp_path: Path) -> None:
     file.write_text(OWN_EFFECT, encoding="utf-8")
     model = make_model("viper", "flat").add(get(f"{file}:gear_friction"), torque=0.2)
     assert model.parameters["gear_friction"]["torque"] == 0.2
-
-
-@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_options_exist(command: list[str], run) -> None:
-    """Each command's own help names the options that the README gives it."""
-    names = [c for i, c in enumerate(command) if c.isalpha() and all(n.isalpha() for n in command[:i])]
-    while run(*names, "--help").status:
-        names.pop()
-    text = run(*names, "--help").out
-    for option in (c for c in command if c.startswith("-")):
-        assert option in text, option

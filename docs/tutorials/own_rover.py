@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Your own rover from URDF
 #
-# `lunar-mjx convert my_rover.urdf -o my_rover/` turns a URDF of a four-wheeled rover into MJCF. Here a small
+# `lunar-mjx convert my_rover.urdf -o my_rover/` turns the URDF of a wheeled rover into MJCF. Here a small
 # skid-steered rover is written down by hand: a box, and four wheels on continuous joints.
 
 # %%

@@ -104,7 +104,7 @@ def demo(out: OutOption = Path("runs/demo"), device: DeviceOption = "auto") -> N
 
 @app.command()
 def convert(
-    urdf: Annotated[Path, typer.Argument(help="URDF of a four-wheeled rover.")],
+    urdf: Annotated[Path, typer.Argument(help="URDF of a rover with three wheels or more.")],
     out: OutOption,
     description: Annotated[
         Path | None, typer.Option(help="Description file; <stem>.rover.toml beside the URDF if left out.")

@@ -11,7 +11,7 @@ import typer
 def parity(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("runs/parity"),
     rover: Annotated[str, typer.Option(help="Name of a shipped rover, or folder that `convert` wrote.")] = "luvmi_x",
-    preset: Annotated[str, typer.Option(help="consistent, paper or both.")] = "both",
+    preset: Annotated[str, typer.Option(help="consistent, field, paper, or both: consistent and paper.")] = "both",
     engines: Annotated[
         str,
         typer.Option(
