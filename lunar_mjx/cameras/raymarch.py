@@ -63,6 +63,7 @@ def mounted(
       mount: its pose in the chassis frame, such as `front_mount(rover)`.
       qpos: the rovers' coordinates; place and orientation of the chassis come first.
     """
+    qpos = jnp.asarray(qpos)  # MuJoCo gives float64, of which JAX would warn at every use
     body = rotation(qpos[..., 3:7])
     arm = jnp.asarray(mount.position, qpos.dtype)
     return qpos[..., :3] + _turned(body, arm), body @ jnp.asarray(mount.rotation, qpos.dtype)
@@ -87,6 +88,7 @@ def height_scan(
     Returns:
       Height of the ground or rock over the chassis' position, m.
     """
+    position = jnp.asarray(position)  # as above
     dtype = position.dtype
     forward = jnp.linspace(ahead[1], ahead[0], shape[0], dtype=dtype)[:, None]
     left = jnp.linspace(aside, -aside, shape[1], dtype=dtype)[None, :]

@@ -83,3 +83,17 @@ def test_agrees_with_the_renderer(scene, march):
     assert np.median(error) < 0.002 and np.mean(error > 0.01) < 0.05
     rocks = both & (images.segmentation == 2)
     assert rocks.sum() > 50 and np.median(error[rocks[both]]) < 0.01
+
+
+def test_coordinates_as_mujoco_gives_them(recwarn):
+    """Arrays of float64 in NumPy are taken without a warning, and give what the same in JAX gives."""
+    rover = load_rover("luvmi_x")
+    qpos = np.array([[1.0, 2.0, 0.5, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.3, 0.6, 0.0, 0.0, 0.8]])
+    yaw = np.array([0.0, 1.8])
+    seen = [
+        (*mounted(front_mount(rover), q), height_scan(flat(10.0), q[:, :3], y, (4, 4)))
+        for q, y in ((qpos, yaw), (jnp.asarray(qpos), jnp.asarray(yaw)))
+    ]
+    for got, want in zip(*seen, strict=True):
+        np.testing.assert_array_equal(got, want)
+    assert not [w for w in recwarn if "dtype" in str(w.message)]
