@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any
@@ -144,7 +145,7 @@ def example(folder: Annotated[Path, typer.Argument(help="Folder to make; must no
     from lunar_mjx.logs.example import copy_example
 
     print(copy_example(folder))
-    print(f"next: lunar-mjx log import {folder} --map husky_borealtc -o runs/husky")
+    print(f"next: lunar-mjx log import {shlex.quote(str(folder))} --map husky_borealtc -o runs/husky")
 
 
 def noise(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -94,7 +95,7 @@ def next_experiment(
     run = folder if isinstance(folder, Run) else load_run(folder)
     verdict = run.load(VERDICT_FILE)
     if verdict is None:
-        raise UserError(f"{run.folder}: has no verdict yet; run lunar-mjx why {run.folder} first.")
+        raise UserError(f"{run.folder}: has no verdict yet; run lunar-mjx why {shlex.quote(str(run.folder))} first.")
     if verdict["verdict"] in ("BAD_DATA", "BAD_FIT"):
         raise UserError(f"{run.folder}: the verdict is {verdict['verdict']}; mend that before planning a measurement.")
     names = _hypotheses(verdict, between, set(candidate_effects(run)))

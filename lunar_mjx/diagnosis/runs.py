@@ -25,6 +25,8 @@ from lunar_mjx.trust import require_trust
 
 FORMAT = "lunar-mjx-run/1"
 RUN_FILE, MODEL_FILE = "run.json", "model.toml"
+FITTED_FILE = "fitted.toml"
+"""The model as refitted, and what was learnt as its priors, where wheel speeds are imposed."""
 COMPARISON_FILE, VERDICT_FILE, SERIES_FILE = "comparison.json", "verdict.json", "series.npz"
 SIGNATURES_FILE, HYPOTHESES_FILE = "signatures.npz", "hypotheses.json"
 

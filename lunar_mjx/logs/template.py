@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +119,7 @@ def new_log(folder: str | Path, rover: str = "viper", manoeuvre: str = "speed_st
     folder = Path(folder)
     if steady:
         new_folder(folder)
-        _write(folder / "log.toml", _STEADY.format(folder=folder, format=FORMAT))
+        _write(folder / "log.toml", _STEADY.format(folder=shlex.quote(str(folder)), format=FORMAT))
         _write(folder / "points.csv", ",".join(_POINTS) + "\n")
         return folder
     # The template is text that is read as TOML again.
@@ -138,7 +139,13 @@ def new_log(folder: str | Path, rover: str = "viper", manoeuvre: str = "speed_st
             noise += f'[noise."{instrument.pattern}"]        # {instrument.source}\n'
             noise += f'std = {instrument.std:g}\nsource = "datasheet"\n\n'
     text = _DRIVE.format(
-        folder=folder, format=FORMAT, rover=rover, manoeuvre=manoeuvre, tables=tables, noise=noise, **settings
+        folder=shlex.quote(str(folder)),
+        format=FORMAT,
+        rover=rover,
+        manoeuvre=manoeuvre,
+        tables=tables,
+        noise=noise,
+        **settings,
     )
     _write(folder / "log.toml", text)
     return folder

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import itertools
 import math
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -139,7 +140,8 @@ class Discovery:
         if self.files:
             runs = ["RUN", *(f"run{k + 2}" for k in range(len(self.files)))]
             sequence = ", then ".join(
-                f"lunar-mjx add {a} {file} -o {b}" for a, file, b in zip(runs, self.files, runs[1:], strict=False)
+                f"lunar-mjx add {a} {shlex.quote(file)} -o {b}"
+                for a, file, b in zip(runs, self.files, runs[1:], strict=False)
             )
             lines.append(f"Effect file: {', '.join(self.files)}; look at it, then: {sequence}")
         else:

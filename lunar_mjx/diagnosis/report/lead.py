@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.words import SURE, and_list
+from lunar_mjx.diagnosis.runs import COMPARISON_FILE, FITTED_FILE, MODEL_FILE
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.report.page import Lead
 
+INSTRUMENT = "calibration: "
+"""Begins what a verdict calls an instrument that errs: no effect, so that `add` does not take it."""
 _TONES = {
     "NOISE_ONLY": ("nothing missing", "good"),
     "KNOWN": ("effect named", "good"),
@@ -30,7 +35,7 @@ def lead(results: Sequence[Result], judge: Result) -> Lead:
             "not diagnosed",
             "open",
             "The model has been compared with the logs. Nobody has asked yet why it fails.",
-            [f"lunar-mjx why {last.name}"],
+            [f"lunar-mjx why {_typed(last.path)}"],
         )
     name = str(judge.verdict.get("verdict"))
     named = [str(e) for e in judge.verdict.get("effects") or []]
@@ -42,7 +47,7 @@ def lead(results: Sequence[Result], judge: Result) -> Lead:
         new = [e for e in added if e not in (judge.run.get("added") or [])]
         now = f"The model now has {_and(new)}." if new else "The model was compared again."
         sentence = f"{now} Nobody has asked yet what it still lacks; the findings below are those on {judge.name}."
-        badge, tone, steps = "not diagnosed", "open", [f"lunar-mjx why {last.name}"]
+        badge, tone, steps = "not diagnosed", "open", [f"lunar-mjx why {_typed(last.path)}"]
     return Lead(badge, tone, sentence, steps)
 
 
@@ -64,15 +69,15 @@ def _sentence(name: str, named: Sequence[str], port: str, added: Sequence[str]) 
 
 
 def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
-    run = judge.name
-    log = next(iter(judge.run.get("logs") or ["LOG"]))
+    run = _typed(judge.path)
+    log = _typed(next(iter(judge.run.get("logs") or ["LOG"])))
     return {
         "NOISE_ONLY": [
-            f"Use the fitted model: lunar-mjx simulate --model {run}/model.toml",
+            _using(judge.path),
             "Test it on a manoeuvre that no fit has seen; that is where the next missing effect shows.",
         ],
-        "KNOWN": _adding(run, [*_law(judge), *named]),
-        "MULTIPLE": _adding(run, [*_law(judge), *named]),
+        "KNOWN": _adding(judge, [*_law(judge), *named]),
+        "MULTIPLE": _adding(judge, [*_law(judge), *named]),
         "KNOWN_CLASS": [
             f"lunar-mjx next {run}  (names the manoeuvre that tells them apart)",
             "Drive that manoeuvre, and compare with its log too.",
@@ -86,6 +91,14 @@ def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
         "BAD_FIT": ["The sentence above says what failed: look at the log and the model there, and compare again."],
         "BAD_DATA": ["Mend what the findings below name.", f"lunar-mjx log check {log}"],
     }.get(name, [])
+
+
+def _using(run: Path) -> str:
+    """How to drive the model that explains everything; `model.toml` is what was compared, before any refit."""
+    if (run / FITTED_FILE).is_file():
+        return f"Use the fitted model: lunar-mjx simulate --model {_typed(run / FITTED_FILE)}"
+    command = f"lunar-mjx simulate --model {_typed(run / MODEL_FILE)}"
+    return f"Use the model as it was compared: {command}  (its parameters as refitted are in {COMPARISON_FILE})"
 
 
 def _searched(judge: Result) -> bool:
@@ -103,13 +116,24 @@ def _law(judge: Result) -> list[str]:
     return [best] if best in CATALOGUE and best not in present and float(forms[best]) >= SURE else []
 
 
-def _adding(run: str, names: Sequence[str]) -> list[str]:
-    """Commands that add effects one after the other, as `add` takes one, and ask again."""
-    steps, last = [], run
+def _adding(judge: Result, names: Sequence[str]) -> list[str]:
+    """Commands that add effects one after the other, as `add` takes one, and ask again; runs lie beside the first."""
+    # A verdict calls the user's own effects by their bare names; to be added they need their file.
+    specs = {str(s).rpartition(":")[2]: str(s) for s in judge.run.get("candidates") or []}
+    steps, last = [], judge.path
     for name in names:
-        steps.append(f"lunar-mjx add {last} {name} -o with_{name}")
-        last = f"with_{name}"
-    return [*steps, f"lunar-mjx why {last}"]
+        if name.startswith(INSTRUMENT):
+            steps.append(f"Recalibrate {name.removeprefix(INSTRUMENT)}: it errs by more than is usual.")
+            continue
+        after = judge.path.parent / f"with_{name}"
+        steps.append(f"lunar-mjx add {_typed(last)} {_typed(specs.get(name, name))} -o {_typed(after)}")
+        last = after
+    return steps if last == judge.path else [*steps, f"lunar-mjx why {_typed(last)}"]
+
+
+def _typed(word: object) -> str:
+    """A word as a shell takes it, blanks and all."""
+    return shlex.quote(str(word))
 
 
 def _and(names: Sequence[str]) -> str:

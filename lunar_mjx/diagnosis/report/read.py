@@ -89,6 +89,11 @@ class Result:
     signatures: dict[str, np.ndarray]
     folder: Path | None = None
 
+    @property
+    def path(self) -> Path:
+        """The folder as it was given, which commands have to be given again; its name for one made in memory."""
+        return self.folder or Path(self.name)
+
     @functools.cached_property
     def model(self) -> Model | None:
         """The model that was compared; None where it cannot be loaded any more, such as without a user's effect."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -72,8 +73,8 @@ def _audit_line(result: Result) -> str:
         older = audit.get("version", __version__) != __version__
         return str(audit["sentence"]) + (f" (Measured with version {audit['version']}.)" if older else "")
     return (
-        f"How often this tool is wrong on logs like these has not been measured; lunar-mjx why {result.name} "
-        "--audit 30 measures it in 30 minutes."
+        "How often this tool is wrong on logs like these has not been measured; "
+        f"lunar-mjx why {shlex.quote(str(result.path))} --audit 30 measures it in 30 minutes."
     )
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shlex
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -57,6 +61,44 @@ def test_several_are_added_one_by_one_and_a_better_contact_law_first(run):
         assert "unexpected extra argument" not in answer.out + answer.err
     judge = result("run1", {"verdict": "KNOWN", "effects": ["side_wall"], "forms": {"stress_integral": 0.6}})
     assert lead([judge], judge).next[0].split()[3] == "side_wall"
+
+
+def placed(verdict: dict | None, **run) -> Result:
+    return Result("my run", run, None, verdict, None, None, None, None, {}, Path("runs/my run"))
+
+
+@pytest.mark.parametrize("verdict", [None, *Verdict])
+def test_commands_name_the_folder_as_it_was_given_and_as_a_shell_takes_it(verdict: Verdict | None):
+    told = verdict and {"verdict": verdict.label, "effects": ["slip_sinkage", "grousers"], "port": "soil"}
+    judge = placed(told, logs=["logs/my log"])
+    commands = [shlex.split(s[s.index("lunar-mjx") :]) for s in lead([judge], judge).next if "lunar-mjx" in s]
+    assert commands or verdict is Verdict.BAD_FIT
+    for words in commands:
+        assert any(w.startswith(("runs/my run", "runs/with_")) or w == "logs/my log" for w in words), words
+    if verdict is Verdict.MULTIPLE:
+        assert commands[1] == ["lunar-mjx", "add", "runs/with_slip_sinkage", "grousers", "-o", "runs/with_grousers"]
+
+
+def test_an_own_effect_is_added_with_its_file_and_an_instrument_not_at_all():
+    named = {"verdict": "MULTIPLE", "effects": ["cable", "calibration: sinkage_m"]}
+    judge = placed(named, candidates=["my effects.py:cable"])
+    add, recalibrate, ask = lead([judge], judge).next
+    assert shlex.split(add)[3:] == ["my effects.py:cable", "-o", "runs/with_cable"]
+    assert recalibrate == "Recalibrate sinkage_m: it errs by more than is usual."
+    assert ask == "lunar-mjx why runs/with_cable"
+    judge = placed({"verdict": "KNOWN", "effects": ["calibration: sinkage_m"]})
+    assert lead([judge], judge).next == [recalibrate]
+
+
+def test_no_model_is_called_fitted_that_is_not(tmp_path):
+    """`model.toml` of a run is what was compared; `fitted.toml`, where there is one, what the fit made of it."""
+    judge = dataclasses.replace(placed({"verdict": "NOISE_ONLY"}), folder=tmp_path / "run1")
+    use = lead([judge], judge).next[0]
+    assert "model.toml" in use and "fitted model" not in use and "comparison.json" in use
+    (tmp_path / "run1").mkdir()
+    (tmp_path / "run1" / "fitted.toml").touch()
+    use = lead([judge], judge).next[0]
+    assert use == f"Use the fitted model: lunar-mjx simulate --model {tmp_path / 'run1' / 'fitted.toml'}"
 
 
 def test_a_run_that_was_not_diagnosed_asks_for_it():

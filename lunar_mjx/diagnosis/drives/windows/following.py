@@ -22,8 +22,7 @@ from lunar_mjx.diagnosis.drives.windows.cut import CUTTING, Cut, cut
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, Proportion, WindowProblem, corners, proportion
 from lunar_mjx.diagnosis.drives.windows.settings import DIFFERENCES, WindowSettings
-from lunar_mjx.diagnosis.drives.windows.verbs import FITTED_FILE
-from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.runs import FITTED_FILE, Run
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.changes import Amounts, ChangeDetector, Restlessness, Step, learn
 from lunar_mjx.inference.fitting import Progress, silent

@@ -18,7 +18,7 @@ from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS
 from lunar_mjx.diagnosis.drives.windows.form import DRIVE, INSTEAD, OF_THE_GROUND, WindowForm, between
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, corners
 from lunar_mjx.diagnosis.folder.refits import write_refits
-from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE, Run
+from lunar_mjx.diagnosis.runs import COMPARISON_FILE, FITTED_FILE, VERDICT_FILE, Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.diagnosis.weighed.form import Problem
@@ -32,8 +32,6 @@ from lunar_mjx.logs import Log
 from lunar_mjx.logs.schema import find_channel
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import save_model
-
-FITTED_FILE = "fitted.toml"
 
 
 @dataclasses.dataclass(frozen=True)
