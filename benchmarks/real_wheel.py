@@ -28,6 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULT, FIGURE = ROOT / "benchmarks" / "real_wheel.json", ROOT / "docs" / "figures" / "real_wheel.svg"
 FIT, HELD = (0, 30, 60), (15, 45, 75)
 PARTS = {"fitted": FIT, "inside": (15, 45), "extrapolated": (75,), "held_out": HELD}
+NO_VERDICT = (1, 2)
+"""Exit statuses of `improve` that are an error's and no verdict."""
 
 
 def write_log(folder: Path) -> None:
@@ -136,8 +138,9 @@ def draw(rows: list[dict[str, Any]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "real_wheel")
-    out = parser.parse_args().out
-    shutil.rmtree(out, ignore_errors=True)
+    out = parser.parse_args().out.resolve()  # since the verb is called from the checkout
+    for made in ("cmu_smooth_wheel", "runs"):  # and nothing else that lies there
+        shutil.rmtree(out / made, ignore_errors=True)
     write_log(out / "cmu_smooth_wheel")
     splits = {**dict.fromkeys(FIT, "fit"), **dict.fromkeys(HELD, "select")}
     words = [w for angle, split in splits.items() for w in ("--split", f"slip_angle {angle} deg={split}")]
@@ -145,6 +148,8 @@ def main() -> None:
     begun = time.perf_counter()
     ended = subprocess.run([sys.executable, "-m", "lunar_mjx.cli", *command], cwd=ROOT, check=False)
     seconds = time.perf_counter() - begun
+    if ended.returncode in NO_VERDICT:
+        sys.exit(ended.returncode)  # it has told why; the kept record stays
     rows = rows_of(out / "runs")
     shown = ["lunar-mjx improve cmu_smooth_wheel", *(f'--split "{w}"' for w in words if w != "--split")]
     result = {
