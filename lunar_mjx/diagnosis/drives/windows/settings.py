@@ -31,7 +31,7 @@ class WindowSettings(SearchSettings):
             if name in changed:
                 problem = "is not read where wheel speeds are imposed"
                 raise bad_input("settings", name, changed[name], problem, "leave it out")
-        return super().of(changed)  # type: ignore[misc]
+        return super().of(changed)
 
 
 @dataclasses.dataclass(frozen=True)
