@@ -336,3 +336,13 @@ def test_a_rover_that_slides_back_down_a_slope_is_no_reversed_axis(
 
     found = check_frames(make_log(tmp_path / "a", change, terrain="slope:8deg"))
     assert bool([f for f in found if "heading" in f.message]) is told, [(f.column, f.message) for f in found]
+
+
+def test_a_long_gap_says_how_to_cut_there(tmp_path: Path) -> None:
+    def change(tables: Tables) -> None:
+        drive = tables["drive"]
+        tables["drive"] = drive[(drive["time_s"] < 10.0) | (drive["time_s"] > 23.0)].reset_index(drop=True)
+
+    (found,) = [f for f in check(make_log(tmp_path / "a", change, seconds=43.0)) if f.table == "drive"]
+    assert "lacks 30.3 % of its samples (at most 30 % may be lost)" in found.message
+    assert "--split-at-gaps" in found.message

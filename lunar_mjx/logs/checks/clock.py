@@ -21,6 +21,8 @@ class ClockLimits:
     # Steps count as one and the same, or as multiples of it, if this share of them lie within `steady` of it.
     steady: float = 0.2
     mostly: float = 0.9
+    usual: float = 6.0
+    """Standard deviations by which a step may differ from what its speed says: next to none does by chance."""
     lost_share: float = 0.3
     """A log that lost more than this share of its samples is no record any more; links lose a few per cent."""
 
@@ -126,11 +128,13 @@ def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
             moved, expected, still = _over_gap(table, int(row), integral, rate, base)
             # Movements below 20 sigma decide nothing.
             sigma = log.noise[integral].std if integral in log.noise else 0.0
-            # The clock jumped if what the sensor moved fits one ordinary step and not the gap, each clearly.
+            # The clock jumped if what the sensor moved fits one ordinary step and not the gap, each clearly. Of a long
+            # gap a quarter is more than a step: a rover that turned or stopped meanwhile moves so.
+            step = abs(still) + CLOCK_LIMITS.usual * _usual(table, integral, rate, steps, base)
             if (
                 abs(expected) > max(20.0 * sigma, 1e-6)
                 and abs(moved - expected) > 0.5 * abs(expected)
-                and (abs(moved - still) < 0.25 * abs(expected))
+                and abs(moved - still) < min(0.25 * abs(expected), step)
             ):
                 return [
                     _finding(
@@ -151,8 +155,9 @@ def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
                 table,
                 row,
                 "dropout",
-                f"lacks {100 * share:.0f} % of its samples (at most "
-                f"{100 * CLOCK_LIMITS.lost_share:.0f} % may be lost); the longest gap lasts {steps.max():.4g} s",
+                f"lacks {100 * share:.3g} % of its samples (at most "
+                f"{100 * CLOCK_LIMITS.lost_share:.0f} % may be lost); the longest gap lasts {steps.max():.4g} s; "
+                "record it anew, or make several drives of it (lunar-mjx log import --split-at-gaps)",
             )
         ]
     return []
@@ -194,6 +199,14 @@ def _over_gap(table: LogTable, row: int, integral: str, rate: str, base: float) 
     if not np.isfinite(mean + moved):
         return 0.0, 0.0, 0.0
     return moved, mean * gap, mean * base
+
+
+def _usual(table: LogTable, integral: str, rate: str, steps: np.ndarray, base: float) -> float:
+    """Standard deviation of what ordinary steps move beside what their speed says, by the median."""
+    values, speed = table.channels[integral], table.channels[rate]
+    off = np.diff(values) - 0.5 * (speed[:-1] + speed[1:]) * steps
+    off = off[(steps < 1.5 * base) & np.isfinite(off)]
+    return 1.4826 * float(np.median(np.abs(off))) if off.size else 0.0
 
 
 def _check_overlap(log: Log) -> list[Finding]:

@@ -128,7 +128,7 @@ def _told(copies: Sequence[Copies], drives: int) -> tuple[str, ...]:
         low, high = min(c.period_s for c in found), max(c.period_s for c in found)
         period = f"{low:.3g}" if high < 1.05 * low else f"{low:.3g} to {high:.3g}"
         readings, rows = sum(c.readings for c in found), sum(c.rows for c in found)
-        where = f" in {len(found)} recordings" if drives > 1 else ""
+        where = f" in {len(found)} recording{'s' if len(found) > 1 else ''}" if drives > 1 else ""
         told.append(
             f"{', '.join(channels)}: renewed every {period} s only{where}; {readings} of {rows} rows are "
             "readings, the others are copies of these and left out"
