@@ -18,7 +18,7 @@ from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.build_problem import known_logs
 from lunar_mjx.diagnosis.drives.form import DriveForm
 from lunar_mjx.diagnosis.drives.loop import build_drives
-from lunar_mjx.diagnosis.runs import MODEL_FILE, Run, folder_hash, load_run
+from lunar_mjx.diagnosis.runs import AUDIT_FILE, MODEL_FILE, Run, folder_hash, load_run
 from lunar_mjx.diagnosis.tables.simulated import VISIBLE, SimulatedTables
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
@@ -30,7 +30,6 @@ from lunar_mjx.inference.weighing.hypotheses import Refit
 from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, search
 from lunar_mjx.logs import Log, SteadyLog
 
-AUDIT_FILE = "audit.json"
 NULL = "nothing"
 
 

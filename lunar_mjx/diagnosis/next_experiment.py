@@ -20,14 +20,13 @@ from lunar_mjx.diagnosis.drives.form import DriveForm
 from lunar_mjx.diagnosis.drives.loop import build_drives
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.planned import planned_drives
-from lunar_mjx.diagnosis.runs import HYPOTHESES_FILE, VERDICT_FILE, Run, load_run
+from lunar_mjx.diagnosis.runs import HYPOTHESES_FILE, NEXT_FILE, VERDICT_FILE, Run, load_run
 from lunar_mjx.diagnosis.tables.sweeps import rank_sweeps
 from lunar_mjx.diagnosis.weighed.answer import kept_start
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.logs import Log, SteadyLog
 
-NEXT_FILE = "next.json"
 NOTHING = "no further effect"
 
 

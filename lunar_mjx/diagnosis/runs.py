@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx._version import __version__
+from lunar_mjx.diagnosis.folder.refits import REFITS_FILE
 from lunar_mjx.diagnosis.folder.stored import read_stored
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.files import write_text
@@ -29,6 +30,14 @@ FITTED_FILE = "fitted.toml"
 """The model as refitted, and what was learnt as its priors, where wheel speeds are imposed."""
 COMPARISON_FILE, VERDICT_FILE, SERIES_FILE = "comparison.json", "verdict.json", "series.npz"
 SIGNATURES_FILE, HYPOTHESES_FILE = "signatures.npz", "hypotheses.json"
+AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE = "audit.json", "unknown.json", "next.json"
+WINDOWS_FILE, RESTLESS_FILE = "windows.json", "watch.json"
+PAGES = ("report.html", "studio.html")
+FOUND = (
+    *(COMPARISON_FILE, VERDICT_FILE, SERIES_FILE, SIGNATURES_FILE, HYPOTHESES_FILE, REFITS_FILE),
+    *(AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE, WINDOWS_FILE, RESTLESS_FILE, FITTED_FILE, *PAGES),
+)
+"""What verbs find of one comparison; none of it is about another."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,8 +89,13 @@ class Run:
         return logs, check(logs)
 
     def write(self) -> None:
-        """Writes `run.json` and `model.toml`; earlier looks at the test split stay on record."""
+        """Writes `run.json` and `model.toml` in place of an earlier comparison, of which nothing that was found stays.
+
+        Earlier looks at the test split stay on record.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
+        for name in FOUND:
+            (self.folder / name).unlink(missing_ok=True)
         opened = (self.load(RUN_FILE) or {}).get("test_opened", [])
         save_model(self.model, self.folder / MODEL_FILE)
         save_json(

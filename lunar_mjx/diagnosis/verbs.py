@@ -95,7 +95,7 @@ def compare(
 
 
 def _compare(run: Run, progress: Progress) -> Run:
-    campaign = gate(run)
+    campaign = gate(run, new=True)
     require_splits(run.splits, campaign)
     require_discrepancy(run.discrepancy, campaign)
     # Logs whose wheels moved as measured are compared in windows, each from its measured start.
@@ -122,8 +122,11 @@ def _problem(run: Run, logs: Sequence[Any], only: Sequence[str] | None, progress
     return build_drives(run, logs, only, progress)
 
 
-def gate(run: Run) -> list[Any]:
+def gate(run: Run, new: bool = False) -> list[Any]:
     """Reads and checks the logs of a run.
+
+    Args:
+      run: whose logs. new: whether it takes the place of what an earlier run has left in the folder.
 
     Raises:
       BadData: they are not fit to be used.
@@ -134,7 +137,8 @@ def gate(run: Run) -> list[Any]:
         sentence = f"{bad[0].where}: {bad[0].message}" + (f" ({len(bad) - 1} more)" if len(bad) > 1 else "")
         diagnosis = Diagnosis(Verdict.BAD_DATA, (), sentence, details={"findings": [f.to_dict() for f in findings]})
         # A refused log leaves a verdict, too: `report` can show the findings without reading the logs again.
-        run.folder.mkdir(parents=True, exist_ok=True)
+        if new:
+            run.write()
         run.save(VERDICT_FILE, diagnosis.to_dict())
         raise BadData(diagnosis)
     return list(logs)
@@ -192,7 +196,8 @@ def why(
     known_logs(run)
     if windows.imposed(campaign):
         limit = windows.TELLING.seconds if seconds is None else seconds
-        return windows.why(run, campaign, only, limit, progress, about)
+        left = max(limit - (time.monotonic() - began), 0.0)
+        return windows.why(run, campaign, only, left, progress, about)
     if about is not None:
         _require_candidate(about, run, campaign, only)
     problem = _problem(run, campaign, only, progress)

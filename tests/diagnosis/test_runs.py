@@ -8,13 +8,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lunar_mjx.criticism import audit, next_experiment
+from lunar_mjx.criticism import audit, next_experiment, report
 from lunar_mjx.diagnosis import verbs
 from lunar_mjx.diagnosis.build_problem import known_logs
 from lunar_mjx.diagnosis.formulas.discover import discover
-from lunar_mjx.diagnosis.runs import RUN_FILE, VERDICT_FILE, Run, load_run, log_folders, plain, save_json
+from lunar_mjx.diagnosis.runs import (
+    COMPARISON_FILE,
+    FOUND,
+    RUN_FILE,
+    VERDICT_FILE,
+    Run,
+    load_run,
+    log_folders,
+    plain,
+    save_json,
+)
 from lunar_mjx.errors import UserError
-from lunar_mjx.logs import Noise, write_steady_log
+from lunar_mjx.logs import Finding, Noise, write_steady_log
 from lunar_mjx.model import make_model
 
 
@@ -138,3 +148,25 @@ def test_json_has_no_nan_and_is_whole_or_absent(tmp_path):
         save_json(path, {"a": object()})
     assert path.read_text() == before
     assert plain({1: np.float32(0.5)}) == {"1": 0.5}
+
+
+def test_a_new_comparison_leaves_nothing_of_the_one_before(run):
+    """Not a verdict, a page or what `watch` has learnt; looks at the test split stay on record."""
+    run.opened_test("compare", {"refitted": "0"})
+    for name in FOUND:
+        (run.folder / name).write_text("of the comparison before")
+    (run.folder / "notes.txt").write_text("of the user")
+    run.write()
+    assert sorted(p.name for p in run.folder.iterdir()) == ["model.toml", "notes.txt", "run.json"]
+    assert len(run.load(RUN_FILE)["test_opened"]) == 1
+
+
+def test_refused_logs_leave_no_comparison_of_others(run, monkeypatch):
+    finding = Finding("log", "drive", None, "time_s", "clock", "goes back")
+    run.save(COMPARISON_FILE, {"of": "the logs before"})
+    run.__dict__["checked"] = ([], [finding])
+    with pytest.raises(verbs.BadData, match="goes back"):
+        verbs._compare(run, lambda *_: None)
+    assert run.load(VERDICT_FILE)["verdict"] == "BAD_DATA"
+    assert run.load(COMPARISON_FILE) is None
+    assert "goes back" in report([run.folder], run.folder / "page.html").read_text(encoding="utf-8")

@@ -20,7 +20,7 @@ from lunar_mjx.diagnosis.formulas.search import FORMULA_SEARCH, Settings, Trial,
 from lunar_mjx.diagnosis.formulas.slots import WHEEL_PORTS, Slots
 from lunar_mjx.diagnosis.formulas.targets import CONSTANTS
 from lunar_mjx.diagnosis.formulas.terms import FORMULA_PORTS, SUGGESTED, Term, effect_of, terms, with_amount
-from lunar_mjx.diagnosis.runs import VERDICT_FILE, Run, load_run
+from lunar_mjx.diagnosis.runs import UNKNOWN_FILE, VERDICT_FILE, Run, load_run
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.effects.base import PORTS
 from lunar_mjx.errors import UserError, bad_input
@@ -31,7 +31,6 @@ from lunar_mjx.inference.held_out import errors
 from lunar_mjx.logs import Log, SteadyLog
 from lunar_mjx.logs.schema import channel_kind, is_command
 
-UNKNOWN_FILE = "unknown.json"
 REFITS = 5
 """Formulas that are suggested; where each is simulated by itself, the best-scored are refitted."""
 LISTED = 100

@@ -187,7 +187,7 @@ def gallery(result: Result) -> list[Block]:
     traces = result.traces
     if traces is None or not result.signatures:
         return []
-    o, residual = traces.observations, traces.residual[_baseline(traces)]
+    o, residual = traces.observations, traces.whitened[_baseline(traces)]
     fitted = np.flatnonzero(o.in_split("fit"))
     shapes = {}
     for e in (result.verdict or {}).get("evidence") or []:

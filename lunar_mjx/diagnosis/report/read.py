@@ -12,12 +12,15 @@ import numpy as np
 
 from lunar_mjx.diagnosis.folder.stored import read_arrays, read_stored
 from lunar_mjx.diagnosis.runs import (
+    AUDIT_FILE,
     COMPARISON_FILE,
     FORMAT,
     MODEL_FILE,
+    NEXT_FILE,
     RUN_FILE,
     SERIES_FILE,
     SIGNATURES_FILE,
+    UNKNOWN_FILE,
     VERDICT_FILE,
 )
 from lunar_mjx.errors import UserError, bad_input, require_file
@@ -25,8 +28,6 @@ from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model
 from lunar_mjx.trust import trusting
-
-AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE = "audit.json", "unknown.json", "next.json"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,7 +37,9 @@ class Traces:
     Attributes:
       observations: the measurements with their noise taken as white (enough for blocks and places).
       labels: names of the models, in the order of fitting.
-      predicted: (models, n), in the channels' units. residual: (models, n), whitened, measured less predicted.
+      predicted: (models, n), in the channels' units.
+      residual: (models, n), measured less predicted, in sigma, as errors are told.
+      whitened: (models, n), the same as signatures are.
       time: (n,) s, NaN for points of tables.
     """
 
@@ -45,6 +48,7 @@ class Traces:
     predicted: np.ndarray
     residual: np.ndarray
     time: np.ndarray
+    whitened: np.ndarray
 
     @property
     def channel(self) -> np.ndarray:
@@ -161,7 +165,9 @@ def _traces(path: Path) -> Traces | None:
             place=arrays["place"] if len(arrays["place"]) else None,
         )
         labels = tuple(map(str, arrays["labels"]))
-        return Traces(observations, labels, arrays["predicted"], arrays["residual"], arrays["time"])
+        residual = arrays["residual"]
+        whitened = arrays.get("whitened", residual)
+        return Traces(observations, labels, arrays["predicted"], residual, arrays["time"], whitened)
     except KeyError as error:
         raise UserError(f"{path}: lacks {error}; make it anew with lunar-mjx compare.") from None
     except (ValueError, TypeError, IndexError) as error:
@@ -180,6 +186,8 @@ def _check_shapes(found: Mapping[str, np.ndarray]) -> None:
         "residual": (models, n),
         "place": (n if len(found["place"]) else 0, 3),
     }
+    if "whitened" in found:
+        shapes["whitened"] = (models, n)
     for name, shape in shapes.items():
         # Text in place of numbers would pass as an array and end a report with a traceback.
         if found[name].shape != shape or found[name].dtype.kind not in "fiu":

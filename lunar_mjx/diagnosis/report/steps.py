@@ -37,7 +37,7 @@ class Step:
 
     @property
     def residual(self) -> np.ndarray:
-        """(n,) whitened residual, in sigma."""
+        """(n,) residual, in sigma, as errors are told."""
         assert self.result.traces is not None
         return self.result.traces.residual[self.row]
 

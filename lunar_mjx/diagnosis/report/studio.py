@@ -178,7 +178,8 @@ def _models(result: Result, traces: Traces) -> list[_Model]:
         words = {"as given": "the model as given", "refitted": "the model, refitted"}.get(label, "+ " + _words(effects))
         kind = "given" if label == "as given" else "refit"
         models.append(_Model(words, effects, kind, traces.residual[row], traces.predicted[row]))
-    base = next((m for m in models if m.kind == "refit"), models[-1])
+    row = next((i for i, m in enumerate(models) if m.kind == "refit"), len(models) - 1)
+    base, white = models[row], traces.whitened[row]
     # A set has no order: `drag + toe` of one file is `toe + drag` of another.
     known = {frozenset(m.effects) for m in models}
     refits = read_refits(result.folder, len(o)) if result.folder is not None else {}
@@ -189,11 +190,13 @@ def _models(result: Result, traces: Traces) -> list[_Model]:
     ]
     known |= {frozenset(m.effects) for m in more}
     fitted = np.flatnonzero(o.in_split("fit"))
+    # An estimate says by which share the whitened error falls; it is shown in the measure of all other errors.
+    measure = (_rms(base.residual[fitted]) or 0.0) / (_rms(white[fitted]) or 1.0)
     for name, signature in result.signatures.items():
-        if frozenset((name,)) not in known and (left := _estimate(base.residual[fitted], signature)) is not None:
+        if frozenset((name,)) not in known and (left := _estimate(white[fitted], signature)) is not None:
             # Signatures are kept of fitted observations alone; what was held out is not estimated but left open.
             residual = np.full(len(o), np.nan)
-            residual[fitted] = left
+            residual[fitted] = measure * left
             more.append(_Model("+ " + _words((name,)), (name,), "estimate", residual, None))
     # Refits before estimates, which are to first order and would win where they are too good to be true.
     more.sort(key=lambda m: (m.kind != "refit", _rms(m.residual[fitted]) or np.inf))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -50,7 +51,7 @@ def compare(run: Run, problem: Problem, progress: Progress) -> Refit:
     with threadpool_limits(1, "blas"):
         refit = own.refit(frozenset(), None, None)
     # the model as given, by its own numbers: what a refit gains is told beside it
-    start = own.residual(own.origin())
+    start = own.told(own.origin())
     alone = own.alone(refit)
     run.save(COMPARISON_FILE, comparison(problem, start, refit, alone))
     run.save(HYPOTHESES_FILE, {own.name: {"u": _by_key(own, refit.u)}})
@@ -78,7 +79,15 @@ def diagnose(
       seconds: after which the answer is to be there, as far as it is known then; a verdict is then written after every
         refit, too, as provisional.
     """
-    settings, end = problem.settings, time.monotonic() + (1.0 - _WRITING) * seconds
+    settings, begun = problem.settings, time.monotonic()
+    end = begun + (1.0 - _WRITING) * seconds
+    turns = itertools.count(sum(1 + len(form.exchanged) for form in problem.forms))
+
+    def over() -> bool:
+        """Asked before each further refit: whether it and what comes after it would last longer than the time given."""
+        now, writing = time.monotonic(), problem.own.writing
+        a_refit = (now - begun) / next(turns)
+        return now > end or (writing > 0.0 and now + (1.0 + writing) * a_refit > begun + seconds)
 
     def provisional(found: ModelSearch) -> None:
         # with a limit the next refit may never come, and what is known by then is the answer
@@ -92,13 +101,7 @@ def diagnose(
         # Matrices of some hundred rows are factored faster by one thread than by several that wait for each other.
         with threadpool_limits(1, "blas"):
             found = search(
-                problem.forms,
-                settings.most_refits,
-                settings.most_terms,
-                settings.window,
-                progress,
-                lambda: time.monotonic() > end,
-                provisional,
+                problem.forms, settings.most_refits, settings.most_terms, settings.window, progress, over, provisional
             )
     except TimeUp:
         said = f"{seconds:.0f} s did not suffice to refit the model as it is, so nothing is said; give more --seconds."
@@ -115,7 +118,7 @@ def diagnose(
     base = found.base(own.name).refit
     best = next(h for h in found.hypotheses if h.refitted)
     diagnosis = _diagnosis(problem, found, best)
-    start = own.residual(own.origin())
+    start = own.told(own.origin())
     after = problem.form(best.form)
     with threadpool_limits(1, "blas"):
         own_alone, best_alone = own.alone(base), after.alone(best.refit)
@@ -128,9 +131,7 @@ def diagnose(
     _save_signatures(run, found.base(best.form).refit, own)
     run.save(HYPOTHESES_FILE, _fits(problem, found))
     diagnosis = dataclasses.replace(
-        diagnosis,
-        error_before=errors(own, own.residual(own_alone)),
-        error_after=errors(after, after.residual(best_alone)),
+        diagnosis, error_before=errors(own, own.told(own_alone)), error_after=errors(after, after.told(best_alone))
     )
     return diagnosis, found
 
@@ -139,13 +140,13 @@ def comparison(problem: Problem, start: np.ndarray, refit: Refit, alone: np.ndar
     """Errors in sigma of the model as given and refitted, by group and channel, and the refitted parameters.
 
     Args:
-      problem: whose own form is told of. start: (n,) whitened residuals of the model as given. refit: of the form.
+      problem: whose own form is told of. start: (n,) residuals of the model as given, as told. refit: of the form.
       alone: (coordinates,) where the model alone predicts best; where the refit stands if None.
     """
     form = problem.own
     observations = form.observations
     alone = refit.u if alone is None else alone
-    residual = form.residual(alone)
+    residual = form.told(alone)
     rows = []
     for s in observations.series:
         part = slice(s.start, s.stop)
@@ -181,7 +182,7 @@ def comparison(problem: Problem, start: np.ndarray, refit: Refit, alone: np.ndar
 
 
 def errors(form: MeasuredForm, residual: np.ndarray) -> dict[str, float]:
-    """Root mean square of whitened residuals by split."""
+    """Root mean square of residuals by split."""
     observations = form.observations
     return {k: _rms(residual[keep]) for k, v in _SPLITS.items() if (keep := observations.in_split(*v)).any()}
 
@@ -239,13 +240,16 @@ def save_series(
     """Measured and predicted series for the report, as `series.npz` (arrays only, no pickle).
 
     Args:
-      run: to write to. own: the model as given. start: its whitened residuals.
+      run: to write to. own: the model as given. start: its residuals as told.
       fits: form and coordinates by label.
       corrected: predictions and whitened residuals of the last fit with what the fitted points taught of discrepancy.
     """
     observations = own.observations
     predicted = [own.predicted(own.origin()), *(f.predicted(u) for f, u in fits.values())]
-    residual = [start, *(f.residual(u) for f, u in fits.values())]
+    residual = np.vstack([start, *(f.told(u) for f, u in fits.values())])
+    # Signatures are whitened, and only what is whitened can be held beside them: kept where it is not what is told.
+    whitened = np.vstack([own.residual(own.origin()), *(f.residual(u) for f, u in fits.values())])
+    more = {} if np.array_equal(whitened, residual, equal_nan=True) else {"whitened": whitened}
     time = np.concatenate(
         [np.full(s.stop - s.start, np.nan) if s.time is None else s.time for s in observations.series]
     )
@@ -266,7 +270,8 @@ def save_series(
             logs=np.array(observations.logs),
             labels=np.array(["as given", *fits]),
             predicted=np.vstack(predicted),
-            residual=np.vstack(residual),
+            residual=residual,
+            **more,
             **({} if corrected is None else dict(zip(("corrected", "corrected_residual"), corrected, strict=True))),
         )
 

@@ -111,6 +111,7 @@ class MeasuredForm(Form):
       words: fields of discrepancy, and what is "good to so many per cent" in the user's words.
       shares: what a field's size is "good to", over that size, where not 1.
       skipped: candidates that the time did not suffice to look at.
+      writing: refits that take as long as what comes after a search, where that is more than a tenth of the time given.
     """
 
     observations: Observations
@@ -120,6 +121,7 @@ class MeasuredForm(Form):
     words: Mapping[str, str]
     shares: Mapping[str, float] = MappingProxyType({})
     skipped: tuple[str, ...] = ()
+    writing: float = 0.0
 
     @abc.abstractmethod
     def predicted(self, u: np.ndarray) -> np.ndarray:
@@ -148,6 +150,10 @@ class MeasuredForm(Form):
         two apart returns where the refit stands.
         """
         return refit.u
+
+    def told(self, u: np.ndarray) -> np.ndarray:
+        """(n,) residuals in sigma as errors are told, whatever they are weighed by: the whitened ones by themselves."""
+        return self.residual(u)
 
     def signatures(self, refit: Refit) -> dict[str, np.ndarray]:
         """(fitted,) whitened signature of each effect at its prior size, where told."""

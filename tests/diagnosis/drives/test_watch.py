@@ -10,9 +10,9 @@ import pytest
 from lunar_mjx.diagnosis import watch as watching
 from lunar_mjx.diagnosis.drives.windows import coordinates
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, GYRO
-from lunar_mjx.diagnosis.drives.windows.following import RESTLESS_FILE, Follower
+from lunar_mjx.diagnosis.drives.windows.following import Follower
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, Proportion, WindowProblem
-from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.runs import RESTLESS_FILE, Run
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.changes import Restlessness
 from lunar_mjx.logs import read_log

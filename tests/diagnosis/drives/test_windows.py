@@ -1,6 +1,7 @@
 """Windows of drives with imposed wheel speeds: cutting, prediction, and what is named of a planted change."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -479,3 +480,15 @@ def test_parts_held_out_are_spread_over_a_drive():
     np.testing.assert_array_equal(np.flatnonzero(held), [0, 5, 8])
     assert held_out_parts(np.arange(60.0)).mean() == pytest.approx(0.3)
     assert not held_out_parts(np.zeros(1)).any()
+
+
+def test_what_is_named_is_not_called_hardly_told(monkeypatch):
+    unknowns = [coordinates.Unknown("calibration", name, 1.0) for name in ("gyro_scale", "pitch", "gyro_scale")]
+    form = SimpleNamespace(unknowns=unknowns, baseline=[0, 1], candidates={"calibration.gyro_scale": [2]})
+    monkeypatch.setattr(verbs, "_posterior", lambda form, refit: {0: 0.9, 1: 0.9, 2: 0.1})
+    assert verbs.not_told(form, None) == ["calibration.gyro_scale", "calibration.pitch"]
+    assert verbs.not_told(form, None, ["calibration.gyro_scale"]) == ["calibration.pitch"]
+
+
+def test_a_switch_between_grounds_is_shown_to_nobody():
+    assert verbs._shown({"cohesion": 900.0, "instead": 1.0}) == {"cohesion": 900.0}

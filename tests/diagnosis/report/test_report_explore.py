@@ -31,7 +31,7 @@ def result():
     shape[180:] = 8.0 * np.sin(TIME)
     residual = noise + np.array([[2.0], [1.0], [0.0]]) * shape
     residual[0, 3] = np.nan
-    traces = Traces(o, ("as given", "refitted", "with drag"), -0.1 * residual, residual, np.tile(TIME, 4))
+    traces = Traces(o, ("as given", "refitted", "with drag"), -0.1 * residual, residual, np.tile(TIME, 4), residual)
     evidence = [{"effect": "drag", "status": "accepted"}, {"effect": "faint", "status": "not tested"}]
     return Result(
         "run", {}, None, {"evidence": evidence}, None, None, None, traces, {"drag": shape, "faint": 0.0 * shape}

@@ -28,7 +28,7 @@ from lunar_mjx.diagnosis.drives.windows.problem import (
     student_weights,
 )
 from lunar_mjx.diagnosis.drives.windows.settings import BETWEEN, DIFFERENCES, WindowSettings
-from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.runs import WINDOWS_FILE, Run
 from lunar_mjx.diagnosis.weighed.form import Problem
 from lunar_mjx.effects import catalogue
 from lunar_mjx.errors import bad_input
@@ -37,7 +37,6 @@ from lunar_mjx.inference.fitting import silent
 from lunar_mjx.logs import Log
 from lunar_mjx.model import Model
 
-WINDOWS_FILE = "windows.json"
 MOST_WINDOWS = 60
 """Windows of a campaign that are simulated: two minutes of driving, drawn evenly over speeds and turns."""
 

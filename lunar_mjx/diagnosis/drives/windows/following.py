@@ -16,13 +16,12 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lunar_mjx.diagnosis.drives.windows.bench import WINDOWS_FILE
 from lunar_mjx.diagnosis.drives.windows.coordinates import baseline, sizes
 from lunar_mjx.diagnosis.drives.windows.cut import CUTTING, Cut, cut
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, Proportion, WindowProblem, corners, proportion
 from lunar_mjx.diagnosis.drives.windows.settings import DIFFERENCES, WindowSettings
-from lunar_mjx.diagnosis.runs import FITTED_FILE, Run
+from lunar_mjx.diagnosis.runs import FITTED_FILE, RESTLESS_FILE, WINDOWS_FILE, Run
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.changes import Amounts, ChangeDetector, Restlessness, Step, learn
 from lunar_mjx.inference.fitting import Progress, silent
@@ -30,7 +29,6 @@ from lunar_mjx.logs import Log
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model
 
-RESTLESS_FILE = "watch.json"
 MOST_LEARNT = 400
 """Windows of the run's logs from which is learnt how much an undisturbed drive moves: a quarter of an hour."""
 SLOPE = "slope"

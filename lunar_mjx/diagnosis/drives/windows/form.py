@@ -143,6 +143,8 @@ class WindowForm(MeasuredForm):
     """
 
     observations: WindowObservations
+    writing = 4.0
+    """Measured: 3 to 4 refits, most of it in what held-out windows say and in the fits of the model alone."""
 
     def __init__(
         self,
@@ -301,6 +303,10 @@ class WindowForm(MeasuredForm):
     def predicted(self, u: np.ndarray) -> np.ndarray:
         """See `MeasuredForm`."""
         return self._rows(u[None], self._soft(u))[0]
+
+    def told(self, u: np.ndarray) -> np.ndarray:
+        """See `MeasuredForm`: every sample by itself and counted once, as `comparison.json` tells errors."""
+        return (self.observations.value - self.predicted(u)) / self.observations.sigma()
 
     def slopes(self, u: np.ndarray, wanted: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
         """Predictions (n,) at a place and derivatives (n, coordinates + 2) by wanted coordinates, `DRAG` and `RISE`."""

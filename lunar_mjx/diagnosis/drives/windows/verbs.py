@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lunar_mjx.diagnosis.drives.windows.bench import WINDOWS_FILE, Bench
+from lunar_mjx.diagnosis.drives.windows.bench import Bench
 from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, DRIFT, Unknown, catalogue_of, data_sheet
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS
 from lunar_mjx.diagnosis.drives.windows.form import DRIVE, INSTEAD, OF_THE_GROUND, WindowForm, between
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, corners
 from lunar_mjx.diagnosis.folder.refits import write_refits
-from lunar_mjx.diagnosis.runs import COMPARISON_FILE, FITTED_FILE, VERDICT_FILE, Run
+from lunar_mjx.diagnosis.runs import COMPARISON_FILE, FITTED_FILE, VERDICT_FILE, WINDOWS_FILE, Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.diagnosis.weighed.form import Problem
@@ -81,9 +81,6 @@ def compare(run: Run, logs: Sequence[Log], progress: Progress = silent, like: Be
     begin = time.monotonic()
     bench = Bench(run, logs)  # before the folder is made: a mistake leaves nothing behind
     run.write()
-    (run.folder / VERDICT_FILE).unlink(missing_ok=True)  # an earlier verdict is not about this comparison
-    if like is None:
-        (run.folder / WINDOWS_FILE).unlink(missing_ok=True)
     # how long a first simulation compiles on this machine, and how many steps a fit takes, is not known beforehand
     progress("compiling, and learning the noise", math.nan)
     with threadpool_limits(1, "blas"):
@@ -95,7 +92,7 @@ def compare(run: Run, logs: Sequence[Log], progress: Progress = silent, like: Be
         refit = _form(question).refit(frozenset(), None, None)
         alone = _form(question).alone(refit)
         own = question.own
-        start = own.residual(own.origin())
+        start = own.told(own.origin())
         _save_windows(bench, noise)
         run.save(COMPARISON_FILE, comparison(bench, question, start, refit, alone, time.monotonic() - begin))
         answer.save_series(run, own, start, {"refitted": (own, alone)})
@@ -136,7 +133,7 @@ def comparison(
     """What `comparison.json` holds: errors in sigma and in the channels' units, parameters, what is not told.
 
     Args:
-      bench, question: the windows and what they are asked. start: (n,) whitened residuals of the model as given.
+      bench, question: the windows and what they are asked. start: (n,) residuals of the model as given, as told.
       refit: of the model. alone: (coordinates,) where it predicts best by itself. seconds: that it took.
     """
     form = _form(question)
@@ -193,10 +190,15 @@ def _posterior(form: WindowForm, refit: Refit) -> dict[int, float]:
     return {i: math.sqrt(max(float(found.covariance[k, k]), 0.0)) for k, i in mine}
 
 
-def not_told(form: WindowForm, refit: Refit) -> list[str]:
-    """The model's own unknowns that these logs hardly tell."""
+def not_told(form: WindowForm, refit: Refit, named: Sequence[str] = ()) -> list[str]:
+    """The model's own unknowns that these logs hardly tell, but for those of effects that are named.
+
+    Within its usual size an unknown may be hardly told, and still be sure to be far beyond it.
+    """
     std = _posterior(form, refit)
-    return [form.unknowns[i].key for i in form.baseline if std.get(int(i), 0.0) > TELLING.not_told]
+    said = {form.unknowns[i].key for name in named for i in form.candidates.get(name, ())}
+    untold = [form.unknowns[i].key for i in form.baseline if std.get(int(i), 0.0) > TELLING.not_told]
+    return [key for key in untold if key not in said]
 
 
 def at_edge(form: WindowForm, refit: Refit) -> list[str]:
@@ -283,17 +285,19 @@ def why(
         return diagnosis
     question = bench.question(noise, suspects)
     _save_windows(bench, noise)
-    diagnosis, found = answer.diagnose(run, question, progress, seconds)
+    # cutting windows and learning their noise counts, too: the user's clock began with the command
+    left = max(seconds - (time.monotonic() - begin), 0.0)
+    diagnosis, found = answer.diagnose(run, question, progress, left)
     if found is not None:
         form = _form(question)
         base = found.base(form.name).refit
-        start = form.residual(form.origin())
+        start = form.told(form.origin())
         alone = form.alone(base)
         run.save(COMPARISON_FILE, comparison(bench, question, start, base, alone, time.monotonic() - begin))
         tried = {tuple(sorted(h.effects)): h.refit.u for h in found.hypotheses if h.refitted and h.effects}
-        write_refits(run.folder, {e: (form.residual(u), form.predicted(u)) for e, u in tried.items()})
-        untold = not_told(form, base)
+        write_refits(run.folder, {e: (form.told(u), form.predicted(u)) for e, u in tried.items()})
         diagnosis = _held_to_account(diagnosis, found, {s.name: s.family for s in bench.suspects})
+        untold = not_told(form, base, diagnosis.effects)
         sentence = diagnosis.sentence
         if diagnosis.verdict in (Verdict.UNKNOWN, Verdict.UNDECIDABLE, Verdict.KNOWN_CLASS):
             sentence += _what_next(bench)
@@ -309,9 +313,15 @@ def why(
             "not_tried": [] if found.complete else ["the search was ended by its time or its number of refits"],
             "windows": {"used": len(bench.cut), "of": bench.cut.available},
         }
-        diagnosis = dataclasses.replace(diagnosis, sentence=sentence, details=details)
+        evidence = [dataclasses.replace(e, values=_shown(e.values), std=_shown(e.std)) for e in diagnosis.evidence]
+        diagnosis = dataclasses.replace(diagnosis, sentence=sentence, details=details, evidence=evidence)
     run.save(VERDICT_FILE, diagnosis.to_dict())
     return diagnosis
+
+
+def _shown(values: Mapping[str, float]) -> dict[str, float]:
+    """Values without the switch from one ground to another, which is no quantity of the ground."""
+    return {name: value for name, value in values.items() if name != INSTEAD}
 
 
 PORTS = {
