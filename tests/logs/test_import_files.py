@@ -272,6 +272,26 @@ def test_cut_at_gaps_and_rests_and_nothing_is_lost(tmp_path: Path) -> None:
         assert all(log.tables["drive"].time_s[0] == 0.0 for log in logs)
 
 
+@pytest.mark.parametrize("imposed", [True, False])
+def test_other_units_lose_nothing_that_the_map_states(imposed: bool, tmp_path: Path) -> None:
+    """Speeds in rpm are imposed and tell rests, and currents in mA are magnitudes, as those in SI units are."""
+    t = 0.1 * np.arange(300)
+    # 0.05 rpm is rest, and would be none in rad/s
+    speed = np.where((t > 10.0) & (t < 20.0), 0.05, 20.0 + np.sin(t))
+    pd.DataFrame({"t": t, "w": speed, "c": 900.0 + 50.0 * np.cos(3.0 * t)}).to_csv(tmp_path / "a.csv", index=False)
+    text = '[log]\nrover = "husky"\nmagnitudes = { "motor_*_drive_current_A" = 0.6 }\n'
+    text += 'imposed = "wheel_speed"\n' if imposed else ""
+    text += '[tables.drive]\nfile = "a.csv"\ntime = "t"\n[tables.drive.channels]\n'
+    for side in ("left", "right"):
+        text += f'joint_{side}_drive_speed_rpm = "w"\nmotor_{side}_drive_current_mA = "c"\n'
+    found = import_drives(tmp_path / "a.csv", tmp_path / "log", write_map(tmp_path, text), split_at_rest_s=5.0)
+    logs = [drive(f) for f in found.logs]
+    assert len(logs) == 2
+    for log in logs:
+        assert log.imposed == ("wheel_speed" if imposed else None)
+        assert log.magnitudes == {"motor_left_drive_current_A": 0.6, "motor_right_drive_current_A": 0.6}
+
+
 def test_groups_are_drives_that_begin_in_motion(tmp_path: Path) -> None:
     frame = pd.DataFrame({"w": np.repeat([0, 1, 2], 20), "t": np.tile(0.05 * np.arange(20), 3), "y": np.arange(60.0)})
     frame.to_csv(tmp_path / "a.csv", index=False)

@@ -13,7 +13,7 @@ from lunar_mjx.logs.readers.drives_from_bags import drive_of_bag
 from lunar_mjx.logs.readers.drives_from_files import drives_of_files
 from lunar_mjx.logs.readers.import_map import ImportMap, changed, merged, read_map
 from lunar_mjx.logs.readers.recorded_drive import Copies, RecordedDrive, cut
-from lunar_mjx.logs.schema import find_channel, is_quantity
+from lunar_mjx.logs.schema import find_channel, is_quantity, parse_column
 from lunar_mjx.logs.write import refuse_used, write_log
 
 
@@ -141,7 +141,9 @@ def _settings(drive: RecordedDrive, mapping: ImportMap, changes: Mapping[str, An
     # The nearer to the user the later: map, then what the recording says, then the call.
     settings = merged(mapping.settings, drive.settings)
     settings = merged(settings, {k: v for k, v in (changes or {}).items() if k not in ("rover", "noise")})
-    channels = {c for frame in drive.tables.values() for c in frame.columns}
+    # Columns may be in units of their own: what they hold is asked by the name that reading will give them.
+    columns = {c for frame in drive.tables.values() for c in frame.columns}
+    channels = {c if (found := parse_column(c, drive.name)) is None else found.name for c in columns}
     if "magnitudes" in settings:
         stated = settings["magnitudes"]
         kept = [m for m in stated if _names(m, channels)]

@@ -203,10 +203,12 @@ def _rests(drive: RecordedDrive, rest_s: float) -> list[float]:
     """Middles of spans in which every wheel speed that is measured, else commanded, is zero."""
     for quantity in ("joint_speed", "command_speed"):
         series = [
-            (f[TIME].to_numpy(float)[keep], f[c].to_numpy(float)[keep])
+            (f[TIME].to_numpy(float)[keep], column.scale * f[c].to_numpy(float)[keep])
             for f in drive.tables.values()
             for c in f.columns
-            if is_quantity(c, quantity, "drive") and (keep := f[c].notna().to_numpy()).any()
+            if (column := parse_column(c, drive.name)) is not None
+            and is_quantity(column.name, quantity, "drive")
+            and (keep := f[c].notna().to_numpy()).any()
         ]
         if series:
             break
