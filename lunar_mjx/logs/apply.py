@@ -83,8 +83,8 @@ def commands(log: Log, model: Model) -> tuple[Commands, float]:
             "commands",
             None,
             "are missing: no channel command_* is in any table",
-            'log what was commanded, such as command_lf_drive_speed_rad_s, or state imposed = "wheel_speed" in log.toml '
-            "where the wheels' speeds were measured",
+            'log what was commanded, such as command_lf_drive_speed_rad_s, or state imposed = "wheel_speed" in '
+            "log.toml where the wheels' speeds were measured",
         )
     for group, mode in modes.items():
         if model.modes[group] != mode:
