@@ -159,6 +159,8 @@ def finish(figure: go.Figure, height: int, **layout: Any) -> go.Figure:
         margin={"l": 62, "r": 16, "t": 60, "b": 52},
         hovermode="closest",
         legend={"orientation": "h", "x": 0.0, "y": 1.02, "yanchor": "bottom", "itemsizing": "constant"},
+        # in a row they would cover the legend's last words
+        modebar={"orientation": "v"},
     )
     figure.update_layout(**layout)
     figure.update_xaxes(**axis)

@@ -2,7 +2,8 @@
 
 A hill that no map has, play in a joint, a link that bends: what a rover's model leaves out shows in its channels as a
 course over seconds. Taken for white noise it would be a thousand independent witnesses, and some effect or other would
-follow it. As an Ornstein-Uhlenbeck process beside the noise it is as many as it lasts seconds.
+follow it. As an Ornstein-Uhlenbeck process beside the noise it is as many as it lasts seconds. How long that is the
+drives tell as well.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ class ChannelErrors:
 
     Attributes:
       log_scale: (levels, groups) sum of the logarithms of what whitening divides the fitted ones by.
-      log_prior: (levels,) of the sizes: half-Cauchy, for nobody knows the order of what a model leaves out
-        (Gelman 2006).
+      log_prior: (levels,) of the sizes and times: half-Cauchy in the size, for nobody knows the order of what a model
+        leaves out (Gelman 2006).
     """
 
     def __init__(self, observations: Observations, group: np.ndarray, kinds: int, settings: DriveSettings):
@@ -35,24 +36,37 @@ class ChannelErrors:
           settings: sizes that are tried, and their prior.
         """
         self._observations, self._group, self._kinds = observations, group, kinds
-        self._sizes, self._spread = settings.errors, spread(observations)
+        # size and time of each level; how long nothing lasts is no question
+        self._levels = [(size, t) for t in settings.error_times_s for size in settings.errors if size > 0.0]
+        self._levels.insert(0, (0.0, settings.error_times_s[0]))
+        self._spread = spread(observations)
         self._fit = observations.in_split("fit")
         self._made: dict[tuple[int, ...], Observations] = {}
-        self.log_prior = -np.log1p((np.array(settings.errors) / settings.usual_error) ** 2)
-        scales = [self.at(np.full(kinds, level)).log_widths()[self._fit] for level in range(len(self._sizes))]
+        sizes = np.array([size for size, _ in self._levels])
+        # every time is as probable as another
+        self.log_prior = -np.log1p((sizes / settings.usual_error) ** 2)
+        self.log_prior -= np.log(len(settings.error_times_s)) * (sizes > 0.0)
+        scales = [self.at(np.full(kinds, level)).log_widths()[self._fit] for level in range(len(sizes))]
         self.log_scale = np.array([np.bincount(group[self._fit], s, minlength=kinds) for s in scales])
-        self.usual = np.full(kinds, int(np.argmin(np.abs(np.array(settings.errors) - settings.usual_error))))
+        self.usual = np.full(kinds, int(np.argmin(np.abs(sizes - settings.usual_error))))
 
     def shares(self, levels: np.ndarray) -> dict[str, float]:
         """The size of a channel's errors, as a share of what it does, at a level (groups,) of each group."""
-        return {s.channel: self._sizes[levels[self._group[s.start]]] for s in self._observations.series}
+        return {s.channel: self._levels[levels[self._group[s.start]]][0] for s in self._observations.series}
+
+    def times_s(self, levels: np.ndarray) -> dict[str, float]:
+        """How long a channel's errors last, s, at a level (groups,) of each group."""
+        return {s.channel: self._levels[levels[self._group[s.start]]][1] for s in self._observations.series}
 
     def at(self, levels: np.ndarray) -> Observations:
         """The observations with errors of a level (groups,) of each group."""
         key = tuple(int(level) for level in levels)
         if key not in self._made:
+            times, made = self.times_s(levels), self._observations
             chosen = {c: share * self._spread[c] for c, share in self.shares(levels).items() if share > 0.0}
-            self._made[key] = with_discrepancy(self._observations, chosen)
+            for time_s in sorted({times[c] for c in chosen}):
+                made = with_discrepancy(made, {c: v for c, v in chosen.items() if times[c] == time_s}, time_s)
+            self._made[key] = made
         return self._made[key]
 
     def levels(self, columns: np.ndarray, residual: np.ndarray) -> Levels:
@@ -62,7 +76,7 @@ class ChannelErrors:
           columns: (n, k) derivatives of the predictions, SI units. residual: (n,) measured less predicted.
         """
         whole, number, grams = np.column_stack([columns, residual]), self._group[self._fit], []
-        for level in range(len(self._sizes)):
+        for level in range(len(self._levels)):
             white = self.at(np.full(self._kinds, level)).whiten(whole)[self._fit]
             grams.append(Gram.of(white[:, :-1], white[:, -1], number, self._kinds))
         matrix = np.stack([g.matrix for g in grams])
@@ -75,11 +89,11 @@ def spread(observations: Observations) -> dict[str, float]:
     for s in observations.series:
         v = observations.value[s.start : s.stop]
         # Axes together, since one of them may stand still in these drives and would be left without any error.
-        by_kind.setdefault(_kind(s.channel), []).append(float(np.mean((v - v[0]) ** 2)))
-    return {s.channel: float(np.sqrt(np.mean(by_kind[_kind(s.channel)]))) for s in observations.series}
+        by_kind.setdefault(error_kind(s.channel), []).append(float(np.mean((v - v[0]) ** 2)))
+    return {s.channel: float(np.sqrt(np.mean(by_kind[error_kind(s.channel)]))) for s in observations.series}
 
 
-def _kind(channel: str) -> str:
-    """A channel's name without its axis and corner."""
+def error_kind(channel: str) -> str:
+    """A channel's name without its axis and corner: channels of one kind share the sizes of their noise and errors."""
     parts = parse_name(channel)
     return channel if parts is None else dataclasses.replace(parts, axis="").kind

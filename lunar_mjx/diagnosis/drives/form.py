@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
-from lunar_mjx.diagnosis.drives.channel_errors import ChannelErrors
+from lunar_mjx.diagnosis.drives.channel_errors import ChannelErrors, error_kind
 from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS, usual_kind
 from lunar_mjx.diagnosis.drives.observations import with_jitter
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
@@ -23,7 +23,6 @@ from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import POSE
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import DRAWBAR, SHARES, WORDS, Usual, rotation
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
-from lunar_mjx.effects.sensor.channels import family
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import (
@@ -113,10 +112,10 @@ class DriveForm(MeasuredForm):
                 if self.coordinates[i].amplitude:
                     self._std[i] = self.effect_size(self.coordinates[i])
         self._size = np.array([usual.size(label, q) for label in labels for q in FOLLOWS[label]])
-        families = [family(s.channel) or s.channel for s in self.observations.series]
-        self.noise_names = tuple(dict.fromkeys(families))
+        kinds = [error_kind(s.channel) for s in self.observations.series]
+        self.noise_names = tuple(dict.fromkeys(kinds))
         self._group = np.empty(len(self.observations), int)
-        for s, name in zip(self.observations.series, families, strict=True):
+        for s, name in zip(self.observations.series, kinds, strict=True):
             self._group[s.start : s.stop] = self.noise_names.index(name)
         self._fit = self.observations.in_split("fit")
         self._seen: np.ndarray | None = None  # (n, coordinates + inputs) derivatives at the base, SI

@@ -90,11 +90,14 @@ def discrepancy_of(discrepancy: Mapping[str, float], channels: Collection[str]) 
     }
 
 
-def with_discrepancy(observations: Observations, discrepancy: Mapping[str, float]) -> Observations:
+def with_discrepancy(
+    observations: Observations, discrepancy: Mapping[str, float], time_s: float = DISCREPANCY_TIME_S
+) -> Observations:
     """Observations whose noise holds a known unexplained error of the model, as a coloured part.
 
     Args:
       observations: of drives. discrepancy: see `discrepancy_of`.
+      time_s: correlation time of the error in a channel whose noise has no coloured part of its own.
 
     Raises:
       UserError: see `discrepancy_of`.
@@ -105,7 +108,7 @@ def with_discrepancy(observations: Observations, discrepancy: Mapping[str, float
         added = sizes[s.channel]
         if added == 0.0:
             return s
-        time = s.correlation_time if s.coloured > 0.0 and s.correlation_time > 0.0 else DISCREPANCY_TIME_S
+        time = s.correlation_time if s.coloured > 0.0 and s.correlation_time > 0.0 else time_s
         return dataclasses.replace(s, coloured=float(np.hypot(s.coloured, added)), correlation_time=time)
 
     return dataclasses.replace(observations, series=tuple(map(widened, observations.series)))

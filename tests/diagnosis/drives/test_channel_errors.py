@@ -19,9 +19,9 @@ SPREAD = float(np.sqrt(np.mean(SIGNAL**2)))
 BASE, EFFECT = np.tile(TIME, LOGS), np.repeat([1.0, -1.0, 0.5, 2.0], SAMPLES) * np.tile(np.cos(0.9 * TIME), LOGS)
 
 
-def _slow(rng, share):
-    """(n,) errors of the channels: an Ornstein-Uhlenbeck process of a second, over what the channels do."""
-    keep = np.exp(-0.1)
+def _slow(rng, share, time_s=1.0):
+    """(n,) errors of the channels: an Ornstein-Uhlenbeck process of a time, over what the channels do."""
+    keep = np.exp(-0.1 / time_s)
     out = np.zeros(LOGS * SAMPLES)
     for i in range(len(out)):
         before = out[i - 1] if i % SAMPLES else 0.0
@@ -41,7 +41,7 @@ def _found(residual: np.ndarray, columns: np.ndarray, std: np.ndarray) -> tuple[
 
 @pytest.mark.parametrize(
     ("share", "amount", "low", "high"),
-    [(0.0, 0.0, 0.0, 0.0), (0.03, 0.0, 0.01, 0.1), (0.0, 0.2, 0.0, 0.0), (0.03, 0.2, 0.01, 0.1)],
+    [(0.0, 0.0, 0.0, 0.003), (0.03, 0.0, 0.01, 0.1), (0.0, 0.2, 0.0, 0.003), (0.03, 0.2, 0.01, 0.1)],
 )
 def test_who_has_the_right_effect_puts_nothing_that_it_explains_down_to_slow_errors(share, amount, low, high):
     rng = np.random.default_rng(2)
@@ -56,7 +56,7 @@ def test_who_lacks_an_effect_has_larger_errors_and_is_less_probable():
     residual = 0.2 * EFFECT + NOISE * rng.standard_normal(len(SIGNAL))
     right, none = _found(residual, np.column_stack([BASE, EFFECT]), np.array([2.0, 1.0]))
     wrong, some = _found(residual, BASE[:, None], np.array([2.0]))
-    assert (none, some > 0.03) == (0.0, True)
+    assert none <= 0.003 and some > 0.03
     assert right.log_evidence > wrong.log_evidence + 100.0
 
 
@@ -70,3 +70,24 @@ def test_a_wrong_candidate_gains_nothing_from_slow_errors():
     plain = dataclasses.replace(manoeuvres(LOGS, SAMPLES, white=NOISE), value=SIGNAL)
     column, left = plain.whiten(EFFECT), plain.whiten(residual)
     assert abs(column @ left) / np.linalg.norm(column) > 5.0, "white noise alone would make it sure"
+
+
+@pytest.mark.parametrize("time_s", [1.0, 10.0])
+def test_how_long_errors_last_is_told_by_them(time_s):
+    """A drift of all of a drive is one witness for a slow effect, and not ten."""
+    rng = np.random.default_rng(5)
+    observations = dataclasses.replace(manoeuvres(LOGS, SAMPLES, white=NOISE), value=SIGNAL)
+    residual = _slow(rng, 0.1, time_s) + NOISE * rng.standard_normal(len(SIGNAL))
+    drift = np.column_stack([BASE, np.repeat([1.0, -1.0, 0.5, 2.0], SAMPLES) * np.tile(np.cos(0.3 * TIME), LOGS)])
+    gains = {}
+    for times in ((1.0,), (1.0, 10.0)):
+        errors = ChannelErrors(observations, np.zeros(len(SIGNAL), int), 1, DriveSettings(error_times_s=times))
+        levels = errors.levels(drift, residual)
+        alone = errors.levels(drift[:, :1], residual)
+        own, rest = (
+            infer_levels(made, Amplitudes.of(np.ones(made.matrix.shape[-1] - 1)), (), [NoiseSize("y", 0.3)])
+            for made in (levels, alone)
+        )
+        gains[times] = own.log_evidence - rest.log_evidence
+    assert errors.times_s(rest.levels)["y"] == time_s  # of the last: both times
+    assert gains[1.0, 10.0] < (1.0 if time_s == 1.0 else max(1.0, 0.7 * gains[(1.0,)]))
