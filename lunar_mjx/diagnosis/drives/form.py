@@ -5,7 +5,6 @@ from __future__ import annotations
 import concurrent.futures
 import copy
 import dataclasses
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -175,13 +174,12 @@ class DriveForm(MeasuredForm):
         seen = np.zeros((len(self.observations), count + len(self._inputs)))
         parts, ground = self.parts, self.drives.ground
         if len(ground):
-            self.progress("signatures of unmapped ground", 0.0)
+            self.progress("signatures of unmapped ground", math.nan)
             seen[:, ground] = self.jacobian(u, ground)[1]
-        self.progress("signatures of unknown inputs", 0.0)
+        self.progress("signatures of unknown inputs", math.nan)
         # to first order in inputs of a hundredth of what is usual
         scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])
         seen[:, count:] = self._changes(u, self._inputs, 1e-3 * self._size / scales) / 1e-3  # of a field of size 1
-        done = itertools.count(1)
 
         def take(part: list[str]) -> tuple[str, ...]:
             """Fills in the signatures of some candidates; those are returned for which there was no time."""
@@ -191,7 +189,7 @@ class DriveForm(MeasuredForm):
                 seen[:, amplitudes] = self._changes(u, amplitudes, steps) / steps
             except TimeUp:
                 return tuple(part)
-            self.progress("signatures of all candidates", next(done) / (len(parts) + 1))
+            self.progress("signatures of all candidates", math.nan)
             return ()
 
         # one program is made while another runs: the first takes Python's lock, and the second a core
@@ -475,7 +473,7 @@ class DriveForm(MeasuredForm):
         ground = self.drives.ground
         if not len(ground):
             return u
-        self.progress("ground that nobody mapped", 0.0)
+        self.progress("ground that nobody mapped", math.nan)
         value, slopes = self.jacobian(u, np.concatenate([free, ground]))
         pose = np.zeros(len(observations), bool)
         for s in observations.series:

@@ -88,6 +88,16 @@ def test_quotients_agree_with_a_change_of_the_parameter(quiet):
     assert np.linalg.norm(jacobian[:, 1] / sigma - central) < 1e-2 * np.linalg.norm(central)
 
 
+def test_no_share_of_a_simulation_is_told_as_one_of_the_whole(quiet, monkeypatch):
+    """Its last part showed as "100 %, 0 s left" while a fit went on for minutes."""
+    told = []
+    monkeypatch.setattr(quiet, "progress", lambda what, share: told.append((what, share)))
+    row = quiet.origin()
+    row[quiet.baseline[0]] += 0.015  # no simulation of other tests
+    quiet.predict(row[None])
+    assert told and all(what == "simulating" and np.isnan(share) for what, share in told)
+
+
 def test_a_program_without_candidates_predicts_what_one_with_them_at_their_null_does(quiet):
     plain = quiet.predict(quiet.origin()[None])
     assert quiet._bench_for(quiet.origin()[None]) is quiet.bench

@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import functools
+import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -139,7 +140,6 @@ class Bench:
         places = _places(self.runs, observations)
         before = values.get((NUISANCE, READS_BEFORE, -1, False))
         before = np.zeros(rows) if before is None else before
-        done = 0
         for logs in self._groups():
             jobs = np.stack(np.meshgrid(np.arange(len(logs.numbers)), np.arange(rows), indexing="ij"), -1).reshape(
                 -1, 2
@@ -152,8 +152,8 @@ class Bench:
                         row = slice(part[low, 1], part[high - 1, 1] + 1)
                         own, names = signals[low:high], logs.program.channels
                         yield number, row, _sample(own, names, places[number], observations.value, before[row])
-                done += len(part)
-                progress("simulating", done / (rows * len(self.runs)))
+                # how many simulations a fit takes is not known beforehand: no share of them is one of the whole
+                progress("simulating", math.nan)
 
     def _signals(self, logs: Logs, parts: Sequence[np.ndarray], values: Rows) -> Iterator[np.ndarray]:
         """Signals (rovers, channels, time) of every part in turn.
