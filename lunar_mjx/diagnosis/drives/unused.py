@@ -21,7 +21,9 @@ REASONS: Mapping[str, str] = {
 OTHERWISE = "the model does not predict it"
 
 
-def unused_channels(log: Log, compared: Collection[str]) -> dict[str, str]:
+def unused_channels(
+    log: Log, compared: Collection[str], reasons: Mapping[str, str] = REASONS, otherwise: str = OTHERWISE
+) -> dict[str, str]:
     """Channels of a log that nothing of a comparison reads, with the reason.
 
     Commands, imposed speeds, conditions of the environment and quaternions beside their angles are read, though they
@@ -29,6 +31,7 @@ def unused_channels(log: Log, compared: Collection[str]) -> dict[str, str]:
 
     Args:
       log: of a drive. compared: channels that the problem compares.
+      reasons: by the beginning of a channel's name. otherwise: of all others.
     """
     read = {v for v in log.environment.values() if isinstance(v, str)}
     if any(e in compared for e in EULER):
@@ -38,19 +41,24 @@ def unused_channels(log: Log, compared: Collection[str]) -> dict[str, str]:
         speed = is_quantity(name, "joint_speed", "drive")
         if name in compared or name in read or is_command(name) or (log.imposed and speed):
             continue
-        out[name] = next((why for start, why in REASONS.items() if name.startswith(start)), OTHERWISE)
+        out[name] = next((why for start, why in reasons.items() if name.startswith(start)), otherwise)
     return out
 
 
-def unused_sentence(logs: Sequence[Log], compared: Sequence[Collection[str]]) -> str:
+def unused_sentence(
+    logs: Sequence[Log],
+    compared: Sequence[Collection[str]],
+    reasons: Mapping[str, str] = REASONS,
+    otherwise: str = OTHERWISE,
+) -> str:
     """What the logs of a campaign hold and nothing reads, as one sentence; empty if all is read.
 
     Args:
-      logs: of drives. compared: channels that are compared, by log.
+      logs: of drives. compared: channels that are compared, by log. reasons, otherwise: as for `unused_channels`.
     """
     by_reason: dict[str, dict[str, None]] = {}
     for log, own in zip(logs, compared, strict=True):
-        for name, why in unused_channels(log, own).items():
+        for name, why in unused_channels(log, own, reasons, otherwise).items():
             by_reason.setdefault(why, {})[name] = None
     parts = [f"{', '.join(names)} ({why})" for why, names in by_reason.items()]
     return f"Not used: {'; '.join(parts)}." if parts else ""

@@ -10,11 +10,12 @@ from lunar_mjx.diagnosis import verbs as all_verbs
 from lunar_mjx.diagnosis.drives.observations import DISCREPANCY_TIME_S
 from lunar_mjx.diagnosis.drives.windows import coordinates, verbs
 from lunar_mjx.diagnosis.drives.windows.bench import Bench, held_out_parts
-from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, _held, cut, imu_clock
+from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, _held, channels_read, cut, imu_clock
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, corners, learn_noise, proportions
 from lunar_mjx.diagnosis.drives.windows.settings import WindowSettings, by_motion
 from lunar_mjx.diagnosis.drives.windows.verbs import fitted_model
+from lunar_mjx.diagnosis.runs import Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
 from lunar_mjx.dynamics.imposed import Windows
@@ -193,16 +194,17 @@ def test_a_fit_teaches_priors(model, tmp_path):
     assert load_model(save_model(taught, tmp_path / "fitted.toml")).priors == taught.priors
 
 
-def a_log(folder):
-    """A log folder with a gap of a second, on a slope that its accelerometer tells."""
+def a_log(folder, **more):
+    """A log folder with a gap of a second, on a slope that its accelerometer tells; `more` columns with one value."""
     folder.mkdir()
     time = np.concatenate([np.arange(40) * 0.1, 5.0 + np.arange(30) * 0.1])
     rows = [f"{t:.3f},{2.0},{2.0},{3.0},{3.1},{1.7},{0.0},{9.66},{0.01}" for t in time]
+    rows = [",".join([row, *map(str, more.values())]) for row in rows]
     header = (
         "time_s,joint_left_drive_speed_rad_s,joint_right_drive_speed_rad_s,motor_left_drive_current_A,"
         "motor_right_drive_current_A,accelerometer_x_m_s2,accelerometer_y_m_s2,accelerometer_z_m_s2,gyro_z_rad_s"
     )
-    (folder / "drive.csv").write_text("\n".join([header, *rows]) + "\n")
+    (folder / "drive.csv").write_text("\n".join([",".join([header, *more]), *rows]) + "\n")
     (folder / "log.toml").write_text(
         'format = "lunar-mjx-log/1"\nrover = "husky"\nmanoeuvre = "straight"\ngravity_m_s2 = 9.81\n'
         'imposed = "wheel_speed"\n[tables.drive]\nfile = "drive.csv"\nrate_hz = 10.0\n'
@@ -238,6 +240,20 @@ def test_settings_and_a_known_error_of_the_model_are_honoured(tmp_path):
         with pytest.raises(UserError, match=words[option]):
             all_verbs.compare([log], model, tmp_path / "other", **{option: value})
         assert not (tmp_path / "other").exists()
+
+
+def test_what_no_window_holds_is_named_with_the_reason(tmp_path):
+    """Positions without a heading were left out without a word."""
+    place, heading = {"position_x_m": 1.0, "position_y_m": 2.0}, {"yaw_deg": 5.0}
+    logs = [a_log(tmp_path / "a"), a_log(tmp_path / "b", **place), a_log(tmp_path / "c", **place, **heading)]
+    read = [channels_read(log) for log in read_campaign(logs)]
+    assert read[0] == read[1] and read[2] - read[0] == {*place, *heading}
+    run = Run(tmp_path / "run", logs[1:2], load_model(shipped("models") / "husky" / "hard_floor.toml"))
+    bench = Bench(run, run.campaign())
+    told = bench.question([Noise(1.0, 0.0, 1.0)] * len(CHANNELS), ()).unused
+    assert told == (
+        "Not used: position_x_m, position_y_m (a speed over ground needs a heading that is known, yaw_deg)."
+    )
 
 
 def test_a_known_error_is_a_coloured_part_of_the_noise():

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.observations import discrepancy_of
+from lunar_mjx.diagnosis.drives.unused import unused_sentence
 from lunar_mjx.diagnosis.drives.windows.coordinates import (
     CALIBRATION,
     Suspect,
@@ -17,7 +18,7 @@ from lunar_mjx.diagnosis.drives.windows.coordinates import (
     sizes,
     suspects_of,
 )
-from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, Cut, cut
+from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, Cut, channels_read, cut
 from lunar_mjx.diagnosis.drives.windows.form import SOFT, WindowForm, observe
 from lunar_mjx.diagnosis.drives.windows.problem import (
     Noise,
@@ -40,6 +41,9 @@ from lunar_mjx.model import Model
 MOST_WINDOWS = 60
 """Windows of a campaign that are simulated: two minutes of driving, drawn evenly over speeds and turns."""
 
+
+UNUSED = {"position_": "a speed over ground needs a heading that is known, yaw_deg"}
+"""Why channels are in no window, by the beginning of their names."""
 
 PARTS = 10
 """Parts of a log of which every third is held out."""
@@ -105,7 +109,9 @@ class Bench:
         """
         form = self.form(noise, suspects)
         effects = {name: catalogue.CATALOGUE[name] for name in form.candidates if name in catalogue.CATALOGUE}
-        return Problem((form,), effects, (), form.settings)
+        read = [channels_read(log) for log in self.logs]
+        unused = unused_sentence(self.logs, read, UNUSED, "windows hold currents, the yaw rate and the speed ahead")
+        return Problem((form,), effects, (), form.settings, unused)
 
     def noise(self) -> list[Noise]:
         """The noise that a run has kept, or what the best single explanation leaves of the windows."""

@@ -467,6 +467,21 @@ def _leans(log: Log) -> bool:
     return any(all(log.channel(c) is not None for c in channels) for channels in LEANS_BY)
 
 
+def channels_read(log: Log) -> set[str]:
+    """The channels of a log that windows are made of."""
+    read = {c for c in CHANNELS if log.channel(c) is not None}
+    for channel in CURRENTS:
+        if channel not in read:
+            read |= set(_of_wheels(log, channel))
+    if GYRO not in read and _turning(log) is not None:
+        read.add("yaw_deg")
+    elif _mounting(log) is not None:
+        read |= {"gyro_x_rad_s", "gyro_y_rad_s"}
+    if AHEAD not in read and _over_ground(log) is not None:
+        read |= {"position_x_m", "position_y_m", "yaw_deg"}
+    return read | set(next((c for c in LEANS_BY if all(log.channel(n) is not None for n in c)), ()))
+
+
 def _up(
     log: Log, edges: np.ndarray, sides: Sequence[tuple[np.ndarray, np.ndarray]], radius: float, clock_s: float
 ) -> np.ndarray:
