@@ -94,8 +94,6 @@ class Run:
         Earlier looks at the test split stay on record.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        for name in FOUND:
-            (self.folder / name).unlink(missing_ok=True)
         opened = (self.load(RUN_FILE) or {}).get("test_opened", [])
         save_model(self.model, self.folder / MODEL_FILE)
         save_json(
@@ -115,6 +113,9 @@ class Run:
                 "test_opened": opened,
             },
         )
+        # last, so that a full disk keeps what was found before
+        for name in FOUND:
+            (self.folder / name).unlink(missing_ok=True)
 
     def opened_test(self, verb: str, models: Mapping[str, str]) -> None:
         """Puts on record that the error on the test split was computed.

@@ -130,14 +130,14 @@ class Levels:
       matrix: (levels, groups, k + 1, k + 1) as that of `Gram`, whitened with each size.
       log_scale: (levels, groups) sum of the logarithms of what whitening divides by.
       log_prior: (levels,) log prior density of each size.
-      start: (groups,) level of each group to begin at.
+      starts: (m, groups) levels to begin at, of which the one counts that leads to the most probable end.
     """
 
     count: np.ndarray
     matrix: np.ndarray
     log_scale: np.ndarray
     log_prior: np.ndarray
-    start: np.ndarray
+    starts: np.ndarray
 
     def gram(self, levels: np.ndarray) -> Gram:
         """The statistics at a level (groups,) of each group."""
@@ -473,7 +473,21 @@ def infer_levels(
     Raises:
       EvidenceError: see `infer`.
     """
-    at, best = levels.start, None
+    # Large errors leave amplitudes wide, which speaks for large errors: from there EM need not come down to none.
+    ends = [_climb(levels, at, amplitudes, fields, noises, start) for at in levels.starts]
+    return max(ends, key=lambda end: end.log_evidence)
+
+
+def _climb(
+    levels: Levels,
+    at: np.ndarray,
+    amplitudes: Amplitudes,
+    fields: Sequence[Field],
+    noises: Sequence[NoiseSize],
+    start: tuple[np.ndarray, np.ndarray] | None,
+) -> Evidence:
+    """What is found where EM from some levels (groups,) ends; the rest as for `infer_levels`."""
+    best = None
     for _ in range(SIZE_DESCENT.most_levels):
         found = infer(levels.gram(at), amplitudes, fields, noises, start)
         found = dataclasses.replace(found, log_evidence=found.log_evidence + levels.log_weight(at), levels=at)

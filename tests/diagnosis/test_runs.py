@@ -161,6 +161,18 @@ def test_a_new_comparison_leaves_nothing_of_the_one_before(run):
     assert len(run.load(RUN_FILE)["test_opened"]) == 1
 
 
+def test_what_was_found_stays_where_a_new_comparison_cannot_be_written(run, monkeypatch):
+    (run.folder / COMPARISON_FILE).write_text("the comparison before")
+
+    def full(path, content):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("lunar_mjx.diagnosis.runs.save_json", full)
+    with pytest.raises(OSError, match="No space"):
+        run.write()
+    assert (run.folder / COMPARISON_FILE).read_text() == "the comparison before"
+
+
 def test_refused_logs_leave_no_comparison_of_others(run, monkeypatch):
     finding = Finding("log", "drive", None, "time_s", "clock", "goes back")
     run.save(COMPARISON_FILE, {"of": "the logs before"})

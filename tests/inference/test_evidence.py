@@ -278,11 +278,11 @@ def test_the_most_probable_level_of_slow_errors_is_taken(drawn):
     for first in range(3):
         for second in range(3):
             at = np.array([first, second])
-            levels = Levels(grams[0].count, matrix, scale, log_prior, at)
+            levels = Levels(grams[0].count, matrix, scale, log_prior, at[None])
             alone[first, second] = infer(levels.gram(at), amplitudes, FIELDS, NOISES).log_evidence + levels.log_weight(
                 at
             )
-    from_afar = Levels(grams[0].count, matrix, scale, log_prior, np.array([2, 2]))
+    from_afar = Levels(grams[0].count, matrix, scale, log_prior, np.array([[2, 2]]))
     found = infer_levels(from_afar, amplitudes, FIELDS, NOISES)
     assert tuple(found.levels) == max(alone, key=lambda k: alone[k])
     assert found.log_evidence == pytest.approx(max(alone.values()), abs=1e-4)

@@ -70,7 +70,7 @@ class ChannelErrors:
         return self._made[key]
 
     def levels(self, columns: np.ndarray, residual: np.ndarray) -> Levels:
-        """Statistics of the fitted observations at every size; the usual one is where to begin.
+        """Statistics of the fitted observations at every size; the usual one and none are where to begin.
 
         Args:
           columns: (n, k) derivatives of the predictions, SI units. residual: (n,) measured less predicted.
@@ -80,7 +80,8 @@ class ChannelErrors:
             white = self.at(np.full(self._kinds, level)).whiten(whole)[self._fit]
             grams.append(Gram.of(white[:, :-1], white[:, -1], number, self._kinds))
         matrix = np.stack([g.matrix for g in grams])
-        return Levels(grams[0].count, matrix, self.log_scale, self.log_prior, self.usual)
+        starts = np.stack([self.usual, np.zeros_like(self.usual)])
+        return Levels(grams[0].count, matrix, self.log_scale, self.log_prior, starts)
 
 
 def spread(observations: Observations) -> dict[str, float]:

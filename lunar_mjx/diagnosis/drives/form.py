@@ -126,6 +126,7 @@ class DriveForm(MeasuredForm):
         self._slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}
         self._sizes: tuple[np.ndarray, np.ndarray] | None = None
         self.channel_errors: Mapping[str, float] = {}
+        self.error_times_s: Mapping[str, float] = {}
         self.start = self.origin()  # where the first refit begins
         self._number = {f.name: k for k, f in enumerate(self._usual_fields())}  # of each field
         self._ground = np.zeros(len(drives.ground))  # amounts of its modes, where the model as it is was refitted
@@ -335,11 +336,17 @@ class DriveForm(MeasuredForm):
           refit: of this form.
 
         Returns:
-          `log_evidence`; `jitter_s`, scatter of times, s; `channel_errors`, shares of what a channel does.
+          `log_evidence`; `jitter_s`, scatter of times, s; `channel_errors`, shares of what a channel does, and
+          `error_times_s`, how long these last, by channel.
         """
         value = refit.linear.evidence(self.listed(refit.effects))[0]
         widths = float(np.sum(self.observations.log_widths()[self._fit]))
-        return {"log_evidence": value - widths, "jitter_s": self.jitter_s, "channel_errors": dict(self.channel_errors)}
+        return {
+            "log_evidence": value - widths,
+            "jitter_s": self.jitter_s,
+            "channel_errors": dict(self.channel_errors),
+            "error_times_s": dict(self.error_times_s),
+        }
 
     def limit(self, until: float) -> None:
         """See `MeasuredForm`."""
@@ -404,7 +411,8 @@ class DriveForm(MeasuredForm):
         self.jitter_s = max(tried, key=lambda s: tried[s].log_evidence)
         errors, levels = made[self.jitter_s], tried[self.jitter_s].levels
         assert levels is not None
-        self.observations, self.channel_errors = errors.at(levels), errors.shares(levels)
+        self.observations = errors.at(levels)
+        self.channel_errors, self.error_times_s = errors.shares(levels), errors.times_s(levels)
 
     def _errors_with(self, jitter_s: float) -> ChannelErrors:
         """Observations whose times scatter by so many seconds, with each size of their channels' errors."""
