@@ -91,10 +91,10 @@ def read(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
 
-def write(path: Path, record: Any, separators: tuple[str, str] | None = None) -> None:
+def write(path: Path, record: Any) -> None:
     """Writes a record so that a kill never leaves half of one."""
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(plain(record), separators=separators) + "\n", encoding="utf-8")
+    part.write_text(json.dumps(plain(record), separators=(",", ":")) + "\n", encoding="utf-8")
     part.replace(path)
 
 

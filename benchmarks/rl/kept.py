@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,8 +15,11 @@ from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.envs.ladder.rungs import get_rung
 from lunar_mjx.resources import shipped
 
-EPOCHS, COLUMNS = ("rows", "epochs"), ("steps", "elapsed_s", "steps_per_s", "episode_return", "success", "stuck")
-"""What a seed's epochs are called, and which of their numbers are kept: those that figures read."""
+SCORED = ("steps", "elapsed_s", "success", "low", "high")
+COLUMNS = {"rows": (*SCORED, "episode_return"), "epochs": SCORED, "unseen": SCORED}
+"""What a seed's epochs and its scores during training are called, and which of their numbers figures read."""
+MOST_EPOCHS = 40
+"""Of a training on a rung, whose curve no figure draws."""
 SAME = {"large": ("rover", "environment", "train", "agents", "about"), "rung": ("training", "environment", "train")}
 """What runs have alike whose seeds stand side by side."""
 MOST_BYTES = 2_000_000
@@ -23,14 +27,19 @@ MOST_BYTES = 2_000_000
 
 
 def rounded(value: Any) -> Any:
-    """What is kept of a record: numbers with five digits, more than one seed tells, and of its epochs `COLUMNS`."""
+    """What is kept of a record: numbers with five digits, and of what seeds went through `COLUMNS`."""
     if isinstance(value, dict):
-        few = [k for k in EPOCHS if "seed" in value and isinstance(value.get(k), list)]
-        value = {**value, **{k: [{c: r[c] for c in COLUMNS if c in r} for r in value[k]] for k in few}}
+        few = [k for k in COLUMNS if "seed" in value and isinstance(value.get(k), list)]
+        value = {**value, **{k: [{c: r[c] for c in COLUMNS[k] if c in r} for r in value[k]] for k in few}}
         return {k: rounded(v) for k, v in value.items()}
     if isinstance(value, list):
         return [rounded(v) for v in value]
     return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def few(epochs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """At most `MOST_EPOCHS` epochs at even distances, the last one among them."""
+    return epochs[:: -math.ceil(max(len(epochs), 1) / MOST_EPOCHS)][::-1]
 
 
 def require_alike(kind: str, records: Iterable[dict[str, Any]]) -> None:
@@ -44,7 +53,7 @@ def require_alike(kind: str, records: Iterable[dict[str, Any]]) -> None:
 
 def keep(name: str, record: dict[str, Any], home: Path = KEPT) -> Path:
     """Writes what is kept of a record; returns the file."""
-    write(home / f"{name}.json", rounded(record), separators=(",", ":"))
+    write(home / f"{name}.json", rounded(record))
     return home / f"{name}.json"
 
 
@@ -72,7 +81,9 @@ def keep_rung(paths: Iterable[Path], home: Path = KEPT) -> Path:
     for record in records:
         about = {k: record[k] for k in ("commit", "tree", "worlds_s", "compile_s") if k in record}
         about["device"] = record["about"]["device"]
-        seeds |= {run["seed"]: {**about, **run} for run in record["seeds"] if "final" in run}
+        seeds |= {
+            run["seed"]: {**about, **run, "epochs": few(run["epochs"])} for run in record["seeds"] if "final" in run
+        }
     shared = {k: records[0][k] for k in ("about", "training", "environment", "train", "learner")}
     return keep(name, {**shared, "seeds": [seeds[n] for n in sorted(seeds)]}, home)
 

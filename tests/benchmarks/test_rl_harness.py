@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import sys
 from pathlib import Path
@@ -67,15 +68,25 @@ def test_what_is_kept_of_a_record_has_few_digits_and_few_columns():
     from kept import rounded
 
     epoch = {"steps": 1, "elapsed_s": 1.23456789, "loss": 3.0}
-    final = {"seed": 1, "rows": {"policy": {"success": 1.0 / 3.0}}}
-    record = {"rows": [{"loss": 1.0}], "seeds": [{"seed": 0, "epochs": [epoch], "final": final}]}
+    final, unseen = {"seed": 1, "rows": {"policy": {"success": 1.0 / 3.0}}}, [{"success": 1.0, "ends": {}}]
+    record = {"rows": [{"loss": 1.0}], "seeds": [{"seed": 0, "epochs": [epoch], "unseen": unseen, "final": final}]}
     assert rounded(record) == {
         "rows": [{"loss": 1.0}],
         "seeds": [
             {
                 "seed": 0,
                 "epochs": [{"steps": 1, "elapsed_s": 1.2346}],
+                "unseen": [{"success": 1.0}],
                 "final": {"seed": 1, "rows": {"policy": {"success": 0.33333}}},
             }
         ],
     }
+
+
+@pytest.mark.parametrize(("count", "left"), [(0, 0), (1, 1), (40, 40), (41, 21), (153, 39)])
+def test_a_long_training_keeps_few_epochs_and_its_last(count, left):
+    from kept import MOST_EPOCHS, few
+
+    kept = few([{"steps": i} for i in range(count)])
+    assert len(kept) == left <= MOST_EPOCHS and [e["steps"] for e in kept[-1:]] == [count - 1] * bool(count)
+    assert len({b["steps"] - a["steps"] for a, b in itertools.pairwise(kept)}) <= 1
