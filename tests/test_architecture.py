@@ -70,10 +70,10 @@ REPEATED = 3
 """Modules of one folder with a first word in common from which that word is a folder."""
 
 
-def modules() -> dict[str, Path]:
-    """Every module of the package by its dotted name."""
+def modules(top: str = PACKAGE) -> dict[str, Path]:
+    """Every module of the package, or of another top folder, by its dotted name."""
     found = {}
-    for path in sorted((ROOT / PACKAGE).rglob("*.py")):
+    for path in sorted((ROOT / top).rglob("*.py")):
         parts = list(path.relative_to(ROOT).with_suffix("").parts)
         found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
@@ -157,6 +157,39 @@ def test_no_import_climbs() -> None:
 
 def test_no_import_circles() -> None:
     assert [c for c in circles(graph()) if c not in LATE_CIRCLES] == []
+
+
+def script_imports(name: str, path: Path, known: dict[str, Path]) -> set[str]:
+    """Modules of `known` that a script imports anywhere: by whole names, from its package, or those beside it."""
+    folder = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            wanted = [a.name for a in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(folder.split(".")[: 1 - node.level or None]) if node.level else ""
+            base = ".".join(part for part in (base, node.module) if part)
+            wanted = [base, *(f"{base}.{a.name}" for a in node.names)]
+        else:
+            continue
+        # a script's own folder is on its path
+        found |= {full for word in wanted for full in (word, f"{folder}.{word}") if full in known}
+    return found - {name, *(m for m, p in known.items() if p.name == "__init__.py")}
+
+
+def test_no_import_circles_among_scripts() -> None:
+    for top in ("benchmarks", "train"):
+        known = modules(top)
+        edges = {name: script_imports(name, path, known) for name, path in known.items()}
+        assert circles(edges) == []
+        assert top == "train" or sum(map(len, edges.values())) > 100, "imports are found"
+
+
+def test_script_imports_are_read_however_they_are_written() -> None:
+    known = modules("benchmarks")
+    found = {n: script_imports(f"benchmarks.{n}", known[f"benchmarks.{n}"], known) for n in ("foreign.sets", "rl.rung")}
+    assert {"benchmarks.foreign.bed", "benchmarks.foreign.work"} <= found["foreign.sets"]
+    assert {"benchmarks.rl.harness", "benchmarks.rl.trials"} <= found["rl.rung"]
 
 
 def test_rooms_take_only_what_belongs_to_them_from_outside() -> None:

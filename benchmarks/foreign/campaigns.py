@@ -25,6 +25,7 @@ from typing import Any
 from . import drive_cases, pool, work
 from .rovers import ROVERS
 from .score import judge, said
+from .sets import campaign
 from .sweep import KEPT, ROWS, score_rows
 
 VERDICTS = "verdicts.jsonl"
@@ -159,8 +160,6 @@ def drives(args: argparse.Namespace) -> None:
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
     folder: Path = args.out
     folder.mkdir(parents=True, exist_ok=True)
-    from .__main__ import campaign
-
     about = campaign(folder, args.set, args.seed)
     path = folder / ROWS
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []

@@ -27,6 +27,7 @@ import numpy as np
 from . import bed, cases, pool, sweep, told, work
 from .cases import Case, generator
 from .score import judge, said
+from .sets import campaign
 from .wheel import Rows
 
 ROWS = "experiments.jsonl"
@@ -180,8 +181,6 @@ def experiments(args: argparse.Namespace) -> None:
     """Follows cases with something hidden until the time is up."""
     until = time.monotonic() + 60.0 * args.minutes
     args.out.mkdir(parents=True, exist_ok=True)
-    from .__main__ import campaign
-
     seed = int(campaign(args.out, args.set, args.seed)["seed"])
     path = args.out / ROWS
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []

@@ -21,6 +21,7 @@ from typing import Any
 
 from . import bed, cases, pool, told, work
 from .score import figures, judge, said, text
+from .sets import TWINS, campaign
 
 ROWS, SCORE, TEXT = "rows.jsonl", "score.json", "score.txt"
 SCORE_EVERY = 30.0
@@ -103,8 +104,6 @@ LAWS = "closed form,stress_integral,granular_resistance"
 
 def jobs(which: str, seed: int, tables: int, every: int, only: str = "") -> list[Job]:
     """All cases in the order of the plan, each of every so many followed by its twins with other stated noise."""
-    from .__main__ import TWINS
-
     found: list[Job] = []
     for n, (group, hidden) in enumerate(cases.plan(which, tables, only)):
         found.append((which, seed, n, group, hidden, "", 1.0))
@@ -119,8 +118,6 @@ def sweep(args: argparse.Namespace) -> None:
     pool.prepare()
     folder: Path = args.out
     folder.mkdir(parents=True, exist_ok=True)
-    from .__main__ import campaign
-
     about = campaign(folder, args.set, args.seed)
     seed = int(about["seed"])
     settings = dict(s.split("=", 1) for s in args.setting)
