@@ -19,7 +19,7 @@ import tables
 from harness import KEPT, ROOT, read
 from kept import keep, read_large, ship_large
 
-from lunar_mjx.agents.curves import mean_interval, moving_mean, new_figure
+from lunar_mjx.agents.curves import draw_mean, new_figure
 from lunar_mjx.report.style import LINES, LIT, MUTED, styled
 
 DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
@@ -66,12 +66,8 @@ def plot_paper(record: dict[str, Any]) -> Any:
             colour, line = LINES[int(name == "DDPG")][:2]
             label = f"{name}, {len(runs)} seed{'s' if len(runs) > 1 else ''}"
             for row, (quantity, factor) in enumerate((("episode_return", 1.0), ("success", 100))):
-                curves = [factor * moving_mean(r["episodes"][quantity]) for r in runs]
-                count = min(len(c) for c in curves)
-                mean, low, high = mean_interval(np.stack([c[:count] for c in curves]))
-                x, axes = np.arange(1, count + 1), rows[row][column]
-                axes.plot(x, mean, color=colour, linestyle=line, label=label)
-                axes.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
+                curves = [r["episodes"][quantity] for r in runs]
+                draw_mean(rows[row][column], curves, factor, color=colour, linestyle=line, label=label)
         rows[0][column].set_title(variant, fontsize=9)
         rows[1][column].set(xlabel="episode", ylim=(-3, 103))
         rows[0][column].legend(frameon=False, fontsize=7)

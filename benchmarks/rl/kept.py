@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from harness import KEPT, percent, read, write
+from harness import KEPT, percent, reached, read, when, write
 
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.envs.ladder.rungs import get_rung
@@ -58,12 +58,27 @@ def keep(name: str, record: dict[str, Any], home: Path = KEPT) -> Path:
 
 
 def read_large(folders: Iterable[Path]) -> dict[str, Any] | None:
-    """The record of part `large`; seeds of further runs join those of the first."""
-    records = [r for r in (read(folder / "large.json") for folder in folders) if r]
+    """The record of part `large` as it is kept; finished seeds of further runs join those of the first."""
+    records = [as_kept(r) for r in (read(folder / "large.json") for folder in folders) if r]
     if not records:
         return None
     require_alike("large", records)
     return {**records[0], "seeds": [seed for record in records for seed in record["seeds"]]}
+
+
+def as_kept(record: dict[str, Any]) -> dict[str, Any]:
+    """A record of part `large` by what its figure, table and card tell."""
+    runs, seeds = [run for run in record["seeds"] if "final" in run], []
+    for run in runs:
+        unseen = [{**score["rows"]["policy"], **when(score), "train": score["train"]} for score in run["scores"]]
+        at, rows = next(s for s in unseen if s["steps"] == run["final"]["steps"]), run["final"]["rows"]
+        about = {"seed": run["seed"], "rows": run["epochs"], "unseen": unseen, "final": rows["policy"]}
+        about |= {"blanked": rows["policy, scans blanked"], "kept": {**when(at), "train_score": at["train"]}}
+        about |= {"train_s": run["epochs"][-1]["elapsed_s"], "steps": run["epochs"][-1]["steps"]}
+        seeds.append({**about, **reached(unseen, record["target"])})
+    agents = {k: v for k, v in runs[0]["final"]["rows"].items() if not k.startswith("policy")} if runs else {}
+    agents = {"untrained": record["untrained"], **agents}
+    return {**record, "compile_epoch_s": record["compile_s"][0], "agents": agents, "seeds": seeds}
 
 
 def keep_rung(paths: Iterable[Path], home: Path = KEPT) -> Path:
@@ -97,28 +112,22 @@ def ship(path: Path, to: Path, card: str, record: dict[str, Any], final: dict[st
     """
     assert path.stat().st_size < MOST_BYTES, "the policy is too large to ship"
     shutil.copyfile(path, to)
-    policy = load_policy(path)
+    words |= {"record": record, "policy": load_policy(path), "size": to.stat().st_size / 1e6}
+    ended = {k: round(v, 4) for k, v in final["ends"].items()}
+    words |= {"options": json.dumps(words["policy"].environment["options"])}
+    words |= {"unseen": json.dumps(record["environment"]["unseen"]), "ends": json.dumps(ended)}
     text = Path(__file__).with_name(f"card_{card}.txt").read_text(encoding="utf-8")
-    told = text.format(
-        **words,
-        record=record,
-        policy=policy,
-        size=to.stat().st_size / 1e6,
-        options=json.dumps(policy.environment["options"]),
-        unseen=json.dumps(record["environment"]["unseen"]),
-        ends=json.dumps({k: round(v, 4) for k, v in final["ends"].items()}),
-    )
-    to.with_name("POLICY.md" if to.stem == "policy" else f"{to.stem}.md").write_text(told, encoding="utf-8")
+    to.with_name("POLICY.md" if to.stem == "policy" else f"{to.stem}.md").write_text(text.format(**words), "utf-8")
     return to
 
 
 def ship_large(record: dict[str, Any], folders: Iterable[Path]) -> Path:
     """Ships the policy of part `large` that scored best on the ground of its training, and keeps the record."""
     best = max(record["seeds"], key=lambda s: s["kept"]["train_score"]["success"])
-    found = (folder / f"policy_{record['rover']}.npz" for folder in folders)
-    path = next(p for p in found if load_policy(p).notes["seed"] == best["seed"])
-    to, rows = shipped("models") / record["rover"] / "policy.npz", {"this policy": best["final"], **record["agents"]}
+    found = (folder / f"large_seed{best['seed']}.npz" for folder in folders)
+    path = next(p for p in found if p.is_file() and load_policy(p).notes["steps"] == best["kept"]["steps"])
     keep(f"large_{record['rover']}", record)
+    rows = {"this policy": best["final"], **record["agents"]}
     words = {
         "run": best,
         "steps": best["kept"]["steps"] / 1e6,
@@ -126,7 +135,7 @@ def ship_large(record: dict[str, Any], folders: Iterable[Path]) -> Path:
         "trained": percent(best["kept"]["train_score"]),
         "rows": "\n".join(f"| {name} | {percent(score)} |" for name, score in rows.items()),
     }
-    return ship(path, to, "large", record, best["final"], **words)
+    return ship(path, shipped("models") / record["rover"] / "policy.npz", "large", record, best["final"], **words)
 
 
 def ship_rung(path: Path) -> Path:
@@ -134,16 +143,9 @@ def ship_rung(path: Path) -> Path:
     policy, training = load_policy(path), path.stem.partition("_")[0]
     options, record = policy.environment["options"], read(KEPT / f"{training}.json")
     run = next(r for r in record["seeds"] if r["seed"] == policy.notes["seed"])
-    final, number = run["final"], int(options["task"].rpartition("/")[2])
+    final, number, rover = run["final"], int(options["task"].rpartition("/")[2]), options.get("rover", "luvmi_x")
     assert final["steps"] == policy.notes["steps"], f"{path}: not the policy that the kept record scores"
-    rover = options.get("rover", "luvmi_x")
-    rows = {"this policy": final["rows"]["policy"], **final["rows"]}
-    lines = [
-        f"| {name} | {percent(r)} | {r['spl']:.2f} | {r['collisions_per_km']:.0f} | {r['wh_per_km']:.0f} "
-        f"| {r['slip']:.2f} |"
-        for name, r in rows.items()
-        if name != "policy"
-    ]
+    rows = {"this policy": final["rows"]["policy"], **{k: v for k, v in final["rows"].items() if k != "policy"}}
     words = {
         "run": run,
         "rover": rover,
@@ -153,7 +155,11 @@ def ship_rung(path: Path) -> Path:
         "learner": record["learner"].removesuffix("Config"),
         "steps": final["steps"] / 1e6,
         "compile_s": max(run["compile_s"]),
-        "rows": "\n".join(lines),
+        "rows": "\n".join(
+            f"| {name} | {percent(r)} | {r['spl']:.2f} | {r['collisions_per_km']:.0f} | {r['wh_per_km']:.0f} "
+            f"| {r['slip']:.2f} |"
+            for name, r in rows.items()
+        ),
     }
     to = shipped("models") / rover / f"{training}.npz"
     return ship(path, to, "rung", record, final["rows"]["policy"], **words)

@@ -1,12 +1,12 @@
 """What Stable-Baselines3's TD3 reaches with the seed paper's engine: one rover in PyBullet on the task `large`.
 
     python benchmarks/rl/sb3_bullet.py --out runs/sb3 --cpu-seconds 3600
-    python benchmarks/rl/sb3_bullet.py --out runs/sb3 --score 128      # scores that policy on unseen ground
 
 The task, its observations, rewards and ends are those of `lunar_mjx.envs`; only the physics between two actions is
 `PyBulletBackend`, with the NumPy forces that agree with the simulator's. Soil and motors are the model's own in every
 episode, which is easier than the drawn ones of the large-batch training. SB3's TD3 has its defaults and the paper's
-action noise N(0, 0.3). The record is written anew every minute.
+action noise N(0, 0.3). The record is written anew every minute; at the end
+the last policy is scored on unseen ground, goals and soil.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import COMMIT, FINAL, SMALL_TASK, ends, percent, read, say, write
+from harness import COMMIT, FINAL, SMALL_TASK, ends, percent, say, write
 
 from lunar_mjx.agents.configs import get_training
 from lunar_mjx.agents.evaluate import evaluate
@@ -130,20 +130,15 @@ def keep_policy(model: Any, env: BulletNavigation, path: Path, record: dict[str,
     """SB3's actor as a policy file of this package: the same layers, so the same actions."""
     layers = [m for m in model.policy.actor.mu if hasattr(m, "weight")]
     arrays = [{"kernel": m.weight.detach().numpy().T, "bias": m.bias.detach().numpy()} for m in layers]
-    network = {
-        "obs": env.env.observation_size,
-        "actions": env.env.action_size,
-        "layers": [m.out_features for m in layers[:-1]],
-        "activation": "relu",
-        "layer_norm": False,
-    }
+    network = {"obs": env.env.observation_size, "actions": env.env.action_size, "activation": "relu"}
+    network |= {"layers": [m.out_features for m in layers[:-1]], "layer_norm": False}
     notes = {"algorithm": "stable-baselines3 TD3", "steps": record["steps"], "cpu_s": record["cpu_s"]}
     params = {"params": {f"hidden_{i}": layer for i, layer in enumerate(arrays)}}
     save_policy(Policy(params, None, None, network, {**TASK, "options": record["options"]}, notes), path)
 
 
 def train(args: argparse.Namespace) -> None:
-    """Trains until the CPU time is over."""
+    """Trains until the CPU time is over, and scores the policy."""
     import pybullet
     import stable_baselines3
     import torch
@@ -157,38 +152,26 @@ def train(args: argparse.Namespace) -> None:
     model = stable_baselines3.TD3(
         "MlpPolicy", env, action_noise=noise, seed=args.seed, device="cpu", buffer_size=200_000
     )
-    record: dict[str, Any] = {
-        "what": "SB3 TD3 defaults, action noise N(0, 0.3), PyBullet reference backend, one rover, one CPU thread",
-        "about": {
-            "stable_baselines3": stable_baselines3.__version__,
-            "torch": torch.__version__,
-            "pybullet_api": pybullet.getAPIVersion(),
-        },
-        "commit": COMMIT,
-        "rover": args.rover,
-        "options": options,
-        "seed": args.seed,
-        "steps": 0,
-        "cpu_s": time.process_time(),
-        "episodes": [],
-    }
+    what = "SB3 TD3 defaults, action noise N(0, 0.3), PyBullet reference backend, one rover, one CPU thread"
+    versions = {"stable_baselines3": stable_baselines3.__version__, "torch": torch.__version__}
+    about = {**versions, "pybullet_api": pybullet.getAPIVersion()}
+    asked = {"rover": args.rover, "options": options, "seed": args.seed}
+    record = {"what": what, "about": about, "commit": COMMIT, **asked, "steps": 0, "cpu_s": 0.0, "episodes": []}
     model.learn(args.steps, callback=make_recorder(args, env, record))
+    record["steps"] = model.num_timesteps
+    keep_policy(model, env, args.out / "policy_sb3.npz", record)
     won = [e["success"] for e in record["episodes"]]
     last = np.mean(won[-50:]) if won else float("nan")
     took = f"{record['steps']} steps, {len(won)} episodes"
     say(f"{took}, success of the last 50 {last:.2f}, {record['cpu_s']:.0f} s of CPU time")
-
-
-def score(args: argparse.Namespace) -> None:
-    """Adds the policy's success on unseen ground, goals and soil to the record."""
-    env, agent, unseen = open_agent(str(args.out / "policy_sb3.npz"))
-    result = evaluate(env, agent, args.score, FINAL, unseen_params(env, unseen)).record()
-    write(args.out / "sb3.json", {**read(args.out / "sb3.json"), "final": result})
-    say(f"unseen {percent(result)}, {ends(result)}")
+    own, agent, unseen = open_agent(str(args.out / "policy_sb3.npz"))
+    record["final"] = evaluate(own, agent, args.score, FINAL, unseen_params(own, unseen)).record()
+    write(args.out / "sb3.json", record)
+    say(f"unseen {percent(record['final'])}, {ends(record['final'])}")
 
 
 def main() -> None:
-    """Trains, or scores what was trained."""
+    """Trains and scores."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--out", type=Path, required=True)
@@ -196,11 +179,11 @@ def main() -> None:
     add("--seed", type=int, default=0)
     add("--steps", type=int, default=10_000_000)
     add("--cpu-seconds", type=float, default=3600.0, help="of this process, after which it stops")
-    add("--score", type=int, help="score the policy that lies there, by so many episodes")
+    add("--score", type=int, default=128, help="episodes that score the last policy")
     add("--tiny", action="store_true")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    (score if args.score else train)(args)
+    train(args)
 
 
 if __name__ == "__main__":

@@ -68,24 +68,29 @@ def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str =
     return path
 
 
-def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path, most: int | None = None) -> Path:
+def draw_mean(
+    axes: Any, curves: Sequence[Sequence[float]], factor: float = 1.0, alpha: float = 0.2, **line: Any
+) -> None:
+    """Draws moving means by episode: mean over seeds and its 95 % interval, as far as every seed has episodes."""
+    smooth = [factor * moving_mean(curve) for curve in curves]
+    count = min(map(len, smooth))
+    mean, low, high = mean_interval(np.stack([curve[:count] for curve in smooth]))
+    at = np.arange(1, count + 1)
+    (drawn,) = axes.plot(at, mean, **line)
+    if len(smooth) > 1:
+        axes.fill_between(at, low, high, alpha=alpha, lw=0, color=drawn.get_color())
+
+
+def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> Path:
     """Average return per episode over episodes, as the paper's Fig. 6: mean over seeds with its interval.
 
     Args:
       groups: by algorithm, records of its seeds.
       path: of the picture.
-      most: episodes to show; as many as every seed has if None.
     """
     figure, (axes,) = new_figure(1, 6.0)
     for name, records in groups.items():
-        curves = [moving_mean(r["episodes"]["episode_return"]) for r in records]
-        count = min(len(c) for c in curves) if most is None else most
-        # A seed that ended early leaves a gap: its mean must not be carried on by the others alone.
-        curves = [np.pad(c[:count], (0, max(0, count - len(c))), constant_values=np.nan) for c in curves]
-        mean, low, high = mean_interval(np.stack(curves))
-        axes.plot(np.arange(1, count + 1), mean, label=name)
-        if len(curves) > 1:
-            axes.fill_between(np.arange(1, count + 1), low, high, alpha=0.2)
+        draw_mean(axes, [r["episodes"]["episode_return"] for r in records], label=name)
     axes.set(xlabel="episode", ylabel=f"average return per episode (mean of {EPISODES})")
     axes.legend(frameon=False)
     with replacing(path) as part:

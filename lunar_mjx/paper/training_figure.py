@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lunar_mjx.agents.curves import EPISODES, mean_interval, moving_mean
+from lunar_mjx.agents.curves import EPISODES, draw_mean
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.report.style import BLUE, GREEN, ORANGE, PAPER, PURPLE, SKY, VERMILION
 
@@ -139,15 +139,9 @@ def _by_step(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str,
 def _by_episode(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str, colour: str, line: Any) -> None:
     """Mean over seeds with its 95 % interval, as far as every seed has episodes."""
     for axes, quantity, factor in zip(panels, ("episode_return", "success"), (1.0, 100.0), strict=True):
-        curves = [factor * moving_mean(r["episodes"][quantity]) for r in runs if quantity in r["episodes"]]
-        if not curves:
-            continue
-        count = min(len(c) for c in curves)
-        mean, low, high = mean_interval(np.stack([c[:count] for c in curves]))
-        at = np.arange(1, count + 1)
-        axes.plot(at, mean, color=colour, linestyle=line, label=label)
-        if len(curves) > 1:
-            axes.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
+        curves = [r["episodes"][quantity] for r in runs if quantity in r["episodes"]]
+        if curves:
+            draw_mean(axes, curves, factor, 0.15, color=colour, linestyle=line, label=label)
 
 
 def _finish(axes: Axes, x: str, y: str) -> None:

@@ -99,6 +99,7 @@ def test_rung_3_tells_those_apart_that_the_page_says_it_does():
 
 def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypatch):
     import rung
+    import trials
 
     from lunar_mjx.agents.policy import load_policy
 
@@ -125,7 +126,7 @@ def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypa
             }
             return {"policy": one}
 
-    monkeypatch.setattr(rung, "Judge", Judge)
+    monkeypatch.setattr(trials, "Judge", Judge)
     monkeypatch.setattr(rung, "rules", lambda env: {})
     words = ["rung.py", "point", "--seeds", "3", "4", "--steps", "300", "--every", "inf", "--out", str(tmp_path)]
     settings = ["--set", "envs=4", "epoch_steps=8", "batch=8", "buffer_steps=64", "random_steps=4", "updates=1"]
@@ -133,7 +134,7 @@ def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypa
     rung.main()
     told = json.loads((tmp_path / "point.json").read_text())
     assert [run["seed"] for run in told["seeds"]] == [3, 4] and len(compiled) == 1
-    assert scored == [rung.FINAL, rung.FINAL], "with no scores before the last nothing is chosen"
+    assert scored == [trials.FINAL, trials.FINAL], "with no scores before the last nothing is chosen"
     for run in told["seeds"]:
         assert run["final"]["steps"] == run["epochs"][-1]["steps"] == 320 and run["scores"] == []
     first, second = (load_policy(tmp_path / f"point_seed{n}.npz") for n in (3, 4))

@@ -83,6 +83,32 @@ def test_what_is_kept_of_a_record_has_few_digits_and_few_columns():
     }
 
 
+def test_a_training_scored_on_its_own_ground_is_kept_as_figures_read_it(harness, tmp_path):
+    from kept import read_large
+    from trials import Trials
+
+    from lunar_mjx.agents.policy import load_policy
+
+    args = argparse.Namespace(rover=None, tiny=False, set=SMALL, env=[])
+    rules = {"scripted": make_agent("scripted", make("point"))}
+    trials = Trials(
+        harness.training_of(args, "point"), "large", tmp_path, harness.Clock(60.0), 4, lambda _: rules, seen=True
+    )
+    trials.record |= {"rover": "none", "target": 0.0, "untrained": {"success": 0.0}}
+    trials(3, 96, 60.0, 0.0)
+    record = read_large([tmp_path])
+    (run,) = record["seeds"]
+    assert run["steps"] == 96 and [s["steps"] for s in run["unseen"]] == [r["steps"] for r in run["rows"]] == [
+        32,
+        64,
+        96,
+    ]
+    best = max(s["train"]["success"] for s in run["unseen"])
+    assert run["kept"]["train_score"]["success"] == best and run["steps_to_target"] == 32
+    assert load_policy(tmp_path / "large_seed3.npz").notes["steps"] == run["kept"]["steps"]
+    assert list(record["agents"]) == ["untrained", "scripted"] and record["agents"]["scripted"]["episodes"] == 4
+
+
 @pytest.mark.parametrize(("count", "left"), [(0, 0), (1, 1), (40, 40), (41, 21), (153, 39)])
 def test_a_long_training_keeps_few_epochs_and_its_last(count, left):
     from kept import MOST_EPOCHS, few
