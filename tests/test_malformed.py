@@ -25,9 +25,8 @@ import pytest
 import rasterio
 from PIL import Image
 
-from lunar_mjx.agents.play import shipped_policy
 from lunar_mjx.agents.policy import FORMAT as POLICY_FORMAT
-from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.agents.policy import load_policy, shipped_policy
 from lunar_mjx.backends.log_channels import command_channels
 from lunar_mjx.diagnosis.folder.stored import read_stored
 from lunar_mjx.diagnosis.report.read import read_result

@@ -18,8 +18,7 @@ import numpy as np
 from harness import KEPT, save, say
 
 from lunar_mjx.agents.export.write import NODE, export_policy
-from lunar_mjx.agents.play import shipped_policy
-from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.agents.policy import load_policy, shipped_policy
 
 COUNT, SEED = 2000, 0
 """Observations, drawn around the training's mean with 1.5 of its deviations."""

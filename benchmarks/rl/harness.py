@@ -8,7 +8,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -227,10 +227,10 @@ class Setup:
         self.environment = environment_of(training)
         self.about = {"environment": self.environment, "train": plain(dataclasses.asdict(training.train))}
 
-    def policies(self) -> dict[str, Any]:
+    def policies(self, ahead: Sequence[str] = AHEAD) -> dict[str, Any]:
         """Agents of a judge: the learner's policy, and the same with all that it sees ahead at its mean."""
         trained, blank = learner_agent(self.learner), np.zeros(self.env.observation_size, bool)
-        for name in AHEAD:
+        for name in ahead:
             if name in getattr(self.env, "blocks", ()):
                 blank[self.env.blocks[name]] = True
 

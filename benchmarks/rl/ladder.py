@@ -24,8 +24,8 @@ import numpy as np
 from harness import AHEAD, COMMIT, KEPT, Judge, percent, read, say, write
 
 from benchmarks.timing import LOCK, alone
-from lunar_mjx.agents.play import UNSEEN_LADDER, shipped_policy
-from lunar_mjx.agents.policy import Policy, load_policy
+from lunar_mjx.agents.play import UNSEEN_LADDER
+from lunar_mjx.agents.policy import Policy, load_policy, shipped_policy
 from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.commands.train import pairs
 from lunar_mjx.envs import TASKS, make_agent, make_navigation

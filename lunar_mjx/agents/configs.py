@@ -9,6 +9,7 @@ from typing import Any
 
 from lunar_mjx.agents import ddpg, td3
 from lunar_mjx.agents.from_brax import ppo, sac
+from lunar_mjx.agents.from_teacher import distill
 from lunar_mjx.agents.learner import TrainConfig
 from lunar_mjx.errors import bad_input, plain_digits
 from lunar_mjx.resources import shipped
@@ -44,6 +45,7 @@ ALGORITHMS: Mapping[str, type] = {
     "ddpg": ddpg.DDPGConfig,
     "sac": sac.SACConfig,
     "ppo": ppo.PPOConfig,
+    "distill": distill.DistillConfig,
 }
 """Tables of a training file that name the algorithm and hold its settings."""
 _KEYS = ("note", "environment", "steps", "learner", "options", "unseen", "train", *ALGORITHMS)

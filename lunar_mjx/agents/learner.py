@@ -21,6 +21,8 @@ from lunar_mjx.agents import guard
 from lunar_mjx.agents.ddpg import DDPG, DDPGConfig
 from lunar_mjx.agents.from_brax.ppo import PPO, PPOConfig, Rollout
 from lunar_mjx.agents.from_brax.sac import SAC, SACConfig
+from lunar_mjx.agents.from_teacher.distill import Distill, DistillConfig, Lesson
+from lunar_mjx.agents.networks import normalised
 from lunar_mjx.agents.replay import Batch, ReplayBuffer, ReplayState, Transition
 from lunar_mjx.agents.td3 import TD3, TD3Config
 from lunar_mjx.envs.core import Environment, State
@@ -35,12 +37,10 @@ EPISODE = ("episode_return", "episode_length", "success")
 """Metrics that every environment gives for episodes that ended."""
 LARGEST_COUNT = 2**31 - 1
 """1; places in a buffer and steps are counted in 32 bits."""
-MOST_DEVIATIONS = 10.0
-"""To which normalised observations are cut."""
-
-
 AGENTS: dict[type, Any] = {TD3Config: TD3, DDPGConfig: DDPG, SACConfig: SAC, PPOConfig: PPO}
-"""Algorithms by the class of their settings."""
+"""Algorithms by the class of their settings; beside them `Distill`, which looks at its environment itself."""
+ON_POLICY = PPOConfig | DistillConfig
+"""Settings of algorithms that learn from each unroll once, without a buffer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ class TrainConfig:
       precision: of matrix products: "highest" is float32; "default" lets recent GPUs round to TF32.
     """
 
-    algorithm: TD3Config | DDPGConfig | SACConfig | PPOConfig
+    algorithm: TD3Config | DDPGConfig | SACConfig | PPOConfig | DistillConfig
     envs: int = 1
     batch: int = 256
     updates: int = 1
@@ -85,7 +85,7 @@ class TrainConfig:
             raise bad_input("TrainConfig", "precision", self.precision, "does not exist", "use highest or default")
         if not 0.0 <= self.noise[0] <= self.noise[1]:
             raise bad_input("TrainConfig", "noise", self.noise, "is no range of deviations", "give (least, greatest)")
-        if not isinstance(self.algorithm, PPOConfig) and self.random_steps < self.algorithm.n_step:
+        if not isinstance(self.algorithm, ON_POLICY) and self.random_steps < self.algorithm.n_step:
             raise bad_input(
                 "TrainConfig",
                 "random_steps",
@@ -99,8 +99,8 @@ class TrainConfig:
 class TrainState:
     """Everything that a training needs to go on; `iterations` counts steps of every environment.
 
-    Of one copy on every device: agent, statistics, iterations. Of one share on every device: the rest. PPO has neither
-    buffer nor noise.
+    Of one copy on every device: agent, statistics, iterations. Of one share on every device: the rest. PPO and
+    distillation have neither buffer nor noise.
     """
 
     agent: Any
@@ -121,8 +121,9 @@ def least_memory(env: Environment, config: TrainConfig) -> int:
     seen = 2 * (env.observation_size + env.privileged_size)  # of a step and of its successor
     # Action and reward are numbers, the two ends of an episode truth values of one byte.
     transition = 4 * (seen + env.action_size + 1) + 2
-    kept = 0 if isinstance(config.algorithm, PPOConfig) else config.buffer_steps
-    return config.envs * (4 * seen + kept * transition) + config.batch * transition
+    if isinstance(config.algorithm, ON_POLICY):
+        return config.envs * 4 * seen * (1 + config.algorithm.unroll)
+    return config.envs * (4 * seen + config.buffer_steps * transition) + config.batch * transition
 
 
 def require_memory(env: Environment, config: TrainConfig, devices: Sequence[Any]) -> None:
@@ -156,7 +157,7 @@ class Learner:
 
     Raises:
       UserError: more than the devices' memory holds, environments or batch that do not divide among them, or for PPO
-        environments among minibatches or an epoch among unrolls.
+        and distillation environments among minibatches or an epoch among unrolls; a teacher that does not fit.
     """
 
     def __init__(self, env: Environment, config: TrainConfig, mesh: Mesh | None = None):
@@ -174,10 +175,15 @@ class Learner:
                 )
         require_memory(env, config, list(self.mesh.devices.flat))
         algorithm = config.algorithm
-        self.agent: Any = AGENTS[type(algorithm)](algorithm, env.observation_size, env.privileged_size, env.action_size)
+        self.agent: Any
+        if isinstance(algorithm, DistillConfig):
+            self.agent = Distill(algorithm, env)
+        else:
+            sizes = env.observation_size, env.privileged_size, env.action_size
+            self.agent = AGENTS[type(algorithm)](algorithm, *sizes)
         shared, own = Spec(), Spec(AXIS)
         self.buffer, buffer = None, None
-        if isinstance(algorithm, PPOConfig):
+        if isinstance(algorithm, ON_POLICY):
             if config.epoch_steps % algorithm.unroll:
                 problem = f"is no multiple of unroll = {algorithm.unroll}"
                 raise bad_input("TrainConfig", "epoch_steps", config.epoch_steps, problem, "give one")
@@ -286,7 +292,7 @@ class Learner:
             return self._unroll(params, state)
 
         steps = self.config.epoch_steps
-        if isinstance(self.config.algorithm, PPOConfig):
+        if isinstance(self.config.algorithm, ON_POLICY):
             state, (seen, losses) = jax.lax.scan(unroll, state, length=steps // self.config.algorithm.unroll)
             seen = jax.tree.map(lambda a: a.reshape(steps, *a.shape[2:]), seen)
         else:
@@ -327,26 +333,35 @@ class Learner:
 
     def _unroll(self, params: Any, state: TrainState) -> tuple[TrainState, Any]:
         """Some steps of every environment with one policy, and the updates that follow."""
-        statistics = state.statistics
+        statistics, algorithm = state.statistics, self.config.algorithm
+        assert isinstance(algorithm, ON_POLICY)
 
         def side_by_side(obs: Any, privileged: Any) -> Any:
             parts = (obs, "obs"), (privileged, "privileged")
             return jnp.concatenate([self._normalised(statistics, values, name) for values, name in parts], axis=-1)
 
-        def step(state: TrainState, _: Any) -> tuple[TrainState, Any]:
-            key, key_action = jax.random.split(state.key[0])
+        def taught(state: TrainState, _: Any) -> tuple[Any, State, Lesson]:
+            obs = self._normalised(statistics, state.env.obs, "obs")
+            # The teacher normalises by itself, as in its own training.
+            action, lesson = self.agent.drive(state.agent, obs, state.env.privileged, state.iterations)
+            return action, self.env.step(params, state.env, action), lesson
+
+        def drawn(state: TrainState, key: Any) -> tuple[Any, State, Rollout]:
             seen = side_by_side(state.env.obs, state.env.privileged)
-            action, raw, logits, log_prob = self.agent.draw(state.agent, seen, key_action)
+            action, raw, logits, log_prob = self.agent.draw(state.agent, seen, key)
             env = self.env.step(params, state.env, action)
             next_seen = side_by_side(env.final_obs, env.final_privileged)
             done, truncated = (a.astype(env.reward.dtype) for a in (env.done, env.truncated))
-            row = Rollout(seen, raw, logits, log_prob, env.reward, done, truncated, next_seen)
+            return action, env, Rollout(seen, raw, logits, log_prob, env.reward, done, truncated, next_seen)
+
+        def step(state: TrainState, _: Any) -> tuple[TrainState, Any]:
+            key, key_action = jax.random.split(state.key[0])
+            driven = taught if isinstance(algorithm, DistillConfig) else drawn
+            action, env, row = driven(state, key_action)
             watched = guard.watch(state.guard, state.env, action, env, state.iterations)
             new = dataclasses.replace(state, env=env, key=key[None], iterations=state.iterations + 1, guard=watched)
             return new, (self._seen(env), row, (env.final_obs, env.final_privileged))
 
-        algorithm = self.config.algorithm
-        assert isinstance(algorithm, PPOConfig)
         state, (seen, rows, observed) = jax.lax.scan(step, state, length=algorithm.unroll)
         # scan stacks by time; minibatches are drawn by environment.
         rollout = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), rows)
@@ -413,11 +428,6 @@ class Learner:
             "tripped": jax.lax.pmax(state.guard.tripped[0].astype(jnp.int32), AXIS),
             "broken": guard.broken(state.agent).astype(jnp.int32),
         }
-
-
-def normalised(values: Any, mean: Any, deviation: Any) -> Any:
-    """Observations in deviations from the mean, within `MOST_DEVIATIONS` of them."""
-    return jnp.clip((values - mean) / deviation, -MOST_DEVIATIONS, MOST_DEVIATIONS)
 
 
 def _transition(before: State, action: Any, after: State) -> Transition:

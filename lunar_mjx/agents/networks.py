@@ -1,4 +1,7 @@
-"""Actor and critics: brax's multi-layer perceptrons, several critics as one batch of parameters."""
+"""Actor and critics: brax's multi-layer perceptrons, several critics as one batch of parameters.
+
+An actor that sees a picture looks at it through convolutions first, whose features join its other numbers.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +24,19 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
     "tanh": jnp.tanh,
 }
 
+MOST_DEVIATIONS = 10.0
+"""To which normalised observations are cut."""
+
 Network = brax_networks.FeedForwardNetwork
 """`init(key) -> params` and `apply(params, ...)`."""
 
 _TORCH = jax.nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
 """PyTorch's default for linear layers, U(-1/sqrt(fan_in), 1/sqrt(fan_in)), which SB3 keeps."""
+
+
+def normalised(values: Any, mean: Any, deviation: Any) -> Any:
+    """Observations in deviations from the mean, within `MOST_DEVIATIONS` of them."""
+    return jnp.clip((values - mean) / deviation, -MOST_DEVIATIONS, MOST_DEVIATIONS)
 
 
 def mlp(sizes: Sequence[int], activation: str, layer_norm: bool) -> Any:
@@ -55,6 +66,8 @@ def make_actor(
     activation: str = "relu",
     layer_norm: bool = False,
     last_scale: float = 1.0,
+    picture: Sequence[int] | None = None,
+    filters: Sequence[int] = (),
 ) -> Network:
     """A deterministic policy: `apply(params, obs) -> action` in [-1, 1].
 
@@ -64,17 +77,55 @@ def make_actor(
       activation: name in `ACTIVATIONS`.
       layer_norm: normalise each hidden layer.
       last_scale: of the last layer's weights at the start; a small one makes the first actions near zero.
+      picture: first number, rows, columns and colours of a picture among the observations; None if there is none.
+      filters: of the convolutions on it, each of which halves rows and columns.
     """
     module = mlp((*layers, actions), activation, layer_norm)
+    eye = None if picture is None else make_eye(picture, filters, activation)
 
     def init(key: Any) -> Any:
+        one = jnp.zeros((1, obs))
+        looked = {} if eye is None else {"eye": eye.init(jax.random.fold_in(key, 1))}
         # Scaled after the initialiser, so that hidden layers keep their own.
-        params = module.init(key, jnp.zeros((1, obs)))
+        params = module.init(key, one if eye is None else eye.apply(looked["eye"], one))
         last = f"hidden_{len(layers)}"
         inner = params["params"]
-        return {"params": {**inner, last: jax.tree.map(lambda a: last_scale * a, inner[last])}}
+        return {"params": {**inner, last: jax.tree.map(lambda a: last_scale * a, inner[last])}, **looked}
 
-    return Network(init=init, apply=lambda params, x: jnp.tanh(module.apply(params, x)))
+    def apply(params: Any, x: Any) -> Any:
+        seen = x if eye is None else eye.apply(params["eye"], x)
+        return jnp.tanh(module.apply({"params": params["params"]}, seen))
+
+    return Network(init=init, apply=apply)
+
+
+def make_eye(picture: Sequence[int], filters: Sequence[int], activation: str = "relu") -> Network:
+    """Convolutions of 3 x 3 over a picture among observations: `apply(params, obs) -> (..., other numbers + features)`.
+
+    Args:
+      picture: first number, rows, columns and colours. filters: of each layer, which halves rows and columns.
+      activation: name in `ACTIVATIONS`.
+    """
+    start, rows, columns, colours = picture
+    stop, wide = start + rows * columns * colours, (colours, *filters)
+
+    def init(key: Any) -> Any:
+        keys = jax.random.split(key, len(filters))
+        kernels = [_TORCH(k, (3, 3, *wide[i : i + 2])) for i, k in enumerate(keys)]
+        return {f"conv_{i}": {"kernel": k, "bias": jnp.zeros(k.shape[-1])} for i, k in enumerate(kernels)}
+
+    def apply(params: Any, x: Any) -> Any:
+        seen = x[..., start:stop].reshape(-1, rows, columns, colours)
+        for i in range(len(filters)):
+            layer = params[f"conv_{i}"]
+            kept = jax.lax.conv_general_dilated(
+                seen, layer["kernel"], (2, 2), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+            )
+            seen = ACTIVATIONS[activation](kept + layer["bias"])
+        features = seen.reshape(*x.shape[:-1], -1)
+        return jnp.concatenate([x[..., :start], x[..., stop:], features], axis=-1)
+
+    return Network(init=init, apply=apply)
 
 
 def make_critics(

@@ -12,14 +12,13 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.agents.policy import load_policy, shipped_policy
 from lunar_mjx.cameras.chase import Chase, wheel_tracks
 from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs import TASKS, NavigationEnv, make, make_agent, split_keys
 from lunar_mjx.envs.scripted import AGENTS, Agent
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.files import replacing, write_text
-from lunar_mjx.resources import shipped
 from lunar_mjx.terrain import height
 from lunar_mjx.trust import require_trust
 
@@ -47,13 +46,6 @@ class EpisodePicture:
 
 
 EPISODE_PICTURE = EpisodePicture()
-
-
-def shipped_policy(name: str) -> Path | None:
-    """The trained policy that ships with a rover (`luvmi_x`), or of another training (`luvmi_x/ladder-3`), or None."""
-    rover, _, training = name.partition("/")
-    path = shipped("models") / rover / f"{training or 'policy'}.npz"
-    return path if path.is_file() else None
 
 
 def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = None) -> tuple[Any, Agent, dict]:

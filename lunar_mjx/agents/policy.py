@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from lunar_mjx.agents.learner import Learner, normalised
-from lunar_mjx.agents.networks import ACTIVATIONS, make_actor
+from lunar_mjx.agents.networks import ACTIVATIONS, make_actor, normalised
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.files import replacing
+from lunar_mjx.resources import shipped
 
 FORMAT = "lunar-mjx-policy/1"
 FORMER_PRESET = "consistent"
@@ -28,7 +28,8 @@ class Policy:
 
     Attributes:
       params: of the actor. mean, deviation: of the observations; None if they are not normalised.
-      network: `obs`, `actions`, `layers`, `activation`, `layer_norm` of the actor.
+      network: `obs`, `actions`, `layers`, `activation`, `layer_norm` of the actor; if it sees pictures also `picture`
+        and `filters`, see `make_actor`.
       environment: name and options that make the environment that it was trained in; empty if it has no name.
       notes: what trained it, with what result.
     """
@@ -47,8 +48,15 @@ class Policy:
         return make_actor(**self.network).apply(self.params, obs)
 
 
-def policy_of(learner: Learner, state: Any, environment: dict[str, Any], notes: dict[str, Any]) -> Policy:
-    """The policy of a training's state."""
+def shipped_policy(name: str) -> Path | None:
+    """The trained policy that ships with a rover (`luvmi_x`), or of another training (`luvmi_x/ladder-3`), or None."""
+    rover, _, training = name.partition("/")
+    path = shipped("models") / rover / f"{training or 'policy'}.npz"
+    return path if path.is_file() else None
+
+
+def policy_of(learner: Any, state: Any, environment: dict[str, Any], notes: dict[str, Any]) -> Policy:
+    """The policy of a state of a training's `Learner`."""
     params, statistics = jax.device_get(learner.policy(state))
     config = learner.config.algorithm
     network = {
@@ -57,6 +65,8 @@ def policy_of(learner: Learner, state: Any, environment: dict[str, Any], notes: 
         "layers": list(config.actor_layers),
         "activation": config.activation,
         "layer_norm": config.layer_norm,
+        # Only where there are pictures: other policies stay readable for those who know of none.
+        **getattr(learner.agent, "eye", {}),
     }
     mean, deviation = statistics if statistics is not None else (None, None)
     return Policy(params, mean, deviation, network, environment, notes)
@@ -69,6 +79,8 @@ class _Network(BaseModel):
     layers: Annotated[list[Annotated[int, Field(ge=1, le=100_000)]], Field(max_length=100)]
     activation: str
     layer_norm: bool
+    picture: Annotated[list[Annotated[int, Field(ge=0, le=100_000)]], Field(min_length=4, max_length=4)] | None = None
+    filters: Annotated[list[Annotated[int, Field(ge=1, le=10_000)]], Field(max_length=10)] = []
 
 
 class _Environment(BaseModel):
@@ -134,6 +146,11 @@ def load_policy(path: str | Path) -> Policy:
     if network["activation"] not in ACTIVATIONS:
         known = ", ".join(ACTIVATIONS)
         raise bad_input(path, "network.activation", network["activation"], "does not exist", f"use one of {known}")
+    if picture := network.get("picture"):
+        start, rows, columns, colours = picture
+        if rows * columns * colours < 1 or start + rows * columns * colours > network["obs"]:
+            problem = f"does not lie within {network['obs']} observations"
+            raise bad_input(path, "network.picture", picture, problem, "fetch it again")
     for name, array in arrays.items():
         wanted = (network["obs"],) if name in ("mean", "deviation") else None
         if array.dtype.kind != "f" or not np.isfinite(array).all():

@@ -14,7 +14,8 @@ import jax
 from lunar_mjx.agents.configs import Training
 from lunar_mjx.agents.curves import plot_episodes, plot_progress
 from lunar_mjx.agents.evaluate import Evaluator, Score
-from lunar_mjx.agents.learner import Learner, TrainState, normalised
+from lunar_mjx.agents.learner import Learner, TrainState
+from lunar_mjx.agents.networks import normalised
 from lunar_mjx.agents.policy import policy_of, save_policy
 from lunar_mjx.agents.train import Result, RunConfig, plain, train
 from lunar_mjx.envs import NavigationEnv, make

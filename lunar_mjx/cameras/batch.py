@@ -66,10 +66,11 @@ class Pictures(NamedTuple):
     """Colour, depth and labels of one or many cameras.
 
     Attributes:
-      rgb: 0 to 1, as shown on a screen. depth: m along the optical axis, infinite in the sky. label: into `LABELS`.
+      rgb: 0 to 1, as shown on a screen; None if nothing is lit. depth: m along the optical axis, infinite in the sky.
+      label: into `LABELS`.
     """
 
-    rgb: Float[Array, "*camera height width 3"]
+    rgb: Float[Array, "*camera height width 3"] | None
     depth: Float[Array, "*camera height width"]
     label: Int[Array, "*camera height width"]
 
@@ -85,6 +86,7 @@ def picture(
     paint: HeightField | None = None,
     key: Any = None,
     far: float = 60.0,
+    lit: bool = True,
 ) -> Pictures:
     """Colour, depth and labels of one camera.
 
@@ -97,11 +99,14 @@ def picture(
       paint: brightness of the ground over that of plain soil, such as mottling and wheel tracks; see `painted`.
       key: random key of the noise; no noise if None.
       far: largest depth that is looked for, m.
+      lit: whether colour is sought; without it no ray asks for shadows.
     """
     light = light or Light()
     dtype = position.dtype
-    to_sun = jnp.asarray(light.sun.direction if sun is None else sun, dtype)
+    to_sun = jnp.asarray(light.sun.direction if sun is None else sun, dtype) if lit else None
     found = trace(terrain, position, turn, camera, far, to_sun, None if rovers is None else bodies(rovers))
+    if to_sun is None:
+        return Pictures(None, found.depth, found.label)
     depth, label, face = found.depth, found.label, found.face
     direction = jnp.sum(turn * jnp.asarray(camera.rays(), dtype)[..., None, :], axis=-1)
     point = position + jnp.where(label == SKY, 0.0, depth)[..., None] * direction
@@ -137,7 +142,7 @@ def pictures(
       others: coordinates of other rovers of the kind that each camera may see.
       at_once: how many pictures are in memory at once; all if None, at most 65,535.
       detail: whether parts too small for small pictures are drawn, such as grousers.
-      more: `far` and `paint` of `picture`.
+      more: `far`, `paint` and `lit` of `picture`.
     """
     # Small by default: pictures for learning, not for looking.
     shapes, optics = rover_shapes(rover, detail), camera or Pinhole(64, 48)

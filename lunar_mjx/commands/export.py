@@ -24,7 +24,7 @@ def policy(
     # A graph is traced, not run: it needs no GPU.
     select_device("cpu")
     from lunar_mjx.agents.export.write import GRAPHS, export_policy
-    from lunar_mjx.agents.play import shipped_policy
+    from lunar_mjx.agents.policy import shipped_policy
 
     path = Path(agent) if agent.endswith(".npz") else shipped_policy(agent)
     if path is None:

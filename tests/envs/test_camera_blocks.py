@@ -7,8 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lunar_mjx.cameras import Pinhole, pictures
+from lunar_mjx.dynamics import build
 from lunar_mjx.envs import make_navigation, split_keys
 from lunar_mjx.errors import UserError
+from lunar_mjx.model import make_model
 
 SIZE = {"camera_width": 16, "camera_height": 12}
 
@@ -33,6 +36,20 @@ def test_pictures_are_blocks_of_the_observation() -> None:
     assert (depth[label == 0] == 1.0).all() and label[:, 0].max() == 0.0 and (label[:, -1] > 0).all()
     after = jax.jit(env.step)(env.params, state, jnp.ones((2, env.action_size)))
     assert after.obs.shape == state.obs.shape and np.isfinite(np.asarray(after.obs)).all()
+
+
+def test_depth_and_labels_need_no_light() -> None:
+    model = make_model("luvmi_x", "lunar_plain")
+    system = build(model)
+    qpos = jnp.stack([system.reset(system.params, x, 5.0, 1.0).qpos for x in (-3.0, 4.0)])
+
+    def look(lit: bool):
+        return jax.jit(lambda q: pictures(model.terrain, model.rover, q, Pinhole(16, 12), lit=lit))(qpos)
+
+    seen, dark = look(True), look(False)
+    assert dark.rgb is None and seen.rgb.shape == (2, 12, 16, 3)
+    assert (seen.label == dark.label).all() and {0, 1} <= set(np.unique(dark.label))
+    assert np.asarray(dark.depth) == pytest.approx(np.asarray(seen.depth), rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 from lunar_mjx.agents.configs import get_training
 from lunar_mjx.agents.evaluate import Evaluator
-from lunar_mjx.agents.play import shipped_policy
-from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.agents.policy import load_policy, shipped_policy
 from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.envs import make_agent, make_navigation, split_keys
 from lunar_mjx.envs.gymnasium_env import NAVIGATION

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from lunar_mjx._version import __version__
-from lunar_mjx.agents.learner import MOST_DEVIATIONS
+from lunar_mjx.agents.networks import MOST_DEVIATIONS
 from lunar_mjx.agents.policy import Policy
 from lunar_mjx.effects.joint.motor import CURRENT, POSITION, TORQUE, VELOCITY
 from lunar_mjx.envs import NavigationEnv

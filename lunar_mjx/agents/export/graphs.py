@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.export import export, symbolic_shape
 
-from lunar_mjx.agents.learner import MOST_DEVIATIONS
+from lunar_mjx.agents.networks import MOST_DEVIATIONS
 from lunar_mjx.agents.policy import Policy
-from lunar_mjx.errors import UserError
+from lunar_mjx.errors import UserError, bad_input
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +38,11 @@ def to_onnx(policy: Policy) -> bytes:
     """The policy as an ONNX model: `obs` (batch, obs) to `action` (batch, action), float32.
 
     Raises:
-      UserError: the package onnx is not installed.
+      UserError: the package onnx is not installed, or the policy sees pictures.
     """
+    if policy.network.get("picture"):
+        remedy = "give --only stablehlo"
+        raise bad_input("export", "network.picture", policy.network["picture"], "has no graph in ONNX yet", remedy)
     try:
         onnx: Any = importlib.import_module("onnx")
         helper, numpy_helper = onnx.helper, onnx.numpy_helper

@@ -198,9 +198,10 @@ def _check(c: NavigationConfig) -> None:
     if c.rung:
         # Refuses a rung that does not exist, in words of its own.
         get_rung(c.rung)
-    for name in ("arrival", "plan"):
-        if name in c.observations and not c.rung:
-            raise bad_input("navigation", "observations", name, "is only told on the ladder", "leave it out")
+    for field, names in (("observations", c.observations), ("privileged", c.privileged)):
+        for name in ("arrival", "plan"):
+            if name in names and not c.rung:
+                raise bad_input("navigation", field, name, "is only told on the ladder", "leave it out")
 
 
 EGOCENTRIC = (

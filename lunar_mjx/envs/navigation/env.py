@@ -200,6 +200,7 @@ class NavigationEnv:
         if "power" in config.observations and not (self._battery and model.sun is not None):
             remedy = "add the effect battery and a Sun to the model, or leave it out"
             raise bad_input("navigation", "observations", "power", "needs a battery and a Sun", remedy)
+        self._told = (*config.observations, *config.privileged)
         # Metrics have a fixed set of names, told once.
         more = ("collided",) if config.collisions == "end" else ()
         self._ends_told = (*ENDS, *more, *(("drained",) if self._battery else ()))
@@ -280,7 +281,7 @@ class NavigationEnv:
             at.goals,
             *(jnp.asarray(a, jnp.result_type(float)) for a in (bounds, gains)),
             shortest=at.shortest if c.tally else None,
-            arrivals=at.arrivals if c.arrive_within < np.pi or "arrival" in c.observations else None,
+            arrivals=at.arrivals if c.arrive_within < np.pi or "arrival" in self._told else None,
             # Looked at once; over a map of many worlds it would cost every step.
             ground=jnp.stack([heights.min(), heights.max()]),
             side=pool.size,
@@ -301,6 +302,15 @@ class NavigationEnv:
         shapes = jax.eval_shape(widths, self.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
         ends = np.cumsum([0, *(shapes[name].shape[1] for name in self.config.observations)]).tolist()
         return {name: slice(a, b) for name, a, b in zip(self.config.observations, ends[:-1], ends[1:], strict=True)}
+
+    @property
+    def picture(self) -> tuple[int, int, int, int] | None:
+        """First number, rows, columns and colours of the observation's first picture; None without any."""
+        for name, place in self.blocks.items():
+            if name.startswith(CAMERA):
+                rows, columns = self.config.camera_height, self.config.camera_width
+                return place.start, rows, columns, (place.stop - place.start) // (rows * columns)
+        return None
 
     def reset(self, params: NavigationParams, keys: Any) -> State:
         """Begins an episode in every environment; `keys` (env, 2) raw random keys."""
@@ -565,9 +575,9 @@ class NavigationEnv:
             place=pick if params.shortest is not None or params.arrivals is not None else None,
             tally=tally.start(count, position.dtype) if c.tally else None,
             left=params.pool.places.shortest[pick] if "way" in c.weights and params.pool is not None else None,
-            trail=jnp.repeat(position[:, None, :2], len(VIEW.trail), axis=1) if "trail" in c.observations else None,
+            trail=jnp.repeat(position[:, None, :2], len(VIEW.trail), axis=1) if "trail" in self._told else None,
             visited=jnp.full((count, VIEW.visited_kept, 2), VIEW.nowhere, position.dtype)
-            if "visited" in c.observations
+            if "visited" in self._told
             else None,
         )
 
@@ -600,14 +610,14 @@ class NavigationEnv:
 
     def _blank(self, params: NavigationParams, inner: Inner) -> chart.Chart | None:
         """The charts of rovers that have seen nothing; None unless they are observed."""
-        if "plan" not in self.config.observations:
+        if "plan" not in self._told:
             return None
         price, _, _, goal, cell = self._on_chart(params, inner)
         return chart.begin(price.shape[-1], goal, cell)
 
     def _plan(self, params: NavigationParams, inner: Inner) -> Any:
         """The field `plan` of `View`; of who has seen nothing yet, straight for the goal."""
-        if "plan" not in self.config.observations:
+        if "plan" not in self._told:
             return None
         price, world, map_position, goal, cell = self._on_chart(params, inner)
         if inner.chart is None:
@@ -651,9 +661,16 @@ class NavigationEnv:
         c, terrain = self.config, params.system.terrain
         seen = None
         if any(name.startswith(CAMERA) for name in names):
-            # Pictures only where a block or a critic asks for them.
-            light = Light(sun=c.sun)
-            seen = pictures(terrain, self.model.rover, view.qpos, c.camera, light=light, far=c.camera_far)
+            # Pictures only where a block or a critic asks for them, and their light only where it shows.
+            seen = pictures(
+                terrain,
+                self.model.rover,
+                view.qpos,
+                c.camera,
+                light=Light(sun=c.sun),
+                far=c.camera_far,
+                lit=CAMERA + "rgb" in names,
+            )
         return Scene(terrain, inner.drawn, self._ride, self._scale, params.system.sun, seen, c.camera_far)
 
     def _info(self, view: View) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""Policies that learn from a policy which sees more."""
