@@ -12,7 +12,7 @@ import numpy as np
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, SteadyLog
 from lunar_mjx.logs.log import LogTable, Noise
-from lunar_mjx.logs.schema import is_command
+from lunar_mjx.logs.schema import is_command, suffix_of
 from lunar_mjx.manoeuvres import MANOEUVRES, commands, load_manoeuvre
 from lunar_mjx.model import ZERO_CELSIUS, Model
 from lunar_mjx.simulate import command_channels
@@ -97,7 +97,7 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
 def _first(channel: str, start: tuple[float, float, float], celsius: float) -> float:
     """Where a channel begins, as far as the start of a simulation reads it from there."""
     known = {"position_x_m": start[0], "position_y_m": start[1], "yaw_deg": float(np.degrees(start[2]))}
-    return celsius if channel.endswith("_temperature_degC") else known.get(channel, 0.0)
+    return celsius if suffix_of(channel) == "degC" else known.get(channel, 0.0)
 
 
 def planned_sweeps(logs: Sequence[SteadyLog]) -> list[tuple[str, str, SteadyLog]]:

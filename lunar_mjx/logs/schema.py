@@ -179,6 +179,11 @@ class ChannelName:
         return {"l": "left", "r": "right"}.get(self.corner[:1], "")
 
     @property
+    def sensor(self) -> str:
+        """What reads the channel, by the first word of its quantity: `gyro`, `motor`, `wheel`, `world` (odometry)."""
+        return self.quantity.partition("_")[0]
+
+    @property
     def kind(self) -> str:
         """The name without its corner: one kind of sensor, wherever on the rover it sits."""
         return str(dataclasses.replace(self, corner=""))
@@ -225,10 +230,26 @@ def is_command(name: str) -> bool:
     return name.startswith("command_")
 
 
-def is_quantity(name: str, quantity: str, joint: str = "") -> bool:
-    """Whether a channel is of a quantity such as `joint_speed`, at a kind of joint or at any, wherever on the rover."""
+def is_quantity(name: str, quantity: str, joint: str = "", axis: str = "") -> bool:
+    """Whether a channel is of a quantity such as `joint_speed`, wherever on the rover.
+
+    Args:
+      name: of the channel. quantity: as in `ChannelName`. joint, axis: which one; any if empty.
+    """
     parts = parse_name(name)
-    return parts is not None and parts.quantity == quantity and joint in ("", parts.joint)
+    return parts is not None and parts.quantity == quantity and joint in ("", parts.joint) and axis in ("", parts.axis)
+
+
+def sensor_of(name: str) -> str:
+    """What reads a channel (`ChannelName.sensor`); the first word of a name that is not of the schema."""
+    parts = parse_name(name)
+    return name.partition("_")[0] if parts is None else parts.sensor
+
+
+def suffix_of(name: str) -> str:
+    """The unit that ends a channel's name (`degC`); empty without one, and for a name that is not of the schema."""
+    parts = parse_name(name)
+    return "" if parts is None else parts.unit
 
 
 def channel_kind(name: str) -> str:

@@ -18,7 +18,7 @@ from lunar_mjx.inference.coordinates import NUISANCE, Coordinate
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.logs import Log
 from lunar_mjx.logs.attitude import EULER
-from lunar_mjx.logs.schema import channel_name
+from lunar_mjx.logs.schema import channel_name, sensor_of, suffix_of
 
 CLOCK, MOUNTING, USUAL = "clock ", "mounting ", "usual "
 """Names of these nuisances begin so, and go on with the table, the axis, or the kind of instrument and its error."""
@@ -67,7 +67,7 @@ def instrument_nuisances(number: int, log: Log, observations: Observations) -> l
     for name, table in log.tables.items():
         if table.clock_offset_std_s > 0.0 and any(s.channel in table.channels for s in mine):
             coordinates.append(_coordinate(CLOCK + name, table.clock_offset_std_s, "s", number))
-    turned = [s for s in mine if s.channel.partition("_")[0] in _VECTORS or (log.imu.attitude and s.channel in EULER)]
+    turned = [s for s in mine if sensor_of(s.channel) in _VECTORS or (log.imu.attitude and s.channel in EULER)]
     for axis, std in zip("xyz", log.imu.mounting_std_deg, strict=True):
         if turned and 0.0 < std < USUAL_ERRORS.unknown_deg:
             coordinates.append(_coordinate(MOUNTING + axis, float(np.radians(std)), "rad", number))
@@ -103,7 +103,7 @@ def instrument_direction(
         return out
     axis = "xyz".index(c.name.removeprefix(MOUNTING))
     for s in series:
-        kind, place = s.channel.partition("_")[0], slice(s.start, s.stop)
+        kind, place = sensor_of(s.channel), slice(s.start, s.stop)
         if log.imu.attitude and s.channel == EULER[axis]:
             out[place] = np.degrees(1.0)  # near level; the attitude's axes are the chassis's
         elif kind in _VECTORS:
@@ -160,12 +160,12 @@ def usual_errors(observations: Observations, predicted: np.ndarray, rate: np.nda
         columns.setdefault(name, np.zeros(len(observations)))[part] = error
 
     for s in observations.series:
-        word, part = s.channel.partition("_")[0], slice(s.start, s.stop)
+        word, part = sensor_of(s.channel), slice(s.start, s.stop)
         if word in USUAL_ZERO:
             add(f"{word}: zero {s.channel}", part, USUAL_ZERO[word])
         if word in USUAL_SCALE:
-            # motors and wheels have channels of several quantities, which their last word tells
-            kind = f"{word} {s.channel.rpartition('_')[2]}" if word in ("motor", "wheel") else word
+            # motors and wheels have channels of several quantities, which their unit tells
+            kind = f"{word} {suffix_of(s.channel)}" if word in ("motor", "wheel") else word
             # Of the prediction: measured values would bring their noise into the column, and it would fit that. Of a
             # position it is the way from the start, which odometry measures.
             since = predicted[part] - predicted[s.start] if word == "position" else predicted[part]

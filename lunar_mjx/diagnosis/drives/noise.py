@@ -13,7 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from lunar_mjx.effects.sensor.channels import family
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.logs.noise import ChannelNoise, noise_of
-from lunar_mjx.logs.schema import is_command
+from lunar_mjx.logs.schema import is_command, is_quantity, sensor_of, suffix_of
 
 if TYPE_CHECKING:
     from lunar_mjx.logs import Log
@@ -40,6 +40,7 @@ DATASHEET = {
 """Standard deviation by the first word of a channel, in its unit, where a log states nothing: visual odometry of a few
 millimetres, a tactical MEMS IMU, 12-bit encoders, thermistors of 0.3 K."""
 _ELECTRICAL = {"A": 0.01, "V": 0.05, "Nm": 0.2}
+_FORCE = {"N": 1.0, "Nm": 0.2}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,16 +92,12 @@ def stated_or_typical(log: Log, channel: str) -> float:
     noise = log.noise.get(channel)
     if noise is not None and noise.std > 0.0:
         return noise.std
-    word = channel.partition("_")[0]
+    unit = suffix_of(channel)
     if family(channel) == "electrical":
-        return _ELECTRICAL.get(channel.rsplit("_", 1)[-1], 0.05)
-    if channel.endswith("_N"):
-        return 1.0
-    if channel.endswith("_Nm"):
-        return 0.2
-    if channel.endswith("slip_ratio"):
+        return _ELECTRICAL.get(unit, 0.05)
+    if is_quantity(channel, "wheel_slip"):
         return 0.02
-    return DATASHEET.get(word, 0.01)
+    return _FORCE.get(unit, DATASHEET.get(sensor_of(channel), 0.01))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +125,7 @@ class Noises:
             for channel in log.channel_names:
                 samples = log.channel(channel)
                 # a slip ratio at rest is noise over zero
-                if is_command(channel) or channel.endswith("slip_ratio") or samples is None:
+                if is_command(channel) or is_quantity(channel, "wheel_slip") or samples is None:
                     continue
                 key = _kind(log, channel)
                 for begin, end in rests:
@@ -215,7 +212,7 @@ def _about_line(time: np.ndarray, values: np.ndarray) -> float:
 
 
 def _kind(log: Log, channel: str) -> tuple[str, float]:
-    return channel.partition("_")[0], stated_or_typical(log, channel)
+    return sensor_of(channel), stated_or_typical(log, channel)
 
 
 def _rests(log: Log) -> list[tuple[float, float]]:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from lunar_mjx.diagnosis.drives.simulation.rollouts import LogRun
+from lunar_mjx.logs.schema import channel_name, is_quantity
 
 if TYPE_CHECKING:
     from lunar_mjx.logs import Log
@@ -22,10 +23,10 @@ the ratio jumps by hundreds of its noise with a millisecond."""
 def defined(log: Log, run: LogRun, channel: str, time: np.ndarray) -> np.ndarray:
     """Where a channel means something: a slip ratio needs a wheel that turns; at rest it is noise over zero."""
     out = np.ones(len(time), bool)
-    if not channel.endswith("_slip_ratio"):
+    if not is_quantity(channel, "wheel_slip"):
         return out
     for wheel in run.model.rover.wheels:
-        if channel != f"wheel_{wheel.corner}_slip_ratio":
+        if wheel.corner != channel_name(channel).corner:
             continue
         name = f"{wheel.corner}_drive"
         speed = log.channel(f"joint_{name}_speed_rad_s")

@@ -6,18 +6,16 @@ from collections.abc import Collection, Mapping, Sequence
 
 from lunar_mjx.logs import Log
 from lunar_mjx.logs.attitude import EULER, QUATERNION
-from lunar_mjx.logs.schema import is_command, is_quantity
+from lunar_mjx.logs.schema import is_command, is_quantity, parse_name
 
 REASONS: Mapping[str, str] = {
     "drawbar_pull": "a pull on a tether is no input of the model yet; compare drives without one",
     "bus_voltage": "the model has no supply; add the effect bus_droop to compare it",
     "wheel_slip_angle": "no camera's slip angle is compared yet",
-    "motor_left": "the model's rover drives every wheel by a motor of its own",
-    "motor_right": "the model's rover drives every wheel by a motor of its own",
-    "joint_left": "the model's rover drives every wheel by a motor of its own",
-    "joint_right": "the model's rover drives every wheel by a motor of its own",
+    "left": "the model's rover drives every wheel by a motor of its own",
+    "right": "the model's rover drives every wheel by a motor of its own",
 }
-"""Why channels are not compared, by the beginning of their names."""
+"""Why channels are not compared, by their quantity, or by the side that they stand for."""
 OTHERWISE = "the model does not predict it"
 
 
@@ -31,7 +29,7 @@ def unused_channels(
 
     Args:
       log: of a drive. compared: channels that the problem compares.
-      reasons: by the beginning of a channel's name. otherwise: of all others.
+      reasons: by quantity or side. otherwise: of all others.
     """
     read = {v for v in log.environment.values() if isinstance(v, str)}
     if any(e in compared for e in EULER):
@@ -41,7 +39,9 @@ def unused_channels(
         speed = is_quantity(name, "joint_speed", "drive")
         if name in compared or name in read or is_command(name) or (log.imposed and speed):
             continue
-        out[name] = next((why for start, why in reasons.items() if name.startswith(start)), otherwise)
+        parts = parse_name(name)
+        places = () if parts is None else (parts.quantity, parts.corner)
+        out[name] = next((reasons[p] for p in places if p in reasons), otherwise)
     return out
 
 

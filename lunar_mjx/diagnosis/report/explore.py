@@ -16,6 +16,7 @@ from lunar_mjx.diagnosis.report.read import Result, Traces
 from lunar_mjx.diagnosis.report.steps import Step
 from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, plot_text, shown
 from lunar_mjx.inference.observations import Observations
+from lunar_mjx.logs.schema import is_quantity
 from lunar_mjx.report.page import Block, Explorer, Figure
 from lunar_mjx.report.style import BLUE, INK, MEASURED, MUTED, ORANGE, SERIES, faded, finish
 
@@ -360,23 +361,20 @@ def _covariates(traces: Traces) -> Mapping[str, np.ndarray]:
     if o.place is not None:
         return dict(zip(("slip ratio", "slip angle, deg", "load, N"), o.place.T, strict=False))
     wanted = {
-        "speed of the wheels, rad/s": ("joint_", "drive_speed_rad_s"),
-        "pitch, deg": ("pitch_deg", ""),
-        "winding temperature, °C": ("winding_", "_degC"),
-        "position x, m": ("position_x_m", ""),
+        "speed of the wheels, rad/s": ("joint_speed", "drive"),
+        "pitch, deg": ("pitch",),
+        "winding temperature, °C": ("winding_temperature",),
+        "position x, m": ("position", "", "x"),
     }
-    out = {"time, s": traces.time}
-    for name, (begin, end) in wanted.items():
-        out[name] = covariate_along(o, begin, end)
-    return out
+    return {"time, s": traces.time} | {name: covariate_along(o, *what) for name, what in wanted.items()}
 
 
-def covariate_along(o: Observations, begin: str, end: str) -> np.ndarray:
-    """Mean of the measured channels of a kind, at the times of all observations of the same log."""
+def covariate_along(o: Observations, quantity: str, joint: str = "", axis: str = "") -> np.ndarray:
+    """(n,) mean of the measured channels of a quantity (as for `is_quantity`) in the log of each observation, then."""
     out = np.full(len(o), np.nan)
     for log in range(len(o.logs)):
         mine = [s for s in o.series if s.log == log and s.time is not None and len(s.time)]
-        kind = [s for s in mine if s.channel.startswith(begin) and s.channel.endswith(end)]
+        kind = [s for s in mine if is_quantity(s.channel, quantity, joint, axis)]
         for s in mine if kind else ():
             # Channels have clocks of their own.
             values = [np.interp(np.asarray(s.time), np.asarray(k.time), o.value[k.start : k.stop]) for k in kind]

@@ -263,7 +263,7 @@ def _map(traces: Traces, models: Sequence[_Model]) -> dict[str, Any] | None:
     if o.place is not None:
         slip_and_angle, titles = np.column_stack([o.place[:, 0], o.place[:, 1]]), ("slip ratio", "slip angle, deg")
     else:
-        parts = [covariate_along(o, f"position_{axis}_m", "") for axis in "xy"]
+        parts = [covariate_along(o, "position", axis=axis) for axis in "xy"]
         slip_and_angle, titles = np.column_stack(parts), ("east x, m", "north y, m")
     known = np.isfinite(slip_and_angle).all(axis=1)
     if not known.any():

@@ -8,6 +8,7 @@ import numpy as np
 
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, LogTable
+from lunar_mjx.logs.schema import channel_name, is_quantity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +31,8 @@ class ClockLimits:
 CLOCK_LIMITS = ClockLimits()
 
 
-_RATES = (("joint_{}_angle_rad", "joint_{}_speed_rad_s"), ("position_{}_m", "world_velocity_{}_m_s"))
+_RATES = {"joint_angle": "joint_speed", "position": "world_velocity"}
+"""Quantities, and those that are their rates."""
 
 
 def check_clock(log: Log) -> list[Finding]:
@@ -179,13 +181,12 @@ def _is_regular(steps: np.ndarray, base: float) -> bool:
 
 def _pairs(table: LogTable) -> list[tuple[str, str]]:
     names = []
-    for integral, rate in _RATES:
-        head, tail = integral.split("{}")
-        for name in table.channels:
-            if name.startswith(head) and name.endswith(tail):
-                partner = rate.format(name[len(head) : -len(tail)])
-                if partner in table.channels:
-                    names.append((name, partner))
+    for integral, rate in _RATES.items():
+        for name in (n for n in table.channels if is_quantity(n, integral)):
+            parts = channel_name(name)
+            partner = str(dataclasses.replace(parts, quantity=rate, unit=f"{parts.unit}_s"))
+            if partner in table.channels:
+                names.append((name, partner))
     return names
 
 

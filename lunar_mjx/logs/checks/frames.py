@@ -9,7 +9,7 @@ import numpy as np
 
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log
-from lunar_mjx.logs.schema import SIDES
+from lunar_mjx.logs.schema import SIDES, sensor_of
 from lunar_mjx.logs.series import (
     Agreement,
     agreement,
@@ -223,7 +223,7 @@ def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Ag
     # Noise of a sum over a window at 20 Hz: the root of its length by the step.
     noise = sigma(log, integral) + abs(scale) * sigma(log, rate) * np.sqrt(length * 0.05)
     expected = scale * integrals(log, rate, windows, like=integral)
-    least = next(v for word, v in LEAST.items() if integral.startswith(word))
+    least = LEAST[sensor_of(integral)]
     return agreement(increments(log, integral, windows), expected, noise, least)
 
 

@@ -12,7 +12,7 @@ from lunar_mjx.logs.checks.clock import CLOCK_LIMITS
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Log, LogTable
 from lunar_mjx.logs.noise import NOISE_ESTIMATE
-from lunar_mjx.logs.schema import MIRROR, find_channel, is_command, is_quantity, limits
+from lunar_mjx.logs.schema import MIRROR, find_channel, is_command, is_quantity, limits, suffix_of
 from lunar_mjx.logs.series import sigma
 from lunar_mjx.model import ZERO_CELSIUS
 
@@ -79,7 +79,7 @@ def _check_channel(log: Log, table: LogTable, name: str) -> list[Finding]:
             f"is {values[row]:.6g}, outside [{low:g}, {high:g}] ({why}), and so in "
             f"{int(beyond.sum())} rows; check its unit, or leave these cells empty",
         )
-    if name.endswith("_temperature_degC") and (text := _kelvin(log, values[finite])):
+    if suffix_of(name) == "degC" and (text := _kelvin(log, values[finite])):
         return finding(int(np.argmax(finite)), "unit", text)
     if is_command(name):
         return []

@@ -133,10 +133,12 @@ def test_the_imus_axes_are_those_of_its_channels(model: Model) -> None:
 
 def test_what_nothing_reads_is_named(tmp_path: Path) -> None:
     columns = {"drawbar_pull_N": 5.0, "bus_voltage_V": 48.0, "gyro_z_rad_s": 0.0, "joint_left_drive_speed_rad_s": 1.0}
-    columns |= {"joint_right_drive_speed_rad_s": 1.0}
+    columns |= {"joint_right_drive_speed_rad_s": 1.0, "wheel_lf_slip_angle_deg": 0.0, "motor_left_drive_current_A": 1.0}
     log = make(tmp_path / "a", columns, imposed="wheel_speed")
     found = unused_channels(log, {"gyro_z_rad_s"})
-    assert set(found) == {"drawbar_pull_N", "bus_voltage_V"} and "bus_droop" in found["bus_voltage_V"]
+    words = {"drawbar_pull_N": "tether", "bus_voltage_V": "bus_droop", "wheel_lf_slip_angle_deg": "camera"}
+    words |= {"motor_left_drive_current_A": "a motor of its own"}
+    assert set(found) == set(words) and all(word in found[name] for name, word in words.items())
 
 
 def test_a_discrepancy_of_an_unknown_channel_is_refused() -> None:

@@ -14,6 +14,7 @@ from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, log_model
 from lunar_mjx.logs import commands as log_commands
+from lunar_mjx.logs.schema import parse_name, suffix_of
 from lunar_mjx.logs.series import sigma
 from lunar_mjx.model import ZERO_CELSIUS, Model
 from lunar_mjx.terrain.heightfield import slope
@@ -135,7 +136,7 @@ def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:
     degrees = [log.initial[k] for k in ("winding_temperature_degC", "housing_temperature_degC") if k in log.initial]
     if degrees:
         start["temperature"] = float(np.mean(degrees)) + ZERO_CELSIUS
-    temperatures = [first(c) for c in log.channel_names if c.endswith("_temperature_degC")]
+    temperatures = [first(c) for c in log.channel_names if suffix_of(c) == "degC"]
     known = [t for t in temperatures if t is not None]
     if known:
         start["temperature"] = float(np.mean(known)) + ZERO_CELSIUS
@@ -154,6 +155,13 @@ def _stated_yaw(log: Log) -> float | None:
         return None
     w, x, y, z = log.initial["quaternion"]
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _speeds_of(joint: str) -> tuple[str, ...]:
+    """Channels that tell a joint's speed: its own, then its side's, which is that of each driven wheel."""
+    name = f"joint_{joint}_speed_rad_s"
+    parts = parse_name(name)
+    return (name, str(parts.at(parts.side))) if parts is not None and parts.joint == "drive" else (name,)
 
 
 def start_motion(log: Log, model: Model, begin: float, yaw: float) -> dict[str, np.ndarray]:
@@ -178,8 +186,7 @@ def start_motion(log: Log, model: Model, begin: float, yaw: float) -> dict[str, 
         return math.nan
 
     channels = joint_channels(model.rover)
-    pairs = [(c, f"{'left' if c[0] == 'l' else 'right'}_drive" if c.endswith("_drive") else c) for c in channels]
-    spin = np.array([measured(f"joint_{c}_speed_rad_s", f"joint_{s}_speed_rad_s") for c, s in pairs])
+    spin = np.array([measured(*_speeds_of(c)) for c in channels])
     rims = [spin[channels.index(f"{w.corner}_drive")] * w.radius for w in model.rover.wheels]
     rolling = float(np.mean(rims)) if np.all(np.isfinite(rims)) else math.nan
     velocity = _start_velocity(log, measured, yaw)

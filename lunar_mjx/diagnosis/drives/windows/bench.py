@@ -42,8 +42,8 @@ MOST_WINDOWS = 60
 """Windows of a campaign that are simulated: two minutes of driving, drawn evenly over speeds and turns."""
 
 
-UNUSED = {"position_": "a speed over ground needs a heading that is known, yaw_deg"}
-"""Why channels are in no window, by the beginning of their names."""
+UNUSED = {"position": "a speed over ground needs a heading that is known, yaw_deg"}
+"""Why channels are in no window, by their quantity."""
 
 PARTS = 10
 """Parts of a log of which every third is held out."""
