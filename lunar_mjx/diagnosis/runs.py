@@ -27,7 +27,7 @@ from lunar_mjx.trust import require_trust
 FORMAT = "lunar-mjx-run/1"
 RUN_FILE, MODEL_FILE = "run.json", "model.toml"
 FITTED_FILE = "fitted.toml"
-"""The model as refitted, and what was learnt as its priors, where wheel speeds are imposed."""
+"""The model as refitted with its posterior and, where wheel speeds are imposed, what was learnt as priors."""
 COMPARISON_FILE, VERDICT_FILE, SERIES_FILE = "comparison.json", "verdict.json", "series.npz"
 SIGNATURES_FILE, HYPOTHESES_FILE = "signatures.npz", "hypotheses.json"
 AUDIT_FILE, UNKNOWN_FILE, NEXT_FILE = "audit.json", "unknown.json", "next.json"

@@ -25,6 +25,7 @@ from lunar_mjx.model.model import (
     settled,
     with_position_gains,
 )
+from lunar_mjx.model.posterior import read_posterior
 from lunar_mjx.model.sun import SunSettings, read_sun
 from lunar_mjx.resources import shipped
 from lunar_mjx.rover import load_rover
@@ -50,6 +51,7 @@ _TOP = (
     "priors",
     "grounds",
     "sun",
+    "posterior",
 )
 _AMBIENT = ("temperature_degC", "noon_temperature_degC", "night_temperature_degC", "noon_time_s", "period_s")
 _CONTROL = ("mode", *GAINS)
@@ -104,6 +106,9 @@ def load_model(path: str | Path) -> Model:
     model = with_position_gains(model, [g for g, entry in data.get("control", {}).items() if GAINS[0] in entry])
     model = _effects(path, data, model)
     model = dataclasses.replace(model, priors=_priors(path, _table(path, "priors", data.get("priors", {})), model))
+    if "posterior" in data:
+        posterior = _table(path, "posterior", data["posterior"])
+        model = dataclasses.replace(model, posterior=read_posterior(path, posterior, model.effects, model.parameters))
     check_effects(model, path)
     return model
 
@@ -175,6 +180,7 @@ def _record(model: Model, path: Path) -> dict[str, Any]:
         **({"sun": _sun(model.sun, folder)} if model.sun is not None else {}),
         **({"grounds": list(model.grounds)} if model.grounds else {}),
         **({"priors": {k: {"value": v, "std": s} for k, (v, s) in model.priors.items()}} if model.priors else {}),
+        **({"posterior": model.posterior.record()} if model.posterior is not None else {}),
     }
 
 

@@ -15,6 +15,7 @@ from lunar_mjx.effects.joint.motor import MODES, WINDINGS
 from lunar_mjx.effects.soil.ground import least_stiffness
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.model.ambient import SYNODIC_DAY
+from lunar_mjx.model.posterior import Posterior
 from lunar_mjx.model.sun import SunSettings
 from lunar_mjx.resources import shipped
 from lunar_mjx.rover import Rover, load_rover
@@ -53,6 +54,7 @@ class Model:
         (`calibration.pitch`) before a fit; a standard deviation of zero fixes it.
       grounds: what the logs that it was fitted to were driven on, in their words.
       sun: where the Sun stands or how it moves, for power, heat and cameras; None where each has its own default.
+      posterior: how far measurements leave the parameters open, about their values; None where nothing was fitted.
     """
 
     rover: Rover
@@ -71,6 +73,7 @@ class Model:
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     sun: SunSettings | None = None
     grounds: tuple[str, ...] = ()
+    posterior: Posterior | None = None
 
     @property
     def effect_names(self) -> tuple[str, ...]:
@@ -111,7 +114,11 @@ class Model:
         parameters[added.name] = added.nominal()
         files = {k: v for k, v in self.effect_files.items() if k not in added.replaces}
         model = dataclasses.replace(
-            self, effects=tuple(kept), parameters=parameters, effect_files={**files, added.name: written}
+            self,
+            effects=tuple(kept),
+            parameters=parameters,
+            effect_files={**files, added.name: written},
+            posterior=self.posterior and self.posterior.within([e.name for e in kept]),
         )
         return model.set(added.name, source, **values)
 
@@ -123,6 +130,7 @@ class Model:
             effects=tuple(e for e in self.effects if e.name != name),
             parameters={k: v for k, v in self.parameters.items() if k != name},
             effect_files={k: v for k, v in self.effect_files.items() if k != name},
+            posterior=self.posterior and self.posterior.within([n for n in self.effect_names if n != name]),
         )
 
     def set(self, name: str, source: str = "Model.set", /, **values: Any) -> Model:

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from lunar_mjx.diagnosis.fitted_model import fitted_model, posterior_of
 from lunar_mjx.diagnosis.runs import (
     COMPARISON_FILE,
+    FITTED_FILE,
     HYPOTHESES_FILE,
     RUN_FILE,
     SERIES_FILE,
@@ -31,6 +33,7 @@ from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Refit
 from lunar_mjx.inference.weighing.search import Hypothesis, ModelSearch, search
+from lunar_mjx.model.file import save_model
 
 _WRITING = 0.1
 """1; share of the time given that is kept for writing the answer."""
@@ -44,7 +47,7 @@ _SPLITS = {
 
 
 def compare(run: Run, problem: Problem, progress: Progress) -> Refit:
-    """The model as given and refitted; writes `comparison.json` and the series."""
+    """The model as given and refitted; writes `comparison.json`, `fitted.toml` and the series."""
     run.save(RUN_FILE, {**run.load(RUN_FILE), "settings": dataclasses.asdict(problem.settings)})
     own = problem.own
     progress("refitting the model", 0.0)
@@ -56,6 +59,11 @@ def compare(run: Run, problem: Problem, progress: Progress) -> Refit:
     run.save(COMPARISON_FILE, comparison(problem, start, refit, alone))
     run.save(HYPOTHESES_FILE, {own.name: {"u": _by_key(own, refit.u)}})
     save_series(run, own, start, {"refitted": (own, alone)})
+    _, found, places = refit.linear.evidence(own.listed(refit.effects))
+    posterior = posterior_of(own.coordinates, found.covariance, refit.linear.amplitudes.std[places], places, run.model)
+    # The values and deviations that `comparison.json` tells.
+    fitted = fitted_model(own.coordinates, alone, own.baseline, run.model)
+    save_model(dataclasses.replace(fitted, posterior=posterior), run.folder / FITTED_FILE)
     return refit
 
 

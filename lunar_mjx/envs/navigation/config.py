@@ -46,6 +46,7 @@ class NavigationConfig:
       place_seed: of those pairs.
       steepest: slope at start and goal.
       randomise: parameters drawn for every episode.
+      posterior: draw those that the model's `[posterior]` tells from it, and not from `randomise`.
       kalman: the acceleration filter's tuning.
       camera_width, camera_height: pixels of the blocks camera/rgb, camera/depth and camera/labels.
       camera_fovy_deg: vertical angle of view. camera_far: how far the camera looks, m.
@@ -85,6 +86,7 @@ class NavigationConfig:
     place_seed: int = 0
     steepest: float = np.radians(20.0)
     randomise: tuple[Range, ...] = ()
+    posterior: bool = False
     kalman: KalmanConfig = dataclasses.field(default_factory=KalmanConfig)
     camera_width: int = 64
     camera_height: int = 48
@@ -167,7 +169,7 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", name, getattr(c, name), "does not exist", f"use one of {', '.join(allowed)}")
     # the optics and the light refuse values that make no sense, in words of their own
     _ = c.camera, c.sun
-    for name in ("tally", "four_wheel_steering"):
+    for name in ("tally", "four_wheel_steering", "posterior"):
         if not isinstance(getattr(c, name), bool):
             raise bad_input("navigation", name, getattr(c, name), "is neither true nor false", "give one of them")
     if not all(isinstance(r, Range) for r in c.randomise):

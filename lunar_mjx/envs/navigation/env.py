@@ -62,6 +62,7 @@ class NavigationParams:
       ground: lowest and highest ground, m; None to look anew.
       side: of the worlds that make up the terrain, m: leaving one's own fails; None if it is one.
       pool: the ladder's worlds, for planners and the reward `way`; None elsewhere.
+      spread: of the model's posterior; None unless it is drawn from.
     """
 
     system: Params
@@ -74,6 +75,7 @@ class NavigationParams:
     ground: Any = None
     side: Any = None
     pool: Pool | None = None
+    spread: randomise.Spread | None = None
 
 
 @pytree
@@ -184,6 +186,9 @@ class NavigationEnv:
     def __init__(self, model: Model, config: NavigationConfig, engine: str = "auto"):
         # Before anything is compiled.
         randomise.check_ranges(model, config.randomise)
+        if config.posterior:
+            told = randomise.spread_of(model).parameters
+            config = config.replace(randomise=tuple(r for r in config.randomise if r.parameter not in told))
         self.model, self.config = model, config
         self.system: System = build(model, engine)
         self.actions = action_map(model, config.action, config.top_speed, config.load_share, config.four_wheel_steering)
@@ -246,8 +251,9 @@ class NavigationEnv:
         bounds = np.array([(r.low, r.high) for r in ranges], np.float32).reshape(-1, 2)
         gains = kalman.gains(c.kalman, c.decimation * model.timestep).astype(np.float32)
         number = c.place_seed if seed is None else seed
+        spread = randomise.spread_of(model) if c.posterior else None
         if c.rung:
-            return self._on_pool(model, self.pool(number, hardness), bounds, gains)
+            return dataclasses.replace(self._on_pool(model, self.pool(number, hardness), bounds, gains), spread=spread)
         starts, goals = draw_places(
             model.terrain,
             c.places,
@@ -260,7 +266,7 @@ class NavigationEnv:
         )
         arrays = [jnp.asarray(a, jnp.result_type(float)) for a in (starts, goals, bounds, gains)]
         shortest = jnp.asarray(np.hypot(*(goals - starts).T), arrays[0].dtype) if c.tally else None
-        return NavigationParams(default_params(model), *arrays, shortest=shortest)
+        return NavigationParams(default_params(model), *arrays, shortest=shortest, spread=spread)
 
     def pool(self, seed: int, hardness: float | None = None) -> Pool:
         """The ladder's worlds of a seed, for this rover."""
@@ -551,6 +557,10 @@ class NavigationEnv:
         # Headings are drawn about the goal's bearing.
         bearing = jnp.arctan2(goal[:, 1] - start[:, 1], goal[:, 0] - start[:, 0])
         drawn = randomise.draw(c.randomise, params.system, params.bounds, split[:, 3])
+        if params.spread is not None:
+            # Keys of its own: ranges draw the same numbers with and without a posterior beside them.
+            own = jax.vmap(lambda k: jax.random.fold_in(k, 1))(split[:, 3])
+            drawn |= randomise.draw_spread(params.spread, params.system, own)
         system, axes = randomise.apply(params.system, drawn)
         warm = drawn.get("winding_temperature")
         physics = jax.vmap(self.system.reset, in_axes=(axes, 0, 0, 0, None if warm is None else 0))(

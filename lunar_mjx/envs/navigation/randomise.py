@@ -14,9 +14,12 @@ from jaxtyping import Array, Float
 from lunar_mjx.dynamics import Params
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.model import Model
-from lunar_mjx.pytree import tree_of
+from lunar_mjx.pytree import pytree, static, tree_of
 
 SCALES = ("uniform", "log")
+_TRIES = 16
+"""Draws from a posterior, of which the first within all bounds counts: even where every fourth alone is, one rover of a
+hundred gets none, and is put at the bounds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +50,50 @@ class Range:
             raise bad_input(where, "scale", self.scale, "does not exist", f"use one of {', '.join(SCALES)}")
         if self.scale == "log" and self.low <= 0.0:
             raise bad_input(where, "low", self.low, "is not positive on a log scale", "give bounds above zero")
+
+
+@pytree
+class Spread:
+    """A model's posterior as arrays; others of the same parameters need no new compilation.
+
+    Attributes:
+      parameters: `effect.parameter` of each. log: of each, whether its logarithm is drawn.
+      factor: (parameter, parameter) that makes deviations of standard normal numbers.
+      low, high: (parameter,) bounds of the deviations, so that values stay within those of their effects.
+    """
+
+    parameters: tuple[str, ...] = static()
+    log: tuple[bool, ...] = static()
+    factor: Any
+    low: Any
+    high: Any
+
+
+def spread_of(model: Model, source: str = "navigation") -> Spread:
+    """The posterior that a model holds, made ready to be drawn from.
+
+    Raises:
+      UserError: the model holds none.
+    """
+    posterior = model.posterior
+    if posterior is None:
+        remedy = "give --env model=RUN/fitted.toml, which `lunar-mjx compare` writes"
+        raise bad_input(source, "posterior", True, "does not go with a model without [posterior]", remedy)
+    low, high = [], []
+    for name, log in zip(posterior.parameters, posterior.log, strict=True):
+        effect, _, parameter = name.partition(".")
+        value = np.asarray(model.parameters[effect][parameter], float)
+        bounds = next(e for e in model.effects if e.name == effect).parameters[parameter].bounds
+        # The first wheel or joint that reaches its bound ends the deviation, which is one for all of them.
+        with np.errstate(divide="ignore"):
+            ends = [
+                np.log(b) - np.log(value) if log else b - value
+                for b in (max(bounds[0], 0.0) if log else bounds[0], bounds[1])
+            ]
+        low.append(np.max(ends[0]))
+        high.append(np.min(ends[1]))
+    arrays = (jnp.asarray(a, jnp.result_type(float)) for a in (posterior.factor(), low, high))
+    return Spread(posterior.parameters, posterior.log, *arrays)
 
 
 def check_ranges(model: Model, ranges: Sequence[Range], source: str = "navigation") -> None:
@@ -104,6 +151,31 @@ def draw(
             # One factor for all wheels or joints: they differ as a set, from rover to rover.
             value = value.reshape(-1, *([1] * own.ndim)) * own
         drawn[r.parameter] = value
+    return drawn
+
+
+def draw_spread(spread: Spread, params: Params, keys: Float[Array, "env 2"]) -> dict[str, Any]:
+    """Draws from a posterior for every environment: a normal distribution cut off at the parameters' bounds.
+
+    Args:
+      spread: of the posterior, about the model's own values. params: those. keys: raw random keys, one per environment.
+
+    Returns:
+      Values by parameter with the leading axis `env`.
+    """
+    count = len(spread.parameters)
+    normal = jax.vmap(lambda k: jax.random.normal(k, (_TRIES, count)))(keys)
+    # Exact products: with a GPU's short factors strongly correlated parameters would come apart.
+    tried = jnp.einsum("etj,ij->eti", normal, spread.factor, precision=jax.lax.Precision.HIGHEST)
+    inside = ((tried >= spread.low) & (tried <= spread.high)).all(-1)
+    first = jnp.argmax(inside, axis=1)
+    deviation = jnp.clip(jnp.take_along_axis(tried, first[:, None, None], axis=1)[:, 0], spread.low, spread.high)
+    drawn = {}
+    for i, (name, log) in enumerate(zip(spread.parameters, spread.log, strict=True)):
+        own = _own(params, name)
+        # One deviation for all wheels or joints, as the fit had it.
+        by = deviation[:, i].reshape(-1, *([1] * own.ndim))
+        drawn[name] = own * jnp.exp(by) if log else own + by
     return drawn
 
 

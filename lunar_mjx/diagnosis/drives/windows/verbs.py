@@ -17,6 +17,7 @@ from lunar_mjx.diagnosis.drives.windows.coordinates import CALIBRATION, DRIFT, U
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS
 from lunar_mjx.diagnosis.drives.windows.form import DRIVE, INSTEAD, OF_THE_GROUND, WindowForm, between
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, corners
+from lunar_mjx.diagnosis.fitted_model import posterior_of
 from lunar_mjx.diagnosis.folder.refits import write_refits
 from lunar_mjx.diagnosis.runs import COMPARISON_FILE, FITTED_FILE, VERDICT_FILE, WINDOWS_FILE, Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
@@ -184,10 +185,15 @@ def unit_of(channel: str) -> str:
 
 def _posterior(form: WindowForm, refit: Refit) -> dict[int, float]:
     """Posterior standard deviations, in units of priors, of what a refit moves; the drive's own amounts left out."""
+    places, covariance = _covariance(form, refit)
+    return {int(i): math.sqrt(max(float(v), 0.0)) for i, v in zip(places, np.diag(covariance), strict=True)}
+
+
+def _covariance(form: WindowForm, refit: Refit) -> tuple[np.ndarray, np.ndarray]:
+    """Places (k,) of what a refit moves, but for the drive's own amounts, and their posterior covariance (k, k)."""
     _, found, places = refit.linear.evidence(form.listed(refit.effects))
-    own = [(k, int(i)) for k, i in enumerate(places) if i < len(form.coordinates)]
-    mine = [(k, i) for k, i in own if form.coordinates[i].effect != DRIVE]
-    return {i: math.sqrt(max(float(found.covariance[k, k]), 0.0)) for k, i in mine}
+    mine = [k for k, i in enumerate(places) if i < len(form.coordinates) and form.coordinates[i].effect != DRIVE]
+    return places[mine], found.covariance[np.ix_(mine, mine)]
 
 
 def not_told(form: WindowForm, refit: Refit, named: Sequence[str] = ()) -> list[str]:
@@ -249,7 +255,10 @@ def fitted_model(form: WindowForm, refit: Refit) -> Model:
     if len(np.unique(cut.recordings[np.unique(form.observations.window[form.fit])])) > 2:
         _, found, _ = refit.linear.evidence(form.listed(refit.effects))
         priors |= between(found.tau, found.tau_log_std, form.shares)
-    return dataclasses.replace(model, priors=priors)
+    places, covariance = _covariance(form, refit)
+    keys = {int(i): form.unknowns[i].key for i in places}
+    posterior = posterior_of(form.coordinates, covariance, refit.linear.amplitudes.std[places], places, model, keys)
+    return dataclasses.replace(model, priors=priors, posterior=posterior)
 
 
 def why(
