@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.cameras import Pinhole, pictures
+from lunar_mjx.cameras import Pinhole, front_mount, pictures
 from lunar_mjx.dynamics import build
 from lunar_mjx.envs import make_navigation, split_keys
 from lunar_mjx.errors import UserError
@@ -38,6 +38,18 @@ def test_pictures_are_blocks_of_the_observation() -> None:
     assert after.obs.shape == state.obs.shape and np.isfinite(np.asarray(after.obs)).all()
 
 
+def test_a_camera_that_looks_down_by_45_deg_sees_the_ground_at_the_root_of_two_times_its_height() -> None:
+    blocks, options = ("goal_body", "camera/depth"), {"camera_pitch_deg": 45.0, "camera_fovy_deg": 20.0}
+    env = make_navigation("consistent", terrain="flat", decimation=1, places=8, observations=blocks, **SIZE, **options)
+    state = jax.jit(env.reset)(env.params, split_keys(jax.random.PRNGKey(0), 1))
+    eye = front_mount(env.model.rover).position
+    depth = 60.0 * np.asarray(state.obs[0, 4:]).reshape(12, 16)
+    # the rover stands level, so that rows are at one depth, and the middle lies between the sixth and the seventh
+    height = eye[2] + float(state.inner.physics.qpos[0, 2])
+    assert depth[5:7].mean() == pytest.approx(np.sqrt(2.0) * height, rel=0.01)
+    assert np.ptp(depth, axis=1).max() < 0.01 and (np.diff(depth[:, 0]) < 0.0).all()
+
+
 def test_depth_and_labels_need_no_light() -> None:
     model = make_model("luvmi_x", "lunar_plain")
     system = build(model)
@@ -57,6 +69,7 @@ def test_depth_and_labels_need_no_light() -> None:
     [
         ({"camera_width": 0}, ("width", "0")),
         ({"camera_far": -1.0}, ("camera_far", "not positive")),
+        ({"camera_pitch_deg": 91.0}, ("camera_pitch_deg", "-90 to 90")),
         ({"sun_elevation_deg": 120.0}, ("elevation", "120")),
         ({"observations": ("camera/infrared",)}, ("camera/infrared", "camera/rgb")),
     ],

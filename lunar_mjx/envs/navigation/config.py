@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.cameras import Pinhole, Sun
+from lunar_mjx.cameras.mount import FRONT_MOUNT
 from lunar_mjx.envs.ladder.rungs import COLLISIONS, RUNGS, get_rung
 from lunar_mjx.envs.navigation.actions import ACTION_MODES
 from lunar_mjx.envs.navigation.kalman import KalmanConfig
@@ -49,7 +50,8 @@ class NavigationConfig:
       posterior: draw those that the model's `[posterior]` tells from it, and not from `randomise`.
       kalman: the acceleration filter's tuning.
       camera_width, camera_height: pixels of the blocks camera/rgb, camera/depth and camera/labels.
-      camera_fovy_deg: vertical angle of view. camera_far: how far the camera looks, m.
+      camera_fovy_deg: vertical angle of view. camera_pitch_deg: how far the camera looks down. camera_far: how far it
+        looks, m.
       sun_azimuth_deg, sun_elevation_deg: where the Sun stands, clockwise from north (y).
       divergence: what follows a state that is not finite: "stop" lets it through, so that a trainer's guard stops and
         dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`, and so a rover that is
@@ -91,6 +93,7 @@ class NavigationConfig:
     camera_width: int = 64
     camera_height: int = 48
     camera_fovy_deg: float = 60.0
+    camera_pitch_deg: float = FRONT_MOUNT.pitch_deg
     camera_far: float = 60.0
     sun_azimuth_deg: float = 135.0
     sun_elevation_deg: float = 15.0
@@ -167,6 +170,8 @@ def _check(c: NavigationConfig) -> None:
     for name, allowed in (("action", ACTION_MODES), ("divergence", DIVERGENCE), ("collisions", COLLISIONS)):
         if getattr(c, name) not in allowed:
             raise bad_input("navigation", name, getattr(c, name), "does not exist", f"use one of {', '.join(allowed)}")
+    if not -90.0 <= require_finite("navigation", "camera_pitch_deg", c.camera_pitch_deg) <= 90.0:
+        raise bad_input("navigation", "camera_pitch_deg", c.camera_pitch_deg, "is no pitch", "give -90 to 90")
     # the optics and the light refuse values that make no sense, in words of their own
     _ = c.camera, c.sun
     for name in ("tally", "four_wheel_steering", "posterior"):

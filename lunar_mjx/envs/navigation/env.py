@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.cameras.batch import Light, pictures
+from lunar_mjx.cameras.mount import front_mount
 from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.effects.power.supply import charge_of
@@ -677,7 +678,8 @@ class NavigationEnv:
                 self.model.rover,
                 view.qpos,
                 c.camera,
-                light=Light(sun=c.sun),
+                front_mount(self.model.rover, c.camera_pitch_deg),
+                Light(sun=c.sun),
                 far=c.camera_far,
                 lit=CAMERA + "rgb" in names,
             )
