@@ -38,7 +38,7 @@ class Finding:
 
     @property
     def where(self) -> str:
-        """Log, table, line and column in a few words."""
+        """Place of the finding in a few words: log, table, line and column."""
         place = self.log + (f"/{self.table}" if self.table else "")
         line = "" if self.row is None else f", line {self.line}"
         return place + line + (f", {self.column}" if self.column else "")

@@ -27,7 +27,7 @@ def continuous(log: Log, name: str) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def known(log: Log, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times, s, and values of a channel that has been seen to be there (by `span`): as `continuous`, and never None."""
+    """Times, s, and values of a channel that `span` has found, without gaps and without jumps of a wrapped angle."""
     samples = continuous(log, name)
     assert samples is not None, name
     return samples
@@ -45,7 +45,7 @@ def at(log: Log, name: str, time: np.ndarray) -> np.ndarray | None:
 
 
 def known_at(log: Log, name: str, time: np.ndarray) -> np.ndarray:
-    """As `at`, of a channel that has been seen to be there."""
+    """(n,) values of a channel that `span` has found, at other times; NaN outside its span."""
     return _straight(known(log, name), time)
 
 

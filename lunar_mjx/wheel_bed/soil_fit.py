@@ -205,7 +205,7 @@ def fit(
 
 
 def _physical(f: Free, unit: Any, numpy: Any) -> Any:
-    """The parameter's value at a place in [0, 1] of its range."""
+    """A parameter's value in its unit, from its place in [0, 1] of the searched range."""
     # Moduli range over decades: a step by a share is alike everywhere.
     if f.log:
         return numpy.exp(np.log(f.low) + unit * np.log(f.high / f.low))

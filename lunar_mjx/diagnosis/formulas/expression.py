@@ -61,7 +61,7 @@ def parsed(text: str, quantities: tuple[Quantity, ...]) -> Expr:
 
 
 def canonical(expression: Expr) -> Expr:
-    """The simplified form without its leading number, which the amount takes in."""
+    """The simplified formula without its leading number, which the fitted amount takes up."""
     return _simplified(expression).as_coeff_Mul()[1]
 
 
@@ -82,7 +82,7 @@ def same(a: Expr, b: Expr) -> bool:
 
 
 def _print_of(expression: Expr, symbols: Sequence[Any]) -> bytes:
-    """Values at random arguments on a scale of their own, rounded: alike for what is algebraically equal."""
+    """Fingerprint of a formula: rounded values at random arguments, alike for formulas that are algebraically equal."""
     # A fixed seed: what is printed in one call is compared with what was printed in another.
     rng = np.random.default_rng(7)
     size = 24
@@ -195,7 +195,7 @@ def per(unit: str, powers: Mapping[str, int]) -> str:
 
 
 def without_floors(expression: Expr) -> Any:
-    """The formula to be read: without the small numbers below which an argument of a logarithm is held."""
+    """The formula as it is to be read: without the small numbers that hold a logarithm's argument off zero."""
     import sympy
 
     def bare(*arguments: Any) -> Any:

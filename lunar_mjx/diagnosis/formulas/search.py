@@ -64,7 +64,7 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """A refitted formula, or two.
+    """One formula, or two together, with their refit and what it gained.
 
     Attributes:
       choices: the formulas. slots: the problem that holds them. fit: the refit.
@@ -82,18 +82,18 @@ class Trial:
 
     @property
     def length(self) -> int:
-        """Operations and symbols."""
+        """Number of operations and symbols in all its formulas."""
         return sum(long(c) for c in self.choices)
 
     @property
     def merit(self) -> float:
-        """What they are ordered by: how far the squared residual falls, less what their length costs."""
+        """Score that orders trials: how far the squared residual falls, less a penalty by length."""
         return self.drop - FORMULA_SEARCH.penalty * self.length
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Found:
-    """What a search has found: the model as it is, trials best first, and all scores at it, highest first."""
+    """Result of a search: the model without formulas, trials best first, and all scores at it, highest first."""
 
     empty: Slots
     base: Fit
@@ -114,7 +114,7 @@ class _Scores:
     scale: np.ndarray
 
     def order(self) -> np.ndarray:
-        """Places, best first."""
+        """Indices of the formulas, the best first: by chi-square less a penalty by length."""
         return np.argsort(
             -(self.chi2 - FORMULA_SEARCH.penalty * np.array([long(c) for c in self.choices])), kind="stable"
         )
@@ -124,7 +124,7 @@ _LENGTHS: dict[tuple[int, int, int], int] = {}
 
 
 def long(choice: Choice) -> int:
-    """Operations and symbols of a formula."""
+    """Number of operations and symbols of a formula."""
     key = (choice.target, choice.first, choice.second)
     if key not in _LENGTHS:
         of, target = features(choice.port), targets()[choice.target]
@@ -229,7 +229,7 @@ class _Search:
         )
 
     def _without(self, slots: Slots, at: Fit, dropped: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residual, and the columns and the leash of all that moves, of a fit without one of its formulas."""
+        """Residual (n,), columns (n, k) and prior weights (k,) of a fit from which one formula is taken away."""
         prior = leash(slots.problem, at)
         if dropped is None:
             return at.residual, at.jacobian, prior
@@ -239,14 +239,14 @@ class _Search:
         return at.residual + column * at.u[place], at.jacobian[:, stay], prior[stay]
 
     def _left(self, slots: Slots, at: Fit, dropped: int | None) -> list[int]:
-        """Places that a fit moves without one of its formulas."""
+        """Coordinates that a fit still moves once one of its formulas is taken away."""
         own = slots.own(dropped) if dropped is not None else []
         return [int(i) for i in at.free if i not in own]
 
     def refit(
         self, slots: Slots, at: Fit, scores: _Scores, most: int, alike: float, dropped: int | None = None
     ) -> list[Trial]:
-        """Refits the best-scored formulas that are not tried yet, and do not look the same in these data."""
+        """Trials of the best-scored formulas that were not tried yet, one of each family that these data tell apart."""
         held = {k: v for k, v in slots.held.items() if k != dropped}
         kept = frozenset(c for c, _ in held.values())
         unit = scores.signature / np.maximum(np.linalg.norm(scores.signature, axis=0), 1e-12)
@@ -300,7 +300,7 @@ class _Search:
         return Trial(choices, slots, found, gain, se, drop, noise_test(slots.problem, found).passes)
 
     def linear(self, trials: Sequence[Trial], most: int = 5) -> list[Trial]:
-        """The best that multiply by exp x once more with 1 + x."""
+        """Trials of the best formulas that multiply by exp x, with 1 + x in its place."""
         out = []
         for t in sorted(trials, key=lambda t: -t.merit)[:most]:
             ((k, (choice, scale)),) = t.slots.held.items()
@@ -310,7 +310,7 @@ class _Search:
         return [t for t in out if t is not None]
 
     def finished(self, trials: Sequence[Trial]) -> list[Trial]:
-        """The best with their descents at an end, and the others."""
+        """The trials, the best of them refitted until their descent has settled."""
         ordered = sorted(trials, key=lambda t: -t.merit)
         done = []
         for t in ordered[: FORMULA_SEARCH.finished]:
@@ -320,7 +320,7 @@ class _Search:
         return done + ordered[FORMULA_SEARCH.finished :]
 
     def pairs(self, trials: Sequence[Trial], choices: Sequence[Choice]) -> list[Trial]:
-        """The best singles with a second formula, where they leave a rest."""
+        """Trials of the best single formulas with a second one, where the single leaves more than noise."""
         out: list[Trial] = []
         for t in sorted(trials, key=lambda t: -t.merit)[: FORMULA_SEARCH.seeds]:
             # where a single formula left noise alone, a second could only explain noise

@@ -30,13 +30,13 @@ _SHAPED = {k for k, v in CONSTANTS.items() if v[4]}
 
 @functools.cache
 def targets() -> tuple[Target, ...]:
-    """Everything that slots may change, in the order of their numbers."""
+    """Everything that slots may change; a `Choice` names its target by the place in this tuple."""
     return tuple(t for port in WHEEL_PORTS for t in wheel_targets(port))
 
 
 @functools.cache
 def shaped(port: str) -> tuple[str, ...]:
-    """By feature of a port: the constant that a fit refines, or nothing."""
+    """For every feature of a port the name of the constant in it that a fit refines; empty without one."""
     return tuple(next((str(s) for s in e.free_symbols if str(s) in _SHAPED), "") for e in features(port))
 
 
@@ -51,7 +51,7 @@ class Choice:
 
     @property
     def port(self) -> str:
-        """Where it acts."""
+        """Port at which the formula acts."""
         return targets()[self.target].port
 
     @property
@@ -61,7 +61,7 @@ class Choice:
 
     @property
     def shape(self) -> str:
-        """The constant in it that a fit refines, or nothing."""
+        """Name of the constant in the formula that a fit refines; empty without one."""
         names = shaped(self.port)
         return names[self.first] or names[self.second]
 
@@ -74,7 +74,7 @@ class Choice:
 
 @functools.cache
 def library(ports: tuple[str, ...]) -> tuple[Choice, ...]:
-    """All formulas at some ports; two constants to be refined are one too many."""
+    """All formulas at some ports that hold at most one constant to refine."""
     functions = []
     for k, target in enumerate(targets()):
         if target.port not in ports:
@@ -98,7 +98,7 @@ _NUMBERS = ("target", "first", "second", "scale", "linear")
 
 @functools.cache
 def slots_effect(early: bool) -> Effect:
-    """The effect that holds any formulas, before the forces are made or after."""
+    """The effect that computes the formulas chosen by its parameters, before (`early`) or after the port's laws."""
     ports = {}
     for port in WHEEL_PORTS:
         mine = [(k, t) for k, t in enumerate(targets()) if t.port == port and (t.order < 0) == early]
@@ -192,24 +192,24 @@ class Slots:
         return given
 
     def own(self, number: int) -> list[int]:
-        """Places of a slot's amount, and of its constant where its formula has one."""
+        """Coordinates of a slot: its amount's, and its constant's where its formula has one."""
         choice = self.held[number][0]
         # Amounts come first among the parameters, and then constants, each by slot.
         places = [int(i) for i in self.problem.candidates[_name(choice)]]
         return [places[number], places[SLOTS + number]] if choice.shape else [places[number]]
 
     def place(self, number: int) -> int:
-        """Place of a slot's amount among the coordinates."""
+        """Coordinate of a slot's amount."""
         return self.own(number)[0]
 
     @property
     def free(self) -> np.ndarray:
-        """Places of what a fit moves: the baseline, amounts, and constants of formulas."""
+        """Coordinates that a fit moves: the baseline's, and every slot's amount and constant."""
         return np.concatenate([self.problem.baseline, *(self.own(k) for k in self.held)]).astype(int)
 
     @property
     def spare(self) -> int:
-        """A slot that holds nothing."""
+        """Number of the first slot without a formula."""
         return next(k for k in range(SLOTS) if k not in self.held)
 
     def probes(self, u: np.ndarray, which: Sequence[int]) -> dict[int, np.ndarray]:

@@ -112,7 +112,7 @@ def features(port: str) -> tuple[Expr, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """Something that a formula changes.
+    """A quantity at a port that a formula changes by adding to it or by multiplying it.
 
     Attributes:
       port: where. words: what. symbol: what it is called in formulas.
@@ -134,7 +134,7 @@ class Target:
 
     @property
     def multiplies(self) -> bool:
-        """Whether the amount is in a factor."""
+        """Whether the formula multiplies the quantity; else it adds to it."""
         return "factor" in self.change
 
 

@@ -63,7 +63,7 @@ class Term:
 
     @property
     def name(self) -> str:
-        """Name of its effect."""
+        """Name of the effect that the formula becomes."""
         return "term_" + re.sub(r"\W+", "_", f"{self.port}_{self.target}_{_words(self.formula)}").strip("_")
 
 

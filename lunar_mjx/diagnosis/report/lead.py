@@ -102,7 +102,7 @@ def _using(run: Path) -> str:
 
 
 def _searched(judge: Result) -> bool:
-    """Whether the search for effects came to its own end."""
+    """Whether the search for effects ended by itself, not by its time."""
     search = ((judge.verdict or {}).get("details") or {}).get("search") or {}
     return bool(search.get("complete", True))
 

@@ -16,7 +16,7 @@ _DRAWS = 1000
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Step:
-    """A model of the chain.
+    """One model of a chain of runs, with the row of its residuals and predictions in its run.
 
     Attributes:
       label: what it is. short: the same on an axis. run: name of its run folder.
@@ -37,7 +37,7 @@ class Step:
 
     @property
     def residual(self) -> np.ndarray:
-        """(n,) residual, in sigma, as errors are told."""
+        """(n,) residuals in sigma, weighed as `compare` tells errors."""
         assert self.result.traces is not None
         return self.result.traces.residual[self.row]
 

@@ -345,7 +345,7 @@ def _effects(
 
 
 def _next(result: Result) -> list[str]:
-    """What to measure next: what `next` found, else what to do now."""
+    """Sentences on what to do next: the measurements that `next` ranked, else the steps of the report."""
     planned = (result.next or {}).get("sentence")
     steps = [str(line) for line in lead([result], result).next]
     return [str(planned)[:600], *steps] if planned else steps

@@ -29,7 +29,7 @@ def plus_minus(value: Any, std: Any, unit: str = "") -> str:
 
 
 def error_rows(steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[Error | None], measure: str) -> Table:
-    """The numbers of the waterfall."""
+    """Table of every model's error and interval on the judged and the fitted splits, as the waterfall draws them."""
     rows = []
     for i, (step, step_error, fit) in enumerate(zip(steps, judged, fitted, strict=True)):
         change = "" if i == 0 else f"{100.0 * (step_error.value / judged[i - 1].value - 1.0):+.0f} %"

@@ -112,7 +112,7 @@ def _not_used(model: Model) -> str:
 
 
 def contact_laws(model: Model, rivals: Sequence[str]) -> dict[str, Model]:
-    """The model, and the same with each of some rival contact laws in place of its own.
+    """Models by contact law: the model under the name of its own, and a copy with each rival law instead.
 
     Raises:
       UserError: no such law.
@@ -130,7 +130,7 @@ def contact_laws(model: Model, rivals: Sequence[str]) -> dict[str, Model]:
 
 
 def with_law(model: Model, law: str) -> Model:
-    """The model with another contact law in place of its own."""
+    """A copy of the model with a contact law of `LAWS` in place of its own."""
     foreign = _CONTACT | (_OF_REECE | build_problem.FINER_FORMS if law == "granular_resistance" else frozenset())
     for name in [n for n in model.effect_names if n in foreign]:
         model = model.remove(name)
@@ -140,7 +140,7 @@ def with_law(model: Model, law: str) -> Model:
 
 
 def better_law(forms: Mapping[str, float], model: Model, sure: float = TableSettings().sure) -> str | None:
-    """An effect that stands for the contact law which surely explains tables better than the model's own, if any."""
+    """Name of the effect of a rival contact law that surely explains tables better than the model's own, or None."""
     if not forms:
         return None
     best = max(forms, key=lambda name: forms[name])

@@ -46,7 +46,7 @@ class Scatter:
 
     @property
     def dependence(self) -> float:
-        """Neighbours whose squares count as one: squares of AR(1) noise correlate by its correlation squared."""
+        """Number of neighbours whose squares count as one: squares of AR(1) noise correlate by correlation squared."""
         return (1.0 + self.correlation**2) / (1.0 - self.correlation**2)
 
 

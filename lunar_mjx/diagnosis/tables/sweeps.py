@@ -92,7 +92,7 @@ def rank_sweeps(
 
 
 def _separation(true: _Expected, judge: _Expected, rows: np.ndarray) -> float:
-    """Length in sigma of a difference of means under the covariance that one of both hypotheses expects."""
+    """Distance of two means, in sigma, under the covariance that `judge`, one of both hypotheses, expects."""
     away = (true.mean - judge.mean)[rows]
     columns = judge.columns[rows]
     covariance = columns @ judge.covariance @ columns.T

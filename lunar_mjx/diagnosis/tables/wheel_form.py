@@ -191,23 +191,23 @@ class WheelForm(MeasuredForm):
         return values[at], slopes[at]
 
     def predicted(self, u: np.ndarray) -> np.ndarray:
-        """See `MeasuredForm`."""
+        """(n,) predictions in SI units at (coordinates,)."""
         return self.predict(u)[0]
 
     def corrected(self, best: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
-        """See `MeasuredForm`."""
+        """Predictions (n,) in SI units and whitened residuals (n,), both with the learnt discrepancy added."""
         _, columns, residual = self.linearise(best.refit.u)
         learnt = columns[:, best.places] @ best.evidence.mean
         return self.predicted(best.refit.u) + self.observations.sigma() * learnt, residual - learnt
 
     def signatures(self, refit: Refit) -> dict[str, np.ndarray]:
-        """See `MeasuredForm`."""
+        """(fitted,) whitened change of the predictions by each candidate at its prior size, by effect."""
         _, columns, _ = self.linearise(refit.u)
         std, fit = refit.linear.amplitudes.std, self._fit
         return {name: columns[fit][:, places] @ std[places] for name, places in self.candidates.items()}
 
     def linearise(self, u: np.ndarray) -> tuple[Linear, np.ndarray, np.ndarray]:
-        """Everything that hypotheses need around a place; whitened columns (n, k) and residuals (n,) beside it."""
+        """Gram matrices of all that a hypothesis may hold, about a place; whitened columns (n, k), residuals (n,)."""
         data, settings, count = self.data, self.settings, len(self.coordinates)
         value, slope = self.predict(u)
         if not np.isfinite(value).all() or not np.isfinite(slope).all():
@@ -288,7 +288,7 @@ class WheelForm(MeasuredForm):
         return np.searchsorted(np.array(self.data.measured), self.data.quantity)
 
     def _share(self, gain: Gain) -> float:
-        """Size of a gain over that of its field."""
+        """Prior size of a port's gain relative to the size of its field of discrepancy."""
         return {ADDED: self.settings.added_force, DRAWN: self.settings.drawn_radius}.get(gain.kind, 1.0)
 
     def _fields(self, slope: np.ndarray, added: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -366,7 +366,7 @@ class WheelForm(MeasuredForm):
         return (np.column_stack(columns), np.array(std), {n: np.flatnonzero([o == n for o in of]) for n in names})
 
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
-        """See `Form`; Levenberg-Marquardt under the covariance of noise, calibration and discrepancy.
+        """The most probable refit with some effects, under the covariance of noise, calibration and discrepancy.
 
         The sizes of these are inferred anew where a descent has ended, and the next begins there, as long as the
         evidence rises: discrepancies are shares of what is predicted, so that no single function is descended.
@@ -401,7 +401,7 @@ class WheelForm(MeasuredForm):
         return best[1]
 
     def alone(self, refit: Refit) -> np.ndarray:
-        """See `MeasuredForm`; least squares under the noise alone, from where the refit has ended."""
+        """(coordinates,) where the model alone predicts best: least squares under the noise, begun at the refit."""
         free = self._free(refit.effects)
         return self._descend(refit.u, free, refit.linear, None)
 
@@ -410,7 +410,7 @@ class WheelForm(MeasuredForm):
         return np.array([self.coordinates[i].bounds() for i in free], float).reshape(-1, 2).T
 
     def _free(self, effects: frozenset[str]) -> np.ndarray:
-        """Places of what a refit with some effects moves."""
+        """(k,) places of the coordinates that a refit with some effects moves: the baseline's and the effects'."""
         return np.concatenate([self.baseline, *(p for e, p in self.candidates.items() if e in effects)]).astype(int)
 
     def _descend(

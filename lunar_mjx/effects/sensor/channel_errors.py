@@ -19,7 +19,7 @@ def _matching(signals: Signals, pattern: str) -> list[str]:
 
 
 def _entry(value: Any, index: int) -> Any:
-    """The value of one joint, from one number for all or one per joint."""
+    """One joint's value of a parameter that is one number for all joints, or one for each."""
     value = jnp.asarray(value)
     return value[index] if value.ndim else value
 

@@ -73,7 +73,7 @@ def rut_under(ctx, p, x):
 
 
 def _remember(ctx, ground, p, x):
-    """Drops a place where the wheel is `spacing` away from its last one, and forgets the oldest.
+    """The remembered places and depths of every wheel, with a new place once it is `spacing` from its last one.
 
     The latest place deepens with the wheel: a wheel that is set down touches its first place before it sinks in.
     """

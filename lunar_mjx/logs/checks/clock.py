@@ -36,7 +36,7 @@ _RATES = {"joint_angle": "joint_speed", "position": "world_velocity"}
 
 
 def check_clock(log: Log) -> list[Finding]:
-    """Time of every table, and that the tables share an origin."""
+    """Findings on the times of every table, and on whether the tables share an origin."""
     findings: list[Finding] = []
     for table in log.tables.values():
         findings += _check_table(log, table)
@@ -121,7 +121,7 @@ def _check_rate(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
 
 
 def _check_jumps(log: Log, table: LogTable, steps: np.ndarray) -> list[Finding]:
-    """Lost samples beyond the tolerable, and gaps in which a moving rover did not move: there the clock jumped."""
+    """Findings of lost samples beyond the tolerable, and of gaps in which a moving rover did not move: clock jumps."""
     base = float(np.median(steps))
     lost = float(np.sum(np.maximum(np.round(steps / base) - 1.0, 0.0)))
     # Three steps: one or two lost samples are common, and too short to tell a jump from noise.
@@ -211,7 +211,7 @@ def _usual(table: LogTable, integral: str, rate: str, steps: np.ndarray, base: f
 
 
 def _check_overlap(log: Log) -> list[Finding]:
-    """All tables count from one origin: each must share half of its span, or of the other's, with the longest one."""
+    """Findings of tables that share less than half of their span, or of the longest one's, with that: other origins."""
     tables = list(log.tables.values())
     longest = max(tables, key=lambda t: float(np.ptp(t.common_time_s)))
     low, high = longest.common_time_s[0], longest.common_time_s[-1]

@@ -54,7 +54,7 @@ FRAME_LIMITS = FrameLimits()
 
 
 def check_frames(log: Log) -> list[Finding]:
-    """Attitude, gravity, velocities against positions, turning against wheels."""
+    """Findings on attitude, gravity, velocities against positions, and turning against the wheels."""
     findings = _quaternion(log)
     if not findings:
         findings += _euler(log) + _gravity(log)
@@ -134,7 +134,7 @@ def _rotation(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.
 
 
 def _euler(log: Log) -> list[Finding]:
-    """Euler angles against the quaternion, where a log has both."""
+    """Findings where Euler angles contradict the quaternion of the same log."""
     limits = span(log, (*QUATERNION, "roll_deg", "pitch_deg", "yaw_deg"))
     if limits is None:
         return []
@@ -159,7 +159,7 @@ def _euler(log: Log) -> list[Finding]:
 
 
 def _gravity(log: Log) -> list[Finding]:
-    """At rest and on the mean of a drive the accelerometer reads +g along the world's z."""
+    """Findings where the accelerometer, at rest or on average, does not read +g along the world's z."""
     names = [f"accelerometer_{a}_m_s2" for a in "xyz"]
     limits = span(log, names)
     if limits is None:
@@ -228,7 +228,7 @@ def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Ag
 
 
 def _velocities(log: Log) -> list[Finding]:
-    """Velocities against positions: unit, sign, swapped axes."""
+    """Findings where velocities do not fit positions: unit, sign, swapped axes."""
     pairs = {a: (f"position_{a}_m", f"world_velocity_{a}_m_s") for a in "xyz"}
     findings = _paired(log, pairs, "the change of") or _ground_speed(log)
     limits = span(log, [f"{k}_velocity_{a}_m_s" for k in ("world", "body") for a in "xy"])
@@ -258,7 +258,7 @@ def _velocities(log: Log) -> list[Finding]:
 
 
 def _ground_speed(log: Log) -> list[Finding]:
-    """Forward velocity against the way that positions tell, over a tenth of the drive at a time."""
+    """Findings where the forward velocity does not fit the way that positions tell, by tenths of the drive."""
     names = ("position_x_m", "position_y_m", "body_velocity_x_m_s")
     limits = span(log, names)
     if limits is None:
@@ -280,13 +280,13 @@ def _ground_speed(log: Log) -> list[Finding]:
 
 
 def _turning(log: Log) -> list[Finding]:
-    """The gyroscope against the attitude."""
+    """Findings where the gyroscope does not fit the change of the attitude."""
     pairs = {"z": ("yaw_deg", "gyro_z_rad_s"), "x": ("roll_deg", "gyro_x_rad_s"), "y": ("pitch_deg", "gyro_y_rad_s")}
     return _paired(log, pairs, "the change of", scale=57.29577951308232)
 
 
 def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float = 1.0) -> list[Finding]:
-    """Each channel against its rate: a wrong factor, or a rate that is another channel's."""
+    """Findings of channels that do not follow their rates: a wrong factor, or another channel's rate."""
     findings = []
     for key, (integral, rate) in pairs.items():
         own = rate_agreement(log, integral, rate, scale)
@@ -366,7 +366,7 @@ def _side_speeds(log: Log) -> tuple[list[str], list[str]]:
 
 
 def _left_right(log: Log) -> list[Finding]:
-    """A rover whose right wheels run faster turns left; front wheels steered left turn a forward drive left."""
+    """Findings where a rover turns against its wheels: faster right wheels and left steering turn it left."""
     turn = _turn_rate(log)
     own_left, own_right = _side_speeds(log)
     sides = [*own_left, *own_right]
@@ -430,7 +430,7 @@ def _climbs(log: Log, windows: np.ndarray, spin: np.ndarray) -> np.ndarray:
 
 
 def _course(log: Log) -> list[Finding]:
-    """A rover that is not steered goes where its wheels drive it, along its heading; unless it slides back downhill."""
+    """Findings where an unsteered rover does not move along its heading as its wheels drive, sliding downhill apart."""
     names = ("position_x_m", "position_y_m", "yaw_deg")
     drives = [n for side in _side_speeds(log) for n in side]
     limits = span(log, (*names, *drives))

@@ -35,7 +35,7 @@ MOTOR_LIMITS = MotorLimits()
 
 
 def check_motors(log: Log) -> list[Finding]:
-    """Every joint, and every pair of corners."""
+    """Findings on every joint's motor, and on pairs of corners whose channels may be swapped."""
     findings = _against(log)
     for kind in ("drive", "steer", "sus"):
         for quantity in ("speed_rad_s", "angle_rad"):
@@ -53,7 +53,7 @@ def _present(log: Log, pattern: str) -> dict[str, str]:
 
 
 def _against(log: Log) -> list[Finding]:
-    """Currents with a sign: a driven rover takes power, so that current and speed agree in sign on average.
+    """Findings of currents that oppose their speed on average, where a driven rover takes power.
 
     A warning only: a motor may brake all the way down a slope that no channel tells.
     """
@@ -79,7 +79,7 @@ def _against(log: Log) -> list[Finding]:
 
 
 def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
-    """Measured joints against their commands, and against other corners' commands."""
+    """Findings of joints that do not follow their commands, or follow another corner's."""
     measured = _present(log, f"joint_{{}}_{kind}_{quantity}")
     commanded = _present(log, f"command_{{}}_{kind}_{quantity}")
     corners = [c for c in measured if c in commanded]
@@ -140,7 +140,7 @@ def _held(log: Log, name: str, time: np.ndarray) -> np.ndarray:
 def _swapped(
     log: Log, names: dict[str, str], seen: dict[str, np.ndarray], wanted: dict[str, np.ndarray], what: str
 ) -> list[Finding]:
-    """Pairs of corners whose channels fit each other's reference far better than their own."""
+    """Findings of two corners whose channels fit each other's reference far better than their own."""
 
     def miss(a: str, b: str) -> float:
         # the response is taken a little later too, so that a controller's lag does not count
@@ -174,7 +174,7 @@ def _swapped(
 
 
 def _angles(log: Log, kind: str) -> list[Finding]:
-    """Angles against speeds."""
+    """Findings of joint angles that do not follow their speeds."""
     angles, speeds = _present(log, f"joint_{{}}_{kind}_angle_rad"), _present(log, f"joint_{{}}_{kind}_speed_rad_s")
     findings = []
     for c, angle in angles.items():
@@ -207,7 +207,7 @@ def _angles(log: Log, kind: str) -> list[Finding]:
 
 
 def _crossed_speeds(log: Log, kind: str, angles: dict[str, str], speeds: dict[str, str]) -> list[Finding]:
-    """Angles of two joints that fit each other's speed."""
+    """Findings of two joints whose angles fit each other's speed."""
     corners = [c for c in angles if c in speeds]
     limits = span(log, [angles[c] for c in corners] + [speeds[c] for c in corners]) if corners else None
     if limits is None or kind != "drive":
@@ -233,7 +233,7 @@ def _crossed_speeds(log: Log, kind: str, angles: dict[str, str], speeds: dict[st
 
 
 def _electric(log: Log, kind: str) -> list[Finding]:
-    """V = R I + k omega with R and k positive: units of the current, swapped columns, swapped motors."""
+    """Findings where V = R I + k omega asks for a negative R or k: unit of the current, swapped columns or motors."""
     current, voltage = _present(log, f"motor_{{}}_{kind}_current_A"), _present(log, f"motor_{{}}_{kind}_voltage_V")
     speed = _present(log, f"joint_{{}}_{kind}_speed_rad_s")
     corners = [c for c in current if c in voltage and c in speed]
@@ -325,7 +325,7 @@ def _crossed_currents(log: Log, names: dict[str, str], data: dict[str, _Motor]) 
 
 
 def _heat(log: Log, kind: str) -> list[Finding]:
-    """The winding, where the heat is made, rises above the housing while current flows."""
+    """Findings of windings that do not rise above their housings while current flows."""
     winding = _present(log, f"winding_{{}}_{kind}_temperature_degC")
     housing = _present(log, f"housing_{{}}_{kind}_temperature_degC")
     current = _present(log, f"motor_{{}}_{kind}_current_A")

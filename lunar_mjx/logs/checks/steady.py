@@ -45,7 +45,7 @@ STEADY_LIMITS = SteadyLimits()
 
 
 def check_steady(log: SteadyLog) -> list[Finding]:
-    """Findings beyond what reading found."""
+    """Findings on a steady-state table beside those of its reader."""
     if len(log.table) == 0:
         return [Finding(log.name, "", None, "", "dropout", "holds no usable row; see the other findings, or fill it")]
     findings = _copies(log) + _ranges(log) + _signs(log) + _swapped(log) + _clipped(log) + _noiseless(log)
@@ -65,7 +65,7 @@ def _columns(log: SteadyLog) -> dict[str, np.ndarray]:
 
 
 def _copies(log: SteadyLog) -> list[Finding]:
-    """Rows whose measured values all occur again, more often than the digits of the instruments explain."""
+    """Findings of rows whose measured values occur again, more often than the instruments' digits explain."""
     measured = np.column_stack(list(log.table.measured.values()))
     if measured.shape[1] < 2:  # one quantity with few digits repeats by chance
         measured = np.column_stack([measured, *log.table.test.values()])
@@ -157,7 +157,7 @@ def _ranges(log: SteadyLog) -> list[Finding]:
 
 
 def _signs(log: SteadyLog) -> list[Finding]:
-    """Pull and torque grow with slip; a wheel sinks downwards; both by rank over the whole table."""
+    """Findings where pull or torque fall with slip, or the wheel sinks upwards, by rank over the whole table."""
     findings = []
     slip = log.table.test["slip_ratio"]
     for quantity in ("drawbar_pull", "driving_torque"):
@@ -194,7 +194,7 @@ def _signs(log: SteadyLog) -> list[Finding]:
 
 
 def _swapped(log: SteadyLog) -> list[Finding]:
-    """A wheel that heads where it goes has no side force; one that follows the slip there is the drawbar pull."""
+    """Findings where side force and drawbar pull are swapped: without a slip angle only the pull follows slip."""
     side, pull = log.table.measured.get("side_force"), log.table.measured.get("drawbar_pull")
     straight = np.abs(log.table.test["slip_angle_deg"]) < 1.0
     slip = log.table.test["slip_ratio"][straight]
@@ -209,7 +209,7 @@ def _swapped(log: SteadyLog) -> list[Finding]:
 
 
 def _clipped(log: SteadyLog) -> list[Finding]:
-    """An extreme value that many rows share, where other values do not repeat so often: the instrument's limit."""
+    """Findings of an extreme value that many rows share although others hardly repeat: the instrument's limit."""
     findings = []
     for quantity, values in log.table.measured.items():
         count = np.unique(values, return_counts=True)[1]
@@ -229,7 +229,7 @@ def _clipped(log: SteadyLog) -> list[Finding]:
 
 
 def _noiseless(log: SteadyLog) -> list[Finding]:
-    """Quantities whose noise neither the log nor replicates tell: nothing could be counted in sigma."""
+    """Findings of quantities whose noise neither the log nor replicates tell, so that nothing counts in sigma."""
     stated_sigma = average(log.table).sigma
     findings = []
     for quantity in log.table.measured:
@@ -243,7 +243,7 @@ def _noiseless(log: SteadyLog) -> list[Finding]:
 
 
 def _replicates(log: SteadyLog) -> list[Finding]:
-    """The scatter of replicates against the stated noise, pooled over the points, by chi-square."""
+    """Findings where the scatter of replicates contradicts the stated noise, by a chi-square over all points."""
     group = replicate_groups(log.table)
     count = np.bincount(group)
     freedom = int((count - 1).sum())

@@ -41,7 +41,7 @@ VALUE_LIMITS = ValueLimits()
 
 
 def check_values(log: Log) -> list[Finding]:
-    """Every channel by itself, and by its stated noise."""
+    """Findings on the values of every channel by itself, and beside its stated noise."""
     findings: list[Finding] = []
     for table in log.tables.values():
         for name in table.channels:

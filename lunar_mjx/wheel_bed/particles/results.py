@@ -53,7 +53,7 @@ def variant_numerics(numerics: Numerics, variant: str) -> Numerics:
 
 
 def error_share(variant: str) -> float:
-    """Error of the table's settings over the difference between it and a variant, per quantity.
+    """Ratio of the numerical error at the table's settings to the difference that a variant of them makes.
 
     Voxel and time step are assumed to err by the first power of their size (no runs of three sizes exist); two
     contacts bracket the truth, of which the whole gap is told; two jitters differ by root two times the scatter of one.
