@@ -26,7 +26,6 @@ from harness import (
     COMMIT,
     DURING,
     FINAL,
-    SMALL_TASK,
     Clock,
     Judge,
     Setup,
@@ -46,7 +45,8 @@ from lunar_mjx.agents.train import RunConfig, train
 from lunar_mjx.envs import make_agent
 from lunar_mjx.envs.navigation.observations import CAMERA
 
-TINY = {"camera_width": 16, "camera_height": 12, **SMALL_TASK["large"]}
+TINY = {"camera_width": 16, "camera_height": 12}
+"""Beside the small task of `harness`."""
 
 
 def words() -> argparse.Namespace:

@@ -11,6 +11,7 @@ import pytest
 
 from lunar_mjx.agents.configs import get_training, learner_name
 from lunar_mjx.agents.evaluate import evaluate
+from lunar_mjx.agents.export.graphs import to_onnx
 from lunar_mjx.agents.from_teacher.distill import Distill, DistillConfig, Lesson
 from lunar_mjx.agents.learner import Learner, TrainConfig
 from lunar_mjx.agents.networks import make_actor
@@ -65,9 +66,20 @@ def test_the_student_reads_from_a_picture_what_the_teacher_is_told(teacher, tmp_
     taught = load_policy(teacher).act(state.privileged)
     apart = np.asarray(policy.act(state.obs) - taught)
     assert np.sqrt(np.mean(apart**2)) < 0.2 < np.sqrt(np.mean(np.asarray(taught) ** 2))
+    with pytest.raises(UserError, match="no graph in ONNX yet; give --only stablehlo"):
+        to_onnx(policy)
     drives = evaluate(env, lambda state, key: policy.act(state.obs), 128, seed=9)
     blind = evaluate(env, lambda state, key: policy.act(state.obs.at[:, 2:].set(policy.mean[2:])), 128, seed=9)
     assert drives.low > 0.8 > 0.5 > blind.high
+
+
+@pytest.mark.parametrize("picture", [[2, 3, 3, 1], [0, 2, 2, 0], [1, 2, 2], "all"])
+def test_a_file_whose_picture_lies_beyond_its_observations_is_refused(picture, teacher, tmp_path):
+    good = load_policy(teacher)
+    network = {**good.network, "obs": 10, "picture": picture, "filters": [2]}
+    path = save_policy(dataclasses.replace(good, network=network), tmp_path / "bad.npz")
+    with pytest.raises(UserError, match="picture"):
+        load_policy(path)
 
 
 def test_the_teacher_hands_over_environment_by_environment(teacher):
