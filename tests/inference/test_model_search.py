@@ -12,7 +12,7 @@ from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
 from lunar_mjx.inference.evidence import EvidenceError, Gram, NoiseSize
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Term, shifted
 from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, search
-from tests.inference.toy_form import EFFECTS, NOISE, ToyForm, X, curve, measured
+from tests.inference.toy_form import EFFECTS, NOISE, ToyForm, TwoValleys, X, curve, measured
 
 
 def look(value, **more):
@@ -53,6 +53,35 @@ def test_every_accepted_effect_is_challenged_by_a_refit_without_it():
     assert len(best.effects) == 2
     refitted = {h.effects for h in listed}
     assert {best.effects - {e} for e in best.effects} <= refitted
+
+
+def test_a_better_valley_is_no_effect():
+    found = search([TwoValleys(measured(0))], most_refits=12, most_terms=4, window=4.0)
+    assert conclude(found, 0.95).verdict is Verdict.NOISE_ONLY
+    assert found.best.refitted and not found.best.terms and found.best.refit.u[0] < 0.0
+    # The effect that was tried first fell into that valley, and counts for what it is worth there.
+    tried = [h for h in found.hypotheses if h.refitted and len(h.effects) == 1]
+    assert tried and all(h.log_posterior < found.best.log_posterior for h in tried)
+
+
+def test_an_effect_is_found_in_a_better_valley():
+    found = search([TwoValleys(measured(1, wave=0.8))], most_refits=20, most_terms=4, window=4.0)
+    assert conclude(found, 0.95).effects == ("wave",)
+
+
+def test_what_ended_in_a_worse_valley_is_refitted_from_a_better_one():
+    class Late(TwoValleys):
+        """Only `twin` leads into the better valley."""
+
+        def refit(self, effects, near, start):
+            if start is not None and effects and "twin" not in effects and near.u[0] > 0.0:
+                return ToyForm.refit(self, effects, near, start)
+            return super().refit(effects, near, start)
+
+    value = measured(2, wave=0.8)
+    found = search([Late(value)], most_refits=30, most_terms=4, window=4.0)
+    assert conclude(found, 0.95).effects == ("wave",)
+    assert found.best.refit.u[0] < 0.0
 
 
 def test_something_unlisted_is_unknown_at_its_port():

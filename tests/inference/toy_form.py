@@ -24,6 +24,7 @@ class ToyForm(Form):
     """Values measured at X."""
 
     name, log_prior = "toy", 0.0
+    curve = staticmethod(curve)
     terms = (
         *(Term(e, EFFECT, math.log(0.02)) for e in EFFECTS),
         Term("level", UNLISTED, math.log(0.01)),
@@ -42,23 +43,23 @@ class ToyForm(Form):
         def residual(x):
             place = u.copy()
             place[free] = x
-            return np.concatenate([(self.value - curve(place)) / NOISE, x / 3.0])
+            return np.concatenate([(self.value - self.curve(place)) / NOISE, x / 3.0])
 
         u[free] = optimize.least_squares(residual, u[free]).x
         return Refit(self.name, frozenset(effects), u, self.linear(u))
 
     def linear(self, u):
         step = 1e-6 * np.eye(5)
-        own = np.stack([(curve(u + h) - curve(u - h)) / 2e-6 for h in step], axis=1)
+        own = np.stack([(self.curve(u + h) - self.curve(u - h)) / 2e-6 for h in step], axis=1)
         modes = np.stack([np.cos(k * np.pi * (X + 1.0) / 2.0) / (1.0 + k) for k in range(8)], axis=1)
-        columns = np.column_stack([own, curve(u), modes]) / NOISE
+        columns = np.column_stack([own, self.curve(u), modes]) / NOISE
         amplitudes = Amplitudes.of(
             np.concatenate([np.full(5, 3.0), [0.02], np.ones(8)]),
             np.array([-1] * 6 + [0] * 8),
             np.append(-u, np.zeros(9)),
         )
         at = np.concatenate([np.where(np.arange(5) >= BASE, u, 0.0), np.zeros(9)])
-        rows = (self.value - curve(u)) / NOISE
+        rows = (self.value - self.curve(u)) / NOISE
         free = np.full(14, np.inf)
         return Linear(
             Gram.of(columns, rows),
@@ -76,6 +77,22 @@ class ToyForm(Form):
             0.5,
             5.0,
         )
+
+
+class TwoValleys(ToyForm):
+    """A toy whose level has a better optimum below zero; only a descent with effects leads into it."""
+
+    @staticmethod
+    def curve(u):
+        """The same curve at a level and its negative, but for a hump that stands in the way above zero."""
+        return curve(np.concatenate([np.abs(u[:1]), u[1:]])) + 0.5 * X**2 * (u[0] > 0.0)
+
+    def refit(self, effects, near, start):
+        if start is None:
+            start = np.array([0.1, 0.0, 0.0, 0.0, 0.0])
+        elif effects:
+            start = np.concatenate([-np.abs(start[:1]), start[1:]])
+        return super().refit(effects, near, start)
 
 
 def measured(seed, **effects):

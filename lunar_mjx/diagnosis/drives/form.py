@@ -366,14 +366,16 @@ class DriveForm(MeasuredForm):
         u[self.drives.ground] = self._ground
         low, high = self.drives.bounds(free)
         u[free] = np.clip(u[free], low + 1e-9, high - 1e-9)
-        if self._seen is None:
+        first = self._seen is None
+        if first:
             if effects:
                 raise EvidenceError("the model as it is has not been refitted")
             u = self._prepare(free)
         slopes = self._guess(free, near)
         terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
         u, slopes = self._descend(u, free, self.observations, sizes, slopes, guessed=bool(effects))
-        if not effects:
+        if first:
+            # all hypotheses are weighed against measurements with the same errors
             self._choose_errors(u, free, slopes)
         linear = self._linear(u, effects, slopes)
         value, found, _ = linear.evidence(terms, sizes)

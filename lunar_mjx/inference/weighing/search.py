@@ -2,9 +2,10 @@
 
 Best first: around each refit all neighbours (one term more, one less) are scored in linear approximation; the most
 probable set that has not been refitted is refitted next, until no other comes near the best. So every accepted effect
-is challenged by a refit without it, and a greedy step that led into a trap is undone. Before something unlisted is
-believed, every effect that could be seen is refitted from a place where it acts: where a signature saturates, the
-linear estimate at its null is much too low.
+is challenged by a refit without it, and a greedy step that led into a trap is undone. That refit begins where the one
+with the effect has ended: a descent that found a better valley on its way must not be taken for what the effect is
+worth. Before something unlisted is believed, every effect that could be seen is refitted from a place where it acts:
+where a signature saturates, the linear estimate at its null is much too low.
 """
 
 from __future__ import annotations
@@ -141,7 +142,9 @@ class _Search:
     Attributes:
       forms, most_refits, most_terms, window, least_signal, unlisted_share, progress: as for `search`.
       known: the best evidence of each set of terms beside each form.
-      done: refits by form and effects; None where the solver failed.
+      done: the best refit by form and effects; None where the solver failed.
+      refits: number made. begun: form, effects, and effects of the refit at whose end it began, of each.
+      again: sets whose refit ended lower than the linear estimate around another one's new and better end promises.
       reasons: "form with effects: reason" of each refit whose solver failed.
       over: whether time was up within a refit.
     """
@@ -155,13 +158,16 @@ class _Search:
     progress: Callable[[str, float], None]
     known: dict[tuple[str, Terms], Hypothesis] = dataclasses.field(default_factory=dict)
     done: dict[tuple[str, frozenset[str]], Refit | None] = dataclasses.field(default_factory=dict)
+    refits: int = 0
+    begun: set[tuple[str, frozenset[str], frozenset[str]]] = dataclasses.field(default_factory=set)
+    again: dict[tuple[str, frozenset[str]], Hypothesis] = dataclasses.field(default_factory=dict)
     reasons: list[str] = dataclasses.field(default_factory=list)
     over: bool = False
 
     @property
     def may_refit(self) -> bool:
         """Whether refits and time are left."""
-        return len(self.done) < self.most_refits and not self.over
+        return self.refits < self.most_refits and not self.over
 
     def begin(self) -> None:
         """Refits every form as it is, then with each effect that takes the place of a part of it.
@@ -202,9 +208,14 @@ class _Search:
             return True
         # What leaving an effect out costs is told by a refit: where several do the work of one another, the linear
         # estimate about the full set is much too high, and a set that grew around a wrong first step would stand.
-        unchallenged = [e for e in sorted(best.effects) if (best.form, best.effects - {e}) not in self.done]
+        rivals = [best.effects - {e} for e in sorted(best.effects)]
+        unchallenged = [r for r in rivals if (best.form, r, best.effects) not in self.begun]
         if unchallenged:
-            self.refit(by_name[best.form], best.effects - {unchallenged[0]}, best)
+            self.refit(by_name[best.form], unchallenged[0], best)
+            return True
+        key = max(self.again, key=lambda key: self.again[key].log_posterior, default=None)
+        if key is not None and self.again[key].log_posterior > best.log_posterior - self.window:
+            self.refit(by_name[key[0]], key[1], self.again.pop(key))
             return True
         untried = self.untried(best)
         if untried:
@@ -219,10 +230,14 @@ class _Search:
           trial: effect that begins where it acts, for one whose slope at its null says little.
         """
         label = form.name + "".join(f" + {e}" for e in sorted(effects))
-        self.progress(f"refitting {label}", len(self.done) / self.most_refits)
-        start = None if near is None else _start(near, form)
+        self.progress(f"refitting {label}", self.refits / self.most_refits)
+        start, key = None, (form.name, effects)
+        if near is not None:
+            start = _start(near, form)
+            self.begun.add((*key, near.refit.effects))
         if trial and start is not None:
             start = form.trial(start, trial)
+        self.refits += 1
         try:
             made = form.refit(effects, near.refit if near else None, start)
         except TimeUp:
@@ -232,13 +247,28 @@ class _Search:
             return
         # A solver that fails says nothing against a hypothesis: it is recorded and the search goes on.
         except (EvidenceError, ValueError, np.linalg.LinAlgError) as error:
-            self.done[form.name, effects] = None
+            self.done.setdefault(key, None)
             self.reasons.append(f"{label}: {error}")
             return
-        self.done[form.name, effects] = made
+        again = self.done.get(key) is not None
         if made.failed:
             self.reasons.append(f"{label}: {made.failed}")
-        self.score_around(form, made, near)
+        if self.score_around(form, made, near):
+            self.done[key] = made
+            if again:
+                self.open_again(form, made)
+
+    def open_again(self, form: Form, made: Refit) -> None:
+        """Asks for a further refit of each neighbour that ended lower than it promises to around a new end."""
+        own = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in made.effects)
+        for t in form.terms:
+            terms = own ^ {t}
+            old, names = self.known.get((form.name, terms)), frozenset(n.name for n in terms)
+            if t.kind != EFFECT or old is None or not old.refitted or (form.name, names, made.effects) in self.begun:
+                continue
+            new = self.estimate(form, made, terms, _sizes(old))
+            if new is not None and new.log_posterior > old.log_posterior:
+                self.again[form.name, names] = new
 
     def ranked(self, complete: bool) -> ModelSearch:
         """What is known, most probable first."""
@@ -247,7 +277,7 @@ class _Search:
         order = sorted(alive, key=lambda h: -h.log_posterior)
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
-        return ModelSearch(tuple(order), weight / weight.sum(), len(self.done), tuple(self.reasons), complete)
+        return ModelSearch(tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete)
 
     def untried(self, best: Hypothesis) -> list[str]:
         """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.
@@ -266,16 +296,20 @@ class _Search:
         names = [n for n in names if (best.form, best.effects | {n}) not in self.done]
         return sorted(names, key=lambda n: -linear.get(n, -math.inf))
 
-    def score_around(self, form: Form, made: Refit, near: Hypothesis | None) -> None:
-        """Scores the refitted set with every choice of terms that need no refit, and their neighbours by one effect."""
+    def score_around(self, form: Form, made: Refit, near: Hypothesis | None) -> bool:
+        """Scores the refitted set with every choice of terms that need no refit, and their neighbours by one effect.
+
+        Returns:
+          Whether this is the best refit of its set so far; around another one nothing is scored.
+        """
         own = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in made.effects)
         felt, shows = made.linear.felt(), made.linear.shows()
         unfitted = [t for t in form.terms if t.kind != EFFECT]
         unfitted = [t for t in unfitted if t.kind != UNLISTED or felt[t.name] >= self.least_signal]
         effects = [t for t in form.terms if t.kind == EFFECT and shows[t.name] >= self.least_signal]
         base = self.score(form, made, own, own, None if near is None else _sizes(near))
-        if base is None:
-            return
+        if base is None or base.refit is not made:
+            return base is None and (form.name, made.effects) not in self.done
 
         def scored(choices: Iterable[Terms], sizes: tuple[np.ndarray, np.ndarray]) -> list[Hypothesis]:
             return [h for terms in choices if (h := self.score(form, made, own, terms, sizes))]
@@ -298,6 +332,7 @@ class _Search:
                 continue
             scored((root.terms | {t} for t in effects if t not in own), _sizes(root))
             scored((root.terms - {t} for t in own), _sizes(root))
+        return True
 
     def score(
         self, form: Form, made: Refit, own: Terms, terms: Terms, sizes: tuple[np.ndarray, np.ndarray] | None
@@ -311,23 +346,37 @@ class _Search:
         refitted = terms.issuperset(own) and not any(t.kind == EFFECT for t in terms - own)
         old = self.known.get((form.name, terms))
         # What a set's own refit says is not replaced by an estimate from another's.
-        if len(terms) > self.most_terms or (old is not None and old.refitted):
+        if len(terms) > self.most_terms or (old is not None and old.refitted and not refitted):
             return old
         named = frozenset(t.name for t in terms if t.kind == EFFECT)
         # These effects have had their refit: an estimate from elsewhere comes too late, even where that refit failed.
         if not refitted and (form.name, named) in self.done:
             return old
+        new = self.estimate(form, made, terms, sizes, refitted)
+        if new is None:
+            return old
+        # Of two linear estimates of one set the one from nearer by counts: that of the more probable refit. Of two
+        # refits of one set it is the better valley.
+        if old is None or (refitted and not old.refitted) or new.log_posterior > old.log_posterior:
+            self.known[form.name, terms] = new
+        return self.known[form.name, terms]
+
+    def estimate(
+        self, form: Form, made: Refit, terms: Terms, sizes: tuple[np.ndarray, np.ndarray] | None, refitted: bool = False
+    ) -> Hypothesis | None:
+        """A set of terms by the linear model around a refit; None where it tells nothing.
+
+        Args:
+          form, made: around which refit. terms: of the set. sizes: of discrepancy and noise to begin at.
+          refitted: whether the refit has the very effects of the set.
+        """
         try:
             value, inferred, places = made.linear.evidence(terms, sizes)
         except (EvidenceError, np.linalg.LinAlgError):
-            return old
+            return None
         # terms are independent beforehand: each has its own odds, and a set the product of theirs
         prior = form.log_prior + sum(t.log_prior for t in terms)
-        new = Hypothesis(form.name, terms, value + prior, made, refitted, inferred, places)
-        # Of two linear estimates of one set the one from nearer by counts: that of the more probable refit.
-        if old is None or refitted or new.log_posterior > old.log_posterior:
-            self.known[form.name, terms] = new
-        return self.known[form.name, terms]
+        return Hypothesis(form.name, terms, value + prior, made, refitted, inferred, places)
 
 
 def _carried_over(listed: Sequence[Hypothesis], best: Hypothesis, form: str) -> float:
