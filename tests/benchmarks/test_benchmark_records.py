@@ -85,6 +85,39 @@ def test_the_plainer_model_has_neither_heat_nor_soil():
     assert model.parameters["motor"]["alpha"] == model.parameters["motor"]["beta"] == 0.0
 
 
+def test_the_hidden_soil_is_a_likely_draw_of_the_kept_posterior_and_lies_in_all_ranges():
+    import posterior
+    from scipy import stats
+
+    from lunar_mjx.envs.navigation.config import SOIL_RANGES
+    from lunar_mjx.model.file import load_model
+
+    fitted = load_model(posterior.FITTED)
+    rows = posterior.told(fitted)
+    assert set(posterior.TRUTH) <= {row["parameter"] for row in rows}
+    off = np.array([np.log(row["hidden"] / row["fitted"]) for row in rows])
+    assert all(fitted.posterior.log)
+    assert off @ np.linalg.solve(fitted.posterior.covariance, off) < stats.chi2(len(off)).ppf(0.99)
+    for r in SOIL_RANGES:
+        assert r.parameter not in posterior.TRUTH or r.low <= posterior.TRUTH[r.parameter] <= r.high
+    hidden = posterior.hidden(make_model("luvmi_x", "flat", "consistent"))
+    assert hidden.parameters["soil"]["k_phi"] == pytest.approx(0.6 * 8.2e5)
+
+
+def test_arms_are_compared_by_pairs_of_one_seed():
+    from posterior import summary
+
+    def run(arm, seed, success):
+        return {"arm": arm, "seed": seed, "score": {"success": success, "episode_return": 0.0, "episode_time": 1.0}}
+
+    rows = [run("posterior", 0, 0.9), run("uniform", 0, 0.8), run("posterior", 1, 0.7), run("uniform", 1, 0.6)]
+    found = summary([*rows, run("uniform", 2, 0.1), run("nominal", 0, 0.5)])
+    assert found["uniform"]["success"]["mean"] == pytest.approx(0.5) and "truth" not in found
+    lead = found["uniform"]["posterior_leads_by"]
+    assert lead["mean"] == pytest.approx(0.1) and lead["error"] == pytest.approx(0.0, abs=1e-9) and lead["seeds"] == 2
+    assert found["nominal"]["posterior_leads_by"]["error"] is None
+
+
 def test_rung_3_tells_those_apart_that_the_page_says_it_does():
     finals = [run["final"]["rows"] for run in record("ladder-3")["seeds"]]
     assert np.mean([rows["policy"]["success"] for rows in finals]) >= 0.9
