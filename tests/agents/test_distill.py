@@ -50,7 +50,7 @@ def teacher(tmp_path_factory) -> str:
 
 
 def config(teacher: str, **settings) -> TrainConfig:
-    algorithm = DistillConfig(teacher, (32,), filters=(8, 8), rate=3e-3, teacher_steps=40, **settings)
+    algorithm = DistillConfig(teacher, (32,), filters=(8, 8), rate=3e-3, tau=0.05, teacher_steps=40, **settings)
     return TrainConfig(algorithm, envs=64, normalise=True, epoch_steps=40, episodes=False)
 
 
@@ -98,7 +98,7 @@ def test_the_teacher_hands_over_environment_by_environment(teacher):
 
 def test_every_lesson_counts_once_in_a_pass(teacher):
     """With one minibatch the update is one step along the gradient of the mean over all lessons."""
-    agent = Distill(DistillConfig(teacher, (4,), filters=(2,), minibatches=1), SeeingPoint())
+    agent = Distill(DistillConfig(teacher, (4,), filters=(2,), minibatches=1, tau=0.25), SeeingPoint())
     state, key = agent.init(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
     lessons = Lesson(jax.random.normal(key, (6, 3, 2 + ROWS * COLUMNS)), jax.random.uniform(key, (6, 3, 2)))
     after, losses = agent.update(state, lessons, key)
@@ -106,6 +106,9 @@ def test_every_lesson_counts_once_in_a_pass(teacher):
     change, _ = agent.optimiser.update(jax.grad(agent.loss)(state.actor, lessons), state.optimiser)
     for a, b, c in zip(*(jax.tree.leaves(t) for t in (after.actor, state.actor, change)), strict=True):
         assert np.asarray(a) == pytest.approx(np.asarray(b + c), abs=1e-6)
+    # the policy that is kept follows by its share
+    for a, b, c in zip(*(jax.tree.leaves(t) for t in (agent.policy(after), state.actor, change)), strict=True):
+        assert np.asarray(a) == pytest.approx(np.asarray(b + 0.25 * c), abs=1e-6)
 
 
 def test_convolutions_see_the_picture_alone_and_pass_the_other_numbers_on():

@@ -18,6 +18,7 @@ import optax
 from lunar_mjx._quiet import without_warp_notices
 from lunar_mjx.agents.networks import make_actor
 from lunar_mjx.agents.policy import Policy, load_policy, shipped_policy
+from lunar_mjx.agents.td3 import polyak
 from lunar_mjx.envs import TASKS, NavigationEnv
 from lunar_mjx.envs.navigation.config import NavigationConfig
 from lunar_mjx.errors import bad_input, require_within
@@ -37,6 +38,7 @@ class DistillConfig:
       actor_last_scale: of the last layer at the start.
       filters: of the convolutions on the student's picture.
       rate: learning rate. max_gradient: norm to which gradients are cut.
+      tau: share of the new parameters in their running mean, per update; the mean is the policy that is kept.
       teacher_steps: steps of every environment over which the teacher hands the driving over, one environment after
         the other; the student drives from the beginning if 0.
       unroll: steps of every environment between updates.
@@ -54,6 +56,7 @@ class DistillConfig:
     filters: tuple[int, ...] = (16, 32, 32)
     rate: float = 5e-4
     max_gradient: float = 1.0
+    tau: float = 0.002
     teacher_steps: int = 1_000
     unroll: int = 8
     minibatches: int = 4
@@ -65,6 +68,7 @@ class DistillConfig:
                 raise bad_input("DistillConfig", name, getattr(self, name), "is below 1", "give at least 1")
         for name in ("actor_last_scale", "rate", "max_gradient"):
             require_within("DistillConfig", name, getattr(self, name), 0.0, above=True)
+        require_within("DistillConfig", "tau", self.tau, 0.0, 1.0, above=True)
         require_within("DistillConfig", "teacher_steps", self.teacher_steps, 0)
         for name in ("actor_layers", "filters"):
             for width in getattr(self, name):
@@ -73,9 +77,10 @@ class DistillConfig:
 
 @pytree
 class DistillState:
-    """Parameters of the student, and their optimiser."""
+    """Parameters of the student, their running mean, and their optimiser."""
 
     actor: Any
+    mean: Any
     optimiser: Any
 
 
@@ -122,11 +127,12 @@ class Distill:
     def init(self, key: Any) -> DistillState:
         """Network and optimiser before the first update, drawn from a key of `jax.random`."""
         actor = self.actor.init(key)
-        return DistillState(actor, self.optimiser.init(actor))
+        # A copy: a state is donated to the next epoch, and one buffer may be given away once only.
+        return DistillState(actor, jax.tree.map(jnp.copy, actor), self.optimiser.init(actor))
 
     def policy(self, state: DistillState) -> Any:
-        """Parameters of the student."""
-        return state.actor
+        """Parameters of the student: their mean over the last updates, which the noise of single ones is not in."""
+        return state.mean
 
     def act(self, actor: Any, obs: Any) -> Any:
         """Actions of the student, (env, action)."""
@@ -170,7 +176,7 @@ class Distill:
 
         def minibatch(state: DistillState, part: Lesson) -> tuple[DistillState, Any]:
             loss, actor, optimiser = learn(state.actor, part, optimizer_state=state.optimiser)
-            return DistillState(actor, optimiser), loss
+            return DistillState(actor, polyak(state.mean, actor, c.tau), optimiser), loss
 
         def once(state: DistillState, key: Any) -> tuple[DistillState, Any]:
             order = jax.random.permutation(key, lessons.action.shape[0]).reshape(c.minibatches, -1)
