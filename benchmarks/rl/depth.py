@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from harness import (
     COMMIT,
     DURING,
@@ -38,6 +37,7 @@ from harness import (
     training_of,
     when,
 )
+from rates import Driven
 
 from benchmarks.provenance import tree
 from lunar_mjx.agents.policy import policy_of, save_policy
@@ -72,57 +72,18 @@ def agents(setup: Setup) -> dict[str, Any]:
     return {"student": student, "blanked": blanked, "teacher": lambda _, state, key: teacher.act(state.privileged)}
 
 
-class Rate:
-    """Steps per second of the environment under random actions; compiled when asked.
-
-    Args:
-      env: the environment. rovers: how many. steps: of each, per repetition.
-    """
-
-    def __init__(self, env: Any, rovers: int, steps: int):
-        self.env, self.rovers, self.steps = env, rovers, steps
-
-        def drive(params: Any, state: Any, key: Any) -> Any:
-            def step(carry: Any, key: Any) -> Any:
-                state, ended = carry
-                state = env.step(params, state, jax.random.uniform(key, (rovers, env.action_size), minval=-1.0))
-                return (state, ended + state.done), None
-
-            start = (state, jnp.zeros(rovers, jnp.int32))
-            (state, ended), _ = jax.lax.scan(step, start, jax.random.split(key, steps))
-            return state, jnp.sum(ended)
-
-        self._drive: Any = jax.jit(drive, donate_argnums=1)
-
-    def compile(self) -> None:
-        """Compiles ahead."""
-        keys = jax.ShapeDtypeStruct((self.rovers, 2), jnp.uint32)
-        state = jax.eval_shape(self.env.reset, self.env.params, keys)
-        self._drive = self._drive.lower(self.env.params, state, jax.random.PRNGKey(0)).compile()
-
-    def measure(self, state: Any, repeats: int) -> dict[str, Any]:
-        """Rates of the repetitions after a first one; `state`, of all rovers, is used up."""
-        # episodes at every stage, so that as many end in one step as in the next
-        share = jax.random.uniform(jax.random.PRNGKey(1), (self.rovers,))
-        inner = dataclasses.replace(state.inner, waited=share * self.env.config.stuck_time)
-        state, taken, ended = dataclasses.replace(state, inner=inner), [], []
-        for i in range(repeats + 1):
-            begin = time.monotonic()
-            state, count = jax.block_until_ready(self._drive(self.env.params, state, jax.random.PRNGKey(i)))
-            taken.append(time.monotonic() - begin)
-            ended.append(int(count))
-        rates = [self.rovers * self.steps / s for s in taken[1:]]
-        c = self.env.config
-        return {
-            "rovers": self.rovers,
-            "steps": self.steps,
-            "picture": [c.camera_width, c.camera_height],
-            "env_steps_per_s": statistics.median(rates),
-            "least": min(rates),
-            "most": max(rates),
-            "seconds": taken[1:],
-            "resets_per_step": sum(ended[1:]) / (repeats * self.steps),
-        }
+def rate_of(driven: Driven, state: Any, repeats: int) -> dict[str, Any]:
+    """Rates of repetitions after a first one; `state`, of all rovers, is used up."""
+    state, taken, ended = driven.staggered(state), [], []
+    for i in range(repeats + 1):
+        begin = time.monotonic()
+        state, count = jax.block_until_ready(driven(driven.env.params, state, jax.random.PRNGKey(i)))
+        taken.append(time.monotonic() - begin)
+        ended.append(int(count))
+    rates, c = [driven.size * driven.steps / s for s in taken[1:]], driven.env.config
+    about = {"rovers": driven.size, "steps": driven.steps, "picture": [c.camera_width, c.camera_height]}
+    found = {"env_steps_per_s": statistics.median(rates), "least": min(rates), "most": max(rates)}
+    return {**about, **found, "seconds": taken[1:], "resets_per_step": sum(ended[1:]) / (repeats * driven.steps)}
 
 
 def main() -> None:
@@ -137,15 +98,15 @@ def main() -> None:
     setup = Setup(training)
     rules = {"straight": make_agent("scripted", setup.env)}
     judge = Judge(setup.env, min(args.episodes, 2) if args.tiny else args.episodes, agents(setup), rules)
-    rate = Rate(setup.env, training.train.envs, 4 if args.tiny else 50)
+    driven = Driven(setup.env, training.train.envs, 4 if args.tiny else 50)
     made_s = clock.spent
-    in_threads(lambda: setup.compile(judge), rate.compile)
+    in_threads(lambda: setup.compile(judge), driven.compile)
     record: dict[str, Any] = {"tree": files, "training": name, **setup.about, "seed": args.seed}
     record |= {"made_s": made_s, "compile_s": clock.spent - made_s, "scores": []}
     say(f"made in {made_s:.0f} s, compiled in {record['compile_s']:.0f} s, {clock.left:.0f} s left")
     # One device of several: the rate is of one, and a state over a mesh is none that the program was compiled for.
     state = jax.device_put(jax.device_get(setup.learner.init(args.seed).env))
-    record["rate"] = rate.measure(state, 2 if args.tiny else args.repeats)
+    record["rate"] = rate_of(driven, state, 2 if args.tiny else args.repeats)
     del state
     r = record["rate"]
     say(

@@ -53,18 +53,23 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
         save(args.out, "rates", {"rover": args.rover, "rows": rows})
 
 
-class Rate:
-    """The environment under random actions, and its physics alone under the same changes; compiled when made."""
+class Driven:
+    """Steps of an environment under random actions in one program; called with parameters, state and key.
+
+    Args:
+      env: the environment. size: rovers. steps: of each, in one call.
+
+    Returns:
+      The state, whose memory is that of the state given, and how many episodes ended.
+    """
 
     def __init__(self, env: Any, size: int, steps: int):
         self.env, self.size, self.steps = env, size, steps
-        decimation, key = env.config.decimation, jax.random.PRNGKey(0)
 
-        def drive(params: Any, state: Any) -> Any:
+        def drive(params: Any, state: Any, key: Any) -> Any:
             def step(carry: Any, key: Any) -> Any:
                 state, ended = carry
-                action = jax.random.uniform(key, (size, env.action_size), minval=-1.0)
-                state = env.step(params, state, action)
+                state = env.step(params, state, jax.random.uniform(key, (size, env.action_size), minval=-1.0))
                 # each rover counts: a sum over all, XLA fuses with the environment's last kernel, run by one block then
                 return (state, ended + state.done), None
 
@@ -72,37 +77,59 @@ class Rate:
             (state, ended), _ = jax.lax.scan(step, start, jax.random.split(key, steps))
             return state, jnp.sum(ended)
 
-        shares = jax.random.uniform(key, (steps, env.action_size), minval=-1.0)
+        self.program: Any = jax.jit(drive, donate_argnums=1)
+
+    def compile(self) -> Any:
+        """Compiles ahead; returns the shapes of the state."""
+        keys = jax.ShapeDtypeStruct((self.size, 2), jnp.uint32)
+        state = jax.eval_shape(self.env.reset, self.env.params, keys)
+        self.program = self.program.lower(self.env.params, state, jax.random.PRNGKey(0)).compile()
+        return state
+
+    def __call__(self, params: Any, state: Any, key: Any) -> Any:
+        return self.program(params, state, key)
+
+    def staggered(self, state: Any) -> Any:
+        """The state with episodes at every stage, so that as many end in one step as in the next."""
+        share = jax.random.uniform(jax.random.PRNGKey(1), (self.size,))
+        inner = dataclasses.replace(state.inner, waited=share * self.env.config.stuck_time)
+        return dataclasses.replace(state, inner=inner)
+
+
+class Rate:
+    """The environment under random actions, and its physics alone under the same changes; compiled when made."""
+
+    def __init__(self, env: Any, size: int, steps: int):
+        self.env, self.size, self.steps, self._key = env, size, steps, jax.random.PRNGKey(0)
+        decimation = env.config.decimation
+        shares = jax.random.uniform(self._key, (steps, env.action_size), minval=-1.0)
         controls = env.actions.controls(shares)
 
         def bare(params: Any, state: Any) -> Any:
             return env.system.rollout_batch(params.system, state, controls, decimation, report=lambda t: None)[0]
 
-        keys = jax.ShapeDtypeStruct((size, 2), jnp.uint32)
-        state = jax.eval_shape(env.reset, env.params, keys)
-        self._reset = jax.jit(env.reset).lower(env.params, keys).compile()
-        self._drive = jax.jit(drive, donate_argnums=1).lower(env.params, state).compile()
+        self._reset = jax.jit(env.reset).lower(env.params, jax.ShapeDtypeStruct((size, 2), jnp.uint32)).compile()
+        self._drive = Driven(env, size, steps)
+        state = self._drive.compile()
         self._bare = jax.jit(bare, donate_argnums=1).lower(env.params, state.inner.physics).compile()
 
     def measure(self, repeats: int) -> dict[str, Any]:
         """Best of several repetitions, in turns."""
         params = self.env.params
-        state = jax.block_until_ready(self._reset(params, split_keys(jax.random.PRNGKey(0), self.size)))
-        # episodes at every stage, so that as many end in one step as in the next
-        share = jax.random.uniform(jax.random.PRNGKey(1), (self.size,))
-        inner = dataclasses.replace(state.inner, waited=share * self.env.config.stuck_time)
-        state = dataclasses.replace(state, inner=inner)
+        state = jax.block_until_ready(self._reset(params, split_keys(self._key, self.size)))
+        state = self._drive.staggered(state)
         physics = jax.tree.map(jnp.copy, state.inner.physics)
         held = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / self.size
         ours, naked, ended = [], [], 0
         for _ in range(repeats + 1):
             begin = time.monotonic()
-            state, ended = jax.block_until_ready(self._drive(params, state))
+            state, ended = jax.block_until_ready(self._drive(params, state, self._key))
             middle = time.monotonic()
             physics = jax.block_until_ready(self._bare(params, physics))
             ours.append(middle - begin)
             naked.append(time.monotonic() - middle)
         steps, best, bare = self.size * self.steps, min(ours[1:]), min(naked[1:])
+        memory = self._drive.program.memory_analysis()
         return {
             "env_steps_per_s": steps / best,
             "physics_steps_per_s": steps * self.env.config.decimation / best,
@@ -112,7 +139,7 @@ class Rate:
             "seconds": ours[1:],
             "bare_seconds": naked[1:],
             "state_bytes_per_rover": held,
-            "temporary_bytes_per_rover": getattr(self._drive.memory_analysis(), "temp_size_in_bytes", 0) / self.size,
+            "temporary_bytes_per_rover": getattr(memory, "temp_size_in_bytes", 0) / self.size,
         }
 
 
