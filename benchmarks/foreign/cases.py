@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from . import kinds
+from .laws import GRANULAR_HOLDS
 from .misfit import Field
 from .wheel import DEEPEST, Result, Rows, World, run
 
@@ -213,18 +214,7 @@ def _traits(
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Choices of the base law and the catalogue's names for them."""
     if law == "granular":
-        # Stress falls as motion turns along the face, in one strength for all directions, and soil behind the axle
-        # bears nothing: sinkage grows with slip and slip angle by the law itself.
-        return {}, (
-            "stress_integral",
-            "slide_softening",
-            "slip_sinkage",
-            "angle_sinkage",
-            "shear_softening",
-            "friction_circle",
-            "skid_shear",
-            "exit_angle",
-        )
+        return {}, GRANULAR_HOLDS
     traits, holds = {"skid": 1.0}, ["stress_integral"] if law == "integral" else []
     if "skid_shear" in hidden or rng.random() < 0.5:
         traits["skid"] = 0.0

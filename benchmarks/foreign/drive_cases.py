@@ -11,6 +11,7 @@ import numpy as np
 
 from .cases import generator
 from .drive import Ground, Motors, Setup, simulate
+from .laws import GRANULAR_HOLDS
 from .misfit import Field
 from .rovers import CORNERS, ROVERS, Build, Rover
 from .wheel import World
@@ -308,16 +309,7 @@ def draw(which: str, seed: int, number: int, group: str, hidden: tuple[str, ...]
     if law == "granular":
         stiffness = pressure / (0.6 * depth) * 9.80665 / rover.gravity
         soil = {"grain_stiffness": stiffness, "rim_friction": _u(rng, 0.45, 0.7)}
-        holds = [
-            "stress_integral",
-            "slide_softening",
-            "slip_sinkage",
-            "angle_sinkage",
-            "shear_softening",
-            "friction_circle",
-            "skid_shear",
-            "exit_angle",
-        ]
+        holds = list(GRANULAR_HOLDS)
         traits: dict[str, float] = {}
     else:
         exponent, cohesion, share = _u(rng, 0.7, 1.1), _u(rng, 100.0, 600.0), _u(rng, 0.0, 0.3)

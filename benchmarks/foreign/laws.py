@@ -291,4 +291,16 @@ def granular(
     return scale * pressure, scale * share * along, scale * share * across
 
 
+GRANULAR_HOLDS = (
+    "stress_integral",
+    "slide_softening",
+    "slip_sinkage",
+    "angle_sinkage",
+    "shear_softening",
+    "friction_circle",
+    "skid_shear",
+    "exit_angle",
+)
+"""What the granular law holds by itself, in the catalogue's names: stress falls as motion turns along the face, in one
+strength for all directions, and soil behind the axle bears nothing, so that sinkage grows with slip and slip angle."""
 LAWS = {"linear": linear, "integral": integral, "granular": granular}
