@@ -370,7 +370,7 @@ class Learner:
         return dataclasses.replace(state, agent=agent, statistics=self._counted(statistics, *observed)), (seen, losses)
 
     def _seen(self, env: State) -> dict[str, Any]:
-        """Of a step, what the reports need: sums over episodes that ended, means over steps for `reward_` terms."""
+        """Numbers of a step for reports: sums over episodes that ended, and means over rovers of `reward_` terms."""
         # Sums and counts instead of means: episodes of an epoch weigh alike, whenever they end.
         ended = {k: jnp.sum(jnp.where(env.done, v, 0.0)) for k, v in env.metrics.items() if not k.startswith("reward_")}
         means = {k: jnp.mean(v) for k, v in env.metrics.items() if k.startswith("reward_")}

@@ -91,7 +91,7 @@ class _Environment(BaseModel):
 
 
 class _Nameless(BaseModel):
-    """Of a policy that was trained in Python, in an environment without a name."""
+    """Environment of a policy that was trained in Python, where it has no name."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -83,7 +83,7 @@ class Regolith:
 
 
 def _lambert_albedo(soil: Regolith) -> float:
-    """Of the white board that is as bright as the soil at incidence and phase 60 deg, seen from above."""
+    """Albedo of a white board as bright as the soil, seen from above at incidence and phase 60 deg."""
     seen = float(dataclasses.replace(soil, law="hapke").radiance_factor(0.5, 1.0, 0.5))
     return seen / 0.5
 

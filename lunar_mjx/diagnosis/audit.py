@@ -35,7 +35,7 @@ NULL = "nothing"
 
 @dataclasses.dataclass(frozen=True)
 class Audit:
-    """What the simulated logs gave.
+    """Result of diagnosing simulated logs whose truth is known.
 
     Attributes:
       cases: one row each: truth, amount (in nominal sizes), verdict, effects named, outcome.
@@ -110,7 +110,7 @@ def audit(folder: str | Path | Run, seconds: float, progress: Progress = silent)
 
 
 def _key(run: Run) -> str:
-    """Of the model and the campaign that an audit belongs to, and of the tool that was audited."""
+    """Hash of the model, the campaign and the tool that an audit belongs to."""
     digest = hashlib.sha256((run.folder / MODEL_FILE).read_bytes())
     for log in run.logs:
         digest.update(folder_hash(log).encode())

@@ -121,12 +121,5 @@ def table_problem(run: Run, logs: Sequence[SteadyLog], candidates: Mapping[str, 
     gravities = {float(log.gravity_m_s2 or EARTH_GRAVITY) for log in logs}
     if len(gravities) > 1:
         raise UserError(f"{logs[0].folder}: tables of different gravity do not go into one run; compare them apart.")
-    model = run.model
-    bed = WheelBed(model.effects, {name: _single(values) for name, values in model.parameters.items()}, gravities.pop())
+    bed = WheelBed.of_first_wheel(run.model, gravities.pop())
     return TableProblem(logs, bed, candidates, run.splits, extra_sigma=run.discrepancy)
-
-
-def _single(values: Mapping[str, Any]) -> dict[str, float]:
-    """One value per parameter: the first where a model has one per wheel or joint."""
-    # A test bed holds one wheel, and its tables do not say which one of the rover's it is.
-    return {k: float(v[0]) if isinstance(v, tuple | list) else v for k, v in values.items()}

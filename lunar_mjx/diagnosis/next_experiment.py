@@ -62,7 +62,7 @@ class Plan:
 
 @dataclasses.dataclass(frozen=True)
 class NextExperiment:
-    """What to measure next.
+    """The measurements to make next, ranked.
 
     Attributes:
       hypotheses: that survive. plans: best first. sentence: the answer.
@@ -151,7 +151,7 @@ def _hypotheses(verdict: dict[str, Any], between: Sequence[str], candidates: set
 
 
 class _Knowledge:
-    """Where each hypothesis stands after the logs so far, and how well they hold what all logs share.
+    """Places and precisions of all hypotheses after the logs so far.
 
     Attributes:
       place: coordinate by key, for each hypothesis. precision: inverse covariance of the shared coordinates `keys`.

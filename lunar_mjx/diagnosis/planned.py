@@ -95,7 +95,7 @@ def planned_drives(logs: Sequence[Log], model: Model, seconds: float) -> list[tu
 
 
 def _first(channel: str, start: tuple[float, float, float], celsius: float) -> float:
-    """Where a channel begins, as far as the start of a simulation reads it from there."""
+    """First value of a planned channel, as far as the start of a simulation reads it."""
     known = {"position_x_m": start[0], "position_y_m": start[1], "yaw_deg": float(np.degrees(start[2]))}
     return celsius if suffix_of(channel) == "degC" else known.get(channel, 0.0)
 
@@ -142,7 +142,7 @@ def planned_sweeps(logs: Sequence[SteadyLog]) -> list[tuple[str, str, SteadyLog]
 
 
 def _sigma(log: SteadyLog, table: SteadyStateTable, quantity: str) -> float:
-    """Noise of one run."""
+    """Standard deviation of the noise of a quantity in one run of a table."""
     stated: Any = log.noise.get(QUANTITIES[quantity][0])
     return float(table.sigma.get(quantity, stated.std if stated is not None else 0.0))
 

@@ -241,7 +241,7 @@ def _require_candidate(name: str, run: Run, logs: Sequence[Any], only: Sequence[
 
 
 def explain(diagnosis: Diagnosis, effect: str) -> Diagnosis:
-    """The answer to "is it this effect?": the diagnosis narrowed to one effect.
+    """The diagnosis of a run narrowed to one effect: the answer to "is it this effect?".
 
     Without a fit there is none, and the diagnosis itself says why.
 

@@ -45,7 +45,7 @@ RECORDINGS = (".mcap", ".bag", ".db3")
 
 @dataclasses.dataclass(frozen=True)
 class Alarm:
-    """Something began.
+    """Moment at which something began in a followed log, with what it is once that is known.
 
     Attributes:
       number: of the alarm, from 1. onset_s: most probable time, on the log's clock. first_s, last_s: between which it
@@ -168,7 +168,7 @@ class _Watch:
         self.count = 0
 
     def alarms(self, once: bool, idle_s: float, sleep: Callable[[float], None]) -> Iterator[Alarm]:
-        """See `watch`."""
+        """Alarms of the log, each twice: as it is raised, and with what began once that is known."""
         last_end, waited = -math.inf, 0.0
         while True:
             try:

@@ -210,6 +210,19 @@ class WheelBed:
         """The wheel of a model, under the Earth's gravity where test beds stand."""
         return cls(model.effects, {name: dict(values) for name, values in model.parameters.items()})
 
+    @classmethod
+    def of_first_wheel(cls, model: Model, gravity: float) -> WheelBed:
+        """The wheel of a model under a gravity, m/s2; of parameters with one value per wheel or joint it has the first.
+
+        For tables, which do not say which one of the rover's wheels they measured.
+        """
+
+        def first(value: Any) -> Any:
+            return float(value[0]) if isinstance(value, tuple | list) else value
+
+        values = {e: {k: first(v) for k, v in own.items()} for e, own in model.parameters.items()}
+        return cls(model.effects, values, gravity)
+
     def with_effect(self, effect: Effect | str, **values: float) -> WheelBed:
         """The bed with one more effect, in the place of those that it replaces."""
         added = catalogue.get(effect) if isinstance(effect, str) else effect

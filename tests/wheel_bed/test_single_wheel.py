@@ -12,6 +12,7 @@ import pytest
 from lunar_mjx.criticism import WheelBed, wheel_test
 from lunar_mjx.effects import Parameter, effect
 from lunar_mjx.errors import UserError
+from lunar_mjx.model import make_model
 from tests.wheel_bed.small_wheel import LOAD, RADIUS, WIDTH, small_test
 
 SLIPS = np.linspace(-1.0, 0.95, 9)
@@ -115,6 +116,15 @@ def test_users_mistakes_are_told(consistent):
         WheelBed(consistent.effects, {"soil": {"n": 9.0}})
     with pytest.raises(UserError, match="does not act on this wheel"):
         consistent.with_values({"penalty_contact": {"stiffness": 1.0}})
+
+
+def test_a_table_of_a_rover_whose_wheels_differ_is_taken_for_its_first_wheel():
+    model = make_model("luvmi_x", "flat", preset="consistent")
+    model = model.add("wheel_radius_error").set("wheel_radius_error", offset=(0.01, 0.0, 0.0, 0.0))
+    bed = WheelBed.of_first_wheel(model, 1.6)
+    assert bed.parameters["wheel_radius_error"]["offset"] == 0.01 and bed.gravity == 1.6
+    with pytest.raises(UserError, match="has one value per wheel"):
+        WheelBed.of_model(model)
 
 
 def test_an_effect_of_the_users_own_changes_the_bed(consistent):

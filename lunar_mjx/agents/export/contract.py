@@ -43,7 +43,7 @@ class Block(_Part):
 
 
 class Normalisation(_Part):
-    """Of observations, within the graphs: clip((obs - mean) / deviation, -most, most)."""
+    """How graphs scale observations: clip((obs - mean) / deviation, -most, most)."""
 
     mean: list[float]
     deviation: list[float]

@@ -119,7 +119,7 @@ def rim_plane(c: Context, field: Grid, moved: Moved | None = None) -> tuple[np.n
 
 
 def faster(rim: np.ndarray, travel: np.ndarray) -> np.ndarray:
-    """Of rim and travel speed the one of larger magnitude, m/s: the denominator of eq. 8."""
+    """The one of rim and travel speed with the larger magnitude, m/s: the denominator of eq. 8."""
     return np.where(np.abs(rim) > np.abs(travel), rim, travel)
 
 

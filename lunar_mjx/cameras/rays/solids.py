@@ -117,7 +117,7 @@ def _box(size: list, o: Vec3, d: Vec3) -> Any:
 
 
 def _round(a: Any, b: Any, c: Any) -> tuple[Any, Any]:
-    """Where a t^2 + 2 b t + c is negative: from, to; an empty span where it never is."""
+    """Interval (from, to) of t in which a t^2 + 2 b t + c is negative; empty where it never is."""
     root = b * b - a * c
     some = root > 0.0
     root, inverse = jnp.sqrt(jnp.where(some, root, 0.0)), over(a)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -86,7 +85,7 @@ def build_tables(
     forms, all_effects, refused = [], {}, ()
     laws = contact_laws(run.model, settings.laws if rivals else ())
     for number, (name, model) in enumerate(laws.items()):
-        bed = WheelBed(model.effects, {n: _single(v) for n, v in model.parameters.items()}, gravity)
+        bed = WheelBed.of_first_wheel(model, gravity)
         grains = "granular_resistance" in bed.parameters
         foreign = _OF_REECE | build_problem.FINER_FORMS if grains else frozenset()
         mine = {n: e for n, e in candidates.items() if not e.replaces and n not in foreign}
@@ -146,12 +145,6 @@ def better_law(forms: Mapping[str, float], model: Model, sure: float = TableSett
     best = max(forms, key=lambda name: forms[name])
     own = next(iter(contact_laws(model, ())))
     return LAWS[best][0] if best != own and best in LAWS and forms[best] >= sure else None
-
-
-def _single(values: Mapping[str, Any]) -> dict[str, float]:
-    """One value per parameter: the first where a model has one per wheel or joint."""
-    # a bed holds one wheel
-    return {k: float(v[0]) if isinstance(v, tuple | list) else v for k, v in values.items()}
 
 
 def grown_model(

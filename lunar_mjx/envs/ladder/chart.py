@@ -184,7 +184,7 @@ def way(chart: Chart, price: Any, world: Any, position: Any, goal: Any, cell: An
 
 
 def straight(position: Any, goal: Any, cell: Any) -> tuple[Any, Any, Any]:
-    """As of `way`, without a chart: straight for the goal."""
+    """Where to aim, nodes and distance as `way` returns them, for a rover without a chart: straight to the goal."""
     away = goal - position
     far = jnp.sqrt(jnp.sum(away * away, axis=-1, keepdims=True))
     reach = jnp.minimum(cell * jnp.arange(1, CHART.steps + 1), far)

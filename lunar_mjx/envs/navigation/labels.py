@@ -11,7 +11,7 @@ from lunar_mjx.envs.navigation.view import SCAN_SCALE, VIEW
 
 
 class Label(NamedTuple):
-    """Of one number: what it is called within its block, and its unit ("1" if it has none)."""
+    """Name of one number within its block of observations, and its unit ("1" if it has none)."""
 
     name: str
     unit: str
