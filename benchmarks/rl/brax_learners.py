@@ -19,8 +19,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import DURING, FINAL, Clock, Judge, percent, reached, save, say, training_of
+from harness import DURING, FINAL, Clock, Judge, reached, save, say, training_of
 from large import episodes_of
+from tables import table_brax
 
 from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.envs import make
@@ -70,10 +71,7 @@ class Run:
         self.walltimes.append(float(metrics["training/walltime"]))
         self.ready.result()
         self.rows.append({"steps": int(steps), **self.score(DURING)})
-        record = self.record()
-        row = record["unseen"][-1]
-        say(f"{self.name}: {row['elapsed_s']:.1f} s, {row['steps']:,} steps, unseen {percent(row)}")
-        self.keep(record)
+        self.keep(self.record())
         if self.clock.left < 0.0:
             raise OutOfTime
 
@@ -140,13 +138,12 @@ def brax(args: argparse.Namespace, clock: Clock) -> None:
         def keep(record: dict[str, Any], name: str = name, settings: dict[str, Any] = settings) -> None:
             about = {"settings": settings, "networks": SETTINGS["networks"][name], "seed": args.first_seed}
             runs[name] = {**runs.get(name, {}), **about, **record}
-            save(args.out, "brax", {"rover": args.rover, "target": args.target, "runs": runs})
+            told = {"rover": args.rover, "target": args.target, "runs": runs}
+            say(table_brax(save(args.out, "brax", told))[-1])
 
         run = Run(name, scored, args.target, Clock(clock.left / (2 - i) - 8.0), keep)
         try:
             run.train(settings, args.first_seed, 3 if args.tiny else SETTINGS["per_epoch"][name])
             keep({**run.record(), "final": run.score(FINAL)})
-            say(f"{name}: at the end {percent(runs[name]['final'])}, {run.clock.spent:.0f} s in all")
         except Exception as error:  # the other one still runs
-            say(f"{name}: {type(error).__name__}: {error}")
             keep({**run.record(), "error": f"{type(error).__name__}: {error}"})

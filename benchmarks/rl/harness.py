@@ -98,11 +98,13 @@ def write(path: Path, record: Any) -> None:
     part.replace(path)
 
 
-def save(out: Path, name: str, record: Mapping[str, Any]) -> None:
-    """Writes a record with the commit, device and versions that it was measured on."""
+def save(out: Path, name: str, record: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes a record with the commit, device and versions that it was measured on; returns it with these."""
     device = {"device": jax.devices()[0].device_kind, "devices": jax.device_count()}
     about = {**device, "jax": jax.__version__, "mujoco": mujoco.__version__}
-    write(out / f"{name}.json", {"about": about, "commit": COMMIT, **record})
+    whole = {"about": about, "commit": COMMIT, **record}
+    write(out / f"{name}.json", whole)
+    return whole
 
 
 def say(text: str) -> None:

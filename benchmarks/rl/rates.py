@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from harness import SMALL_TASK, Clock, in_threads, in_time, save, say, training_of
 from jax.sharding import Mesh
+from tables import table_rates, table_scaling
 
 from lunar_mjx.agents.learner import AXIS, Learner
 from lunar_mjx.envs import make, make_navigation, split_keys
@@ -46,11 +47,7 @@ def rates(args: argparse.Namespace, clock: Clock) -> None:
     for seen, every, size in in_time(clock, plan):
         row = waiting.pop((seen, every, size)).measure(1 if args.tiny else 5)
         rows.append({"observation": seen, "decimation": every, "rovers": size, **row})
-        say(
-            f"rates: {seen}, decimation {every}, {size:,} rovers: {row['env_steps_per_s']:,.0f} environment steps/s, "
-            f"bare physics {row['bare_steps_per_s']:,.0f}, ratio {row['ratio']:.3f}"
-        )
-        save(args.out, "rates", {"rover": args.rover, "rows": rows})
+        say(table_rates(save(args.out, "rates", {"rover": args.rover, "rows": rows}))[-1])
 
 
 class Driven:
@@ -164,6 +161,5 @@ def scaling(args: argparse.Namespace, clock: Clock) -> None:
         rate = config.envs * config.epoch_steps / best
         row = {"devices": count, "steps_per_s": rate, "updates_per_s": config.updates * config.epoch_steps / best}
         rows.append({**row, "efficiency": rate / count / (rows[0]["steps_per_s"] if rows else rate)})
-        say(f"scaling: {count} devices, {rate:,.0f} steps/s, efficiency {rows[-1]['efficiency']:.3f}")
-        save(args.out, "scaling", {"rover": args.rover, "rows": rows})
+        say(table_scaling(save(args.out, "scaling", {"rover": args.rover, "rows": rows}))[-1])
         del state

@@ -25,7 +25,8 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import COMMIT, FINAL, SMALL_TASK, ends, percent, say, write
+from harness import COMMIT, FINAL, SMALL_TASK, say, write
+from tables import table_sb3
 
 from lunar_mjx.agents.configs import get_training
 from lunar_mjx.agents.evaluate import evaluate
@@ -160,14 +161,10 @@ def train(args: argparse.Namespace) -> None:
     model.learn(args.steps, callback=make_recorder(args, env, record))
     record["steps"] = model.num_timesteps
     keep_policy(model, env, args.out / "policy_sb3.npz", record)
-    won = [e["success"] for e in record["episodes"]]
-    last = np.mean(won[-50:]) if won else float("nan")
-    took = f"{record['steps']} steps, {len(won)} episodes"
-    say(f"{took}, success of the last 50 {last:.2f}, {record['cpu_s']:.0f} s of CPU time")
     own, agent, unseen = open_agent(str(args.out / "policy_sb3.npz"))
     record["final"] = evaluate(own, agent, args.score, FINAL, unseen_params(own, unseen)).record()
     write(args.out / "sb3.json", record)
-    say(f"unseen {percent(record['final'])}, {ends(record['final'])}")
+    say("\n".join(table_sb3(record)))
 
 
 def main() -> None:
