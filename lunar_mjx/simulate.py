@@ -279,7 +279,7 @@ def front_steering(model: Model, commands: Commands, angle: float) -> Commands:
     """
     if not np.isfinite(angle):
         raise bad_input("command", "steer", angle, "is not finite", "give an angle in rad")
-    fronts = [w.steer for w in model.rover.wheels if w.corner in ("lf", "rf") and w.steer]
+    fronts = [w.steer for w in model.rover.wheels if w.row == "front" and w.steer]
     if angle and not fronts:
         raise bad_input("command", "steer", angle, "needs steered front wheels, which the rover lacks", "leave it at 0")
     # The caller keeps its commands.

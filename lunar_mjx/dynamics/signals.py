@@ -69,8 +69,8 @@ def side_channels(rover: Rover) -> dict[str, tuple[str, ...]]:
     names, found = dict(zip(rover.joints, joint_channels(rover), strict=True)), {}
     for group in rover.drive_groups:
         wheels = [names[j] for j in group.joints]
-        side = {"l": "left", "r": "right"}.get(wheels[0][0])
-        if side is None or any(w[0] != wheels[0][0] for w in wheels):
+        side, *others = {w.side for w in rover.wheels if w.drive in group.joints}
+        if others or not side:
             continue
         for pattern in ("motor_{}_drive_current_A", "joint_{}_drive_speed_rad_s", "joint_{}_drive_angle_rad"):
             found[pattern.format(side)] = tuple(pattern.replace("_drive", "").format(w) for w in wheels)

@@ -69,7 +69,7 @@ def _toward(goal: Any) -> Any:
 def _driver(env: NavigationEnv) -> Agent:
     """Full speed ahead, steering in proportion to the bearing of the goal; suspension untouched."""
     joints = env.model.rover.joints
-    fronts = [joints.index(w.steer) for w in env.model.rover.wheels if w.corner in ("lf", "rf") and w.steer]
+    fronts = [joints.index(w.steer) for w in env.model.rover.wheels if w.row == "front" and w.steer]
     torque = env.config.action == "paper"
     limit = min(env.model.rover.joint_limits[joints[i]][1] for i in fronts)
 
@@ -114,7 +114,7 @@ class Reactive:
 
 def _steering_limit(env: NavigationEnv) -> float:
     rover = env.model.rover
-    return min(rover.joint_limits[w.steer][1] for w in rover.wheels if w.corner in ("lf", "rf") and w.steer)
+    return min(rover.joint_limits[w.steer][1] for w in rover.wheels if w.row == "front" and w.steer)
 
 
 def _wheels(env: NavigationEnv, drive: Any, steer: Any) -> Any:

@@ -176,8 +176,7 @@ def _of_wheel(value: Sided, wheel: Wheel) -> float:
     if not isinstance(value, Mapping):
         return float(value)
     # A wheel in the middle is neither front nor rear: only its side counts.
-    sides = ("left" if wheel.corner[0] == "l" else "right", {"f": "front", "r": "rear"}.get(wheel.corner[1], ""))
-    return sum(value.get(side, 0.0) for side in sides)
+    return sum(value.get(place, 0.0) for place in (wheel.side or "right", wheel.row))
 
 
 def with_arrangement(manoeuvre: Manoeuvre, model: Model) -> Model:

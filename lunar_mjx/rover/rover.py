@@ -14,7 +14,7 @@ class Wheel:
     """One wheel of a rover, its joints and its size.
 
     Attributes:
-      corner: lf, rf, lr, rr; lm, rm for a middle row.
+      corner: lf, rf, lr, rr; lm, rm (lm1, lm2, ...) between; c in place of l or r in the middle.
       body: its body in the MJCF; at zero joint angles its origin is the rim's centre, x forward, y the axle, z up.
       radius: m, without grousers.
       width: m.
@@ -30,6 +30,16 @@ class Wheel:
     drive: str
     steer: str | None
     suspension: str | None
+
+    @property
+    def side(self) -> str:
+        """`left` or `right`; "" between the sides."""
+        return {"l": "left", "r": "right"}.get(self.corner[:1], "")
+
+    @property
+    def row(self) -> str:
+        """`front`, `middle` or `rear`; "" where the corner's name tells none."""
+        return {"f": "front", "m": "middle", "r": "rear"}.get(self.corner[1:2], "")
 
 
 @dataclass(frozen=True)

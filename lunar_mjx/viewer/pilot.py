@@ -59,9 +59,9 @@ class Pilot:
         self.top_speed = top_speed
         self._joints = len(rover.joints)
         self._drives = [
-            (rover.joints.index(w.drive), w.radius, 1.0 if w.corner[0] == "l" else -1.0) for w in rover.wheels
+            (rover.joints.index(w.drive), w.radius, 1.0 if w.side == "left" else -1.0) for w in rover.wheels
         ]
-        fronts = [w.steer for w in rover.wheels if w.steer and w.corner[1] == "f"]
+        fronts = [w.steer for w in rover.wheels if w.steer and w.row == "front"]
         self._steers = [(rover.joints.index(name), _span(*rover.joint_limits[name])) for name in fronts]
         self.halt()
 

@@ -12,7 +12,7 @@ from lunar_mjx.dynamics import build
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 from lunar_mjx.resources import shipped
-from lunar_mjx.rover import convert, load_rover
+from lunar_mjx.rover import Wheel, convert, load_rover
 
 
 def test_sides_of_the_husky():
@@ -76,3 +76,12 @@ def test_convert_says_which_motor_it_assumed(tmp_path):
     assert any("assumed the motor" in note and "243" in note for note in rover.notes)
     assert not any("assumed" in note for note in load_rover("husky").notes)
     assert dataclasses.replace(rover).gravity == 1.625
+
+
+@pytest.mark.parametrize(
+    ("corner", "side", "row"),
+    [("lf", "left", "front"), ("rr", "right", "rear"), ("lm2", "left", "middle"), ("cf", "", "front"), ("x", "", "")],
+)
+def test_a_corner_tells_side_and_row(corner, side, row):
+    wheel = Wheel(corner, "wheel", 0.1, 0.1, "drive", None, None)
+    assert (wheel.side, wheel.row) == (side, row)

@@ -86,7 +86,7 @@ def _stones(rover: Rover) -> np.ndarray:
         compiled, np.array([compiled.body(w.body).id for w in rover.wheels]), compiled.body(rover.chassis).id
     )
     size = rover.wheels[0].radius
-    front = [(*feet[i, :2], w.corner) for i, w in enumerate(rover.wheels) if w.corner in ("lf", "rf")]
+    front = [(*feet[i, :2], w.corner) for i, w in enumerate(rover.wheels) if w.row == "front"]
     stones = [[x + 1.7 * size + (0.2 if corner == "rf" else 0.0), y, -0.1 * size, 0.4 * size] for x, y, corner in front]
     belly = rover.standing_height + float(rover.chassis_points[:, 2].min())
     nose = float(rover.chassis_points[rover.chassis_points[:, 2].argmin(), 0])
@@ -111,7 +111,7 @@ def drive(model: Model, duration: float) -> Commands:
     values = np.zeros_like(commands.values)
     for joint, (group, name) in enumerate((g, j) for g in model.rover.groups for j in g.joints):
         wheel = next((w for w in model.rover.wheels if name in (w.drive, w.steer, w.suspension)), None)
-        front = wheel is not None and wheel.corner in ("lf", "rf")
+        front = wheel is not None and wheel.row == "front"
         if group.name == "drive":
             radius = model.rover.wheels[0].radius
             values[:, joint] = 0.1 / radius * np.clip(8.0 * (time - 0.05), 0.0, 1.0) * (time < 0.9)

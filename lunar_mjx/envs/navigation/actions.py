@@ -110,9 +110,7 @@ def _six(rover: Rover, mode: str, groups: list[str], limits: np.ndarray, all_ste
     torque = mode == "paper"
     modes = {"drive": TORQUE if torque else VELOCITY, "steer": TORQUE if torque else POSITION}
     source, scale, code = [], [], []
-    rear = {w.steer for w in rover.wheels if w.steer and w.corner[0] == "l" and w.corner[1] == "r"}
-    rear |= {w.steer for w in rover.wheels if w.steer and w.corner == "rr"}
-    front = {w.steer for w in rover.wheels if w.steer and w.corner in ("lf", "rf")}
+    rear, front = ({w.steer for w in rover.wheels if w.steer and w.row == row} for row in ("rear", "front"))
     for joint, group, limit in zip(rover.joints, groups, limits, strict=True):
         source.append({"drive": 0, "steer": 1}.get(group, names.index(joint) if joint in names else 0))
         value, kind = limit, modes.get(group, TORQUE if torque else POSITION)
