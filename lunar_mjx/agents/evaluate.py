@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.envs.core import Environment, split_keys
+from lunar_mjx.envs.core import PER_STEP, Environment, split_keys
 from lunar_mjx.envs.navigation.tally import METRICS
 from lunar_mjx.envs.scripted import Agent
 
@@ -92,7 +92,7 @@ class Evaluator:
                 # Environments go on after their first episode: later ones would favour short episodes, and are not
                 # counted.
                 first = state.done & ~over
-                seen = {k: v for k, v in state.metrics.items() if not k.startswith("reward_")}
+                seen = {k: v for k, v in state.metrics.items() if not k.startswith(PER_STEP)}
                 result = jax.tree.map(lambda old, new: jnp.where(first, new, old), result, seen)
                 return (state, over | state.done, result), None
 
@@ -111,7 +111,7 @@ class Evaluator:
     def _carry(self, state: Any) -> Any:
         """State, whether each first episode is over, and what it came to."""
         zero = jnp.zeros(self.copies * self.episodes)
-        seen = {k: zero for k in state.metrics if not k.startswith("reward_")}
+        seen = {k: zero for k in state.metrics if not k.startswith(PER_STEP)}
         return state, zero.astype(bool), seen
 
     def __call__(self, env_params: Any, agent_params: Any, seed: int) -> Score:

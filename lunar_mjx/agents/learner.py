@@ -25,7 +25,7 @@ from lunar_mjx.agents.from_teacher.distill import Distill, DistillConfig, Lesson
 from lunar_mjx.agents.networks import normalised
 from lunar_mjx.agents.replay import Batch, ReplayBuffer, ReplayState, Transition
 from lunar_mjx.agents.td3 import TD3, TD3Config
-from lunar_mjx.envs.core import Environment, State
+from lunar_mjx.envs.core import PER_STEP, Environment, State
 from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.pytree import pytree, tree_of
 
@@ -370,10 +370,10 @@ class Learner:
         return dataclasses.replace(state, agent=agent, statistics=self._counted(statistics, *observed)), (seen, losses)
 
     def _seen(self, env: State) -> dict[str, Any]:
-        """Numbers of a step for reports: sums over episodes that ended, and means over rovers of `reward_` terms."""
+        """Numbers of a step for reports: sums over episodes that ended, and means over rovers of `PER_STEP`."""
         # Sums and counts instead of means: episodes of an epoch weigh alike, whenever they end.
-        ended = {k: jnp.sum(jnp.where(env.done, v, 0.0)) for k, v in env.metrics.items() if not k.startswith("reward_")}
-        means = {k: jnp.mean(v) for k, v in env.metrics.items() if k.startswith("reward_")}
+        ended = {k: jnp.sum(jnp.where(env.done, v, 0.0)) for k, v in env.metrics.items() if not k.startswith(PER_STEP)}
+        means = {k: jnp.mean(v) for k, v in env.metrics.items() if k.startswith(PER_STEP)}
         seen = {"ended": ended, "count": jnp.sum(env.done), "means": {**means, "reward": jnp.mean(env.reward)}}
         if self.config.episodes:
             seen |= {name: env.metrics[name] for name in EPISODE} | {"done": env.done}

@@ -16,6 +16,7 @@ from lunar_mjx.agents.policy import load_policy, shipped_policy
 from lunar_mjx.cameras.chase import Chase, wheel_tracks
 from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs import TASKS, NavigationEnv, make, make_agent, split_keys
+from lunar_mjx.envs.core import PER_STEP
 from lunar_mjx.envs.scripted import AGENTS, Agent
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.files import replacing, write_text
@@ -223,7 +224,7 @@ def play_episode(env: Any, params: Any, agent: Agent, seed: int = 0) -> Episode:
         actions.append(np.asarray(action[0]))
         rewards.append(float(state.reward[0]))
         if bool(state.done[0]):
-            flags = {k: float(v[0]) for k, v in state.metrics.items() if not k.startswith("reward_")}
+            flags = {k: float(v[0]) for k, v in state.metrics.items() if not k.startswith(PER_STEP)}
             names = {
                 "success": "goal reached",
                 "rolled_over": "rolled over",

@@ -56,7 +56,9 @@ def shipped_policy(name: str) -> Path | None:
 
 
 def policy_of(learner: Any, state: Any, environment: dict[str, Any], notes: dict[str, Any]) -> Policy:
-    """The policy of a state of a training's `Learner`."""
+    """The policy of a state of a training's `Learner`; who drives it makes its environment without a curriculum."""
+    options = {k: v for k, v in environment.get("options", {}).items() if k != "curriculum_levels"}
+    environment = {**environment, "options": options} if environment else environment
     params, statistics = jax.device_get(learner.policy(state))
     config = learner.config.algorithm
     network = {

@@ -11,6 +11,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lunar_mjx.pytree import AnyArray, pytree
 
+PER_STEP = ("reward_", "curriculum_")
+"""What the names of metrics begin with that say something in every step: parts of the step's reward, and where rovers
+stand in a curriculum."""
+
 
 @pytree
 class State:
@@ -28,7 +32,7 @@ class State:
       truncated: the episode was cut off although the task goes on: the value of `final_obs` still counts.
       final_obs, final_privileged: the true successors, before any reset.
       metrics: numbers for logs, by name: `episode_return`, `episode_length`, `success` and others of the episode, which
-        mean something only where `done`; and, where the name begins with `reward_`, parts of the step's reward.
+        mean something only where `done`; and those of `PER_STEP`.
       info: what scripted agents and viewers read.
       inner: the environment's own state.
     """

@@ -18,7 +18,7 @@ import numpy as np
 from lunar_mjx.envs.ladder.chart import coarse_prices
 from lunar_mjx.envs.ladder.ground import World, make_world
 from lunar_mjx.envs.ladder.rungs import Rung
-from lunar_mjx.envs.ladder.ways import draw_goal, passable
+from lunar_mjx.envs.ladder.ways import draw_goal, survey
 from lunar_mjx.errors import bad_input
 from lunar_mjx.pytree import pytree
 from lunar_mjx.terrain import HeightField, Rocks, Terrain
@@ -48,6 +48,8 @@ class Places:
       starts, goals: (place, 2) m on the map.
       arrivals: heading to arrive in, rad. shortest: length of the shortest way, m.
       way: number of the goal's distances in `Pool.ways`. world: number of the world.
+      nearer: (place, level, 2) starts of a curriculum, nearer to the goal on the shortest way, the last one `starts`;
+        nearer_shortest: (place, level) what is left of it. None without one.
     """
 
     starts: Any
@@ -56,6 +58,8 @@ class Places:
     shortest: Any
     way: Any
     world: Any
+    nearer: Any = None
+    nearer_shortest: Any = None
 
 
 @pytree
@@ -69,6 +73,7 @@ class Pool:
       middles: (world, 2) of the worlds on the map, m.
       size: side of a world, m.
       prices: (world, row, column) price of a metre on the grid of the rovers' charts, infinite where blocked.
+      usual_price: median of those where nothing blocks.
     """
 
     terrain: Any
@@ -77,6 +82,7 @@ class Pool:
     middles: Any
     size: Any
     prices: Any
+    usual_price: Any
 
 
 def way_left(pool: Pool, place: Any, position: Any) -> tuple[Any, Any]:
@@ -104,46 +110,52 @@ def way_left(pool: Pool, place: Any, position: Any) -> tuple[Any, Any]:
     return total / jnp.maximum(weight, 1e-3), weight > 1e-3
 
 
-def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: float = 1.0) -> Pool:
+def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: float = 1.0, levels: int = 0) -> Pool:
     """Makes the worlds of a rung with their places.
 
     Args:
       rung: which, for this rover (`Rung.scaled`).
       seed: of everything in them.
       worlds: how many. half_width: of the rover with a margin, m. hardness: see `make_world`.
+      levels: of a curriculum, see `Places.nearer`.
 
     Raises:
       UserError: no world has a pair of places as the rung asks.
     """
-    made = _worlds(rung, worlds, half_width)(jax.random.PRNGKey(seed), jnp.float32(hardness))
-    world, goals, free = made
+    made = _worlds(rung, worlds, half_width, levels)(jax.random.PRNGKey(seed), jnp.float32(hardness))
+    world, goals, clear, slope = made
     valid = np.asarray(goals["valid"])
     if not valid.any():
         raise bad_input("ladder", "worlds", worlds, "have no such places", "raise it, or lower the hardness")
     # About square: float32 places are finest near the map's middle.
     across = math.ceil(math.sqrt(worlds))
     middles = _middles(worlds, across, rung.size)
+    grounds = zip(np.asarray(clear), np.asarray(slope), strict=True)
+    price = np.stack([coarse_prices(c, s, rung.plan_cell) for c, s in grounds])
     return Pool(
         _atlas(rung, world, middles, across),
         _places(goals, valid, np.asarray(middles), seed),
         goals["way"].reshape(-1, *goals["way"].shape[2:]),
         jnp.asarray(middles, jnp.float32),
         jnp.float32(rung.size),
-        jnp.asarray(np.stack([coarse_prices(f, rung.plan_cell) for f in np.asarray(free)]), jnp.float32),
+        jnp.asarray(price, jnp.float32),
+        jnp.float32(np.median(price[np.isfinite(price)])),
     )
 
 
 @functools.cache
-def _worlds(rung: Rung, worlds: int, half_width: float) -> Any:
-    """The compiled maker: key and hardness to worlds, their goals and their free nodes, some worlds at a time."""
+def _worlds(rung: Rung, worlds: int, half_width: float, levels: int) -> Any:
+    """The compiled maker: key and hardness to worlds, their goals, and which nodes are clear and how steep, some worlds
+    at a time."""
 
     def one(key: Any, hardness: Any) -> Any:
         k_world, k_goals = jax.random.split(key)
         world = make_world(rung, k_world, hardness)
-        free, roomy = passable(rung, world, half_width)
+        ground = survey(rung, world, half_width)
         keys = jax.random.split(k_goals, POOL_SIZES.goals)
         # Distances are found once per goal and kept: a step then only reads them.
-        return world, jax.vmap(lambda k: draw_goal(rung, free, roomy, k, POOL_SIZES.starts))(keys), free
+        goals = jax.vmap(lambda k: draw_goal(rung, ground, k, POOL_SIZES.starts, levels))(keys)
+        return world, goals, ground.clear, ground.slope
 
     def all_of(key: Any, hardness: Any) -> Any:
         # A few at a time: all at once would need their distances' memory at once.
@@ -203,4 +215,12 @@ def _places(goals: dict[str, Any], valid: np.ndarray, middles: np.ndarray, seed:
     arrival = bearing + np.random.default_rng([seed, 17]).uniform(-0.5 * np.pi, 0.5 * np.pi, len(way))
     shortest = shortest.reshape(-1, starts.shape[2])[way, world_number]
     start, goal, arrival, shortest = (jnp.asarray(a, jnp.float32) for a in (start, goal, arrival, shortest))
-    return Places(start, goal, arrival, shortest, jnp.asarray(way), jnp.asarray(world))
+    places = Places(start, goal, arrival, shortest, jnp.asarray(way), jnp.asarray(world))
+    if "nearer" not in goals:
+        return places
+    nearer, left = (np.asarray(goals[k]) for k in ("nearer", "nearer_shortest"))
+    nearer = nearer.reshape(-1, *nearer.shape[2:])[way, world_number] + middles[world][:, None]
+    left = left.reshape(-1, *left.shape[2:])[way, world_number]
+    return dataclasses.replace(
+        places, nearer=jnp.asarray(nearer, jnp.float32), nearer_shortest=jnp.asarray(left, jnp.float32)
+    )

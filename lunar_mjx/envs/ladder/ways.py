@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from lunar_mjx.envs.ladder.ground import RIM, World, near_boulders, nodes, steepness
 from lunar_mjx.envs.ladder.rungs import Rung
+from lunar_mjx.pytree import pytree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,18 +45,35 @@ def slope_grid(rung: Rung, heights: Any) -> Any:
     return blocks.max(axis=(1, 3))
 
 
-def passable(rung: Rung, world: World, half_width: float) -> tuple[Any, Any]:
-    """Nodes of the planning grid that a rover can stand on, and those with room to turn; (row, column) booleans."""
+@pytree
+class Ground:
+    """What the planning grid says of a world; (row, column) each.
+
+    Attributes:
+      clear: no boulder within a rover's half width, and inside the world's rim.
+      slope: greatest within the node, tangent.
+      free: clear, and level enough that ways are planned there. roomy: free, with room to turn.
+    """
+
+    clear: Any
+    slope: Any
+    free: Any
+    roomy: Any
+
+
+def survey(rung: Rung, world: World, half_width: float) -> Ground:
+    """The planning grid of a world for a rover of this half width, m."""
     at = nodes(rung.size, rung.plan_cell)
     x, y = jnp.meshgrid(at, at)
     gap, _ = near_boulders(rung, world.centers, world.radii, x, y)
     slope = slope_grid(rung, world.heights)
     inside = jnp.abs(at) < 0.5 * rung.size - RIM
-    inside = inside[:, None] & inside[None, :]
+    clear = inside[:, None] & inside[None, :] & (gap > half_width)
     # Wider rovers need more of it, in proportion.
     room = WAY_LIMITS.room * half_width / WAY_LIMITS.half_width
-    free = inside & (gap > half_width) & (slope < math.tan(WAY_LIMITS.steepest))
-    return free, free & (gap > room) & (slope < math.tan(WAY_LIMITS.level * WAY_LIMITS.steepest))
+    free = clear & (slope < math.tan(WAY_LIMITS.steepest))
+    roomy = free & (gap > room) & (slope < math.tan(WAY_LIMITS.level * WAY_LIMITS.steepest))
+    return Ground(clear, slope, free, roomy)
 
 
 def distances(free: Any, row: Any, column: Any, cell: float, price: Any = 1.0) -> Any:
@@ -83,13 +101,54 @@ def distances(free: Any, row: Any, column: Any, cell: float, price: Any = 1.0) -
     return jax.lax.while_loop(lambda carry: carry[1], relax, (start, jnp.array(True)))[0]
 
 
-def draw_goal(rung: Rung, free: Any, roomy: Any, key: Any, starts: int) -> dict[str, Any]:
+def on_the_way(way: Any, roomy: Any, begin: Any, shares: Any, cell: float) -> Any:
+    """Nodes on the shortest ways at which a share of them is left, and which have room to turn.
+
+    Args:
+      way: (row, column) distances to the goal. roomy: (row, column).
+      begin: (start,) numbers of the nodes where ways begin. shares: (level,) of their lengths. cell: m.
+
+    Returns:
+      (level, start) numbers of nodes; the beginning where no node on the way has room.
+    """
+    count = way.shape[0]
+    flat, room = way.reshape(-1), roomy.reshape(-1)
+    wanted = shares[:, None] * flat[begin]
+
+    def forward(carry: Any) -> Any:
+        node, best, chosen = carry
+        gap = jnp.where(room[node], jnp.abs(flat[node] - wanted), jnp.inf)
+        best, chosen = jnp.minimum(best, gap), jnp.where(gap < best, node, chosen)
+        row, column = node // count, node % count
+        near = jnp.stack(
+            [jnp.clip(row + j, 0, count - 1) * count + jnp.clip(column + i, 0, count - 1) for j, i, _ in _STEPS]
+        )
+        length = flat[near] + cell * jnp.asarray([s for _, _, s in _STEPS])[:, None]
+        following = jnp.take_along_axis(near, jnp.argmin(length, axis=0)[None], axis=0)[0]
+        # who has arrived waits for the others
+        return jnp.where(flat[node] > 0.0, following, node), best, chosen
+
+    def on(carry: Any) -> Any:
+        return (flat[carry[0]] > 0.0).any() & jnp.isfinite(flat[carry[0]]).all()
+
+    far = jnp.full(wanted.shape, jnp.inf)
+    chosen = jnp.broadcast_to(begin, wanted.shape)
+    return jax.lax.while_loop(on, forward, (begin, far, chosen))[2]
+
+
+def draw_goal(rung: Rung, ground: Ground, key: Any, starts: int, levels: int = 0) -> dict[str, Any]:
     """A goal with its distances, and starts for it.
+
+    Args:
+      rung: which. ground: of the world. key: random. starts: how many.
+      levels: of a curriculum.
 
     Returns:
       `goal` (2,), `starts` (start, 2), m from the world's middle; `shortest` (start,) length of the shortest way;
-      `way` (row, column) the distances; `valid`: whether the world has such starts.
+      `way` (row, column) the distances; `valid`: whether the world has such starts. With levels also `nearer`
+      (start, level, 2), starts on the shortest ways, and `nearer_shortest` (start, level), m.
     """
+    free, roomy = ground.free, ground.roomy
     at = nodes(rung.size, rung.plan_cell)
     count = at.shape[0]
     k_goal, k_start = jax.random.split(key)
@@ -103,10 +162,15 @@ def draw_goal(rung: Rung, free: Any, roomy: Any, key: Any, starts: int) -> dict[
     # A detour is asked for, so that driving straight is not enough.
     fits = roomy & jnp.isfinite(way) & (straight >= low) & (straight <= high) & (way >= rung.detour * straight)
     begin = jax.random.categorical(k_start, jnp.where(fits.reshape(-1), 0.0, -jnp.inf), shape=(starts,))
-    return {
+    found = {
         "goal": goal,
         "starts": jnp.stack([at[begin % count], at[begin // count]], axis=-1),
         "shortest": way.reshape(-1)[begin],
         "way": way,
         "valid": fits.any(),
     }
+    if levels:
+        near = on_the_way(way, roomy, begin, (jnp.arange(levels) + 1.0) / levels, rung.plan_cell).T
+        found["nearer"] = jnp.stack([at[near % count], at[near // count]], axis=-1)
+        found["nearer_shortest"] = way.reshape(-1)[near]
+    return found

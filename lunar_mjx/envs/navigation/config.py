@@ -63,6 +63,9 @@ class NavigationConfig:
       rung: of the ladder, whose worlds take the terrain's place; 0 for none.
       worlds: of the rung, side by side; as many as it says if 0.
       hardness: by which the rung's slopes, craters, ridges and boulders are multiplied.
+      curriculum_levels: of the ladder's training: on level k of n a rover begins on the shortest way where k/n of it
+        is left. Every success raises a rover's level by one, every failure lowers it. 0 or 1 for none; evaluations
+        (`NavigationEnv.place`) are always on the last level.
     """
 
     decimation: int = 50
@@ -104,6 +107,7 @@ class NavigationConfig:
     rung: int = 0
     worlds: int = 0
     hardness: float = 1.0
+    curriculum_levels: int = 0
 
     def __post_init__(self) -> None:
         _check(self)
@@ -198,13 +202,16 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", "weights", name, "is only known on the ladder", "leave it out")
     if c.collisions != "free" and not c.tally:
         raise bad_input("navigation", "tally", c.tally, f"does not go with collisions = {c.collisions}", "give true")
-    for name in ("rung", "worlds", "place_seed"):
+    for name in ("rung", "worlds", "place_seed", "curriculum_levels"):
         value = getattr(c, name)
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
             raise bad_input("navigation", name, value, "is not a whole number of at least 0", "give one")
     if c.rung:
         # Refuses a rung that does not exist, in words of its own.
         get_rung(c.rung)
+    if c.curriculum_levels > 1 and not c.rung:
+        given = c.curriculum_levels
+        raise bad_input("navigation", "curriculum_levels", given, "is for the ladder only", "leave it out")
     for field, names in (("observations", c.observations), ("privileged", c.privileged)):
         for name in ("arrival", "plan"):
             if name in names and not c.rung:

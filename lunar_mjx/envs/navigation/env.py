@@ -64,6 +64,7 @@ class NavigationParams:
       side: of the worlds that make up the terrain, m: leaving one's own fails; None if it is one.
       pool: the ladder's worlds, for planners and the reward `way`; None elsewhere.
       spread: of the model's posterior; None unless it is drawn from.
+      least_level: of the curriculum, from 0: below it no rover begins; None without one.
     """
 
     system: Params
@@ -77,6 +78,7 @@ class NavigationParams:
     side: Any = None
     pool: Pool | None = None
     spread: randomise.Spread | None = None
+    least_level: Any = None
 
 
 @pytree
@@ -84,7 +86,7 @@ class Ready:
     """The beginning of each rover's next episode, prepared; leading axis `env`.
 
     Attributes:
-      obs, privileged, info: as in `State`. inner: with neither `ready` nor `used` nor `chart` of its own.
+      obs, privileged, info: as in `State`. inner: with neither `ready` nor `used`, `chart` or `next_level` of its own.
     """
 
     obs: Any
@@ -111,6 +113,8 @@ class Inner:
         goal from where the rover last stood on free ground, m. trail: (3, 2) means of past positions, m.
         visited: (place, 2) where it was, newest first, m. All None unless the task needs them.
       chart: what the rover knows of its world; None unless it is observed, and in a prepared beginning.
+      level: of the curriculum on which the episode began, from 0. next_level: on which beginnings are prepared. None
+        without one.
       ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
     """
 
@@ -133,6 +137,8 @@ class Inner:
     trail: Any = None
     visited: Any = None
     chart: chart.Chart | None = None
+    level: Any = None
+    next_level: Any = None
     ready: Ready | None = None
     used: Any = None
 
@@ -203,6 +209,7 @@ class NavigationEnv:
         self._scale = SCAN_SCALE.get(model.rover.name, 1.0)
         self._outline = tally.Outline(self.system) if config.tally else None
         self._battery = "battery" in model.effect_names
+        self._levels = config.curriculum_levels if config.curriculum_levels > 1 else 0
         if "power" in config.observations and not (self._battery and model.sun is not None):
             remedy = "add the effect battery and a Sun to the model, or leave it out"
             raise bad_input("navigation", "observations", "power", "needs a battery and a Sun", remedy)
@@ -211,6 +218,9 @@ class NavigationEnv:
         more = ("collided",) if config.collisions == "end" else ()
         self._ends_told = (*ENDS, *more, *(("drained",) if self._battery else ()))
         self.params = self.place(model)
+        if self._levels:
+            # only the training's own parameters: all others that are made are for tests of what was learnt
+            self.params = dataclasses.replace(self.params, least_level=jnp.int32(0))
         self.action_size = self.actions.size
         # Sizes are read off the program itself, so that no table of widths can be wrong.
         shapes = jax.eval_shape(self.reset, self.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
@@ -275,7 +285,8 @@ class NavigationEnv:
         half_width = (self._outline or tally.Outline(self.system)).half[1] + 0.1
         # Whole multiples of LUVMI-X's world: grids and boulders then divide as they do there.
         rung = get_rung(c.rung).scaled(max(1.0, round(half_width / 0.4)))
-        return make_pool(rung, seed, c.worlds or rung.worlds, half_width, c.hardness if hardness is None else hardness)
+        hardness = c.hardness if hardness is None else hardness
+        return make_pool(rung, seed, c.worlds or rung.worlds, half_width, hardness, self._levels)
 
     def _on_pool(self, model: Model, pool: Pool, bounds: Any, gains: Any) -> NavigationParams:
         from lunar_mjx.dynamics.system import default_params
@@ -294,6 +305,7 @@ class NavigationEnv:
             side=pool.size,
             # the map is in `system` already
             pool=dataclasses.replace(pool, terrain=None),
+            least_level=jnp.int32(self._levels - 1) if self._levels else None,
         )
 
     @functools.cached_property
@@ -322,7 +334,9 @@ class NavigationEnv:
     def reset(self, params: NavigationParams, keys: Any) -> State:
         """Begins an episode in every environment; `keys` (env, 2) raw random keys."""
         # the first episode and the prepared one in one batch: half the program to compile
-        begun = self._begin(params, jnp.concatenate([keys, _split(keys)[:, 0]]))
+        level = self._first_level(params, keys)
+        twice = None if level is None else jnp.tile(level, 2)
+        begun = self._begin(params, jnp.concatenate([keys, _split(keys)[:, 0]]), twice)
         first, ready = (
             jax.tree.map(lambda a, p=part: a[p], begun) for part in (slice(keys.shape[0]), slice(keys.shape[0], None))
         )
@@ -330,9 +344,10 @@ class NavigationEnv:
         zero, no = jnp.zeros(keys.shape[0], obs.dtype), jnp.zeros(keys.shape[0], bool)
         terms = (f"reward_{n}" for n in self.config.weights)
         metric_names = tally.METRICS if self.config.tally else ()
-        names = ("episode_return", "episode_length", "success", *self._ends_told[1:], *metric_names, *terms)
+        told = ("curriculum_level",) if self._levels else ()
+        names = ("episode_return", "episode_length", "success", *self._ends_told[1:], *metric_names, *terms, *told)
         metrics = dict.fromkeys(names, zero)
-        inner = dataclasses.replace(inner, ready=ready, used=no, chart=self._blank(params, inner))
+        inner = dataclasses.replace(inner, ready=ready, used=no, chart=self._blank(params, inner), next_level=level)
         return State(obs, privileged, zero, no, no, obs, privileged, metrics, first.info, inner)
 
     def step(self, params: NavigationParams, state: State, action: Any) -> State:
@@ -379,7 +394,13 @@ class NavigationEnv:
             **{f"reward_{name}": value for name, value in terms.items()},
         }
         if inner.tally is not None:
-            metrics |= tally.metrics(inner.tally, params.shortest[inner.place], inner.steps)
+            metrics |= tally.metrics(inner.tally, self._shortest(params, inner.place, inner.level), inner.steps)
+        if inner.level is not None:
+            metrics["curriculum_level"] = 1.0 + inner.level.astype(reward.dtype)
+            # The next episode is prepared already: this one's end decides about those that are prepared from now on.
+            reached = jnp.clip(inner.level + jnp.where(success, 1, -1), params.least_level, self._levels - 1)
+            after = jnp.where(terminated | truncated, reached, inner.next_level)
+            inner = dataclasses.replace(inner, next_level=after)
         # before the restart: the successor in the replay buffer is the old episode's last state, not the new one's
         final_obs, final_privileged = self._observe(params, inner, view)
         if c.divergence == "reset":
@@ -413,11 +434,13 @@ class NavigationEnv:
         """
         done, kept = state.done, side_by_side((inner.ready, inner.used))
         # the prepared episode lies inside the state that it replaces, so that it is taken out before the selection
-        alone = dataclasses.replace(inner, ready=None, used=None, chart=None)
+        alone = dataclasses.replace(inner, ready=None, used=None, chart=None, next_level=None)
 
         def prepare(carry: Any) -> Any:
             _, (_, used) = carry
-            return jnp.zeros((), bool), side_by_side((self._begin(params, inner.key), jnp.zeros_like(used)))
+            return jnp.zeros((), bool), side_by_side(
+                (self._begin(params, inner.key, inner.next_level), jnp.zeros_like(used))
+            )
 
         short = (done & inner.used).any() | (inner.used.mean(dtype=jnp.float32) > _USED)
         # a loop of no or one turn: unlike a conditional, it leaves what it does not change where it is
@@ -428,12 +451,12 @@ class NavigationEnv:
         if known is not None:
             # a blank chart is cheaper made than kept
             known = where(done, self._blank(params, alone), known)
-        inner = dataclasses.replace(alone, ready=ready, used=used | done, chart=known)
+        inner = dataclasses.replace(alone, ready=ready, used=used | done, chart=known, next_level=inner.next_level)
         return dataclasses.replace(state, obs=obs, privileged=privileged, info=info, inner=inner)
 
-    def _begin(self, params: NavigationParams, keys: Any) -> Ready:
-        """New episodes with their first observations."""
-        inner = self._fresh(params, keys)
+    def _begin(self, params: NavigationParams, keys: Any, level: Any = None) -> Ready:
+        """New episodes with their first observations, on levels of the curriculum where there is one."""
+        inner = self._fresh(params, keys, level)
         view = self._view(params, inner)
         return Ready(*self._observe(params, inner, view), self._info(view), inner)
 
@@ -499,12 +522,11 @@ class NavigationEnv:
             left, known = way_left(params.pool, inner.place, position[:, :2])
             inner = dataclasses.replace(inner, left=jnp.where(known, left, inner.left))
         if inner.chart is not None:
-            assert params.pool is not None
-            place, yaw = self._on_chart(params, inner), self._reader.pose(physics)["yaw"]
-            price, world, map_position, goal, cell = place
-            inner = dataclasses.replace(
-                inner, chart=chart.look(inner.chart, price, world, map_position, yaw, goal, cell)
-            )
+            patience, yaw = chart.CHART.patience, self._reader.pose(physics)["yaw"]
+            # tried in vain each time that as long has passed without progress
+            vain = jnp.floor(waited / patience) > jnp.floor((waited - self.control_interval) / patience)
+            vain = jnp.where(vain & (waited > 0.0), jnp.sign(action[:, 0]), 0.0)
+            inner = dataclasses.replace(inner, chart=chart.look(inner.chart, self._errand(params, inner), yaw, vain))
         view = self._view(params, inner)
         if inner.tally is not None and self._outline is not None:
             touching = self._outline.touches(params.system.terrain, view)
@@ -547,13 +569,32 @@ class NavigationEnv:
             no_reward = no_reward | happened
         return end_flags
 
-    def _fresh(self, params: NavigationParams, keys: Any) -> Inner:
+    def _first_level(self, params: NavigationParams, keys: Any) -> Any:
+        """Levels of the curriculum on which rovers begin, drawn evenly, so that all are driven from the first step on;
+        None without one."""
+        if not self._levels:
+            return None
+        # folded, so that everything else is drawn as without a curriculum
+        draw = jax.vmap(lambda k: jax.random.randint(jax.random.fold_in(k, 0), (), 0, self._levels))
+        return jnp.maximum(draw(keys), params.least_level)
+
+    def _shortest(self, params: NavigationParams, place: Any, level: Any) -> Any:
+        """Length of the shortest way of pairs of start and goal, from where a level of the curriculum begins."""
+        if level is None or params.pool is None:
+            return params.shortest[place]
+        return params.pool.places.nearer_shortest[place, level]
+
+    def _fresh(self, params: NavigationParams, keys: Any, level: Any = None) -> Inner:
         """New episodes, all at their beginning."""
         c, count = self.config, keys.shape[0]
+        if level is None:
+            level = self._first_level(params, keys)
         split = _split(keys)
         # One key for each environment: what an episode draws does not depend on how many others run beside it.
         pick = jax.vmap(lambda k: jax.random.randint(k, (), 0, params.starts.shape[0]))(split[:, 1])
         start, goal = params.starts[pick], params.goals[pick]
+        if level is not None and params.pool is not None:
+            start = params.pool.places.nearer[pick, level]
         turn = jax.vmap(lambda k: jax.random.uniform(k, (), minval=-1.0, maxval=1.0))(split[:, 2])
         # Headings are drawn about the goal's bearing.
         bearing = jnp.arctan2(goal[:, 1] - start[:, 1], goal[:, 0] - start[:, 0])
@@ -585,7 +626,8 @@ class NavigationEnv:
             total=zero,
             place=pick if params.shortest is not None or params.arrivals is not None else None,
             tally=tally.start(count, position.dtype) if c.tally else None,
-            left=params.pool.places.shortest[pick] if "way" in c.weights and params.pool is not None else None,
+            left=self._shortest(params, pick, level) if "way" in c.weights and params.pool is not None else None,
+            level=level,
             trail=jnp.repeat(position[:, None, :2], len(VIEW.trail), axis=1) if "trail" in self._told else None,
             visited=jnp.full((count, VIEW.visited_kept, 2), VIEW.nowhere, position.dtype)
             if "visited" in self._told
@@ -610,31 +652,33 @@ class NavigationEnv:
             high = low + params.side
         return jnp.stack([low + self.config.edge, high - self.config.edge], axis=1)
 
-    def _on_chart(self, params: NavigationParams, inner: Inner) -> tuple[Any, ...]:
-        """What the functions of `ladder.chart` take: prices, world, position and goal in it, and the nodes' spacing."""
+    def _errand(self, params: NavigationParams, inner: Inner) -> chart.Errand:
+        """What the functions of `ladder.chart` take."""
         assert params.pool is not None
-        pool = params.pool
+        pool, within = params.pool, self.config.arrive_within
         world = pool.places.world[inner.place]
         corner = pool.middles[world] - 0.5 * pool.size
-        on_map = inner.physics.qpos[:, :2] - corner
-        return pool.prices, world, on_map, inner.goal - corner, pool.size / pool.prices.shape[-1]
+        return chart.Errand(
+            pool.prices,
+            world,
+            inner.physics.qpos[:, :2] - corner,
+            inner.goal - corner,
+            pool.size / pool.prices.shape[-1],
+            pool.usual_price,
+            pool.places.arrivals[inner.place] if within < np.pi else None,
+            within,
+        )
 
     def _blank(self, params: NavigationParams, inner: Inner) -> chart.Chart | None:
         """The charts of rovers that have seen nothing; None unless they are observed."""
-        if "plan" not in self._told:
-            return None
-        price, _, _, goal, cell = self._on_chart(params, inner)
-        return chart.begin(price.shape[-1], goal, cell)
+        return chart.begin(self._errand(params, inner)) if "plan" in self._told else None
 
     def _plan(self, params: NavigationParams, inner: Inner) -> Any:
         """The field `plan` of `View`; of who has seen nothing yet, straight for the goal."""
         if "plan" not in self._told:
             return None
-        price, world, map_position, goal, cell = self._on_chart(params, inner)
-        if inner.chart is None:
-            aim, nodes, left = chart.straight(map_position, goal, cell)
-        else:
-            aim, nodes, left = chart.way(inner.chart, price, world, map_position, goal, cell)
+        errand = self._errand(params, inner)
+        aim, nodes, left = chart.straight(errand) if inner.chart is None else chart.way(inner.chart, errand)
         return jnp.concatenate([aim, nodes.reshape(aim.shape[0], -1), left[:, None]], axis=-1)
 
     def _charge(self, params: NavigationParams, inner: Inner) -> Any:

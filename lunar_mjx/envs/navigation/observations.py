@@ -168,7 +168,7 @@ def visited(v: View, s: Scene) -> Any:
 def plan(v: View, s: Scene) -> Any:
     """The way to the goal on the map that the rover has drawn of what it has seen (`ladder.chart`): where to aim, then
     the next nodes of the way, m, all in the body frame as along and across pairs, and the way's cost in units of 50 m
-    of open ground."""
+    of ground as it is on average."""
     assert v.plan is not None, "the environment keeps the chart that this block asks for"
     cos, sin = jnp.cos(v.yaw)[:, None], jnp.sin(v.yaw)[:, None]
     x, y = v.plan[:, :-1:2], v.plan[:, 1:-1:2]
