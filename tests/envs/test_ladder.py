@@ -245,11 +245,13 @@ def test_the_reward_of_the_way_adds_up_and_the_trail_follows():
     been = np.asarray(state.obs[:, env.blocks["visited"]]).reshape(3, 5, 5)
     np.testing.assert_allclose(been[:, 2, 2], np.exp(-0.125 * gone**2), atol=0.05)
     assert (been.reshape(3, -1).argmax(1) == 12).all()
-    # the map is drawn from the first step on, and its way is no shorter than the straight line
+    # the map is drawn from the first step on; its way costs no less than the straight line over open ground
     seen, plan = np.asarray(state.inner.chart.seen), np.asarray(state.obs[:, env.blocks["plan"]])
     assert (seen.sum((1, 2)) > 100).all() and not seen.all()
     straight = np.hypot(*(state.inner.goal - here).T)
-    assert (50.0 * plan[:, -1] > straight - 1.0).all() and (np.hypot(plan[:, 0], plan[:, 1]) < 8.0).all()
+    usual = float(env.params.pool.usual_price)
+    assert usual > 1.0 and (50.0 * usual * plan[:, -1] > straight - 1.0).all()
+    assert (np.hypot(plan[:, 0], plan[:, 1]) < 8.0).all()
     # an episode that ends leaves no map to the next one
     blank = env._restart(env.params, state.inner, dataclasses.replace(state, terminated=jnp.ones(3, bool))).inner.chart
     assert not np.asarray(blank.seen).any() and np.isfinite(np.asarray(blank.cost)).all()
