@@ -86,7 +86,8 @@ class Trials:
                 best = chosen["success"]
                 self.store(seed, state, row, found["policy"])
             self.save()
-            shown(found, f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s: chosen by {percent(chosen)}; ")
+            say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s: the best is chosen by {percent(chosen)}")
+            shown(found, "    ")
             return chosen["success"]
 
         config = RunConfig(steps, seed, seconds, math.inf, quiet=True)

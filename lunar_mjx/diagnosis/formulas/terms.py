@@ -26,6 +26,7 @@ from lunar_mjx.diagnosis.formulas.targets import (
     known,
 )
 from lunar_mjx.effects.base import PORTS, Effect
+from lunar_mjx.logs.schema import CHANNELS, unit_of
 
 if TYPE_CHECKING:
     from sympy import Expr
@@ -348,22 +349,8 @@ def _sensor(kinds: Sequence[str]) -> Iterator[Term]:
             )
 
 
-_UNITS = {
-    "m": "m",
-    "s": "m/s",
-    "s2": "m/s2",
-    "rad": "rad",
-    "deg": "deg",
-    "A": "A",
-    "V": "V",
-    "Nm": "N m",
-    "N": "N",
-    "degC": "K",
-    "ratio": "1",
-}
-
-
 def _unit_of(kind: str) -> str:
-    if kind.endswith("rad_s"):
-        return "rad/s"
-    return _UNITS.get(kind.rsplit("_", 1)[-1], "1")
+    """Unit of a change of a kind of channel, by the longest suffix of the schema that ends its name."""
+    suffix = max((c.suffix for c in CHANNELS if c.suffix and kind.endswith(f"_{c.suffix}")), key=len, default="")
+    # a difference of temperatures
+    return "K" if suffix == "degC" else unit_of(suffix)

@@ -60,6 +60,8 @@ def test_units_follow_from_scaling():
         f.unit_of(f.parsed("z + z**2", SHEAR), SHEAR)
     assert f.per("N m", {"rad/s": 2, "A": -1}) == "N m s2 A/rad2"
     assert [t.unit for t in terms("motor_torque")][:4] == ["N m", "N m s/rad", "N m s2/rad2", "N m/A"]
+    for kind, unit in (("motor_drive_current_A", "A"), ("winding_drive_temperature_degC", "K"), ("bus_load_W", "W")):
+        assert [t.unit for t in terms("sensor", (kind,))] == [unit, "1", "s", f"{unit}/s"]
 
 
 def test_what_a_force_may_be_is_every_product_of_the_same_unit():
