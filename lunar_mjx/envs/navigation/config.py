@@ -16,7 +16,7 @@ from lunar_mjx.envs.navigation.kalman import KalmanConfig
 from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION, check_blocks
 from lunar_mjx.envs.navigation.randomise import Range
 from lunar_mjx.envs.navigation.rewards import CONSISTENT_WEIGHTS, PAPER_ENDS, PAPER_WEIGHTS, TERMS, TOLD_BY_TALLY
-from lunar_mjx.errors import bad_input, require_finite
+from lunar_mjx.errors import bad_input, require_finite, require_within
 
 DIVERGENCE = ("stop", "reset")
 
@@ -49,6 +49,10 @@ class NavigationConfig:
       randomise: parameters drawn for every episode.
       posterior: draw those that the model's `[posterior]` tells from it, and not from `randomise`.
       kalman: the acceleration filter's tuning.
+      delay: by which observations come late, in whole control steps; `last_action` is known at once.
+      drift: share of the way by which odometry errs, to one side drawn per episode: in what tells of goal and map.
+      mast: height above the ground of the sensor that makes the height scan: what it cannot see is told as 1.5 times
+        the scan's lowest value; 0: it sees all.
       camera_width, camera_height: pixels of the blocks camera/rgb, camera/depth and camera/labels.
       camera_fovy_deg: vertical angle of view. camera_pitch_deg: how far the camera looks down. camera_far: how far it
         looks, m.
@@ -100,6 +104,9 @@ class NavigationConfig:
     camera_far: float = 60.0
     sun_azimuth_deg: float = 135.0
     sun_elevation_deg: float = 15.0
+    delay: float = 0.0
+    drift: float = 0.0
+    mast: float = 0.0
     divergence: str = "stop"
     tally: bool = False
     collisions: str = "free"
@@ -159,6 +166,8 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", name, getattr(c, name), "is not positive", "give a number above zero")
     for name in ("success", "failure", "edge", "start_yaw"):
         require_finite("navigation", name, getattr(c, name))
+    for name, most in (("delay", 10.0), ("drift", 1.0), ("mast", 100.0)):
+        require_within("navigation", name, getattr(c, name), 0.0, most)
     distance = c.goal_distance
     pair = isinstance(distance, list | tuple) and len(distance) == 2
     low, high = (require_finite("navigation", "goal_distance", v) for v in distance) if pair else (0.0, 0.0)

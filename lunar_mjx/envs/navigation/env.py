@@ -23,7 +23,7 @@ from lunar_mjx.envs.core import State, side_by_side, where
 from lunar_mjx.envs.ladder import chart
 from lunar_mjx.envs.ladder.pool import Pool, make_pool, way_left
 from lunar_mjx.envs.ladder.rungs import get_rung
-from lunar_mjx.envs.navigation import kalman, randomise, rewards, tally
+from lunar_mjx.envs.navigation import kalman, randomise, rewards, sensing, tally
 from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
 from lunar_mjx.envs.navigation.observations import CAMERA, Scene, observe
@@ -115,6 +115,8 @@ class Inner:
       chart: what the rover knows of its world; None unless it is observed, and in a prepared beginning.
       level: of the curriculum on which the episode began, from 0. next_level: on which beginnings are prepared. None
         without one.
+      late: (steps, obs) observations on their way, newest first. odometry: where the rover believes to be. Both None
+        where sensors are at once and exact.
       ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
     """
 
@@ -139,6 +141,8 @@ class Inner:
     chart: chart.Chart | None = None
     level: Any = None
     next_level: Any = None
+    late: Any = None
+    odometry: sensing.Odometry | None = None
     ready: Ready | None = None
     used: Any = None
 
@@ -203,6 +207,10 @@ class NavigationEnv:
         self.system.info = dataclasses.replace(self.system.info, mode=self.actions.mode)
         self.control_interval = config.decimation * model.timestep
         self.episode_steps = max(1, round(config.episode_time / self.control_interval))
+        self._late_steps = round(config.delay / self.control_interval)
+        if abs(self._late_steps * self.control_interval - config.delay) > 1e-6:
+            remedy = f"give a multiple of {self.control_interval:g} s"
+            raise bad_input("navigation", "delay", config.delay, "is no whole number of control steps", remedy)
         self._reader = Reader(self.system)
         self._wheels = len(model.rover.wheels)
         self._ride = model.rover.standing_height
@@ -403,6 +411,8 @@ class NavigationEnv:
             inner = dataclasses.replace(inner, next_level=after)
         # before the restart: the successor in the replay buffer is the old episode's last state, not the new one's
         final_obs, final_privileged = self._observe(params, inner, view)
+        if inner.late is not None:
+            final_obs, inner = self._after_delay(inner, final_obs)
         if c.divergence == "reset":
             # the successor of a state that is gone carries no value, but must not poison a batch
             final_obs, final_privileged = bounded(final_obs), bounded(final_privileged)
@@ -458,7 +468,18 @@ class NavigationEnv:
         """New episodes with their first observations, on levels of the curriculum where there is one."""
         inner = self._fresh(params, keys, level)
         view = self._view(params, inner)
-        return Ready(*self._observe(params, inner, view), self._info(view), inner)
+        obs, privileged = self._observe(params, inner, view)
+        if self._late_steps:
+            inner = dataclasses.replace(inner, late=sensing.queue_of(obs, self._late_steps))
+        return Ready(obs, privileged, self._info(view), inner)
+
+    def _after_delay(self, inner: Inner, obs: Any) -> tuple[Any, Inner]:
+        """The observation that arrives while `obs` is made; a rover knows at once what it has commanded itself."""
+        late, queue = sensing.arrived(inner.late, obs)
+        own = self.blocks.get("last_action")
+        if own is not None:
+            late = late.at[:, own].set(obs[:, own])
+        return late, dataclasses.replace(inner, late=queue)
 
     def _costs(self, inner: Inner) -> tuple[Any, ...]:
         """Power, mean slip, hottest winding and collisions of a step, where the task keeps a tally."""
@@ -507,14 +528,18 @@ class NavigationEnv:
             anchor=jnp.where(away[:, None], position[:, :2], inner.anchor),
             waited=waited,
         )
+        believed = position[:, :2]
+        if inner.odometry is not None:
+            odometry = sensing.drifted(inner.odometry, moved, c.drift)
+            inner, believed = dataclasses.replace(inner, odometry=odometry), believed + odometry.error
         if inner.trail is not None:
             fade = jnp.exp(-self.control_interval / jnp.asarray(VIEW.trail, position.dtype))[:, None]
             # Exponential means over three times: a memory of fixed size of where the rover has been.
-            trail = position[:, None, :2] + fade * (inner.trail - position[:, None, :2])
+            trail = believed[:, None] + fade * (inner.trail - believed[:, None])
             inner = dataclasses.replace(inner, trail=trail)
         if inner.visited is not None:
-            far = rewards.length(position[:, :2] - inner.visited[:, 0]) > VIEW.visited_apart
-            more = jnp.concatenate([position[:, None, :2], inner.visited[:, :-1]], axis=1)
+            far = rewards.length(believed - inner.visited[:, 0]) > VIEW.visited_apart
+            more = jnp.concatenate([believed[:, None], inner.visited[:, :-1]], axis=1)
             inner = dataclasses.replace(inner, visited=jnp.where(far[:, None, None], more, inner.visited))
         if inner.left is not None and params.pool is not None:
             # the way from where a boulder's margin was entered counts until it is left, so that pressing into a ridge
@@ -628,6 +653,11 @@ class NavigationEnv:
             tally=tally.start(count, position.dtype) if c.tally else None,
             left=self._shortest(params, pick, level) if "way" in c.weights and params.pool is not None else None,
             level=level,
+            odometry=sensing.odometry_at_start(
+                jax.vmap(lambda k: jax.random.fold_in(k, 1))(split[:, 2]), position.dtype
+            )
+            if c.drift > 0.0
+            else None,
             trail=jnp.repeat(position[:, None, :2], len(VIEW.trail), axis=1) if "trail" in self._told else None,
             visited=jnp.full((count, VIEW.visited_kept, 2), VIEW.nowhere, position.dtype)
             if "visited" in self._told
@@ -658,11 +688,13 @@ class NavigationEnv:
         pool, within = params.pool, self.config.arrive_within
         world = pool.places.world[inner.place]
         corner = pool.middles[world] - 0.5 * pool.size
+        # The map is drawn about the rover, wherever that may be: what odometry errs by displaces the goal on it.
+        goal = inner.goal if inner.odometry is None else inner.goal - inner.odometry.error
         return chart.Errand(
             pool.prices,
             world,
             inner.physics.qpos[:, :2] - corner,
-            inner.goal - corner,
+            goal - corner,
             pool.size / pool.prices.shape[-1],
             pool.usual_price,
             pool.places.arrivals[inner.place] if within < np.pi else None,
@@ -706,6 +738,7 @@ class NavigationEnv:
             corners=self._corners(params, inner),
             trail=inner.trail,
             plan=self._plan(params, inner),
+            drift=None if inner.odometry is None else inner.odometry.error,
         )
 
     def _observe(self, params: NavigationParams, inner: Inner, view: View) -> tuple[Any, Any]:
@@ -727,7 +760,7 @@ class NavigationEnv:
                 far=c.camera_far,
                 lit=CAMERA + "rgb" in names,
             )
-        return Scene(terrain, inner.drawn, self._ride, self._scale, params.system.sun, seen, c.camera_far)
+        return Scene(terrain, inner.drawn, self._ride, self._scale, params.system.sun, seen, c.camera_far, c.mast)
 
     def _info(self, view: View) -> dict[str, Any]:
         return {

@@ -8,7 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from lunar_mjx.cameras.batch import Pictures
-from lunar_mjx.envs.navigation.view import VIEW, View, goal_in_body, height_scan
+from lunar_mjx.envs.navigation.sensing import in_sight
+from lunar_mjx.envs.navigation.view import VIEW, View, goal_in_body, height_scan, scan_places
 from lunar_mjx.errors import bad_input
 from lunar_mjx.pytree import pytree, static
 from lunar_mjx.terrain import Terrain
@@ -29,6 +30,7 @@ class Scene:
       ride: standing height of the chassis frame, m. scan_scale: of the height scan's pattern.
       sun: over the terrain; None where there is none.
       seen: what the front cameras see, where a block asks for it. far: depth that counts as 1, m.
+      mast: height of the scan's sensor above the ground, m; 0 where nothing hides anything from it.
     """
 
     terrain: Terrain
@@ -38,6 +40,7 @@ class Scene:
     sun: Sun | None = None
     seen: Pictures | None = None
     far: float = static(default=60.0)
+    mast: float = static(default=0.0)
 
 
 Block = Callable[[View, Scene], Any]
@@ -45,7 +48,8 @@ Block = Callable[[View, Scene], Any]
 
 def position(v: View, s: Scene) -> Any:
     """Position of the chassis frame from where the episode began, world axes, m."""
-    return v.position - v.origin
+    away = v.position - v.origin
+    return away if v.drift is None else away.at[:, :2].add(v.drift)
 
 
 def euler(v: View, s: Scene) -> Any:
@@ -120,20 +124,33 @@ def sinkage(v: View, s: Scene) -> Any:
 def scan(v: View, s: Scene) -> Any:
     """Height of ground and rocks at a pattern of places around the rover, m, within 1 m of its standing plane."""
     # Bounded: a cliff must not drown what lies before the wheels.
-    return jnp.clip(height_scan(s.terrain, v, s.scan_scale, s.ride), -1.0, 1.0)
+    return _scanned(v, s, s.scan_scale, 1.0)
 
 
 def far_scan(v: View, s: Scene) -> Any:
-    """The height scan over a wider and coarser pattern, m, within 2 m of the standing plane. Nothing hides what lies
-    behind a boulder from it."""
-    return jnp.clip(height_scan(s.terrain, v, VIEW.far_scan * s.scan_scale, s.ride), -2.0, 2.0)
+    """The height scan over a wider and coarser pattern, m, within 2 m of the standing plane. Without a mast nothing
+    hides what lies behind a boulder from it."""
+    return _scanned(v, s, VIEW.far_scan * s.scan_scale, 2.0)
+
+
+def _scanned(v: View, s: Scene, scale: float, most: float) -> Any:
+    """Heights within `most`; below that, -1.5 times it, where the sensor on its mast sees nothing."""
+    height = height_scan(s.terrain, v, scale, s.ride)
+    told = jnp.clip(height, -most, most)
+    if s.mast == 0.0:
+        return told
+    foot = v.position[:, 2] - s.ride
+    eye = jnp.stack([v.position[:, 0], v.position[:, 1], foot + s.mast], axis=-1)
+    x, y = scan_places(v, scale)
+    clear = in_sight(s.terrain, eye, (x, y, height + foot[:, None]), scale * VIEW.scan_reach)
+    return jnp.where(clear, told, -1.5 * most)
 
 
 def trail(v: View, s: Scene) -> Any:
     """Where the rover was: means of its past positions that fade within the times `VIEW.trail`, along and across the
     heading from where it is now, m. Dead reckoning tells it; it is all the memory that a policy without any has."""
     assert v.trail is not None, "the environment keeps the trail that this block asks for"
-    away = v.trail - v.position[:, None, :2]
+    away = v.trail - v.believed[:, None]
     cos, sin = jnp.cos(v.yaw)[:, None], jnp.sin(v.yaw)[:, None]
     ahead = cos * away[..., 0] + sin * away[..., 1], cos * away[..., 1] - sin * away[..., 0]
     return jnp.concatenate(ahead, axis=-1)
@@ -142,7 +159,7 @@ def trail(v: View, s: Scene) -> Any:
 def border(v: View, s: Scene) -> Any:
     """Distance to the border of the ground that the rover may drive on, ahead, to the left, behind and to the right,
     in units of 10 m and at most one: a fence that the operators have drawn."""
-    low, high = v.corners[:, 0] - v.position[:, :2], v.corners[:, 1] - v.position[:, :2]
+    low, high = v.corners[:, 0] - v.believed, v.corners[:, 1] - v.believed
     rays = v.yaw[:, None] + 0.5 * jnp.pi * jnp.arange(4)
     way = []
     for k, along in enumerate((jnp.cos(rays), jnp.sin(rays))):
@@ -156,7 +173,7 @@ def visited(v: View, s: Scene) -> Any:
     """How often the rover has been near the places of a grid around it: a sum of bells two metres wide over the places
     that it remembers. Dead reckoning tells it; it shows which ways have been tried."""
     assert v.visited is not None, "the environment remembers the places that this block asks for"
-    away = v.visited - v.position[:, None, :2]
+    away = v.visited - v.believed[:, None]
     cos, sin = jnp.cos(v.yaw)[:, None], jnp.sin(v.yaw)[:, None]
     ahead, aside = cos * away[..., 0] + sin * away[..., 1], cos * away[..., 1] - sin * away[..., 0]
     grid = jnp.asarray(VIEW.visited_grid)

@@ -68,6 +68,7 @@ class View:
         they are observed.
       charge: of the battery above that at which it cuts the motors off, 0 to 1; None without one.
       trail: where the rover was, averaged over the `VIEW.trail` times, m; None unless it is observed.
+      drift: believed less true horizontal position, m; None where odometry is exact.
       plan: where to aim and the next nodes of the way on the rover's own map, x and y from the rover along the world's
         axes, m, and the cost of that way, m; (env, 2 + 2 * node + 1), None unless it is observed.
     """
@@ -99,6 +100,12 @@ class View:
     charge: Any = None
     trail: Any = None
     plan: Any = None
+    drift: Any = None
+
+    @property
+    def believed(self) -> Any:
+        """(env, 2) horizontal position as odometry tells it, m."""
+        return self.position[:, :2] if self.drift is None else self.position[:, :2] + self.drift
 
 
 def rotation(quaternion: Float[Array, "env 4"]) -> Float[Array, "env 3 3"]:
@@ -153,6 +160,17 @@ def _turn(matrix: Any, vector: Any) -> Any:
     return jnp.sum(matrix * vector[:, None, :], axis=-1)
 
 
+def scan_places(view: View, scale: float) -> tuple[Float[Array, "env point"], Float[Array, "env point"]]:
+    """Places of the pattern `VIEW.scan_ahead` x `VIEW.scan_aside` around the rover, times `scale`, m."""
+    ahead, aside = jnp.meshgrid(jnp.asarray(VIEW.scan_ahead), jnp.asarray(VIEW.scan_aside), indexing="ij")
+    ahead, aside = scale * ahead.reshape(-1), scale * aside.reshape(-1)
+    cos, sin = jnp.cos(view.yaw)[:, None], jnp.sin(view.yaw)[:, None]
+    return (
+        view.position[:, 0, None] + cos * ahead - sin * aside,
+        view.position[:, 1, None] + sin * ahead + cos * aside,
+    )
+
+
 def height_scan(terrain: Terrain, view: View, scale: float, ride: float) -> Float[Array, "env point"]:
     """Height of the surface around the rover over the plane its wheels would stand on if it were level, m.
 
@@ -164,17 +182,13 @@ def height_scan(terrain: Terrain, view: View, scale: float, ride: float) -> Floa
       scale: of the pattern `VIEW.scan_ahead` x `VIEW.scan_aside`.
       ride: height of the chassis frame over the ground when standing, m.
     """
-    ahead, aside = jnp.meshgrid(jnp.asarray(VIEW.scan_ahead), jnp.asarray(VIEW.scan_aside), indexing="ij")
-    ahead, aside = scale * ahead.reshape(-1), scale * aside.reshape(-1)
-    cos, sin = jnp.cos(view.yaw)[:, None], jnp.sin(view.yaw)[:, None]
-    x = view.position[:, 0, None] + cos * ahead - sin * aside
-    y = view.position[:, 1, None] + sin * ahead + cos * aside
+    x, y = scan_places(view, scale)
     return surface(terrain, x, y, scale * VIEW.scan_reach) - (view.position[:, 2, None] - ride)
 
 
 def goal_in_body(view: View) -> Float[Array, "env 2"]:
-    """Horizontal vector to the goal along and across the heading, m."""
-    to_goal = view.goal - view.position[:, :2]
+    """Horizontal vector to the goal along and across the heading, as odometry tells it, m."""
+    to_goal = view.goal - view.believed
     cos, sin = jnp.cos(view.yaw), jnp.sin(view.yaw)
     return jnp.stack([cos * to_goal[:, 0] + sin * to_goal[:, 1], cos * to_goal[:, 1] - sin * to_goal[:, 0]], axis=-1)
 
