@@ -104,6 +104,15 @@ def test_the_hidden_soil_is_a_likely_draw_of_the_kept_posterior_and_lies_in_all_
     assert hidden.parameters["soil"]["k_phi"] == pytest.approx(0.6 * 8.2e5)
 
 
+def test_the_page_quotes_what_late_and_drifting_sensors_cost():
+    from tables import percent
+
+    rows = {name: row["score"] for name, row in record("sensors")["rows"].items()}
+    assert set(rows) > {"exact", "delay 0.3 s, drift 2 %"}
+    for name, score in rows.items():
+        assert f"| {name}{' (as trained)' * (name == 'exact')} | {percent(score)} |" in PAGE
+
+
 def test_arms_are_compared_by_pairs_of_one_seed():
     from posterior import summary
 
