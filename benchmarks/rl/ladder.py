@@ -3,6 +3,7 @@
     python benchmarks/rl/ladder.py --rungs 1 2 3 --episodes 32 --out benchmarks/rl/ladder.json
     python benchmarks/rl/ladder.py --tune 24 --rungs 3 --episodes 8 --out benchmarks/rl/ladder.json
     python benchmarks/rl/ladder.py --rungs 3 --policies "TD3=runs/ladder-3/policy.npz"
+    python benchmarks/rl/ladder.py --rungs 4 --agents mapper --episodes 16        # the rule on its own map alone
 
 All agents drive the same episodes side by side in one program, in unseen worlds and soil as `lunar-mjx evaluate` takes
 them. Rungs that the file holds already are kept unless they are measured again.
@@ -38,6 +39,8 @@ def agents(env: Any, params: Any, rover: str, tuned: Mapping[str, Any] | None, p
     """All agents by name, functions of state and key; the reactive rule with its own and with `tuned` settings, and
     every policy with and without what it sees ahead."""
     found = {name: make_agent(name, env, params) for name in SCRIPTED}
+    if "plan" in env.blocks:
+        found["mapper"] = make_agent("mapper", env, params)
     if tuned is not None:
         found["reactive, tuned"] = reactive_rule(env, Reactive(**tuned))
     path = shipped_policy(rover)
@@ -79,6 +82,8 @@ def measure(args: argparse.Namespace, number: int, tuned: Any, policies: Mapping
     blocks = dict.fromkeys(TASKS[f"ladder/{number}"].observations)
     for path in policies.values():
         blocks |= dict.fromkeys(seen_by(load_policy(path)))
+    if "mapper" in args.agents:
+        blocks |= {"plan": None}
     env = make_navigation(f"ladder/{number}", args.rover, observations=tuple(blocks), **settings)
     params = unseen_params(env, UNSEEN_LADDER)
     chosen = {n: a for n, a in agents(env, params, args.rover, tuned, policies).items() if n in (args.agents or [n])}
