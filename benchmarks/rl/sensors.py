@@ -1,6 +1,6 @@
 """A shipped policy with sensors as rovers have them, which it was not trained with, beside exact ones.
 
-    python benchmarks/rl/sensors.py --out runs/sensors               # 64 episodes a row: 10 minutes on two CPU cores
+    python benchmarks/rl/sensors.py --out runs/sensors               # 64 episodes a row: 3 minutes on two CPU cores
     python benchmarks/rl/sensors.py --episodes 1024 --out runs/sensors    # one GPU
 
 Each row is what `lunar-mjx evaluate AGENT --episodes N --env delay=0.3 ...` scores: the same unseen ground, soils and
