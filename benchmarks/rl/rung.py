@@ -38,6 +38,7 @@ def words() -> argparse.Namespace:
     add("training", nargs="?", default="ladder-3", help="a shipped training of the ladder, or a file like it")
     add("--name", help="of the files; the training's unless told")
     add("--learner", help="another algorithm than the file's")
+    add("--begin-with", default="", help="policy that the training begins with, as of `lunar-mjx train`")
     add("--last", type=float, default=70.0, help="s of all that are kept for the last two scores")
     add("--steps", type=float, help="of the environment, of each seed; the training's own unless told")
     add("--target", type=float, default=math.inf, help="success of the policy at which the training stops")
@@ -68,7 +69,9 @@ def main() -> None:
         return
     clock, training = Clock(args.seconds), training_of(args, args.training, args.learner)
     episodes = min(args.episodes, 2) if args.tiny else args.episodes
-    trials = Trials(training, args.name or Path(args.training).stem, args.out, clock, episodes, rules)
+    trials = Trials(
+        training, args.name or Path(args.training).stem, args.out, clock, episodes, rules, begin_with=args.begin_with
+    )
     for seed in in_time(clock, args.seeds):
         trials(seed, int(args.steps or training.steps), max(1.0, clock.left - args.last), args.every, args.target)
 

@@ -24,6 +24,7 @@ class Trials:
     Args:
       training: what to train. name: of the files. out: folder that they go to. clock: of everything.
       episodes: of each row of a score. rules: makes agents that learn nothing for an environment.
+      begin_with: policy that all seeds begin with, if any.
       seen: choose the best policy by its score on the ground and soils of its training, and score it alone meanwhile;
         else by the unseen ones, beside the other agents.
     """
@@ -37,8 +38,10 @@ class Trials:
         episodes: int,
         rules: Callable[[Any], Mapping[str, Any]],
         seen: bool = False,
+        begin_with: str = "",
     ):
         self.name, self.out, self.clock, self.seen, files = name, out, clock, seen, tree()
+        self.begin_with = begin_with
         out.mkdir(parents=True, exist_ok=True)
         self.setup = Setup(training)
         env, policies = self.setup.env, self.setup.policies()
@@ -49,6 +52,7 @@ class Trials:
         say(f"worlds {worlds_s:.0f} s, compiled after {compile_s}, {clock.left:.0f} s left")
         learner = type(training.train.algorithm).__name__
         about = {"tree": files, "training": name, **self.setup.about, "learner": learner}
+        about |= {"begin_with": begin_with} if begin_with else {}
         self.record: dict[str, Any] = {**about, "worlds_s": worlds_s, "compile_s": compile_s, "seeds": []}
 
     def save(self) -> None:
@@ -90,7 +94,7 @@ class Trials:
             shown(found, "    ")
             return chosen["success"]
 
-        config = RunConfig(steps, seed, seconds, math.inf, quiet=True)
+        config = RunConfig(steps, seed, seconds, math.inf, quiet=True, begin_with=self.begin_with)
         result, policy, row = trained(self.setup, config, every, look, target)
         found, last = self.judge(unseen, policy, FINAL), result.rows[-1]
         run["final"], run["epochs"] = {**when(row), "seed": FINAL, "rows": found}, plainly(result.rows)

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from lunar_mjx.agents import guard
+from lunar_mjx.agents.from_brax.begin import begin_with
 from lunar_mjx.agents.learner import EPISODE, Learner, TrainState
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.record import Progress, Record
@@ -37,6 +38,8 @@ class RunConfig:
       checkpoint_every: s between checkpoints; also one at the end; none at all if infinite.
       resume: go on from the folder's newest checkpoint, if it has one.
       quiet: print no progress.
+      begin_with: path of a policy, or name of one that ships, that the training begins with; see
+        `lunar_mjx.agents.from_brax.begin`.
     """
 
     steps: int
@@ -45,6 +48,7 @@ class RunConfig:
     checkpoint_every: float = 300.0
     resume: bool = True
     quiet: bool = False
+    begin_with: str = ""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -127,9 +131,8 @@ class _Loop:
         learner, run, folder = self.learner, self.config, self.folder
         with agreed("opening its folder"):
             self.lock = only_writer(folder) if folder and self.lead else None
-        settings = plain(
-            {"train": dataclasses.asdict(learner.config), "seed": run.seed, "environment": self.environment}
-        )
+        made = {"train": dataclasses.asdict(learner.config), "seed": run.seed, "environment": self.environment}
+        settings = plain(made | ({"begin_with": run.begin_with} if run.begin_with else {}))
         self.checkpoints = _checkpoints(folder / "checkpoints", settings) if folder else None
         self.episodes: dict[str, list[float]] = {name: [] for name in (*EPISODE, "step")}
         self.epochs, self.elapsed, rows = 0, 0.0, []
@@ -145,6 +148,8 @@ class _Loop:
             self.episodes = notes["episodes"]
         else:
             self.state = learner.init(run.seed)
+            if run.begin_with:
+                self.state = begin_with(learner, self.state, run.begin_with)
         with agreed("beginning its records"):
             self.record = Record(folder, rows) if folder and self.lead else None
         self.rows: list[dict[str, Any]] = self.record.rows if self.record else list(rows)
@@ -243,6 +248,7 @@ class _Loop:
             "algorithm": type(self.learner.agent).__name__,
             "train": plain(dataclasses.asdict(self.learner.config)),
             "seed": self.config.seed,
+            **({"begin_with": self.config.begin_with} if self.config.begin_with else {}),
             "steps": self.epochs * self.per_epoch,
             "elapsed_s": self.elapsed,
         }

@@ -68,6 +68,9 @@ def train(
     eval_every: Annotated[float, typer.Option(help="s of training between evaluations.")] = 30.0,
     eval_episodes: Annotated[int, typer.Option(min=1, max=MOST_EPISODES)] = 256,
     checkpoint_every: Annotated[float, typer.Option(help="s between checkpoints.")] = 300.0,
+    begin_with: Annotated[
+        str, typer.Option(help="Policy to begin with: policy.npz, or a shipped one (luvmi_x/ladder-3); PPO alone.")
+    ] = "",
     restart: Annotated[bool, typer.Option(help="Begin anew although the folder has a checkpoint.")] = False,
     quiet: Annotated[bool, typer.Option(help="No progress.")] = False,
     list_: Annotated[bool, typer.Option("--list", help="List the trainings and stop.")] = False,
@@ -113,7 +116,7 @@ def train(
     from lunar_mjx.agents.run import run_training
     from lunar_mjx.agents.train import RunConfig
 
-    run = RunConfig(steps or chosen.steps, seed, time_limit, checkpoint_every, not restart, quiet)
+    run = RunConfig(steps or chosen.steps, seed, time_limit, checkpoint_every, not restart, quiet, begin_with)
     report = run_training(training, chosen, run, make_folder(out), eval_every, eval_episodes, target)
     # All processes hold the same score; one is to tell it.
     if not leads():
