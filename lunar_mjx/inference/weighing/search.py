@@ -2,10 +2,12 @@
 
 Best first: around each refit all neighbours (one term more, one less) are scored in linear approximation; the most
 probable set that has not been refitted is refitted next, until no other comes near the best. So every accepted effect
-is challenged by a refit without it, and a greedy step that led into a trap is undone. That refit begins where the one
-with the effect has ended: a descent that found a better valley on its way must not be taken for what the effect is
-worth. Before something unlisted is believed, every effect that could be seen is refitted from a place where it acts:
-where a signature saturates, the linear estimate at its null is much too low.
+is challenged by a refit without it, and a greedy step that led into a trap is undone. Where the set without it promises
+more around the refit with it than its own refit has reached, it is refitted again, from there: a descent that found a
+better valley on its way must not be taken for what the effect is worth.
+
+Before something unlisted is believed, every effect that could be seen is refitted from a place where it acts: where a
+signature saturates, the linear estimate at its null is much too low.
 """
 
 from __future__ import annotations
@@ -209,10 +211,11 @@ class _Search:
         # What leaving an effect out costs is told by a refit: where several do the work of one another, the linear
         # estimate about the full set is much too high, and a set that grew around a wrong first step would stand.
         rivals = [best.effects - {e} for e in sorted(best.effects)]
-        unchallenged = [r for r in rivals if (best.form, r, best.effects) not in self.begun]
+        unchallenged = [r for r in rivals if (best.form, r) not in self.done]
         if unchallenged:
             self.refit(by_name[best.form], unchallenged[0], best)
             return True
+        self.open_again(by_name[best.form], best.refit, rivals)
         key = max(self.again, key=lambda key: self.again[key].log_posterior, default=None)
         if key is not None and self.again[key].log_posterior > best.log_posterior - self.window:
             self.refit(by_name[key[0]], key[1], self.again.pop(key))
@@ -256,15 +259,19 @@ class _Search:
         if self.score_around(form, made, near):
             self.done[key] = made
             if again:
-                self.open_again(form, made)
+                # A better valley of a set that was thought known: its neighbours may have missed it, too.
+                self.open_again(form, made, [effects ^ {t.name} for t in form.terms if t.kind == EFFECT])
 
-    def open_again(self, form: Form, made: Refit) -> None:
-        """Asks for a further refit of each neighbour that ended lower than it promises to around a new end."""
-        own = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in made.effects)
-        for t in form.terms:
-            terms = own ^ {t}
-            old, names = self.known.get((form.name, terms)), frozenset(n.name for n in terms)
-            if t.kind != EFFECT or old is None or not old.refitted or (form.name, names, made.effects) in self.begun:
+    def open_again(self, form: Form, made: Refit, sets: Iterable[frozenset[str]]) -> None:
+        """Asks for a further refit of each set of effects that promises more around a refit than its own has reached.
+
+        The promise is the linear estimate: it costs no refit where all are in one valley.
+        """
+        effects = {t.name: t for t in form.terms if t.kind == EFFECT}
+        for names in sets:
+            terms = frozenset(effects[name] for name in names)
+            old = self.known.get((form.name, terms))
+            if old is None or not old.refitted or (form.name, names, made.effects) in self.begun:
                 continue
             new = self.estimate(form, made, terms, _sizes(old))
             if new is not None and new.log_posterior > old.log_posterior:
