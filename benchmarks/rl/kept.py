@@ -20,7 +20,10 @@ COLUMNS = {"rows": (*SCORED, "episode_return"), "epochs": SCORED, "unseen": SCOR
 """What a seed's epochs and its scores during training are called, and which of their numbers figures read."""
 MOST_EPOCHS = 40
 """Of a training on a rung, whose curve no figure draws."""
-SAME = {"large": ("rover", "environment", "train", "agents", "about"), "rung": ("training", "environment", "train")}
+SAME = {
+    "large": ("rover", "environment", "train", "agents", "about"),
+    "rung": ("training", "environment", "train", "learner", "begin_with"),
+}
 """What runs have alike whose seeds stand side by side."""
 MOST_BYTES = 2_000_000
 """Of a shipped policy."""
@@ -47,8 +50,8 @@ def require_alike(kind: str, records: Iterable[dict[str, Any]]) -> None:
     first, *others = records
     for same in SAME[kind]:
         for other in others:
-            if other[same] != first[same]:
-                raise ValueError(f"{kind}: {same} is not the same in all runs: {first[same]}; {other[same]}")
+            if (there := other.get(same)) != (here := first.get(same)):
+                raise ValueError(f"{kind}: {same} is not the same in all runs: {here}; {there}")
 
 
 def keep(name: str, record: dict[str, Any], home: Path = KEPT) -> Path:
@@ -81,14 +84,17 @@ def as_kept(record: dict[str, Any]) -> dict[str, Any]:
     return {**record, "compile_epoch_s": record["compile_s"][0], "agents": agents, "seeds": seeds}
 
 
-def keep_rung(paths: Iterable[Path], home: Path = KEPT) -> Path:
+def keep_rung(paths: Iterable[Path], home: Path = KEPT, name: str = "") -> Path:
     """The kept record of a training on a rung, with finished seeds of further runs; a seed told twice is the later's.
 
+    Args:
+      paths: of the runs' records. home: folder of kept records. name: of the kept record, the training's unless told.
+
     Raises:
-      ValueError: runs of different trainings, environments or settings.
+      ValueError: runs of different trainings, environments, settings, learners or beginnings.
     """
     records = [read(path) for path in paths]
-    name = records[0]["training"]
+    name = name or records[0]["training"]
     if before := read(home / f"{name}.json"):
         records.insert(0, before)
     require_alike("rung", records)
@@ -99,7 +105,7 @@ def keep_rung(paths: Iterable[Path], home: Path = KEPT) -> Path:
         seeds |= {
             run["seed"]: {**about, **run, "epochs": few(run["epochs"])} for run in record["seeds"] if "final" in run
         }
-    shared = {k: records[0][k] for k in ("about", "training", "environment", "train", "learner")}
+    shared = {k: records[0][k] for k in ("about", *SAME["rung"]) if k in records[0]}
     return keep(name, {**shared, "seeds": [seeds[n] for n in sorted(seeds)]}, home)
 
 

@@ -227,3 +227,28 @@ def test_seeds_of_further_runs_join_the_kept_record_unless_settings_differ(tmp_p
     assert kept["seeds"][0]["epochs"] == [{"steps": 1}] and kept["seeds"][0]["device"] == "GPU"
     with pytest.raises(ValueError, match="train is not the same"):
         keep([run("c", [5], 20, rate=2.0)], tmp_path)
+    for more in ({"learner": "SACConfig"}, {"begin_with": "luvmi_x/ladder-3"}):
+        other = run(f"d{next(iter(more))}", [0], 20)
+        other.write_text(json.dumps(json.loads(other.read_text()) | more))
+        with pytest.raises(ValueError, match=f"{next(iter(more))} is not the same"):
+            keep([other], tmp_path)
+        own = json.loads(keep([other], tmp_path, "mine-other" + next(iter(more))).read_text())
+        assert own.items() >= more.items() and own["training"] == "mine"
+
+
+def test_the_page_quotes_that_rung_4_is_missed_and_what_beginning_with_rung_3_is_worth():
+    begun, anew = record("ladder-4"), record("ladder-4-scratch")
+    assert begun["begin_with"] == "luvmi_x/ladder-3" and "begin_with" not in anew
+    assert all(begun[k] == anew[k] for k in ("environment", "train", "learner"))
+    rows, other = (r["seeds"][0]["final"]["rows"] for r in (begun, anew))
+    policy, mapper, worse = rows["policy"]["success"], rows["mapper"]["success"], other["policy"]["success"]
+    assert worse < policy < mapper < 0.9 and rows["mapper"] == other["mapper"]
+    for share in (policy, mapper, worse):
+        assert f"{100 * share:.1f} %" in PAGE
+    assert rows["scripted"]["success"] == rows["reactive, tuned"]["success"] == 0.0
+
+
+def test_rung_1_is_kept_by_learner():
+    ppo, sac = record("ladder-1-ppo"), record("ladder-1-sac")
+    assert (ppo["learner"], sac["learner"]) == ("PPOConfig", "SACConfig") and len(ppo["seeds"]) == 5
+    assert min(s["final"]["rows"]["policy"]["success"] for s in ppo["seeds"] + sac["seeds"]) >= 0.99
