@@ -2,6 +2,7 @@
 
     python benchmarks/rl/depth.py large-depth --seconds 420 --out runs/depth        # one GPU
     python benchmarks/rl/depth.py large-depth --tiny --seconds 200 --out runs/tiny  # the same code on two CPU cores
+    python benchmarks/rl/depth.py --keep runs/depth/large-depth.json              # to the records that pages quote
 
 Writes `NAME.json` and, after every score, `NAME_seedN.npz`, so that a run that is cut off leaves what it had. The rate
 is of the environment alone under random actions, with as many rovers as the training has: median, least and most of
@@ -32,11 +33,13 @@ from harness import (
     in_threads,
     options,
     percent,
+    read,
     save,
     say,
     training_of,
     when,
 )
+from kept import few, keep
 from rates import Driven
 
 from benchmarks.provenance import tree
@@ -61,6 +64,7 @@ def words() -> argparse.Namespace:
     add("--episodes", type=int, default=256, help="of each row")
     add("--last", type=float, default=30.0, help="s of all that are kept for the last score")
     add("--repeats", type=int, default=9, help="of the rate")
+    add("--keep", type=Path, metavar="JSON", help="train nothing; this record is kept")
     return parser.parse_args()
 
 
@@ -87,8 +91,12 @@ def rate_of(driven: Driven, state: Any, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Compiles all programs side by side, measures the rate, trains while there is time, and scores."""
+    """Compiles all programs side by side, measures the rate, trains in time and scores; or keeps a record."""
     args = words()
+    if args.keep:
+        record = read(args.keep)
+        say(str(keep(record["training"], {**record, "epochs": few(record["epochs"])})))
+        return
     clock, files = Clock(args.seconds), tree()
     training = training_of(args, args.training)
     if args.tiny:

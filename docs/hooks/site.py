@@ -151,6 +151,25 @@ def _ladder(number: int) -> str:
     return table(header, [[n, _share(r), *(text.format(r[k]) for k, text in numbers.items())] for n, r in rows])
 
 
+def depth() -> str:
+    """Who arrives with a depth picture in place of the height scan, on two tasks (`benchmarks/rl/depth.py --keep`)."""
+    kept = {"`large`": "large-depth", "rung 3": "ladder-3-depth"}
+    agents = {
+        "teacher": "teacher, sees the height scan",
+        "student": "student, sees the picture",
+        "blanked": "the same student, its picture blanked",
+        "straight": "straight ahead",
+    }
+    rows = []
+    for task, name in kept.items():
+        found = json.loads((RECORDS / f"{name}.json").read_text(encoding="utf-8"))["final"]["rows"]
+        for agent, text in agents.items():
+            r = found[agent]
+            costs = ["", ""] if r["spl"] is None else [f"{r['spl']:.2f}", f"{r['collisions_per_km']:.0f}"]
+            rows.append([task, text, _share(r), *costs, f"{r['episode_time']:.0f} s"])
+    return table(["task", "256 episodes", "success", "SPL", "collisions/km", "mean episode"], rows)
+
+
 def ladder_trainings() -> str:
     """What the trainings on rungs took."""
     header = [
@@ -210,6 +229,7 @@ TABLES = {
     "flaws": flaws,
     "field": field,
     "field_measured": field_measured,
+    "depth": depth,
     **{f"ladder_{number}": partial(_ladder, number) for number in LADDER},
     "ladder_trainings": ladder_trainings,
     "unsaid": unsaid,

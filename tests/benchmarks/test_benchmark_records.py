@@ -248,6 +248,20 @@ def test_the_page_quotes_that_rung_4_is_missed_and_what_beginning_with_rung_3_is
     assert rows["scripted"]["success"] == rows["reactive, tuned"]["success"] == 0.0
 
 
+def test_the_page_quotes_how_fast_pictures_are_and_what_they_are_worth():
+    large, rung = record("large-depth"), record("ladder-3-depth")
+    assert all(r["rate"]["rovers"] == 4096 and r["rate"]["picture"] == [64, 48] for r in (large, rung))
+    rates = [{k: f"{r['rate'][k]:,.0f}" for k in ("env_steps_per_s", "least", "most")} for r in (large, rung)]
+    assert " | ".join("{env_steps_per_s} ({least} to {most})".format(**r) for r in rates) in PAGE
+    assert " | ".join(f"{r['train_steps_per_s']:,.0f}" for r in (large, rung)) in PAGE
+    points = {}
+    for name, found in (("large", large), ("rung 3", rung)):
+        rows = {k: 100 * v["success"] for k, v in found["final"]["rows"].items()}
+        assert rows["student"] > 0.95 * rows["teacher"]
+        points[name] = round(rows["student"] - rows["blanked"])
+    assert f"The picture is worth {points['rung 3']} points there and {points['large']} on `large`" in PAGE
+
+
 def test_rung_1_is_kept_by_learner():
     ppo, sac = record("ladder-1-ppo"), record("ladder-1-sac")
     assert (ppo["learner"], sac["learner"]) == ("PPOConfig", "SACConfig") and len(ppo["seeds"]) == 5
