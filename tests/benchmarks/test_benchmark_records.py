@@ -104,14 +104,15 @@ def test_the_hidden_soil_is_a_likely_draw_of_the_kept_posterior_and_lies_in_all_
     assert hidden.parameters["soil"]["k_phi"] == pytest.approx(0.6 * 8.2e5)
 
 
-def test_the_page_quotes_what_a_log_is_worth_to_a_training():
+@pytest.mark.parametrize("name", ["posterior_short", "posterior_large"])
+def test_the_page_quotes_what_a_log_is_worth_to_a_training(name):
     from posterior import summary
 
-    found = record("posterior_short")
+    found = record(name)
     again = summary(found["runs"])
     assert list(found["summary"]) == list(again)
-    for name, arm in found["summary"].items():
-        assert arm["success"] == pytest.approx(again[name]["success"], abs=1e-4), "the means are those of the runs"
+    for trained, arm in found["summary"].items():
+        assert arm["success"] == pytest.approx(again[trained]["success"], abs=1e-4), "the means are those of the runs"
         mean, seeds = arm["success"], arm["success"]["seeds"]
         assert f"| {100 * mean['mean']:.1f} +- {100 * mean['error']:.1f} % | {seeds} |" in PAGE
         if "posterior_leads_by" in arm:
