@@ -10,7 +10,7 @@ import pytest
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
 from lunar_mjx.inference.evidence import EvidenceError, Gram, NoiseSize
-from lunar_mjx.inference.weighing.hypotheses import EFFECT, Term, shifted
+from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Term, shifted
 from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, search
 from tests.inference.toy_form import EFFECTS, NOISE, ToyForm, TwoValleys, X, curve, measured
 
@@ -67,6 +67,29 @@ def test_a_better_valley_is_no_effect():
 def test_an_effect_is_found_in_a_better_valley():
     found = search([TwoValleys(measured(1, wave=0.8))], most_refits=20, most_terms=4, window=4.0)
     assert conclude(found, 0.95).effects == ("wave",)
+
+
+def test_a_refit_without_evidence_is_made_once_and_named():
+    class Spoilt(Linear):
+        """Statistics that rounding spoils."""
+
+        def evidence(self, *args, **kwargs):
+            raise EvidenceError("rounding spoils it")
+
+    class Mute(ToyForm):
+        """No evidence around refits with `wave`."""
+
+        def refit(self, effects, near, start):
+            made = super().refit(effects, near, start)
+            fields = {f.name: getattr(made.linear, f.name) for f in dataclasses.fields(made.linear)}
+            linear = Spoilt(**fields) if "wave" in effects else made.linear
+            return dataclasses.replace(made, linear=linear)
+
+    tried = []
+    found = search([Mute(measured(0, wave=0.8))], 12, 4, 4.0, progress=lambda text, share: tried.append(text))
+    assert tried.count("refitting toy + wave") == 1
+    assert "toy + wave: no evidence around its refit" in found.failed
+    assert not any("wave" in h.effects for h in found.hypotheses)
 
 
 def test_what_ended_in_a_worse_valley_is_refitted_from_a_better_one():

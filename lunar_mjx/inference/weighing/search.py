@@ -261,6 +261,10 @@ class _Search:
             if again:
                 # A better valley of a set that was thought known: its neighbours may have missed it, too.
                 self.open_again(form, made, [effects ^ {t.name} for t in form.terms if t.kind == EFFECT])
+        elif key not in self.done:
+            # A refit around which nothing can be said is a failed one; the set would else be refitted for ever.
+            self.done[key] = None
+            self.reasons.append(f"{label}: no evidence around its refit")
 
     def open_again(self, form: Form, made: Refit, sets: Iterable[frozenset[str]]) -> None:
         """Asks for a further refit of each set of effects that promises more around a refit than its own has reached.
@@ -290,7 +294,10 @@ class _Search:
         """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.
 
         Empty where something unlisted is less probable than its share: then what is listed explains the measurements.
+        Empty, too, where one effect more would be too many.
         """
+        if len(best.effects) >= self.most_terms:
+            return []
         scored = list(self.known.values())
         top = max(h.log_posterior for h in scored)
         weights = [(math.exp(h.log_posterior - top), any(t.kind == UNLISTED for t in h.terms)) for h in scored]
@@ -307,7 +314,7 @@ class _Search:
         """Scores the refitted set with every choice of terms that need no refit, and their neighbours by one effect.
 
         Returns:
-          Whether this is the best refit of its set so far; around another one nothing is scored.
+          Whether this is the best refit of its set so far and has evidence; around another one nothing is scored.
         """
         own = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in made.effects)
         felt, shows = made.linear.felt(), made.linear.shows()
@@ -316,7 +323,7 @@ class _Search:
         effects = [t for t in form.terms if t.kind == EFFECT and shows[t.name] >= self.least_signal]
         base = self.score(form, made, own, own, None if near is None else _sizes(near))
         if base is None or base.refit is not made:
-            return base is None and (form.name, made.effects) not in self.done
+            return False
 
         def scored(choices: Iterable[Terms], sizes: tuple[np.ndarray, np.ndarray]) -> list[Hypothesis]:
             return [h for terms in choices if (h := self.score(form, made, own, terms, sizes))]
