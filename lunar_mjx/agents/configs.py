@@ -166,15 +166,22 @@ def _settings(defaults: Any, table: Fields, unused: tuple[str, ...] = ()) -> Any
 def _as(old: Any, table: Fields, key: str) -> Any:
     """A value of the kind that the setting has: a whole number serves for a number, a list for a tuple."""
     value = table.values[key]
-    # Whoever writes 1 for 1.0 means the number; true for 1.0 is a mistake.
-    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+
+    def fits(kind: Any, part: Any) -> bool:
+        # Whoever writes 1 for 1.0 means the number; true for 1.0 is a mistake.
+        return kind is None or type(part) is type(kind) or (isinstance(kind, float) and type(part) is int)
+
+    def made(kind: Any, part: Any) -> Any:
+        return float(part) if isinstance(kind, float) else part
+
     if isinstance(old, tuple) and isinstance(value, list):
         # TOML has lists; frozen settings hold tuples, so that they can be hashed and compared.
-        return tuple(float(v) if old and isinstance(old[0], float) else v for v in value)
-    if old is not None and type(value) is not type(old):
-        raise bad_input(table.path, table.field(key), value, f"is not like {old}", f"write it like {old}")
-    return value
+        kind = old[0] if old else None
+        if all(fits(kind, part) for part in value):
+            return tuple(made(kind, part) for part in value)
+    elif fits(old, value):
+        return made(old, value)
+    raise bad_input(table.path, table.field(key), value, f"is not like {old}", f"write it like {old}")
 
 
 def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:

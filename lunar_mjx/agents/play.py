@@ -100,6 +100,11 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
             f"do not fit the environment's {env.observation_size}",
             "change no observations or actions",
         )
+    theirs, ours = policy.network.get("picture"), getattr(env, "picture", None)
+    if theirs is not None and (ours is None or list(theirs) != list(ours)):
+        # A picture of as many pixels in other rows would pass for what it was trained on.
+        problem = f"is not the environment's {ours}"
+        raise bad_input(path, "network.picture", theirs, problem, "change no camera_width or camera_height")
     return env, lambda state, key: policy.act(state.obs), dict(made_in.get("unseen", {}))
 
 

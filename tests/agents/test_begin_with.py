@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 
 import jax
 import numpy as np
 import pytest
 
-from lunar_mjx.agents.from_brax.begin import begin_with
+from lunar_mjx.agents.from_brax.begin import _check, begin_with
 from lunar_mjx.agents.from_brax.ppo import PPOConfig
 from lunar_mjx.agents.learner import Learner, TrainConfig
-from lunar_mjx.agents.policy import load_policy, policy_of, save_policy
+from lunar_mjx.agents.policy import load_policy, policy_of, save_policy, shipped_policy
 from lunar_mjx.agents.td3 import TD3Config
 from lunar_mjx.agents.train import RunConfig, train
-from lunar_mjx.envs import make
+from lunar_mjx.envs import make, make_navigation
 from lunar_mjx.errors import UserError
 
 SMALL = PPOConfig((16, 16), (16,), minibatches=2, passes=1, unroll=12)
@@ -93,3 +94,18 @@ def test_a_policy_of_another_environment_is_refused(learned):
         begin_with(learner, learner.init(0), "luvmi_x/ladder-3")
     with pytest.raises(UserError, match="is no policy that ships"):
         begin_with(learner, learner.init(0), "nobody")
+
+
+@pytest.mark.parametrize(("field", "value"), [("action", "paper"), ("four_wheel_steering", False)])
+def test_actions_that_mean_something_else_are_refused(field, value):
+    path = shipped_policy("luvmi_x")
+    assert path is not None
+    policy = load_policy(path)
+    like = {name: policy.network[name] for name in ("activation", "layer_norm")}
+    made = config(dataclasses.replace(SMALL, actor_layers=tuple(policy.network["layers"]), **like))
+    told = {"preset": "consistent", "terrain": "flat", "places": 8, "goal_distance": (2.0, 4.0)}
+    learner = types.SimpleNamespace(config=made, env=make_navigation("large", **told))
+    _check(learner, policy, "luvmi_x")
+    learner.env = make_navigation("large", **told, **{field: value})
+    with pytest.raises(UserError, match=f"has {field} = .*--env {field}="):
+        _check(learner, policy, "luvmi_x")

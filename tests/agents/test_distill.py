@@ -12,7 +12,7 @@ import pytest
 from lunar_mjx.agents.configs import get_training, learner_name
 from lunar_mjx.agents.evaluate import evaluate
 from lunar_mjx.agents.export.graphs import to_onnx
-from lunar_mjx.agents.from_teacher.distill import Distill, DistillConfig, Lesson
+from lunar_mjx.agents.from_teacher.distill import Distill, DistillConfig, Lesson, open_teacher, taught_in
 from lunar_mjx.agents.learner import Learner, TrainConfig
 from lunar_mjx.agents.networks import make_actor
 from lunar_mjx.agents.play import open_agent
@@ -153,6 +153,8 @@ def test_a_rover_learns_from_the_shipped_policy_and_its_file_brings_the_camera(r
     path = save_policy(result.policy, tmp_path / "policy.npz")
     made, agent, _ = open_agent(str(path))
     assert made.blocks == env.blocks and "height_scan" not in made.blocks
+    with pytest.raises(UserError, match=r"network\.picture"):
+        open_agent(str(path), options={"camera_width": 12, "camera_height": 16})
     state = env.reset(env.params, split_keys(jax.random.PRNGKey(3), 2))
     assert np.asarray(agent(state, None)) == pytest.approx(np.asarray(result.policy.act(state.obs)), abs=1e-6)
 
@@ -204,3 +206,18 @@ def test_a_point_that_heads_for_the_goal_is_what_scripted_agents_do(teacher):
     env, policy = PointEnv(), load_policy(teacher)
     score = evaluate(env, lambda state, key: policy.act(state.privileged), 128, seed=3)
     assert score.low > 0.9 and make_agent("scripted", env) is not None
+
+
+@pytest.mark.parametrize("line", ["filters = [1.5]", 'actor_layers = ["64"]', "filters = [true]"])
+def test_a_file_with_widths_that_are_no_whole_numbers_is_refused(tmp_path, line):
+    path = tmp_path / "mine.toml"
+    path.write_text(f'environment = "point"\nsteps = 64\n[train]\nenvs = 4\n[distill]\nteacher = "luvmi_x"\n{line}\n')
+    with pytest.raises(UserError, match=f"distill.{line.split()[0]} = .* is not like"):
+        get_training(str(path))
+
+
+def test_a_teacher_whose_file_names_no_task_is_refused():
+    policy = open_teacher("luvmi_x")
+    environment = {**policy.environment, "options": {**policy.environment["options"], "task": ["large"]}}
+    with pytest.raises(UserError, match="teacher's task"):
+        taught_in(dataclasses.replace(policy, environment=environment))

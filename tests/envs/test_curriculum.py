@@ -46,6 +46,7 @@ def test_levels_begin_on_the_shortest_way_and_the_last_one_where_the_rung_does()
         ({"task": "large", "terrain": "flat", "curriculum_levels": 3}, "ladder only"),
         ({"task": "ladder/1", "curriculum_levels": -1}, "whole number"),
         ({"task": "ladder/1", "curriculum_levels": 2.5}, "whole number"),
+        ({"task": "ladder/1", "curriculum_levels": 20}, r"within goal_radius = 0.5 m of the goal; give less than 20"),
     ],
 )
 def test_mistakes_are_told(settings, said):

@@ -80,6 +80,12 @@ def test_draws_stay_within_the_effects_bounds_and_do_not_pile_up_there(plain):
     assert (n >= bounds[0] * (1 - 1e-6)).all() and (n <= bounds[1] * (1 + 1e-6)).all()
 
 
+def test_what_is_drawn_by_its_logarithm_stays_positive(plain):
+    wide = dataclasses.replace(plain, posterior=Posterior.of(("soil.k_phi",), (True,), np.array([[1e6]])))
+    assert plain.effects[plain.effect_names.index("soil")].parameters["k_phi"].bounds[0] == 0.0
+    assert (_draws(wide, 100)["soil.k_phi"] > 0.0).all()
+
+
 def test_a_key_gives_its_draw_whatever_runs_beside_it(model):
     many, again, few = _draws(model, 8), _draws(model, 8), _draws(model, 8, seed=1)
     for name in NAMES:

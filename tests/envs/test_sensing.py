@@ -134,6 +134,9 @@ def test_nothing_hides_level_ground():
         ({"delay": -0.1}, "delay"),
         ({"drift": 2.0}, "drift"),
         ({"mast": -1.0}, "mast"),
+        ({"drift": True}, "drift = True is not a number"),
+        ({"delay": "0.1"}, "delay = '0.1' is not a number"),
+        ({"mast": 1.0}, "mast = 1.0 does nothing where no height_scan is observed"),
     ],
 )
 def test_what_no_sensor_does_is_refused(setting, says):

@@ -100,6 +100,11 @@ def _check(learner: Any, policy: Policy, source: str) -> None:
         task, rover = taught_in(policy)
         if rover is not None and rover != env.model.rover.name:
             raise refuse(f"drives {rover}, and the training {env.model.rover.name}", "give a policy of the same rover")
+        # As many actions may mean something else: torques in place of speeds.
+        for field in ("action", "four_wheel_steering"):
+            theirs, ours = getattr(task, field), getattr(env.config, field)
+            if theirs != ours:
+                raise refuse(f"has {field} = {theirs}, and the training {ours}", f"give --env {field}={str(theirs).lower()}")
         theirs, ours = tuple(task.observations), tuple(env.config.observations)
         fits = ours[: len(theirs)] == theirs and env.blocks[theirs[-1]].stop == network["obs"]
         said = list(theirs), list(ours)

@@ -239,6 +239,6 @@ def taught_in(teacher: Policy) -> tuple[NavigationConfig, str | None]:
     # JSON knows lists only; settings are tuples.
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items() if k not in made_by}
     task = options.get("task", "consistent")
-    if task not in TASKS:
+    if not isinstance(task, str) or task not in TASKS:
         raise bad_input("distill", "teacher's task", task, "does not exist", f"give one of {', '.join(TASKS)}")
     return TASKS[task].replace(**settings), None if "model" in options else options.get("rover", "luvmi_x")

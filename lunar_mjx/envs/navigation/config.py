@@ -167,7 +167,11 @@ def _check(c: NavigationConfig) -> None:
     for name in ("success", "failure", "edge", "start_yaw"):
         require_finite("navigation", name, getattr(c, name))
     for name, most in (("delay", 10.0), ("drift", 1.0), ("mast", 100.0)):
-        require_within("navigation", name, getattr(c, name), 0.0, most)
+        value = getattr(c, name)
+        # True counts as 1 in Python: `drift=true` would be a rover that errs by its whole way.
+        if isinstance(value, bool | str):
+            raise bad_input("navigation", name, value, "is not a number", "give one")
+        require_within("navigation", name, value, 0.0, most)
     distance = c.goal_distance
     pair = isinstance(distance, list | tuple) and len(distance) == 2
     low, high = (require_finite("navigation", "goal_distance", v) for v in distance) if pair else (0.0, 0.0)
@@ -198,6 +202,9 @@ def _check(c: NavigationConfig) -> None:
         raise bad_input("navigation", "weights", c.weights, "are no weights by name", f"use some of {', '.join(TERMS)}")
     check_blocks(c.observations, "observations")
     check_blocks(c.privileged, "privileged")
+    if c.mast > 0.0 and not {"height_scan", "far_scan"} & {*c.observations, *c.privileged}:
+        problem = "does nothing where no height_scan is observed"
+        raise bad_input("navigation", "mast", c.mast, problem, "leave it out")
     if not c.observations:
         raise bad_input("navigation", "observations", c.observations, "is empty", "name at least one block")
     for name, weight in c.weights.items():

@@ -294,6 +294,11 @@ class NavigationEnv:
         # Whole multiples of LUVMI-X's world: grids and boulders then divide as they do there.
         rung = get_rung(c.rung).scaled(max(1.0, round(half_width / 0.4)))
         hardness = c.hardness if hardness is None else hardness
+        # Who begins within the goal's radius has arrived: such a level would teach nothing, and always be passed.
+        if self._levels * c.goal_radius >= rung.goal_distance[0]:
+            problem = f"lets rovers begin within goal_radius = {c.goal_radius:g} m of the goal"
+            remedy = f"give less than {rung.goal_distance[0] / c.goal_radius:g}"
+            raise bad_input("navigation", "curriculum_levels", c.curriculum_levels, problem, remedy)
         return make_pool(rung, seed, c.worlds or rung.worlds, half_width, hardness, self._levels)
 
     def _on_pool(self, model: Model, pool: Pool, bounds: Any, gains: Any) -> NavigationParams:

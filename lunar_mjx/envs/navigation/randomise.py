@@ -20,6 +20,8 @@ SCALES = ("uniform", "log")
 _TRIES = 16
 """Draws from a posterior, of which the first within all bounds counts: even where every fourth alone is, one rover of a
 hundred gets none, and is put at the bounds."""
+_LEAST = 1e-30
+"""Least value of what is drawn by its logarithm, in SI units: positive in single precision."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,11 +87,9 @@ def spread_of(model: Model, source: str = "navigation") -> Spread:
         value = np.asarray(model.parameters[effect][parameter], float)
         bounds = next(e for e in model.effects if e.name == effect).parameters[parameter].bounds
         # The first wheel or joint that reaches its bound ends the deviation, which is one for all of them.
-        with np.errstate(divide="ignore"):
-            ends = [
-                np.log(b) - np.log(value) if log else b - value
-                for b in (max(bounds[0], 0.0) if log else bounds[0], bounds[1])
-            ]
+        # However wide the posterior, an exponential must not become zero.
+        least = max(bounds[0], _LEAST) if log else bounds[0]
+        ends = [np.log(b) - np.log(value) if log else b - value for b in (least, bounds[1])]
         low.append(np.max(ends[0]))
         high.append(np.min(ends[1]))
     arrays = (jnp.asarray(a, jnp.result_type(float)) for a in (posterior.factor(), low, high))
