@@ -32,6 +32,16 @@ def require_view(view: str) -> None:
         raise bad_input("play", "view", view, "does not exist", f"use one of {', '.join(VIEWS)}")
 
 
+END_WORDS = {
+    "success": "goal reached",
+    "rolled_over": "rolled over",
+    "stuck": "stuck",
+    "off_terrain": "left the terrain",
+    "collided": "struck a boulder",
+    "drained": "battery empty",
+    "diverged": "diverged",
+}
+"""Ends of episodes by the metrics that tell them; where none does, time is up."""
 UNSEEN_LADDER = {"ranges": "unseen", "hardness": 1.1}
 """What agents are scored on: worlds of another seed, harder than the training's by a tenth, and the held-out soil."""
 
@@ -230,14 +240,7 @@ def play_episode(env: Any, params: Any, agent: Agent, seed: int = 0) -> Episode:
         rewards.append(float(state.reward[0]))
         if bool(state.done[0]):
             flags = {k: float(v[0]) for k, v in state.metrics.items() if not k.startswith(PER_STEP)}
-            names = {
-                "success": "goal reached",
-                "rolled_over": "rolled over",
-                "stuck": "stuck",
-                "off_terrain": "left the terrain",
-                "diverged": "diverged",
-            }
-            end = next((text for k, text in names.items() if flags[k] > 0), end)
+            end = next((text for k, text in END_WORDS.items() if flags.get(k, 0.0) > 0), end)
             # the pose after the last step is gone with the reset: the picture ends one step before
             qpos.append(qpos[-1])
             break

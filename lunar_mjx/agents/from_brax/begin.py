@@ -104,7 +104,8 @@ def _check(learner: Any, policy: Policy, source: str) -> None:
         for field in ("action", "four_wheel_steering"):
             theirs, ours = getattr(task, field), getattr(env.config, field)
             if theirs != ours:
-                raise refuse(f"has {field} = {theirs}, and the training {ours}", f"give --env {field}={str(theirs).lower()}")
+                remedy = f"give --env {field}={str(theirs).lower()}"
+                raise refuse(f"has {field} = {theirs}, and the training {ours}", remedy)
         theirs, ours = tuple(task.observations), tuple(env.config.observations)
         fits = ours[: len(theirs)] == theirs and env.blocks[theirs[-1]].stop == network["obs"]
         said = list(theirs), list(ours)
