@@ -240,7 +240,6 @@ class _Search:
             self.begun.add((*key, near.refit.effects))
         if trial and start is not None:
             start = form.trial(start, trial)
-        self.refits += 1
         try:
             made = form.refit(effects, near.refit if near else None, start)
         except TimeUp:
@@ -250,9 +249,11 @@ class _Search:
             return
         # A solver that fails says nothing against a hypothesis: it is recorded and the search goes on.
         except (EvidenceError, ValueError, np.linalg.LinAlgError) as error:
+            self.refits += 1
             self.done.setdefault(key, None)
             self.reasons.append(f"{label}: {error}")
             return
+        self.refits += 1
         again = self.done.get(key) is not None
         if made.failed:
             self.reasons.append(f"{label}: {made.failed}")
