@@ -12,6 +12,7 @@ from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result, read_result
 from lunar_mjx.diagnosis.report.steps import Step, chain, comparable, error, judged
 from lunar_mjx.diagnosis.report.words import and_list, shown
+from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.report.page import Block, Figure, Section, Text, write_page
 
@@ -72,10 +73,11 @@ def _audit_line(result: Result) -> str:
     if audit.get("sentence"):
         older = audit.get("version", __version__) != __version__
         return str(audit["sentence"]) + (f" (Measured with version {audit['version']}.)" if older else "")
-    return (
-        "How often this tool is wrong on logs like these has not been measured; "
-        f"lunar-mjx why {shlex.quote(str(result.path))} --audit 30 measures it in 30 minutes."
-    )
+    unknown = "How often this tool is wrong on logs like these has not been measured"
+    # Logs that were refused, or that no model could be fitted to, have to be mended before anything is measured.
+    if (result.verdict or {}).get("verdict") in (Verdict.BAD_DATA.label, Verdict.BAD_FIT.label):
+        return f"{unknown}."
+    return f"{unknown}; lunar-mjx why {shlex.quote(str(result.path))} --audit 30 measures it in 30 minutes."
 
 
 def _error_section(steps: Sequence[Step], results: Sequence[Result]) -> Section:

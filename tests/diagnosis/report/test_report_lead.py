@@ -13,6 +13,7 @@ from lunar_mjx.diagnosis.report import figures, tables
 from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error
+from lunar_mjx.diagnosis.report.write import _audit_line
 from lunar_mjx.diagnosis.verdict import Verdict
 
 
@@ -34,6 +35,15 @@ def test_a_search_that_was_cut_short_is_to_be_asked_again():
     assert lead([judge], judge).next[0].startswith("lunar-mjx why run1 ")
     judge = result("run1", {**verdict, "details": {"search": {"complete": True}}})
     assert lead([judge], judge).next[0].startswith("lunar-mjx next run1 ")
+
+
+REFUSED = ("BAD_DATA", "BAD_FIT")
+
+
+@pytest.mark.parametrize("verdict", [*REFUSED, "KNOWN", "UNKNOWN"])
+def test_an_audit_is_asked_for_where_there_is_something_to_audit(verdict):
+    said = _audit_line(result("run1", {"verdict": verdict}))
+    assert said.endswith(".") and ("--audit" in said) == (verdict not in REFUSED)
 
 
 def test_probabilities_claim_no_more_digits_than_they_have():
