@@ -84,7 +84,7 @@ class TwoValleys(ToyForm):
 
     @staticmethod
     def curve(u):
-        """The same curve at a level and its negative, but for a hump that stands in the way above zero."""
+        """The toy's curve (n,) at the level |u[0]|, with a hump x^2 / 2 added where u[0] is positive."""
         return curve(np.concatenate([np.abs(u[:1]), u[1:]])) + 0.5 * X**2 * (u[0] > 0.0)
 
     def refit(self, effects, near, start):

@@ -19,7 +19,7 @@ class Step:
     """One model of a chain of runs, with the row of its residuals and predictions in its run.
 
     Attributes:
-      label: what it is. short: the same on an axis. run: name of its run folder.
+      label: what it is. short: its label on an axis. run: name of its run folder.
       result: that it comes from. row: its place among the run's models.
     """
 

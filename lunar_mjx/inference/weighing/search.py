@@ -4,7 +4,7 @@ Best first: around each refit all neighbours (one term more, one less) are score
 probable set that has not been refitted is refitted next, until no other comes near the best. So every accepted effect
 is challenged by a refit without it, and a greedy step that led into a trap is undone. Where the set without it promises
 more around the refit with it than its own refit has reached, it is refitted again, from there: a descent that found a
-better valley on its way must not be taken for what the effect is worth.
+better optimum on its way must not be taken for what the effect is worth.
 
 Before something unlisted is believed, every effect that could be seen is refitted from a place where it acts: where a
 signature saturates, the linear estimate at its null is much too low.
@@ -146,7 +146,6 @@ class _Search:
       known: the best evidence of each set of terms beside each form.
       done: the best refit by form and effects; None where the solver failed.
       refits: number made. begun: form, effects, and effects of the refit at whose end it began, of each.
-      again: sets whose refit ended lower than the linear estimate around another one's new and better end promises.
       reasons: "form with effects: reason" of each refit whose solver failed.
       over: whether time was up within a refit.
     """
@@ -162,7 +161,6 @@ class _Search:
     done: dict[tuple[str, frozenset[str]], Refit | None] = dataclasses.field(default_factory=dict)
     refits: int = 0
     begun: set[tuple[str, frozenset[str], frozenset[str]]] = dataclasses.field(default_factory=set)
-    again: dict[tuple[str, frozenset[str]], Hypothesis] = dataclasses.field(default_factory=dict)
     reasons: list[str] = dataclasses.field(default_factory=list)
     over: bool = False
 
@@ -215,10 +213,9 @@ class _Search:
         if unchallenged:
             self.refit(by_name[best.form], unchallenged[0], best)
             return True
-        self.open_again(by_name[best.form], best.refit, rivals)
-        key = max(self.again, key=lambda key: self.again[key].log_posterior, default=None)
-        if key is not None and self.again[key].log_posterior > best.log_posterior - self.window:
-            self.refit(by_name[key[0]], key[1], self.again.pop(key))
+        better = self.promising(by_name[best.form], best, rivals)
+        if better is not None:
+            self.refit(by_name[best.form], better.effects, better)
             return True
         untried = self.untried(best)
         if untried:
@@ -254,33 +251,34 @@ class _Search:
             self.reasons.append(f"{label}: {error}")
             return
         self.refits += 1
-        again = self.done.get(key) is not None
         if made.failed:
             self.reasons.append(f"{label}: {made.failed}")
         if self.score_around(form, made, near):
             self.done[key] = made
-            if again:
-                # A better valley of a set that was thought known: its neighbours may have missed it, too.
-                self.open_again(form, made, [effects ^ {t.name} for t in form.terms if t.kind == EFFECT])
         elif key not in self.done:
             # A refit around which nothing can be said is a failed one; the set would else be refitted for ever.
             self.done[key] = None
             self.reasons.append(f"{label}: no evidence around its refit")
 
-    def open_again(self, form: Form, made: Refit, sets: Iterable[frozenset[str]]) -> None:
-        """Asks for a further refit of each set of effects that promises more around a refit than its own has reached.
+    def promising(self, form: Form, best: Hypothesis, rivals: Iterable[frozenset[str]]) -> Hypothesis | None:
+        """The set of effects that promises most around a refit beyond what its own has reached; None if none does.
 
-        The promise is the linear estimate: it costs no refit where all are in one valley.
+        The promise is the linear estimate: it costs no refit where all refits are at one optimum.
+
+        Args:
+          form: of the model. best: around whose refit. rivals: sets of effects that have been refitted.
         """
         effects = {t.name: t for t in form.terms if t.kind == EFFECT}
-        for names in sets:
+        found = []
+        for names in rivals:
             terms = frozenset(effects[name] for name in names)
             old = self.known.get((form.name, terms))
-            if old is None or not old.refitted or (form.name, names, made.effects) in self.begun:
+            if old is None or not old.refitted or (form.name, names, best.effects) in self.begun:
                 continue
-            new = self.estimate(form, made, terms, _sizes(old))
-            if new is not None and new.log_posterior > old.log_posterior:
-                self.again[form.name, names] = new
+            new = self.estimate(form, best.refit, terms, _sizes(old))
+            if new is not None and new.log_posterior > max(old.log_posterior, best.log_posterior - self.window):
+                found.append(new)
+        return max(found, key=lambda h: h.log_posterior, default=None)
 
     def ranked(self, complete: bool) -> ModelSearch:
         """What is known, most probable first."""
@@ -371,7 +369,7 @@ class _Search:
         if new is None:
             return old
         # Of two linear estimates of one set the one from nearer by counts: that of the more probable refit. Of two
-        # refits of one set it is the better valley.
+        # refits of one set the better optimum counts.
         if old is None or (refitted and not old.refitted) or new.log_posterior > old.log_posterior:
             self.known[form.name, terms] = new
         return self.known[form.name, terms]
