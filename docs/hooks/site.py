@@ -144,8 +144,9 @@ def _ladder(number: int) -> str:
     tuned = str(number) in json.loads((RECORDS / "ladder.json").read_text(encoding="utf-8"))["tuned"]
     reactive = "reactive, tuned" if tuned else "reactive, not tuned"
     rules = {"mapper": "`mapper`", "reactive, tuned": reactive, "reactive": reactive, "scripted": "straight ahead"}
-    first = next(iter(finals.values()))
-    rows += [(text, first[name]) for name, text in rules.items() if name in first]
+    # the newest run's, since the map by which a rule finds its way has changed
+    newest = _seeds(next(iter(LADDER[number].values())))[-1]["final"]["rows"]
+    rows += [(text, newest[name]) for name, text in rules.items() if name in newest]
     numbers = {"spl": "{:.2f}", "collisions_per_km": "{:.0f}", "wh_per_km": "{:.0f}", "slip": "{:.2f}"}
     header = [f"{rows[0][1]['episodes']} episodes", "success", "SPL", "collisions/km", "W h/km", "mean slip"]
     return table(header, [[n, _share(r), *(text.format(r[k]) for k, text in numbers.items())] for n, r in rows])
