@@ -14,6 +14,7 @@ from lunar_mjx.agents.evaluate import score
 from lunar_mjx.envs import TASKS, make_navigation, split_keys
 from lunar_mjx.envs.contract import check_environment
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
+from lunar_mjx.envs.ladder import chart
 from lunar_mjx.envs.ladder.ground import make_world
 from lunar_mjx.envs.ladder.pool import make_pool, way_left
 from lunar_mjx.envs.ladder.rungs import RUNGS, get_rung
@@ -214,6 +215,23 @@ def test_a_rung_keeps_the_contract_and_collisions_end_episodes():
     assert bool(touching[0]) and not bool(touching[2])
     ends = env._ends(env.params, moved, view, moved.goal - qpos[:, :2])
     assert bool(ends["off_terrain"][1]) and not bool(ends["off_terrain"][2])
+
+
+@pytest.mark.slow
+def test_what_was_tried_in_vain_lies_where_the_wheels_drove_and_not_the_first_joint(monkeypatch):
+    env = make_navigation("ladder/1", worlds=1, decimation=25, action="joint_velocity", observations=("plan",))
+    inner = env._fresh(env.params, split_keys(jax.random.PRNGKey(0), 2))
+    almost = jnp.full(2, chart.CHART.patience - 0.5 * env.control_interval)
+    inner = dataclasses.replace(inner, chart=env._blank(env.params, inner), waited=almost)
+    wheels, joints = jnp.zeros((2, 4)), jnp.zeros((2, env.action_size))
+    monkeypatch.setattr(env, "_drive", lambda params, inner, action: (inner.physics, (wheels, wheels, joints)))
+    told, looking = [], chart.look
+    monkeypatch.setattr(chart, "look", lambda *given: told.append(given[-1]) or looking(*given))
+    asked = np.zeros((2, env.action_size), np.float32)
+    # three wheels drive against the first
+    asked[:, :4] = np.array([[0.8], [-0.8]]) * np.array([-0.5, 1.0, 1.0, 1.0])
+    env._advance(env.params, inner, jnp.asarray(asked))
+    assert np.asarray(told[0]).tolist() == [1.0, -1.0]
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.envs import make_agent, make_navigation, split_keys
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
 from lunar_mjx.envs.navigation import rewards
-from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
+from lunar_mjx.envs.navigation.actions import ACTION_MODES, action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import SOIL_RANGES, TASKS, UNSEEN_SOIL
 from lunar_mjx.envs.navigation.places import draw_places
 from lunar_mjx.envs.navigation.randomise import Range, check_ranges
@@ -252,6 +252,13 @@ def test_six_actions_drive_the_joints_that_the_paper_names():
         else:
             assert (turned[:, i] == 0).all()
     assert action_map(model, "joint_torque", 0.5).size == len(rover.joints) == 12
+    for mode in ACTION_MODES:
+        asked = action_map(model, mode, 0.5)
+        action = np.zeros((3, asked.size), np.float32)
+        # ahead, backwards, and the steering alone
+        action[0, asked.source[:4]], action[1, asked.source[:4]] = 0.3, -1.0
+        action[2, asked.source[rover.joints.index("lf_steer")]] = 1.0
+        assert np.asarray(asked.ahead(action)).tolist() == [1.0, -1.0, 0.0], mode
     with pytest.raises(UserError, match="does not exist"):
         action_map(model, "thoughts", 0.5)
 

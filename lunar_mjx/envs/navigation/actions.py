@@ -47,12 +47,14 @@ class ActionMap:
       source: (joint,) which action drives each joint.
       scale: (joint,) target at an action of 1; 0 for a joint that is held at zero.
       mode: (joint,) control mode, as in `RoverInfo`.
+      drives: (wheel,) numbers of the joints that drive wheels.
     """
 
     names: tuple[str, ...]
     source: np.ndarray
     scale: np.ndarray
     mode: np.ndarray
+    drives: np.ndarray
 
     @property
     def size(self) -> int:
@@ -63,6 +65,10 @@ class ActionMap:
         """Targets of all joints; actions beyond [-1, 1] are clipped."""
         chosen: Any = jnp.clip(action, -1.0, 1.0)[:, self.source]
         return chosen * jnp.asarray(self.scale, action.dtype)
+
+    def ahead(self, action: Float[Array, "env action"]) -> Float[Array, "env"]:
+        """1 where an action drives the wheels forwards on average, -1 backwards, 0 where it does neither."""
+        return jnp.sign(self.controls(action)[:, self.drives].mean(-1))
 
 
 def action_map(
@@ -100,8 +106,12 @@ def action_map(
         code = {"joint_torque": TORQUE, "joint_current": CURRENT, "joint_velocity": VELOCITY}[mode]
         count = len(rover.joints)
         names = tuple(rover.joints)
-        return ActionMap(names, np.arange(count), limits, np.full(count, code))
+        return ActionMap(names, np.arange(count), limits, np.full(count, code), _drives(rover))
     return _six(rover, mode, groups, limits, four_wheel_steering)
+
+
+def _drives(rover: Rover) -> np.ndarray:
+    return np.array([rover.joints.index(w.drive) for w in rover.wheels if w.drive])
 
 
 def _six(rover: Rover, mode: str, groups: list[str], limits: np.ndarray, all_steer: bool) -> ActionMap:
@@ -121,7 +131,7 @@ def _six(rover: Rover, mode: str, groups: list[str], limits: np.ndarray, all_ste
             kind = kind if value else POSITION
         scale.append(value)
         code.append(kind)
-    return ActionMap(names, np.array(source), np.array(scale), np.array(code))
+    return ActionMap(names, np.array(source), np.array(scale), np.array(code), _drives(rover))
 
 
 def reachable_speed(model: Model) -> float:

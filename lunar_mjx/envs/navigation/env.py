@@ -555,7 +555,7 @@ class NavigationEnv:
             patience, yaw = chart.CHART.patience, self._reader.pose(physics)["yaw"]
             # tried in vain each time that as long has passed without progress
             vain = jnp.floor(waited / patience) > jnp.floor((waited - self.control_interval) / patience)
-            vain = jnp.where(vain & (waited > 0.0), jnp.sign(action[:, 0]), 0.0)
+            vain = jnp.where(vain & (waited > 0.0), self.actions.ahead(action), 0.0)
             inner = dataclasses.replace(inner, chart=chart.look(inner.chart, self._errand(params, inner), yaw, vain))
         view = self._view(params, inner)
         if inner.tally is not None and self._outline is not None:
