@@ -56,18 +56,19 @@ def test_an_environment_observes_late_and_astray_and_drives_as_before(envs):
         state, step = env.reset(env.params, keys), jax.jit(env.step)
         if state.inner.odometry is not None:
             astray = np.asarray(state.inner.odometry.astray)
-        observed, positions = [state.obs], [state.info["position"]]
+        observed, positions, rules = [state.obs], [state.info["position"]], [{**state.info}]
         for i in range(count):
             action = jnp.tile(jnp.array([1.0, 0.1 * i, 0.0, 0.0, 0.0, 0.0]), (4, 1))
             state = step(env.params, state, action)
             observed.append(state.obs)
             positions.append(state.info["position"])
+            rules.append({**state.info})
             if i == 9:
                 assert np.asarray(state.done).all()
                 final = np.asarray(state.final_obs)
-        told.append((np.asarray(observed), final))
+        told.append((np.asarray(observed), final, rules))
         places.append(np.asarray(positions))
-    (plain, plain_final), (late, late_final) = told
+    (plain, plain_final, plain_rules), (late, late_final, late_rules) = told
     np.testing.assert_allclose(places[1], places[0], atol=1e-4)
     way = np.cumsum(np.hypot(*np.moveaxis(np.diff(places[0][:10, :, :2], axis=0), -1, 0)), axis=0)
     assert way[-1].min() > 0.02
@@ -89,6 +90,14 @@ def test_an_environment_observes_late_and_astray_and_drives_as_before(envs):
     for t in range(10, 14):
         np.testing.assert_allclose(late[t][:, 2], plain[max(t - 3, 10)][:, 2], atol=2e-4)
     np.testing.assert_allclose(late[10][:, blocks["goal_body"]], plain[10][:, blocks["goal_body"]], atol=2e-4)
+    # Rules act by what is told beside the observation: late as well, and as astray as the block of the same name.
+    for t in range(14):
+        then = max(t - 3, 10 * (t >= 10))
+        for name in ("joint_angle", "body_velocity"):
+            np.testing.assert_allclose(late_rules[t][name], plain_rules[then][name], atol=2e-4)
+        distance = np.hypot(*np.asarray(late_rules[t]["goal_body"]).T)
+        np.testing.assert_allclose(distance, late[t][:, blocks["goal_body"].start], atol=2e-4)
+    assert np.abs(np.asarray(plain_rules[9]["body_velocity"]) - plain_rules[6]["body_velocity"]).max() > 1e-3
 
 
 def _view(x=0.0):

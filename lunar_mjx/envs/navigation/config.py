@@ -49,7 +49,8 @@ class NavigationConfig:
       randomise: parameters drawn for every episode.
       posterior: draw those that the model's `[posterior]` tells from it, and not from `randomise`.
       kalman: the acceleration filter's tuning.
-      delay: by which observations come late, in whole control steps; `last_action` is known at once.
+      delay: by which observations come late, in whole control steps, and with them what rules act by, but for the
+        `planner`, which knows all; `last_action` is known at once.
       drift: share of the way by which odometry errs, to one side drawn per episode: in what tells of goal and map.
       mast: height above the ground of the sensor that makes the height scan: what it cannot see is told as 1.5 times
         the scan's lowest value; 0: it sees all.

@@ -115,8 +115,8 @@ class Inner:
       chart: what the rover knows of its world; None unless it is observed, and in a prepared beginning.
       level: of the curriculum on which the episode began, from 0. next_level: on which beginnings are prepared. None
         without one.
-      late: (steps, obs) observations on their way, newest first. odometry: where the rover believes to be. Both None
-        where sensors are at once and exact.
+      late: (steps, ...) observations and `info` on their way, newest first. odometry: where the rover believes to be.
+        Both None where sensors are at once and exact.
       ready: the next episode's beginning, from `key`. used: (env,) where it has been taken and not yet replaced.
     """
 
@@ -416,8 +416,9 @@ class NavigationEnv:
             inner = dataclasses.replace(inner, next_level=after)
         # before the restart: the successor in the replay buffer is the old episode's last state, not the new one's
         final_obs, final_privileged = self._observe(params, inner, view)
+        info = self._info(view)
         if inner.late is not None:
-            final_obs, inner = self._after_delay(inner, final_obs)
+            final_obs, info, inner = self._after_delay(inner, final_obs, info)
         if c.divergence == "reset":
             # the successor of a state that is gone carries no value, but must not poison a batch
             final_obs, final_privileged = bounded(final_obs), bounded(final_privileged)
@@ -434,7 +435,7 @@ class NavigationEnv:
                     final_obs,
                     final_privileged,
                     metrics,
-                    self._info(view),
+                    info,
                     inner,
                 ),
             )
@@ -474,17 +475,19 @@ class NavigationEnv:
         inner = self._fresh(params, keys, level)
         view = self._view(params, inner)
         obs, privileged = self._observe(params, inner, view)
+        info = self._info(view)
         if self._late_steps:
-            inner = dataclasses.replace(inner, late=sensing.queue_of(obs, self._late_steps))
-        return Ready(obs, privileged, self._info(view), inner)
+            inner = dataclasses.replace(inner, late=sensing.queue_of((obs, info), self._late_steps))
+        return Ready(obs, privileged, info, inner)
 
-    def _after_delay(self, inner: Inner, obs: Any) -> tuple[Any, Inner]:
-        """The observation that arrives while `obs` is made; a rover knows at once what it has commanded itself."""
-        late, queue = sensing.arrived(inner.late, obs)
+    def _after_delay(self, inner: Inner, obs: Any, info: dict[str, Any]) -> tuple[Any, dict[str, Any], Inner]:
+        """What arrives while `obs` and `info` are made; a rover knows at once what it has commanded itself."""
+        (late, told), queue = sensing.arrived(inner.late, (obs, info))
         own = self.blocks.get("last_action")
         if own is not None:
             late = late.at[:, own].set(obs[:, own])
-        return late, dataclasses.replace(inner, late=queue)
+        # The true position is no sensor's: pictures and tests read it.
+        return late, {**told, "position": info["position"]}, dataclasses.replace(inner, late=queue)
 
     def _costs(self, inner: Inner) -> tuple[Any, ...]:
         """Power, mean slip, hottest winding and collisions of a step, where the task keeps a tally."""

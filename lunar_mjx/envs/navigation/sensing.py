@@ -18,20 +18,26 @@ GRAZE = 0.05
 """m by which ground may stand above a line of sight and hide nothing: what a map's cell averages over."""
 
 
-def queue_of(obs: Float[Array, "env obs"], steps: int) -> Float[Array, "env steps obs"]:
-    """Observations on their way at the beginning of an episode: the first one, as nothing older is known."""
-    return jnp.repeat(obs[:, None], steps, axis=1)
-
-
-def arrived(
-    queue: Float[Array, "env steps obs"], obs: Float[Array, "env obs"]
-) -> tuple[Float[Array, "env obs"], Float[Array, "env steps obs"]]:
-    """The observation that arrives now, and those then on their way, newest first.
+def queue_of(seen: Any, steps: int) -> Any:
+    """Observations on their way at the beginning of an episode: the first one, as nothing older is known.
 
     Args:
-      queue: on their way so far. obs: made now.
+      seen: arrays (env, ...). steps: for which they are on their way.
+
+    Returns:
+      Arrays (env, steps, ...).
     """
-    return queue[:, -1], jnp.concatenate([obs[:, None], queue[:, :-1]], axis=1)
+    return jax.tree.map(lambda a: jnp.repeat(a[:, None], steps, axis=1), seen)
+
+
+def arrived(queue: Any, seen: Any) -> tuple[Any, Any]:
+    """The observations that arrive now, and those then on their way, newest first.
+
+    Args:
+      queue: on their way so far, arrays (env, steps, ...). seen: made now, (env, ...).
+    """
+    on_their_way = jax.tree.map(lambda old, new: jnp.concatenate([new[:, None], old[:, :-1]], axis=1), queue, seen)
+    return jax.tree.map(lambda a: a[:, -1], queue), on_their_way
 
 
 @pytree
