@@ -198,13 +198,19 @@ def override(training: Training, **values: Any) -> Training:
     unused = {"algorithm", *_unused(algorithm)}
     for name, value in values.items():
         if name in {f.name for f in dataclasses.fields(train)} - unused:
-            train = dataclasses.replace(train, **{name: _like(getattr(train, name), name, value)})
+            train = dataclasses.replace(train, **{name: _like(_example(train, name), name, value)})
         elif name in {f.name for f in dataclasses.fields(algorithm)}:
-            algorithm = dataclasses.replace(algorithm, **{name: _like(getattr(algorithm, name), name, value)})
+            algorithm = dataclasses.replace(algorithm, **{name: _like(_example(algorithm, name), name, value)})
         else:
             known = [f.name for c in (train, algorithm) for f in dataclasses.fields(c) if f.name not in unused]
             raise bad_input("train", name, value, "is no setting of this training", f"use one of {', '.join(known)}")
     return dataclasses.replace(training, train=dataclasses.replace(train, algorithm=algorithm))
+
+
+def _example(settings: Any, name: str) -> Any:
+    """The value of a setting, or its default where an empty list tells no type."""
+    value = getattr(settings, name)
+    return next(f.default for f in dataclasses.fields(settings) if f.name == name) if value == () else value
 
 
 def _like(old: Any, name: str, value: Any) -> Any:

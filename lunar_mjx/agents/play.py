@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from lunar_mjx.agents.policy import load_policy, shipped_policy
+from lunar_mjx.agents.policy import load_policy, shipped_policy, taught_in
 from lunar_mjx.cameras.chase import Chase, wheel_tracks
 from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs import TASKS, NavigationEnv, make, make_agent, split_keys
@@ -102,6 +102,14 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
     # A policy may name a Python file as its environment, which would run.
     require_trust(path, "environment.name", made_in["name"])
     env = make(made_in["name"], **{**arguments, **options})
+    if isinstance(env, NavigationEnv) and made_in["name"] == "navigation":
+        theirs, ours = taught_in(policy, path)[0].observations, env.config.observations
+        # Other blocks of the same size together would be taken for those of the training.
+        if theirs != ours:
+            raise UserError(
+                f"{path}: was trained on the observations {', '.join(theirs)}, and the environment has "
+                f"{', '.join(ours)}; change no observations."
+            )
     if env.observation_size != policy.network["obs"] or env.action_size != policy.network["actions"]:
         raise bad_input(
             path,

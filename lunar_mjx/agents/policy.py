@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from lunar_mjx.agents.networks import ACTIVATIONS, make_actor, normalised
+from lunar_mjx.envs import TASKS, NavigationConfig
 from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.files import replacing
 from lunar_mjx.resources import shipped
@@ -53,6 +54,25 @@ def shipped_policy(name: str) -> Path | None:
     rover, _, training = name.partition("/")
     path = shipped("models") / rover / f"{training or 'policy'}.npz"
     return path if path.is_file() else None
+
+
+def taught_in(policy: Policy, source: str | Path) -> tuple[NavigationConfig, str | None]:
+    """The navigation task that a policy was trained in, and its rover; None where only a model's file names it.
+
+    Args:
+      policy: of the environment `navigation`. source: who asks, for the sentence.
+
+    Raises:
+      UserError: its file names a task or setting that does not exist.
+    """
+    options = policy.environment["options"]
+    made_by = ("task", "rover", "terrain", "preset", "model", "engine")
+    # JSON knows lists only; settings are tuples.
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items() if k not in made_by}
+    task = options.get("task", "consistent")
+    if not isinstance(task, str) or task not in TASKS:
+        raise bad_input(source, "the policy's task", task, "does not exist", f"give one of {', '.join(TASKS)}")
+    return TASKS[task].replace(**settings), None if "model" in options else options.get("rover", "luvmi_x")
 
 
 def policy_of(learner: Any, state: Any, environment: dict[str, Any], notes: dict[str, Any]) -> Policy:

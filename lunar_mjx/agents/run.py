@@ -48,6 +48,13 @@ def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
     return env.place(model, ranges, seed=env.config.place_seed + 7919, hardness=options.get("hardness"))
 
 
+def soil_note(env: Any) -> str:
+    """One line about the soil of an evaluation that is the training's own; empty where there is nothing to say."""
+    if not isinstance(env, NavigationEnv) or env.params.spread is None:
+        return ""
+    return f"drawn from [posterior] as in training, not unseen: {', '.join(env.params.spread.parameters)}"
+
+
 def learner_agent(learner: Learner) -> Any:
     """The learner's policy as an agent of `Evaluator`, whose parameters are those of `Learner.policy`."""
 

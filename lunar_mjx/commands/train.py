@@ -113,7 +113,7 @@ def train(
 
     # Before anything asks for devices: JAX must know its fellow processes by then.
     join(coordinator, processes, process)
-    from lunar_mjx.agents.run import run_training
+    from lunar_mjx.agents.run import run_training, soil_note
     from lunar_mjx.agents.train import RunConfig
 
     run = RunConfig(steps or chosen.steps, seed, time_limit, checkpoint_every, not restart, quiet, begin_with)
@@ -126,6 +126,8 @@ def train(
         f"success on unseen ground {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of "
         f"{score.episodes} episodes, return {score.episode_return:.1f}"
     )
+    if note := soil_note(report.result.learner.env):
+        print(note)
     if not report.result.finished:
         print("time limit reached; the same command resumes")
     print(out / "policy.npz")
@@ -173,7 +175,7 @@ def evaluate(
     select_device(device)
     from lunar_mjx.agents.evaluate import Evaluator
     from lunar_mjx.agents.play import knowing, open_agent
-    from lunar_mjx.agents.run import unseen_params
+    from lunar_mjx.agents.run import soil_note, unseen_params
 
     wanted = _one_agent(agent, agent_option)
     made, act, unseen = open_agent(wanted, task, env_options(env))
@@ -189,6 +191,8 @@ def evaluate(
         f"{score.episode_time:.1f} s an episode"
     )
     print(", ".join(f"{name} {100 * share:.1f} %" for name, share in score.ends.items()))
+    if not seen and (note := soil_note(made)):
+        print(note)
     if score.spl is not None:
         print(
             f"success weighted by path length {score.spl:.3f}, {score.collisions_per_km:.1f} collisions/km, "

@@ -109,3 +109,16 @@ def test_actions_that_mean_something_else_are_refused(field, value):
     learner.env = make_navigation("large", **told, **{field: value})
     with pytest.raises(UserError, match=f"has {field} = .*--env {field}="):
         _check(learner, policy, "luvmi_x")
+
+
+def test_a_policy_whose_file_names_no_task_is_told_by_what_the_user_did():
+    path = shipped_policy("luvmi_x")
+    assert path is not None
+    policy = load_policy(path)
+    options = {**policy.environment["options"], "task": "maze"}
+    policy = dataclasses.replace(policy, environment={**policy.environment, "options": options})
+    like = {name: policy.network[name] for name in ("activation", "layer_norm")}
+    made = config(dataclasses.replace(SMALL, actor_layers=tuple(policy.network["layers"]), **like))
+    env = make_navigation("large", preset="consistent", terrain="flat", places=8, goal_distance=(2.0, 4.0))
+    with pytest.raises(UserError, match="train: --begin-with luvmi_x: the policy's task = 'maze' does not exist"):
+        _check(types.SimpleNamespace(config=made, env=env), policy, "luvmi_x")

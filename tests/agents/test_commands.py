@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from lunar_mjx.agents.networks import make_actor
+from lunar_mjx.agents.play import open_agent
 from lunar_mjx.agents.policy import Policy, load_policy, save_policy
 
 SHORT = [
@@ -97,3 +98,16 @@ def test_a_policy_of_an_environment_without_a_name_is_read_and_not_played(run, t
 
 def test_lists_the_trainings(run):
     assert "large-td3" in run("train", "--list").out
+
+
+def test_a_policy_whose_observations_lie_in_another_order_is_not_driven(run, tmp_path):
+    layers = {"obs": 6, "actions": 6, "layers": [3], "activation": "relu", "layer_norm": False}
+    params = make_actor(**layers).init(jax.random.PRNGKey(0))
+    made = {"terrain": "flat", "places": 8, "observations": ["body_velocity", "body_rates"]}
+    policy = Policy(params, None, None, layers, {"name": "navigation", "options": made}, {})
+    path = str(save_policy(policy, tmp_path / "policy.npz"))
+    assert open_agent(path)[0].config.observations == ("body_velocity", "body_rates")
+    found = run("play", path, "--env", 'observations=["body_rates", "body_velocity"]', "-o", tmp_path / "out")
+    assert found.status == 2
+    assert "trained on the observations body_velocity, body_rates, and" in found.err
+    assert "the environment has body_rates, body_velocity; change no observations" in found.err

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.agents.configs import get_training, learner_name
+from lunar_mjx.agents.configs import get_training, learner_name, override
 from lunar_mjx.agents.evaluate import evaluate
 from lunar_mjx.agents.export.graphs import to_onnx
-from lunar_mjx.agents.from_teacher.distill import Distill, DistillConfig, Lesson, open_teacher, taught_in
+from lunar_mjx.agents.from_teacher.distill import Distill, DistillConfig, Lesson, check_teacher, open_teacher
 from lunar_mjx.agents.learner import Learner, TrainConfig
 from lunar_mjx.agents.networks import make_actor
 from lunar_mjx.agents.play import open_agent
@@ -216,8 +216,21 @@ def test_a_file_with_widths_that_are_no_whole_numbers_is_refused(tmp_path, line)
         get_training(str(path))
 
 
-def test_a_teacher_whose_file_names_no_task_is_refused():
+def test_a_list_that_the_file_leaves_empty_is_set_by_its_kind(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'environment = "point"\nsteps = 64\n[train]\nenvs = 4\n[distill]\nteacher = "luvmi_x"\nfilters = []\n'
+    )
+    training = get_training(str(path))
+    assert training.train.algorithm.filters == ()
+    assert override(training, filters="16,8").train.algorithm.filters == (16, 8)
+    with pytest.raises(UserError, match="filters = '16,wide' is not like"):
+        override(training, filters="16,wide")
+
+
+def test_a_teacher_whose_file_names_no_task_is_refused(rovers):
     policy = open_teacher("luvmi_x")
     environment = {**policy.environment, "options": {**policy.environment["options"], "task": ["large"]}}
-    with pytest.raises(UserError, match="teacher's task"):
-        taught_in(dataclasses.replace(policy, environment=environment))
+    nameless = dataclasses.replace(policy, environment=environment)
+    with pytest.raises(UserError, match=r"distill: teacher luvmi_x: the policy's task = \['large'\] does not exist"):
+        check_teacher("luvmi_x", nameless, rovers[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import jax
@@ -11,9 +12,12 @@ import pytest
 from scipy import stats
 
 from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.agents.run import soil_note
+from lunar_mjx.envs import make, make_navigation
 from lunar_mjx.logs import Noise, write_steady_log
 from lunar_mjx.model import make_model
 from lunar_mjx.model.file import load_model
+from lunar_mjx.model.posterior import Posterior
 from lunar_mjx.wheel_bed.bed import WheelBed, wheel_test
 
 STD = {"drawbar_pull_N": 0.1, "side_force_N": 0.1, "sinkage_m": 1e-4}
@@ -64,9 +68,20 @@ def test_a_table_is_fitted_and_trained_on(run, table, tmp_path):
     options = (*ENV, f"model={tmp_path / 'run1' / 'fitted.toml'}", "posterior=true")
     found = run(*line, *(f"--env={text}" for text in options))
     assert found.status == 0, found.err
+    said = "drawn from [posterior] as in training, not unseen: soil."
+    assert said in found.out
     policy = load_policy(tmp_path / "learnt" / "policy.npz")
     assert policy.environment["options"]["posterior"] is True
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy.params))
+    scored = ("evaluate", tmp_path / "learnt" / "policy.npz", "--episodes", 2)
+    assert said in run(*scored).out and said not in run(*scored, "--seen").out
+
+
+def test_soil_that_is_no_posteriors_needs_no_note():
+    task = {"model": make_model("luvmi_x", "flat", "consistent"), "places": 8}
+    assert soil_note(make_navigation("consistent", **task)) == "" == soil_note(make("point"))
+    fitted = dataclasses.replace(task["model"], posterior=Posterior.of(("soil.n",), (True,), np.eye(1) / 100))
+    assert "not unseen: soil.n" in soil_note(make_navigation("consistent", **{**task, "model": fitted}, posterior=True))
 
 
 def test_a_model_that_was_never_fitted_is_refused(run, tmp_path):

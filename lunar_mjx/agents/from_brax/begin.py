@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.agents.from_brax.ppo import PPOConfig
-from lunar_mjx.agents.from_teacher.distill import taught_in
-from lunar_mjx.agents.policy import Policy, load_policy, shipped_policy
+from lunar_mjx.agents.policy import Policy, load_policy, shipped_policy, taught_in
 from lunar_mjx.envs import NavigationEnv
 from lunar_mjx.errors import bad_input
 
@@ -97,7 +96,7 @@ def _check(learner: Any, policy: Policy, source: str) -> None:
             raise refuse(f"has {name} = {theirs}, and the training {ours}", "give a policy of a training like this one")
     fits, said = network["obs"] == env.observation_size, (network["obs"], env.observation_size)
     if isinstance(env, NavigationEnv) and policy.environment.get("name") == "navigation":
-        task, rover = taught_in(policy)
+        task, rover = taught_in(policy, f"train: {FIELD} {source}")
         if rover is not None and rover != env.model.rover.name:
             raise refuse(f"drives {rover}, and the training {env.model.rover.name}", "give a policy of the same rover")
         # As many actions may mean something else: torques in place of speeds.

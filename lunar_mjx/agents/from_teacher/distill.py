@@ -17,10 +17,9 @@ import optax
 
 from lunar_mjx._quiet import without_warp_notices
 from lunar_mjx.agents.networks import make_actor
-from lunar_mjx.agents.policy import Policy, load_policy, shipped_policy
+from lunar_mjx.agents.policy import Policy, load_policy, shipped_policy, taught_in
 from lunar_mjx.agents.td3 import polyak
-from lunar_mjx.envs import TASKS, NavigationEnv
-from lunar_mjx.envs.navigation.config import NavigationConfig
+from lunar_mjx.envs import NavigationEnv
 from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.pytree import pytree
 
@@ -211,7 +210,7 @@ def check_teacher(name: str, teacher: Policy, env: Any) -> None:
     """Raises `UserError` for a teacher whose actions or observations are not those of the environment."""
     source = f"distill: teacher {name}"
     if isinstance(env, NavigationEnv) and teacher.environment.get("name") == "navigation":
-        task, rover = taught_in(teacher)
+        task, rover = taught_in(teacher, source)
         if rover is not None and rover != env.model.rover.name:
             problem = f"is not the {env.model.rover.name} that is to learn"
             raise bad_input(source, "rover", rover, problem, f"give a teacher of {env.model.rover.name}")
@@ -230,15 +229,3 @@ def check_teacher(name: str, teacher: Policy, env: Any) -> None:
         if theirs != ours:
             remedy = "give a teacher that was trained in such an environment"
             raise bad_input(source, field, theirs, f"are not the environment's {ours}", remedy)
-
-
-def taught_in(teacher: Policy) -> tuple[NavigationConfig, str | None]:
-    """The navigation task that a policy was trained in, and its rover; None where only a model's file names it."""
-    options = teacher.environment["options"]
-    made_by = ("task", "rover", "terrain", "preset", "model", "engine")
-    # JSON knows lists only; settings are tuples.
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items() if k not in made_by}
-    task = options.get("task", "consistent")
-    if not isinstance(task, str) or task not in TASKS:
-        raise bad_input("distill", "teacher's task", task, "does not exist", f"give one of {', '.join(TASKS)}")
-    return TASKS[task].replace(**settings), None if "model" in options else options.get("rover", "luvmi_x")
