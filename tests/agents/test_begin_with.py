@@ -53,6 +53,18 @@ def test_it_trains_on_and_remembers_what_it_began_with(learned, tmp_path):
         train(learner, RunConfig(4 * 8 * 24, quiet=True), tmp_path)
 
 
+def test_resumed_it_goes_on_as_if_never_stopped_and_does_not_begin_again(learned, tmp_path, monkeypatch):
+    learner, path = learned
+    whole = train(learner, RunConfig(4 * 8 * 24, quiet=True, begin_with=str(path)), None)
+    train(learner, RunConfig(2 * 8 * 24, quiet=True, begin_with=str(path)), tmp_path)
+    monkeypatch.setattr("lunar_mjx.agents.train.begin_with", lambda *_: pytest.fail("began again"))
+    resumed = train(learner, RunConfig(4 * 8 * 24, quiet=True, begin_with=str(path)), tmp_path)
+    for one, other in zip(jax.tree.leaves(resumed.state), jax.tree.leaves(whole.state), strict=True):
+        np.testing.assert_allclose(np.asarray(one, float), np.asarray(other, float), rtol=1e-6, atol=1e-7)
+    assert [row["steps"] for row in resumed.rows] == [8 * 24 * n for n in (1, 2, 3, 4)]
+    assert resumed.policy.notes["begin_with"] == str(path)
+
+
 def test_observations_that_are_new_count_nothing_at_first(learned, monkeypatch):
     learner, path = learned
     policy = load_policy(path)

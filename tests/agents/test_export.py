@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.agents.export import graphs, ros2_node
-from lunar_mjx.agents.export.contract import Contract
+from lunar_mjx.agents.export.contract import Contract, contract_of
 from lunar_mjx.agents.export.write import export_policy
 from lunar_mjx.agents.networks import ACTIVATIONS, make_actor
 from lunar_mjx.agents.policy import Policy, save_policy
@@ -108,7 +108,32 @@ def test_the_contract_names_every_number(env, policy, exported):
     assert set(contract.sha256) == {"policy.npz", "policy.stablehlo"}
 
 
-@pytest.mark.parametrize("options", [{"task": "paper", "terrain": "flat", "rover": "viper", "places": 16}, SMALL])
+SEEING = {
+    **SMALL,
+    "observations": ("up", "camera/rgb", "camera/depth", "camera/labels"),
+    "camera_width": 4,
+    "camera_height": 3,
+    "camera_far": 12.5,
+}
+
+
+def test_the_contract_tells_the_shape_and_scale_of_pictures():
+    env = make_navigation(**SEEING)
+    policy = make_policy(env.observation_size, env.action_size, {"name": "navigation", "options": SEEING})
+    up, rgb, depth, kinds = contract_of(policy, env, "policy.npz", {}).observations
+    assert up.picture is None
+    for block, colours in ((rgb, 3), (depth, 1), (kinds, 1)):
+        assert (block.picture.rows, block.picture.columns, block.picture.colours) == (3, 4, colours)
+        assert (block.picture.far_m, block.picture.fovy_deg) == (12.5, env.config.camera_fovy_deg)
+        assert len(set(block.names)) == 12 * colours
+    # A pixel's number times its unit is metres.
+    assert set(depth.units) == {"12.5 m"} and depth.names[4 + 2] == "row 1, column 2"
+    assert rgb.names[3 * (2 * 4 + 3) + 1] == "row 2, column 3, green" and set(rgb.units + kinds.units) == {"1"}
+
+
+@pytest.mark.parametrize(
+    "options", [{"task": "paper", "terrain": "flat", "rover": "viper", "places": 16}, SMALL, SEEING]
+)
 def test_every_block_has_as_many_labels_as_numbers(options):
     env = make_navigation(**options)
     told = labels(env)

@@ -15,7 +15,7 @@ from lunar_mjx.agents.policy import Policy
 from lunar_mjx.effects.joint.motor import CURRENT, POSITION, TORQUE, VELOCITY
 from lunar_mjx.envs import NavigationEnv
 from lunar_mjx.envs.navigation.labels import Label, labels
-from lunar_mjx.envs.navigation.observations import BLOCKS
+from lunar_mjx.envs.navigation.observations import BLOCKS, CAMERA
 
 FORMAT = "lunar-mjx-contract/1"
 Mode = Literal["position", "velocity", "torque", "current"]
@@ -32,14 +32,32 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
+class Picture(_Part):
+    """Shape and optics of a block that is a picture: rows from the top, pixels from the left, the colours of each.
+
+    Attributes:
+      rows, columns, colours: how many. fovy_deg: vertical angle of view. pitch_deg: how far the camera looks down.
+      far_m: depth from which on a pixel reads 1 in `camera/depth`, and beyond which the camera sees nothing, m.
+    """
+
+    rows: Annotated[int, Field(ge=1)]
+    columns: Annotated[int, Field(ge=1)]
+    colours: Annotated[int, Field(ge=1)]
+    fovy_deg: float
+    pitch_deg: float
+    far_m: float
+
+
 class Block(_Part):
-    """A run of observations: `names` and `units` are of its numbers, `start` is the place of the first."""
+    """A run of observations: `names` and `units` are of its numbers, `start` is the place of the first; `picture` is
+    None unless they are pixels."""
 
     name: str
     about: str
     start: Annotated[int, Field(ge=0)]
     names: list[str]
     units: list[str]
+    picture: Picture | None = None
 
 
 class Normalisation(_Part):
@@ -194,9 +212,22 @@ def _blocks(env: NavigationEnv) -> list[Block]:
             start=env.blocks[name].start,
             names=[label.name for label in parts],
             units=[label.unit for label in parts],
+            picture=_picture(env, len(parts)) if name.startswith(CAMERA) else None,
         )
         for name, parts in told.items()
     ]
+
+
+def _picture(env: NavigationEnv, size: int) -> Picture:
+    c = env.config
+    return Picture(
+        rows=c.camera_height,
+        columns=c.camera_width,
+        colours=size // (c.camera_height * c.camera_width),
+        fovy_deg=c.camera_fovy_deg,
+        pitch_deg=c.camera_pitch_deg,
+        far_m=c.camera_far,
+    )
 
 
 def _joints(env: NavigationEnv) -> list[Joint]:

@@ -52,6 +52,15 @@ def _scan(env: NavigationEnv, wider: float = 1.0) -> list[Label]:
     ]
 
 
+def _pixels(unit: Callable[[NavigationEnv], str], colours: tuple[str, ...] = ("",)) -> Callable[..., list[Label]]:
+    return lambda env: [
+        Label(f"row {row}, column {column}{colour}", unit(env))
+        for row in range(env.config.camera_height)
+        for column in range(env.config.camera_width)
+        for colour in colours
+    ]
+
+
 _PLACES = ("aim", *(f"node {k + 1} of the way" for k in range(CHART.steps)))
 
 LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
@@ -91,8 +100,11 @@ LABELS: dict[str, Callable[[NavigationEnv], list[Label]]] = {
     "trail": lambda env: [
         Label(f"{axis}, {time:g} s", "m") for axis in ("ahead", "to the left") for time in VIEW.trail
     ],
+    "camera/rgb": _pixels(lambda env: "1", (", red", ", green", ", blue")),
+    "camera/depth": _pixels(lambda env: f"{env.config.camera_far:g} m"),
+    "camera/labels": _pixels(lambda env: "1"),
 }
-"""Blocks whose numbers have names of their own. Pictures and what was drawn are counted through."""
+"""Blocks whose numbers have names of their own. What was drawn is counted through."""
 
 
 def labels(env: NavigationEnv) -> dict[str, list[Label]]:

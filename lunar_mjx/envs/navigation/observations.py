@@ -210,7 +210,7 @@ def camera_rgb(v: View, s: Scene) -> Any:
 
 
 def camera_depth(v: View, s: Scene) -> Any:
-    """Front camera's depth as a share of the farthest, pixel by pixel; 1 in the sky."""
+    """Front camera's depth along its axis, as a share of the farthest, pixel by pixel; 1 in the sky."""
     return _flat(jnp.minimum(_seen(s).depth / s.far, 1.0))
 
 
