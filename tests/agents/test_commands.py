@@ -62,6 +62,16 @@ def test_plays_an_agent_as_video_picture_and_table(run, tmp_path):
     assert table["reward"][-1] > 400.0, "the goal pays 500"
 
 
+@pytest.mark.slow
+def test_plays_a_policy_of_the_ladder_in_its_unseen_worlds(run, tmp_path):
+    few = ("--env=worlds=4", "--env=episode_time=3.0")
+    found = run("play", "luvmi_x/ladder-3", "--view", "top", "-o", tmp_path, *few)
+    assert found.status == 0, found.err
+    assert found.out.startswith("time is up after 3.0 s")
+    table = np.genfromtxt(tmp_path / "episode.csv", delimiter=",", names=True)
+    assert np.hypot(np.ptp(table["position_x_m"]), np.ptp(table["position_y_m"])) > 0.5
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
