@@ -69,18 +69,23 @@ class ChannelErrors:
             self._made[key] = made
         return self._made[key]
 
-    def levels(self, columns: np.ndarray, residual: np.ndarray) -> Levels:
-        """Statistics of the fitted observations at every size; the usual one and none are where to begin.
+    def log_weight(self, levels: np.ndarray) -> float:
+        """See `Levels.log_weight`."""
+        return float(np.sum(self.log_prior[levels] - self.log_scale[levels, np.arange(len(levels))]))
+
+    def levels(self, columns: np.ndarray, residual: np.ndarray, start: np.ndarray | None = None) -> Levels:
+        """Statistics of the fitted observations at every size.
 
         Args:
           columns: (n, k) derivatives of the predictions, SI units. residual: (n,) measured less predicted.
+          start: (groups,) levels to begin at; the usual size and none if None.
         """
         whole, number, grams = np.column_stack([columns, residual]), self._group[self._fit], []
         for level in range(len(self._levels)):
             white = self.at(np.full(self._kinds, level)).whiten(whole)[self._fit]
             grams.append(Gram.of(white[:, :-1], white[:, -1], number, self._kinds))
         matrix = np.stack([g.matrix for g in grams])
-        starts = np.stack([self.usual, np.zeros_like(self.usual)])
+        starts = np.stack([self.usual, np.zeros_like(self.usual)] if start is None else [start])
         return Levels(grams[0].count, matrix, self.log_scale, self.log_prior, starts)
 
 

@@ -30,7 +30,6 @@ from lunar_mjx.inference.evidence import (
     EvidenceError,
     Field,
     Gram,
-    Levels,
     NoiseSize,
     infer,
     infer_levels,
@@ -58,8 +57,6 @@ class DriveRefit:
     """1; factor on the damping where no step gained."""
     softer: float = 1e-2
     """1; factor on the damping of a step that gained: what held it back may lie behind it."""
-    most_damping: float = 1e6
-    """1; damping beyond which steps are too short to tell, and slopes are taken anew."""
     steep: float = 1e4
     """sigma; change of one reading within a coordinate's prior from which a slope is taken to the other side, too."""
     together: int = 8
@@ -163,6 +160,19 @@ class DriveForm(MeasuredForm):
             slopes[:, steep] = np.where(np.isfinite(other) & (np.abs(other) < np.abs(first)), other, first)
         return value, slopes
 
+    def _see_inputs(self, u: np.ndarray) -> np.ndarray:
+        """(n, coordinates + inputs) signatures of unmapped ground and unknown inputs at a place; others are 0."""
+        count, ground = len(self.coordinates), self.drives.ground
+        seen = np.zeros((len(self.observations), count + len(self._inputs)))
+        if len(ground):
+            self.progress("signatures of unmapped ground", math.nan)
+            seen[:, ground] = self.jacobian(u, ground)[1]
+        self.progress("signatures of unknown inputs", math.nan)
+        # to first order in inputs of a hundredth of what is usual
+        scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])
+        seen[:, count:] = self._changes(u, self._inputs, 1e-3 * self._size / scales) / 1e-3  # of a field of size 1
+        return seen
+
     def _see(self, u: np.ndarray) -> None:
         """Takes the signatures of all candidates and unknown inputs at a refit of the model as it is.
 
@@ -171,16 +181,7 @@ class DriveForm(MeasuredForm):
         Raises:
           TimeUp: not even the unknown inputs were simulated.
         """
-        count = len(self.coordinates)
-        seen = np.zeros((len(self.observations), count + len(self._inputs)))
-        parts, ground = self.parts, self.drives.ground
-        if len(ground):
-            self.progress("signatures of unmapped ground", math.nan)
-            seen[:, ground] = self.jacobian(u, ground)[1]
-        self.progress("signatures of unknown inputs", math.nan)
-        # to first order in inputs of a hundredth of what is usual
-        scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])
-        seen[:, count:] = self._changes(u, self._inputs, 1e-3 * self._size / scales) / 1e-3  # of a field of size 1
+        seen, parts = self._see_inputs(u), self.parts
 
         def take(part: list[str]) -> tuple[str, ...]:
             """Fills in the signatures of some candidates; those are returned for which there was no time."""
@@ -372,11 +373,12 @@ class DriveForm(MeasuredForm):
                 raise EvidenceError("the model as it is has not been refitted")
             u = self._prepare(free)
         slopes = self._guess(free, near)
-        terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
-        u, slopes = self._descend(u, free, self.observations, sizes, slopes, guessed=bool(effects))
         if first:
             # all hypotheses are weighed against measurements with the same errors
-            self._choose_errors(u, free, slopes)
+            found = self._choose_errors(u, free, slopes, self.settings.jitters_s)
+            self._sizes = found.tau, found.noise
+        terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
+        u, slopes = self._descend(u, free, self.observations, sizes, slopes, guessed=bool(effects))
         linear = self._linear(u, effects, slopes)
         value, found, _ = linear.evidence(terms, sizes)
         for _ in range(self.settings.most_rounds - 1):
@@ -389,11 +391,16 @@ class DriveForm(MeasuredForm):
         self._slopes[effects] = free, slopes
         return Refit(self.name, effects, u, linear)
 
-    def _choose_errors(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> None:
+    def _choose_errors(
+        self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, jitters_s: Sequence[float]
+    ) -> Evidence:
         """Takes scatter of times, then errors of channels, of the most probable size: by the model with what is usual.
 
         Args:
-          u, free, slopes: as for `_columns`.
+          u, free, slopes: as for `_columns`. jitters_s: scatters that are tried.
+
+        Returns:
+          Sizes of discrepancy and noise with these errors.
         """
         assert self._fields is not None
         columns, residual = self._columns(u, free, slopes)
@@ -403,18 +410,30 @@ class DriveForm(MeasuredForm):
         field = np.concatenate([np.full(count, -1), number])[always]
         own = [self.coordinates[i].centre - u[i] for i in self.baseline]
         prior, columns = Amplitudes(std, field, np.concatenate([own, self._centre(u)])), columns[:, always]
+        fields, noises = self._usual_fields(), self._noise_sizes()
 
-        def found(levels: Levels) -> Evidence:
-            return infer_levels(levels, prior, self._usual_fields(), self._noise_sizes(), self._sizes)
+        def climbed(errors: ChannelErrors, start: Evidence | None) -> Evidence:
+            levels = errors.levels(columns, residual, None if start is None else start.levels)
+            sizes = None if start is None else (start.tau, start.noise)
+            return infer_levels(levels, prior, fields, noises, sizes)
 
-        made = {s: self._errors_with(s) for s in self.settings.jitters_s}
-        # Each scatter with the errors that go best with it: at the usual ones a scatter stands for their being larger.
-        tried = {s: found(e.levels(columns, residual)) for s, e in made.items()}
-        self.jitter_s = max(tried, key=lambda s: tried[s].log_evidence)
-        errors, levels = made[self.jitter_s], tried[self.jitter_s].levels
-        assert levels is not None
-        self.observations = errors.at(levels)
-        self.channel_errors, self.error_times_s = errors.shares(levels), errors.times_s(levels)
+        # The usual scatter with the errors that go best with it; then every other one with these errors, and with those
+        # that go best with the scatter that gains. At the usual errors a scatter would stand for their being larger.
+        made = {s: self._errors_with(s) for s in jitters_s}
+        self.jitter_s = min(jitters_s, key=lambda s: abs(s - USUAL_ERRORS.jitter_s))
+        best = climbed(made[self.jitter_s], None)
+        assert best.levels is not None
+        for jitter_s in [s for s in jitters_s if s != self.jitter_s]:
+            errors = made[jitter_s]
+            white = errors.at(best.levels).whiten(np.column_stack([columns, residual]))[self._fit]
+            gram = Gram.of(white[:, :-1], white[:, -1], self._group[self._fit], len(noises))
+            value = infer(gram, prior, fields, noises, (best.tau, best.noise)).log_evidence
+            if value + errors.log_weight(best.levels) > best.log_evidence:
+                self.jitter_s, best = jitter_s, climbed(errors, best)
+        errors = made[self.jitter_s]
+        self.observations = errors.at(best.levels)
+        self.channel_errors, self.error_times_s = errors.shares(best.levels), errors.times_s(best.levels)
+        return best
 
     def _errors_with(self, jitter_s: float) -> ChannelErrors:
         """Observations whose times scatter by so many seconds, with each size of their channels' errors."""
@@ -443,44 +462,53 @@ class DriveForm(MeasuredForm):
         return found.tau, found.noise
 
     def _prepare(self, free: np.ndarray) -> np.ndarray:
-        """Refits the model as it is with noise and the channels' usual errors, and takes all signatures there.
+        """Refits the model as it is with what may be wrong at its ports, and takes all signatures there.
 
         Returns:
           (coordinates,) the refit.
         """
         drives, usual_jitter = self.drives, USUAL_ERRORS.jitter_s
         errors = self._errors_with(usual_jitter)
-        noisy = errors.at(errors.usual)
+        self.observations = errors.at(errors.usual)
         # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after it,
         # and a descent that moves everything at once follows them into soil that nothing brings it back from.
         nuisances = free[[self.coordinates[i].nuisance for i in free]]
-        u, _ = self._descend(self.start, nuisances, noisy)
+        u, _ = self._descend(self.start, nuisances, self.observations)
         # Ground before soil: waves that nobody mapped cost a rover more torque than a few per cent of the soil's
         # constants do, which would follow them.
-        u = self._find_ground(u, free, noisy)
-        u, slopes = self._descend(u, free, noisy, self._sizes)
-        u = self._find_ground(u, free, noisy)
+        u = self._find_ground(u, free)
+        for _ in range(self.settings.most_rounds):
+            # A law that errs by more than noise says little of its constants. Held to noise alone these would leave
+            # their priors by many standard deviations, for places where wheels stick and slip and no slope holds.
+            slopes = self.jacobian(u, free)[1]
+            self._seen = self._see_inputs(u)
+            self._fields = self._field_columns(self.observations)
+            before = self.channel_errors, self.error_times_s
+            found = self._choose_errors(u, free, slopes, (usual_jitter,))
+            if (self.channel_errors, self.error_times_s) == before:
+                break
+            u, slopes = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
+            u = self._find_ground(u, free)
         if drives.noise_unlearnt:
             drives.learn_noise(self._whole(u))
+            # what is learnt of the noise is in what the drives hold from now on
+            errors = self._errors_with(usual_jitter)
+            self.observations = errors.at(errors.usual)
         self._see(u)
-        # what is learnt of the noise is in what the drives hold from now on
-        errors = self._errors_with(usual_jitter)
-        self.observations = errors.at(errors.usual)
         self._fields = self._field_columns(self.observations)
-        self._slopes[frozenset()] = free, slopes
-        self._sizes = np.array([f.usual for f in self._usual_fields()]), np.ones(len(self.noise_names))
+        self._slopes[frozenset()] = free, self.jacobian(u, free)[1]
         self._ground = u[drives.ground]
         return u
 
-    def _find_ground(self, u: np.ndarray, free: np.ndarray, observations: Observations) -> np.ndarray:
+    def _find_ground(self, u: np.ndarray, free: np.ndarray) -> np.ndarray:
         """A place (coordinates,) with the most probable ground by a linear model around it; its size is inferred.
 
         Of drives that are held out nothing counts but pose: their ground is mapped, not fitted.
 
         Args:
-          u: the place. free: what else may move, and is not moved. observations: with the channels' errors.
+          u: the place. free: what else may move, and is not moved.
         """
-        ground = self.drives.ground
+        ground, observations = self.drives.ground, self.observations
         if not len(ground):
             return u
         self.progress("ground that nobody mapped", math.nan)
@@ -500,10 +528,6 @@ class DriveForm(MeasuredForm):
         low, high = self.drives.bounds(ground)
         out = u.copy()
         out[ground] = np.clip(u[ground] + found.mean[len(free) :], low, high)
-        self._fields = slopes[:, len(free) :], np.full(len(ground), self._number[GROUND])
-        sizes = np.array([f.usual for f in self._usual_fields()])
-        sizes[self._number[GROUND]] = found.tau[0]
-        self._sizes = sizes, np.ones(len(self.noise_names))
         return out
 
     def _descend(
@@ -571,16 +595,18 @@ class DriveForm(MeasuredForm):
                 normal = inner(jacobian, jacobian) + np.diag(std**-2)
                 while True:
                     downhill = inner(jacobian, residual) - (u[free] - centre) / std**2
-                    whole = _bounded_step(normal, downhill, u[free], low, high)
-                    promised = _promised(whole, normal, downhill)
-                    if promised < settings.settled or damping > DRIVE_REFIT.most_damping:
-                        break
                     dampings = damping * np.array(DRIVE_REFIT.factors[:trials])
                     steps = [
                         _bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], low, high)
                         for d in dampings
                     ]
-                    steps = [s * min(1.0, settings.longest_step / max(float(np.abs(s).max()), 1e-300)) for s in steps]
+                    steps = [
+                        s * min(1.0, settings.longest_step / max(float(np.abs(s).max(initial=0.0)), 1e-300))
+                        for s in steps
+                    ]
+                    # Shorter ones promise less: there is nothing left to gain where these slopes hold.
+                    if _promised(steps[0], normal, downhill) < settings.settled:
+                        break
                     rows = np.repeat(u[None], trials, axis=0)
                     rows[:, free] = np.clip(u[free] + steps, low, high)
                     residuals = [white(wanted - v) for v in self.drives.predict(self._whole(rows))]
@@ -595,7 +621,7 @@ class DriveForm(MeasuredForm):
                     # A step that keeps less than a third of its promise has left where these slopes hold.
                     if gained < 0.3 * _promised(steps[best], normal, downhill):
                         break
-                if not guessed and (promised < settings.settled or first - present_chi2 < settings.settled):
+                if not guessed and first - present_chi2 < settings.settled:
                     break
                 # slopes that are new earn new trust
                 damping = min(damping, 1.0)

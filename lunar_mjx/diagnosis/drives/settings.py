@@ -11,6 +11,9 @@ from lunar_mjx.diagnosis.weighed.form import SearchSettings
 class DriveSettings(SearchSettings):
     """Sizes, priors and effort of a diagnosis of drives."""
 
+    effect_odds: float = 0.0033
+    """1; prior odds of each effect of the catalogue: of some fifty, one is missing in every seventh campaign, as of the
+    fifteen of a table. How many are listed says nothing about a rover (multiplicity: Scott & Berger 2010)."""
     stated_spread: float = 0.3
     """1; standard deviation of the logarithm of the noise's size: it is only stated, or taken from a second of rest."""
     own_share: float = 0.5
@@ -51,7 +54,8 @@ class DriveSettings(SearchSettings):
     """1; rounds of refit and re-linearisation."""
     most_jacobians: int = 12
     """1; Jacobians of one descent."""
-    settled: float = 0.5
-    """chi-square; what a further step must promise."""
+    settled: float = 2.0
+    """chi-square; what a further step must promise, and what the steps with one Jacobian must gain: a nat, a quarter of
+    the `window`."""
     longest_step: float = 3.0
     """scale; longest step of a coordinate."""
