@@ -412,27 +412,27 @@ class DriveForm(MeasuredForm):
         prior, columns = Amplitudes(std, field, np.concatenate([own, self._centre(u)])), columns[:, always]
         fields, noises = self._usual_fields(), self._noise_sizes()
 
-        def climbed(errors: ChannelErrors, start: Evidence | None) -> Evidence:
-            levels = errors.levels(columns, residual, None if start is None else start.levels)
-            sizes = None if start is None else (start.tau, start.noise)
-            return infer_levels(levels, prior, fields, noises, sizes)
+        def climbed(errors: ChannelErrors, begin: np.ndarray | None, sizes: Any) -> tuple[Evidence, np.ndarray]:
+            found = infer_levels(errors.levels(columns, residual, begin), prior, fields, noises, sizes)
+            assert found.levels is not None
+            return found, found.levels
 
         # The usual scatter with the errors that go best with it; then every other one with these errors, and with those
         # that go best with the scatter that gains. At the usual errors a scatter would stand for their being larger.
         made = {s: self._errors_with(s) for s in jitters_s}
         self.jitter_s = min(jitters_s, key=lambda s: abs(s - USUAL_ERRORS.jitter_s))
-        best = climbed(made[self.jitter_s], None)
-        assert best.levels is not None
+        best, levels = climbed(made[self.jitter_s], None, None)
         for jitter_s in [s for s in jitters_s if s != self.jitter_s]:
             errors = made[jitter_s]
-            white = errors.at(best.levels).whiten(np.column_stack([columns, residual]))[self._fit]
+            white = errors.at(levels).whiten(np.column_stack([columns, residual]))[self._fit]
             gram = Gram.of(white[:, :-1], white[:, -1], self._group[self._fit], len(noises))
             value = infer(gram, prior, fields, noises, (best.tau, best.noise)).log_evidence
-            if value + errors.log_weight(best.levels) > best.log_evidence:
-                self.jitter_s, best = jitter_s, climbed(errors, best)
+            if value + errors.log_weight(levels) > best.log_evidence:
+                self.jitter_s = jitter_s
+                best, levels = climbed(errors, levels, (best.tau, best.noise))
         errors = made[self.jitter_s]
-        self.observations = errors.at(best.levels)
-        self.channel_errors, self.error_times_s = errors.shares(best.levels), errors.times_s(best.levels)
+        self.observations = errors.at(levels)
+        self.channel_errors, self.error_times_s = errors.shares(levels), errors.times_s(levels)
         return best
 
     def _errors_with(self, jitter_s: float) -> ChannelErrors:
