@@ -478,8 +478,8 @@ class DriveForm(MeasuredForm):
         # constants do, which would follow them.
         u = self._find_ground(u, free)
         for _ in range(self.settings.most_rounds):
-            # A law that errs by more than noise says little of its constants. Held to noise alone these would leave
-            # their priors by many standard deviations, for places where wheels stick and slip and no slope holds.
+            # A law that errs by more than noise says little of its constants. Held to noise and usual errors these
+            # would leave their priors by many deviations, for places where wheels stick and slip and no slope holds.
             slopes = self.jacobian(u, free)[1]
             self._seen = self._see_inputs(u)
             self._fields = self._field_columns(self.observations)
