@@ -5,8 +5,10 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +40,11 @@ class Browser:
 
     Attributes:
       problems: errors of the page and entries of its log. requests: addresses that it asked for.
+      patience_s: how long one call may take: what never comes is told instead of waited for. The longest call of the
+        proofs takes seconds; a busy machine takes ten times that, not a hundred.
     """
+
+    patience_s = 600.0
 
     def __init__(self, folder: Path, size: tuple[int, int] = (1280, 760)):
         assert CHROMIUM is not None
@@ -87,8 +93,9 @@ class Browser:
         if self._session:
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
+        deadline = time.monotonic() + self.patience_s
         while True:
-            answer = self._next()
+            answer = self._next(deadline, f"{method} {parameters.get('expression', '')}".strip())
             if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
                 self.problems.append(answer["params"])
             if answer.get("method") == "Network.requestWillBeSent":
@@ -97,8 +104,11 @@ class Browser:
                 assert "error" not in answer, answer["error"]
                 return answer["result"]
 
-    def _next(self) -> dict[str, Any]:
+    def _next(self, deadline: float, awaited: str) -> dict[str, Any]:
         while b"\0" not in self._rest:
+            if not select.select([self._read], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                self._process.kill()  # or closing would wait for it
+                raise TimeoutError(f"no answer from Chromium within {self.patience_s:g} s to: {awaited}")
             piece = os.read(self._read, 1 << 16)
             assert piece, "Chromium ended"
             self._rest += piece

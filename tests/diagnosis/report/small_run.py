@@ -1,4 +1,4 @@
-"""A run folder of two channels and two manoeuvres, written without fitting anything."""
+"""A run folder of two or three channels and two manoeuvres, written without fitting anything."""
 
 from __future__ import annotations
 
@@ -14,15 +14,20 @@ POINTS = 24
 
 
 def write_run(folder: Path, table: bool, hostile: str = "") -> Path:
-    """A run of two channels and two manoeuvres, the second held out: an effect `drag` is refitted, `toe` is not."""
+    """A run of two manoeuvres, the second held out: an effect `drag` is refitted, `toe` is not.
+
+    A table has two channels, a drive a third one. The last one bears the hostile text: positions would be none with it.
+    """
     folder.mkdir()
-    n = 4 * POINTS
+    channels = (
+        ["drawbar_pull_N", "sinkage_m"] if table else ["position_x_m", "position_y_m", "motor_lf_drive_current_A"]
+    )
+    n = 2 * POINTS * len(channels)
     rng = np.random.default_rng(0)
-    unit = np.repeat([0, 1, 0, 1], POINTS)
+    unit = np.tile(np.repeat([0, 1], POINTS), len(channels))
     signal = 6.0 * np.sin(np.linspace(0, 9, n))
     residual = rng.standard_normal((3, n)) + np.array([[2.0], [1.0], [0.0]]) * signal
-    time = np.tile(np.arange(POINTS) * 0.5, 4)
-    channels = ["drawbar_pull_N", "sinkage_m"] if table else ["position_x_m", "position_y_m"]
+    time = np.tile(np.arange(POINTS) * 0.5, 2 * len(channels))
     np.savez_compressed(
         folder / "series.npz",
         measured=np.zeros(n),
@@ -34,9 +39,9 @@ def write_run(folder: Path, table: bool, hostile: str = "") -> Path:
         unit=unit,
         unit_names=np.array(["flat", "climb" + hostile]),
         split=np.array(["fit", "select"]),
-        series_start=np.array([0, 2 * POINTS]),
-        series_channel=np.array([channels[0], channels[1] + hostile]),
-        series_log=np.array([0, 0]),
+        series_start=2 * POINTS * np.arange(len(channels)),
+        series_channel=np.array([*channels[:-1], channels[-1] + hostile]),
+        series_log=np.zeros(len(channels), int),
         logs=np.array(["a"]),
         labels=np.array(["as given", "refitted", "with drag"]),
         predicted=-0.1 * residual,

@@ -90,3 +90,9 @@ def test_figures_follow_the_page_into_the_dark(tmp_path: Path, browser: Browser,
     shades = browser.value("document.getElementById('figure-1').data[0].colorscale.map(step => step[1])")
     assert shades == list(DARK_SHADES if dark else (c for _, c in SHADES))
     assert not browser.problems
+
+
+def test_what_never_comes_is_told_by_name(browser: Browser) -> None:
+    browser.patience_s = 0.5
+    with pytest.raises(TimeoutError, match=r"within 0\.5 s.*window\.missing"):
+        browser.wait("window.missing")
