@@ -89,7 +89,7 @@ def _shown(value: Any) -> dict[str, str]:
 
         FigureCanvasAgg(value)
         file = io.BytesIO()
-        value.savefig(file, dpi=80)
+        value.savefig(file, dpi=110)
         return {"image/png": base64.b64encode(file.getvalue()).decode("ascii"), "text/plain": "<Figure>"}
     return {"text/plain": str(value)}
 

@@ -24,7 +24,7 @@ qpos = jnp.stack([system.reset(system.params, *place).qpos for place in places])
 # `pictures` takes the ground, a rover and the coordinates of all rovers. Light comes from a Sun 8 degrees high.
 
 # %%
-eye = Pinhole(64, 48)
+eye = Pinhole(160, 120)
 look = jax.jit(lambda terrain, q: pictures(terrain, model.rover, q, eye, light=Light(sun=Sun(200.0, 8.0))))
 seen = jax.device_get(look(model.terrain, qpos))
 print("colour, depth, labels:", seen.rgb.shape, seen.depth.shape, seen.label.shape)
@@ -33,19 +33,23 @@ for i, name in enumerate(LABELS):
 assert np.isfinite(seen.depth[seen.label > 0]).all() and np.isinf(seen.depth[seen.label == 0]).all()
 
 # %%
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from lunar_mjx.report.style import HEIGHTS_DOWN
 
 
 def shown(seen):
-    figure = Figure(figsize=(7, 2.9), layout="constrained")
+    figure = Figure(figsize=(9, 3.9), layout="constrained")
     panels = figure.subplots(2, len(seen.rgb))
-    for (above, below), rgb, depth in zip(panels.T, seen.rgb, seen.depth, strict=True):
-        above.imshow(rgb)
-        below.imshow(np.log(depth), cmap=HEIGHTS_DOWN)
+    for i, (above, below) in enumerate(panels.T):
+        above.imshow(seen.rgb[i])
+        above.set_title(f"rover {i}: colour")
+        image = below.imshow(seen.depth[i], cmap=HEIGHTS_DOWN, norm=LogNorm(0.5, 50.0))
+        below.set_title(f"rover {i}: distance")
     for axes in panels.ravel():
         axes.set_axis_off()
+    figure.colorbar(image, ax=panels[1], ticks=(0.5, 5, 50), format="%g m")
     return figure
 
 

@@ -54,9 +54,9 @@ from matplotlib.figure import Figure
 def curve(table):
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.plot(table.steps, table.episode_return, color="#0072B2")
+    left.plot(table.steps, table.episode_return)
     left.set(xlabel="environment steps", ylabel="return of ended episodes")
-    right.plot(table.steps, 100 * table.success, color="#D55E00")
+    right.plot(table.steps, 100 * table.success)
     right.set(xlabel="environment steps", ylabel="success in training, %", ylim=(-3, 103))
     return figure
 

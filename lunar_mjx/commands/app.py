@@ -211,15 +211,17 @@ def _require_possible(commands: Any, names: Sequence[str], yaw_deg: float) -> No
 
 @app.command()
 def preset(
-    name: Annotated[str, typer.Argument(help="consistent, field or paper")],
+    name: Annotated[str, typer.Argument(help="consistent, field or paper; or list, for what each is for.")],
     rover: RoverOption = "viper",
     save: Annotated[Path | None, typer.Option(help="Write the preset as a model.toml.")] = None,
 ) -> None:
     """Print a preset: its effects with every value and source, and for `paper` what it leaves unsaid or undefined."""
     from lunar_mjx.model import make_model
-    from lunar_mjx.model.describe import make_console, print_preset
+    from lunar_mjx.model.describe import make_console, print_preset, print_presets
     from lunar_mjx.model.file import save_model
 
+    if name == "list":
+        return print_presets(make_console())
     model = make_model(rover, "flat", name)
     written = save_model(model, save) if save else None
     print_preset(model, make_console())

@@ -8,6 +8,13 @@ from typing import NamedTuple
 from lunar_mjx.effects.joint.motor import WINDINGS
 from lunar_mjx.terrain.soil.named import SOILS
 
+MEANT_FOR: Mapping[str, str] = {
+    "field": "What a drive outdoors needs; simulate, view and the environments run it unless told otherwise.",
+    "consistent": "The seed paper's physics corrected, assuming least; diagnosis and make_model start from it.",
+    "paper": "The seed paper's equations as printed, flaws included.",
+}
+"""What each preset is for, in a sentence."""
+
 PRESETS: Mapping[str, tuple[str, ...]] = {
     "consistent": (
         "joint_control",

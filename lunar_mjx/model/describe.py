@@ -13,7 +13,7 @@ from rich.table import Table
 
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.effects.presets import FIELD_CHANGES, FLAWS, PRESETS, UNSAID
+from lunar_mjx.effects.presets import FIELD_CHANGES, FLAWS, MEANT_FOR, PRESETS, UNSAID
 from lunar_mjx.effects.wheel.paper import REGULARISATIONS
 from lunar_mjx.model.model import Model, Value, preset_values, rover_motors
 from lunar_mjx.rover.load import MARKER
@@ -72,6 +72,15 @@ def by_group(entries: Sequence[Entry], model: Model) -> list[tuple[str, Entry]]:
     for name, entry in dict.fromkeys(zip(names, entries, strict=True)):
         alike.setdefault(entry, []).append(name)
     return [(", ".join(names_of_group), entry) for entry, names_of_group in alike.items()]
+
+
+def print_presets(console: Console) -> None:
+    """Every preset: its name, how many effects it holds, and what it is for."""
+    table = make_table("preset", "effects", "what it is for", names=2)
+    for name, text in MEANT_FOR.items():
+        table.add_row(name, str(len(PRESETS[name])), text)
+    console.print(table)
+    console.print("`lunar-mjx preset NAME` gives every value and its source.")
 
 
 def print_preset(model: Model, console: Console) -> None:

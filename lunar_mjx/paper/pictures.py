@@ -258,7 +258,10 @@ def figure_4() -> tuple[Figure, dict[str, Any]]:
     )
     surface.zaxis.set_major_locator(MaxNLocator(2))  # flat at its true scale
     surface.set_box_aspect((1, 1, max(0.01, float(np.ptp(part)) / (extent[1] - extent[0]))))
-    surface.set(xlabel="east, m", ylabel="north, m", zlabel="height, m")
+    surface.grid(False)
+    for axis in (surface.xaxis, surface.yaxis, surface.zaxis):
+        axis.pane.set_visible(False)  # grey panes and their grid would hide the ground on a dark page
+    surface.set(xlabel="east, m", ylabel="north, m", zlabel="height, m", xlim=extent[:2], ylim=extent[2:])
     surface.set_title("(d) its surface, true to scale", loc="left", fontsize=10)
     numbers["terrain"] = {
         "name": terrain.name,
@@ -279,8 +282,9 @@ def _portrait(name: str, distance: float) -> tuple[np.ndarray, dict[str, Any]]:
     pose = orbit(np.array([0.0, 0.0, 0.3 * top]), distance, 150.0, 18.0)
     light, optics = Light(Sun(200.0, 25.0), film=_FILM), Pinhole(900, 640, 42.0)
     seen = _taken(model.terrain, stands, pose, optics, light, _trodden(stands), detail=True)
+    called = name.upper().replace("_", "-")
     title = (
-        f"{name}: {rover.mass:g} kg, {len(rover.wheels)} wheels, {len(rover.joints)} motors, {len(rover.loops)} loops"
+        f"{called}: {rover.mass:g} kg, {len(rover.wheels)} wheels, {len(rover.joints)} motors, {len(rover.loops)} loops"
     )
     about = {"title": title, "mass_kg": rover.mass, "motors": len(rover.joints), "loops": len(rover.loops)}
     return np.asarray(seen.rgb), about

@@ -285,13 +285,14 @@ def _temperature(axes: Axes, drive: RecordedDrive) -> None:
     winding = drive.per_motor("winding_{}_temperature_degC")
     housing = drive.per_motor("housing_{}_temperature_degC")
     hottest = int(np.argmax(winding.max(axis=0)))
-    axes.fill_between(drive.time, winding.min(axis=1), winding.max(axis=1), color=VERMILION, alpha=0.15, linewidth=0)
+    coldest, warmest = winding.min(axis=1), winding.max(axis=1)
+    axes.fill_between(drive.time, coldest, warmest, color=VERMILION, alpha=0.15, linewidth=0, label="all windings")
     corner, _, joint = names[hottest].partition("_")
     where = f"{CORNER_WORDS.get(corner, corner)} {joint}".strip()
-    axes.plot(drive.time, winding[:, hottest], color=VERMILION, label=f"winding, {where}: the hottest")
+    axes.plot(drive.time, winding[:, hottest], color=VERMILION, label=f"hottest: {where}")
     axes.plot(drive.time, housing[:, hottest], color=BLUE, linestyle="--", label="its housing")
     style(axes, "temperature, °C")
-    axes.legend(fontsize=7, frameon=False, ncols=2)
+    axes.legend(fontsize=7, frameon=False, ncols=3)
 
 
 def _power(axes: Axes, drive: RecordedDrive) -> None:

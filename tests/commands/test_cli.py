@@ -16,7 +16,7 @@ from lunar_mjx import __version__
 from lunar_mjx.commands.diagnosis import print_probabilities
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.effects.presets import FLAWS, PRESETS, UNSAID
+from lunar_mjx.effects.presets import FLAWS, MEANT_FOR, PRESETS, UNSAID
 from lunar_mjx.effects.wheel.paper import REGULARISATIONS
 from lunar_mjx.model import make_model
 from lunar_mjx.model.file import load_model, save_model
@@ -87,7 +87,9 @@ def test_effect_list(run: Run) -> None:
         assert plain(effect.doc.split("\n")[0]) in plain(result.out)
 
 
-@pytest.mark.parametrize("command", [["effect", "list"], ["effect", "show", "slip_sinkage"], ["preset", "paper"]])
+@pytest.mark.parametrize(
+    "command", [["effect", "list"], ["effect", "show", "slip_sinkage"], ["preset", "paper"], ["preset", "list"]]
+)
 def test_tables_read_well_on_a_narrow_terminal(command: list[str], run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is cut at 80 columns, and no column of words is squeezed until each line holds one or two of them."""
     monkeypatch.setenv("COLUMNS", "80")
@@ -132,6 +134,13 @@ def test_show_a_users_effect_with_brackets_in_its_text(run: Run, tmp_path: Path)
     result = run("effect", "show", path)
     assert result.status == 0 and "Text with [/] and [link=x]." in result.out
     assert "in [/bold] [0, 1]" in result.out and "[red]me" in result.out
+
+
+def test_preset_list_tells_what_each_is_for(run: Run) -> None:
+    result = run("preset", "list")
+    assert result.status == 0 and set(MEANT_FOR) == set(PRESETS)
+    for name, text in MEANT_FOR.items():
+        assert f"{name} {len(PRESETS[name])} {text}" in plain(result.out)
 
 
 def test_preset_paper(run: Run) -> None:

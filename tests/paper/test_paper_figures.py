@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
-from lunar_mjx.paper import training_figure
+from lunar_mjx.paper import pictures, training_figure
 from lunar_mjx.paper.figures import FIGURES, available_figures, make_figures
 from lunar_mjx.paper.training_figure import figure_6
-from lunar_mjx.report.style import DARK, PAPER
+from lunar_mjx.report.style import DARK, PAPER, darkened, styled
 
 
 def test_all_figures_have_a_counterpart(monkeypatch, capsys, tmp_path):
@@ -134,3 +135,16 @@ def test_a_figure_for_dark_pages_comes_beside_the_light_one(tmp_path):
         with Image.open(path) as picture:
             corners.append("#{:02x}{:02x}{:02x}".format(*picture.convert("RGB").getpixel((0, 0))))
     assert corners == [PAPER, DARK[PAPER]]
+
+
+def test_the_ground_in_space_stands_on_the_page_itself(monkeypatch):
+    monkeypatch.setattr(pictures, "_portrait", lambda *_: (np.zeros((2, 2, 3)), {"title": ""}))
+    with styled():
+        figure, _ = pictures.figure_4()
+    canvas = FigureCanvasAgg(darkened(figure))
+    canvas.draw()
+    seen = np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
+    high, wide = seen.shape[0] // 2, seen.shape[1] // 2
+    surface = seen[high:, wide:]  # the last of four fields
+    page = [int(DARK[PAPER][i : i + 2], 16) for i in (1, 3, 5)]
+    assert (np.abs(surface - page).max(axis=-1) < 3).mean() > 0.88  # it is 0.91, and with panes behind the ground 0.85

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from matplotlib.figure import Figure
 from lunar_mjx.diagnosis.report.explore import cells
 from lunar_mjx.diagnosis.report.read import read_result
 from lunar_mjx.diagnosis.report.steps import Step, chain, comparable, error, judged
-from lunar_mjx.diagnosis.report.words import channel_label, shown
+from lunar_mjx.diagnosis.report.words import channel_label
 from lunar_mjx.errors import UserError
 from lunar_mjx.report.style import BLUE, DARK, INK, ORANGE, SKY, styled
 from lunar_mjx.visual.encode import require_encoder, writer
@@ -39,6 +40,8 @@ class FallingFilm:
     """Lines break where two observations are so many times further apart than is usual."""
     title_width: int = 104
     """Characters of a line above the bar."""
+    least_fall: float = 0.01
+    """A proposal that takes a smaller share of the error away is left out: nothing would be seen to move."""
 
 
 FILM = FallingFilm()
@@ -83,6 +86,9 @@ def write_falling(runs: str | Path | Sequence[str | Path], out: str | Path, dark
         raise UserError("--animation: these runs are of other measurements; give runs of the same logs.")
     splits, measure = judged(steps)
     errors = [e.value for s in steps if (e := error(s, splits)) is not None]
+    proposed = len(steps) > 2 and steps[-1].result is steps[-2].result
+    if proposed and abs(errors[-1] / errors[-2] - 1.0) < FILM.least_fall:
+        steps, errors = steps[:-1], errors[:-1]
     panels = _worst(steps, splits)
     course = _course(len(steps))
     with styled(dark):
@@ -177,8 +183,10 @@ def _picture(
     bar.barh([0], [shown_error], color=ORANGE, height=0.6)
     bar.axvline(1.0, color=ink, linestyle="--", linewidth=1.5)
     bar.set(xlim=(0.0, 1.25 * max(errors)), ylim=(-0.5, 0.5), yticks=[])
+    # As many digits in all pictures, so that the number does not jump: three of the smallest error.
+    digits = max(0, 2 - math.floor(math.log10(max(min(errors), 1e-3))))
     bar.text(
-        shown_error + 0.012 * max(errors), 0, f"{shown(shown_error)} sigma", va="center", fontsize=12, weight="bold"
+        shown_error + 0.012 * max(errors), 0, f"{shown_error:.{digits}f} sigma", va="center", fontsize=12, weight="bold"
     )
     name = steps[low if share < 0.5 else high].label
     title = f"{name}: error on {measure} points (dashed: the noise)"

@@ -106,6 +106,21 @@ def test_the_error_falls_in_an_animation(tmp_path):
         falling.write_falling(folder, tmp_path / "falling.txt")
 
 
+def test_a_film_ends_where_the_error_stops_falling(tmp_path, monkeypatch):
+    folder = write_run(tmp_path / "run", table=True)
+    shown = []
+    picture = falling._picture
+    monkeypatch.setattr(falling, "_picture", lambda steps, *rest: shown.append(len(steps)) or picture(steps, *rest))
+    falling.write_falling(folder, tmp_path / "falling.gif")
+    with np.load(folder / "series.npz") as kept:
+        series = dict(kept)
+    for name in ("residual", "predicted"):
+        series[name][-1] = series[name][-2]  # what the diagnosis proposes changes nothing
+    np.savez(folder / "series.npz", **series)
+    falling.write_falling(folder, tmp_path / "still.gif")
+    assert shown[0] - 1 == shown[-1] > 1
+
+
 def test_a_run_without_series_says_what_to_do(tmp_path):
     folder = write_run(tmp_path / "run", table=True)
     (folder / "series.npz").unlink()
