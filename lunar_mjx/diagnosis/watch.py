@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar_mjx.diagnosis.build_problem import known_logs
 from lunar_mjx.diagnosis.drives.windows.began import ONSET, began
 from lunar_mjx.diagnosis.drives.windows.cut import CUTTING, Cut
 from lunar_mjx.diagnosis.drives.windows.following import Follower, Steps
@@ -107,7 +108,8 @@ def watch(
       idle_s: s. progress: told what is being done. sleep: how time passes between two looks at a growing log.
 
     Raises:
-      UserError: the log cannot be followed, or the run is none of drives with imposed wheel speeds.
+      UserError: the log cannot be followed, the run is none of drives with imposed wheel speeds, or its `run.json`
+        names what does not exist.
     """
     path = Path(log)
     if path.suffix in RECORDINGS:
@@ -122,6 +124,7 @@ def watch(
         raise bad_input("watch", "--hours", hours, "is no time between false alarms", "give hours above 0")
     run = run if isinstance(run, Run) else load_run(run)
     follower = Follower(run)
+    known_logs(run)
     _read(path, follower)
     place = run.folder / "watch" if out is None else Path(out)
     return _Watch(path, run, follower, follower.restlessness(progress), hours, place, progress).alarms(

@@ -24,13 +24,14 @@ wheels or joints, and knows nothing of the engine that calls it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from lunar_mjx.errors import UserError, bad_input, require_finite
+from lunar_mjx.rover import Rover
 
 # A step's order is physical: what the controller asks for, what the motor gives, the rover's true shape, the ground,
 # then what the ground does to the wheels. Heat and readings come last because they need the rest.
@@ -130,8 +131,8 @@ class Refusal(NamedTuple):
 
 
 PortFunction = Callable[..., Any]
-Validate = Callable[[Mapping[str, Any], Sequence[float]], Refusal | None]
-"""From values by parameter and the widths of the rover's wheels, m, to a refusal, or None where they are sound."""
+Validate = Callable[[Mapping[str, Any], Rover], Refusal | None]
+"""From values by parameter and the rover to a refusal, or None where they are sound."""
 Recall = Callable[[Any, Any], Any]
 """From an effect's state and the contact of the wheels as it is now to the contact as the soil remembers it."""
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
@@ -151,7 +152,7 @@ class Effect:
       transient: the effect vanishes on a wheel in steady state, or needs its history or its place, so that a
         steady-state wheel test bed leaves it out.
       requires: names of effects whose parameters it reads: they must be in the list.
-      validate: refuses values that make no sense together, though each is within its bounds.
+      validate: refuses values that make no sense together or for the rover, though each is within its bounds.
       recall: what its state says about the contact of wheel and ground, for the ports from `soil` on: the only way by
         which one effect's state is seen by others.
       doc: equation and source.
@@ -231,18 +232,18 @@ class Effect:
             )
         return number
 
-    def check_together(self, values: Mapping[str, Any], wheel_widths: Sequence[float], source: str) -> None:
-        """Refuses values that make no sense together.
+    def check_together(self, values: Mapping[str, Any], rover: Rover, source: str) -> None:
+        """Refuses values that make no sense together, or for the rover.
 
         Args:
           values: of all parameters, each checked by itself.
-          wheel_widths: of the rover, m.
+          rover: that is to have the effect.
           source: file or function to name in the error.
 
         Raises:
           UserError: what `validate` refuses.
         """
-        refusal = None if self.validate is None else self.validate(values, wheel_widths)
+        refusal = None if self.validate is None else self.validate(values, rover)
         if refusal is not None:
             field = f"effects.{self.name}.{refusal.parameter}"
             raise bad_input(source, field, values[refusal.parameter], refusal.problem, refusal.remedy)

@@ -157,7 +157,7 @@ class Model:
             new[key] = checked
         model = dataclasses.replace(self, parameters={**self.parameters, name: new})
         # After all values are set: an order of setting must not refuse what is sound in the end.
-        effect.check_together(new, [wheel.width for wheel in self.rover.wheels], source)
+        effect.check_together(new, self.rover, source)
         return model
 
     def replace(self, **changes: Any) -> Model:

@@ -55,6 +55,7 @@ ROVER = 'rover = "luvmi_x"'
         ('rover = "luvmi_x"\nterrain = "gone.tif"', "", ["terrain = 'gone.tif' is not there"]),
         ('rover = "luvmi_x"\nterrain = "slope:95deg"', "", ["'slope:95deg'", "below 90"]),
         (ROVER, "[rover_changes]\npayload_kg = 1e9", ["rover_changes.payload_kg = 1000000000.0", "10000 at"]),
+        (ROVER, "[rover_changes]\npayload_kg = 251", ["payload_kg = 251.0 is more than 5 times the 50 kg", "250 at"]),
         (ROVER, "[rover_changes]\ncom_offset_m = [0, 9, 0]", ["rover_changes.com_offset_m = 9.0", "1 at most"]),
         (ROVER, "[rover_changes]\nwheel_radius_offset_m = -3", ["wheel_radius_offset_m = -3.0", "-0.05 or"]),
     ],

@@ -146,6 +146,10 @@ REFUSED: dict[str, tuple[Change, list[str]]] = {
     ),
     "remove what is not there": (lambda m: m.remove("payload"), ["Model.remove", "payload", "not in the model"]),
     "set what is not there": (lambda m: m.set("payload", mass=1.0), ["payload", "not in the model", "soil"]),
+    "more than the rover carries": (
+        lambda m: m.add("payload", mass=5.1 * m.rover.mass),
+        ["effects.payload.mass", "more than 5 times the 50 kg of the rover", "250 at most"],
+    ),
     "unknown parameter": (lambda m: m.set("soil", stickiness=1.0), ["effects.soil.stickiness", "unknown", "cohesion"]),
     "unknown parameter by group": (lambda m: m.set("soil", sticky={"drive": 1.0}), ["effects.soil.sticky", "unknown"]),
     "out of bounds": (lambda m: m.set("soil", n=99.0), ["effects.soil.n = 99", "outside", "[0.1, 3]"]),

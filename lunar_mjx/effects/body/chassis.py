@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 
-from lunar_mjx.effects.base import Parameter, StateVariable, effect
+from lunar_mjx.effects.base import Parameter, Refusal, StateVariable, effect
+from lunar_mjx.rover import Rover
 from lunar_mjx.spatial import Vec3
 
 _HERE = "the user's measurement"
+MOST_PAYLOAD = 5.0
+"""Times the rover's mass that it may carry. A choice: twice what the Lunar Roving Vehicle did, 490 kg on 210 kg."""
 
 
 def _place(axis: str) -> Parameter:
     return Parameter(0.0, None, (-10.0, 10.0), "m", f"{axis} of the payload in the chassis frame", _HERE)
 
 
+def payload_refusal(values: Mapping[str, Any], rover: Rover) -> Refusal | None:
+    """Why the payload `mass`, kg, is none that the rover carries, or None where it is."""
+    if values["mass"] <= MOST_PAYLOAD * rover.mass:
+        return None
+    problem = f"is more than {MOST_PAYLOAD:g} times the {rover.mass:g} kg of the rover"
+    return Refusal("mass", problem, f"give the mass in kg, {MOST_PAYLOAD * rover.mass:g} at most")
+
+
 @effect(
     "geometry",
+    validate=payload_refusal,
     mass=Parameter(0.0, 0.0, (0.0, 1e4), "kg", "payload mass", _HERE),
     x=_place("x"),
     y=_place("y"),

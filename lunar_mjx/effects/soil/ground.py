@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.effects.base import Parameter, Refusal, effect
+from lunar_mjx.rover import Rover
 from lunar_mjx.terrain import rock_fraction, soil_parameters
 from lunar_mjx.terrain.soil.named import BOUNDS
 
@@ -23,9 +24,9 @@ def least_stiffness(k_c: Any, k_phi: Any, wheel_widths: Sequence[float]) -> tupl
     return narrowest, float(np.min(np.asarray(k_c, float) / narrowest + np.asarray(k_phi, float)))
 
 
-def _positive_stiffness(values: Mapping[str, Any], wheel_widths: Sequence[float]) -> Refusal | None:
+def _positive_stiffness(values: Mapping[str, Any], rover: Rover) -> Refusal | None:
     """Refuses a soil that would pull a wheel down: k_c/b + k_phi must be positive for every width b of a wheel."""
-    narrowest, stiffness = least_stiffness(values["k_c"], values["k_phi"], wheel_widths)
+    narrowest, stiffness = least_stiffness(values["k_c"], values["k_phi"], [w.width for w in rover.wheels])
     if stiffness > 0.0:
         return None
     return Refusal(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from lunar_mjx.effects.body.chassis import payload_refusal
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.logs.checks.clock import check_clock
@@ -21,6 +22,7 @@ from lunar_mjx.logs.findings import Finding, is_bad
 from lunar_mjx.logs.log import Log, SteadyLog
 from lunar_mjx.logs.readers.folder import LOG_FILE
 from lunar_mjx.resources import find
+from lunar_mjx.rover import load_rover
 from lunar_mjx.terrain import load_terrain
 
 Slowest = Mapping[str, float]
@@ -45,7 +47,7 @@ def check(logs: Log | SteadyLog | Sequence[Log | SteadyLog], slowest_s: Slowest 
 
 
 def require_named(logs: Sequence[Log | SteadyLog], slowest_s: Slowest) -> None:
-    """Raises `UserError` where a log or a question names what is not there.
+    """Raises `UserError` where a log or a question names what is not there, or a payload that its rover cannot carry.
 
     A rover or a terrain that is neither shipped nor where the log says, or an effect that the catalogue does not hold.
     """
@@ -64,6 +66,10 @@ def require_named(logs: Sequence[Log | SteadyLog], slowest_s: Slowest) -> None:
                 except UserError:
                     remedy = f"name a shipped one, or a folder with a {marker}, counted from the log's"
                     raise bad_input(log.folder / LOG_FILE, field, spec, "is not there", remedy) from None
+        mass = log.rover_changes.get("payload_kg", 0.0)
+        if mass and (refusal := payload_refusal({"mass": mass}, load_rover(log.rover))) is not None:
+            field = "rover_changes.payload_kg"
+            raise bad_input(log.folder / LOG_FILE, field, mass, refusal.problem, refusal.remedy)
     for name, seconds in slowest_s.items():
         # One's own effect is named by its file, which nothing here needs to run.
         if name not in CATALOGUE and ".py:" not in name:

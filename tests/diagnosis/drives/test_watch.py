@@ -12,7 +12,7 @@ from lunar_mjx.diagnosis.drives.windows import coordinates
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, GYRO
 from lunar_mjx.diagnosis.drives.windows.following import Follower
 from lunar_mjx.diagnosis.drives.windows.problem import Noise, Proportion, WindowProblem
-from lunar_mjx.diagnosis.runs import RESTLESS_FILE, Run
+from lunar_mjx.diagnosis.runs import RESTLESS_FILE, RUN_FILE, Run
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.changes import Restlessness
 from lunar_mjx.logs import read_log
@@ -104,6 +104,20 @@ def test_a_run_of_other_logs_is_refused(run, tmp_path):
     (run.folder / "windows.json").unlink()
     with pytest.raises(UserError, match="no windows"):
         next(watching.watch(write_log(tmp_path / "log", still()), run))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"splits": {"nowhere": "test"}}, r"run\.json: splits = 'nowhere=test' names nothing of these logs"),
+        ({"added": ["warp"]}, r"run\.json: added = 'warp' is no effect"),
+        ({"discrepancy": {"gyro_z_rad_s": 1e12}}, r"run\.json: discrepancy: gyro_z_rad_s = .* is out of range"),
+    ],
+)
+def test_what_a_run_says_of_other_logs_is_refused(run, tmp_path, change, said):
+    run.save(RUN_FILE, {**run.load(RUN_FILE), **change})
+    with pytest.raises(UserError, match=said):
+        next(watching.watch(write_log(tmp_path / "log", still()), run.folder))
 
 
 @pytest.mark.parametrize("hours", [0.0, float("nan"), -1.0])
