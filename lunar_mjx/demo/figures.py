@@ -82,7 +82,7 @@ def paths_figure(drives: Sequence[Drive], terrain: Terrain) -> go.Figure:
                 "line": {"color": colour, "width": 2},
             },
         )
-    finish(figure, 640, margin={"l": 52, "r": 8, "t": 64, "b": 46})
+    finish(figure, 640, margin={"l": 52, "r": 36, "t": 64, "b": 46})
     figure.update_xaxes(title_text="east, m", range=[west, east], constrain="domain", showgrid=False)
     figure.update_yaxes(
         title_text="north, m", range=[south, north], scaleanchor="x", constrain="domain", showgrid=False
@@ -135,12 +135,12 @@ CASE_LABELS = {
 
 def headline_figure(cases: Sequence[Case]) -> go.Figure:
     """How far each wheel model is from the measurements that no fit saw, in scatter of single runs; 1 is perfect."""
-    names = [CASE_LABELS.get(c.name, c.name) for c in cases]
+    names = [CASE_LABELS.get(c.name, c.name).replace(", ", ",<br>") for c in cases]  # so that a phone shows it whole
     figure = go.Figure()
     # numbers stand on two sides, for the marks may lie close to each other
     for key, label, look, side in (
-        ("held out, inside", "slip angles between the fitted ones", SERIES[1], "top center"),
-        ("held out, beyond", "slip angles beyond the fitted ones", SERIES[2], "bottom center"),
+        ("held out, inside", "angles between the fitted", SERIES[1], "top center"),
+        ("held out, beyond", "angles beyond the fitted", SERIES[2], "bottom center"),
     ):
         values = [c.scores()[key] for c in cases]
         figure.add_scatter(
@@ -154,7 +154,7 @@ def headline_figure(cases: Sequence[Case]) -> go.Figure:
             hovertemplate="%{y}: %{x:.1f}<extra></extra>",
             marker={"color": look.colour, "symbol": look.symbol, "size": 13, "line": {"color": INK, "width": 1}},
         )
-    finish(figure, 110 + 52 * len(names), margin={"l": 24, "r": 24, "t": 48, "b": 52})
+    finish(figure, 110 + 52 * len(names), margin={"l": 24, "r": 36, "t": 48, "b": 52})
     figure.add_scatter(
         x=[1.0, 1.0],
         y=[names[0], names[-1]],
@@ -164,10 +164,7 @@ def headline_figure(cases: Sequence[Case]) -> go.Figure:
         line={"color": MEASURED.colour, "width": 3},
     )
     figure.update_xaxes(
-        type="log",
-        title_text="root mean square error, in scatter of single runs",
-        range=[-0.12, 1.9],
-        tickvals=[1, 2, 5, 10, 20, 50],
+        type="log", title_text="error, in scatter of single runs", range=[-0.12, 1.9], tickvals=[1, 2, 5, 10, 20, 50]
     )
     # Half a row of room at both ends, for the numbers above the first and below the last.
     figure.update_yaxes(type="category", range=[len(names) - 0.4, -0.6], automargin=True, showgrid=False)
@@ -197,7 +194,7 @@ def husky_figure(case: HuskyCase) -> go.Figure:
         marker={"color": MEASURED.colour, "size": 5, "symbol": MEASURED.symbol},
         hovertemplate="measured: %{y:.1f} A<extra></extra>",
     )
-    finish(figure, 360, margin={"l": 60, "r": 24, "t": 48, "b": 52})
+    finish(figure, 360, margin={"l": 60, "r": 36, "t": 48, "b": 52})
     figure.update_xaxes(title_text="time, s")
     figure.update_yaxes(title_text="current of the left motor, A", rangemode="tozero")
     return figure
@@ -218,7 +215,7 @@ def history_figure(drives: Sequence[Drive], individuals: int = 3) -> go.Figure:
         colour = ROVERS.get(d.rover, (d.rover, INK))[1]
         for row, values in enumerate((d.mean_slip, 1e3 * d.sinkage.max(axis=-1), d.winding_degC), 1):
             _band(figure, d.time, values, colour, row, column, individuals, legend=row == 1 and column == 1)
-    finish(figure, 640, margin={"l": 62, "r": 8, "t": 84, "b": 46})
+    finish(figure, 640, margin={"l": 62, "r": 36, "t": 84, "b": 46})
     figure.update_layout(legend={"y": 1.06})
     for row, title in enumerate(rows, 1):
         figure.update_yaxes(title_text=title, row=row, col=1)
@@ -325,7 +322,7 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
                 hovertemplate="measured: %{y}<extra></extra>",
                 **place,
             )
-    finish(figure, 820, margin={"l": 66, "r": 12, "t": 130, "b": 52})
+    finish(figure, 820, margin={"l": 66, "r": 36, "t": 130, "b": 52})
     figure.update_layout(legend={"y": 1.08})
     # what no fit saw stands on a tinted ground
     for column, angle in enumerate(angles, 1):

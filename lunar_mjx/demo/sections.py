@@ -76,7 +76,7 @@ def headline_section(cases: Sequence[Case]) -> Section:
         "Four wheel models against a measured wheel, at slip angles that no fit saw. Left is better; the line is how "
         "well a repeated run agrees. Refitting the soil helps and does not suffice: lunar-mjx why says what is missing."
     )
-    figure = Figure(headline_figure(cases), caption, least=560)
+    figure = Figure(headline_figure(cases), caption, least=440)
     return Section("How far the wheel models are from the measurements", [figure])
 
 
@@ -193,7 +193,7 @@ def wheel_section(cases: Sequence[Case]) -> Section:
         f"The same wheel-soil functions that drive the rovers above, in the test bed of the {table.name}: imposed "
         f"slip, slip angle and load. Errors are in units of the scatter of single runs about their mean: {sigma}."
     )
-    figure = Figure(wheel_figure(cases, table, angles, beds), caption, least=100 + 120 * len(angles))
+    figure = Figure(wheel_figure(cases, table, angles, beds), caption, least=130 + 120 * len(angles))
     blocks = [Text([about]), figure, _error_table(cases), _worst_table(cases), _fit_table(cases)]
     return Section("The wheel against measurements", blocks)
 

@@ -156,10 +156,10 @@ def finish(figure: go.Figure, height: int, **layout: Any) -> go.Figure:
         font={"family": FONT, "size": 13, "color": INK},
         paper_bgcolor=PAPER,
         plot_bgcolor=PAPER,
-        margin={"l": 62, "r": 16, "t": 60, "b": 52},
+        margin={"l": 62, "r": 36, "t": 60, "b": 52},
         hovermode="closest",
         legend={"orientation": "h", "x": 0.0, "y": 1.02, "yanchor": "bottom", "itemsizing": "constant"},
-        # in a row they would cover the legend's last words
+        # in a row they would cover the legend's last words; in the right margin they cover nothing
         modebar={"orientation": "v"},
     )
     figure.update_layout(**layout)

@@ -14,7 +14,7 @@ from plotly.subplots import make_subplots
 from lunar_mjx.diagnosis.report.figures import SHADES
 from lunar_mjx.diagnosis.report.read import Result, Traces
 from lunar_mjx.diagnosis.report.steps import Step
-from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, plot_text, shown
+from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, plot_text, sigmas
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.logs.schema import is_quantity
 from lunar_mjx.report.page import Block, Explorer, Figure
@@ -69,7 +69,7 @@ def panels(steps: Sequence[Step]) -> list[Block]:
             y=[plot_text(channel_label(c)) for c in channels],
             z=[[_depth(channel_rms.get((c, u))) for u in units] for c in channels],
             text=[
-                [shown(channel_rms[c, u]) if channel_rms.get((c, u)) is not None else "" for u in units]
+                [sigmas(channel_rms[c, u]) if channel_rms.get((c, u)) is not None else "" for u in units]
                 for c in channels
             ],
             texttemplate="%{text}",
@@ -88,7 +88,7 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     # seven pixels a letter: manoeuvres below, channels at the left
     wide = 20 + 7 * min(max(len(o.unit_names[u]) for u in units), EXPLORE.name)
     beside = 50 + 7 * max(len(plot_text(channel_label(c))) for c in channels)
-    finish(figure, 100 + (height + 34) * len(rms), margin={"l": 16, "r": 16, "t": 36, "b": 64})
+    finish(figure, 100 + (height + 34) * len(rms), margin={"l": 16, "r": 36, "t": 36, "b": 64})
     figure.update_yaxes(autorange="reversed", showgrid=False, type="category", automargin=True)
     figure.update_xaxes(tickangle=0 if level else -45, showgrid=False, type="category", automargin=True)
     figure.update_annotations(x=0.0, xanchor="left")
@@ -173,12 +173,12 @@ def dependence(result: Result) -> list[Block]:
                 **at,
             )
         figure.update_xaxes(title_text=name, **at)
-    finish(figure, 120 + 260 * rows, margin={"l": 62, "r": 16, "t": 70, "b": 52})
+    finish(figure, 120 + 260 * rows, margin={"l": 62, "r": 36, "t": 70, "b": 52})
     figure.update_yaxes(title_text="mean residual, sigma", col=1)
     figure.add_hline(y=0.0, line={"color": MUTED, "width": 1})
     caption = (
-        f"What the model {traces.labels[-1]} leaves in its {len(worst)} worst channels, averaged in bins with 95 % "
-        "intervals: noise would scatter about zero whatever it is drawn over."
+        f"What {result.name}'s model {traces.labels[-1]} leaves in its {len(worst)} worst channels, averaged in bins "
+        "with 95 % intervals: noise would scatter about zero whatever it is drawn over."
     )
     return [Figure(figure, caption, least=80 + 220 * columns)]
 
@@ -236,7 +236,7 @@ def gallery(result: Result) -> list[Block]:
     finish(
         figure,
         110 + 300 * rows,
-        margin={"l": 62, "r": 16, "t": 110, "b": 52},
+        margin={"l": 62, "r": 36, "t": 110, "b": 52},
         legend={"orientation": "h", "x": 0.0, "y": 1.0 + 0.22 / rows, "yanchor": "bottom"},
     )
     figure.update_yaxes(title_text="sigma", col=1)
@@ -350,7 +350,7 @@ def _detail(models: Sequence[Step]) -> go.Figure:
         fillcolor=faded(BLUE, 0.12),
         layer="below",
     )
-    finish(figure, 450, margin={"l": 70, "r": 16, "t": 60, "b": 52})
+    finish(figure, 450, margin={"l": 70, "r": 36, "t": 60, "b": 52})
     figure.update_yaxes(title_text="residual, sigma", row=2, col=1)
     return figure
 

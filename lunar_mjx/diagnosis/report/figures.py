@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
 
 from lunar_mjx.diagnosis.report.steps import Error, Step
-from lunar_mjx.diagnosis.report.words import plot_text, port_label, shown
+from lunar_mjx.diagnosis.report.words import percent, plot_text, port_label, sigmas
 from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, SHADES, VERMILION, faded, finish
 
 
@@ -16,7 +17,7 @@ def waterfall(
     steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[Error | None], measure: str
 ) -> go.Figure:
     """The error of each model of the chain, a row each from the first to the last, with its interval."""
-    names = [f"{i}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for i, s in enumerate(steps, 1)]
+    names = [_row_name(f"{i}. {s.short.replace('<br>', ' ')}") for i, s in enumerate(steps, 1)]
     value = [e.value for e in judged]
     known = [(name, e) for name, e in zip(names, fitted, strict=True) if e is not None and measure != "fitted"]
     highest = max(e.high if np.isfinite(e.high) else e.value for e in (*judged, *(e for _, e in known)))
@@ -51,7 +52,7 @@ def waterfall(
             xref="paper",
             x=1.01,
             y=name,
-            text=f"<b>{shown(e.value)}</b> sigma",
+            text=f"<b>{sigmas(e.value)}</b> sigma",
             showarrow=False,
             xanchor="left",
             font={"size": 14},
@@ -61,17 +62,27 @@ def waterfall(
     ends = [names[0], names[-1]]
     figure.add_scatter(x=[1.0, 1.0], y=ends, mode="lines", name=name, hoverinfo="skip", line=floor)
     figure.add_vline(x=1.0, line=floor)
-    finish(figure, 150 + 42 * len(names), margin={"t": 74, "b": 52, "l": 24, "r": 96})
+    lines = max(name.count("<br>") + 1 for name in names)
+    # at the right room for the numbers, and beside them for the buttons that come up on pointing
+    finish(figure, 150 + max(42, 18 * lines) * len(names), margin={"t": 74, "b": 52, "l": 24, "r": 128})
     figure.update_yaxes(type="category", autorange="reversed", automargin=True, showgrid=False)
     figure.update_xaxes(
-        title_text="root mean square residual, sigma",
-        type="log" if logarithmic else "linear",
-        range=[0.0, 1.05 * max(highest, 1.2)],
+        title_text="error, sigma", type="log" if logarithmic else "linear", range=[0.0, 1.05 * max(highest, 1.2)]
     )
     if logarithmic:
         low = np.log10(0.5 * min(1.0, *value))
         figure.update_xaxes(range=[low, np.log10(1.2 * highest)], dtick="D2")
     return figure
+
+
+_NAME_WIDTH = 26
+"""Characters of a line of a row's name: on a phone, bars need more than half of the width."""
+
+
+def _row_name(text: str) -> str:
+    lines = textwrap.wrap(text, _NAME_WIDTH, break_long_words=False)
+    lines = lines if len(lines) <= 4 else [*lines[:3], lines[3] + " …"]
+    return "<br>".join(plot_text(line) for line in lines)
 
 
 def _interval(errors: Sequence[Error]) -> dict:
@@ -81,24 +92,24 @@ def _interval(errors: Sequence[Error]) -> dict:
 
 
 def bars(values: Mapping[str, float | None], title: str, named: str = "") -> go.Figure:
-    """Horizontal bars, largest first; the one of a name stands out."""
+    """Horizontal bars of probabilities in percent, largest first; the one of a name stands out."""
     ascending = sorted(((k, v or 0.0) for k, v in values.items()), key=lambda item: item[1])
     figure = go.Figure(
         go.Bar(
-            x=[v for _, v in ascending],
+            x=[100.0 * v for _, v in ascending],
             y=[plot_text(port_label(k)) for k, _ in ascending],
             orientation="h",
-            text=[shown(v) for _, v in ascending],
+            text=[percent(v) for _, v in ascending],
             textposition="outside",
             cliponaxis=False,
             marker={
                 "color": [BLUE if k == named else faded(BLUE, 0.35) for k, _ in ascending],
                 "line": {"color": INK, "width": 1},
             },
-            hovertemplate="%{y}: %{x:.4g}<extra></extra>",
+            hovertemplate="%{y}: %{x:.3g} %<extra></extra>",
         )
     )
-    finish(figure, 90 + 26 * max(len(ascending), 2), margin={"l": 16, "r": 70, "t": 20, "b": 52}, showlegend=False)
+    finish(figure, 90 + 26 * max(len(ascending), 2), margin={"l": 16, "r": 128, "t": 20, "b": 52}, showlegend=False)
     figure.update_yaxes(automargin=True)
     figure.update_xaxes(title_text=title)
     return figure

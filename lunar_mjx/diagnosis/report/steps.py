@@ -73,7 +73,7 @@ def chain(results: Sequence[Result]) -> list[Step]:
                 steps.append(Step(*words, result.name, result, row))
             elif last:
                 names = label.removeprefix("with ")
-                model = f"the same with {names} added" if before else f"the model with {names}"
+                model = f"{result.name}'s model with {names} added" if before else f"the model with {names}"
                 words = (f"{model}, as the diagnosis proposes", f"+ {names}<br>(proposed)")
                 steps.append(Step(*words, result.name, result, row))
     return steps

@@ -11,7 +11,7 @@ from typing import Any
 from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error, Step
-from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, percent, port_label, shown
+from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, percent, port_label, shown, sigmas
 from lunar_mjx.model.describe import by_group
 from lunar_mjx.report.page import Block, Facts, Table, Text
 
@@ -47,7 +47,7 @@ def error_rows(steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[
 def _with_interval(e: Error | None) -> str:
     if e is None:
         return "-"
-    return f"{shown(e.value)} ({shown(e.low)} to {shown(e.high)})"
+    return f"{sigmas(e.value)} ({sigmas(e.low)} to {sigmas(e.high)})"
 
 
 LISTED = 0.001
@@ -80,10 +80,11 @@ def hypotheses(result: Result) -> list[Block]:
     held = (verdict.get("details") or {}).get("held_out") or {}
     groups = held.get("manoeuvres")
     if groups and held["gain"]:  # exactly zero where no refit was held against them
-        gain = plus_minus(held["gain"], held["se"] if groups > 1 else None)
+        gain = plus_minus(abs(held["gain"]), held["se"] if groups > 1 else None)
+        where = "above" if held["gain"] > 0.0 else "below"
         text = (
             f"On {groups} group{'s' if groups > 1 else ''} that chose nothing, the log predictive density of the best "
-            f"hypothesis is {gain} above that of the model as it is."
+            f"hypothesis is {gain} {where} that of the model as it is."
         )
         blocks.append(Text([text]))
     return blocks
@@ -124,7 +125,8 @@ def parameters(first: Result, last: Result) -> list[Block]:
     before = (first.comparison or {}).get("parameters") or {}
     proposed = ((last.verdict or {}).get("details") or {}).get("parameters")
     after = proposed or (last.comparison or {}).get("parameters") or {}
-    rows = []
+    rows: list[list[str]] = []
+    still: list[str] = []
     for effect, parameters_of in {**before, **after}.items():
         old, new = before.get(effect) or {}, after.get(effect) or {}
         for name in parameters_of.get("value") or {}:
@@ -132,6 +134,9 @@ def parameters(first: Result, last: Result) -> list[Block]:
             sa, sb = ((t.get("std") or {}).get(name) for t in (old, new))
             unit = (parameters_of.get("unit") or {}).get(name, "")
             given = (old.get("given") or {}).get(name)
+            if given is not None and a is not None and b is not None and all(_alike(given, v) for v in (a, b)):
+                still.append(f"{effect}.{name}")
+                continue
             strength = shown(abs(a - b) / sa, 2) if a is not None and b is not None and a != b and sa else "-"
             for label, own, last_size in _sizes(first, last, effect, name, unit):
                 # values before are in units of the first run's model, values after in those of the last one's
@@ -141,15 +146,24 @@ def parameters(first: Result, last: Result) -> list[Block]:
                     bias = shown(a_ - b_) + (f" ({100.0 * (a_ / b_ - 1.0):+.0f} %)" if b_ else "")
                 unit_ = _unit(first, last, effect, name, unit)
                 rows.append([label, unit_, shown(g), plus_minus(a_, sa_), plus_minus(b_, sb_), bias, strength])
+    unmoved = [Text([f"Left as given by both fits: {', '.join(still)}."])] if still else []
     if not rows:
-        return []
+        return [*unmoved]
     note = (
         "Bias: the refitted value before less the value with the effects named, that is, what the parameter had taken "
         "up for the missing physics; the last column is its size in standard deviations of the value before. Standard "
         "deviations are those of the noise alone: while the residual is above the noise they are too small."
     )
     header = ["parameter", "unit", "as given", "refitted, before", "with the effects", "bias before", "bias, std"]
-    return [Table("Parameters before and after", header, rows, note, texts=2)]
+    return [Table("Parameters before and after", header, rows, note, texts=2), *unmoved]
+
+
+_STILL = 1e-9
+"""Relative change of a parameter up to which a fit has not moved it: what rounding leaves."""
+
+
+def _alike(given: float, fitted: float) -> bool:
+    return abs(fitted - given) <= _STILL * abs(given)
 
 
 def _scaled(own: float, *values: float | None) -> list[float | None]:
@@ -205,8 +219,8 @@ def by_channel(result: Result) -> list[Block]:
                     str(SPLIT_NAMES.get(r["split"], r["split"])),
                     channel_label(r["channel"]),
                     str(r["samples"]),
-                    shown(r["as_given"]),
-                    shown(r["refitted"]),
+                    sigmas(r["as_given"]),
+                    sigmas(r["refitted"]),
                 ]
                 for r in worst
             ],
@@ -240,7 +254,9 @@ def provenance(results: Sequence[Result]) -> list[Block]:
         added = ", ".join(r.run.get("added") or []) or "-"
         rows.append([r.name, str(r.run.get("version")), str(r.run.get("seed")), added, chosen, problems])
     header = ["run", "version", "seed", "effects added", "splits by the user", "certificate of the fit"]
-    blocks.append(Table("Runs", header, rows, texts=6))
+    if all(row[-1] == "-" for row in rows):  # steady tables have none
+        header, rows = header[:-1], [row[:-1] for row in rows]
+    blocks.append(Table("Runs", header, rows, texts=len(header)))
     blocks += [*_splits(results[-1]), *_openings(results)]
     versions = [(name, metadata.version(name)) for name in ("jax", "mujoco", "numpy", "scipy", "plotly")]
     blocks.append(Facts([("report by lunar-mjx", __version__), *versions, ("Python", platform.python_version())]))

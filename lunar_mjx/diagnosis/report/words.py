@@ -30,6 +30,13 @@ def shown(value: Any, digits: int = 3) -> str:
     return f"{value:.0f}" if size >= 10 ** (digits - 1) else f"{value:.{digits}g}"
 
 
+def sigmas(value: Any) -> str:
+    """An error in sigma with trailing zeros, as in the studio: 25.0 beside 29.2; a dash for None and NaN."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or math.isnan(value):
+        return "-"
+    return f"{value:.{0 if value >= 100.0 else 1 if value >= 10.0 else 2}f}"
+
+
 def plot_text(text: str, most: int = 60) -> str:
     """Text for a figure: plotly reads a few tags and entities, which names from a log must not hold."""
     return html.escape(text if len(text) <= most else text[: most - 1] + "…", quote=False)

@@ -11,7 +11,7 @@ from lunar_mjx.diagnosis.report import explore, figures, tables
 from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result, read_result
 from lunar_mjx.diagnosis.report.steps import Step, chain, comparable, error, judged
-from lunar_mjx.diagnosis.report.words import and_list, shown
+from lunar_mjx.diagnosis.report.words import and_list, sigmas
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.report.page import Block, Figure, Section, Text, write_page
@@ -62,7 +62,7 @@ def _verdict(results: Sequence[Result], judge: Result, steps: Sequence[Step]) ->
             verb = "falls" if end.value < first.value else "rises"
             lines.append(
                 f"From {steps[0].label} to {steps[-1].label}, the error on {measure} manoeuvres {verb} from "
-                f"{shown(first.value)} to {shown(end.value)} sigma; the noise is 1."
+                f"{sigmas(first.value)} to {sigmas(end.value)} sigma; the noise is 1."
             )
     lines.append(_audit_line(judge))
     return lines
@@ -105,7 +105,7 @@ def _where(judge: Result, steps: Sequence[Step]) -> Section:
     if ports:
         best = max(ports, key=lambda k: ports[k] or 0.0)
         caption = "Probability that something unlisted acts at a port."
-        blocks.append(Figure(figures.bars(ports, "probability", best), caption, least=520))
+        blocks.append(Figure(figures.bars(ports, "probability, %", best), caption, least=520))
     return Section("Where it fails", blocks)
 
 

@@ -200,3 +200,19 @@ def test_what_was_held_against_no_measurement_is_not_told():
     assert "On 1 group that" in one and "±" not in one  # one group has no scatter
     (three,) = told(manoeuvres=3, gain=4.0, se=2.0)
     assert "On 3 groups that" in three and "4 ± 2" in three
+
+
+def test_parameters_that_no_fit_moved_stand_in_one_line():
+    given = {"n": 1.0, "stiffness": 2e5}
+    moved = {"value": {"n": 0.9, "stiffness": 2e5 * (1.0 + 1e-15)}, "std": {"n": 0.1, "stiffness": 6e4}, "given": given}
+    run = result("run1", None, {"parameters": {"soil": moved}})
+    table, unmoved = tables.parameters(run, run)
+    assert [row[0] for row in table.rows] == ["soil.n"]
+    assert "soil.stiffness" in unmoved.paragraphs[0] and "soil.n" not in unmoved.paragraphs[0]
+
+
+def test_rows_of_the_waterfall_fit_a_phone():
+    steps = [Named("as given"), Named("+ stress_integral, side_wall, side_entry, shear_softening, skid_shear")]
+    bars = figures.waterfall(steps, [Error(v, v, v, 10, 5) for v in (25.0, 10.8)], [None] * 2, "held-out").data[0]
+    assert max(len(line) for name in bars.y for line in name.split("<br>")) <= figures._NAME_WIDTH
+    assert "skid_shear" in bars.y[1]
