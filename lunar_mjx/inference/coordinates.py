@@ -13,6 +13,8 @@ NUISANCE = "initial"
 """Effect of the coordinates that belong to logs."""
 WIDE = 10.0
 """Prior standard deviation, in scales, of a coordinate that the data alone should settle."""
+FACTOR_UNIT = "factor"
+"""Unit, in tables, of a value that multiplies the model's own, which may differ between wheels or joints."""
 
 
 @dataclasses.dataclass(frozen=True)

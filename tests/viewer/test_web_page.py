@@ -57,7 +57,9 @@ def test_a_page_from_elsewhere_can_neither_read_nor_drive(live_viewer, browser):
     assert live_viewer.drive.pilot.throttle == 0.0
 
 
-@pytest.mark.parametrize("size", [(360, 740), (740, 360), (1280, 760)], ids=["phone", "phone, lying", "desk"])
+@pytest.mark.parametrize(
+    "size", [(360, 740), (500, 900), (740, 360), (1280, 760)], ids=["phone", "large phone", "phone, lying", "desk"]
+)
 def test_panels_stay_in_the_window_and_off_each_other(live_viewer, browser, size):
     browser.resize(*size)
     browser.open(live_viewer.address)
@@ -67,6 +69,10 @@ def test_panels_stay_in_the_window_and_off_each_other(live_viewer, browser, size
         ".map(s => { const b = s.getBoundingClientRect(); return [s.id, b.left, b.top, b.right, b.bottom]; })"
     )
     assert len(boxes) >= 2
+    beyond = browser.value(
+        "[...document.querySelectorAll('section')].filter(s => s.scrollWidth > s.clientWidth + 1).map(s => s.id)"
+    )
+    assert beyond == []  # what a panel holds lies within it
     for name, left, top, right, bottom in boxes:
         assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1], name
     for (a, *one), (b, *other) in itertools.combinations(boxes, 2):

@@ -36,6 +36,8 @@ class ExploreSizes:
     """Channels drawn over a covariate."""
     maps: int = 6
     """Models of a chain whose heat maps are shown; of longer chains the first five and the last."""
+    channels: int = 24
+    """Rows of a heat map: of more channels the worst."""
     name: int = 30
     """Letters of a manoeuvre's name that stand at a map."""
     shapes: int = 6
@@ -57,6 +59,11 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     channels, units = list(dict.fromkeys(c for c, _ in places)), sorted({u for _, u in places})
     shown_steps = [*steps[: EXPLORE.maps - 1], steps[-1]] if len(steps) > EXPLORE.maps else list(steps)
     rms = [{key: _rms(s.residual[at]) for key, at in places.items()} for s in shown_steps]
+    measured = len(channels)
+    if measured > EXPLORE.channels:
+        worst_of = {c: max(row[key] or 0.0 for row in rms for key in places if key[0] == c) for c in channels}
+        kept = sorted(channels, key=lambda c: -worst_of[c])[: EXPLORE.channels]
+        channels = [c for c in channels if c in kept]
     # One scale of shades for all maps: a field that fades from one to the next is an error that fell.
     most = max(v for row in rms for v in row.values() if v is not None)
     titles = [f"{_number(steps, s)}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for s in shown_steps]
@@ -99,10 +106,11 @@ def panels(steps: Sequence[Step]) -> list[Block]:
     models = _compared(steps)
     channel_rms = {_key(*key): _panel(models, *key, places[key][::thin]) for key in worst}
     left = f" {len(steps) - EXPLORE.maps} models in between are left out." if len(steps) > EXPLORE.maps else ""
+    fewer = f" Of {measured} channels the {len(channels)} worst are shown." if measured > len(channels) else ""
     caption = (
         "Root mean square residual in sigma, 1 is the noise: one map for each model of the chain, in one scale of "
-        f"shades.{left} What is held out was never fitted. Click a field, or choose from the list, to see what was "
-        "measured, what the models say, and what they leave."
+        f"shades.{left}{fewer} What is held out was never fitted. Click a field, or choose from the list, to see what "
+        "was measured, what the models say, and what they leave."
     )
     return [
         Explorer(figure, _detail(models), channel_rms, caption, least=beside + (wide if level else 44) * len(units))

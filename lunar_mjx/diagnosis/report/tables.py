@@ -12,6 +12,7 @@ from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error, Step
 from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, channel_label, percent, port_label, shown, sigmas
+from lunar_mjx.inference.coordinates import FACTOR_UNIT, NUISANCE
 from lunar_mjx.model.describe import by_group
 from lunar_mjx.report.page import Block, Facts, Table, Text
 
@@ -121,11 +122,15 @@ def effects(result: Result) -> list[Block]:
 
 
 def parameters(first: Result, last: Result) -> list[Block]:
-    """Baseline parameters before and after, with the bias that the missing effects had caused."""
+    """Baseline parameters before and after, with the bias that the missing effects had caused; then the instruments'.
+
+    Of a single run that proposes nothing there is no after.
+    """
     before = (first.comparison or {}).get("parameters") or {}
     proposed = ((last.verdict or {}).get("details") or {}).get("parameters")
     after = proposed or (last.comparison or {}).get("parameters") or {}
     rows: list[list[str]] = []
+    instruments: list[list[str]] = []
     still: list[str] = []
     for effect, parameters_of in {**before, **after}.items():
         old, new = before.get(effect) or {}, after.get(effect) or {}
@@ -145,17 +150,31 @@ def parameters(first: Result, last: Result) -> list[Block]:
                 if a_ is not None and b_ is not None and a != b:
                     bias = shown(a_ - b_) + (f" ({100.0 * (a_ / b_ - 1.0):+.0f} %)" if b_ else "")
                 unit_ = _unit(first, last, effect, name, unit)
-                rows.append([label, unit_, shown(g), plus_minus(a_, sa_), plus_minus(b_, sb_), bias, strength])
+                table = instruments if effect == NUISANCE else rows
+                table.append([label, unit_, shown(g), plus_minus(a_, sa_), plus_minus(b_, sb_), bias, strength])
     unmoved = [Text([f"Left as given by both fits: {', '.join(still)}."])] if still else []
-    if not rows:
-        return [*unmoved]
+    blocks: list[Block] = []
     note = (
         "Bias: the refitted value before less the value with the effects named, that is, what the parameter had taken "
-        "up for the missing physics; the last column is its size in standard deviations of the value before. Standard "
-        "deviations are those of the noise alone: while the residual is above the noise they are too small."
+        "up for the missing physics; the last column is its size in standard deviations of the value before. "
+        + _DEVIATIONS
     )
     header = ["parameter", "unit", "as given", "refitted, before", "with the effects", "bias before", "bias, std"]
-    return [Table("Parameters before and after", header, rows, note, texts=2), *unmoved]
+    title, width = "Parameters before and after", len(header)
+    if first is last and not proposed:
+        header, title, note, width = ["parameter", "unit", "as given", "refitted"], "Parameters", _DEVIATIONS, 4
+    if rows:
+        blocks.append(Table(title, header, [row[:width] for row in rows], note, texts=2))
+    blocks += unmoved
+    if instruments:
+        title = "Starts of the logs and errors of their instruments, fitted with the parameters, in SI units"
+        blocks.append(Table(title, header, [row[:width] for row in instruments], texts=2, folded=True))
+    return blocks
+
+
+_DEVIATIONS = (
+    "Standard deviations are those of the noise alone: while the residual is above the noise they are too small."
+)
 
 
 _STILL = 1e-9
@@ -172,7 +191,7 @@ def _scaled(own: float, *values: float | None) -> list[float | None]:
 
 def _unit(first: Result, last: Result, effect: str, name: str, unit: str) -> str:
     """Unit of a parameter; of one that is fitted as a common factor, the unit of the values that it multiplies."""
-    if unit != "factor":
+    if unit != FACTOR_UNIT:
         return "" if unit == "1" else unit
     model = last.model or first.model
     known = {e.name: e for e in model.effects} if model else {}
@@ -188,7 +207,7 @@ def _sizes(first: Result, last: Result, effect: str, name: str, unit: str) -> li
     A factor on values that differ between wheels or joints gives a row for each group of them that agree.
     """
     label = f"{effect}.{name}"
-    if unit != "factor":
+    if unit != FACTOR_UNIT:
         return [(label, 1.0, 1.0)]
     owns = []
     for result in (first, last):

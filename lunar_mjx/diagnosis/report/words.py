@@ -52,7 +52,8 @@ def channel_label(channel: str) -> str:
     if channel_entry is None:
         return channel.replace("_", " ")
     kind, match = channel_entry
-    return f"{match[0].replace('_', ' ')}, {kind.unit}"
+    label = match[0].replace("_", " ")
+    return label if kind.unit == "1" else f"{label}, {kind.unit}"
 
 
 def port_label(label: str) -> str:

@@ -28,6 +28,7 @@ from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, label, 
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm, Problem
 from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, account, gains_on_held_out
 from lunar_mjx.files import replacing
+from lunar_mjx.inference.coordinates import FACTOR_UNIT
 from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress
@@ -209,7 +210,7 @@ def parameter_table(form: MeasuredForm, u: np.ndarray, covariance: np.ndarray, p
         entry = table.setdefault(c.effect, {"value": {}, "std": {}, "given": {}, "unit": {}})
         entry["value"][c.name] = float(c.value(u[i]))
         entry["std"][c.name] = c.std(u[i], math.sqrt(max(float(covariance[k, k]), 0.0)))
-        entry["given"][c.name], entry["unit"][c.name] = c.start, c.unit
+        entry["given"][c.name], entry["unit"][c.name] = c.start, FACTOR_UNIT if c.factor else c.unit
     return table
 
 

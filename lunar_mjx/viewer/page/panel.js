@@ -6,7 +6,10 @@ const number = (v, digits) =>
   v === null ? "–" : (Number(v.toFixed(digits)) || 0).toFixed(digits).replace("-", "−");   // no minus before zero
 
 const WORDS = { lf: "left front", rf: "right front", lm: "left middle", rm: "right middle", lr: "left rear",
-  rr: "right rear" };
+  rr: "right rear", sus: "suspension" };
+
+// A joint's name in words: "rf_sus" is the right front suspension.
+const spoken = (joint) => joint.split("_").map((part) => WORDS[part] ?? part).join(" ");
 
 export class Panel {
   constructor(scene) {
@@ -55,7 +58,7 @@ export class Panel {
     byId("roll").textContent = `${number(now.roll_deg, 1)}°`;
     byId("goal").textContent = now.goal ? `${number(now.goal_m, 1)} m away` : "";
     byId("power").textContent = `${number(now.power_W, 0)} W`;
-    byId("hottest").textContent = `${now.hottest} ${number(now.hottest_degC, 1)} °C`;
+    byId("hottest").textContent = `${spoken(now.hottest)} ${number(now.hottest_degC, 1)} °C`;
     this.rows.forEach((row, i) => {
       const slip = clamp(now.slip[i] ?? 0, -1, 1);
       row.fill.style.left = `${slip < 0 ? 50 + 50 * slip : 50}%`;

@@ -41,7 +41,8 @@ const extent = (lists) => {
   const spare = 0.06 * (high - low) || 1;
   return [low - spare, high + spare];
 };
-const short = (v) => (Math.abs(v) >= 1000 || (v && Math.abs(v) < 0.01) ? v.toExponential(1) : v.toPrecision(3)).replace("-", "−");
+// An end of an axis, with as many digits as its span needs: both ends alike.
+const end = (v, span) => (span >= 1e5 ? v.toExponential(1) : v.toFixed(clamp(2 - Math.ceil(Math.log10(span)), 0, 6))).replace("-", "−");
 
 class Plot {
   constructor(parent, trace, span) {
@@ -73,8 +74,8 @@ class Plot {
     const y = (v) => HIGH - HIGH * (v - low) / (high - low);
     const zero = HIGH + GAP + LOW / 2, sigma = (v) => zero - LOW / 2 * clamp(v / MOST_SIGMA, -1, 1);
     pen.fillStyle = MUTED;
-    pen.fillText(short(high), LEFT - 4, 6);
-    pen.fillText(short(low), LEFT - 4, HIGH - 6);
+    pen.fillText(end(high, high - low), LEFT - 4, 6);
+    pen.fillText(end(low, high - low), LEFT - 4, HIGH - 6);
     pen.fillText("residual", LEFT - 4, zero);
     pen.strokeStyle = RULE;
     pen.strokeRect(LEFT, 0.5, WIDE - LEFT - 4, HIGH - 1);

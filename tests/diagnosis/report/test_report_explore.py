@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -55,6 +56,13 @@ def test_every_channel_of_every_manoeuvre_has_a_panel_and_the_worst_comes_first(
         worst = float(np.log10(np.sqrt(np.nanmean(residual[180:] ** 2))))
         assert heat.z[1][1] == pytest.approx(max(worst, np.log10(0.3)))
     json.dumps(block.panels, allow_nan=False)
+
+
+def test_of_many_channels_the_worst_have_rows_and_all_are_in_the_list(result, monkeypatch):
+    monkeypatch.setattr(explore, "EXPLORE", dataclasses.replace(explore.EXPLORE, channels=1))
+    (block,) = explore.panels(chain([result]))
+    assert [list(heat.y) for heat in block.figure.data] == [["motor lf drive current, A"]] * 3
+    assert len(block.panels) == 4 and "Of 2 channels" in block.caption
 
 
 def test_residuals_are_averaged_over_what_they_may_follow(result):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error
 from lunar_mjx.diagnosis.report.write import _audit_line
 from lunar_mjx.diagnosis.verdict import Verdict
+from lunar_mjx.diagnosis.weighed.answer import parameter_table
+from lunar_mjx.inference.coordinates import FACTOR_UNIT, NUISANCE, Coordinate
 
 
 def result(name: str, verdict: dict | None, comparison: dict | None = None, **run) -> Result:
@@ -153,7 +157,7 @@ def test_a_common_factor_is_shown_in_the_unit_of_what_it_multiplies(tmp_path):
         }
     }
     run = Result("run1", {}, {"parameters": fitted}, None, None, None, None, None, {}, tmp_path)
-    (table,) = tables.parameters(run, run)
+    (table,) = tables.parameters(run, dataclasses.replace(run))
     own = np.unique(np.asarray(model.parameters["motor"]["gear_ratio"], float))
     assert len(table.rows) == len(own) > 1
     shown = sorted(float(row[2]) for row in table.rows)
@@ -207,6 +211,7 @@ def test_parameters_that_no_fit_moved_stand_in_one_line():
     moved = {"value": {"n": 0.9, "stiffness": 2e5 * (1.0 + 1e-15)}, "std": {"n": 0.1, "stiffness": 6e4}, "given": given}
     run = result("run1", None, {"parameters": {"soil": moved}})
     table, unmoved = tables.parameters(run, run)
+    assert table.header == ["parameter", "unit", "as given", "refitted"]  # of a run that proposes nothing
     assert [row[0] for row in table.rows] == ["soil.n"]
     assert "soil.stiffness" in unmoved.paragraphs[0] and "soil.n" not in unmoved.paragraphs[0]
 
@@ -216,3 +221,18 @@ def test_rows_of_the_waterfall_fit_a_phone():
     bars = figures.waterfall(steps, [Error(v, v, v, 10, 5) for v in (25.0, 10.8)], [None] * 2, "held-out").data[0]
     assert max(len(line) for name in bars.y for line in name.split("<br>")) <= figures._NAME_WIDTH
     assert "skid_shear" in bars.y[1]
+
+
+def test_a_factor_on_the_models_own_values_is_recorded_as_such():
+    known = dataclasses.replace(Coordinate("soil", "n", 1.0, 0.1, 0.5, 2.0), unit="1")
+    form = SimpleNamespace(coordinates=(known, dataclasses.replace(known, name="cohesion", factor=True)))
+    table = parameter_table(cast(Any, form), np.zeros(2), np.eye(2), np.arange(2))
+    assert table["soil"]["unit"] == {"n": "1", "cohesion": FACTOR_UNIT}
+
+
+def test_starts_and_instruments_have_a_table_of_their_own():
+    fitted = {name: {"value": {"x": 0.2}, "std": {"x": 0.1}, "given": {"x": 0.0}} for name in ("drag", NUISANCE)}
+    run = result("run1", None, {"parameters": fitted})
+    own, instruments = tables.parameters(run, run)
+    assert [row[0] for row in own.rows] == ["drag.x"] and not own.folded
+    assert [row[0] for row in instruments.rows] == [f"{NUISANCE}.x"] and instruments.folded
