@@ -44,6 +44,7 @@ def told(found: list[dict[str, Any]]) -> list[str]:
     return [f"{r['case']}: {r['outcome']}, {r['sentence']}" for r in found if not r["right"]]
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize("numbers", [FEW_NULLS, pytest.param(MORE_NULLS, marks=pytest.mark.slow)], ids=["few", "more"])
 def test_nothing_is_found_where_nothing_is_hidden(numbers: Sequence[int]) -> None:
     """White, coloured and quantised noise by turns, with a little unmodelled dirt."""
@@ -53,6 +54,7 @@ def test_nothing_is_found_where_nothing_is_hidden(numbers: Sequence[int]) -> Non
     assert all(r["outcome"] == "quiet" for r in found), told(found)
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("group", "numbers", "misses"),
     [
@@ -72,6 +74,7 @@ def test_what_is_hidden_is_named(group: str, numbers: Sequence[int], misses: int
     assert len(told(found)) <= misses, told(found)
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     "numbers", [FEW_UNDECIDABLE, pytest.param(MORE_UNDECIDABLE, marks=pytest.mark.slow)], ids=["few", "more"]
 )
