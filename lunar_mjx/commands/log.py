@@ -169,15 +169,15 @@ def noise(
         }
         print(json.dumps(plain, indent=2))
         return
-    table = make_table("channel", "kind", "std", "coloured", "time, s", "log std")
+    table = make_table("channel, and what tells", "std", "coloured", "time, s", "log std", names=5)
     for channel, kinds in found.items():
+        table.add_row(channel, style="bold")
         for kind, n in kinds.items():
-            # what a drive itself shows needs no more than its own word, so that rows fit into 80 columns
+            # what a drive itself shows needs no more than its own word
             shows = kind == "drive" and n.source in ("vibration", "ripple", "estimate")
             label = n.source if shows else kind if kind in (n.source, "rest") else f"{kind}: {n.source}"
-            table.add_row(
-                channel, label, f"{n.std:.3g}", f"{n.share:.2g}", f"{n.correlation_time_s:.2g}", f"{n.log_std:.2g}"
-            )
+            numbers = (f"{n.std:.3g}", f"{n.share:.2g}", f"{n.correlation_time_s:.2g}", f"{n.log_std:.2g}")
+            table.add_row(f"  {label}", *numbers)
     make_console().print(table)
 
 
@@ -355,10 +355,11 @@ def manoeuvres() -> None:
     from lunar_mjx.manoeuvres import MANOEUVRES, load_manoeuvre
     from lunar_mjx.model.describe import make_console, make_table
 
-    table = make_table("manoeuvre", "s", "what", "tells apart")
+    table = make_table("manoeuvre", "s", "what, and what it tells apart", names=2)
     for name in MANOEUVRES:
         plan = load_manoeuvre(name)
-        table.add_row(name, f"{plan.duration_s:g}", plan.description, ", ".join(plan.separates))
+        told = f"{plan.description}\nTells apart: {', '.join(plan.separates)}."
+        table.add_row(name, f"{plan.duration_s:g}", told)
     # The TOML files are package data, which a broken build leaves out.
     if not MANOEUVRES:
         raise UserError("manoeuvres: none ships with this installation; reinstall the package.")

@@ -88,7 +88,14 @@ def test_effect_list(run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [["effect", "list"], ["effect", "show", "slip_sinkage"], ["preset", "paper"], ["preset", "list"]]
+    "command",
+    [
+        ["effect", "list"],
+        ["effect", "show", "slip_sinkage"],
+        ["preset", "paper"],
+        ["preset", "list"],
+        ["log", "manoeuvres"],
+    ],
 )
 def test_tables_read_well_on_a_narrow_terminal(command: list[str], run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is cut at 80 columns, and no column of words is squeezed until each line holds one or two of them."""
