@@ -7,7 +7,8 @@ Pictures are colour, depth and labels with shadows. A row of the JAX cameras cou
 the depth of one picture of the same size against MuJoCo's renderer; `labels` is the share of pixels whose label agrees.
 Where there is OpenGL, what the renderer drew is kept in `cameras_drawn.npz`; where there is none, as on most machines
 with a large GPU, pictures are held against that file, and there is no row of the renderer. `mebibytes` is what the
-compiled program needs beyond arguments and results.
+compiled program needs beyond arguments and results. `ssim` is the structural similarity of a boulder's colour with the
+same picture by formulas (`camera_reference.py`).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from camera_reference import likeness
 from provenance import commit
 from timing import LOCK, alone
 
@@ -46,6 +48,10 @@ TOLERANCE = 0.01
 
 LABELS = 0.98
 """Least share of pixels whose label agrees with the renderer's; below 100 pixels a side, edges are 1 % of all."""
+
+
+LIKENESS = 0.9
+"""Least structural similarity of a boulder's picture with the one by formulas."""
 
 
 def seconds(function: Any, repeats: int) -> tuple[float, float]:
@@ -119,6 +125,9 @@ def picture_rows(
 ) -> list[dict]:
     """Colour, depth and labels with shadows and the rover itself, in JAX."""
     rows, median, share = [], None, None
+    alike = likeness(camera)
+    if alike < LIKENESS:
+        raise SystemExit(f"{camera.width} x {camera.height}: structural similarity {alike:.4f} is below {LIKENESS}")
     terrain = jax.device_put(model.terrain)
     for batch in batches:
         at_once = max(1, min(batch, given.pixels // (camera.width * camera.height)))
@@ -147,6 +156,7 @@ def picture_rows(
                 "mebibytes": None if needed is None else needed.temp_size_in_bytes / 2**20,
                 "median_error": median,
                 "labels": share,
+                "ssim": alike,
             }
         )
     return rows
