@@ -115,12 +115,12 @@ from matplotlib.figure import Figure
 
 
 def bars(steps):
-    figure = Figure(figsize=(7, 3.2), layout="constrained")
+    figure, words = Figure(figsize=(7, 3.2), layout="constrained"), {"fit": "fitted", "held_out": "held out"}
     axes, place = figure.subplots(), np.arange(len(steps))
     for shift, split, colour, hatch in ((-0.2, "fit", "#56B4E9", ""), (0.2, "held_out", "#0072B2", "//")):
-        axes.bar(place + shift, [e[split] for e in steps.values()], 0.38, color=colour, hatch=hatch, label=split)
+        axes.bar(place + shift, [e[split] for e in steps.values()], 0.38, color=colour, hatch=hatch, label=words[split])
     axes.axhline(1.0, color="black", linewidth=0.8, linestyle="--", label="noise")
-    axes.set_xticks(place, list(steps))
+    axes.set_xticks(place, [step.replace("_", " ") for step in steps])
     axes.set_ylabel("error, standard deviations")
     axes.legend(frameon=False)
     return figure

@@ -250,7 +250,7 @@ def _slope(axes: Axes, drive: RecordedDrive) -> None:
     axes.plot(drive.time, along, color=INK, label="along the heading")
     axes.plot(drive.time, across, color=GREEN, linestyle="--", label="across (up to the left)")
     style(axes, "slope, °")
-    axes.legend(fontsize=7, frameon=False, ncols=2)
+    axes.legend(fontsize=7, frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
 
 
 def _wheels(axes: Axes, drive: RecordedDrive, values: np.ndarray) -> None:
@@ -272,7 +272,7 @@ def _wheels(axes: Axes, drive: RecordedDrive, values: np.ndarray) -> None:
 def _slip(axes: Axes, drive: RecordedDrive) -> None:
     _wheels(axes, drive, drive.per_wheel("wheel_{}_slip_ratio"))
     style(axes, "slip ratio")
-    axes.legend(fontsize=7, frameon=False, ncols=4, handlelength=3.4)
+    axes.legend(fontsize=7, frameon=True, framealpha=0.85, edgecolor="none", ncols=4, handlelength=3.4)
 
 
 def _sinkage(axes: Axes, drive: RecordedDrive) -> None:
@@ -292,7 +292,7 @@ def _temperature(axes: Axes, drive: RecordedDrive) -> None:
     axes.plot(drive.time, winding[:, hottest], color=VERMILION, label=f"hottest: {where}")
     axes.plot(drive.time, housing[:, hottest], color=BLUE, linestyle="--", label="its housing")
     style(axes, "temperature, °C")
-    axes.legend(fontsize=7, frameon=False, ncols=3)
+    axes.legend(fontsize=7, frameon=True, framealpha=0.85, edgecolor="none", ncols=3)
 
 
 def _power(axes: Axes, drive: RecordedDrive) -> None:
