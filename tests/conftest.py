@@ -29,6 +29,16 @@ settings.register_profile("any machine", deadline=None, derandomize=True)
 settings.load_profile("any machine")
 
 
+LONGEST = ("test_hidden_subset.py", "test_windows.py", "test_effect_contract.py", "test_verbs_table.py")
+"""Files of a minute or more. They go first, or one of two processes would wait for the other at the end."""
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first; all else stays in its random order."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """`make test` compiles with few optimisations, which takes half the time; tests marked `optimised` do not."""
