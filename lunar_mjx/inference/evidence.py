@@ -593,11 +593,10 @@ def _density(
     quadratic[many:, many:] = np.diag(power[many:]) - own.T @ back
     # The trace of a product of two blocks of a symmetric matrix is the sum of its squared entries between them.
     traces[:many, :many] = member @ absorbed**2 @ member.T
+    # Traces of products of two filters: one product of matrices whose rows are the filters' entries.
+    traces[many:, many:] = filtered.reshape(groups, k * k) @ filtered.transpose(0, 2, 1).reshape(groups, k * k).T
+    traces[:many, many:] = member @ np.einsum("gij,ij->gi", filtered, inverse).T
     for c in range(groups):
-        traces[:many, many + c] = member @ np.einsum("ij,ji->i", filtered[c], inverse)
-        for d in range(c, groups):
-            both = float(np.sum(filtered[c] * filtered[d].T))
-            traces[many + c, many + d] = traces[many + d, many + c] = both
         # V^-1 V_c is the identity less the filter; squared, it leaves the count less twice the filter's trace, beside
         # the above.
         traces[many + c, many + c] += gram.count[c] - 2.0 * np.trace(filtered[c])
