@@ -9,6 +9,8 @@ drives tell as well.
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -57,6 +59,16 @@ class ChannelErrors:
     def times_s(self, levels: np.ndarray) -> dict[str, float]:
         """How long a channel's errors last, s, at a level (groups,) of each group."""
         return {s.channel: self._levels[levels[self._group[s.start]]][1] for s in self._observations.series}
+
+    def at_shares(self, shares: Mapping[str, float], times_s: Mapping[str, float]) -> np.ndarray | None:
+        """(groups,) levels at which channels have such errors, as `shares` and `times_s` tell them; None for none."""
+        found = np.full(self._kinds, -1)
+        for s in self._observations.series:
+            level = shares.get(s.channel, math.nan), times_s.get(s.channel, math.nan)
+            if level not in self._levels:
+                return None
+            found[self._group[s.start]] = self._levels.index(level)
+        return found
 
     def at(self, levels: np.ndarray) -> Observations:
         """The observations with errors of a level (groups,) of each group."""

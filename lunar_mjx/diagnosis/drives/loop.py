@@ -6,11 +6,11 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from lunar_mjx.diagnosis.build_problem import candidates_of
-from lunar_mjx.diagnosis.drives.form import DriveForm
+from lunar_mjx.diagnosis.drives.form import LEARNT, DriveForm
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.fitted_model import fitted_model
-from lunar_mjx.diagnosis.runs import Run
+from lunar_mjx.diagnosis.runs import COMPARISON_FILE, Run
 from lunar_mjx.diagnosis.weighed.answer import kept_start
 from lunar_mjx.diagnosis.weighed.form import Problem
 from lunar_mjx.effects import catalogue
@@ -42,7 +42,9 @@ def build_drives(
     drives = DriveProblem(logs, run.model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
     form = DriveForm(drives, settings, progress)
     kept = kept_start(run, form, frozenset())
-    form.start = form.start if kept is None else kept
+    if kept is not None:
+        told = run.load(COMPARISON_FILE) or {}
+        form.start, form.kept = kept, told if LEARNT.issubset(told) else {}
     return Problem((form,), drives.effects, drives.not_tested, settings, drives.unused)
 
 

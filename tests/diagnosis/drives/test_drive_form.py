@@ -350,3 +350,100 @@ def test_a_jump_within_the_step_of_a_derivative_is_no_slope():
     toy.edge = place[0] + 1e-9
     assert abs(toy.jacobian(form._whole(place), free)[1][7, 0] - smooth[7, 0]) > 1e4
     np.testing.assert_allclose(form.jacobian(place, free)[1], smooth, atol=1e-3)
+
+
+class Turning(Toy):
+    """A toy whose drag comes back to nothing at the amount over which secants are taken."""
+
+    def predict(self, u):
+        far = DriveSettings().secant * DriveSettings().effect_size
+        u = np.atleast_2d(u).copy()
+        u[:, 2] = np.where(np.abs(u[:, 2]) <= far, far / np.pi * np.sin(np.pi * u[:, 2] / far), u[:, 2])
+        return super().predict(u)
+
+
+class Deaf(Toy):
+    """A toy whose drag does nothing below a thousandth of its nominal size."""
+
+    def predict(self, u):
+        u = np.atleast_2d(u).copy()
+        u[:, 2] = np.sign(u[:, 2]) * np.maximum(np.abs(u[:, 2]) - 1e-3, 0.0)
+        return super().predict(u)
+
+
+@pytest.mark.parametrize("kind", [Turning, Deaf])
+def test_an_effect_shows_by_its_derivative_or_by_a_usual_amount_of_it(kind):
+    """Each of the two alone tells nothing of one of these toys."""
+    form = DriveForm(kind({"drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    drag = next(t for t in form.terms if t.name == "drag")
+    shown, nothing = (base.linear.evidence(form.listed(e))[0] for e in (frozenset({drag.name}), frozenset()))
+    assert shown > nothing + 5.0
+
+
+class Coupled(Toy):
+    """A toy whose drag is another one where a parameter is another one."""
+
+    def predict(self, u):
+        u = np.atleast_2d(u).copy()
+        u[:, 2] *= 1.0 + u[:, 0]
+        return super().predict(u)
+
+
+def test_signatures_are_those_of_where_the_refit_has_ended():
+    toy = Coupled({"a": 1.5, "b": -0.8})
+    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    assert form._seen is not None
+    there = form.jacobian(base.u, np.array([2]))[1][:, 0]
+    # a secant is up to a fifth shorter, as the toy's drag saturates; where the refit began both have two fifths of that
+    assert form._seen[:, 2] @ there / (there @ there) == pytest.approx(0.9, abs=0.13)
+
+
+def test_a_jump_at_nothing_of_an_effect_is_no_slope():
+    form = DriveForm(Toy({}), DriveSettings())  # type: ignore[arg-type]
+    slopes, secants = np.ones((len(form.observations), 1)), np.ones((len(form.observations), 1))
+    slopes[7] = 1e6
+    found = form._tamed(np.array([2]), slopes, secants)[0]
+    assert found[7] == 1.0
+    assert np.all(found == 1.0)
+
+
+def test_a_refit_that_was_kept_is_not_made_again():
+    toy = Toy({"a": 1.5, "b": -0.8, "drag": 1.0}, unlisted=2.0)
+    first = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    base = first.refit(frozenset(), None, None)
+    learnt, rows = first.learnt(base), toy.rows
+    again = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    again.start, again.kept = base.u, learnt
+    toy.rows = 0
+    other = again.refit(frozenset(), None, None)
+    assert toy.rows < 0.5 * rows
+    np.testing.assert_allclose(other.u, base.u, atol=0.1)
+    told = again.learnt(other)
+    assert told["log_evidence"] == pytest.approx(learnt["log_evidence"], abs=1.0)
+    assert {k: told[k] for k in module.LEARNT} == {k: learnt[k] for k in module.LEARNT}
+
+
+def test_a_refit_with_errors_that_are_tried_no_more_is_made_again():
+    form = DriveForm(Toy({"a": 1.5}), DriveSettings())  # type: ignore[arg-type]
+    channel = form.observations.series[0].channel
+    form.kept = {"jitter_s": 0.0, "channel_errors": {channel: 0.07}, "error_times_s": {channel: 1.0}}
+    assert form.refit(frozenset(), None, None).u[0] == pytest.approx(1.5, abs=0.3)
+    assert not form.kept
+
+
+@pytest.mark.parametrize("truth", [{"a": 1.5, "b": -0.8}, {"drag": 2.0}])
+def test_the_model_alone_predicts_no_worse_than_as_given_or_refitted(truth):
+    """Something unlisted as large as this a refit leaves to its port."""
+    form = DriveForm(Toy(truth, unlisted=1.0), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    fitted = form.observations.in_split("fit")
+
+    def error(u):
+        return np.sqrt(np.mean(form.told(u)[fitted] ** 2))
+
+    alone = error(form.alone(base))
+    assert alone <= error(base.u) + 1e-3
+    assert alone <= error(form.origin()) + 1e-3
+    assert alone < error(base.u) - 1e-3 or alone < error(form.origin()) - 1e-3
