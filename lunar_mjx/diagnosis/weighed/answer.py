@@ -367,6 +367,15 @@ def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[st
     whose searches ended so, six such names were wrong, each with more than 99 %.
     """
     named = {e for e in said.effects if not e.startswith("calibration: ")}
+    if said.verdict is Verdict.UNKNOWN and (estimates := named.difference(*refitted)):
+        # What is unlisted is linear and needs no refit; what would help beside it does.
+        told = said.sentence.partition(" Beside it ")[0]
+        told += (
+            f" A first-order estimate points to {' and '.join(sorted(estimates))} beside it, which is not named, as no "
+            "refit with it was made."
+        )
+        rest = tuple(e for e in said.effects if e not in estimates)
+        return dataclasses.replace(said, effects=rest, sentence=told), told + sentence.removeprefix(said.sentence)
     if said.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE) or any(named <= effects for effects in refitted):
         return said, sentence
     told = (

@@ -18,7 +18,7 @@ from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotation
 from lunar_mjx.diagnosis.verbs import explain
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unrefitted, _without
-from lunar_mjx.diagnosis.weighed.conclusion import conclude
+from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude
 from lunar_mjx.diagnosis.weighed.form import Problem, SearchSettings
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.inference.coordinates import Coordinate
@@ -248,6 +248,14 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     assert sentence.startswith("A first-order estimate points to drag. No refit with it was made")
     assert "%" not in sentence and "is missing" not in sentence
     assert _unrefitted(said, said.sentence, [*refitted, frozenset({"drag", "lag"})]) == (said, said.sentence)
+    # beside something unlisted it is no name either, and the port stands
+    beside = Conclusion(
+        Verdict.UNKNOWN, ("drag", "lag"), True, "soil", 0.99, "It acts at soil. Beside it drag and lag help."
+    )
+    told, sentence = _unrefitted(beside, beside.sentence + " More.", [frozenset({"lag"})])
+    assert (told.verdict, told.effects, told.port) == (Verdict.UNKNOWN, ("lag",), "soil")
+    assert sentence.startswith("It acts at soil. A first-order estimate points to drag beside it, which is not named")
+    assert sentence.endswith(" More.")
 
 
 def test_an_estimate_is_no_name_where_candidates_were_skipped_as_well(monkeypatch):
