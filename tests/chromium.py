@@ -5,10 +5,8 @@ from __future__ import annotations
 import base64
 import json
 import os
-import select
 import shutil
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +38,11 @@ class Browser:
 
     Attributes:
       problems: errors of the page and entries of its log. requests: addresses that it asked for.
-      patience_s: how long one call may take: what never comes is told instead of waited for. The longest call of the
-        proofs takes seconds; a busy machine takes ten times that, not a hundred.
+      most_frames: how often the page is drawn while `wait` looks: what never comes is told instead of waited for. It is
+        drawn 60 times a second where it is idle, and less often where it is busy.
     """
 
-    patience_s = 600.0
+    most_frames = 36_000
 
     def __init__(self, folder: Path, size: tuple[int, int] = (1280, 760)):
         assert CHROMIUM is not None
@@ -93,9 +91,8 @@ class Browser:
         if self._session:
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
-        deadline = time.monotonic() + self.patience_s
         while True:
-            answer = self._next(deadline, f"{method} {parameters.get('expression', '')}".strip())
+            answer = self._next()
             if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
                 self.problems.append(answer["params"])
             if answer.get("method") == "Network.requestWillBeSent":
@@ -104,11 +101,8 @@ class Browser:
                 assert "error" not in answer, answer["error"]
                 return answer["result"]
 
-    def _next(self, deadline: float, awaited: str) -> dict[str, Any]:
+    def _next(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
-            if not select.select([self._read], [], [], max(0.0, deadline - time.monotonic()))[0]:
-                self._process.kill()  # or closing would wait for it
-                raise TimeoutError(f"no answer from Chromium within {self.patience_s:g} s to: {awaited}")
             piece = os.read(self._read, 1 << 16)
             assert piece, "Chromium ended"
             self._rest += piece
@@ -125,9 +119,19 @@ class Browser:
         return result["result"].get("value")
 
     def wait(self, expression: str) -> Any:
-        """Waits until an expression is true; the page looks each time that it is drawn."""
-        look = f"const look = () => {{ const v = {expression}; v ? done(v) : requestAnimationFrame(look); }}; look();"
-        return self.value(f"new Promise(done => {{ {look} }})")
+        """Waits until an expression is true; the page looks each time that it is drawn.
+
+        Raises:
+          TimeoutError: it was drawn `most_frames` times, and the expression was never true.
+        """
+        look = (
+            f"let left = {self.most_frames}; const look = () => {{ const v = {expression}; "
+            "v || !left-- ? done(v || null) : requestAnimationFrame(look); }; look();"
+        )
+        found = self.value(f"new Promise(done => {{ {look} }})")
+        if found is None:
+            raise TimeoutError(f"not within {self.most_frames} frames of the page: {expression}")
+        return found
 
     def key(self, kind: str, code: str, key: str) -> None:
         """`kind` is keyDown or keyUp."""

@@ -595,17 +595,16 @@ class DriveForm(MeasuredForm):
         return self._see_all(u, free)
 
     def _take_kept(self) -> bool:
-        """Takes the errors that an earlier refit of these drives has chosen; whether there are such."""
+        """Whether an earlier refit of these drives has left errors of channels, which are taken then."""
+        kept, self.kept = self.kept, {}
         # Noise that is learnt from a refit is not among what is kept.
-        if not self.kept or self.drives.noise_unlearnt or self.kept["jitter_s"] not in self.settings.jitters_s:
-            self.kept = {}
+        if not kept or self.drives.noise_unlearnt or kept["jitter_s"] not in self.settings.jitters_s:
             return False
-        errors = self._errors_with(self.kept["jitter_s"])
-        levels = errors.at_shares(self.kept["channel_errors"], self.kept["error_times_s"])
+        errors = self._errors_with(kept["jitter_s"])
+        levels = errors.at_shares(kept["channel_errors"], kept["error_times_s"])
         if levels is None:
-            self.kept = {}
             return False
-        self.jitter_s = self.kept["jitter_s"]
+        self.kept, self.jitter_s = kept, kept["jitter_s"]
         self._take(errors, levels)
         return True
 

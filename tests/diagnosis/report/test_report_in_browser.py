@@ -93,6 +93,6 @@ def test_figures_follow_the_page_into_the_dark(tmp_path: Path, browser: Browser,
 
 
 def test_what_never_comes_is_told_by_name(browser: Browser) -> None:
-    browser.patience_s = 0.5
-    with pytest.raises(TimeoutError, match=r"within 0\.5 s.*window\.missing"):
+    browser.most_frames = 30
+    with pytest.raises(TimeoutError, match=r"within 30 frames.*window\.missing"):
         browser.wait("window.missing")
