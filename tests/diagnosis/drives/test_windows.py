@@ -27,6 +27,7 @@ from lunar_mjx.model.file import load_model, save_model
 from lunar_mjx.model.hard_floor import hard_floor
 from lunar_mjx.resources import shipped
 
+pytestmark = pytest.mark.optimised
 RADIUS, SAMPLES, INTERVAL = 0.165, 8, 0.15
 NOISE = (Noise(0.25, 0.0, 1.0), Noise(0.25, 0.0, 1.0), Noise(0.01, 0.0, 1.0), Noise(0.05, 0.0, 1.0))
 
