@@ -16,8 +16,9 @@ export MUJOCO_GL ?= disable
 export PIP_NO_COMPILE ?= 1
 
 # Tests compile far more than they run; these take half the time of the usual ones. (Tests marked `optimised` do not, and
-# test-all does not.)
-FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1
+# test-all does not.) Thousands of programs compile in less than the second below which JAX keeps none: kept, they are shared
+# by both processes and by the next run.
+FAST_COMPILE := JAX_DISABLE_MOST_OPTIMIZATIONS=1 JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test fast-tests busy-test test-all for-proofs proofs all-proofs lint docs foreign-tune foreign-report hashes clean

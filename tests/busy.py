@@ -36,7 +36,7 @@ WORKERS = 2
 PAIRS, PER_PAIR = "LUNAR_MJX_BUSY_PAIRS", "LUNAR_MJX_BUSY_WORKERS"
 """Environment variables that tell test processes their pairs (0,1;2,3;...), and how many share one."""
 SPIN = "while True: pass"
-FAST_COMPILE = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+FAST_COMPILE = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 """As the Makefile sets for `make test`."""
 
 
