@@ -17,7 +17,8 @@ from lunar_mjx.agents.from_brax.begin import begin_with
 from lunar_mjx.agents.learner import EPISODE, Learner, TrainState
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.record import Progress, Record
-from lunar_mjx.errors import UserError
+from lunar_mjx.envs.navigation.env import NavigationEnv
+from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.together import agreed, everywhere, leads, of_the_first
 
 if TYPE_CHECKING:
@@ -142,6 +143,7 @@ class _Loop:
         elif self.checkpoints:
             # Else the newest of the old training would be resumed by the next command.
             self.checkpoints.clear()
+        self._renewing(None if restored is None else restored[1].get("renewal"))
         if restored is not None:
             self.state, notes = restored
             self.epochs, self.elapsed, rows = notes["epochs"], notes["elapsed"], notes["rows"]
@@ -154,6 +156,22 @@ class _Loop:
             self.record = Record(folder, rows) if folder and self.lead else None
         self.rows: list[dict[str, Any]] = self.record.rows if self.record else list(rows)
         self.progress = Progress(run.steps, run.time_limit, run.quiet or not self.lead)
+
+    def _renewing(self, notes: dict[str, Any] | None) -> None:
+        """Begins to renew the ladder's worlds where the task says so; goes on from a checkpoint's notes."""
+        env: Any = self.learner.env
+        self.renewal = env.renewal() if isinstance(env, NavigationEnv) else None
+        if self.renewal is None:
+            return
+        if jax.process_count() > 1:
+            raise bad_input("train", "renew", True, "is not for several processes", "leave it out")
+        pool = None
+        if notes is not None:
+            pool = self.renewal.restore(env.pool(env.config.place_seed), notes)
+        elif int(env.params.begins[-1]) < len(env.params.begins):
+            # an earlier training has left others
+            pool = env.pool(env.config.place_seed)
+        env.params = env.on_renewed(self.renewal, env.params, pool)
 
     def run(self, callback: Callback | None) -> Result:
         c, total = self.config, max(1, math.ceil(self.config.steps / self.per_epoch))
@@ -192,6 +210,9 @@ class _Loop:
         self.state, (numbers, episodes) = self.learner.epoch(self.learner.env.params, self.state)
         # Waits for the epoch: from here its time is known.
         row = {k: float(v) for k, v in jax.device_get(numbers).items()}
+        if self.renewal is not None:
+            env: Any = self.learner.env
+            env.params = env.renewed(self.renewal, env.params, self.state.env)
         first = self.epochs * self.per_epoch
         self.epochs += 1
         if row.pop("tripped") or row.pop("broken", 0.0):
@@ -220,6 +241,7 @@ class _Loop:
     def _save(self) -> None:
         assert self.checkpoints is not None
         notes = {"epochs": self.epochs, "elapsed": self.elapsed, "rows": self.rows, "episodes": self.episodes}
+        notes |= {} if self.renewal is None else {"renewal": self.renewal.notes()}
         self.checkpoints.save(self.epochs, self.state, plain(notes))
 
     def _diverged(self) -> None:

@@ -136,24 +136,24 @@ def train(
 AgentArgument = Annotated[
     str,
     typer.Argument(
-        help="policy.npz, a shipped policy (luvmi_x, viper, luvmi_x/ladder-3), or zero, random, scripted, reactive, "
-        "mapper, planner."
+        help="policy.npz, a shipped policy (luvmi_x, viper, luvmi_x/ladder-3), or zero, random, scripted, rocking, "
+        "reactive, mapper, planner."
     ),
 ]
 AgentOption = Annotated[str | None, typer.Option("--agent", help="The same as an option, for agents without a policy.")]
 TaskOption = Annotated[
-    str, typer.Option(help="Task for agents without a policy: paper, consistent, large, ladder/1 to ladder/5.")
+    str, typer.Option(help="Task for agents without a policy: paper, consistent, large, escape, ladder/1 to ladder/5.")
 ]
 
 
 SHIPPED_AGENT = "luvmi_x"
 
 
-def _one_agent(argument: str, option: str | None) -> str:
-    """The agent that was named, as an argument or as an option."""
+def one_agent(source: str, argument: str, option: str | None) -> str:
+    """The agent that was named to the verb `source`, as an argument or as an option."""
     # The default of the argument cannot be told from the same name typed.
     if option is not None and argument not in (SHIPPED_AGENT, option):
-        raise bad_input("evaluate", "--agent", option, f"is given beside {argument!r}", "name one agent")
+        raise bad_input(source, "--agent", option, f"is given beside {argument!r}", "name one agent")
     return argument if option is None else option
 
 
@@ -177,7 +177,7 @@ def evaluate(
     from lunar_mjx.agents.play import knowing, open_agent
     from lunar_mjx.agents.run import soil_note, unseen_params
 
-    wanted = _one_agent(agent, agent_option)
+    wanted = one_agent("evaluate", agent, agent_option)
     made, act, unseen = open_agent(wanted, task, env_options(env))
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}
@@ -224,7 +224,7 @@ def play(
     from lunar_mjx.agents.run import unseen_params
 
     require_view(view)
-    wanted = _one_agent(agent, agent_option)
+    wanted = one_agent("play", agent, agent_option)
     made, act, unseen = open_agent(wanted, task, env_options(env))
     if terrain is not None:
         unseen = {**unseen, "terrain": terrain}

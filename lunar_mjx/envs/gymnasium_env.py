@@ -168,8 +168,8 @@ class NavigationGymEnv(SingleEnv):
     `episode_return` and the ends.
 
     ## Arguments
-    `task` = `paper`, `consistent` (default), `large` or `ladder/1` to `ladder/5`, which are also
-    `LunarMJX/Ladder1-v0` and so on; `rover`, `terrain`, `preset`, `model`, `engine`; every field of
+    `task` = `paper`, `consistent` (default), `large`, `escape` (also `LunarMJX/Escape-v0`) or `ladder/1` to `ladder/5`
+    (also `LunarMJX/Ladder1-v0` and so on); `rover`, `terrain`, `preset`, `model`, `engine`; every field of
     `lunar_mjx.envs.NavigationConfig`, such as `decimation` (physics steps per action), `episode_time` or
     `goal_distance`; `render_mode="rgb_array"`, `view` = `auto`, `camera` or `top`.
 
@@ -275,12 +275,11 @@ def register() -> None:
         # This module may be imported by several names, and Gymnasium warns of a second registration.
         if name not in gym.registry:
             gym.register(name, entry_point=single, vector_entry_point=vector)
-    for rung in RUNGS:
-        name = f"LunarMJX/Ladder{rung}-v0"
+    tasks = {"Escape": "escape", **{f"Ladder{rung}": f"ladder/{rung}" for rung in RUNGS}}
+    for word, task in tasks.items():
+        name = f"LunarMJX/{word}-v0"
         if name not in gym.registry:
-            gym.register(
-                name, entry_point=NavigationGymEnv, vector_entry_point=VectorEnv, kwargs={"task": f"ladder/{rung}"}
-            )
+            gym.register(name, entry_point=NavigationGymEnv, vector_entry_point=VectorEnv, kwargs={"task": task})
 
 
 register()

@@ -1,5 +1,8 @@
-"""Agents that learn nothing, to look at an environment and to beat: zero, random, straight for the goal, around what
-the height scan shows, along the way on a map drawn while driving, and along that of one who knows the whole map."""
+"""Agents that learn nothing, to look at an environment and to beat.
+
+Zero, random, straight for the goal, to and fro out of a hole, around what the height scan shows, along the way on a map
+drawn while driving, and along that of one who knows the whole map.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +23,16 @@ from lunar_mjx.errors import bad_input
 Agent = Callable[[State, Any], Any]
 """Function of the batch's state and a random key to actions (env, action)."""
 
-AGENTS = ("zero", "random", "scripted", "reactive", "mapper", "planner")
+AGENTS = ("zero", "random", "scripted", "rocking", "reactive", "mapper", "planner")
 
 
 def make_agent(name: str, env: Environment, params: Any = None) -> Agent:
     """An agent by name.
 
-    `zero` does nothing, `random` draws uniformly, `scripted` drives straight for the goal, `reactive` steers around
-    what the height scan shows. `mapper` follows the way on the map of what it has seen, `planner` the shortest way over
-    the whole map of a ladder's worlds, which it knows.
+    `zero` does nothing, `random` draws uniformly, `scripted` drives straight for the goal (straight ahead where the
+    task is to escape), `rocking` to and fro until it is free, `reactive` steers around what the height scan shows.
+    `mapper` follows the way on the map of what it has seen, `planner` the shortest way over the whole map of a
+    ladder's worlds, which it knows.
 
     Args:
       name: of the agent. env: to drive in. params: of the environment, whose map `planner` knows; `env.params` if None.
@@ -52,6 +56,8 @@ def make_agent(name: str, env: Environment, params: Any = None) -> Agent:
     if env.config.action not in modes:
         remedy = f"use the action mode {' or '.join(modes)}"
         raise bad_input("agent", name, env.config.action, "is no action mode that it can drive in", remedy)
+    if name == "rocking":
+        return rocking_rule(env)
     if name == "reactive":
         return reactive_rule(env)
     if name == "mapper":
@@ -76,6 +82,9 @@ def _driver(env: NavigationEnv) -> Agent:
     def act(state: State, key: Any) -> Any:
         goal = state.info["goal_body"]
         bearing = jnp.arctan2(goal[:, 1], goal[:, 0])
+        if env.config.escape_distance:
+            # no goal to steer for
+            bearing = jnp.zeros_like(bearing)
         wanted = jnp.clip(1.5 * bearing, -limit, limit)
         if torque:
             # a proportional controller for the angle: the motor's own damping does the rest
@@ -121,6 +130,39 @@ def _wheels(env: NavigationEnv, drive: Any, steer: Any) -> Any:
     """Actions of the mode `velocity` from speed and steering, each (env,)."""
     first = jnp.stack([drive, jnp.clip(steer, -1.0, 1.0)], axis=-1)
     return jnp.pad(first, ((0, 0), (0, env.action_size - 2)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Rocking:
+    """Settings of the rule that rocks a rover out of its hole; choices.
+
+    Attributes:
+      period: s of once ahead and once back. free: m from the hole from which on it drives away from it.
+    """
+
+    period: float = 6.0
+    free: float = 0.5
+
+
+def rocking_rule(env: NavigationEnv, settings: Rocking | None = None) -> Agent:
+    """Full speed ahead and back in turn; once out, on to the side that it is on.
+
+    Raises:
+      UserError: the environment is none to escape in, where `goal_body` would be a goal to drive away from.
+    """
+    if not env.config.escape_distance:
+        raise bad_input("agent", "rocking", env.config.escape_distance, "is no escape_distance", "use the task escape")
+    r = settings or Rocking()
+
+    def act(state: State, key: Any) -> Any:
+        hole = state.info["goal_body"]
+        time = state.inner.steps.astype(hole.dtype) * env.control_interval
+        rock = jnp.where(time % r.period < 0.5 * r.period, 1.0, -1.0)
+        out = jnp.where(hole[:, 0] < 0.0, 1.0, -1.0)
+        drive = jnp.where(jnp.linalg.norm(hole, axis=-1) > r.free, out, rock)
+        return _wheels(env, drive, jnp.zeros_like(drive))
+
+    return act
 
 
 def reactive_rule(env: NavigationEnv, settings: Reactive | None = None) -> Agent:

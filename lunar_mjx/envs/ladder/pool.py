@@ -122,7 +122,7 @@ def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: f
     Raises:
       UserError: no world has a pair of places as the rung asks.
     """
-    made = _worlds(rung, worlds, half_width, levels)(jax.random.PRNGKey(seed), jnp.float32(hardness))
+    made = maker(rung, worlds, half_width, levels)(jax.random.PRNGKey(seed), jnp.float32(hardness))
     world, goals, clear, slope = made
     valid = np.asarray(goals["valid"])
     if not valid.any():
@@ -144,7 +144,7 @@ def make_pool(rung: Rung, seed: int, worlds: int, half_width: float, hardness: f
 
 
 @functools.cache
-def _worlds(rung: Rung, worlds: int, half_width: float, levels: int) -> Any:
+def maker(rung: Rung, worlds: int, half_width: float, levels: int) -> Any:
     """The compiled maker: key and hardness to worlds, their goals, and which nodes are clear and how steep, some worlds
     at a time."""
 
@@ -202,25 +202,45 @@ def _atlas(rung: Rung, world: World, middles: np.ndarray, across: int) -> Terrai
 
 def _places(goals: dict[str, Any], valid: np.ndarray, middles: np.ndarray, seed: int) -> Places:
     """The pairs of the goals that have starts, repeated until there are as many as with all goals."""
-    starts, shortest = (np.asarray(goals[k]) for k in ("starts", "shortest"))
+    starts = goals["starts"].shape[2]
     good = np.flatnonzero(valid.reshape(-1))
     # Repeated to a fixed number, so that another seed's pool has the same shapes.
-    way = np.repeat(np.resize(good, valid.size), starts.shape[2])
-    world_number = np.tile(np.arange(starts.shape[2]), valid.size)
+    way = np.repeat(np.resize(good, valid.size), starts)
+    number = np.tile(np.arange(starts), valid.size)
     world = way // valid.shape[1]
-    start = starts.reshape(-1, starts.shape[2], 2)[way, world_number] + middles[world]
-    goal = np.asarray(goals["goal"]).reshape(-1, 2)[way] + middles[world]
+    return pairs(goals, way, number, world, middles[world], np.random.default_rng([seed, 17]))
+
+
+def pairs(
+    goals: dict[str, Any],
+    way: np.ndarray,
+    number: np.ndarray,
+    world: np.ndarray,
+    middle: np.ndarray,
+    draw: np.random.Generator,
+) -> Places:
+    """Pairs of start and goal, all arguments leading with `place`.
+
+    Args:
+      goals: of some worlds, as `draw_goal` tells them. way: which of their goals, counted through. number: which of its
+        starts. world: number of the world. middle: (place, 2) of it, m. draw: of the headings to arrive in.
+    """
+
+    def of_goals(name: str) -> np.ndarray:
+        array = np.asarray(goals[name])
+        return array.reshape(-1, *array.shape[2:])
+
+    start = of_goals("starts")[way, number] + middle
+    goal = of_goals("goal")[way] + middle
     bearing = np.arctan2(*(goal - start).T[::-1])
     # from any side but the far one: a rover need not drive around its goal
-    arrival = bearing + np.random.default_rng([seed, 17]).uniform(-0.5 * np.pi, 0.5 * np.pi, len(way))
-    shortest = shortest.reshape(-1, starts.shape[2])[way, world_number]
+    arrival = bearing + draw.uniform(-0.5 * np.pi, 0.5 * np.pi, len(way))
+    shortest = of_goals("shortest")[way, number]
     start, goal, arrival, shortest = (jnp.asarray(a, jnp.float32) for a in (start, goal, arrival, shortest))
     places = Places(start, goal, arrival, shortest, jnp.asarray(way), jnp.asarray(world))
     if "nearer" not in goals:
         return places
-    nearer, left = (np.asarray(goals[k]) for k in ("nearer", "nearer_shortest"))
-    nearer = nearer.reshape(-1, *nearer.shape[2:])[way, world_number] + middles[world][:, None]
-    left = left.reshape(-1, *left.shape[2:])[way, world_number]
+    nearer, left = of_goals("nearer")[way, number] + middle[:, None], of_goals("nearer_shortest")[way, number]
     return dataclasses.replace(
         places, nearer=jnp.asarray(nearer, jnp.float32), nearer_shortest=jnp.asarray(left, jnp.float32)
     )

@@ -71,6 +71,9 @@ class NavigationConfig:
       curriculum_levels: of the ladder's training: on level k of n a rover begins on the shortest way where k/n of it
         is left. Every success raises a rover's level by one, every failure lowers it. 0 or 1 for none; evaluations
         (`NavigationEnv.place`) are always on the last level.
+      renew: a training makes the ladder's worlds anew while it goes on, each when no rover is in it (`ladder.renewal`).
+      escape_distance: episodes begin with the rover dug in (`navigation.digging`), and it succeeds this far from there,
+        on any side; observations and rewards of the goal are then of the place to get away from. 0: drive to a goal.
     """
 
     decimation: int = 50
@@ -116,6 +119,8 @@ class NavigationConfig:
     worlds: int = 0
     hardness: float = 1.0
     curriculum_levels: int = 0
+    renew: bool = False
+    escape_distance: float = 0.0
 
     def __post_init__(self) -> None:
         _check(self)
@@ -167,7 +172,7 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", name, getattr(c, name), "is not positive", "give a number above zero")
     for name in ("success", "failure", "edge", "start_yaw"):
         require_finite("navigation", name, getattr(c, name))
-    for name, most in (("delay", 10.0), ("drift", 1.0), ("mast", 100.0)):
+    for name, most in (("delay", 10.0), ("drift", 1.0), ("mast", 100.0), ("escape_distance", 1000.0)):
         value = getattr(c, name)
         # True counts as 1 in Python: `drift=true` would be a rover that errs by its whole way.
         if isinstance(value, bool | str):
@@ -192,7 +197,7 @@ def _check(c: NavigationConfig) -> None:
         raise bad_input("navigation", "camera_pitch_deg", c.camera_pitch_deg, "is no pitch", "give -90 to 90")
     # the optics and the light refuse values that make no sense, in words of their own
     _ = c.camera, c.sun
-    for name in ("tally", "four_wheel_steering", "posterior"):
+    for name in ("tally", "four_wheel_steering", "posterior", "renew"):
         if not isinstance(getattr(c, name), bool):
             raise bad_input("navigation", name, getattr(c, name), "is neither true nor false", "give one of them")
     if not all(isinstance(r, Range) for r in c.randomise):
@@ -226,6 +231,11 @@ def _check(c: NavigationConfig) -> None:
     if c.rung:
         # Refuses a rung that does not exist, in words of its own.
         get_rung(c.rung)
+    if c.renew and not c.rung:
+        raise bad_input("navigation", "renew", c.renew, "is for the ladder only", "leave it out")
+    if c.escape_distance and c.rung:
+        problem = f"does not go with rung = {c.rung}: its worlds have goals"
+        raise bad_input("navigation", "escape_distance", c.escape_distance, problem, "leave it out")
     if c.curriculum_levels > 1 and not c.rung:
         given = c.curriculum_levels
         raise bad_input("navigation", "curriculum_levels", given, "is for the ladder only", "leave it out")
@@ -273,6 +283,13 @@ UNSEEN_SOIL = (
 motors; outside training's range in every parameter. The weak end of all ranges at once is no test: slip is 0.7 on flat
 ground, and 9 rovers of 10 dig in on the slopes of `world:train` without any rock."""
 
+SOFT_SOIL = (
+    Range("soil.k_phi", 0.15, 0.6, "log", relative=True),
+    Range("soil.cohesion", 0.25, 1.0, "log", relative=True),
+    Range("soil.friction_angle", 0.75, 0.95, relative=True),
+)
+"""Soils in which LUVMI-X digs itself in on level ground; a choice. In lunar nominal soil, at 1, it drives off."""
+
 LOW_CHARGE = Range("battery.initial", 0.055, 0.075)
 """State of charge at which drives on a battery begin: 0.5 to 2.5 % above the cut-off, 10 to 48 W h. Electronics of 60 W
 alone empty that in 10 to 48 minutes of shadow, and 500 m take LUVMI-X 12 minutes or more."""
@@ -298,6 +315,26 @@ TASKS: dict[str, NavigationConfig] = {
         randomise=SOIL_RANGES,
         divergence="reset",
     ),
+    "escape": NavigationConfig(
+        # 4 actions a second: rocking takes seconds, and a learner sees ahead by actions
+        decimation=125,
+        action="velocity",
+        four_wheel_steering=True,
+        # what the bus voltage of the preset `field` allows: both models of the soil are driven alike
+        top_speed=0.25,
+        observations=tuple(b for b in EGOCENTRIC if b != "height_scan"),
+        privileged=("sinkage", "temperatures", "drawn"),
+        episode_time=60.0,
+        weights={"away": 20.0, "tilt": 0.05, "excite": 0.02, "jerkiness": 0.02},
+        failure=-100.0,
+        # to stand still is where it begins, and no end
+        stuck_time=1e6,
+        places=256,
+        randomise=SOFT_SOIL,
+        divergence="reset",
+        # two lengths of LUVMI-X
+        escape_distance=2.0,
+    ),
 }
 
 
@@ -321,8 +358,8 @@ def _ladder(number: int) -> NavigationConfig:
 
 TASKS |= {f"ladder/{number}": _ladder(number) for number in RUNGS}
 """`paper`: section V with its reward as printed. `consistent`: the same with signed progress. `large`: the task of the
-large-batch trainings, goals 10 to 40 m away over rough ground, drawn soils and motors. `ladder/1` to `ladder/5`: the
-rungs of the ladder."""
+large-batch trainings, goals 10 to 40 m away over rough ground, drawn soils and motors. `escape`: get out of a hole that
+the wheels have dug in soft soil. `ladder/1` to `ladder/5`: the rungs of the ladder."""
 
 UNSAID: dict[str, tuple[str, str]] = {
     "rover": ("luvmi_x", "the smaller of the two that the paper ships; every setting takes viper as well"),

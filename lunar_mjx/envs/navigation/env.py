@@ -19,11 +19,13 @@ from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.effects.power.supply import charge_of
 from lunar_mjx.effects.presets import DEFAULT_PRESET
-from lunar_mjx.envs.core import State, side_by_side, where
+from lunar_mjx.envs.core import State, side_by_side, split_keys, where
 from lunar_mjx.envs.ladder import chart
 from lunar_mjx.envs.ladder.pool import Pool, make_pool, way_left
-from lunar_mjx.envs.ladder.rungs import get_rung
-from lunar_mjx.envs.navigation import kalman, randomise, rewards, sensing, tally
+from lunar_mjx.envs.ladder.renewal import Renewal, begins, worlds_in_use
+from lunar_mjx.envs.ladder.renewal import pick as pick_open
+from lunar_mjx.envs.ladder.rungs import Rung, get_rung
+from lunar_mjx.envs.navigation import digging, kalman, randomise, rewards, sensing, tally
 from lunar_mjx.envs.navigation.actions import action_map, reachable_speed
 from lunar_mjx.envs.navigation.config import TASKS, NavigationConfig
 from lunar_mjx.envs.navigation.observations import CAMERA, Scene, observe
@@ -65,6 +67,8 @@ class NavigationParams:
       pool: the ladder's worlds, for planners and the reward `way`; None elsewhere.
       spread: of the model's posterior; None unless it is drawn from.
       least_level: of the curriculum, from 0: below it no rover begins; None without one.
+      begins: (place,) see `renewal.begins`; None where episodes begin at all places.
+      dug: (place, ...) rovers that have dug themselves in; None unless the task is to escape.
     """
 
     system: Params
@@ -79,6 +83,8 @@ class NavigationParams:
     pool: Pool | None = None
     spread: randomise.Spread | None = None
     least_level: Any = None
+    begins: Any = None
+    dug: digging.Dug | None = None
 
 
 @pytree
@@ -285,14 +291,29 @@ class NavigationEnv:
         )
         arrays = [jnp.asarray(a, jnp.result_type(float)) for a in (starts, goals, bounds, gains)]
         shortest = jnp.asarray(np.hypot(*(goals - starts).T), arrays[0].dtype) if c.tally else None
-        return NavigationParams(default_params(model), *arrays, shortest=shortest, spread=spread)
+        params = NavigationParams(default_params(model), *arrays, shortest=shortest, spread=spread)
+        if not c.escape_distance:
+            return params
+        # Made once and kept: an episode's reset then only picks, and no rover waits for another to dig.
+        found = self._dig(params, split_keys(jax.random.PRNGKey(number), c.places))
+        return dataclasses.replace(params, dug=digging.stuck_ones(*found))
+
+    @functools.cached_property
+    def _dig(self) -> Any:
+        """The compiled maker: parameters and keys to rovers that have spun, what they drew, and which are stuck."""
+
+        def dig(params: NavigationParams, keys: Any) -> tuple[Physics, dict[str, Any], Any]:
+            fresh = self._fresh(params, keys)
+            system, axes = randomise.apply(params.system, fresh.drawn)
+            physics, stuck = digging.spin(self.system, system, axes, fresh.physics, self.actions)
+            return physics, fresh.drawn, stuck
+
+        return jax.jit(dig)
 
     def pool(self, seed: int, hardness: float | None = None) -> Pool:
         """The ladder's worlds of a seed, for this rover."""
         c = self.config
-        half_width = (self._outline or tally.Outline(self.system)).half[1] + 0.1
-        # Whole multiples of LUVMI-X's world: grids and boulders then divide as they do there.
-        rung = get_rung(c.rung).scaled(max(1.0, round(half_width / 0.4)))
+        rung, half_width = self._rung()
         hardness = c.hardness if hardness is None else hardness
         # Who begins within the goal's radius has arrived: such a level would teach nothing, and always be passed.
         if self._levels * c.goal_radius >= rung.goal_distance[0]:
@@ -300,6 +321,56 @@ class NavigationEnv:
             remedy = f"give less than {rung.goal_distance[0] / c.goal_radius:g}"
             raise bad_input("navigation", "curriculum_levels", c.curriculum_levels, problem, remedy)
         return make_pool(rung, seed, c.worlds or rung.worlds, half_width, hardness, self._levels)
+
+    def _rung(self) -> tuple[Rung, float]:
+        """The rung for this rover, and half its width with a margin, m."""
+        half_width = (self._outline or tally.Outline(self.system)).half[1] + 0.1
+        # Whole multiples of LUVMI-X's world: grids and boulders then divide as they do there.
+        return get_rung(self.config.rung).scaled(max(1.0, round(half_width / 0.4))), half_width
+
+    def renewal(self) -> Renewal | None:
+        """Makes the ladder's worlds anew between epochs of a training (`renewed`); None unless the task says so.
+
+        Raises:
+          UserError: a single world.
+        """
+        c = self.config
+        if not c.renew:
+            return None
+        rung, half_width = self._rung()
+        return Renewal(rung, c.place_seed, c.worlds or rung.worlds, half_width, c.hardness, self._levels)
+
+    def renewed(self, renewal: Renewal, params: NavigationParams, state: State) -> NavigationParams:
+        """The parameters with all worlds anew in which no episode of `state` is under way or prepared.
+
+        Nothing that is under way changes, and shapes stay, so that nothing is compiled again.
+        """
+        inner, pool = state.inner, self._whole(params)
+        count = len(renewal.generation)
+        used = worlds_in_use(pool.places.world, count, inner.place, inner.ready.inner.place, inner.used)
+        pool = renewal(pool, used)
+        return params if pool is None else self.on_renewed(renewal, params, pool)
+
+    def _whole(self, params: NavigationParams) -> Pool:
+        """The pool with its map, which the parameters keep but once."""
+        assert params.pool is not None
+        return dataclasses.replace(params.pool, terrain=params.system.terrain)
+
+    def on_renewed(self, renewal: Renewal, params: NavigationParams, pool: Pool | None = None) -> NavigationParams:
+        """The parameters on a pool of which only the open worlds are begun in; on their own if None."""
+        pool = self._whole(params) if pool is None else pool
+        at, heights = pool.places, pool.terrain.field.heights
+        return dataclasses.replace(
+            params,
+            system=dataclasses.replace(params.system, terrain=pool.terrain),
+            starts=at.starts,
+            goals=at.goals,
+            shortest=None if params.shortest is None else at.shortest,
+            arrivals=None if params.arrivals is None else at.arrivals,
+            ground=jnp.stack([heights.min(), heights.max()]),
+            pool=dataclasses.replace(pool, terrain=None),
+            begins=begins(at.world, renewal.is_open),
+        )
 
     def _on_pool(self, model: Model, pool: Pool, bounds: Any, gains: Any) -> NavigationParams:
         from lunar_mjx.dynamics.system import default_params
@@ -319,6 +390,7 @@ class NavigationEnv:
             # the map is in `system` already
             pool=dataclasses.replace(pool, terrain=None),
             least_level=jnp.int32(self._levels - 1) if self._levels else None,
+            begins=begins(at.world, np.ones(len(pool.middles), bool)) if c.renew else None,
         )
 
     @functools.cached_property
@@ -368,6 +440,10 @@ class NavigationEnv:
 
         Next episodes are prepared with `params` as they were then: after another terrain or range, call `reset`.
         """
+        return self.restarted(params, self.act(params, state, action))
+
+    def act(self, params: NavigationParams, state: State, action: Any) -> State:
+        """The state after an action, that of the episode that ended where one did; `step` goes on from it."""
         c, inner = self.config, state.inner
         # before rewards see it: an agent must not be punished or paid for what the motors never got
         action = jnp.clip(action, -1.0, 1.0).astype(inner.last_action.dtype)
@@ -422,24 +498,22 @@ class NavigationEnv:
         if c.divergence == "reset":
             # the successor of a state that is gone carries no value, but must not poison a batch
             final_obs, final_privileged = bounded(final_obs), bounded(final_privileged)
-        return side_by_side(
-            self._restart(
-                params,
-                inner,
-                State(
-                    final_obs,
-                    final_privileged,
-                    reward,
-                    terminated,
-                    truncated,
-                    final_obs,
-                    final_privileged,
-                    metrics,
-                    info,
-                    inner,
-                ),
-            )
+        return State(
+            final_obs,
+            final_privileged,
+            reward,
+            terminated,
+            truncated,
+            final_obs,
+            final_privileged,
+            metrics,
+            info,
+            inner,
         )
+
+    def restarted(self, params: NavigationParams, after: State) -> State:
+        """The state of `act` with new episodes where one ended: `step` in two parts, for who records the ends."""
+        return side_by_side(self._restart(params, after.inner, after))
 
     def _restart(self, params: NavigationParams, inner: Inner, state: State) -> State:
         """Begins anew where the episode ended, keeping the final observations.
@@ -582,6 +656,8 @@ class NavigationEnv:
         position_xy = view.position[:, :2]
         inside = ((position_xy > view.corners[:, 0]) & (position_xy < view.corners[:, 1])).all(-1)
         reached = rewards.reached(to_goal, c.goal_radius)
+        if c.escape_distance:
+            reached = rewards.length(to_goal) > c.escape_distance
         if c.arrive_within < np.pi and view.arrival is not None:
             reached = reached & (jnp.cos(view.arrival - view.yaw) > np.cos(c.arrive_within))
         end_flags = {
@@ -624,23 +700,20 @@ class NavigationEnv:
             level = self._first_level(params, keys)
         split = _split(keys)
         # One key for each environment: what an episode draws does not depend on how many others run beside it.
-        pick = jax.vmap(lambda k: jax.random.randint(k, (), 0, params.starts.shape[0]))(split[:, 1])
+        if params.begins is None:
+            pick = jax.vmap(lambda k: jax.random.randint(k, (), 0, params.starts.shape[0]))(split[:, 1])
+        else:
+            pick = pick_open(params.begins, jax.vmap(jax.random.uniform)(split[:, 1]))
         start, goal = params.starts[pick], params.goals[pick]
         if level is not None and params.pool is not None:
             start = params.pool.places.nearer[pick, level]
-        turn = jax.vmap(lambda k: jax.random.uniform(k, (), minval=-1.0, maxval=1.0))(split[:, 2])
-        # Headings are drawn about the goal's bearing.
-        bearing = jnp.arctan2(goal[:, 1] - start[:, 1], goal[:, 0] - start[:, 0])
-        drawn = randomise.draw(c.randomise, params.system, params.bounds, split[:, 3])
-        if params.spread is not None:
-            # Keys of its own: ranges draw the same numbers with and without a posterior beside them.
-            own = jax.vmap(lambda k: jax.random.fold_in(k, 1))(split[:, 3])
-            drawn |= randomise.draw_spread(params.spread, params.system, own)
-        system, axes = randomise.apply(params.system, drawn)
-        warm = drawn.get("winding_temperature")
-        physics = jax.vmap(self.system.reset, in_axes=(axes, 0, 0, 0, None if warm is None else 0))(
-            system, start[:, 0], start[:, 1], bearing + c.start_yaw * turn, warm
-        )
+        if params.dug is None:
+            physics, drawn = self._placed(params, split, start, goal)
+        else:
+            dug = jax.tree.map(lambda a: a[pick], params.dug)
+            physics, drawn = dug.physics, dug.drawn
+            # The place to get away from takes the goal's.
+            start = goal = physics.qpos[:, :2]
         position = physics.qpos[:, :3]
         zero, wheels = jnp.zeros(count, position.dtype), jnp.zeros((count, self._wheels), position.dtype)
         return Inner(
@@ -671,6 +744,24 @@ class NavigationEnv:
             if "visited" in self._told
             else None,
         )
+
+    def _placed(self, params: NavigationParams, split: Any, start: Any, goal: Any) -> tuple[Physics, dict[str, Any]]:
+        """Rovers at rest where their episodes begin, and the parameters drawn for them; `split` of their keys."""
+        c = self.config
+        turn = jax.vmap(lambda k: jax.random.uniform(k, (), minval=-1.0, maxval=1.0))(split[:, 2])
+        # Headings are drawn about the goal's bearing.
+        bearing = jnp.arctan2(goal[:, 1] - start[:, 1], goal[:, 0] - start[:, 0])
+        drawn = randomise.draw(c.randomise, params.system, params.bounds, split[:, 3])
+        if params.spread is not None:
+            # Keys of its own: ranges draw the same numbers with and without a posterior beside them.
+            own = jax.vmap(lambda k: jax.random.fold_in(k, 1))(split[:, 3])
+            drawn |= randomise.draw_spread(params.spread, params.system, own)
+        system, axes = randomise.apply(params.system, drawn)
+        warm = drawn.get("winding_temperature")
+        physics = jax.vmap(self.system.reset, in_axes=(axes, 0, 0, 0, None if warm is None else 0))(
+            system, start[:, 0], start[:, 1], bearing + c.start_yaw * turn, warm
+        )
+        return physics, drawn
 
     def _corners(self, params: NavigationParams, inner: Inner) -> Any:
         """South-western and north-eastern corner of the ground that each rover must not leave, (env, 2, 2) m."""
@@ -803,10 +894,11 @@ def make_navigation(
     """Makes the navigation environment.
 
     Args:
-      task: name of a shipped task (`paper`, `consistent`, `large`, `ladder/1` to `ladder/5`), or a configuration.
+      task: name of a shipped task (`paper`, `consistent`, `large`, `escape`, `ladder/1` to `ladder/5`), or a
+        configuration.
       rover: name or folder.
       terrain: anything `make_model` takes, or `world:train`, `world:heldout` and others of `worlds.WORLDS`; by default
-        `lunar_plain`, for the task `large` `world:train`. The ladder makes its own.
+        `lunar_plain`, for `large` `world:train`, for `escape` `flat`. The ladder makes its own.
       preset: of the physics; `default_preset(task)` if None.
       model: a model or `model.toml` instead of rover, terrain and preset; a terrain given beside it takes its place.
       engine: of the physics.
@@ -831,7 +923,7 @@ def make_navigation(
         # replaced by the worlds of the rung wherever parameters are made
         terrain = "flat"
     if terrain is None and model is None:
-        terrain = PREFIX + "train" if task == "large" else "lunar_plain"
+        terrain = {"large": PREFIX + "train", "escape": "flat"}.get(str(task), "lunar_plain")
     if isinstance(terrain, str) and terrain.startswith(PREFIX):
         terrain = world(terrain.removeprefix(PREFIX))
     if isinstance(model, str | Path):
@@ -846,6 +938,9 @@ def make_navigation(
         for name in SUPPLY:
             model = model if name in model.effect_names else model.add(name)
         model = model.replace(sun=model.sun or LOW_SUN)
+    if config.escape_distance:
+        for name in digging.EFFECTS:
+            model = model if name in model.effect_names else model.add(name)
     if isinstance(task, str) and "episode_time" not in settings:
         # a task's time is for its top speed, which the bus voltage may not allow
         slower = max(1.0, config.top_speed / reachable_speed(model))

@@ -59,6 +59,11 @@ def progress(t: Transition) -> Any:
     return length(t.to_goal_before) - length(t.to_goal)
 
 
+def away(t: Transition) -> Any:
+    """Increase of the distance from the place to get away from, m; negative when coming back. Not in the paper."""
+    return -progress(t)
+
+
 def way(t: Transition) -> Any:
     """Decrease of the shortest way to the goal over the ladder's map, m: a way out of a dead end pays. The map is told
     to the reward alone, and never to the rover. Not in the paper."""
@@ -117,6 +122,7 @@ Term = Callable[[Transition], Any]
 TERMS: dict[str, Term] = {
     "progress_paper": progress_paper,
     "progress": progress,
+    "away": away,
     "way": way,
     "heading": heading,
     "tilt": tilt,
