@@ -7,6 +7,18 @@ from typing import Annotated
 
 import typer
 
+from lunar_mjx.commands.options import MOST_SEED
+from lunar_mjx.commands.train import (
+    MOST_EPISODES,
+    SHIPPED_AGENT,
+    AgentArgument,
+    AgentOption,
+    DeviceOption,
+    EnvSetOption,
+    TaskOption,
+    env_options,
+    one_agent,
+)
 from lunar_mjx.errors import bad_input
 
 
@@ -33,8 +45,42 @@ def policy(
         print(written)
 
 
+def dataset(
+    agent: AgentArgument = SHIPPED_AGENT,
+    agent_option: AgentOption = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("runs/datasets"),
+    name: Annotated[str, typer.Option(help="Name of the dataset, as Minari takes it.")] = "lunar-mjx/drives-v0",
+    frames: Annotated[int, typer.Option(min=1, max=10**9, help="Steps of all rovers together.")] = 100_000,
+    rovers: Annotated[int, typer.Option(min=1, max=MOST_EPISODES, help="Side by side.")] = 256,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 0,
+    task: TaskOption = "large",
+    unseen: Annotated[bool, typer.Option(help="On the ground and soil of evaluations, not of the training.")] = False,
+    env: EnvSetOption = None,
+    device: DeviceOption = "auto",
+) -> None:
+    """Drive an agent and write its episodes, with slip and sinkage of every wheel, as a dataset for Minari (HDF5)."""
+    from lunar_mjx.commands.options import check_folder, make_folder, select_device
+
+    check_folder(out)
+    select_device(device)
+    from lunar_mjx.agents.export.dataset import check_dataset, export_dataset
+    from lunar_mjx.agents.play import knowing, open_agent
+    from lunar_mjx.agents.run import unseen_params
+
+    # Before minutes of compiling.
+    check_dataset(name, frames, rovers)
+    wanted = one_agent("export", agent, agent_option)
+    options = env_options(env)
+    made, act, ground = open_agent(wanted, task, options)
+    params = unseen_params(made, ground) if unseen else made.params
+    act = knowing(wanted, made, params, act)
+    about = {"algorithm_name": wanted, "unseen": unseen, "options": options}
+    print(export_dataset(made, params, act, make_folder(out), name, rovers, frames, seed, print, about))
+
+
 def register(app: typer.Typer) -> None:
     """Adds the group `export` to the application."""
-    group = typer.Typer(help="Take a policy out of the simulator.", no_args_is_help=True)
+    group = typer.Typer(help="Take policies and drives out of the simulator.", no_args_is_help=True)
     group.command("policy")(policy)
+    group.command("dataset")(dataset)
     app.add_typer(group, name="export")
