@@ -29,9 +29,9 @@ from lunar_mjx.simulate import joint_channels
 
 SEED = 20261
 DRIVE_KINDS = {**drive_effects.KNOWN, **drive_effects.OUTSIDE}
-FEW_NULLS, MORE_NULLS = (0, 1, 2), (3, 4, 5, 6)
-QUICK, MORE = (2, 5), (4, 6, 7)
-"""Single effects of the test bed that are refitted fast: exit angle, friction circle; grousers, rolling, radius."""
+FEW_NULLS, MORE_NULLS = (1,), (0, 2, 3, 4, 5, 6)
+QUICK, MORE = (2,), (4, 5, 6, 7)
+"""Single effects of the test bed that are refitted fast: exit angle; grousers, friction circle, rolling, radius."""
 NOISY, PAIRS = (5, 6), (7,)
 FEW_UNDECIDABLE, MORE_UNDECIDABLE = (4,), (5, 6, 8)
 
@@ -45,11 +45,15 @@ def told(found: list[dict[str, Any]]) -> list[str]:
 
 
 @pytest.mark.optimised
-@pytest.mark.parametrize("numbers", [FEW_NULLS, pytest.param(MORE_NULLS, marks=pytest.mark.slow)], ids=["few", "more"])
-def test_nothing_is_found_where_nothing_is_hidden(numbers: Sequence[int]) -> None:
+@pytest.mark.parametrize(
+    ("numbers", "noises"),
+    [(FEW_NULLS, {"coloured"}), pytest.param(MORE_NULLS, {"white", "coloured", "quantised"}, marks=pytest.mark.slow)],
+    ids=["few", "more"],
+)
+def test_nothing_is_found_where_nothing_is_hidden(numbers: Sequence[int], noises: set[str]) -> None:
     """White, coloured and quantised noise by turns, with a little unmodelled dirt."""
     found = chosen("nulls", numbers)
-    assert {r["noise"] for r in found} == {"white", "coloured", "quantised"}
+    assert {r["noise"] for r in found} == noises
     assert not any(r["wrong_name"] for r in found), told(found)
     assert all(r["outcome"] == "quiet" for r in found), told(found)
 
