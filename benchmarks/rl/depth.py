@@ -4,47 +4,28 @@
     python benchmarks/rl/depth.py large-depth --tiny --seconds 200 --out runs/tiny  # the same code on two CPU cores
     python benchmarks/rl/depth.py --keep runs/depth/large-depth.json              # to the records that pages quote
 
-Writes `NAME.json` and, after every score, `NAME_seedN.npz`, so that a run that is cut off leaves what it had. The rate
-is of the environment alone under random actions, with as many rovers as the training has: median, least and most of
-several repetitions, each from where the one before ended. Rows of a score, all on the same unseen episodes in one
-program: the student, the student with its picture at the mean (`blanked`), its teacher, and straight ahead. The last
-policy is scored at the end, on other episodes than during the training; nothing is chosen by a score.
+Writes `NAME.json` and, after every score, `NAME_seedN.npz` (the last policy), so that a run that is cut off leaves what
+it had. The rate is of the environment alone under random actions, with as many rovers as the training has: median,
+least and most of several repetitions, each from where the one before ended. Rows of a score, all on the same unseen
+episodes in one program: the student, the student with its picture at the mean (`blanked`), its teacher, and straight
+ahead. The last policy is scored at the end, on other episodes than during the training; nothing is chosen by a score.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
 import statistics
 import time
 from pathlib import Path
 from typing import Any
 
 import jax
-from harness import (
-    COMMIT,
-    DURING,
-    FINAL,
-    Clock,
-    Judge,
-    Setup,
-    ends,
-    in_threads,
-    options,
-    percent,
-    read,
-    save,
-    say,
-    training_of,
-    when,
-)
+from harness import Clock, Setup, options, read, say, training_of
 from kept import few, keep
 from rates import Driven
+from trials import Trials
 
-from benchmarks.provenance import tree
-from lunar_mjx.agents.policy import policy_of, save_policy
-from lunar_mjx.agents.train import RunConfig, train
 from lunar_mjx.envs import make_agent
 from lunar_mjx.envs.navigation.observations import CAMERA
 
@@ -95,62 +76,35 @@ def main() -> None:
     args = words()
     if args.keep:
         record = read(args.keep)
-        say(str(keep(record["training"], {**record, "epochs": few(record["epochs"])})))
+        (run,) = record.pop("seeds")
+        took = {"made_s": record.pop("worlds_s"), "compile_s": max(record["compile_s"])}
+        say(str(keep(record["training"], {**record, **took, **run, "epochs": few(run["epochs"])})))
         return
-    clock, files = Clock(args.seconds), tree()
-    training = training_of(args, args.training)
+    clock, training = Clock(args.seconds), training_of(args, args.training)
     if args.tiny:
         training = dataclasses.replace(training, options={**training.options, **TINY})
-    name, steps = Path(args.training).stem, int(args.steps or training.steps)
-    args.out.mkdir(parents=True, exist_ok=True)
-    setup = Setup(training)
-    rules = {"straight": make_agent("scripted", setup.env)}
-    judge = Judge(setup.env, min(args.episodes, 2) if args.tiny else args.episodes, agents(setup), rules)
-    driven = Driven(setup.env, training.train.envs, 4 if args.tiny else 50)
-    made_s = clock.spent
-    in_threads(lambda: setup.compile(judge), driven.compile)
-    record: dict[str, Any] = {"tree": files, "training": name, **setup.about, "seed": args.seed}
-    record |= {"made_s": made_s, "compile_s": clock.spent - made_s, "scores": []}
-    say(f"made in {made_s:.0f} s, compiled in {record['compile_s']:.0f} s, {clock.left:.0f} s left")
+    episodes, driven = min(args.episodes, 2) if args.tiny else args.episodes, []
+
+    def beside(setup: Setup) -> None:
+        driven.append(Driven(setup.env, training.train.envs, 4 if args.tiny else 50))
+        driven[0].compile()
+
+    def rules(env: Any) -> dict[str, Any]:
+        return {"straight": make_agent("scripted", env)}
+
+    name = Path(args.training).stem
+    trials = Trials(training, name, args.out, clock, episodes, rules, agents=agents, last=True, beside=beside)
     # One device of several: the rate is of one, and a state over a mesh is none that the program was compiled for.
-    state = jax.device_put(jax.device_get(setup.learner.init(args.seed).env))
-    record["rate"] = rate_of(driven, state, 2 if args.tiny else args.repeats)
+    state = jax.device_put(jax.device_get(trials.setup.learner.init(args.seed).env))
+    trials.record["rate"] = r = rate_of(driven[0], state, 2 if args.tiny else args.repeats)
     del state
-    r = record["rate"]
     say(
         f"{r['env_steps_per_s']:,.0f} environment steps/s ({r['least']:,.0f} to {r['most']:,.0f}), {r['rovers']} rovers"
     )
-    save(args.out, name, record)
-    due = args.every
-
-    def score(state: Any, row: dict[str, Any], seed: int) -> dict[str, Any]:
-        rows = judge(setup.unseen, setup.policy(state), seed)
-        notes = {"score": rows["student"], "seed": args.seed, "commit": COMMIT, "tree": files, **when(row)}
-        save_policy(policy_of(setup.learner, state, setup.environment, notes), args.out / f"{name}_seed{args.seed}.npz")
-        told = {**when(row), "seed": seed, "imitation_loss": row["imitation_loss"], "rows": rows}
-        say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s, loss {row['imitation_loss']:.4f}")
-        for agent, one in rows.items():
-            say(f"    {agent}: {percent(one)}, {ends(one)}")
-        return told
-
-    epochs: list[dict[str, Any]] = []
-
-    def after_epoch(_: Any, state: Any, row: dict[str, Any]) -> dict[str, Any]:
-        nonlocal due
-        epochs.append({k: v for k, v in row.items() if not k.startswith("reward_")})
-        if row["elapsed_s"] >= due:
-            due = row["elapsed_s"] + args.every
-            record["scores"].append(score(state, row, DURING))
-            save(args.out, name, {**record, "epochs": epochs})
-        return {}
-
-    run = RunConfig(steps, args.seed, max(1.0, clock.left - args.last), math.inf, quiet=True)
-    result = train(setup.learner, run, None, setup.environment, after_epoch)
-    say("at the end:")
-    record["final"] = score(result.state, result.rows[-1], FINAL)
-    record["train_steps_per_s"] = statistics.median(row["steps_per_s"] for row in epochs)
-    save(args.out, name, {**record, "epochs": epochs})
-    say(f"done after {clock.spent:.0f} s; while training {record['train_steps_per_s']:,.0f} environment steps/s")
+    trials(args.seed, int(args.steps or training.steps), max(1.0, clock.left - args.last), args.every)
+    (run,) = trials.record["seeds"]
+    trials.record["train_steps_per_s"] = statistics.median(row["steps_per_s"] for row in run["epochs"])
+    trials.save()
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python benchmarks/rl/sensors.py --out runs/sensors               # 64 episodes a row: 3 minutes on two CPU cores
     python benchmarks/rl/sensors.py --episodes 1024 --out runs/sensors    # one GPU
 
-Each row is what `lunar-mjx evaluate AGENT --episodes N --env delay=0.3 ...` scores: the same unseen ground, soils and
+Each row is what `lunar-mjx evaluate AGENT --episodes N --env delay=0.3 ...` writes: the same unseen ground, soils and
 goals.
 """
 
@@ -11,12 +11,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness import Clock, ends, in_time, options, percent, save, say
+from harness import Clock, in_time, options, read, save
 
 from benchmarks.provenance import tree
-from lunar_mjx.agents.evaluate import Evaluator
-from lunar_mjx.agents.play import open_agent
-from lunar_mjx.agents.run import unseen_params
+from lunar_mjx.commands.train import evaluate
 
 ROWS = {
     "exact": {},
@@ -37,13 +35,12 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=64)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    about, rows = {"tree": tree(), "agent": args.agent, "seed": SEED}, {}
+    about, rows, out = {"tree": tree(), "agent": args.agent, "seed": SEED}, {}, args.out / "row.json"
     for name in in_time(Clock(args.seconds or float("inf")), ROWS):
-        env, act, unseen = open_agent(args.agent, options=ROWS[name])
-        evaluator = Evaluator(env, lambda _, state, key, act=act: act(state, key), args.episodes)
-        rows[name] = {"options": ROWS[name], "score": evaluator(unseen_params(env, unseen), (), SEED).record()}
+        evaluate(args.agent, None, args.episodes, SEED, env=[f"{k}={v}" for k, v in ROWS[name].items()], out=out)
+        score = {k: v for k, v in read(out).items() if k != "agent"}
+        rows[name] = {"options": ROWS[name], "score": score}
         save(args.out, "sensors", {**about, "rows": rows})
-        say(f"{name}: {percent(rows[name]['score'])}, {ends(rows[name]['score'])}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from harness import COMMIT, DURING, FINAL, Clock, Judge, Setup, ends, percent, save, say, trained, when
+from harness import COMMIT, DURING, FINAL, Clock, Judge, Setup, ends, in_threads, percent, save, say, trained, when
 
 from benchmarks.provenance import tree
 from lunar_mjx.agents.configs import Training
@@ -27,6 +27,9 @@ class Trials:
       begin_with: policy that all seeds begin with, if any.
       seen: choose the best policy by its score on the ground and soils of its training, and score it alone meanwhile;
         else by the unseen ones, beside the other agents.
+      agents: makes the policy's agents for a `Setup`, the one that is trained first; `Setup.policies` if None.
+      last: choose nothing; the last policy is the one that is scored and kept.
+      beside: called with the `Setup` while the rest compiles, if given.
     """
 
     def __init__(
@@ -39,16 +42,21 @@ class Trials:
         rules: Callable[[Any], Mapping[str, Any]],
         seen: bool = False,
         begin_with: str = "",
+        agents: Callable[[Setup], Mapping[str, Any]] = Setup.policies,
+        last: bool = False,
+        beside: Callable[[Setup], Any] = lambda _: None,
     ):
-        self.name, self.out, self.clock, self.seen, files = name, out, clock, seen, tree()
+        self.name, self.out, self.clock, self.seen, self.last, files = name, out, clock, seen, last, tree()
         self.begin_with = begin_with
         out.mkdir(parents=True, exist_ok=True)
         self.setup = Setup(training)
-        env, policies = self.setup.env, self.setup.policies()
+        env, policies = self.setup.env, agents(self.setup)
+        self.own = next(iter(policies))
         self.judge = Judge(env, episodes, policies, rules(env))
-        self.during = Judge(env, episodes, {"policy": policies["policy"]}) if seen else self.judge
+        self.during = Judge(env, episodes, {self.own: policies[self.own]}) if seen else self.judge
         worlds_s = clock.spent
-        compile_s = self.setup.compile(*dict.fromkeys((self.judge, self.during)))
+        judges = dict.fromkeys((self.judge, self.during))
+        compile_s = in_threads(lambda: self.setup.compile(*judges), lambda: beside(self.setup))
         say(f"worlds {worlds_s:.0f} s, compiled after {compile_s}, {clock.left:.0f} s left")
         learner = type(training.train.algorithm).__name__
         about = {"tree": files, "training": name, **self.setup.about, "learner": learner}
@@ -81,25 +89,27 @@ class Trials:
             row, run["epochs"] = epochs[-1], plainly(epochs)
             found = self.during(unseen, policy, DURING)
             score = {**when(row), "seed": DURING, "rows": found}
-            chosen = found["policy"]
+            chosen = found[self.own]
             if self.seen:
-                score["train"] = chosen = self.during(self.setup.env.params, policy, DURING)["policy"]
+                score["train"] = chosen = self.during(self.setup.env.params, policy, DURING)[self.own]
+            good = row["steps"] if self.last else chosen["success"]
             run["scores"].append(score)
-            self.store(seed, state, row, found["policy"], "_last")
-            if chosen["success"] > best:
-                best = chosen["success"]
-                self.store(seed, state, row, found["policy"])
+            self.store(seed, state, row, found[self.own], "_last")
+            if good > best:
+                best = good
+                self.store(seed, state, row, found[self.own])
             self.save()
-            say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s: the best is chosen by {percent(chosen)}")
+            how = "nothing is chosen" if self.last else f"the best is chosen by {percent(chosen)}"
+            say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s: {how}")
             shown(found, "    ")
-            return chosen["success"]
+            return good
 
         config = RunConfig(steps, seed, seconds, math.inf, quiet=True, begin_with=self.begin_with)
         result, policy, row = trained(self.setup, config, every, look, target)
         found, last = self.judge(unseen, policy, FINAL), result.rows[-1]
         run["final"], run["epochs"] = {**when(row), "seed": FINAL, "rows": found}, plainly(result.rows)
         if math.isinf(every):
-            self.store(seed, result.state, row, found["policy"])
+            self.store(seed, result.state, row, found[self.own])
         self.save()
         shown(found, f"seed {seed} final ")
         say(f"done after {self.clock.spent:.0f} s, {last['steps']:.3g} steps, {last['steps_per_s']:.3g} steps/s")
