@@ -296,6 +296,20 @@ class Evidence:
         joint = _condition(self.gram + held_out, self.amplitudes, self.tau, self.noise)[0]
         return joint - _condition(self.gram, self.amplitudes, self.tau, self.noise)[0]
 
+    def within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """(k,) most probable amplitudes within (k,) bounds, relative to the refit, at the sizes found.
+
+        The others follow those that a bound holds: cut off alone, these would leave them at a place that fits nothing.
+        """
+        place, edge, held = self.mean.copy(), np.zeros(len(self.mean)), np.zeros(len(self.mean), bool)
+        while (outside := ~held & ((place < low) | (place > high))).any():
+            edge[outside] = np.clip(place, low, high)[outside]
+            held |= outside
+            pulled = np.linalg.solve(self.covariance[np.ix_(held, held)], edge[held] - self.mean[held])
+            place = self.mean + self.covariance[:, held] @ pulled
+            place[held] = edge[held]
+        return place
+
     def log_inside(self, low: np.ndarray, high: np.ndarray) -> float:
         """Log of the posterior over the prior probability that amplitudes lie in (k,) bounds, relative to the refit.
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import integrate, special, stats
+from scipy import integrate, optimize, special, stats
 
 from lunar_mjx.inference import evidence
 from lunar_mjx.inference.evidence import (
@@ -286,3 +286,15 @@ def test_the_most_probable_level_of_slow_errors_is_taken(drawn):
     found = infer_levels(from_afar, amplitudes, FIELDS, NOISES)
     assert tuple(found.levels) == max(alone, key=lambda k: alone[k])
     assert found.log_evidence == pytest.approx(max(alone.values()), abs=1e-4)
+
+
+def test_amplitudes_within_bounds_are_the_most_probable_ones(drawn):
+    """The others follow those that a bound holds, against bounded least squares."""
+    columns, residual, group, amplitudes = drawn
+    found = infer(Gram.of(columns, residual, group, 2), amplitudes, FIELDS, NOISES)
+    low, high = np.full(len(found.mean), -np.inf), np.full(len(found.mean), np.inf)
+    high[:2], low[2] = found.mean[:2] - [0.3, 0.5], found.mean[2] + 0.1
+    root = np.linalg.cholesky(np.linalg.inv(found.covariance)).T
+    best = optimize.lsq_linear(root, root @ found.mean, (low, high), tol=1e-12).x
+    np.testing.assert_allclose(found.within(low, high), best, atol=1e-6)
+    np.testing.assert_array_equal(found.within(low - 9.0, high + 9.0), found.mean)

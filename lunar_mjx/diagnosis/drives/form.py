@@ -62,6 +62,8 @@ class DriveRefit:
     """1; factor on the damping of a step that gained: what held it back may lie behind it."""
     steep: float = 1e4
     """sigma; change of one reading within a coordinate's prior from which a slope is taken to the other side, too."""
+    speaks: float = 0.5
+    """1; amount that is asked for, over that of a secant, from which the secant is the nearer one."""
     dead: float = 0.01
     """1; length of a derivative over that of the secant below which an effect does nothing at its null."""
     together: int = 8
@@ -123,6 +125,7 @@ class DriveForm(MeasuredForm):
         self._secants: np.ndarray | None = None  # (n, coordinates) changes by a usual amount there, over that amount
         # (n, m) SI columns at size 1, (m,) field of each; the last ones are those of the ground
         self._fields: tuple[np.ndarray, np.ndarray] | None = None
+        self._beside: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}  # the same beside a refit's effects
         self.jitter_s = USUAL_ERRORS.jitter_s
         kinds = [usual_kind(c) for c in self.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
@@ -222,7 +225,7 @@ class DriveForm(MeasuredForm):
             places = self.candidates[name]
             self._seen[:, places], self._secants[:, places] = seen[:, places], secants[:, places]
         self.skipped = tuple(name for name in self.skipped if name in skipped)
-        self._fields = self._field_columns(self.observations)
+        self._take_fields()
 
     def _tamed(self, places: np.ndarray, slopes: np.ndarray, secants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives (n, m) and secants (n, m) of candidates, where either tells nothing the other in its place.
@@ -242,7 +245,8 @@ class DriveForm(MeasuredForm):
 
         Where wheels stick and slip a usual amount may lead elsewhere than its beginning. On two foreign campaigns of a
         Husky slip-sinkage showed with 348 nats by its secant and not at all by its derivative, and a wheel that is too
-        small with 3 and 24.
+        small with 3 and 24. A secant speaks of amounts as large as its own alone: beside the slope of a clock, which
+        every model has, it would else stand for a curve that no clock bends (252 nats where nothing was hidden).
 
         Args:
           u, free, slopes: as for `_columns`. found: sizes of discrepancy and noise there.
@@ -259,15 +263,20 @@ class DriveForm(MeasuredForm):
         factor = linalg.cho_factor(np.eye(len(always)) + rest.T @ rest)
         left = white - rest @ linalg.cho_solve(factor, rest.T @ white)
 
-        def gain(places: np.ndarray) -> float:
-            """Log evidence of columns of `white` at these sizes."""
+        def explained(places: np.ndarray) -> tuple[float, np.ndarray]:
+            """Log evidence of columns of `white` at these sizes, and the amounts, over the prior's, with it."""
             matrix = np.eye(len(places)) + white[:, places].T @ left[:, places]
             seen = white[:, places].T @ left[:, -1]
-            return float(0.5 * seen @ np.linalg.solve(matrix, seen) - 0.5 * np.linalg.slogdet(matrix)[1])
+            amounts = np.linalg.solve(matrix, seen)
+            return float(0.5 * seen @ amounts - 0.5 * np.linalg.slogdet(matrix)[1]), amounts
 
         for places in self.candidates.values():
-            if gain(len(scale) + places) > gain(places):
-                self._seen[:, places] = self._secants[:, places]
+            far = np.array([self._secant(i) for i in places])
+            amounts = explained(len(scale) + places)[1] * self._std[places]
+            speaks = amounts / far > DRIVE_REFIT.speaks
+            mixed = np.where(speaks, len(scale), 0) + places
+            if speaks.any() and explained(mixed)[0] > explained(places)[0]:
+                self._seen[:, places[speaks]] = self._secants[:, places[speaks]]
 
     def effect_size(self, c: Coordinate) -> float:
         """See `MeasuredForm`: nominal sizes are a small rover's; a larger one's forces and torques are larger."""
@@ -288,10 +297,32 @@ class DriveForm(MeasuredForm):
         change[~np.isfinite(change).all(axis=1)] = 0.0
         return change.T
 
-    def _field_columns(self, observations: Observations) -> tuple[np.ndarray, np.ndarray]:
+    def _take_fields(self) -> None:
+        """Makes the columns of all fields from the signatures as they are now."""
+        self._fields, self._beside = self._field_columns(self.observations), {}
+
+    def _fields_beside(self, effects: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
+        """See `_field_columns`.
+
+        Where an effect has its own refit, what is usual has none of it: the difference of its derivatives here and
+        there would be one more freedom, which no other hypothesis has.
+        """
+        assert self._fields is not None
+        if not effects:
+            return self._fields
+        if effects not in self._beside:
+            self._beside[effects] = self._field_columns(self.observations, effects)
+        return self._beside[effects]
+
+    def _field_columns(
+        self, observations: Observations, but: frozenset[str] = frozenset()
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Columns (n, m) of all fields at size 1, SI units, and the field (m,) of each: in common, and of every log.
 
         They are turned so that few are left which the observations' noise does not hide.
+
+        Args:
+          observations: with the channels' errors. but: effects that are no part of what is usual.
         """
         assert self._seen is not None
         settings = self.settings
@@ -310,7 +341,8 @@ class DriveForm(MeasuredForm):
             turned = whole @ rotation(observations.whiten(whole), settings.least_length / settings.unlisted_discrepancy)
             columns.append(turned)
             number.append(np.full(turned.shape[1], k))
-        small = [i for own in self.candidates.values() for i in own if self.coordinates[i].amplitude]
+        others = [own for e, own in self.candidates.items() if e not in but]
+        small = [i for own in others for i in own if self.coordinates[i].amplitude]
         whole = self._seen[:, small] * self._std[small]
         turned = whole @ rotation(observations.whiten(whole), settings.least_length / settings.usual_effect)
         columns.append(turned)
@@ -319,46 +351,54 @@ class DriveForm(MeasuredForm):
         number.append(np.full(len(self.drives.ground), self._number.get(GROUND, -1)))
         return np.column_stack(columns), np.concatenate(number)
 
-    def _centre(self, u: np.ndarray) -> np.ndarray:
-        """(m,) prior mean of the amplitudes of all fields, relative to a place: the ground has been moved to there."""
-        assert self._fields is not None
+    def _centre(self, u: np.ndarray, count: int) -> np.ndarray:
+        """(m,) prior mean of the amplitudes of all fields, relative to a place: the ground has been moved to there.
+
+        Args:
+          u: the place. count: of amplitudes; those of the ground are the last ones.
+        """
         ground = self.drives.ground
-        mean = np.zeros(len(self._fields[1]))
+        mean = np.zeros(count)
         mean[len(mean) - len(ground) :] = -u[ground]
         return mean
 
-    def _columns(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _columns(
+        self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, effects: frozenset[str] = frozenset()
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives (n, k) by all that hypotheses hold, and residuals (n,), SI units, around a place (coordinates,).
 
         Args:
           u: the place. free: coordinates whose derivatives (n, free) there are the `slopes`; others keep signatures.
+          effects: of a refit.
         """
-        assert self._seen is not None and self._fields is not None
+        assert self._seen is not None
         seen = self._seen[:, : len(self.coordinates)].copy()
         seen[:, free] = slopes
-        return np.column_stack([seen, self._fields[0]]), self.observations.value - self.predicted(u)
+        return np.column_stack([seen, self._fields_beside(effects)[0]]), self.observations.value - self.predicted(u)
 
-    def _linear(self, u: np.ndarray, effects: frozenset[str], slopes: np.ndarray) -> Linear:
+    def _linear(self, u: np.ndarray, effects: frozenset[str], slopes: np.ndarray, unkept: float = 0.0) -> Linear:
         """Everything that hypotheses need around a place (coordinates,) with some effects.
 
         Args:
-          u: the place. effects: those of the refit. slopes: (n, free) derivatives there.
+          u: the place. effects: those of the refit. slopes: (n, free) derivatives there. unkept: see `Linear`.
         """
-        assert self._fields is not None
-        settings, count, field_of = self.settings, len(self.coordinates), self._fields[1]
-        columns, residual = map(self.observations.whiten, self._columns(u, self._free(effects), slopes))
+        settings, count, field_of = self.settings, len(self.coordinates), self._fields_beside(effects)[1]
+        columns, residual = map(self.observations.whiten, self._columns(u, self._free(effects), slopes, effects))
         std = np.concatenate([self._std, np.ones(len(field_of))])
         low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
+        # Where the step's error or a reading before its command would have to be more than all there is, the model is
+        # not that much better: linear estimates had gone beyond (on a foreign campaign of a Husky clock_offset promised
+        # 87 nats so, and its refit gained none).
+        bounded = np.concatenate([self.baseline, *(i for i in self.candidates.values())]).astype(int)
+        bounded = bounded[[i in self.baseline or self.coordinates[i].amplitude for i in bounded]]
+        low[bounded], high[bounded] = np.array([self.coordinates[i].bounds() for i in bounded]).T - u[bounded]
         at, mean = np.zeros(len(std)), np.zeros(len(std))
         mean[:count] = [c.centre for c in self.coordinates]
         # Amplitudes are counted from the refit: the prior's centre lies at its distance from there.
         mean[:count] -= u
-        mean[count:] = self._centre(u)
+        mean[count:] = self._centre(u, len(field_of))
         for places in self.candidates.values():
             at[places] = u[places]
-            for i in places:
-                if self.coordinates[i].amplitude:
-                    low[i], high[i] = np.array(self.coordinates[i].bounds()) - u[i]
         kinds, fit, observations = len(self.noise_names), self._fit, self.observations
         held = {}
         for name, rows in held_out_pieces(observations, settings.held_out_piece).items():
@@ -378,6 +418,7 @@ class DriveForm(MeasuredForm):
             noises=self._noise_sizes(),
             wide=settings.unlisted_discrepancy,
             far=1.0,
+            unkept=unkept,
         )
 
     def _free(self, effects: frozenset[str]) -> np.ndarray:
@@ -437,6 +478,8 @@ class DriveForm(MeasuredForm):
         u[self.drives.ground] = self._ground
         low, high = self.drives.bounds(free)
         u[free] = np.clip(u[free], low + 1e-9, high - 1e-9)
+        if near is not None and start is not None:
+            u = self._better_start(u, near, free)
         first = self._seen is None
         if first:
             if effects:
@@ -451,16 +494,21 @@ class DriveForm(MeasuredForm):
                 found = self._choose_errors(u, free, slopes, self.settings.jitters_s)
             self._sizes = found.tau, found.noise
         terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
-        u, slopes = self._descend(u, free, self.observations, sizes, slopes, guessed=bool(effects))
-        linear = self._linear(u, effects, slopes)
-        value, found, _ = linear.evidence(terms, sizes)
-        for _ in range(self.settings.most_rounds - 1):
-            before, sizes = value, (found.tau, found.noise)
-            u, slopes = self._descend(u, free, self.observations, sizes, slopes)
-            linear = self._linear(u, effects, slopes)
+        best: tuple[float, np.ndarray, np.ndarray, Linear, Evidence] | None = None
+        for number in range(self.settings.most_rounds):
+            guessed = number == 0 and bool(effects)
+            u, slopes, promised = self._descend(u, free, self.observations, sizes, slopes, guessed=guessed)
+            # An effect is credited with what its refit has reached, not with what slopes promise that no step has kept.
+            linear = self._linear(u, effects, slopes, 0.5 * promised if effects else 0.0)
             value, found, _ = linear.evidence(terms, sizes)
-            if abs(value - before) < self.settings.settled:
+            gained = math.inf if best is None else value - best[0]
+            if best is None or gained > 0.0:
+                best = value, u, slopes, linear, found
+            if gained < self.settings.settled:
                 break
+            sizes = found.tau, found.noise
+        assert best is not None
+        _, u, slopes, linear, found = best
         self._slopes[effects] = free, slopes
         if first:
             # Signatures belong to the place around which hypotheses are weighed: a descent away from where they were
@@ -468,8 +516,24 @@ class DriveForm(MeasuredForm):
             if not self.kept:
                 self._see_again(u)
             self._choose_signatures(u, free, slopes, found)
+            self._take_fields()
             linear = self._linear(u, effects, slopes)
         return Refit(self.name, effects, u, linear)
+
+    def _better_start(self, start: np.ndarray, near: Refit, free: np.ndarray) -> np.ndarray:
+        """Of a linear estimate's place, the refit around which it was made, and that refit with the estimate's effects
+        alone, the one that the model itself likes best.
+
+        A linear estimate moves soil and starts of logs along slopes that do not hold so far: of a foreign LUVMI-X whose
+        IMU is off, refits from the estimate's place ended 25 nats below those from the refit around which it was made.
+        """
+        rows = np.stack([start, near.u, near.u])
+        own = np.setdiff1d(free, self.baseline)
+        rows[2, own] = start[own]
+        cost = self._cost(near.u, free, self.observations, self._sizes_of(near))
+        values = self.drives.predict(self._whole(rows))
+        costs = [cost.chi2(cost.white(cost.wanted - v), row[free]) for v, row in zip(values, rows, strict=True)]
+        return rows[int(np.argmin(costs))]
 
     def alone(self, refit: Refit) -> np.ndarray:
         """See `MeasuredForm`; with the derivatives of the refit, from there and from the parameters as given.
@@ -507,7 +571,8 @@ class DriveForm(MeasuredForm):
         std = np.concatenate([self._std, np.ones(len(number))])[always]
         field = np.concatenate([np.full(count, -1), number])[always]
         own = [self.coordinates[i].centre - u[i] for i in self.baseline]
-        prior, columns = Amplitudes(std, field, np.concatenate([own, self._centre(u)])), columns[:, always]
+        prior = Amplitudes(std, field, np.concatenate([own, self._centre(u, len(number))]))
+        columns = columns[:, always]
         fields, noises = self._usual_fields(), self._noise_sizes()
 
         def climbed(errors: ChannelErrors, begin: np.ndarray | None, sizes: Any) -> tuple[Evidence, np.ndarray]:
@@ -571,21 +636,22 @@ class DriveForm(MeasuredForm):
         # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after it,
         # and a descent that moves everything at once follows them into soil that nothing brings it back from.
         nuisances = free[[self.coordinates[i].nuisance for i in free]]
-        u, _ = self._descend(self.start, nuisances, self.observations)
+        u, _, _ = self._descend(self.start, nuisances, self.observations)
         # Ground before soil: waves that nobody mapped cost a rover more torque than a few per cent of the soil's
         # constants do, which would follow them.
         u = self._find_ground(u, free)
         for _ in range(self.settings.most_rounds):
             # A law that errs by more than noise says little of its constants. Held to noise and usual errors these
             # would leave their priors by many deviations, for places where wheels stick and slip and no slope holds.
+            drives.about(u)
             slopes = self.jacobian(u, free)[1]
             self._seen = self._see_inputs(u)
-            self._fields = self._field_columns(self.observations)
+            self._take_fields()
             before = self.channel_errors, self.error_times_s
             found = self._choose_errors(u, free, slopes, (usual_jitter,))
             if (self.channel_errors, self.error_times_s) == before:
                 break
-            u, slopes = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
+            u, slopes, _ = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
             u = self._find_ground(u, free)
         if drives.noise_unlearnt:
             drives.learn_noise(self._whole(u))
@@ -600,6 +666,7 @@ class DriveForm(MeasuredForm):
         # Noise that is learnt from a refit is not among what is kept.
         if not kept or self.drives.noise_unlearnt or kept["jitter_s"] not in self.settings.jitters_s:
             return False
+        self.drives.about(self.start)
         errors = self._errors_with(kept["jitter_s"])
         levels = errors.at_shares(kept["channel_errors"], kept["error_times_s"])
         if levels is None:
@@ -616,7 +683,7 @@ class DriveForm(MeasuredForm):
     def _see_all(self, u: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Takes all derivatives at a refit (coordinates,) of the model as it is, and returns it."""
         self._see(u)
-        self._fields = self._field_columns(self.observations)
+        self._take_fields()
         self._slopes[frozenset()] = free, self.jacobian(u, free)[1]
         self._ground = u[self.drives.ground]
         return u
@@ -651,6 +718,22 @@ class DriveForm(MeasuredForm):
         out[ground] = np.clip(u[ground] + found.mean[len(free) :], low, high)
         return out
 
+    def _cost(
+        self, u: np.ndarray, free: np.ndarray, observations: Observations, sizes: tuple[np.ndarray, np.ndarray] | None
+    ) -> _Cost:
+        """What a descent from a place minimises; arguments as for `_descend`."""
+        noise = np.ones(len(self.noise_names)) if sizes is None else sizes[1]
+        weight = 1.0 / noise[self._group[self._fit]]
+        misfit, offset = np.zeros((len(weight), 0)), np.zeros(len(observations))
+        if sizes is not None and self._fields is not None:
+            columns, number = self._fields_beside(frozenset(e for e, own in self.candidates.items() if own[0] in free))
+            misfit = observations.whiten(columns)[self._fit] * sizes[0][number] * weight[:, None]
+            offset = columns @ self._centre(u, len(number))
+        factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
+        centre = np.array([self.coordinates[i].centre for i in free])
+        wanted = observations.value - offset
+        return _Cost(observations, self._fit, wanted, weight, misfit, factor, self._std[free], centre)
+
     def _descend(
         self,
         u: np.ndarray,
@@ -660,8 +743,9 @@ class DriveForm(MeasuredForm):
         slopes: np.ndarray | None = None,
         guessed: bool = False,
         once: bool = False,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The most probable coordinates at given sizes of discrepancy and noise, and the derivatives near them.
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """The most probable coordinates at given sizes of discrepancy and noise, the derivatives near them, and the
+        decrease of chi-square that these still promise.
 
         Levenberg-Marquardt with bounds; derivatives serve for further steps as long as these keep what they promise.
 
@@ -675,33 +759,10 @@ class DriveForm(MeasuredForm):
           EvidenceError: the simulation diverged at the start.
           TimeUp: before the descent of some effects had ended, or before that of the model as it is had begun.
         """
-        fit, settings = self._fit, self.settings
-        noise = np.ones(len(self.noise_names)) if sizes is None else sizes[1]
-        weight = 1.0 / noise[self._group[fit]]
-        misfit, offset = np.zeros((int(fit.sum()), 0)), np.zeros(len(observations))
-        if sizes is not None and self._fields is not None:
-            columns, number = self._fields
-            misfit = observations.whiten(columns)[fit] * sizes[0][number] * weight[:, None]
-            offset = columns @ self._centre(u)
-        wanted = observations.value - offset
-        factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
-        std = self._std[free]
-        centre = np.array([self.coordinates[i].centre for i in free])
+        settings, cost = self.settings, self._cost(u, free, observations, sizes)
+        white, inner, std, centre = cost.white, cost.inner, cost.std, cost.centre
+        wanted = cost.wanted
         low, high = self.drives.bounds(free)
-
-        def white(columns: np.ndarray) -> np.ndarray:
-            found = observations.whiten(columns)[fit]
-            return found * (weight if found.ndim == 1 else weight[:, None])
-
-        def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-            """Products of whitened columns under the covariance of noise and discrepancy."""
-            # Woodbury's identity: the covariance of the data is as large as they are, and is never made.
-            return a.T @ b - (misfit.T @ a).T @ linalg.cho_solve(factor, misfit.T @ b)
-
-        def chi2(residual: np.ndarray, x: np.ndarray) -> float:
-            if not np.isfinite(residual).all():
-                return np.inf
-            return float(inner(residual, residual)) + float(np.sum(((x - centre) / std) ** 2))
 
         if slopes is None:
             value, slopes = self.jacobian(u, free)
@@ -710,7 +771,7 @@ class DriveForm(MeasuredForm):
         residual = white(wanted - value)
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
-        present_chi2 = chi2(residual, u[free])
+        present_chi2 = cost.chi2(residual, u[free])
         damping, trials = DRIVE_REFIT.damping, min(len(DRIVE_REFIT.factors), self.drives.together)
         try:
             for _ in range(settings.most_jacobians):
@@ -733,7 +794,7 @@ class DriveForm(MeasuredForm):
                     rows = np.repeat(u[None], trials, axis=0)
                     rows[:, free] = np.clip(u[free] + steps, low, high)
                     residuals = [white(wanted - v) for v in self.drives.predict(self._whole(rows))]
-                    reached = [chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
+                    reached = [cost.chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
                     best = int(np.argmin(reached))
                     gained = present_chi2 - reached[best]
                     if not gained > 0.0:
@@ -752,7 +813,47 @@ class DriveForm(MeasuredForm):
         except TimeUp:
             if not set(self.baseline) >= set(free):
                 raise
-        return u, slopes
+        jacobian = white(slopes)
+        normal = inner(jacobian, jacobian) + np.diag(std**-2)
+        downhill = inner(jacobian, residual) - (u[free] - centre) / std**2
+        step = _bounded_step(normal, downhill, u[free], low, high)
+        return u, slopes, _promised(step, normal, downhill)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Cost:
+    """Chi-square under the covariance of noise and discrepancy, and of the prior.
+
+    Attributes:
+      observations, fit: which of them count. wanted: (n,) what is to be predicted, SI units. weight: (fitted,).
+      misfit: (fitted, m) whitened discrepancy at its sizes; factor: of the identity and its products.
+      std, centre: (free,) of the prior.
+    """
+
+    observations: Observations
+    fit: np.ndarray
+    wanted: np.ndarray
+    weight: np.ndarray
+    misfit: np.ndarray
+    factor: tuple[np.ndarray, bool]
+    std: np.ndarray
+    centre: np.ndarray
+
+    def white(self, columns: np.ndarray) -> np.ndarray:
+        """(fitted, ...) whitened columns or residual (n, ...)."""
+        found = self.observations.whiten(columns)[self.fit]
+        return found * (self.weight if found.ndim == 1 else self.weight[:, None])
+
+    def inner(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Products of whitened columns under the covariance of noise and discrepancy."""
+        # Woodbury's identity: the covariance of the data is as large as they are, and is never made.
+        return a.T @ b - (self.misfit.T @ a).T @ linalg.cho_solve(self.factor, self.misfit.T @ b)
+
+    def chi2(self, residual: np.ndarray, x: np.ndarray) -> float:
+        """Of a whitened residual (fitted,) at a place (free,); infinite where the simulation diverged."""
+        if not np.isfinite(residual).all():
+            return np.inf
+        return float(self.inner(residual, residual)) + float(np.sum(((x - self.centre) / self.std) ** 2))
 
 
 def _promised(step: np.ndarray, normal: np.ndarray, downhill: np.ndarray) -> float:

@@ -29,7 +29,10 @@ class UsualErrors:
     """What instruments usually get wrong, and by how much at most."""
 
     farthest: float = 6.0
-    """Standard deviations at which they are bounded."""
+    """Standard deviations at which stated errors are bounded."""
+    usual_farthest: float = 30.0
+    """Standard deviations at which usual errors are bounded: they are linear, and a bound that binds makes one of the
+    least convincing parts of a model the most rigid."""
     unknown_deg: float = 60.0
     """A mounting less well known than this is no small angle: its axis tells nothing, and has no nuisance."""
     usual_clock_s: float = 0.005
@@ -132,10 +135,8 @@ def _turned(kind: str, one: Series, series: list[Series], log: Log, axis: int, p
 def usual_nuisances(observations: Observations) -> list[Coordinate]:
     """Coordinates of what instruments get wrong as much as is usual, in units of that, shared by all logs."""
     names = usual_errors(observations, observations.value, np.zeros(len(observations)))
-    return [
-        Coordinate(NUISANCE, USUAL + name, 0.0, 1.0, -USUAL_ERRORS.farthest, USUAL_ERRORS.farthest, prior=1.0)
-        for name in names
-    ]
+    far = USUAL_ERRORS.usual_farthest
+    return [Coordinate(NUISANCE, USUAL + name, 0.0, 1.0, -far, far, prior=1.0) for name in names]
 
 
 def usual_kind(c: Coordinate) -> str:

@@ -138,6 +138,7 @@ class DriveProblem:
         self._wider: dict[frozenset[str], Bench] = {}
         self._step_error: np.ndarray | None = None
         self._instruments: dict[str, np.ndarray] = {}
+        self._reference = self.origin()
 
     @property
     def unused(self) -> str:
@@ -161,6 +162,15 @@ class DriveProblem:
         """Lower and upper bounds of some coordinates."""
         pairs = np.array([self.coordinates[i].bounds() for i in which], float).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
+
+    def about(self, u: np.ndarray) -> None:
+        """Takes what instruments and finite steps add about the model's predictions at (coordinates,) from now on.
+
+        About the model as given, where that errs much, an instrument's scale would be one of other signals.
+        """
+        self._reference = self.origin()
+        self._reference[self.baseline], self._reference[self.ground] = u[self.baseline], u[self.ground]
+        self._rate, self._step_error, self._instruments = None, None, {}
 
     def _standing_shows(self) -> frozenset[int]:
         """Logs on a slope whose predictions depend on how long the rover had stood before."""
@@ -223,9 +233,9 @@ class DriveProblem:
         return direction(c, self.observations, self.step_error if c.name == STEP_ERROR else np.zeros(0))
 
     def _instrument(self, c: Coordinate) -> np.ndarray:
-        """(n,) what one unit of an instrument's error adds, about the predictions of the model as given."""
+        """(n,) what one unit of an instrument's error adds, see `about`."""
         if c.key not in self._instruments:
-            predicted = self._simulations(self.bench, self.origin()[None], silent)[0]
+            predicted = self._simulations(self.bench, self._reference[None], silent)[0]
             if c.name.startswith(USUAL):
                 direction = usual_errors(self.observations, predicted, self.rate)[c.name.removeprefix(USUAL)]
             else:
@@ -236,13 +246,13 @@ class DriveProblem:
 
     @property
     def rate(self) -> np.ndarray:
-        """(n,) change by time of what the model as given predicts, per second, over a simulated sample each way."""
+        """(n,) change by time of what the model predicts, see `about`, a second, over a simulated sample each way."""
         if self._rate is None:
-            found = self._rate_as_given()
+            found = self._rate_there()
             self._rate = np.where(np.isfinite(found), found, 0.0)
         return self._rate
 
-    def _rate_as_given(self) -> np.ndarray:
+    def _rate_there(self) -> np.ndarray:
         sides = []
         interval = [run.every * run.model.timestep for run in self.bench.runs]
         for side in (-1.0, 1.0):
@@ -251,7 +261,7 @@ class DriveProblem:
                 for s in self.observations.series
             ]
             at = dataclasses.replace(self.observations, series=tuple(series))
-            simulated = self._run(self.bench, 1, self._values(self.origin()[None]), silent, at)
+            simulated = self._run(self.bench, 1, self._values(self._reference[None]), silent, at)
             sides.append(from_first(simulated, self.observations)[0])
         apart = np.empty(len(self.observations))
         for s in self.observations.series:
@@ -260,15 +270,15 @@ class DriveProblem:
 
     @property
     def step_error(self) -> np.ndarray:
-        """(n,) what a vanishing time step would add to the predictions of the model as given, to first order.
+        """(n,) what a vanishing time step would add to the model's predictions (see `about`), to first order.
 
         The step's error leads joints by a step or so, which an encoder sees. How much of it logs contain is a
         nuisance: all where a rover was measured, nothing where a simulator with the same step recorded it.
         """
         # the integrator is of first order: halving the step halves its error, so that twice the change is all of it
         if self._step_error is None:
-            origin = self.origin()[None]
-            coarse, fine = (self._simulations(b, origin, silent)[0] for b in (self.bench, self.bench.halved()))
+            there = self._reference[None]
+            coarse, fine = (self._simulations(b, there, silent)[0] for b in (self.bench, self.bench.halved()))
             two_step_error = 2.0 * (fine - coarse)
             self._step_error = np.where(np.isfinite(two_step_error), two_step_error, 0.0)
         return self._step_error

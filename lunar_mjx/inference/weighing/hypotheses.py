@@ -52,6 +52,8 @@ class Linear:
       wide: scale of tau's prior where something unlisted acts at a port. far: factor on the prior of an instrument that
         errs more than usual.
       judged: statistics of measurements that no fit sees and by whose prediction every hypothesis is weighed as well.
+      unkept: nats that the derivatives promise beyond the refit and that its descent could not reach: no hypothesis
+        around it is credited with them.
     """
 
     gram: Gram
@@ -70,6 +72,7 @@ class Linear:
     far: float
     added: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     judged: Gram | None = None
+    unkept: float = 0.0
 
     def evidence(
         self, terms: frozenset[Term], start: tuple[np.ndarray, np.ndarray] | None = None
@@ -108,7 +111,7 @@ class Linear:
         prior = Amplitudes(std, self.amplitudes.field, self.amplitudes.mean).select(places)
         fields = tuple(Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields)
         inferred = infer(gram.select(places), prior, fields, self.noises, start)
-        value = inferred.log_evidence + inferred.log_inside(self.low[places], self.high[places])
+        value = inferred.log_evidence + inferred.log_inside(self.low[places], self.high[places]) - self.unkept
         if self.judged is not None:
             held = self.judged if not gone else shifted(self.judged, discrepancy_back)
             value += inferred.log_score(held.select(places))

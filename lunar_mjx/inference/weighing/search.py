@@ -419,7 +419,8 @@ def _start(near: Hypothesis, form: Form) -> np.ndarray:
     u = near.refit.u.copy()
     # beyond the coordinates lie the amplitudes of unlisted inputs, which are integrated out and have no place in u
     own = near.places < len(u)
-    u[near.places[own]] += near.evidence.mean[own]
+    linear = near.refit.linear
+    u[near.places[own]] += near.evidence.within(linear.low[near.places], linear.high[near.places])[own]
     return u
 
 

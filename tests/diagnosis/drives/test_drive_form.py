@@ -55,6 +55,9 @@ class Toy:
         noise = np.random.default_rng(1).standard_normal(LOGS * SAMPLES)
         self.observations = dataclasses.replace(manoeuvres(LOGS, SAMPLES), value=self.predict(u[None])[0] + noise)
 
+    def about(self, u):
+        del u
+
     def predict(self, u):
         u = np.atleast_2d(u).copy()
         self.rows += len(u)
@@ -455,3 +458,66 @@ def test_the_model_alone_predicts_no_worse_than_as_given_or_refitted(truth):
     assert alone <= error(base.u) + 1e-3
     assert alone <= error(form.origin()) + 1e-3
     assert alone < error(base.u) - 1e-3 or alone < error(form.origin()) - 1e-3
+
+
+def test_a_secant_speaks_of_amounts_as_large_as_its_own_alone():
+    """Where little of an effect is asked for, its slope stands: a secant beside it would be one more freedom."""
+    form = DriveForm(Toy({"drag": 0.02}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    slope, secant = (form.jacobian(base.u, np.array([2]))[1][:, 0], form._secants[:, 2])  # type: ignore[index]
+    assert np.linalg.norm(secant) < 0.95 * np.linalg.norm(slope)
+    np.testing.assert_allclose(form._seen[:, 2], slope, rtol=1e-3)  # type: ignore[index]
+
+
+def test_no_estimate_goes_beyond_what_a_parameter_can_be():
+    """A base that is held by a bound is as bad as its bound makes it, and what a slope beyond promises is nothing."""
+    toy = Toy({"a": 1.5})
+    toy.coordinates = (dataclasses.replace(toy.coordinates[0], low=-1.0, high=1.0), *toy.coordinates[1:])
+    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    assert base.u[0] == pytest.approx(1.0, abs=1e-6)
+    free = DriveForm(Toy({"a": 1.5}), DriveSettings())  # type: ignore[arg-type]
+    bound, unbound = (f.learnt(f.refit(frozenset(), None, None))["log_evidence"] for f in (form, free))
+    assert bound < unbound - 5.0
+
+
+def test_an_effect_is_credited_with_what_its_refit_has_reached():
+    """What slopes promise beyond a place that no step could leave is nobody's."""
+    form = DriveForm(Toy({"a": 1.5, "drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    drag = frozenset({"drag"})
+    refit = form.refit(drag, base, None)
+    assert 0.0 <= refit.linear.unkept < form.settings.settled
+    away = refit.u + np.eye(len(refit.u))[0]
+    slopes = form.jacobian(away, form._free(drag))[1]
+    promised = form._descend(away, form._free(drag), form.observations, form._sizes_of(refit), slopes, once=True)[2]
+    assert promised >= 0.0
+    lavish, plain = (form._linear(away, drag, slopes, k).evidence(form.listed(drag))[0] for k in (7.0, 0.0))
+    assert lavish == pytest.approx(plain - 7.0)
+
+
+def test_a_refit_begins_where_the_model_itself_is_best():
+    """An estimate that leads far from what it was made around is not where its refit begins."""
+    form = DriveForm(Toy({"a": 0.8, "drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    free, far = form._free(frozenset({"drag"})), base.u.copy()
+    far[:3] = 4.0, -3.0, 0.5
+    begun = form._better_start(far, base, free)
+    np.testing.assert_array_equal(begun[:2], base.u[:2])
+    assert begun[2] == 0.5
+
+
+def test_what_is_usual_has_none_of_an_effect_that_was_refitted():
+    form = DriveForm(Toy({"drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
+    form.refit(frozenset(), None, None)
+    usual = form._number[module.USUAL_EFFECTS]
+    drag = form._seen[:, 2]  # type: ignore[index]
+
+    def left(effects: frozenset[str]) -> float:
+        """Share of the effect's signature that the columns of usual effects cannot give."""
+        columns, number = form._fields_beside(effects)
+        mine = columns[:, number == usual]
+        return float(np.linalg.norm(drag - mine @ np.linalg.lstsq(mine, drag, rcond=None)[0]) / np.linalg.norm(drag))
+
+    assert left(frozenset()) < 1e-6
+    assert left(frozenset({"drag"})) > 0.9
