@@ -297,9 +297,11 @@ class Evidence:
         return joint - _condition(self.gram, self.amplitudes, self.tau, self.noise)[0]
 
     def within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """(k,) most probable amplitudes within (k,) bounds, relative to the refit, at the sizes found.
+        """(k,) probable amplitudes within (k,) bounds, relative to the refit, at the sizes found.
 
         The others follow those that a bound holds: cut off alone, these would leave them at a place that fits nothing.
+        No bound lets go again: where one binds they are the most probable amplitudes, where several do there may be
+        better ones.
         """
         place, edge, held = self.mean.copy(), np.zeros(len(self.mean)), np.zeros(len(self.mean), bool)
         while (outside := ~held & ((place < low) | (place > high))).any():

@@ -527,7 +527,10 @@ class DriveForm(MeasuredForm):
         A linear estimate moves soil and starts of logs along slopes that do not hold so far: of a foreign LUVMI-X whose
         IMU is off, refits from the estimate's place ended 25 nats below those from the refit around which it was made.
         """
-        rows = np.stack([start, near.u, near.u])
+        # What that refit has and this set has not stays at its null: a set is told by what it has alone.
+        there, (low, high) = start.copy(), self.drives.bounds(free)
+        there[free] = np.clip(near.u[free], low, high)
+        rows = np.stack([start, there, there])
         own = np.setdiff1d(free, self.baseline)
         rows[2, own] = start[own]
         cost = self._cost(near.u, free, self.observations, self._sizes_of(near))
@@ -816,8 +819,7 @@ class DriveForm(MeasuredForm):
         jacobian = white(slopes)
         normal = inner(jacobian, jacobian) + np.diag(std**-2)
         downhill = inner(jacobian, residual) - (u[free] - centre) / std**2
-        step = _bounded_step(normal, downhill, u[free], low, high)
-        return u, slopes, _promised(step, normal, downhill)
+        return u, slopes, _promise_left(normal, downhill, u[free], low, high)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -859,6 +861,11 @@ class _Cost:
 def _promised(step: np.ndarray, normal: np.ndarray, downhill: np.ndarray) -> float:
     """Decrease of chi-square that the linear model promises of a step."""
     return float(2.0 * step @ downhill - step @ normal @ step)
+
+
+def _promise_left(normal: np.ndarray, downhill: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+    """Decrease of chi-square that a step within bounds still promises; 0 where it leads uphill, since none need be."""
+    return max(_promised(_bounded_step(normal, downhill, x, low, high), normal, downhill), 0.0)
 
 
 def held_out_pieces(observations: Observations, seconds: float) -> dict[str, np.ndarray]:
