@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import resource
 import sys
 
 import jax
@@ -112,6 +113,29 @@ def test_a_failure_keeps_the_dataset_that_was_there(env, driven, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         dataset.write_dataset(failing(), env, tmp_path, NAME, {})
     assert {p.name: p.read_bytes() for p in data.iterdir()} == before
+
+
+def test_a_full_disk_is_told_in_a_sentence(env, driven, tmp_path):
+    """A file that may not grow stands for it; HDF5's own writes ended the process with a fault of memory."""
+    pytest.importorskip("h5py", reason=LACKS)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.raises(UserError, match=r"main_data.hdf5: cannot be written \(File too large\)"):
+            _written(env, driven * 20, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list((tmp_path / NAME / "data").iterdir())
+
+
+def test_metadata_tell_the_whole_environment(env, driven, tmp_path):
+    pytest.importorskip("h5py", reason=LACKS)
+    _written(env, driven, tmp_path)
+    told = json.loads((tmp_path / NAME / "data" / "metadata.json").read_text())
+    assert told["rover"] == "luvmi_x" and "slip_sinkage" not in told["effects"] and told["effects"]
+    settings = told["settings"]
+    assert (settings["decimation"], settings["observations"][0]) == (5, "goal_body")
+    assert settings["randomise"][0]["parameter"] == "soil.cohesion"
 
 
 def _unread(*_):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import io
 import json
 import re
 import time
@@ -14,6 +16,7 @@ import jax
 import numpy as np
 
 from lunar_mjx._version import __version__
+from lunar_mjx.agents.train import plain
 from lunar_mjx.envs.core import State, split_keys
 from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.envs.navigation.labels import labels
@@ -150,6 +153,36 @@ def _space(low: float, high: float, size: int) -> str:
     return json.dumps(box)
 
 
+class _Sink(io.FileIO):
+    """A file that keeps what the operating system refuses until it is asked.
+
+    HDF5 cannot close a file that it could not write: where a disk is full it ends the process with a fault of memory.
+    """
+
+    def __init__(self, path: Path):
+        super().__init__(path, "w+")
+        self.refused: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while len(rest) and self.refused is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.refused = error
+        return size
+
+    def check(self) -> None:
+        """Raises what was refused.
+
+        Raises:
+          OSError: a write was.
+        """
+        if self.refused is not None:
+            raise self.refused
+
+
 def write_dataset(
     episodes: Iterator[Episode], env: NavigationEnv, folder: Path, name: str, about: dict[str, Any]
 ) -> tuple[int, int]:
@@ -158,6 +191,9 @@ def write_dataset(
     Args:
       episodes: from `drives`. env: whose observations they are. folder: that exists. name: of the dataset, as
         `check_dataset` takes it. about: what the metadata says beside sizes and names of numbers.
+
+    Raises:
+      UserError: it cannot be written: no permission, disk full.
     """
     h5py: Any = importlib.import_module("h5py")
     data = folder / name / "data"
@@ -165,7 +201,7 @@ def write_dataset(
     count = steps = 0
     # Renamed together, at the end: who kills it keeps the dataset that was there.
     with replacing(data / METADATA) as metadata_part, replacing(data / DATA) as part:
-        with h5py.File(part, "w", track_order=True) as file:
+        with _Sink(part) as sink, h5py.File(sink, "w", track_order=True) as file:
             for episode in episodes:
                 length = len(episode["rewards"])
                 group = file.create_group(f"episode_{count}")
@@ -176,6 +212,9 @@ def write_dataset(
                         if key != "infos":
                             parent.create_dataset(key, data=value)
                 count, steps = count + 1, steps + length
+                sink.check()
+            file.flush()
+            sink.check()
         told = {
             "dataset_id": name,
             "minari_version": MINARI,
@@ -190,11 +229,14 @@ def write_dataset(
             "actions": list(env.actions.names),
             "wheels": [wheel.corner for wheel in env.model.rover.wheels],
             "infos": UNITS,
+            "rover": env.model.rover.name,
+            "effects": env.model.effect_names,
+            "settings": dataclasses.asdict(env.config),
             "control_interval_s": env.control_interval,
             "lunar_mjx_version": __version__,
             **about,
         }
-        metadata_part.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        metadata_part.write_text(json.dumps(plain(told), indent=1) + "\n", encoding="utf-8")
     return count, steps
 
 
