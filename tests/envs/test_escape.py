@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gymnasium as gym
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,8 @@ import pytest
 
 import lunar_mjx.envs.gymnasium_env  # noqa: F401
 from lunar_mjx.envs import make_agent, make_navigation, split_keys
-from lunar_mjx.envs.navigation import rewards
+from lunar_mjx.envs.navigation import digging, rewards
+from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.envs.navigation.randomise import Range
 from lunar_mjx.errors import UserError
 
@@ -120,3 +123,25 @@ def test_rocking_is_refused_where_there_is_a_goal():
     env = make_navigation("consistent", terrain="flat", places=8, preset="consistent", action="velocity")
     with pytest.raises(UserError, match="use the task escape"):
         make_agent("rocking", env)
+
+
+def test_the_least_way_out_is_the_distance_to_escape(env, monkeypatch):
+    """What `spl` compares the way with: starts and goals of other tasks have nothing to do with it."""
+    # holes are none of its business, and take a minute to compile
+    monkeypatch.setattr(NavigationEnv, "_dig", lambda *_: ())
+    monkeypatch.setattr(digging, "stuck_ones", lambda: None)
+    config = dataclasses.replace(env.config, tally=True, places=2)
+    shortest = make_navigation(config, preset="consistent").params.shortest
+    np.testing.assert_array_equal(shortest, np.full(2, 2.0, np.float32))
+
+
+def test_driving_away_from_a_goal_pays_nobody():
+    with pytest.raises(UserError, match=r"weights = 'away' pays for driving away from a goal"):
+        make_navigation("escape", escape_distance=0.0)
+    with pytest.raises(UserError, match=r"weights = 'away'"):
+        make_navigation("large", weights={"away": 1.0})
+
+
+def test_a_filter_that_is_none_is_refused():
+    with pytest.raises(UserError, match=r"kalman = True is no KalmanConfig; set it in Python, or leave it out"):
+        make_navigation("consistent", kalman=True)

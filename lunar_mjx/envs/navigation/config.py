@@ -200,6 +200,8 @@ def _check(c: NavigationConfig) -> None:
     for name in ("tally", "four_wheel_steering", "posterior", "renew"):
         if not isinstance(getattr(c, name), bool):
             raise bad_input("navigation", name, getattr(c, name), "is neither true nor false", "give one of them")
+    if not isinstance(c.kalman, KalmanConfig):
+        raise bad_input("navigation", "kalman", c.kalman, "is no KalmanConfig", "set it in Python, or leave it out")
     if not all(isinstance(r, Range) for r in c.randomise):
         raise bad_input(
             "navigation", "randomise", c.randomise, "are no ranges", "give some Range(parameter, low, high)"
@@ -222,6 +224,9 @@ def _check(c: NavigationConfig) -> None:
             raise bad_input("navigation", "tally", c.tally, f"does not go with the reward term {name}", "give true")
         if name == "way" and not c.rung:
             raise bad_input("navigation", "weights", name, "is only known on the ladder", "leave it out")
+        if name == "away" and not c.escape_distance:
+            problem = "pays for driving away from a goal where escape_distance = 0"
+            raise bad_input("navigation", "weights", name, problem, "give escape_distance, or leave the term out")
     if c.collisions != "free" and not c.tally:
         raise bad_input("navigation", "tally", c.tally, f"does not go with collisions = {c.collisions}", "give true")
     for name in ("rung", "worlds", "place_seed", "curriculum_levels"):

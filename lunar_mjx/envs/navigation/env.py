@@ -290,7 +290,9 @@ class NavigationEnv:
             within=c.start_within,
         )
         arrays = [jnp.asarray(a, jnp.result_type(float)) for a in (starts, goals, bounds, gains)]
-        shortest = jnp.asarray(np.hypot(*(goals - starts).T), arrays[0].dtype) if c.tally else None
+        # out of a hole any straight way will do
+        least = np.full(len(starts), c.escape_distance) if c.escape_distance else np.hypot(*(goals - starts).T)
+        shortest = jnp.asarray(least, arrays[0].dtype) if c.tally else None
         params = NavigationParams(default_params(model), *arrays, shortest=shortest, spread=spread)
         if not c.escape_distance:
             return params
