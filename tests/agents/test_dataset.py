@@ -8,6 +8,7 @@ import resource
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -136,6 +137,15 @@ def test_metadata_tell_the_whole_environment(env, driven, tmp_path):
     settings = told["settings"]
     assert (settings["decimation"], settings["observations"][0]) == (5, "goal_body")
     assert settings["randomise"][0]["parameter"] == "soil.cohesion"
+
+
+def test_observations_that_are_not_finite_are_not_written(env):
+    def broken(state, key):
+        del key
+        return jnp.full((ROVERS, env.action_size), jnp.nan)
+
+    with pytest.raises(UserError, match=r"divergence = 'stop' lets .* not finite; give --env divergence=reset"):
+        list(dataset.drives(env, env.params, broken, ROVERS, FRAMES, 3))
 
 
 def _unread(*_):

@@ -75,6 +75,9 @@ def drives(env: NavigationEnv, params: Any, agent: Agent, rovers: int, frames: i
     Args:
       env, params: where. agent: who. rovers: side by side. frames: steps of all together, whole steps of all rovers.
       seed: of starts, goals, soils and random agents.
+
+    Raises:
+      UserError: an observation is not finite.
     """
 
     def step(state: State, key: Any) -> tuple[State, dict[str, Any]]:
@@ -101,6 +104,10 @@ def drives(env: NavigationEnv, params: Any, agent: Agent, rovers: int, frames: i
         state, told = piece(state, keys)
         told = jax.device_get(told)
         steps = min(_PIECE, left - number * _PIECE)
+        if not np.isfinite(told["after"]["observations"][:steps]).all():
+            # a learner reads such numbers without a word; where episodes end by divergence, observations are bounded
+            problem = "lets a rover's state through that is not finite"
+            raise bad_input("export", "divergence", env.config.divergence, problem, "give --env divergence=reset")
         for i, rover in enumerate(open_ones):
             yield from rover.add(told, i, steps)
     for rover in open_ones:
@@ -173,6 +180,16 @@ class _Sink(io.FileIO):
             self.refused = error
         return size
 
+    def truncate(self, size: int | None = None, /) -> int:
+        try:
+            return super().truncate(size) if self.refused is None else size or 0
+        except OSError as error:
+            self.refused = error
+            return size or 0
+
+    def flush(self) -> None:
+        """Nothing is held back here; `replacing` has it written to the disk."""
+
     def check(self) -> None:
         """Raises what was refused.
 
@@ -201,19 +218,20 @@ def write_dataset(
     count = steps = 0
     # Renamed together, at the end: who kills it keeps the dataset that was there.
     with replacing(data / METADATA) as metadata_part, replacing(data / DATA) as part:
-        with _Sink(part) as sink, h5py.File(sink, "w", track_order=True) as file:
-            for episode in episodes:
-                length = len(episode["rewards"])
-                group = file.create_group(f"episode_{count}")
-                group.attrs.update({"id": count, "total_steps": length})
-                infos = group.create_group("infos")
-                for parent, values in ((group, episode), (infos, episode["infos"])):
-                    for key, value in values.items():
-                        if key != "infos":
-                            parent.create_dataset(key, data=value)
-                count, steps = count + 1, steps + length
-                sink.check()
-            file.flush()
+        with _Sink(part) as sink:
+            with h5py.File(sink, "w", track_order=True) as file:
+                for episode in episodes:
+                    length = len(episode["rewards"])
+                    group = file.create_group(f"episode_{count}")
+                    group.attrs.update({"id": count, "total_steps": length})
+                    infos = group.create_group("infos")
+                    for parent, values in ((group, episode), (infos, episode["infos"])):
+                        for key, value in values.items():
+                            if key != "infos":
+                                parent.create_dataset(key, data=value)
+                    count, steps = count + 1, steps + length
+                    if sink.refused:
+                        break
             sink.check()
         told = {
             "dataset_id": name,
