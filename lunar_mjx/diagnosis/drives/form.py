@@ -135,6 +135,7 @@ class DriveForm(MeasuredForm):
         self.error_times_s: Mapping[str, float] = {}
         self.start = self.origin()  # where the first refit begins
         self.kept: Mapping[str, Any] = {}  # what `learnt` told of that place; then it has been refitted already
+        self._trial: np.ndarray | None = None  # where a refit begins for which an effect is to act
         self._number = {f.name: k for k, f in enumerate(self._usual_fields())}  # of each field
         self._ground = np.zeros(len(drives.ground))  # amounts of its modes, where the model as it is was refitted
 
@@ -439,6 +440,11 @@ class DriveForm(MeasuredForm):
 
     # --- refits ------------------------------------------------------------------------------------------------------
 
+    def trial(self, u: np.ndarray, effect: str) -> np.ndarray:
+        """See `Form`."""
+        self._trial = super().trial(u, effect)
+        return self._trial
+
     def learnt(self, refit: Refit) -> dict[str, Any]:
         """Log evidence of a refit, and the errors beside the noise that it was found with.
 
@@ -478,7 +484,8 @@ class DriveForm(MeasuredForm):
         u[self.drives.ground] = self._ground
         low, high = self.drives.bounds(free)
         u[free] = np.clip(u[free], low + 1e-9, high - 1e-9)
-        if near is not None and start is not None:
+        # A trial begins where its effect acts, whatever that costs: at its null it may have no slope.
+        if near is not None and start is not None and start is not self._trial:
             u = self._better_start(u, near, free)
         first = self._seen is None
         if first:
@@ -499,6 +506,7 @@ class DriveForm(MeasuredForm):
             guessed = number == 0 and bool(effects)
             u, slopes, promised = self._descend(u, free, self.observations, sizes, slopes, guessed=guessed)
             # An effect is credited with what its refit has reached, not with what slopes promise that no step has kept.
+            # The model as it is keeps its promise: what a descent that ended early has left is no effect's gain.
             linear = self._linear(u, effects, slopes, 0.5 * promised if effects else 0.0)
             value, found, _ = linear.evidence(terms, sizes)
             gained = math.inf if best is None else value - best[0]

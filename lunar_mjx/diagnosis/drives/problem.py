@@ -164,9 +164,9 @@ class DriveProblem:
         return pairs[:, 0], pairs[:, 1]
 
     def about(self, u: np.ndarray) -> None:
-        """Takes what instruments and finite steps add about the model's predictions at (coordinates,) from now on.
+        """Sets the place (coordinates,) at whose predictions errors of instruments and of finite steps are linear.
 
-        About the model as given, where that errs much, an instrument's scale would be one of other signals.
+        It is the model as given until then. Where that errs much, an instrument's scale there is one of other signals.
         """
         self._reference = self.origin()
         self._reference[self.baseline], self._reference[self.ground] = u[self.baseline], u[self.ground]
@@ -246,7 +246,7 @@ class DriveProblem:
 
     @property
     def rate(self) -> np.ndarray:
-        """(n,) change by time of what the model predicts, see `about`, a second, over a simulated sample each way."""
+        """(n,) change of the predictions by time, 1/s, over a simulated sample each way, at the place of `about`."""
         if self._rate is None:
             found = self._rate_there()
             self._rate = np.where(np.isfinite(found), found, 0.0)

@@ -109,6 +109,23 @@ def test_a_program_without_candidates_predicts_what_one_with_them_at_their_null_
     assert np.abs((both[1] - both[0]) / quiet.observations.sigma()).max() > 5.0
 
 
+def test_usual_errors_are_those_of_the_place_where_the_model_stands(quiet):
+    """A current's scale is a share of the current that is predicted there, not of that of the model as given."""
+    (scale,) = [i for i, c in enumerate(quiet.coordinates) if c.name == "usual motor A: scale"]
+    (motor,) = [i for i, c in enumerate(quiet.coordinates) if c.key == "motor.torque_constant"]
+    there, more = quiet.origin(), quiet.origin()
+    there[motor] = more[motor] = 3.0
+    more[scale] = 1.0
+    rows = np.concatenate([np.arange(s.start, s.stop) for s in quiet.observations.series if "current" in s.channel])
+    changes = []
+    for place in (quiet.origin(), there):
+        quiet.about(place)
+        changes.append((quiet.predict(more[None]) - quiet.predict(there[None]))[0, rows])
+        np.testing.assert_allclose(changes[-1], 0.01 * quiet.predict(place[None])[0, rows], atol=1e-12)
+    quiet.about(quiet.origin())
+    assert np.abs(changes[1] - changes[0]).max() > 0.05 * np.abs(changes[0]).max()
+
+
 def test_drives_without_a_hidden_effect_are_noise_only(quiet):
     form, found, said = _found(quiet)
     assert said.verdict is Verdict.NOISE_ONLY, said.sentence

@@ -37,3 +37,15 @@ def test_a_step_within_bounds_that_leads_uphill_is_no_promise():
     far = np.full(3, 1e9)
     best = downhill @ np.linalg.solve(normal, downhill)
     assert module._promise_left(normal, downhill, np.zeros(3), -far, far) == pytest.approx(best)
+
+
+def test_a_trial_begins_where_its_effect_acts(monkeypatch):
+    """Even where the model is better without it: at its null it may have no slope."""
+    form = DriveForm(Toy({"a": 0.8}), DriveSettings())  # type: ignore[arg-type]
+    base, begun, descend = form.refit(frozenset(), None, None), [], form._descend
+    monkeypatch.setattr(form, "_descend", lambda u, *rest, **more: (begun.append(u[2]), descend(u, *rest, **more))[1])
+    start = form.trial(base.u, "drag")
+    form.refit(frozenset({"drag"}), base, start)
+    form.refit(frozenset({"drag"}), base, start.copy())
+    assert begun[0] == 0.5 * form.effect_size(form.coordinates[2])
+    assert 0.0 in begun
