@@ -288,8 +288,8 @@ def test_the_most_probable_level_of_slow_errors_is_taken(drawn):
     assert found.log_evidence == pytest.approx(max(alone.values()), abs=1e-4)
 
 
-def test_amplitudes_within_bounds_are_the_most_probable_ones(drawn):
-    """The others follow those that a bound holds, against bounded least squares."""
+def test_amplitudes_within_bounds_are_those_of_bounded_least_squares(drawn):
+    """Amplitudes that no bound holds move to where they fit best beside those that one does."""
     columns, residual, group, amplitudes = drawn
     found = infer(Gram.of(columns, residual, group, 2), amplitudes, FIELDS, NOISES)
     low, high = np.full(len(found.mean), -np.inf), np.full(len(found.mean), np.inf)

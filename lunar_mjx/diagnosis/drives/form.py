@@ -303,7 +303,7 @@ class DriveForm(MeasuredForm):
         self._fields, self._beside = self._field_columns(self.observations), {}
 
     def _fields_beside(self, effects: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
-        """See `_field_columns`.
+        """Columns (n, m) of all fields beside a refit's effects, SI units at size 1, and the field (m,) of each.
 
         Where an effect has its own refit, what is usual has none of it: the difference of its derivatives here and
         there would be one more freedom, which no other hypothesis has.
@@ -771,8 +771,7 @@ class DriveForm(MeasuredForm):
           TimeUp: before the descent of some effects had ended, or before that of the model as it is had begun.
         """
         settings, cost = self.settings, self._cost(u, free, observations, sizes)
-        white, inner, std, centre = cost.white, cost.inner, cost.std, cost.centre
-        wanted = cost.wanted
+        white, inner, wanted, std, centre = cost.white, cost.inner, cost.wanted, cost.std, cost.centre
         low, high = self.drives.bounds(free)
 
         if slopes is None:

@@ -31,8 +31,8 @@ class UsualErrors:
     farthest: float = 6.0
     """Standard deviations at which stated errors are bounded."""
     usual_farthest: float = 30.0
-    """Standard deviations at which usual errors are bounded: they are linear, and a bound that binds makes one of the
-    least convincing parts of a model the most rigid."""
+    """Standard deviations at which usual errors are bounded: far enough that their prior holds them and no bound
+    does (a gyro's zero had ended at six, where a foreign LUVMI-X asked for seven and a half)."""
     unknown_deg: float = 60.0
     """A mounting less well known than this is no small angle: its axis tells nothing, and has no nuisance."""
     usual_clock_s: float = 0.005
