@@ -316,6 +316,7 @@ UNCHECKED = {
     "spatial.py": (2, SUMS),
     "terrain/sky/ephemeris.py": (4, OPTIONAL),
     "wheel_bed/particles/kernels.py": (2, "Warp compiles these functions, with types of its own"),
+    "wheel_bed/particles/moving_bed.py": (1, OPTIONAL),
     "wheel_bed/particles/sand_box.py": (1, OPTIONAL),
     "wheel_bed/particles/slump.py": (1, OPTIONAL),
 }

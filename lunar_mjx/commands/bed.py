@@ -1,7 +1,8 @@
-"""`lunar-mjx bed`: single-wheel test beds that are simulated, with a soil of particles."""
+"""`lunar-mjx bed`: simulated test beds with a soil of particles, for one wheel or a rover."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,8 +23,9 @@ VOXELS = 8.0
 
 def register(app: typer.Typer) -> None:
     """Adds the command `bed` to the application."""
-    bed_app = typer.Typer(help="Simulated single-wheel test beds.", no_args_is_help=True)
+    bed_app = typer.Typer(help="Simulated test beds: a wheel or a rover in particle sand.", no_args_is_help=True)
     bed_app.command("simulate")(simulate)
+    bed_app.command("drive")(drive)
     app.add_typer(bed_app, name="bed")
 
 
@@ -88,8 +90,7 @@ def simulate(
         path=path,
         seed=seed,
     )
-    g = GRAVITIES.get(gravity)
-    g = require_within("bed simulate", "--gravity", gravity, 0.0, 100.0, above=True) if g is None else g
+    g = _gravity(gravity, "bed simulate")
     # The whole plan first: what the folder lacks of it is what there is to do, after a stop as well.
     runs = campaign.plan(wheel, sand, g, points, numerics, controls)
     if campaign.missing(runs, out):
@@ -107,6 +108,90 @@ def simulate(
     _tell(outcome, folder, len(points))
     if outcome.results:
         print(write_particle_log(folder, outcome.results, definition))
+
+
+def drive(
+    out: Annotated[Path, typer.Argument(help="New folder: log/, drive.json and surface.csv.")],
+    rover: Annotated[str, typer.Option(help="Name of a shipped rover, or folder of one.")] = "luvmi_x",
+    manoeuvre: Annotated[str, typer.Option(help="Canned manoeuvre, or TOML file of one.")] = "speed_staircase",
+    terrain: Annotated[
+        str | None, typer.Option(help="flat or slope:5deg, in place of the manoeuvre's terrain.")
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Length of the drive, s; the manoeuvre's own if left out.")
+    ] = None,
+    gravity: Annotated[str, typer.Option(help="earth, moon, or m/s2")] = "moon",
+    friction_angle: Annotated[
+        float | None, typer.Option(help="of the sand, deg; the model's soil's if left out")
+    ] = None,
+    cohesion: Annotated[float | None, typer.Option(help="of the sand, Pa; the model's soil's if left out")] = None,
+    density: Annotated[float, typer.Option(help="of the sand, kg/m3")] = 1600.0,
+    wheel_friction: Annotated[float, typer.Option(help="coefficient between wheel and sand")] = 0.5,
+    voxel: Annotated[float | None, typer.Option(help="m; an eighth of the radius if left out")] = None,
+    contact: Annotated[str, typer.Option(help="S2 (nodes of the grid) or pic8 (particles)")] = "S2",
+    step_share: Annotated[float, typer.Option(help="voxels that a rim moves in a time step, at most")] = 0.15,
+    control: Annotated[
+        bool, typer.Option(help="Drive again with voxels 1.5 times as large, to learn the numerical error.")
+    ] = True,
+    noise: Annotated[str, typer.Option(help="Of the instruments: datasheet, none or scale:5.")] = "datasheet",
+    forces: Annotated[bool, typer.Option(help="With force and torque sensors.")] = False,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of particles' places and of noise.")] = 0,
+    seconds: Annotated[float | None, typer.Option(help="Time limit; what was driven until then is written.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+) -> None:
+    """Drive a rover through simulated sand and write a log of it, with its numerical error in the noise."""
+    check_folder(out)
+    select_device("cpu")  # JAX only makes the model here, and must not take the GPU's memory
+    import dataclasses
+
+    import numpy as np
+
+    from lunar_mjx.backends.in_sand import plane_of
+    from lunar_mjx.backends.sand_drive import require_shown, smooth_wheels
+    from lunar_mjx.logs.recorder.instruments import Recording, parse_noise
+    from lunar_mjx.logs.recorder.particle_drive import record_sand_drive
+    from lunar_mjx.logs.write import refuse_used
+    from lunar_mjx.manoeuvres import commands, load_manoeuvre
+    from lunar_mjx.model import make_model
+    from lunar_mjx.report.progress import console_progress
+    from lunar_mjx.wheel_bed.particles.sand_box import open_device
+    from lunar_mjx.wheel_bed.particles.settings import Numerics, Sand
+
+    limit = float("inf") if seconds is None else require_within("bed drive", "--seconds", seconds, 0.0, above=True)
+    recording = Recording(parse_noise(noise), forces=forces)
+    plan = load_manoeuvre(manoeuvre)
+    spec = terrain or plan.terrain
+    plan = dataclasses.replace(plan, terrain=spec)
+    scale = 1.0 if duration is None else require_within("bed drive", "--duration", duration, 0.5, 1e5) / plan.duration_s
+    model = make_model(rover, spec, "consistent").replace(gravity=_gravity(gravity, "bed drive"))
+    model = model.replace(modes={"drive": plan.drive_mode})
+    soil = model.parameters["soil"]
+    sand = Sand(
+        math.degrees(float(np.asarray(soil["friction_angle"]))) if friction_angle is None else friction_angle,
+        float(np.asarray(soil["cohesion"])) if cohesion is None else cohesion,
+        density,
+        wheel_friction,
+    )
+    wheels = smooth_wheels(model)
+    size = min(w.radius for w in wheels) / VOXELS if voxel is None else voxel
+    numerics = Numerics(voxel=size, contact=contact, step_share=step_share, seed=seed)
+    require_shown(wheels, size)
+    moves = commands(plan, model, scale)
+    plane_of(model.terrain, plan.start[0], plan.start[1])  # refuses hills
+    refuse_used(out)
+    name = open_device(device)  # before anything is written
+    with console_progress() as progress:
+        told = record_sand_drive(
+            make_folder(out), model, rover, plan, moves, sand, numerics, name, limit, progress, control, recording
+        )
+    for line in told:
+        print(line)
+
+
+def _gravity(text: str, command: str) -> float:
+    """Gravity by name, or as a number in m/s2."""
+    named = GRAVITIES.get(text)
+    return require_within(command, "--gravity", text, 0.0, 100.0, above=True) if named is None else named
 
 
 def _table(like: str) -> SteadyStateTable:

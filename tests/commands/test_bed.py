@@ -1,4 +1,4 @@
-"""`lunar-mjx bed simulate`: what it refuses, and the table of runs that are already there."""
+"""`lunar-mjx bed`: what it refuses, and the table of runs that are already there."""
 
 from __future__ import annotations
 
@@ -40,6 +40,32 @@ def test_mistakes(run, tmp_path, options, words):
 @pytest.mark.skipif(HERE, reason="the extra `particles` is installed")
 def test_without_the_extra(run, tmp_path):
     result = run("bed", "simulate", tmp_path / "out", *WHEEL, "--slips", 0.1, "--loads", 10, "--controls", 0)
+    assert result.status == 2 and "pip install 'lunar-mjx[particles]'" in result.err
+    assert result.err.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--manoeuvre", "waltz"), "name = 'waltz' is neither canned nor a TOML file"),
+        (("--terrain", "slope:95deg"), "is not a slope below 90 degrees"),
+        (("--voxel", "0.03"), "--voxel = 0.03 is too coarse"),
+        (("--gravity", "mars"), "--gravity = 'mars'"),
+        (("--duration", "0"), "--duration = 0"),
+        (("--friction-angle", "80"), "friction_angle = 80"),
+        (("--contact", "Q9"), "contact = 'Q9' does not exist"),
+        (("--device", "tpu"), "--device = 'tpu' does not exist"),
+    ],
+)
+def test_mistakes_of_a_drive(run, tmp_path, options, words):
+    result = run("bed", "drive", tmp_path / "out", *options)
+    assert result.status == 2 and words in result.err
+    assert result.err.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(HERE, reason="the extra `particles` is installed")
+def test_a_drive_without_the_extra(run, tmp_path):
+    result = run("bed", "drive", tmp_path / "out", "--duration", 1)
     assert result.status == 2 and "pip install 'lunar-mjx[particles]'" in result.err
     assert result.err.count("\n") == 1 and not (tmp_path / "out").exists()
 
