@@ -86,10 +86,10 @@ def test_the_teacher_hands_over_environment_by_environment(teacher):
     env = SeeingPoint()
     agent = Distill(DistillConfig(teacher, (4,), filters=(2,), teacher_steps=10), env)
     state = env.reset(env.params, split_keys(jax.random.PRNGKey(0), 8))
-    student = agent.init(jax.random.PRNGKey(1))
+    student, drive = jax.jit(agent.init)(jax.random.PRNGKey(1)), jax.jit(agent.drive)
     own, taught = agent.act(student.actor, state.obs), agent.teacher.act(state.privileged)
     for steps, by_teacher in ((0, 8), (5, 4), (9, 1), (10, 0), (1000, 0)):
-        action, lesson = agent.drive(student, state.obs, state.privileged, jnp.asarray(steps))
+        action, lesson = drive(student, state.obs, state.privileged, jnp.asarray(steps))
         assert (action[:by_teacher] == taught[:by_teacher]).all() and (action[by_teacher:] == own[by_teacher:]).all()
         assert (lesson.action == taught).all() and (lesson.obs == state.obs).all()
     alone = Distill(dataclasses.replace(agent.config, teacher_steps=0), env)
@@ -99,11 +99,12 @@ def test_the_teacher_hands_over_environment_by_environment(teacher):
 def test_every_lesson_counts_once_in_a_pass(teacher):
     """With one minibatch the update is one step along the gradient of the mean over all lessons."""
     agent = Distill(DistillConfig(teacher, (4,), filters=(2,), minibatches=1, tau=0.25), SeeingPoint())
-    state, key = agent.init(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
+    state, key = jax.jit(agent.init)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
     lessons = Lesson(jax.random.normal(key, (6, 3, 2 + ROWS * COLUMNS)), jax.random.uniform(key, (6, 3, 2)))
-    after, losses = agent.update(state, lessons, key)
-    assert float(losses["imitation_loss"]) == pytest.approx(float(agent.loss(state.actor, lessons)), rel=1e-5)
-    change, _ = agent.optimiser.update(jax.grad(agent.loss)(state.actor, lessons), state.optimiser)
+    after, losses = jax.jit(agent.update)(state, lessons, key)
+    loss, gradient = jax.jit(jax.value_and_grad(agent.loss))(state.actor, lessons)
+    assert float(losses["imitation_loss"]) == pytest.approx(float(loss), rel=1e-5)
+    change, _ = jax.jit(agent.optimiser.update)(gradient, state.optimiser)
     for a, b, c in zip(*(jax.tree.leaves(t) for t in (after.actor, state.actor, change)), strict=True):
         assert np.asarray(a) == pytest.approx(np.asarray(b + c), abs=1e-6)
     # the policy that is kept follows by its share
@@ -113,15 +114,15 @@ def test_every_lesson_counts_once_in_a_pass(teacher):
 
 def test_convolutions_see_the_picture_alone_and_pass_the_other_numbers_on():
     actor = make_actor(3 + 4 * 6 + 2, 2, (8,), picture=(3, 4, 6, 1), filters=(5, 7))
-    params = actor.init(jax.random.PRNGKey(0))
+    params, apply = jax.jit(actor.init)(jax.random.PRNGKey(0)), jax.jit(actor.apply)
     # two halvings of 4 x 6 leave 1 x 2 places of 7 features beside the 5 other numbers
     assert params["params"]["hidden_0"]["kernel"].shape == (5 + 1 * 2 * 7, 8)
     seen = jax.random.normal(jax.random.PRNGKey(1), (9, 29))
-    slope = np.asarray(jax.jacobian(lambda x: actor.apply(params, x))(seen[0]))
+    slope = np.asarray(jax.jit(jax.jacobian(lambda x: actor.apply(params, x)))(seen[0]))
     assert slope.shape == (2, 29) and (np.abs(slope) > 0).any(axis=0).all()
     # leading axes do not matter
-    assert np.asarray(actor.apply(params, seen.reshape(3, 3, 29))).reshape(9, 2) == pytest.approx(
-        np.asarray(actor.apply(params, seen)), abs=1e-6
+    assert np.asarray(apply(params, seen.reshape(3, 3, 29))).reshape(9, 2) == pytest.approx(
+        np.asarray(apply(params, seen)), abs=1e-6
     )
 
 
@@ -138,11 +139,12 @@ SMALL = {
 @pytest.fixture(scope="module")
 def rovers():
     options = {**get_training("large-depth").options, **SMALL}
-    return options, make_navigation(**options)
+    env = make_navigation(**options)
+    return options, env, jax.jit(env.reset)
 
 
 def test_a_rover_learns_from_the_shipped_policy_and_its_file_brings_the_camera(rovers, tmp_path):
-    options, env = rovers
+    options, env, reset = rovers
     assert env.picture == (env.blocks["camera/depth"].start, 12, 16, 1)
     assert env.observation_size == env.blocks["camera/depth"].start + 12 * 16
     algorithm = DistillConfig("luvmi_x", (16,), filters=(4, 4), unroll=2, minibatches=2)
@@ -155,15 +157,15 @@ def test_a_rover_learns_from_the_shipped_policy_and_its_file_brings_the_camera(r
     assert made.blocks == env.blocks and "height_scan" not in made.blocks
     with pytest.raises(UserError, match=r"network\.picture"):
         open_agent(str(path), options={"camera_width": 12, "camera_height": 16})
-    state = env.reset(env.params, split_keys(jax.random.PRNGKey(3), 2))
+    state = reset(env.params, split_keys(jax.random.PRNGKey(3), 2))
     assert np.asarray(agent(state, None)) == pytest.approx(np.asarray(result.policy.act(state.obs)), abs=1e-6)
 
 
 def test_the_privileged_numbers_are_what_the_teacher_was_trained_on(rovers):
-    _, env = rovers
+    _, env, reset = rovers
     seeing = make_navigation("large", preset="consistent", **{**SMALL, "privileged": ()})
     keys = split_keys(jax.random.PRNGKey(1), 2)
-    assert (env.reset(env.params, keys).privileged == seeing.reset(seeing.params, keys).obs).all()
+    assert (reset(env.params, keys).privileged == jax.jit(seeing.reset)(seeing.params, keys).obs).all()
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,14 @@ def _field(heights: Any, cell: float = 0.02) -> HeightField:
 
 def _wheels(field: HeightField, x: Any, z: Any, share: float = 1.0, y: Any = 0.0, axle: Any = (0.0, 1.0, 0.0)) -> Any:
     """Contact, load and force in the world of standing wheels with their centres at x, y, z."""
-    x, z = np.broadcast_arrays(np.asarray(x, float), np.asarray(z, float))
+    places = np.broadcast_arrays(*(np.asarray(v, float) for v in (x, y, z)))
+    contact, load, force = _compiled(field, *places, share, axle)
+    return contact, np.asarray(load), force
+
+
+@jax.jit
+def _compiled(field: HeightField, x: Any, y: Any, z: Any, share: Any, axle: Any) -> Any:
+    """See `_wheels`; compiled once for a shape of the field and a number of wheels."""
     zero = jnp.zeros(x.shape)
     still = Vec3(zero, zero, zero)
     pipeline = Pipeline(effects_named(NAMES))
@@ -40,7 +47,7 @@ def _wheels(field: HeightField, x: Any, z: Any, share: float = 1.0, y: Any = 0.0
     given = parameters(pipeline.effects, {})
     ctx = bare_context(
         terrain=SimpleNamespace(field=field),
-        wheel_position=Vec3(jnp.asarray(x), zero + y, jnp.asarray(z)),
+        wheel_position=Vec3(x, y, z),
         wheel_axle=Vec3(*(zero + a for a in axle)),
         wheel_velocity=still,
         wheel_angular_velocity=still,
@@ -53,7 +60,7 @@ def _wheels(field: HeightField, x: Any, z: Any, share: float = 1.0, y: Any = 0.0
     contact: Any = ctx.contact
     wheel: Any = wheel_ports(pipeline, ctx, {})[0].wheel
     force = contact.forward * wheel.force.x + contact.left * wheel.force.y + contact.normal * wheel.force.z
-    return contact, np.asarray(wheel.force.z), force
+    return contact, wheel.force.z, force
 
 
 @pytest.fixture(autouse=True)
@@ -147,7 +154,7 @@ def test_engines_meet_the_same_plane():
 def test_it_has_derivatives():
     """Of the load by the height of the wheel, in the air, touching, and in the ground."""
     field = _field(lambda x, y: 0.02 * np.sin(9.0 * x))
-    slope = jax.vmap(jax.grad(lambda z: jnp.sum(initial(field, z))))(jnp.array([0.2, 0.249, 0.3, 2.0]))
+    slope = jax.jit(jax.vmap(jax.grad(lambda z: jnp.sum(initial(field, z)))))(jnp.array([0.2, 0.249, 0.3, 2.0]))
     assert np.isfinite(np.asarray(slope)).all()
 
 

@@ -58,10 +58,14 @@ def sense(name: str, values: Any, channels: Any, times: Array = TIMES) -> dict[s
     return effect.ports["sensor"](ctx, own, SimpleNamespace(), Signals(times, dict(channels))).channels
 
 
+_compiled = jax.jit(sense, static_argnums=0)
+
+
 def sensed(name: str, values: Any, channels: Any, times: Array = TIMES) -> dict[str, Array]:
+    """`sense` in float64, compiled once for an effect; values not given are at their null."""
     with jax.enable_x64(True):
-        arrays = {k: jnp.asarray(v) for k, v in channels.items()}
-        return {k: np.asarray(v) for k, v in sense(name, values, arrays, jnp.asarray(times)).items()}
+        whole, arrays, at = jax.tree.map(jnp.asarray, ({**catalogue.get(name).null(), **values}, dict(channels), times))
+        return {k: np.asarray(v) for k, v in _compiled(name, whole, arrays, at).items()}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -147,7 +151,7 @@ def test_a_late_clock_is_right_to_first_order() -> None:
         def angle(offset: Array) -> Array:
             return sense("clock_offset", {"joint": offset}, channels, jnp.asarray(TIMES))["joint_lf_drive_angle_rad"]
 
-        slope = np.asarray(jax.jacfwd(angle)(jnp.zeros(())))
+        slope = np.asarray(jax.jit(jax.jacfwd(angle))(jnp.zeros(())))
     assert np.abs(slope + np.cos(TIMES))[1:-1].max() < 1e-3
 
 
@@ -245,9 +249,7 @@ def test_a_batch_of_drives_is_sensed_as_each_alone() -> None:
     both = {k: np.stack([one[k], two[k]]) for k in one}
     for name in NAMES:
         values = catalogue.get(name).nominal()
-        with jax.enable_x64(True):
-            arrays = {k: jnp.asarray(v) for k, v in both.items()}
-            batch = {k: np.asarray(v) for k, v in sense(name, values, arrays, jnp.asarray(TIMES)).items()}
+        batch = sensed(name, values, both)
         for i, single in enumerate((one, two)):
             for key, want in sensed(name, values, single).items():
                 assert batch[key][i] == pytest.approx(want, abs=1e-11), f"{name} {key}"

@@ -17,6 +17,7 @@ from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.envs.navigation.randomise import Range
 from lunar_mjx.errors import UserError
 
+pytestmark = pytest.mark.optimised
 SMALL = {"task": "escape", "preset": "consistent", "places": 16, "episode_time": 40.0}
 ROVERS = 8
 

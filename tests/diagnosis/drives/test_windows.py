@@ -9,10 +9,18 @@ import pytest
 from lunar_mjx.diagnosis import verbs as all_verbs
 from lunar_mjx.diagnosis.drives.observations import DISCREPANCY_TIME_S
 from lunar_mjx.diagnosis.drives.windows import coordinates, verbs
+from lunar_mjx.diagnosis.drives.windows import problem as problem_room
 from lunar_mjx.diagnosis.drives.windows.bench import Bench, held_out_parts
 from lunar_mjx.diagnosis.drives.windows.cut import CHANNELS, CURRENTS, Cut, _held, channels_read, cut, imu_clock
 from lunar_mjx.diagnosis.drives.windows.form import WindowForm, observe
-from lunar_mjx.diagnosis.drives.windows.problem import Noise, WindowProblem, corners, learn_noise, proportions
+from lunar_mjx.diagnosis.drives.windows.problem import (
+    Noise,
+    WindowProblem,
+    WindowProgram,
+    corners,
+    learn_noise,
+    proportions,
+)
 from lunar_mjx.diagnosis.drives.windows.settings import WindowSettings, by_motion
 from lunar_mjx.diagnosis.drives.windows.verbs import fitted_model
 from lunar_mjx.diagnosis.runs import Run
@@ -30,6 +38,13 @@ from lunar_mjx.resources import shipped
 pytestmark = pytest.mark.optimised
 RADIUS, SAMPLES, INTERVAL = 0.165, 8, 0.15
 NOISE = (Noise(0.25, 0.0, 1.0), Noise(0.25, 0.0, 1.0), Noise(0.01, 0.0, 1.0), Noise(0.05, 0.0, 1.0))
+
+
+@pytest.fixture(autouse=True)
+def few_at_once(request, monkeypatch):
+    """Windows in batches of few alone: the program of many has to be compiled, too, and is filled up to 1,024."""
+    if not request.node.get_closest_marker("slow"):
+        monkeypatch.setattr(problem_room, "PROGRAM", WindowProgram(sizes=(64, 64)))
 
 
 @pytest.fixture(scope="module")
