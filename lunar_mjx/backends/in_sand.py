@@ -146,6 +146,14 @@ class RoverInSand(NativeBackend):
         self.set_state(state)
         self.plane = plane
 
+    def wheel_forces(self) -> np.ndarray:
+        """Forces and moments of the last step of the bed on the wheels, world, (2, w, 3), N and N m."""
+        return np.stack([self._force, self._moment])
+
+    def set_wheel_forces(self, forces: np.ndarray) -> None:
+        """Takes what `wheel_forces` gave as the last step's."""
+        self._force, self._moment = forces.copy()
+
     def mobility(self) -> tuple[float, float]:
         """1/mass, 1/kg, and 1/inertia about the axle, 1/(kg m2), as which a wheel shall yield to new impulses.
 

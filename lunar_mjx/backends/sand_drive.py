@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from lunar_mjx.backends.base import Observation, telemetry, whole_steps
+from lunar_mjx.backends.base import BackendState, Observation, telemetry, whole_steps
 from lunar_mjx.backends.in_sand import Balance, Bed, RoverInSand, plane_of
 from lunar_mjx.dynamics.state import Telemetry
 from lunar_mjx.errors import bad_input
@@ -91,17 +91,8 @@ def moving_bed(
     return MovingBed(smooth_wheels(model), sand, gravity, numerics, step, yields, device)
 
 
-def drive(
-    model: Model,
-    moves: Commands,
-    start: tuple[float, float, float],
-    sand: Sand,
-    numerics: Numerics,
-    device: str,
-    going_on: Callable[[float], bool] = lambda share: True,
-    make_bed: Callable[..., Any] = moving_bed,
-) -> SandDrive | None:
-    """Drives a rover through particle sand.
+class SandRun:
+    """A drive of a rover through particle sand, which may be left and gone on with.
 
     Args:
       model: its rover, motors, gravity and a plane as terrain; its soil has no say.
@@ -109,81 +100,147 @@ def drive(
       start: x, y in m and yaw in rad.
       sand, numerics: of the bed; step_share is the share of a voxel that the rims move in a step.
       device: by Warp's name.
-      going_on: called after each step of the bed with the share that is done; False ends the drive.
       make_bed: what makes the bed.
-
-    Returns:
-      The drive, as far as it came; None where it ended before the rover stood.
 
     Raises:
       UserError: the terrain is no plane, or the model has an effect that NumPy's physics lacks.
-      FloatingPointError: the rover's place is no longer finite.
     """
-    begun = time.perf_counter()
-    backend = RoverInSand(model, bed_substeps(model, moves, numerics))
-    plane = plane_of(model.terrain, start[0], start[1])
-    # Contact at nodes of the grid acts from a quarter of a voxel outside a wheel.
-    backend.place_above(plane, *start, 0.25 * numerics.voxel if numerics.contact == "S2" else 0.0)
-    yields = backend.mobility()
-    down = plane.into(np.array([0.0, 0.0, -model.gravity]))
-    bed = backend.bed = make_bed(model, sand, down, numerics, backend.bed_step, yields, device)
-    set_up = time.perf_counter() - begun
 
-    radius = max(w.radius for w in model.rover.wheels)
-    settle = math.ceil(numerics.settle * math.sqrt(radius / model.gravity) / backend.bed_step)
-    per_command = whole_steps(moves, model.timestep)
-    keep = _kept_steps(per_command, model.timestep)
-    steps = len(moves.values) * per_command
-    rounds = settle + math.ceil(steps / backend.substeps)
-    balance = Balance(np.zeros(3), np.zeros(3), np.zeros(3))
-    rows: list[Observation] = []
-    standing: list[Observation] = []
-    still = np.zeros((backend.substeps, moves.values.shape[1]))
-    done, driven = 0, 0
-    for done in range(1, rounds + 1):
-        before = (done - 1 - settle) * backend.substeps
-        if done <= settle:
+    def __init__(
+        self,
+        model: Model,
+        moves: Commands,
+        start: tuple[float, float, float],
+        sand: Sand,
+        numerics: Numerics,
+        device: str,
+        make_bed: Callable[..., Any] = moving_bed,
+    ) -> None:
+        begun = time.perf_counter()
+        self.moves = moves
+        backend = self.backend = RoverInSand(model, bed_substeps(model, moves, numerics))
+        plane = plane_of(model.terrain, start[0], start[1])
+        # Contact at nodes of the grid acts from a quarter of a voxel outside a wheel.
+        backend.place_above(plane, *start, 0.25 * numerics.voxel if numerics.contact == "S2" else 0.0)
+        self._yields = backend.mobility()
+        down = plane.into(np.array([0.0, 0.0, -model.gravity]))
+        self.bed: Any = make_bed(model, sand, down, numerics, backend.bed_step, self._yields, device)
+        backend.bed = self.bed
+        radius = max(w.radius for w in model.rover.wheels)
+        self._settle = math.ceil(numerics.settle * math.sqrt(radius / model.gravity) / backend.bed_step)
+        self._per_command = whole_steps(moves, model.timestep)
+        self._keep = _kept_steps(self._per_command, model.timestep)
+        self._steps = len(moves.values) * self._per_command
+        self.rounds = self._settle + math.ceil(self._steps / backend.substeps)
+        """Steps of the bed in all."""
+        self.done = 0
+        """Steps of the bed that are done."""
+        self._balance = Balance(np.zeros(3), np.zeros(3), np.zeros(3))
+        self._rows: list[Observation] = []
+        self._standing: list[Observation] = []
+        self._set_up, self._seconds = time.perf_counter() - begun, 0.0
+
+    def run(self, going_on: Callable[[float], bool] = lambda share: True) -> None:
+        """Drives on, until the end or until `going_on`, called with the share that is done, says False.
+
+        Raises:
+          FloatingPointError: the rover's place is no longer finite.
+        """
+        while self.done < self.rounds:
+            begun = time.perf_counter()
+            self._advance()
+            self._seconds += time.perf_counter() - begun
+            if not going_on(self.done / self.rounds):
+                return
+
+    def _advance(self) -> None:
+        """One step of the bed."""
+        substeps, values = self.backend.substeps, self.moves.values
+        before = (self.done - self._settle) * substeps
+        if before < 0:
             # Set down slowly over the first half: sand stays as deep as it was ever pressed.
-            borne = max(0.0, 1.0 - 2.0 * done / settle)
-            controls = still
+            borne, controls = (
+                max(0.0, 1.0 - 2.0 * (self.done + 1) / self._settle),
+                np.zeros((substeps, values.shape[1])),
+            )
         else:
-            borne = 0.0
-            which = np.minimum((before + np.arange(backend.substeps)) // per_command, len(moves.values) - 1)
-            controls = moves.values[which]
+            which = np.minimum((before + np.arange(substeps)) // self._per_command, len(values) - 1)
+            borne, controls = 0.0, values[which]
 
-        def seen(k: int, saw: Observation, before: int = before) -> None:
+        def seen(k: int, saw: Observation) -> None:
             if before < 0 and k == 0:
-                standing.append(saw)
-            if 0 <= before + k < steps and (before + k) % keep == 0:
-                rows.append(saw)
+                self._standing.append(saw)
+            if 0 <= before + k < self._steps and (before + k) % self._keep == 0:
+                self._rows.append(saw)
 
-        backend.advance(controls, yields, borne, balance, seen)
-        driven = max(0, before + backend.substeps)
-        if not going_on(done / rounds):
-            break
-    if not rows:
-        return None
-    seconds = time.perf_counter() - begun
-    times = telemetry(rows)
-    times = dataclasses.replace(times, time=times.time - settle * backend.bed_step)
-    fine = np.repeat(moves.values, per_command // keep, axis=0)[: len(rows)]
-    facts = {
-        "particles": getattr(bed, "particles", 0),
-        "bed_step_s": backend.bed_step,
-        "settle_s": settle * backend.bed_step,
-        "yields_per_kg_and_per_kg_m2": list(yields),
-        "weight_N": backend.weight,
-        "standing": _standing(standing[-math.ceil(DRIVE_NUMBERS.standing * settle) :], backend),
-        "momentum_error": np.abs(balance.error).max().item(),
-        "disagreement_m_s": math.sqrt(balance.disagreement / max(balance.steps, 1)),
-        "rover_seconds": done * backend.bed_step,
-        "driven_s": min(driven, steps) * model.timestep,
-        "seconds": seconds,
-        "set_up_seconds": set_up,
-        "seconds_per_rover_second": (seconds - set_up) / (done * backend.bed_step),
-    }
-    surface = bed.surface() if hasattr(bed, "surface") else np.zeros((0, 3))
-    return SandDrive(times, Commands(fine, keep * model.timestep), surface, facts, driven >= steps)
+        self.backend.advance(controls, self._yields, borne, self._balance, seen)
+        self.done += 1
+
+    def result(self) -> SandDrive | None:
+        """The drive, as far as it came; None where the rover does not stand yet."""
+        if not self._rows:
+            return None
+        backend, balance = self.backend, self._balance
+        times = telemetry(self._rows)
+        times = dataclasses.replace(times, time=times.time - self._settle * backend.bed_step)
+        fine = np.repeat(self.moves.values, self._per_command // self._keep, axis=0)[: len(self._rows)]
+        driven = min((self.done - self._settle) * backend.substeps, self._steps)
+        rover_seconds = self.done * backend.bed_step
+        facts = {
+            "particles": self.bed.particles,
+            "bed_step_s": backend.bed_step,
+            "settle_s": self._settle * backend.bed_step,
+            "yields_per_kg_and_per_kg_m2": list(self._yields),
+            "weight_N": backend.weight,
+            "standing": _standing(self._standing[-math.ceil(DRIVE_NUMBERS.standing * self._settle) :], backend),
+            "momentum_error": np.abs(balance.error).max().item(),
+            "disagreement_m_s": math.sqrt(balance.disagreement / max(balance.steps, 1)),
+            "rover_seconds": rover_seconds,
+            "driven_s": driven * backend.model.timestep,
+            "seconds": self._seconds,
+            "set_up_seconds": self._set_up,
+            "seconds_per_rover_second": self._seconds / rover_seconds,
+        }
+        kept = Commands(fine, self._keep * backend.model.timestep)
+        return SandDrive(times, kept, self.bed.surface(), facts, driven >= self._steps)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the drive needs to go on, as arrays by name."""
+        engine, balance = self.backend.state(), self._balance
+        out = {f"bed/{k}": v for k, v in self.bed.state().items()}
+        out |= {f"engine/{k}": np.asarray(getattr(engine, k)) for k in _ENGINE}
+        out |= {f"effects/{e}/{k}": v for e, own in engine.effects.items() for k, v in own.items()}
+        out |= {f"balance/{k}": np.asarray(v) for k, v in dataclasses.asdict(balance).items()}
+        for name, rows in (("rows", self._rows), ("standing", self._standing)):
+            out |= {f"{name}/{k}": np.stack([r[k] for r in rows]) for k in (rows[0] if rows else ())}
+        wheels = self.backend.wheel_forces()
+        return {**out, "wheels": wheels, "done": np.array(self.done), "seconds": np.array(self._seconds)}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Goes back to where `state` was taken; the sand's solver begins anew from there."""
+        own: dict[str, dict[str, np.ndarray]] = {}
+        for name, value in state.items():
+            part, _, rest = name.partition("/")
+            own.setdefault(part, {})[rest] = value
+        effects: dict[str, dict[str, np.ndarray]] = {}
+        for name, value in own.get("effects", {}).items():
+            effects.setdefault(name.split("/")[0], {})[name.split("/")[1]] = value
+        engine: dict[str, Any] = {k: own["engine"][k] for k in _ENGINE}
+        engine["step"] = int(engine["step"])
+        self.backend.set_state(BackendState(**engine, effects=effects))
+        self.backend.set_wheel_forces(state["wheels"])
+        self.bed.restore(own.get("bed", {}))
+        balance: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in own["balance"].items()}
+        self._balance = Balance(**balance)
+        for name in ("rows", "standing"):
+            held = own.get(name, {})
+            count = len(next(iter(held.values()))) if held else 0
+            setattr(self, f"_{name}", [{k: v[i] for k, v in held.items()} for i in range(count)])
+        self.done, self._seconds = int(state["done"]), float(state["seconds"])
+
+
+_ENGINE = ("step", "qpos", "qvel", "winding_temperature", "housing_temperature")
+"""Fields of `BackendState` that are arrays; no hook of a rover in sand has a state."""
 
 
 def _kept_steps(per_command: int, timestep: float) -> int:

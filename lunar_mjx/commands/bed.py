@@ -111,7 +111,12 @@ def simulate(
 
 
 def drive(
-    out: Annotated[Path, typer.Argument(help="New folder: log/, drive.json and surface.csv.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            help="New folder, for log/, drive.json and surface.csv; one that keeps a drive is gone on with."
+        ),
+    ],
     rover: Annotated[str, typer.Option(help="Name of a shipped rover, or folder of one.")] = "luvmi_x",
     manoeuvre: Annotated[str, typer.Option(help="Canned manoeuvre, or TOML file of one.")] = "speed_staircase",
     terrain: Annotated[
@@ -136,7 +141,9 @@ def drive(
     noise: Annotated[str, typer.Option(help="Of the instruments: datasheet, none or scale:5.")] = "datasheet",
     forces: Annotated[bool, typer.Option(help="With force and torque sensors.")] = False,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of particles' places and of noise.")] = 0,
-    seconds: Annotated[float | None, typer.Option(help="Time limit; what was driven until then is written.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Time limit; what was driven is written, and the same command goes on.")
+    ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
 ) -> None:
     """Drive a rover through simulated sand and write a log of it, with its numerical error in the noise."""
@@ -149,8 +156,7 @@ def drive(
     from lunar_mjx.backends.in_sand import plane_of
     from lunar_mjx.backends.sand_drive import require_shown, smooth_wheels
     from lunar_mjx.logs.recorder.instruments import Recording, parse_noise
-    from lunar_mjx.logs.recorder.particle_drive import record_sand_drive
-    from lunar_mjx.logs.write import refuse_used
+    from lunar_mjx.logs.recorder.particle_drive import record_sand_drive, refuse_other
     from lunar_mjx.manoeuvres import commands, load_manoeuvre
     from lunar_mjx.model import make_model
     from lunar_mjx.report.progress import console_progress
@@ -178,7 +184,7 @@ def drive(
     require_shown(wheels, size)
     moves = commands(plan, model, scale)
     plane_of(model.terrain, plan.start[0], plan.start[1])  # refuses hills
-    refuse_used(out)
+    refuse_other(out)
     name = open_device(device)  # before anything is written
     with console_progress() as progress:
         told = record_sand_drive(

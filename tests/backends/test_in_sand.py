@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.backends.in_sand import plane_of
-from lunar_mjx.backends.sand_drive import SandDrive, bed_substeps, drive, require_shown, smooth_wheels
+from lunar_mjx.backends.sand_drive import SandDrive, SandRun, bed_substeps, require_shown, smooth_wheels
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
 from lunar_mjx.simulate import constant_commands
@@ -29,7 +29,9 @@ def luvmi(terrain: str = "flat") -> Model:
 
 def driven(model: Model, seconds: float, bed: type = SpringBed, yaw: float = 0.3, **commands: float) -> SandDrive:
     moves = constant_commands(model, seconds, **commands)
-    found = drive(model, moves, (0.5, -0.2, yaw), Sand(), NUMERICS, "cpu", make_bed=bed)
+    run = SandRun(model, moves, (0.5, -0.2, yaw), Sand(), NUMERICS, "cpu", make_bed=bed)
+    run.run()
+    found = run.result()
     assert found is not None and found.whole
     return found
 
@@ -119,14 +121,15 @@ def test_hills_and_coarse_voxels_are_refused():
 @pytest.mark.slow
 def test_a_rover_in_particles():
     """It stands on its four wheels alike, the sand bears its weight, and it drives off and sinks in."""
-    from lunar_mjx.backends.sand_drive import moving_bed
     from lunar_mjx.wheel_bed.particles.sand_box import open_device
 
     open_device("cpu")
     model = luvmi()
     moves = constant_commands(model, 0.5, drive=1.0)
     coarse = dataclasses.replace(NUMERICS, voxel=0.04, contact="S2")
-    found = drive(model, moves, (0.0, 0.0, 0.0), Sand(), coarse, "cpu", make_bed=moving_bed)
+    run = SandRun(model, moves, (0.0, 0.0, 0.0), Sand(), coarse, "cpu")
+    run.run()
+    found = run.result()
     assert found is not None
     standing = found.facts["standing"]
     assert standing["force_over_weight"] == pytest.approx(1.0, abs=0.03)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
+import shutil
 import time
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,14 +18,14 @@ import pandas as pd
 
 from lunar_mjx._version import __version__
 from lunar_mjx.backends.log_channels import log_channels
-from lunar_mjx.backends.sand_drive import SandDrive, drive, moving_bed
+from lunar_mjx.backends.sand_drive import SandDrive, SandRun, moving_bed
 from lunar_mjx.effects.joint.electrical import BUS_VOLTAGE
-from lunar_mjx.errors import UserError
-from lunar_mjx.files import write_text
+from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.files import replacing, write_text
 from lunar_mjx.logs.log import Noise
 from lunar_mjx.logs.recorder.instruments import Recording, record
 from lunar_mjx.logs.schema import is_command
-from lunar_mjx.logs.write import write_frame, write_log
+from lunar_mjx.logs.write import refuse_used, write_frame, write_log
 from lunar_mjx.manoeuvres import Manoeuvre
 from lunar_mjx.model import Model
 from lunar_mjx.simulate import Commands
@@ -31,6 +34,10 @@ from lunar_mjx.wheel_bed.particles.settings import Numerics, Sand
 
 LOG_FOLDER = "log"
 """Folder of the log within the folder of a drive."""
+STATES = {"drive": "drive.npz", "control": "control.npz"}
+"""Files that keep drives that are not at their end."""
+KEEP_EVERY = 120.0
+"""Seconds between keepings: what a kill costs at most."""
 
 
 def numerical_error(tables: Mapping[str, Any], control: Mapping[str, Any] | None) -> dict[str, tuple[float, float]]:
@@ -144,8 +151,10 @@ def record_sand_drive(
 ) -> list[str]:
     """Drives, and writes the log, `drive.json` with settings, balance and cost, and `surface.csv` with the ruts.
 
+    A drive that is not at its end is kept in the folder, too, and the same call goes on with it.
+
     Args:
-      folder: exists, and is empty.
+      folder: exists; `refuse_other` has passed it.
       rover: name or folder, as the log is to have it.
       moves: of the plan, for the model.
       device: by Warp's name.
@@ -153,21 +162,30 @@ def record_sand_drive(
       progress: called with what is done and its share.
       control: whether to drive again with larger voxels; as far as the time goes.
       recording: noise of the instruments and its like; the datasheet's if None. Its seed is that of the numerics.
-      make_bed: see `drive`.
+      make_bed: see `SandRun`.
 
     Returns:
       Lines that tell what came out.
 
     Raises:
-      UserError: the drive diverged, or ended too early.
+      UserError: the drive diverged, ended too early, or the folder keeps another one.
     """
     begun = time.perf_counter()
+    settings = {
+        "rover": rover,
+        "terrain": plan.terrain,
+        "sand": dataclasses.asdict(sand),
+        "numerics": {k: getattr(numerics, k) for k in ("voxel", "per_edge", "contact", "step_share", "seed")},
+    }
+    driving = [moves.values.tolist(), moves.interval, list(plan.start), model.gravity, model.timestep]
+    key = hashlib.sha256(json.dumps([settings, driving], sort_keys=True).encode()).hexdigest()
     larger = variant_numerics(numerics, "voxel")
     # The control has fewer particles, as the cube of the voxel, and about as many steps.
     share = 1.0 / (1.0 + (numerics.voxel / larger.voxel) ** 3) if control else 1.0
     done: dict[str, SandDrive | None] = {"drive": None, "control": None}
     for what, setting in (("drive", numerics), ("control", larger)):
-        if what == "control" and (not control or done["drive"] is None):
+        first = done["drive"]
+        if what == "control" and (not control or first is None or not first.whole):
             break
 
         def going_on(part: float, what: str = what) -> bool:
@@ -176,25 +194,66 @@ def record_sand_drive(
             return time.perf_counter() - begun < seconds
 
         try:
-            done[what] = drive(model, moves, plan.start, sand, setting, device, going_on, make_bed)
+            run = SandRun(model, moves, plan.start, sand, setting, device, make_bed)
+            _go_on(run, folder / STATES[what], key, going_on)
+            done[what] = run.result()
         except FloatingPointError as error:
             raise UserError(f"particles: {error}; give a smaller --step-share or --voxel.") from error
     driven, checked = done["drive"], done["control"]
     if driven is None:
         raise UserError(
-            f"particles: the time limit of {seconds:g} s ended before the rover stood; give more --seconds."
+            f"particles: the time limit of {seconds:g} s ended before the rover stood; run the same command again, or "
+            "give more --seconds."
         )
-    settings = {
-        "rover": rover,
-        "terrain": plan.terrain,
-        "sand": dataclasses.asdict(sand),
-        "numerics": {k: getattr(numerics, k) for k in ("voxel", "per_edge", "contact", "step_share", "seed")},
-    }
+    shutil.rmtree(folder / LOG_FOLDER, ignore_errors=True)  # of an earlier part of the same drive
     log = write_drive_log(folder, model, plan, driven, checked, settings, recording or Recording(), numerics.seed)
     facts = {**settings, "device": device, **driven.facts, "control": None if checked is None else checked.facts}
     write_text(folder / "drive.json", json.dumps(facts, indent=1) + "\n")
     write_frame(pd.DataFrame(driven.surface, columns=["x_m", "y_m", "height_m"]), folder / "surface.csv")
+    if driven.whole and (not control or (checked is not None and checked.whole)):
+        for name in STATES.values():
+            (folder / name).unlink(missing_ok=True)
     return [*_told(driven, checked, moves), str(log)]
+
+
+def refuse_other(folder: Path) -> None:
+    """Raises `UserError` for a folder that holds anything, unless it keeps a drive that is not at its end."""
+    if not any((folder / name).exists() for name in STATES.values()):
+        refuse_used(folder)
+
+
+def _go_on(run: SandRun, path: Path, key: str, going_on: Callable[[float], bool]) -> None:
+    """Drives on from what `path` keeps, if it is there, and keeps there how far it came."""
+    if path.exists():
+        run.restore(_kept_state(path, key))
+    kept = time.perf_counter()
+
+    def keep() -> None:
+        arrays: dict[str, Any] = {**run.state(), "key": np.array(key)}
+        with replacing(path) as part:
+            np.savez(part, **arrays)
+
+    def and_keep(share: float) -> bool:
+        nonlocal kept
+        if time.perf_counter() - kept > KEEP_EVERY:
+            keep()
+            kept = time.perf_counter()
+        return going_on(share)
+
+    if run.done < run.rounds:
+        run.run(and_keep)
+        keep()
+
+
+def _kept_state(path: Path, key: str) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            state = {name: file[name] for name in file.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise bad_input(path, "contents", str(error)[:60], "are no state of a drive", "remove the file") from error
+    if str(state.pop("key", "")) != key:
+        raise bad_input(path, "settings", "kept", "are those of another drive", "name a new folder")
+    return state
 
 
 def _told(driven: SandDrive, control: SandDrive | None, moves: Commands) -> list[str]:
@@ -209,7 +268,10 @@ def _told(driven: SandDrive, control: SandDrive | None, moves: Commands) -> list
     ]
     if not driven.whole:
         planned = len(moves.values) * moves.interval
-        lines.append(f"stopped: time limit; {planned - facts['driven_s']:.2f} s of {planned:.2f} s are not driven")
+        lines.append(
+            f"stopped: time limit; {planned - facts['driven_s']:.2f} s of {planned:.2f} s are not driven, the same "
+            "command goes on with them"
+        )
     if control is None:
         lines.append("numerical error not computed: the log's noise is the instruments' alone")
     elif not control.whole:

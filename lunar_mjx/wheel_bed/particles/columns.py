@@ -6,6 +6,7 @@ The bed's surface is the plane z = 0 of its own frame; columns are numbered by i
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -55,8 +56,7 @@ class Columns:
     @property
     def most_particles(self) -> int:
         """Particles that one wheel's sand may have, with room for what other columns push into it."""
-        across = 2.0 * np.ceil((self.reach + self.rim) / self.voxel) + 2.0
-        return int(1.2 * np.pi / 4.0 * across**2 * self._one.particles)
+        return int(1.2 * len(self._within(np.zeros((1, 2)), self.reach + self.rim)) * self._one.particles)
 
     def number(self, place: np.ndarray) -> np.ndarray:
         """Numbers of the columns of places (n, 2 or more), m."""
@@ -120,6 +120,21 @@ class Columns:
         corner = np.array([*(self.middle(np.array([number]))[0] - 0.5 * self.voxel), -self.depth * self.voxel])
         strewn = particle_places(self._one, np.random.SeedSequence([self.seed, number]).generate_state(1)[0]) + corner
         return strewn if kept is None else np.concatenate([strewn, kept])
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What lies outside the computation, as arrays by name."""
+        kept = [np.zeros((0, 3), np.float32), *self.kept.values()]
+        return {
+            "kept": np.concatenate(kept),
+            "kept_column": np.repeat(np.array(list(self.kept), np.int64), [len(p) for p in self.kept.values()]),
+            "strewn": np.array(sorted(self._strewn), np.int64),
+        }
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Goes back to where `state` was taken; the next `near` tells of a change."""
+        self.kept, self._strewn = {}, set(state["strewn"].tolist())
+        self._moving = self._still = np.zeros(0, np.int64)
+        self._keep(state["kept"], state["kept_column"])
 
     def surface(self, grains: Grains) -> np.ndarray:
         """Middle x, y of every column that was ever strewn and the height of its highest particle, (n, 3) m."""

@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,7 @@ class MovingBed:
         reach = margin + 0.5 * max(w.width for w in wheels)
         self.columns = Columns(voxel, numerics.per_edge, depth, reach, RIM_VOXELS * voxel, numerics.seed)
         self.grains, self._count, n = Grains.none(), 0, len(wheels)
+        self._restored = False
         capacity = n * self.columns.most_particles
         builder = newton.ModelBuilder()
         SolverImplicitMPM.register_custom_attributes(builder)
@@ -77,7 +79,7 @@ class MovingBed:
             self.model: Any = builder.finalize(device=device)
         set_sand(self.model, sand, 0.0)
         self.model.set_gravity(tuple(float(g) for g in gravity))
-        self.state: Any = self.model.state()
+        self._state: Any = self.model.state()
         config = SolverImplicitMPM.Config()
         config.voxel_size, config.collider_basis = voxel, numerics.contact
         config.max_iterations, config.tolerance = numerics.iterations, numerics.tolerance
@@ -88,7 +90,7 @@ class MovingBed:
         self.solver.setup_collider(
             body_mass=wp.array(np.full(n, 1.0 / mobility[0], np.float32), dtype=float, device=device),
             body_inv_inertia=wp.array(spin, dtype=wp.mat33, device=device),
-            body_q=self.state.body_q,
+            body_q=self._state.body_q,
         )
         self._total = wp.zeros((n + 1, 7), dtype=float, device=device)
 
@@ -110,8 +112,10 @@ class MovingBed:
         from lunar_mjx.wheel_bed.particles.kernels import sum_impulses
 
         if self.columns.near(place[:, :2]):
-            self._exchange()
-        state = self.state
+            # What was restored is not in the solver yet.
+            self._exchange(self.grains if self._restored else self.read())
+            self._restored = False
+        state = self._state
         turned = Rotation.from_matrix(axes).as_quat()
         state.body_q.assign(np.concatenate([place, turned], axis=1).astype(np.float32))
         state.body_qd.assign(np.concatenate([velocity, spin], axis=1).astype(np.float32))
@@ -137,7 +141,9 @@ class MovingBed:
 
     def read(self) -> Grains:
         """The particles that are computed, as they are now."""
-        n, state = self._count, self.state
+        if self._restored:
+            return self.grains
+        n, state = self._count, self._state
         return Grains(
             state.particle_q.numpy()[:n],
             state.particle_qd.numpy()[:n],
@@ -149,29 +155,41 @@ class MovingBed:
         """Middle x, y of every column of sand and the height of its surface, (n, 3) m."""
         return self.columns.surface(self.read())
 
+    def state(self) -> dict[str, np.ndarray]:
+        """All sand, as arrays by name."""
+        return {**dataclasses.asdict(self.read()), **self.columns.state()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Goes back to where `state` was taken; the solver then begins without a guess."""
+        self.columns.restore(state)
+        self.grains = Grains(**{f.name: state[f.name] for f in dataclasses.fields(Grains)})
+        self._restored = True
+
     @property
     def particles(self) -> int:
         """Number of particles that are computed."""
-        return self._count
+        return len(self.grains.place)
 
-    def _exchange(self) -> None:
-        """Gives the solver the particles that the wheels need now."""
+    def _exchange(self, before: Grains) -> None:
+        """Gives the solver the particles that the wheels need now, of those that it had and those outside."""
         import newton
 
-        self.grains = grains = self.columns.exchange(self.read())
+        self.grains = grains = self.columns.exchange(before)
         capacity, n = self.model.particle_count, len(grains.place)
         if n > capacity:
             raise FloatingPointError(f"{n} particles crowd about the wheels, where {capacity} have room")
         self._count = n
+
+        # Those in reserve wait among the held ones, spread out: they are left out of all sums, but not of the search.
+        waiting = np.resize(grains.place[grains.held], (capacity - n, 3))
 
         def filled(values: np.ndarray, rest: Any) -> np.ndarray:
             out = np.empty((capacity, *values.shape[1:]), values.dtype)
             out[:n], out[n:] = values, rest
             return out
 
-        state, model = self.state, self.model
-        # Those in reserve wait where another one is: they are left out of all sums and need no voxel of their own.
-        state.particle_q.assign(filled(grains.place, grains.place[0]))
+        state, model = self._state, self.model
+        state.particle_q.assign(filled(grains.place, waiting))
         state.particle_qd.assign(filled(grains.velocity, 0.0))
         state.mpm.particle_qd_grad.assign(filled(grains.gradient, 0.0))
         # To the solver a particle without mass is one whose velocity is given.

@@ -37,5 +37,11 @@ class SpringBed:
             moment[i] = np.cross(arm, rub)
         return impulse, moment
 
+    def state(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        pass
+
     def surface(self) -> np.ndarray:
         return np.zeros((1, 3))
