@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.envs.ladder.chart import CHART, Chart, Errand, begin, coarse_prices, look, straight, way
+from lunar_mjx.envs.ladder import chart as charts
+from lunar_mjx.envs.ladder.chart import CHART, Chart, Errand, coarse_prices
 
+begin, look, straight, way = (jax.jit(f) for f in (charts.begin, charts.look, charts.straight, charts.way))
 COUNT, CELL = 40, 0.8
 GOAL, START = jnp.asarray([[28.4, 16.4]]), jnp.asarray([[6.0, 16.4]])
 WORLD = jnp.zeros(1, jnp.int32)

@@ -46,7 +46,12 @@ def border() -> Terrain:
 
 def wheels(terrain: Terrain, x: Any, soil: Any = None) -> tuple[Any, Any]:
     """Soil under driving wheels 2 cm deep at x, and the forces on them."""
-    x = jnp.asarray(x, float)
+    return _wheels(terrain, jnp.asarray(x, float), soil or {})
+
+
+@jax.jit
+def _wheels(terrain: Terrain, x: Any, soil: Any) -> tuple[Any, Any]:
+    """See `wheels`; compiled once for a kind of ground and a number of wheels."""
     zero = jnp.zeros_like(x)
     pipeline = Pipeline(effects_named(("soil", "surface_type", "pressure_sinkage", "closed_form_shear")))
     ctx = bare_context(
@@ -56,7 +61,7 @@ def wheels(terrain: Terrain, x: Any, soil: Any = None) -> tuple[Any, Any]:
         wheel_velocity=Vec3(zero + 0.08, zero, zero),
         wheel_angular_velocity=Vec3(zero, zero + 0.1 / RADIUS, zero),
         geometry=nominal_geometry(rover_info(RADIUS + zero, WIDTH + zero)),
-        parameters=parameters(pipeline.effects, {"soil": soil or {}}),
+        parameters=parameters(pipeline.effects, {"soil": soil}),
     )
     ctx = wheel_ports(pipeline, dataclasses.replace(ctx, contact=wheel_contact(ctx)), {})[0]
     wheel: Any = ctx.wheel

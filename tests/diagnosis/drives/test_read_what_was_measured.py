@@ -119,7 +119,7 @@ def test_the_imus_axes_are_those_of_its_channels(model: Model) -> None:
 
     system = build(model, "auto")
     with jax.enable_x64(True):
-        state = system.reset(system.params, 0.0, 0.0, 0.0)
+        state = jax.jit(system.reset)(system.params, 0.0, 0.0, 0.0)
         commands = np.ones((8, len(model.rover.joints)))
         _, telemetry = system.rollout(system.params, state, commands, 4)
         turn = Rotation.from_euler("ZYX", [90.0, 10.0, 5.0], degrees=True)
