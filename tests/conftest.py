@@ -30,8 +30,17 @@ settings.register_profile("any machine", deadline=None, derandomize=True)
 settings.load_profile("any machine")
 
 
-LONGEST = ("test_hidden_subset.py", "test_windows.py", "test_effect_contract.py", "test_verbs_table.py")
-"""Files of a minute or more. They go first, or one of two processes would wait for the other at the end."""
+LONGEST = (
+    "test_effect_contract.py",
+    "test_hidden_subset.py",
+    "test_windows.py",
+    "test_verbs_table.py",
+    "test_camera_blocks.py",
+    "test_escape.py",
+    "test_distill.py",
+    "test_drive.py",
+)
+"""Files of half a minute or more. They go first, or one of two processes would wait for the other at the end."""
 
 
 @pytest.hookimpl(trylast=True)

@@ -180,7 +180,7 @@ def test_payload_weighs_on_the_wheels_near_it() -> None:
     b = bench("luvmi_x")
     model = b.model.add("payload", mass=10.0, y=0.1, z=0.2)
     system = build(model, "mjx")
-    state = system.reset(system.params)
+    state = jax.jit(system.reset)(system.params)
     control = jnp.zeros((100, len(system.joint_names)))
     _, seen = jax.jit(lambda p, s: system.rollout(p, s, control, EVERY))(system.params, state)
     load = np.asarray(seen.wheel_force.z[-1])
@@ -193,6 +193,6 @@ def test_payload_weighs_on_the_wheels_near_it() -> None:
 
 def test_state_is_a_pytree_of_arrays() -> None:
     b = bench("luvmi_x")
-    state = b.system.reset(b.system.params)
+    state = jax.jit(b.system.reset)(b.system.params)
     assert isinstance(state, State)
     assert all(hasattr(leaf, "dtype") for leaf in jax.tree.leaves(state))

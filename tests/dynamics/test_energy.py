@@ -45,7 +45,7 @@ def test_energy_never_grows_in_a_drop() -> None:
     model = make_model("luvmi_x", "flat", modes={"drive": "torque", "steer": "torque", "suspension": "torque"})
     model = model.set("motor", rotor_inertia=9e-7).set("shear_state", damping_time=0.0)
     system = build(model)
-    state = system.reset(system.params)
+    state = jax.jit(system.reset)(system.params)
     state = dataclasses.replace(state, qpos=state.qpos.at[2].add(0.3).at[3:7].set(np.array([0.9994, 0.02, 0.028, 0.0])))
     control = np.zeros(len(system.joint_names))
 

@@ -41,7 +41,7 @@ def _parked():
 
         axes = {name: {k: 0 if (name, k) in COLUMNS else None for k in v} for name, v in params.effects.items()}
         each = dataclasses.replace(params, gravity=None, ambient=None, terrain=None, effects=axes)
-        start = system.reset(params)
+        start = jax.jit(system.reset)(params)
 
         @jax.jit
         def stand(rows):

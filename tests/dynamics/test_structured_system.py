@@ -61,7 +61,7 @@ def test_one_step_agrees_with_mjx_in_float32():
         system = build(model, engine)
         # MJX compiles faster than it runs operation by operation, the structured engine does not
         step = jax.jit(system.step) if engine == "mjx" else system.step
-        new[engine] = step(system.params, system.reset(system.params), _controls(system, 3)[1])
+        new[engine] = step(system.params, jax.jit(system.reset)(system.params), _controls(system, 3)[1])
     for a, b in zip(*(jax.tree.leaves(v) for v in new.values()), strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4 * max(1.0, float(jnp.abs(b).max())))
 
@@ -87,7 +87,7 @@ def test_batches_equal_single_rovers(chunk):
     shared["soil"]["cohesion"] = 0
     axes = Params(0, None, shared, 0)
     per_rover = jax.tree.broadcast(jax.tree.map(lambda a: a is not None, axes, is_leaf=lambda a: a is None), params)
-    start = jax.vmap(lambda x: system.reset(system.params, x))(jnp.linspace(-1.0, 1.0, count))
+    start = jax.jit(jax.vmap(lambda x: system.reset(system.params, x)))(jnp.linspace(-1.0, 1.0, count))
     controls = jnp.broadcast_to(_controls(system, 5), (count, 5, len(system.joint_names)))
     end, seen = jax.jit(lambda s, c: system.rollout_batch(params, s, c, every=2, params_axes=axes, chunk=chunk))(
         start, controls
@@ -175,7 +175,7 @@ def test_derivatives_agree_with_finite_differences(rover):
 def test_gradients_are_finite_in_float32(rover):
     """Reverse mode by every parameter, for a rover that lands, on terrain with craters and boulders."""
     system = build(make_model(rover), "structured")
-    state, control = system.reset(system.params), _controls(system, 1)[0]
+    state, control = jax.jit(system.reset)(system.params), _controls(system, 1)[0]
     gradient = jax.grad(lambda p: _three_steps(system, state, control, p), allow_int=True)(system.params)
     leaves = jax.tree.leaves((gradient.gravity, gradient.effects))
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)

@@ -222,7 +222,7 @@ def test_a_rover_steps_with_all_of_it():
     for name in ("motor_power", "electronics", "solar_panels", "battery", "chassis_node", "solar_flux"):
         model = model.add(name)
     system = build(model.replace(sun=SunSettings(horizon=False)))
-    state = system.reset(system.params)
+    state = jax.jit(system.reset)(system.params)
     assert float(state.temperature.winding_kelvin[0]) == pytest.approx(230.0)
     after, seen = jax.eval_shape(system.step, system.params, state, jnp.zeros(len(system.joint_names)))
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)

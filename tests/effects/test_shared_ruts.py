@@ -95,7 +95,7 @@ def test_a_whole_rover_that_follows_meets_the_ruts_of_the_one_ahead() -> None:
     model = make_model("luvmi_x", "flat", "field").add("ruts")
     system = build(model)
     wheels = model.rover.wheels
-    state = jax.vmap(lambda x: system.reset(system.params, x))(jnp.array([1.2, 0.0, 0.0]))
+    state = jax.jit(jax.vmap(lambda x: system.reset(system.params, x)))(jnp.array([1.2, 0.0, 0.0]))
     cell = model.parameters["ruts"]["cell"] * float(np.mean([w.width for w in wheels]))
     ground = shared_ground(state.effects["ruts"], jnp.array([0, 0, 1]), (-3.0, -3.0), (6.0, 3.0), cell)
     drives = np.array([1.0 if g.name == "drive" else 0.0 for g in model.rover.groups for _ in g.joints])

@@ -53,7 +53,8 @@ def test_a_camera_that_looks_down_by_45_deg_sees_the_ground_at_the_root_of_two_t
 def test_depth_and_labels_need_no_light() -> None:
     model = make_model("luvmi_x", "lunar_plain")
     system = build(model)
-    qpos = jnp.stack([system.reset(system.params, x, 5.0, 1.0).qpos for x in (-3.0, 4.0)])
+    place = jax.jit(lambda x: system.reset(system.params, x, 5.0, 1.0).qpos)
+    qpos = jnp.stack([place(x) for x in (-3.0, 4.0)])
 
     def look(lit: bool):
         return jax.jit(lambda q: pictures(model.terrain, model.rover, q, Pinhole(16, 12), lit=lit))(qpos)

@@ -105,7 +105,7 @@ def test_the_rover_does_what_is_asked(rocker: CmdVel) -> None:
     controls = jnp.asarray(
         np.concatenate([np.tile(turned[:, None], (1, 40, 1)), np.tile(steer[:, None], (1, 80, 1))], 1)
     )
-    start = jax.vmap(lambda _: system.reset(system.params))(jnp.arange(3))
+    start = jax.jit(jax.vmap(lambda _: system.reset(system.params)))(jnp.arange(3))
     _, seen = jax.device_get(
         jax.jit(lambda s: system.rollout_batch(system.params, s, controls, 50, one_body=True))(start)
     )

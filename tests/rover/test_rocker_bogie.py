@@ -67,7 +67,7 @@ def test_engines_agree_over_a_crater(engine: str, tolerance: float) -> None:
         system = build(model, engine)
         held = jnp.tile(jnp.asarray(control), (intervals, 1))
         run = jax.jit(lambda s: system.rollout(system.params, s, held, every))
-        end, seen = jax.device_get(run(system.reset(system.params)))
+        end, seen = jax.device_get(run(jax.jit(system.reset)(system.params)))
         np.testing.assert_allclose(end.qpos, reference, atol=tolerance)
         compiled = system.engine.mj_model
         left, right = (end.qpos[compiled.joint(f"{side}_rocker_pivot").qposadr[0]] for side in "lr")
@@ -82,9 +82,7 @@ def test_stands_level_with_equal_loads() -> None:
         model = make_model("rocker_bogie", "flat")
         system = build(model, "structured")
         still = jnp.zeros((20, len(system.joint_names)))
-        seen = jax.device_get(
-            jax.jit(lambda s: system.rollout(system.params, s, still, 50)[1])(system.reset(system.params))
-        )
+        seen = jax.device_get(jax.jit(lambda p: system.rollout(p, system.reset(p), still, 50)[1])(system.params))
         assert abs(seen.euler.y[-1]) < np.deg2rad(1.0)
         loads = seen.wheel_force.z[-1]
         assert loads.sum() == pytest.approx(rover.mass * model.gravity, rel=1e-2)

@@ -47,7 +47,7 @@ def test_engines_agree_on_tied_wheels():
         for engine in ("structured", "mjx"):
             system = build(model, engine)
             state, _ = jax.jit(lambda s, system=system: system.rollout(system.params, s, command, 5))(
-                system.reset(system.params)
+                jax.jit(system.reset)(system.params)
             )
             ends.append((np.array(state.qpos), np.array(state.qvel)))
     (q, v), (q_mjx, v_mjx) = ends
