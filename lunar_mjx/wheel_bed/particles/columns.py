@@ -52,6 +52,7 @@ class Columns:
         """Places of the particles of columns that are not computed, by the column's number."""
         self._strewn: set[int] = set()
         self._moving = self._still = np.zeros(0, np.int64)
+        self._about: np.ndarray | None = None
 
     @property
     def most_particles(self) -> int:
@@ -68,19 +69,23 @@ class Columns:
         return self.voxel * (np.stack([number // _ROW - _DIGIT, number % _ROW - _DIGIT], axis=-1) + 0.5)
 
     def near(self, wheels: np.ndarray) -> bool:
-        """Whether wheels at (w, 2), m, need other columns than those computed; remembers which."""
+        """Whether wheels at (w, 2), m, need other columns than those computed; remembers which.
+
+        They do once one of them has moved by a voxel: an exchange for all together, since it costs as much as a step.
+        """
+        if self._about is not None and np.hypot(*(wheels - self._about).T).max() <= self.voxel:
+            return False
+        self._about = np.array(wheels, float)
         moving, every = (self._within(wheels, r) for r in (self.reach, self.reach + self.rim))
-        still = np.setdiff1d(every, moving, assume_unique=True)
-        same = np.array_equal(moving, self._moving) and np.array_equal(still, self._still)
-        self._moving, self._still = moving, still
-        return not same
+        self._moving, self._still = moving, np.setdiff1d(every, moving, assume_unique=True)
+        return True
 
     def _within(self, wheels: np.ndarray, radius: float) -> np.ndarray:
         """Sorted numbers of the columns whose middles lie within a radius, m, of a wheel's column."""
         steps = np.arange(-np.ceil(radius / self.voxel), np.ceil(radius / self.voxel) + 1.0)
         disc = self.voxel * np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
         disc = disc[np.hypot(disc[:, 0], disc[:, 1]) <= radius]
-        # About the middles of columns, so that what is computed changes once a voxel and not with every step.
+        # About the middles of columns, so that every wheel has as many.
         middles = self.middle(self.number(wheels))
         return np.unique(self.number((middles[:, None] + disc[None]).reshape(-1, 2)))
 
@@ -133,7 +138,7 @@ class Columns:
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Goes back to where `state` was taken; the next `near` tells of a change."""
         self.kept, self._strewn = {}, set(state["strewn"].tolist())
-        self._moving = self._still = np.zeros(0, np.int64)
+        self._about = None
         self._keep(state["kept"], state["kept_column"])
 
     def surface(self, grains: Grains) -> np.ndarray:

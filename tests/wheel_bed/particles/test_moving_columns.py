@@ -44,7 +44,7 @@ def test_sand_near_a_wheel_moves_and_sand_around_it_is_held():
 def test_nothing_changes_within_a_voxel():
     bed = columns()
     at(bed, Grains.none(), (0.001, 0.001))
-    assert not bed.near(np.array([[0.024, 0.002]])) and bed.near(np.array([[0.026, 0.002]]))
+    assert not bed.near(np.array([[0.025, 0.003]])) and bed.near(np.array([[0.026, 0.008]]))
 
 
 def test_ruts_are_found_again_and_no_particle_is_lost():
