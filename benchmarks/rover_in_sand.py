@@ -40,27 +40,29 @@ def run(out: Path, options: list[str]) -> None:
     (out / PROVENANCE).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
 
 
-def rut_field(rover: str, drive: dict[str, Any], folder: Path) -> dict[str, dict[str, float]]:
-    """The same manoeuvre on the engine with the effect `ruts` and the model's own soil: see `wheels`."""
+def rut_field(drive: dict[str, Any], options: list[str], folder: Path) -> dict[str, dict[str, float]]:
+    """The same drive, as long, on the engine with the effect `ruts` and the model's own soil: see `wheels`."""
     from lunar_mjx.logs import Recording, simulate_log
+
+    whole = float(options[options.index("--duration") + 1]) if "--duration" in options else None
 
     log = simulate_log(
         folder / "ruts",
-        rover,
+        drive["rover"],
         PLAN,
-        ["ruts"],
+        ["rim_contact", "ruts"],
         terrain=drive["terrain"],
         recording=Recording(scale=0.0),
-        seconds=drive["driven_s"],
+        seconds=whole,
         seed=0,
     )
-    return wheels(log)
+    return wheels(log, drive["driven_s"])
 
 
-def wheels(log: Path) -> dict[str, dict[str, float]]:
-    """Mean sinkage, mm, and slip of front and rear wheels over the second half of a log."""
+def wheels(log: Path, seconds: float) -> dict[str, dict[str, float]]:
+    """Mean sinkage, mm, and slip of front and rear wheels over the second half of a log's first `seconds`."""
     camera = pd.read_csv(log / "camera.csv")
-    late = camera[camera["time_s"] > 0.5 * camera["time_s"].iloc[-1]]
+    late = camera[(camera["time_s"] > 0.5 * seconds) & (camera["time_s"] <= seconds)]
     return {
         side: {
             "sinkage_mm": 1e3 * float(np.mean([late[f"wheel_{c}_sinkage_m"] for c in corners])),
@@ -112,13 +114,14 @@ def rut_depths(out: Path, drive: dict[str, Any], voxel: float) -> dict[str, floa
 def report(out: Path) -> None:
     """Writes the record of a drive."""
     drive = json.loads((out / "drive.json").read_text(encoding="utf-8"))
+    made = json.loads((out / PROVENANCE).read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:
-        field = rut_field(drive["rover"], drive, Path(folder))
+        field = rut_field(drive, made["options"], Path(folder))
     record = {
-        "drive": json.loads((out / PROVENANCE).read_text(encoding="utf-8")),
+        "drive": made,
         "report": {"commit": commit()},
         "facts": drive,
-        "particles": wheels(out / "log"),
+        "particles": wheels(out / "log", drive["driven_s"]),
         "rut_field": field,
         "rut_depth_mm": rut_depths(out, drive, drive["numerics"]["voxel"]),
     }
