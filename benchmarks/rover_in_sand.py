@@ -1,7 +1,8 @@
 """A rover in particle sand: balance of forces, ruts of front and rear wheels beside those of the rut field, and speed.
 
     python benchmarks/rover_in_sand.py run OUT --voxel 0.025 --duration 8 --device cpu
-    python benchmarks/rover_in_sand.py report OUT
+    lunar-mjx compare OUT/log -o RUN
+    python benchmarks/rover_in_sand.py report OUT --compared RUN
 
 `run` drives `benchmarks/particles/ten_metres.toml` by `lunar-mjx bed drive OUT`, to which the other options go
 (`--rover`, `--seconds`, ...), and needs the extra `particles`. With the settings above it takes half an hour on one
@@ -111,8 +112,20 @@ def rut_depths(out: Path, drive: dict[str, Any], voxel: float) -> dict[str, floa
     return {k: float(np.mean(v)) for k, v in found.items() if v}
 
 
-def report(out: Path) -> None:
-    """Writes the record of a drive."""
+def compared(folder: Path) -> dict[str, Any]:
+    """Errors in sigma that `compare` has found, in all and by channel, and the soil that its refit ended with."""
+    found = json.loads((folder / "comparison.json").read_text(encoding="utf-8"))
+    rows = {r["channel"]: [r["as_given"], r["refitted"]] for r in found["by_channel"]}
+    return {
+        "as_given": found["as_given"],
+        "refitted": found["refitted"],
+        "by_channel": rows,
+        "soil": found["parameters"]["soil"],
+    }
+
+
+def report(out: Path, run_folder: Path | None) -> None:
+    """Writes the record of a drive, and of the run folder of `compare` on its log."""
     drive = json.loads((out / "drive.json").read_text(encoding="utf-8"))
     made = json.loads((out / PROVENANCE).read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:
@@ -123,6 +136,7 @@ def report(out: Path) -> None:
         "facts": drive,
         "particles": wheels(out / "log", drive["driven_s"]),
         "rut_field": field,
+        "compare": None if run_folder is None else compared(run_folder),
         "rut_depth_mm": rut_depths(out, drive, drive["numerics"]["voxel"]),
     }
     RESULT.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
@@ -134,11 +148,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "report"))
     parser.add_argument("out", type=Path)
+    parser.add_argument("--compared", type=Path, help="run folder of `compare` on OUT/log")
     options, rest = parser.parse_known_args()
     if options.what == "run":
         run(options.out, rest)
     else:
-        report(options.out)
+        report(options.out, options.compared)
 
 
 if __name__ == "__main__":
