@@ -202,7 +202,7 @@ def initial_wheel(contact: Contact) -> WheelForce:
         slip_x=(contact.rim_speed - contact.v_x) / speed,
         slip_y=lateral_slip_speed(contact) / speed,
         # Falls to 0 at rest instead of jumping by sign: a parked wheel has no direction in which its contact leans.
-        direction=jnp.clip(roll / SLIP_SPEED_FLOOR, -1.0, 1.0),
+        direction=jnp.clip((contact.rim_speed + contact.v_x) / SLIP_SPEED_FLOOR, -1.0, 1.0),
         force=zero,
         moment=zero,
     )

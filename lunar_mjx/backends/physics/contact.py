@@ -126,12 +126,9 @@ def faster(rim: np.ndarray, travel: np.ndarray) -> np.ndarray:
 def side_speed(contact: Values) -> np.ndarray:
     """Numerator of (1 - s) tan(beta): v_y when driving, v_y (2 - r omega/v_x) when braking, m/s (eqs. 8, 9, 11)."""
     rim, v_x, v_y = contact["rim_speed"], contact["v_x"], contact["v_y"]
-    braking = (np.abs(rim) <= np.abs(v_x)) & (np.abs(v_x) > CONTACT.standing)
-    if not braking.any():
-        return v_y
-    # Divided only where wheels brake: elsewhere v_x may be zero.
-    ratio = np.divide(rim, v_x, out=np.ones_like(rim), where=braking)
-    return v_y * (2.0 - clamp(ratio, -1.0, 1.0))
+    # share by which travel outruns the rim: none for a driven wheel, all for a locked one, less for one turning back
+    outrun = np.maximum(np.abs(v_x) - np.abs(rim), 0.0) / np.maximum(np.abs(v_x), CONTACT.standing)
+    return v_y * (1.0 + outrun)
 
 
 def momentary_slip(contact: Values) -> Values:
@@ -141,5 +138,5 @@ def momentary_slip(contact: Values) -> Values:
     return {
         "slip_x": (contact["rim_speed"] - contact["v_x"]) / speed,
         "slip_y": side_speed(contact) / speed,
-        "direction": clamp(fastest / CONTACT.slow, -1.0, 1.0),
+        "direction": clamp((contact["rim_speed"] + contact["v_x"]) / CONTACT.slow, -1.0, 1.0),
     }

@@ -101,7 +101,7 @@ def skid_shear(c: Context, p: SimpleNamespace) -> None:
     Ahead of the angle of reversal the slip is that which brings the displacement back to zero there, if it is less.
     """
     slip, theta_1 = c.slip, c.normal["entrance"]
-    skid = clamp(-np.sign(slip["direction"]) * slip["slip_x"], 0.0, 1.0)
+    skid = clamp(-slip["direction"] * slip["slip_x"], 0.0, 1.0)
     left = np.maximum(1.0 - p.share * skid, 0.01)
     slip["slip_x"], slip["slip_y"] = slip["slip_x"] / left, slip["slip_y"] / (left * (1.0 + p.share * skid))
     theta_0 = np.minimum(c.normal["reversal"], theta_1)

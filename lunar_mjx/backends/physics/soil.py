@@ -173,7 +173,9 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
 
     slip_x, pushed_x = advance(state["slip_x"], contact["rim_speed"] - contact["v_x"])
     slip_y, pushed_y = advance(state["slip_y"], side_speed(contact))
-    direction = np.minimum(np.maximum(advance(state["direction"], roll)[0], -1.0), 1.0)
+    # hub and rim together tell which way the contact leans, so that it turns over by degrees where they are opposed
+    way = np.minimum(np.maximum(contact["rim_speed"] + contact["v_x"], -speed), speed)
+    direction = np.minimum(np.maximum(advance(state["direction"], way)[0], -1.0), 1.0)
     c.slip.update(slip_x=pushed_x, slip_y=pushed_y, direction=direction)
     return {"slip_x": slip_x, "slip_y": slip_y, "direction": direction}
 

@@ -213,7 +213,8 @@ def shear_state(ctx, p, x, wheel):
     L dk/dt = v_slip - V_r k with V_r = max(|r omega|, |v_x|) and L the contact length times `relaxation` (relaxation
     length model, Bernard & Clover 1995, SAE 950311): k tends to the slip of eq. 8 while rolling, and keeps the
     displacement of a wheel that stands. The same for (1 - s) tan(beta) of eq. 11, and for the direction in which the
-    contact leans. Integrated exactly over a step, hence stable at any speed.
+    contact leans: that of rim and hub, their sum within V_r where they are opposed. Integrated exactly over a step,
+    hence stable at any speed.
     """
     contact = ctx.contact
     rock = ctx.soil.rock > 0.5
@@ -235,20 +236,20 @@ def shear_state(ctx, p, x, wheel):
 
     slip_x, loaded_x = advance(x.slip_x, contact.rim_speed - contact.v_x)
     slip_y, loaded_y = advance(x.slip_y, lateral_slip_speed(contact))
-    direction, _ = advance(x.direction, roll)
+    # The contact leans the way that rim and hub move; where they are opposed, the faster one prevails by degrees. Were
+    # it to prevail at once, the step in which a reversing wheel does so would jump, and with it all that follows.
+    direction, _ = advance(x.direction, jnp.clip(contact.rim_speed + contact.v_x, -jnp.abs(roll), jnp.abs(roll)))
     direction = jnp.clip(direction, -1.0, 1.0)
     wheel = dataclasses.replace(wheel, slip_x=loaded_x, slip_y=loaded_y, direction=direction)
     return wheel, {"slip_x": slip_x, "slip_y": slip_y, "direction": direction}
 
 
 def lateral_slip_speed(contact):
-    """Numerator of (1 - s) tan(beta) over V_r: v_y driving, v_y (2 - r omega/v_x) braking, m/s (eqs. 8-11)."""
-    braking = jnp.abs(contact.rim_speed) <= jnp.abs(contact.v_x)
-    # a wheel at rest counts as driving: its ratio of speeds would be 0/0
-    rolling = jnp.abs(contact.v_x) > STANDSTILL_SPEED
-    speed = jnp.where(rolling, contact.v_x, 1.0)
-    # At equal speeds of rim and travel both formulas agree, so that nothing jumps where braking begins.
-    factor = jnp.where(braking & rolling, 2.0 - jnp.clip(contact.rim_speed / speed, -1.0, 1.0), 1.0)
+    """Numerator of (1 - s) tan(beta) over V_r: v_y driving, v_y (2 - |r omega/v_x|) braking, m/s (eqs. 8-11)."""
+    # By magnitudes, and fading below a millimetre per second: the ratio of a wheel that turns against its travel, and
+    # of one that stops, would else jump, and with it the side force in the step in which a rover reverses.
+    rim, travel = jnp.abs(contact.rim_speed), jnp.abs(contact.v_x)
+    factor = 1.0 + jnp.maximum(travel - rim, 0.0) / jnp.maximum(travel, STANDSTILL_SPEED)
     return contact.v_y * factor
 
 

@@ -207,7 +207,7 @@ def _angle_of_reversal(ctx, p, x, normal):
 
 
 def _own_turning(ctx, p, x, wheel):
-    skid = jnp.clip(-jnp.sign(wheel.direction) * wheel.slip_x, 0.0, 1.0)
+    skid = jnp.clip(-wheel.direction * wheel.slip_x, 0.0, 1.0)
     stretch = 1.0 / jnp.maximum(1.0 - p.share * skid, SLIDING.shortest_turn)
     slip_x = wheel.slip_x * stretch
     theta_1 = ctx.normal.entrance
@@ -310,11 +310,10 @@ def side_wall(ctx, p, x, wheel):
     length = r * jnp.sin(jnp.minimum(normal.entrance, 0.5 * jnp.pi))
     axle = r * jnp.cos(normal.entrance)
     turning = contact.rim_speed / r
-    ahead = jnp.where(wheel.direction < 0.0, -1.0, 1.0)
     along = length * first_axis(_ALONG, length)
     h = jnp.maximum(jnp.sqrt(jnp.maximum(r * r - along * along, 1e-12 * r * r)) - axle, 0.0)
     q = (length - along) * _tangent_of_travel(contact, wheel, p.speed_scale) / (p.build_up * soil.shear_modulus_y)
-    arm, place = axle + 2.0 / 3.0 * h, ahead * along
+    arm, place = axle + 2.0 / 3.0 * h, wheel.direction * along
     rise = jnp.abs(contact.v_y) / (soil.tan_phi + jnp.sqrt(1.0 + soil.tan_phi**2))
     u_x, u_z = contact.v_x - turning * arm, -turning * place - rise
     speed = jnp.sqrt(u_x**2 + u_z**2 + (SLIDING.spread * contact.v_y) ** 2 + p.speed_scale**2)
@@ -334,5 +333,5 @@ def side_wall(ctx, p, x, wheel):
 def _tangent_of_travel(contact, wheel, still):
     """v_y/|v_x| from the displacement across of eq. 11, which refers to the faster of rim and travel; kept at rest."""
     fastest = jnp.maximum(jnp.abs(contact.rim_speed), jnp.abs(contact.v_x))
-    braking = jnp.clip(-jnp.sign(wheel.direction) * wheel.slip_x, 0.0, 1.0)
+    braking = jnp.clip(-wheel.direction * wheel.slip_x, 0.0, 1.0)
     return wheel.slip_y / (1.0 + braking) * jnp.sqrt((fastest**2 + still**2) / (contact.v_x**2 + still**2))
