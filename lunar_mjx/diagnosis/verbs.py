@@ -19,12 +19,13 @@ from lunar_mjx.diagnosis.build_problem import (
     require_discrepancy,
     require_splits,
 )
+from lunar_mjx.diagnosis.contact_laws import better_law
 from lunar_mjx.diagnosis.drives.loop import build_drives, grown_drives
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.windows import verbs as windows
 from lunar_mjx.diagnosis.folder.refits import write_refits
 from lunar_mjx.diagnosis.runs import COMPARISON_FILE, VERDICT_FILE, Run, load_run, log_folders
-from lunar_mjx.diagnosis.tables.loop import better_law, build_tables, grown_model
+from lunar_mjx.diagnosis.tables.loop import build_tables, grown_model
 from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
@@ -119,7 +120,7 @@ def _problem(run: Run, logs: Sequence[Any], only: Sequence[str] | None, progress
     """The problem of a run's tables or drives; without candidates where `only` is empty."""
     if isinstance(logs[0], SteadyLog):
         return build_tables(run, logs, rivals=False) if only == () else build_tables(run, logs, only)
-    return build_drives(run, logs, only, progress)
+    return build_drives(run, logs, only, progress, rivals=only != ())
 
 
 def gate(run: Run, new: bool = False) -> list[Any]:

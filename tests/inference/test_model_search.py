@@ -107,6 +107,50 @@ def test_what_ended_in_a_worse_valley_is_refitted_from_a_better_one():
     assert found.best.refit.u[0] < 0.0
 
 
+class Lured(ToyForm):
+    """A toy whose `twin` has a slope at its null and goes nowhere: what a linear estimate promises of it is not there.
+
+    Nothing else that is listed can do what it promises.
+    """
+
+    terms = tuple(t for t in ToyForm.terms if t.name != "square")
+
+    @staticmethod
+    def curve(u):
+        """The toy's curve (n,), with `twin` saturated beyond a hundredth."""
+        reached = 0.01 * np.tanh(u[4:5] / 0.01)
+        return curve(np.concatenate([u[:4], reached]))
+
+
+def test_a_promise_that_a_refit_has_broken_is_not_believed_beside_other_effects():
+    for amount in (0.6, 1.0):
+        found = search([Lured(measured(2, wave=0.8, square=amount))], 20, 4, 3.0)
+        assert any(h.refitted and "twin" in h.effects for h in found.hypotheses), "no promise was put to the test"
+        estimates = [h for h in found.hypotheses if "twin" in h.effects and not h.refitted]
+        assert estimates and all(h.log_posterior < found.best.log_posterior - 5.0 for h in estimates)
+
+
+class Rival(ToyForm):
+    """Another law: the toy's with x^2 added, which nothing but a name would have to explain beside the first."""
+
+    name, late = "rival", True
+
+    @staticmethod
+    def curve(u):
+        """The toy's curve (n,), and half of x^2."""
+        return curve(u) + 0.5 * X**2
+
+
+def test_a_late_form_is_asked_before_anything_is_named_and_not_otherwise():
+    for value, asked in ((measured(0), False), (measured(1) + 0.5 * X**2, True)):
+        tried = []
+        found = search([ToyForm(value), Rival(value)], 12, 4, 4.0, progress=lambda text, share, t=tried: t.append(text))
+        assert ("refitting rival" in tried) is asked
+        assert conclude(found, 0.95).verdict is Verdict.NOISE_ONLY
+    assert tried[1] == "refitting rival"
+    assert found.forms()["rival"] > 0.95
+
+
 def test_something_unlisted_is_unknown_at_its_port():
     value = measured(3) + 0.5 * np.where(X > 0.2, X - 0.2, 0.0) * np.cos(6.0 * X)
     found = look(value)

@@ -84,16 +84,24 @@ class DriveForm(MeasuredForm):
     as it is has been refitted.
     """
 
-    name, log_prior = OWN_FORM, 0.0
-
-    def __init__(self, drives: DriveProblem, settings: DriveSettings, progress: Progress = silent):
+    def __init__(
+        self,
+        drives: DriveProblem,
+        settings: DriveSettings,
+        progress: Progress = silent,
+        name: str = OWN_FORM,
+        beside: DriveForm | None = None,
+    ):
         """Makes the form.
 
         Args:
           drives: simulation of the logs with all candidates and unknown inputs. settings: sizes and priors.
-          progress: told of refits.
+          progress: told of refits. name: of the form.
+          beside: the model's own form where this is a rival of it, weighed against measurements with the same errors.
         """
         self.drives, self.settings, self.progress = drives, settings, progress
+        self.name, self.log_prior, self.late = name, 0.0, beside is not None
+        self._rival_of = beside
         labels = list(drives.inputs)
         self._inputs = np.concatenate([np.zeros(0, int), *(drives.inputs[label] for label in labels)])
         self._label = np.repeat(np.arange(len(labels)), [len(drives.inputs[label]) for label in labels])
@@ -138,6 +146,7 @@ class DriveForm(MeasuredForm):
         self._trial: np.ndarray | None = None  # where a refit begins for which an effect is to act
         self._number = {f.name: k for k, f in enumerate(self._usual_fields())}  # of each field
         self._ground = np.zeros(len(drives.ground))  # amounts of its modes, where the model as it is was refitted
+        self._base = self.origin()  # where it was refitted
 
     @property
     def parts(self) -> list[list[str]]:
@@ -491,6 +500,8 @@ class DriveForm(MeasuredForm):
         if first:
             if effects:
                 raise EvidenceError("the model as it is has not been refitted")
+            if self._rival_of is not None:
+                self._begin_beside(self._rival_of)
             u = self._prepare(free)
         slopes = self._guess(free, near)
         if first:
@@ -526,6 +537,7 @@ class DriveForm(MeasuredForm):
             self._choose_signatures(u, free, slopes, found)
             self._take_fields()
             linear = self._linear(u, effects, slopes)
+            self._base = u
         return Refit(self.name, effects, u, linear)
 
     def _better_start(self, start: np.ndarray, near: Refit, free: np.ndarray) -> np.ndarray:
@@ -641,7 +653,7 @@ class DriveForm(MeasuredForm):
         """
         drives, usual_jitter = self.drives, USUAL_ERRORS.jitter_s
         if self._take_kept():
-            return self._see_all(self.start, free)
+            return self._see_all(self.start if self._rival_of is None else self._settled(free), free)
         errors = self._errors_with(usual_jitter)
         self.observations = errors.at(errors.usual)
         # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after it,
@@ -685,6 +697,39 @@ class DriveForm(MeasuredForm):
         self.kept, self.jitter_s = kept, kept["jitter_s"]
         self._take(errors, levels)
         return True
+
+    def _begin_beside(self, own: DriveForm) -> None:
+        """Takes the errors of the measurements from a rival's refit, and begins where that ended."""
+        self.drives.take_noise(own.drives)
+        self.observations = self.drives.observations
+        self.kept = {
+            "jitter_s": own.jitter_s,
+            "channel_errors": dict(own.channel_errors),
+            "error_times_s": dict(own.error_times_s),
+        }
+        there = {c.key: amount for c, amount in zip(own.coordinates, own._base, strict=True)}
+        mine = {*self.baseline, *self.drives.ground}
+        self.start = np.array([there.get(c.key, 0.0) if i in mine else 0.0 for i, c in enumerate(self.coordinates)])
+
+    def _settled(self, free: np.ndarray) -> np.ndarray:
+        """A refit (coordinates,) with errors that are known, from the start or the model's own parameters as given."""
+        given, own = self.start.copy(), [i for i in self.baseline if not self.coordinates[i].nuisance]
+        # A rival's parameters make up for what it lacks; where this form has that, they are far off.
+        given[own] = 0.0
+        cost = self._cost(self.start, free, self.observations, None)
+        rows = np.stack([self.start, given])
+        values = self.drives.predict(self._whole(rows))
+        costs = [cost.chi2(cost.white(cost.wanted - v), row[free]) for v, row in zip(values, rows, strict=True)]
+        u = rows[int(np.argmin(costs))]
+        for _ in range(self.settings.most_rounds):
+            self.drives.about(u)
+            slopes = self.jacobian(u, free)[1]
+            self._seen = self._see_inputs(u)
+            self._take_fields()
+            found = self._linear(u, frozenset(), slopes).evidence(frozenset())[1]
+            u, _, _ = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
+            u = self._find_ground(u, free)
+        return u
 
     def _take(self, errors: ChannelErrors, levels: np.ndarray) -> None:
         """Holds the measurements with errors of a level (groups,) of each group from now on."""

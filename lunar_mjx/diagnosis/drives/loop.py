@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from lunar_mjx.diagnosis.build_problem import candidates_of
+from lunar_mjx.diagnosis.contact_laws import CLOSED_FORM, contact_laws
 from lunar_mjx.diagnosis.drives.form import LEARNT, DriveForm
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
@@ -26,6 +27,7 @@ def build_drives(
     only: Sequence[str] | None = None,
     progress: Progress = silent,
     candidates: Mapping[str, Effect] | None = None,
+    rivals: bool = False,
 ) -> Problem:
     """The problem of a run's drives.
 
@@ -33,6 +35,7 @@ def build_drives(
       run: model, candidates, splits, settings. logs: its drives.
       only: candidates to include; all if None. progress: told of simulations and refits.
       candidates: effects by name, in place of those of the catalogue.
+      rivals: whether other contact laws take part, where the model has the closed form.
 
     Raises:
       UserError: a candidate or a setting that does not exist.
@@ -45,7 +48,13 @@ def build_drives(
     if kept is not None:
         told = run.load(COMPARISON_FILE) or {}
         form.start, form.kept = kept, told if LEARNT.issubset(told) else {}
-    return Problem((form,), drives.effects, drives.not_tested, settings, drives.unused)
+    forms = [form]
+    laws = contact_laws(run.model, settings.laws if rivals else ())
+    for law, model in laws.items() if CLOSED_FORM in laws else ():
+        if law != CLOSED_FORM:
+            beside = DriveProblem(logs, model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
+            forms.append(DriveForm(beside, settings, progress, law, form))
+    return Problem(forms, drives.effects, drives.not_tested, settings, drives.unused)
 
 
 def grown_drives(

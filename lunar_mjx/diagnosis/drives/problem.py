@@ -192,6 +192,11 @@ class DriveProblem:
         self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
         self.noise_unlearnt = False
 
+    def take_noise(self, other: DriveProblem) -> None:
+        """Takes the noise as another problem of these logs has learnt it."""
+        self._noise_alone, self.noise_unlearnt = other._noise_alone, other.noise_unlearnt
+        self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
+
     def predict(self, u: np.ndarray) -> np.ndarray:
         """(k, n) predicted observations at (k, coordinates), in the channels' units; not finite where one diverged."""
         rows = np.atleast_2d(u)

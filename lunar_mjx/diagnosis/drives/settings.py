@@ -14,6 +14,9 @@ class DriveSettings(SearchSettings):
     effect_odds: float = 0.0033
     """1; prior odds of each effect of the catalogue: of some fifty, one is missing in every seventh campaign, as of the
     fifteen of a table. How many are listed says nothing about a rover (multiplicity: Scott & Berger 2010)."""
+    laws: tuple[str, ...] = ()
+    """Contact laws that are tried beside a model with the closed form, before anything is named, such as
+    `stress_integral`; none by itself, since a rival's refit takes longer than all others together."""
     stated_spread: float = 0.3
     """1; standard deviation of the logarithm of the noise's size: it is only stated, or taken from a second of rest."""
     own_share: float = 0.5

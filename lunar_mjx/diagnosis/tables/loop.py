@@ -11,32 +11,19 @@ from threadpoolctl import threadpool_limits
 
 from lunar_mjx.diagnosis import build_problem
 from lunar_mjx.diagnosis.candidates import usable
+from lunar_mjx.diagnosis.contact_laws import LAWS, OF_REECE, contact_laws, with_law
 from lunar_mjx.diagnosis.runs import HYPOTHESES_FILE, Run
 from lunar_mjx.diagnosis.tables import problem as tables
 from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.tables.wheel_form import WheelForm, table_data
 from lunar_mjx.diagnosis.weighed.form import Problem
 from lunar_mjx.effects import catalogue
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError
 from lunar_mjx.logs import SteadyLog
 from lunar_mjx.model import Model
 from lunar_mjx.wheel_bed.bed import WheelBed
 
 Progress = Callable[[str, float], None]
-
-OWN_FORM = "the model's own contact law"
-LAWS: Mapping[str, tuple[str, ...]] = {
-    "closed form": ("pressure_sinkage", "closed_form_shear"),
-    "stress_integral": ("stress_integral",),
-    "granular_resistance": ("granular_resistance",),
-}
-"""Contact laws that are rivals of each other, and the effects that make them up. (The forms that the seed paper printed
-are none: they are kept to reproduce it.)"""
-_CONTACT = frozenset(
-    {*(part for parts in LAWS.values() for part in parts), "penalty_contact", "printed_shear", "engine_friction"}
-)
-_OF_REECE = frozenset({"exit_angle", "friction_circle"})
-"""Effects that change the course of Wong and Reece's stress along the rim: a law without it has nothing to change."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,7 +74,7 @@ def build_tables(
     for number, (name, model) in enumerate(laws.items()):
         bed = WheelBed.of_first_wheel(model, gravity)
         grains = "granular_resistance" in bed.parameters
-        foreign = _OF_REECE | build_problem.FINER_FORMS if grains else frozenset()
+        foreign = OF_REECE | build_problem.FINER_FORMS if grains else frozenset()
         mine = {n: e for n, e in candidates.items() if not e.replaces and n not in foreign}
         effects, left = usable(bed.effects, mine, tables._unfit)
         refused = left if number == 0 else refused
@@ -108,43 +95,6 @@ def _not_used(model: Model) -> str:
     if not names:
         return ""
     return f"Not used: {', '.join(names)} of the model ({tables.SENSORS})."
-
-
-def contact_laws(model: Model, rivals: Sequence[str]) -> dict[str, Model]:
-    """Models by contact law: the model under the name of its own, and a copy with each rival law instead.
-
-    Raises:
-      UserError: no such law.
-    """
-    for name in rivals:
-        if name not in LAWS:
-            raise bad_input("settings", "laws", name, "is not known", f"use some of {', '.join(LAWS)}")
-    present = set(model.effect_names)
-    own = next((name for name, parts in LAWS.items() if set(parts) <= present), OWN_FORM)
-    laws = {own: model}
-    for name in rivals:
-        if name != own:
-            laws[name] = with_law(model, name)
-    return laws
-
-
-def with_law(model: Model, law: str) -> Model:
-    """A copy of the model with a contact law of `LAWS` in place of its own."""
-    foreign = _CONTACT | (_OF_REECE | build_problem.FINER_FORMS if law == "granular_resistance" else frozenset())
-    for name in [n for n in model.effect_names if n in foreign]:
-        model = model.remove(name)
-    for part in LAWS[law]:
-        model = model.add(part, "contact law")
-    return model
-
-
-def better_law(forms: Mapping[str, float], model: Model, sure: float = TableSettings().sure) -> str | None:
-    """Name of the effect of a rival contact law that surely explains tables better than the model's own, or None."""
-    if not forms:
-        return None
-    best = max(forms, key=lambda name: forms[name])
-    own = next(iter(contact_laws(model, ())))
-    return LAWS[best][0] if best != own and best in LAWS and forms[best] >= sure else None
 
 
 def grown_model(

@@ -90,7 +90,7 @@ def diagnose(
     """
     settings, begun = problem.settings, time.monotonic()
     end = begun + (1.0 - _WRITING) * seconds
-    turns = itertools.count(sum(1 + len(form.exchanged) for form in problem.forms))
+    turns = itertools.count(sum(1 + len(form.exchanged) for form in problem.forms if not form.late))
 
     def over() -> bool:
         """Asked before each further refit: whether it and what comes after it would last longer than the time given."""

@@ -91,10 +91,10 @@ class SearchSettings:
 
 
 def _like(usual: Any, value: Any) -> Any:
-    """A value in the kind of the usual one; lists may be text with commas."""
+    """A value in the kind of the usual one; lists may be text with commas, and one that is empty holds names."""
     if isinstance(usual, tuple):
         texts = [v.strip() for v in value.split(",")] if isinstance(value, str) else list(value)
-        return tuple(type(usual[0])(v) for v in texts if v != "")
+        return tuple(type(usual[0] if usual else "")(v) for v in texts if v != "")
     found = float(value)
     if not math.isfinite(found) or (isinstance(usual, int) and found != int(found)):
         raise ValueError(value)

@@ -180,12 +180,14 @@ class Form(abc.ABC):
       terms: everything that may be the matter beside it.
       exchanged: effects that take the place of a part of the model and have no small amounts: as no linear estimate
         holds for them, a search refits each of them alone.
+      late: whether it is refitted only where something would else be said to be missing beside another.
     """
 
     name: str
     log_prior: float
     terms: Sequence[Term]
     exchanged: Sequence[str] = ()
+    late: bool = False
 
     @abc.abstractmethod
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:

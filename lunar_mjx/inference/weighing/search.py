@@ -6,6 +6,9 @@ is challenged by a refit without it, and a greedy step that led into a trap is u
 more around the refit with it than its own refit has reached, it is refitted again, from there: a descent that found a
 better optimum on its way must not be taken for what the effect is worth.
 
+What an effect promises is believed in the share that its refits have kept. Else some larger set, of which there are
+always more than refits, would stand in front of those that were refitted by a promise that has been broken already.
+
 Before something unlisted is believed, every effect that could be seen is refitted from a place where it acts: where a
 signature saturates, the linear estimate at its null is much too low.
 """
@@ -32,6 +35,24 @@ UNLISTED_SHARE = 0.5
 probable than not."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Promise:
+    """What an effect adds to a set of terms by the linear model around a refit without it.
+
+    Attributes:
+      effect: its name. beside: log posterior of the set without the gain, the effect's odds counted.
+      gain: nats of evidence.
+    """
+
+    effect: str
+    beside: float
+    gain: float
+
+    def believed(self, share: float) -> float:
+        """Log posterior if no more than a share of the gain is kept; a loss counts in full."""
+        return self.beside + (share * self.gain if self.gain > 0.0 else self.gain)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hypothesis:
     """A set of terms beside a form, and how probable it is.
@@ -41,6 +62,7 @@ class Hypothesis:
       log_posterior: log evidence and log prior, up to a constant that all hypotheses share.
       refit: around which the evidence was computed. refitted: whether that refit has the very effects of the set.
       evidence: sizes and posterior. places: columns of the posterior.
+      promise: what one effect adds by a linear estimate; None for sets without such a one.
     """
 
     form: str
@@ -50,6 +72,7 @@ class Hypothesis:
     refitted: bool
     evidence: Evidence
     places: np.ndarray
+    promise: Promise | None = None
 
     @property
     def names(self) -> frozenset[str]:
@@ -147,6 +170,7 @@ class _Search:
       done: the best refit by form and effects; None where the solver failed.
       refits: number made. begun: form, effects, and effects of the refit at whose end it began, of each.
       reasons: "form with effects: reason" of each refit whose solver failed.
+      record: nats that refits of each effect beside a form have been promised, and how many of these they kept.
       over: whether time was up within a refit.
     """
 
@@ -162,6 +186,7 @@ class _Search:
     refits: int = 0
     begun: set[tuple[str, frozenset[str], frozenset[str]]] = dataclasses.field(default_factory=set)
     reasons: list[str] = dataclasses.field(default_factory=list)
+    record: dict[tuple[str, str], tuple[float, float]] = dataclasses.field(default_factory=dict)
     over: bool = False
 
     @property
@@ -170,13 +195,14 @@ class _Search:
         return self.refits < self.most_refits and not self.over
 
     def begin(self) -> None:
-        """Refits every form as it is, then with each effect that takes the place of a part of it.
+        """Refits every form that is not late as it is, then with each effect that takes the place of a part of it.
 
         Raises:
           EvidenceError: no form could be fitted. TimeUp: before the first one was.
         """
         for form in self.forms:
-            self.refit(form, frozenset(), None)
+            if not form.late:
+                self.refit(form, frozenset(), None)
         if not self.known:
             raise EvidenceError("; ".join(self.reasons))
         for form in self.forms:
@@ -186,6 +212,12 @@ class _Search:
     def go_on(self, provisional: Callable[[ModelSearch], None]) -> bool:
         """Makes the refit that promises most; false where none is left that could change the answer."""
         by_name = {form.name: form for form in self.forms}
+        late = [f for f in self.forms if f.late and (f.name, frozenset()) not in self.done]
+        # A form that has to explain what another one lacks is asked before the first name: beside a law that is a
+        # little wrong everywhere, some set of effects always looks like what it lacks.
+        if late and max(self.known.values(), key=lambda h: h.log_posterior).terms:
+            self.refit(late[0], frozenset(), None)
+            return True
         # Unlisted inputs are linear and need no refit; effects are not, and gain by theirs. What is unlisted closes the
         # door on no effect before that has been refitted.
         listed = [h for h in self.known.values() if not any(t.kind == UNLISTED for t in h.terms)]
@@ -195,6 +227,7 @@ class _Search:
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
         # order of what it promises there. Else one form's many neighbours would take the refits that tell which it is.
         other_forms = [f for f in self.forms if best.refitted and (f.name, best.effects) not in self.done]
+        other_forms = [f for f in other_forms if f not in late]
         other_forms = [f for f in other_forms if best.effects <= {t.name for t in f.terms}]
         promise = {f.name: _carried_over(listed, best, f.name) for f in other_forms}
         other_forms.sort(key=lambda f: -promise[f.name])
@@ -253,12 +286,35 @@ class _Search:
         self.refits += 1
         if made.failed:
             self.reasons.append(f"{label}: {made.failed}")
+        listed = _listed(form, effects)
+        estimated = self.known.get((form.name, listed))
         if self.score_around(form, made, near):
             self.done[key] = made
+            if estimated is not None and estimated.promise is not None and not made.failed:
+                self.hold(estimated.promise, self.known[form.name, listed])
         elif key not in self.done:
             # A refit around which nothing can be said is a failed one; the set would else be refitted for ever.
             self.done[key] = None
             self.reasons.append(f"{label}: no evidence around its refit")
+
+    def hold(self, promise: Promise, reached: Hypothesis) -> None:
+        """Holds a promise against what its refit has reached, and all others of the same effect with it."""
+        if promise.gain <= 0.0:
+            return
+        key = reached.form, promise.effect
+        promised, kept = self.record.get(key, (0.0, 0.0))
+        gain = min(max(reached.log_posterior - promise.beside, 0.0), promise.gain)
+        self.record[key] = promised + promise.gain, kept + gain
+        for place, h in self.known.items():
+            if h.form == reached.form and h.promise is not None and h.promise.effect == promise.effect:
+                self.known[place] = self.believed(h)
+
+    def believed(self, h: Hypothesis) -> Hypothesis:
+        """A linear estimate as far as refits of its effect have kept what others like it had promised."""
+        if h.promise is None or (h.form, h.promise.effect) not in self.record:
+            return h
+        promised, kept = self.record[h.form, h.promise.effect]
+        return dataclasses.replace(h, log_posterior=h.promise.believed(kept / promised))
 
     def promising(self, form: Form, best: Hypothesis, rivals: Iterable[frozenset[str]]) -> Hypothesis | None:
         """The set of effects that promises most around a refit beyond what its own has reached; None if none does.
@@ -268,10 +324,9 @@ class _Search:
         Args:
           form: of the model. best: around whose refit. rivals: sets of effects that have been refitted.
         """
-        effects = {t.name: t for t in form.terms if t.kind == EFFECT}
         found = []
         for names in rivals:
-            terms = frozenset(effects[name] for name in names)
+            terms = _listed(form, names)
             old = self.known.get((form.name, terms))
             if old is None or not old.refitted or (form.name, names, best.effects) in self.begun:
                 continue
@@ -315,7 +370,7 @@ class _Search:
         Returns:
           Whether this is the best refit of its set so far and has evidence; around another one nothing is scored.
         """
-        own = frozenset(t for t in form.terms if t.kind == EFFECT and t.name in made.effects)
+        own = _listed(form, made.effects)
         felt, shows = made.linear.felt(), made.linear.shows()
         unfitted = [t for t in form.terms if t.kind != EFFECT]
         unfitted = [t for t in unfitted if t.kind != UNLISTED or felt[t.name] >= self.least_signal]
@@ -324,37 +379,43 @@ class _Search:
         if base is None or base.refit is not made:
             return False
 
-        def scored(choices: Iterable[Terms], sizes: tuple[np.ndarray, np.ndarray]) -> list[Hypothesis]:
-            return [h for terms in choices if (h := self.score(form, made, own, terms, sizes))]
+        def scored(choices: Iterable[Terms], beside: Hypothesis) -> list[Hypothesis]:
+            return [h for terms in choices if (h := self.score(form, made, own, terms, _sizes(beside), beside))]
 
         roots = [base]
         # Terms without a refit: all single ones, then more beside the best of them.
-        level = scored((own | {t} for t in unfitted), _sizes(base))
+        level = scored((own | {t} for t in unfitted), base)
         best = max([base, *level], key=lambda h: h.log_posterior)
         while level and best is not roots[-1] and len(best.terms) < self.most_terms:
             roots.append(best)
-            level = scored((best.terms | {t} for t in unfitted if t not in best.terms), _sizes(best))
+            level = scored((best.terms | {t} for t in unfitted if t not in best.terms), best)
             best = max([best, *level], key=lambda h: h.log_posterior)
             # What a later term makes needless goes again.
-            fewer = scored((best.terms - {t} for t in best.terms - own), _sizes(best))
+            fewer = scored((best.terms - {t} for t in best.terms - own), best)
             best = max([best, *fewer], key=lambda h: h.log_posterior)
         top = max(h.log_posterior for h in self.known.values())
         for root in roots:
             # A neighbour of what is hopeless may still be the truth where nothing has been found yet.
             if root is not base and root.log_posterior < top - self.window:
                 continue
-            scored((root.terms | {t} for t in effects if t not in own), _sizes(root))
-            scored((root.terms - {t} for t in own), _sizes(root))
+            scored((root.terms | {t} for t in effects if t not in own), root)
+            scored((root.terms - {t} for t in own), root)
         return True
 
     def score(
-        self, form: Form, made: Refit, own: Terms, terms: Terms, sizes: tuple[np.ndarray, np.ndarray] | None
+        self,
+        form: Form,
+        made: Refit,
+        own: Terms,
+        terms: Terms,
+        sizes: tuple[np.ndarray, np.ndarray] | None,
+        beside: Hypothesis | None = None,
     ) -> Hypothesis | None:
         """The best that is known of a set of terms after it was scored around a refit; None if nothing is.
 
         Args:
           form, made: around which refit. own: its effects as terms. terms: of the set.
-          sizes: of discrepancy and noise to begin at.
+          sizes: of discrepancy and noise to begin at. beside: set around the same refit of which it is a neighbour.
         """
         refitted = terms.issuperset(own) and not any(t.kind == EFFECT for t in terms - own)
         old = self.known.get((form.name, terms))
@@ -368,6 +429,11 @@ class _Search:
         new = self.estimate(form, made, terms, sizes, refitted)
         if new is None:
             return old
+        more = [] if refitted or beside is None else list(terms - beside.terms)
+        if more and beside is not None:
+            without = beside.log_posterior + more[0].log_prior
+            new = dataclasses.replace(new, promise=Promise(more[0].name, without, new.log_posterior - without))
+            new = self.believed(new)
         # Of two linear estimates of one set the one from nearer by counts: that of the more probable refit. Of two
         # refits of one set the better optimum counts.
         if old is None or (refitted and not old.refitted) or new.log_posterior > old.log_posterior:
@@ -390,6 +456,11 @@ class _Search:
         # terms are independent beforehand: each has its own odds, and a set the product of theirs
         prior = form.log_prior + sum(t.log_prior for t in terms)
         return Hypothesis(form.name, terms, value + prior, made, refitted, inferred, places)
+
+
+def _listed(form: Form, effects: frozenset[str]) -> Terms:
+    """The terms of some effects beside a form."""
+    return frozenset(t for t in form.terms if t.kind == EFFECT and t.name in effects)
 
 
 def _carried_over(listed: Sequence[Hypothesis], best: Hypothesis, form: str) -> float:

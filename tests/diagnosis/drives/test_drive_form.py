@@ -58,6 +58,9 @@ class Toy:
     def about(self, u):
         del u
 
+    def take_noise(self, other):
+        self.observations = other.observations
+
     def predict(self, u):
         u = np.atleast_2d(u).copy()
         self.rows += len(u)
@@ -138,6 +141,33 @@ def test_an_effect_is_named_and_sized(effect, amount):
     assert found.best.refit.u[form.candidates[effect][0]] == pytest.approx(amount, abs=0.2)
     assert set(found.best.refit.linear.held_out) == {f"{log} from {k} s" for log in ("log4", "log5") for k in range(8)}
     assert "idle" not in {t.name for t in found.inclusion()}, "what cannot show is not weighed"
+
+
+class Finer(Toy):
+    """A toy with another law, in which something acts that looks like `drag` beside the first one's."""
+
+    def predict(self, u):
+        return super().predict(u) + 2.0 * SHAPES[2]
+
+
+def test_a_rival_law_is_asked_before_anything_is_named_with_the_same_errors():
+    settings = DriveSettings()
+    for truth, better in ((Finer({"a": 0.5}), True), (Toy({"a": 0.5, "lag": 0.7}), False)):
+        toy, other = Toy({}), Finer({})
+        toy.observations = truth.observations
+        own = DriveForm(toy, settings)  # type: ignore[arg-type]
+        rival = DriveForm(other, settings, name="finer", beside=own)  # type: ignore[arg-type]
+        found = search([own, rival], settings.most_refits, settings.most_terms, settings.window)
+        said = conclude(found, settings.sure)
+        assert (found.forms()["finer"] > 0.99) is better
+        assert said.effects == (() if better else ("lag",)), said.sentence
+        assert rival.observations.log_widths() == pytest.approx(own.observations.log_widths())
+        assert rival.channel_errors == own.channel_errors
+    # what explains itself asks for no rival
+    toy, other = Toy({"a": 0.5}), Finer({})
+    own = DriveForm(toy, settings)  # type: ignore[arg-type]
+    search([own, DriveForm(other, settings, name="finer", beside=own)], 8, 7, 4.0)  # type: ignore[arg-type]
+    assert other.rows == 1, "nothing but its own making"
 
 
 @pytest.mark.parametrize(("everywhere", "verdict"), [(True, Verdict.KNOWN), (False, Verdict.UNDECIDABLE)])
