@@ -24,7 +24,7 @@ def test_a_search_leaves_time_for_what_comes_after_it(writing, end, monkeypatch)
 
     monkeypatch.setattr(answer, "search", search)
     monkeypatch.setattr(answer.time, "monotonic", lambda: clock[0])
-    form = SimpleNamespace(limit=lambda until: None, exchanged=("soft_ground",), writing=writing)
+    form = SimpleNamespace(limit=lambda until: None, exchanged=("soft_ground",), late=False, writing=writing)
     question = SimpleNamespace(forms=(form,), own=form, settings=SearchSettings())
     answer.diagnose(None, question, lambda text, share: None, 120.0)
     assert clock[0] - 7.0 == end
