@@ -124,7 +124,7 @@ def faster(rim: np.ndarray, travel: np.ndarray) -> np.ndarray:
 
 
 def side_speed(contact: Values) -> np.ndarray:
-    """Numerator of (1 - s) tan(beta): v_y when driving, v_y (2 - r omega/v_x) when braking, m/s (eqs. 8, 9, 11)."""
+    """Numerator of (1 - s) tan(beta): v_y when driving, v_y (2 - |r omega/v_x|) when braking, m/s (eqs. 8, 9, 11)."""
     rim, v_x, v_y = contact["rim_speed"], contact["v_x"], contact["v_y"]
     # share by which travel outruns the rim: none for a driven wheel, all for a locked one, less for one turning back
     outrun = np.maximum(np.abs(v_x) - np.abs(rim), 0.0) / np.maximum(np.abs(v_x), CONTACT.standing)

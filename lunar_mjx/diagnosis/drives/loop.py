@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from lunar_mjx.diagnosis.build_problem import candidates_of
-from lunar_mjx.diagnosis.contact_laws import CLOSED_FORM, contact_laws
+from lunar_mjx.diagnosis.contact_laws import CLOSED_FORM, LAWS, contact_laws
 from lunar_mjx.diagnosis.drives.form import LEARNT, DriveForm
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
@@ -16,6 +16,7 @@ from lunar_mjx.diagnosis.weighed.answer import kept_start
 from lunar_mjx.diagnosis.weighed.form import Problem
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
+from lunar_mjx.errors import bad_input
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.logs import Log
 from lunar_mjx.model import Model
@@ -38,7 +39,7 @@ def build_drives(
       rivals: whether other contact laws take part, where the model has the closed form.
 
     Raises:
-      UserError: a candidate or a setting that does not exist.
+      UserError: a candidate or a setting that does not exist; rival laws of a model without a law of soil.
     """
     settings = DriveSettings.of(run.settings)
     wanted = candidates_of(run, only) if candidates is None else candidates
@@ -48,12 +49,15 @@ def build_drives(
     if kept is not None:
         told = run.load(COMPARISON_FILE) or {}
         form.start, form.kept = kept, told if LEARNT.issubset(told) else {}
-    forms = [form]
-    laws = contact_laws(run.model, settings.laws if rivals else ())
-    for law, model in laws.items() if CLOSED_FORM in laws else ():
-        if law != CLOSED_FORM:
-            beside = DriveProblem(logs, model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
-            forms.append(DriveForm(beside, settings, progress, law, form))
+    forms, laws = [form], contact_laws(run.model, settings.laws)
+    own = next(iter(laws))
+    if settings.laws and own not in LAWS:
+        problem = "has no use beside a model without a closed form"
+        raise bad_input("settings", "laws", ", ".join(settings.laws), problem, "leave it away")
+    # the closed form is an approximation of the others: beside one of these it is no rival
+    for law in [name for name in laws if rivals and own == CLOSED_FORM and name != own]:
+        beside = DriveProblem(logs, laws[law], wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
+        forms.append(DriveForm(beside, settings, progress, law, form))
     return Problem(forms, drives.effects, drives.not_tested, settings, drives.unused)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from lunar_mjx.diagnosis.build_problem import FINER_FORMS
 from lunar_mjx.diagnosis.candidates import usable
 from lunar_mjx.diagnosis.drives import form as module
+from lunar_mjx.diagnosis.drives import loop
 from lunar_mjx.diagnosis.drives.baseline import unfit
 from lunar_mjx.diagnosis.drives.form import DriveForm, _bounded_step
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
@@ -21,6 +24,7 @@ from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _un
 from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude
 from lunar_mjx.diagnosis.weighed.form import Problem, SearchSettings
 from lunar_mjx.effects.catalogue import CATALOGUE
+from lunar_mjx.errors import UserError
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.deadline import Deadline, TimeUp
 from lunar_mjx.inference.weighing.search import search
@@ -168,6 +172,36 @@ def test_a_rival_law_is_asked_before_anything_is_named_with_the_same_errors():
     own = DriveForm(toy, settings)  # type: ignore[arg-type]
     search([own, DriveForm(other, settings, name="finer", beside=own)], 8, 7, 4.0)  # type: ignore[arg-type]
     assert other.rows == 1, "nothing but its own making"
+
+
+@pytest.mark.parametrize(
+    ("preset", "laws", "refused"),
+    [
+        ("paper", "stress_integral", "has no use"),
+        ("consistent", "foo", "is not known"),
+        ("consistent", "stress_integral", ""),
+        ("field", "stress_integral", ""),
+    ],
+)
+def test_rival_laws_go_with_the_closed_form(monkeypatch, preset: str, laws: str, refused: str):
+    """Refused where there is nothing to compete with; an integral that is in the model already has no rival."""
+    toy: Any = Toy({})
+    toy.effects, toy.not_tested, toy.unused = {}, (), ""
+    monkeypatch.setattr(loop, "DriveProblem", lambda *args, **more: toy)
+    run: Any = SimpleNamespace(
+        model=make_model("luvmi_x", terrain="flat", preset=preset),
+        settings={"laws": laws},
+        splits={},
+        discrepancy={},
+        load=lambda name: None,
+    )
+    if refused:
+        with pytest.raises(UserError, match=refused):
+            loop.build_drives(run, [], candidates={}, rivals=True)
+        return
+    forms = loop.build_drives(run, [], candidates={}, rivals=True).forms
+    assert [f.late for f in forms] == ([False, True] if preset == "consistent" else [False])
+    assert len(loop.build_drives(run, [], candidates={}).forms) == 1, "whoever only compares pays for no rival"
 
 
 @pytest.mark.parametrize(("everywhere", "verdict"), [(True, Verdict.KNOWN), (False, Verdict.UNDECIDABLE)])
