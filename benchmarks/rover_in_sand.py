@@ -42,7 +42,7 @@ def run(out: Path, options: list[str]) -> None:
 
 
 def rut_field(drive: dict[str, Any], options: list[str], folder: Path) -> dict[str, dict[str, float]]:
-    """The same drive, as long, on the engine with the effect `ruts` and the model's own soil: see `wheels`."""
+    """Sinkage and slip by wheel on the engine in the model's soil with `ruts`, for as long as the particles' drive."""
     from lunar_mjx.logs import Recording, simulate_log
 
     whole = float(options[options.index("--duration") + 1]) if "--duration" in options else None

@@ -120,7 +120,7 @@ def test_hills_and_coarse_voxels_are_refused():
 @needs_extra
 @pytest.mark.slow
 def test_a_rover_in_particles():
-    """It stands on its four wheels alike, the sand bears its weight, and it drives off and sinks in."""
+    """A rover in sand stands on its four wheels alike, the sand bears its weight, and it drives off and sinks in."""
     from lunar_mjx.wheel_bed.particles.sand_box import open_device
 
     open_device("cpu")

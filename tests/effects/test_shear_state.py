@@ -170,7 +170,7 @@ def test_damping_adds_what_the_soil_is_sheared_in_the_damping_time() -> None:
 
 
 def test_nothing_jumps_while_a_wheel_reverses() -> None:
-    """Along all that rim and hub do to each other, a hundredth of a millimetre per second changes no state by more.
+    """A hundredth of a millimetre per second more of rim or hub changes slip and lean by less than 2e-3 in a step.
 
     A jump within a reversal is met in one time step or the next, so that what is predicted jumps with every parameter:
     drives of a skid-steer rover could not be fitted for this.
