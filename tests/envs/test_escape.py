@@ -18,7 +18,7 @@ from lunar_mjx.envs.navigation.randomise import Range
 from lunar_mjx.errors import UserError
 
 pytestmark = pytest.mark.optimised
-SMALL = {"task": "escape", "preset": "consistent", "places": 16, "episode_time": 40.0}
+SMALL = {"task": "escape", "preset": "consistent", "places": 16, "episode_time": 60.0}
 ROVERS = 8
 
 
@@ -65,9 +65,10 @@ def test_resets_and_holes_are_the_same_again_and_others_with_another_seed(env, b
 
 @pytest.mark.slow
 def test_driving_on_keeps_rovers_stuck_and_rocking_frees_some(env):
-    keys = jnp.tile(split_keys(jax.random.PRNGKey(4), ROVERS), (2, 1))
+    # a sixth to a third of the rovers that rock come out: of 32, none would by chance be one case in 300
+    keys = split_keys(jax.random.PRNGKey(4), ROVERS + 32)
     straight, rocking = make_agent("scripted", env), make_agent("rocking", env)
-    rocks = (jnp.arange(2 * ROVERS) >= ROVERS)[:, None]
+    rocks = (jnp.arange(len(keys)) >= ROVERS)[:, None]
 
     def step(state, key):
         state = env.step(env.params, state, jnp.where(rocks, rocking(state, key), straight(state, key)))
