@@ -70,6 +70,7 @@ UNITS: Mapping[type, Mapping[str, str | None]] = {
         "v_y": "m/s",
         "rim_speed": "m/s",
         "soil_slip": "1",
+        "soil_slid": "1",
         "forward": "1",
         "left": "1",
         "normal": "1",

@@ -71,6 +71,8 @@ class Contact:
       inside: whether the wheel is over the terrain's grid.
       soil_slip: the slip as the soil remembers it, within [-1, 1]: its shear displacement over the contact length. It
         tends to the slip while the wheel rolls on and stays when it stops; the slip itself where no effect keeps it.
+        Where rim and hub are opposed it passes over from skidding to driving, through 0.
+      soil_slid: size of that shear displacement, within [0, 1], whichever way it is called.
     """
 
     sinkage: Float[Array, "wheel"]
@@ -85,6 +87,7 @@ class Contact:
     normal: Vec3
     inside: Array
     soil_slip: Float[Array, "wheel"]
+    soil_slid: Float[Array, "wheel"]
 
 
 @pytree
@@ -170,7 +173,8 @@ class WheelForce:
       slip_x: rim speed less travel speed over the larger of the two, signed in the wheel's frame (positive pushes the
         soil backward); equals eq. 8 when the rover moves forward.
       slip_y: (1 - s) tan(beta) of eq. 11, signed as the lateral velocity.
-      direction: +1 when the wheel rolls forward, -1 when it rolls backward.
+      direction: +1 when the wheel rolls forward, -1 when it rolls backward; rim and travel speed together over the
+        larger where they are opposed.
       force: on the wheel's centre in the wheel frame (forward, left, ground normal), N.
       moment: on the wheel about its centre in the wheel frame, N m.
       circle: share of the shear stress that both directions have in common (friction circle); None for none.

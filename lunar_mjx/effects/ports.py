@@ -157,6 +157,7 @@ def wheel_contact(ctx: Context) -> Contact:
         normal=normal,
         inside=inside(ctx.terrain.field, place.x, place.y),
         soil_slip=jnp.clip(slip, -1.0, 1.0),
+        soil_slid=jnp.minimum(jnp.abs(slip), 1.0),
     )
 
 
@@ -202,7 +203,7 @@ def initial_wheel(contact: Contact) -> WheelForce:
         slip_x=(contact.rim_speed - contact.v_x) / speed,
         slip_y=lateral_slip_speed(contact) / speed,
         # Falls to 0 at rest instead of jumping by sign: a parked wheel has no direction in which its contact leans.
-        direction=jnp.clip((contact.rim_speed + contact.v_x) / SLIP_SPEED_FLOOR, -1.0, 1.0),
+        direction=jnp.clip(contact.rim_speed + contact.v_x, -jnp.abs(roll), jnp.abs(roll)) / speed,
         force=zero,
         moment=zero,
     )

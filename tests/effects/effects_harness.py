@@ -128,6 +128,7 @@ def _compiled(names: tuple[str | Effect, ...]) -> Callable[..., tuple[WheelForce
             nil,
             zero == 0,
             jnp.clip(jnp.sign(roll) * s.slip_x, -1.0, 1.0),
+            jnp.minimum(jnp.abs(s.slip_x), 1.0),
         )
         soil = Soil(s.k_c, s.k_phi, s.n, s.cohesion, s.tan_phi, s.shear_modulus_x, s.shear_modulus_y, rock + zero)
         ctx = bare_context(

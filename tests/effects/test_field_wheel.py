@@ -77,7 +77,8 @@ def _program(names: tuple[str, ...]) -> Any:
         nil = Vec3(*(0.0 * z,) * 3)
         roll = jnp.where(jnp.abs(rim) > jnp.abs(v_x), rim, v_x)
         slip = (rim - v_x) / roll
-        contact = Contact(z, 0.0 * z, slip, jnp.arctan2(v_y, v_x), v_x, v_y, rim, nil, nil, nil, z > 0.0, slip)
+        angle, slid = jnp.arctan2(v_y, v_x), jnp.abs(slip)
+        contact = Contact(z, 0.0 * z, slip, angle, v_x, v_y, rim, nil, nil, nil, z > 0.0, slip, slid)
         ctx = bare_context(
             dt=jnp.asarray(0.002, z.dtype),
             gravity=GRAVITY,

@@ -31,7 +31,7 @@ def _step(
 ) -> Any:
     zero = jnp.zeros_like(v_x)
     nil = Vec3(zero, zero, zero)
-    contact = Contact(sinkage, zero, zero, zero, v_x, v_y, rim, nil, nil, nil, zero == 0, zero)
+    contact = Contact(sinkage, zero, zero, zero, v_x, v_y, rim, nil, nil, nil, zero == 0, zero, zero)
     normal = initial_normal(v_x)
     normal = functools.partial(type(normal), THETA_1 + zero, zero, THETA_1 / 2 + zero)(zero, zero, zero, zero)
     soil = dataclasses.replace(initial_soil(v_x), rock=rock)

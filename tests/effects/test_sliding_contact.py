@@ -71,6 +71,7 @@ def blade(degrees: Array, rim: Array, **values: float) -> Array:
             nil,
             zero == 0,
             s.slip_x,
+            jnp.abs(s.slip_x),
         )
         normal = initial_normal(zero)
         normal = dataclasses.replace(normal, entrance=entrance_angle(s.sinkage, s.radius))

@@ -67,6 +67,7 @@ def wheel_contact(
         "sinkage_rate": -dot(c.wheel_velocity, normal),
         "slip": slip,
         "soil_slip": clamp(slip, -1.0, 1.0),
+        "soil_slid": np.minimum(np.abs(slip), 1.0),
         "slip_angle": np.arctan2(v_y, np.maximum(np.abs(v_x), CONTACT.slow)),
         "v_x": v_x,
         "v_y": v_y,
@@ -138,5 +139,5 @@ def momentary_slip(contact: Values) -> Values:
     return {
         "slip_x": (contact["rim_speed"] - contact["v_x"]) / speed,
         "slip_y": side_speed(contact) / speed,
-        "direction": clamp((contact["rim_speed"] + contact["v_x"]) / CONTACT.slow, -1.0, 1.0),
+        "direction": clamp(contact["rim_speed"] + contact["v_x"], -np.abs(fastest), np.abs(fastest)) / speed,
     }

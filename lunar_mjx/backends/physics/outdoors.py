@@ -39,8 +39,9 @@ DENSITY_POWERS = {"cohesion": 11.0, "tan_phi": 2.7, "shear_modulus_x": -1.0, "sh
 
 def slip_sinkage(c: Context, p: SimpleNamespace, soil: Values) -> None:
     """Sinkage exponent n_0 + n_1 s driving, n_0 + n_2 |s| skidding, with equal pressure at a sinkage of one radius."""
-    s = c.contact["soil_slip"]
-    more = np.where(s > 0.0, p.driving * s, -p.skid * s)
+    s, slid = c.contact["soil_slip"], c.contact["soil_slid"]
+    # opposed rim and hub drive and skid at once
+    more = 0.5 * (slid + s) * p.driving + 0.5 * (slid - s) * p.skid
     scale = c.geometry["radius"] ** -more
     soil["k_c"], soil["k_phi"], soil["n"] = soil["k_c"] * scale, soil["k_phi"] * scale, soil["n"] + more
 
@@ -89,7 +90,7 @@ def multipass(c: Context, p: SimpleNamespace, soil: Values, places: Values) -> V
 
 def skid_reversal(c: Context, p: SimpleNamespace) -> None:
     """theta_0 with cos(theta_0 + X) = (1 - |s|) cos X, X = 45 deg - phi/2: in front of it soil is shoved ahead; rad."""
-    turning = 1.0 - p.share * np.maximum(-c.contact["soil_slip"], 0.0)
+    turning = 1.0 - p.share * 0.5 * (c.contact["soil_slid"] - c.contact["soil_slip"])
     break_out = 0.5 * (0.5 * np.pi - np.arctan(c.soil["tan_phi"]))
     angle = np.arccos(turning * np.cos(break_out)) - break_out
     c.normal["reversal"] = np.where(turning < 1.0, angle, 0.0)
@@ -127,7 +128,9 @@ def bulldozing(c: Context, p: SimpleNamespace) -> None:
     sinkage, r = below_surface(c), c.geometry["radius"]
     soft = (sinkage > 0.0) & (c.soil["rock"] <= 0.5)
     weight = p.density * c.gravity
-    ahead = clamp(c.slip["direction"] - c.slip["slip_x"], -1.0, 1.0)
+    # opposed rim and hub: the lean holds the travel twice
+    share = 1.0 - 0.5 * (np.abs(c.slip["slip_x"]) > 1.0)
+    ahead = clamp(share * (c.slip["direction"] - c.slip["slip_x"]), -1.0, 1.0)
     front = -p.front * soft * c.geometry["width"] * earth_pressure(c, weight, sinkage, sinkage * sinkage) * ahead
     theta_1 = c.normal["entrance"]
     length = r * np.sin(np.minimum(theta_1, 0.5 * np.pi))

@@ -52,10 +52,10 @@ def slip_sinkage(ctx, p, x, ground):
     that stops. Ding et al. 2010 and the seed paper's n_0 + n_1 |s|, with the sinkage normalised by the
     wheel's radius, p = p_0 (z/r)^(n - n_0), so that the moduli keep their meaning whatever the exponent.
     """
-    slip = ctx.contact.soil_slip
-    # Two coefficients: a driven wheel throws soil out behind it, a braked one piles it up before itself.
-    change = p.driving * jnp.maximum(slip, 0.0) + p.skid * jnp.maximum(-slip, 0.0)
-    return with_exponent(ctx, ground, change)
+    slip, slid = ctx.contact.soil_slip, ctx.contact.soil_slid
+    # Two coefficients: a driven wheel throws soil out behind it, a braked one piles it up before itself. The slip is
+    # all driving or all skidding but where rim and hub are opposed.
+    return with_exponent(ctx, ground, 0.5 * (p.driving * (slid + slip) + p.skid * (slid - slip)))
 
 
 def lateral_slip(contact):
@@ -87,7 +87,7 @@ def angle_sinkage(ctx, p, x, ground):
     speed: slip-sinkage of the total sliding (Lyasko 2010 explains it by the shear displacement, which
     has no preferred direction), less the share along the wheel that `slip_sinkage` holds.
     """
-    s_x, s_y = ctx.contact.soil_slip, lateral_slip(ctx.contact)
+    s_x, s_y = ctx.contact.soil_slid, lateral_slip(ctx.contact)
     # Rounded off, because |s_x| has no derivative where a wheel rolls freely.
     along = jnp.sqrt(s_x**2 + _FLAT**2)
     return with_exponent(ctx, ground, p.lateral * (jnp.sqrt(s_x**2 + s_y**2 + _FLAT**2) - along))

@@ -61,8 +61,10 @@ def bulldozing(ctx, p, x, wheel):
     z, r = contact.sinkage, geometry.radius
     weight = p.density * ctx.gravity
     soft = grounded(contact, jnp.where(soil.rock > 0.5, 0.0, 1.0))
-    # Travel per rolling, 1 - s: a wheel that spins on the spot pushes no wall of soil before it.
-    ahead = jnp.clip(wheel.direction - wheel.slip_x, -1.0, 1.0)
+    # Travel over the faster of rim and travel, 1 - s: a wheel that spins on the spot pushes no wall of soil before it.
+    # The lean less the slip is that where both go one way, and twice that where they are opposed.
+    opposed = jnp.abs(wheel.slip_x) > 1.0
+    ahead = jnp.clip(jnp.where(opposed, 0.5, 1.0) * (wheel.direction - wheel.slip_x), -1.0, 1.0)
     front = -p.front * soft * geometry.width * passive_pressure(soil, weight, z, z * z) * ahead
     length = r * jnp.sin(jnp.minimum(normal.entrance, 0.5 * jnp.pi))
     # Mobilised as shear is: a wall that has not moved yet meets no passive pressure (Janosi's curve stands for the

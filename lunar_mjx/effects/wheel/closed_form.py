@@ -169,7 +169,8 @@ def _remembered_slip(x, contact):
     The slip of a wheel that creeps changes within a millimetre per second from none to full. Soil that answered to it
     at once would shake a parked rover for ever; it is displaced over a contact length instead.
     """
-    return dataclasses.replace(contact, soil_slip=jnp.clip(x.direction * x.slip_x, -1.0, 1.0))
+    slip, slid = jnp.clip(x.direction * x.slip_x, -1.0, 1.0), jnp.minimum(jnp.abs(x.slip_x), 1.0)
+    return dataclasses.replace(contact, soil_slip=slip, soil_slid=slid)
 
 
 @effect(

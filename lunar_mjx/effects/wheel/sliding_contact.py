@@ -90,7 +90,7 @@ def slide_softening(ctx, p, x, ground):
     c = ctx.contact
     fastest = jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + c.v_y**2 + _STILL**2))
     # eq. 8 has the larger of rim and forward speed below
-    along = c.soil_slip * jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + _STILL**2)) / fastest
+    along = c.soil_slid * jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + _STILL**2)) / fastest
     across = c.v_y / fastest
     sliding = jnp.sqrt(along**2 + across**2 + SLIDING.flat**2) - SLIDING.flat
     factor = 1.0 / (1.0 + p.softening * sliding)
@@ -200,7 +200,7 @@ def side_exit(ctx, p, x, normal):
 
 
 def _angle_of_reversal(ctx, p, x, normal):
-    skid = p.share * jnp.maximum(-ctx.contact.soil_slip, 0.0)
+    skid = p.share * 0.5 * (ctx.contact.soil_slid - ctx.contact.soil_slip)
     break_out = 0.25 * jnp.pi - 0.5 * jnp.arctan(ctx.soil.tan_phi)
     turned = jnp.arccos((1.0 - skid) * jnp.cos(break_out)) - break_out
     return dataclasses.replace(normal, reversal=jnp.where(skid > 0.0, turned, 0.0))
