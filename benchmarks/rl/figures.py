@@ -1,61 +1,93 @@
-"""Curves, tables and model cards from what measure.py measured; no number is typed in by hand.
+"""Figures and lines of a table from records of measure.py; no number is typed in by hand.
 
-python benchmarks/rl/figures.py runs/proof                        # figures to docs/figures, tables to the screen
-python benchmarks/rl/figures.py runs/proof runs/more --ship luvmi_x   # seeds of both runs; also the policy and its card
-                                                                  # to models/luvmi_x, the record to benchmarks
-python benchmarks/rl/figures.py runs/proof --keep                 # the other parts' records to benchmarks
-python benchmarks/rl/figures.py benchmarks/rl                      # figures and tables of the records kept there
+python benchmarks/rl/figures.py benchmarks/rl/*.json                       # all that is kept
+python benchmarks/rl/figures.py runs/rates/rates.json --out runs/rates     # what was just measured
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tables
-from harness import KEPT, ROOT, read
-from kept import keep, read_large, ship_large
+from harness import KEPT, ROOT, percent, read, say
 
-from lunar_mjx.agents.curves import draw_mean, new_figure
+from lunar_mjx.agents.curves import draw_mean, moving_mean, new_figure, plot_progress
+from lunar_mjx.agents.evaluate import wilson
 from lunar_mjx.report.style import LINES, LIT, MUTED, styled
 
 DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
 """Variants of the paper's task that the figure shows; the table has all."""
 REASONS = {"stuck": "", "rolled_over": "///", "time": "xxx", "off_terrain": "...", "diverged": "---"}
 """For which drives fail, in the order of the figure's bars, with what tells a bar apart without colour."""
-UNSEEN = {"ylabel": "success on unseen ground, %", "ylim": (-3, 103)}
-"""The axis of success."""
+LAST = 50
+"""Episodes that a training on the paper's task is judged by at its end."""
+CURVES = ("rows", "epochs", "unseen", "scores", "episodes")
+"""What a seed went through, of which no table tells."""
 
 
-def shares(scores: Sequence[Mapping[str, Any]], name: str = "success") -> list[float]:
+def variants(record: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any]]]]:
+    """Runs on the paper's own task by variant and algorithm, the main variant first."""
+    found = {record["variant"]: record["runs"], **{v: other["runs"] for v, other in record["others"].items()}}
+    return {
+        v: {n.removeprefix("paper-").upper(): runs for n, runs in groups.items() if runs} for v, groups in found.items()
+    }
+
+
+def first_good(run: dict[str, Any], share: float = 0.9) -> int | None:
+    """Episode at which the mean success of 20 episodes first reaches a share; None if it never does."""
+    at = np.flatnonzero(moving_mean(run["episodes"]["success"])[19:] >= share)
+    return int(at[0]) + 20 if at.size else None
+
+
+def realism_cells(record: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
+    """Pooled scores by (trained, tested), each with and without the thermal and soil effects."""
+    kinds = ("with", "without")
+    return {
+        (trained, tested): pooled([s["scores"][tested] for s in record["seeds"] if s["trained"] == trained])
+        for trained in kinds
+        for tested in kinds
+        if any(s["trained"] == trained for s in record["seeds"])
+    }
+
+
+def pooled(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Success over the episodes of several seeds, with its interval."""
+    count = sum(r["episodes"] for r in records)
+    won = sum(r["success"] * r["episodes"] for r in records)
+    low, high = wilson(won, count)
+    ended = {k: float(np.mean([r["ends"][k] for r in records])) for k in records[0]["ends"]}
+    return {"success": won / count, "low": low, "high": high, "episodes": count, "ends": ended}
+
+
+def scores(record: Any, name: str) -> Iterator[str]:
+    """A line for every score in a record, by where it stands there."""
+    if isinstance(record, list):
+        names = [" ".join(f"{k} {v[k]}" for k in ("arm", "trained", "seed") if k in v) for v in record]
+        record = {name or str(i): v for i, (name, v) in enumerate(zip(names, record, strict=True))}
+    if {"success", "low", "high", "episodes"} <= record.keys():
+        yield f"{name}: {percent(record)} of {record['episodes']:,}"
+        return
+    for key, value in record.items():
+        rows = isinstance(value, list) and value and isinstance(value[0], dict) and key not in CURVES
+        if rows or isinstance(value, dict):
+            yield from scores(value, f"{name}, {key}")
+
+
+def shares(found: Sequence[Mapping[str, Any]], name: str = "success") -> list[float]:
     """Shares of scores in percent."""
-    return [100 * s[name] for s in scores]
-
-
-def plot_large(record: dict[str, Any]) -> Any:
-    """Success on unseen ground and return in training over wall time; the agents that learn nothing as lines."""
-    figure, (left, right) = new_figure(2)
-    for seed in record["seeds"]:
-        found, rows = seed["unseen"], [r for r in seed["rows"] if r.get("episode_return") is not None]
-        left.plot(
-            [s["elapsed_s"] for s in found], shares(found), marker="o", ms=3, lw=1.2, label=f"seed {seed['seed']}"
-        )
-        right.plot([r["elapsed_s"] for r in rows], [r["episode_return"] for r in rows], lw=1.2)
-    for style, (name, score) in zip(("--", "-.", ":", (0, (1, 4))), record["agents"].items(), strict=False):
-        left.axhline(100 * score["success"], color=MUTED, lw=0.8, ls=style, label=name)
-    left.axhline(100 * record["target"], color=MUTED, lw=0.8)
-    left.set(xlabel="wall time of training, s", **UNSEEN)
-    right.set(xlabel="wall time of training, s", ylabel="return of ended episodes in training")
-    left.legend(frameon=False, fontsize=7)
-    return figure
+    return [100 * s[name] for s in found]
 
 
 def plot_paper(record: dict[str, Any]) -> Any:
     """Return by episode on the axes of the paper's Fig. 6 (above) and success (below), a column per variant."""
-    groups = {v: found for v, found in tables.variants(record).items() if v in DRAWN or v == record["variant"]}
+    for variant, algorithms in variants(record).items():
+        for name, runs in algorithms.items():
+            last = [round(float(np.mean(r["episodes"]["success"][-LAST:])), 2) for r in runs]
+            say(f"{variant}, {name}: success of the last {LAST} {last}; 90 % of 20 at {[first_good(r) for r in runs]}")
+    groups = {v: found for v, found in variants(record).items() if v in DRAWN or v == record["variant"]}
     figure, above = new_figure(len(groups), 2.7, 5.0)
     for axes in above:
         axes.remove()
@@ -78,6 +110,8 @@ def plot_paper(record: dict[str, Any]) -> Any:
 
 def plot_rates(record: dict[str, Any]) -> Any:
     """Environment steps per second against the bare physics, over the number of rovers, at decimation 5."""
+    for r in record["rows"]:
+        say(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in r.items() if "conds" not in k))
     rows = [r for r in record["rows"] if r["decimation"] == 5 and r["observation"] == "17 numbers"]
     rows.sort(key=lambda r: r["rovers"])
     figure, (left, right) = new_figure(2)
@@ -99,7 +133,9 @@ def plot_rates(record: dict[str, Any]) -> Any:
 def plot_realism(record: dict[str, Any]) -> Any:
     """Failures of policies trained with and without the thermal and soil effects, in both models."""
     figure, (axes,) = new_figure(1, 5.6, 3.2)
-    cells = tables.realism_cells(record)
+    cells = realism_cells(record)
+    for (trained, tested), cell in cells.items():
+        say(f"trained {trained}, tested {tested}: {percent(cell)} of {cell['episodes']:,}")
     at, bottom = np.arange(len(cells)), np.zeros(len(cells))
     for reason, hatch in REASONS.items():
         share = np.array([100.0 * c["ends"][reason] for c in cells.values()])
@@ -116,10 +152,11 @@ def plot_realism(record: dict[str, Any]) -> Any:
     return figure
 
 
-def plot_learners(large: dict[str, Any] | None, brax: dict[str, Any]) -> Any:
-    """Success on unseen ground over time of training: TD3's seeds and brax's learners."""
+def plot_learners(brax: dict[str, Any]) -> Any:
+    """Success on unseen ground over time of training: the seeds of TD3 that are kept, and brax's learners."""
     figure, both = new_figure(2)
-    lines = [(f"TD3, {large['about']['device']}", s["unseen"], LINES[0]) for s in large["seeds"]] if large else []
+    large = read(KEPT / f"large_{brax['rover']}.json") or {"seeds": []}
+    lines = [(f"TD3, {large['about']['device']}", s["unseen"], LINES[0]) for s in large["seeds"]]
     for look, (name, run) in zip(LINES[1:], brax["runs"].items(), strict=False):
         lines.append((f"brax {name.upper()}, {brax['about']['device']}", run.get("unseen", []), look))
     for i, (label, found, (colour, line)) in enumerate(lines):
@@ -129,53 +166,33 @@ def plot_learners(large: dict[str, Any] | None, brax: dict[str, Any]) -> Any:
             places = [s[x] / unit if s[x] is not None else np.nan for s in found]
             axes.plot(places, shares(found), marker="o", ms=2.5, lw=1.2, color=colour, linestyle=line, label=label)
             axes.fill_between(places, shares(found, "low"), shares(found, "high"), color=colour, alpha=0.15, lw=0)
-    both[0].set(xlabel="s of training", xscale="log", **UNSEEN)
+    both[0].set(xlabel="s of training", xscale="log", ylabel="success on unseen ground, %", ylim=(-3, 103))
     both[1].set(xlabel="million environment steps", xscale="log", ylim=(-3, 103))
     both[0].legend(frameon=False, fontsize=7)
     return figure
 
 
-PLOTS = {"paper": plot_paper, "rates": plot_rates, "realism": plot_realism}
-TABLES = {
-    "paper": tables.table_paper,
-    "rates": tables.table_rates,
-    "scaling": tables.table_scaling,
-    "realism": tables.table_realism,
-    "brax": tables.table_brax,
-    "sb3": tables.table_sb3,
-}
+PLOTS = {"paper": plot_paper, "rates": plot_rates, "realism": plot_realism, "brax": plot_learners}
+"""Figures by the names of records."""
+FILES = {"brax": "rl_learners"}
+"""Of figures that are not called by the record's name."""
 
 
 def main() -> None:
-    """Draws, prints and keeps what the folders hold."""
+    """Prints what records hold, and draws those that have a figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", type=Path, nargs="+")
+    parser.add_argument("records", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "figures")
-    parser.add_argument("--keep", action="store_true", help="records of the other parts go to benchmarks")
-    parser.add_argument("--ship", help="rover whose policy goes to models/")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    lines, figures, large = [], {}, read_large(args.folders)
-    # trainings just measured, or the one that the guide shows of those kept
-    kept = read(KEPT / "large_luvmi_x.json") if KEPT in [f.resolve() for f in args.folders] else None
-    for record in [r for r in (large, kept) if r and r["seeds"]]:
-        figures[f"large_{record['rover']}"] = plot_large(record)
-        lines += tables.table_large(record)
-    parts = {name: found for name in TABLES for folder in args.folders if (found := read(folder / f"{name}.json"))}
-    for name, record in parts.items():
-        lines += TABLES[name](record)
+    for path in args.records:
+        record, name = read(path), path.stem
+        say("\n".join(scores(record, name)))
+        to = args.out / f"{FILES.get(name, f'rl_{name}')}.png"
         if name in PLOTS:
-            figures[name] = PLOTS[name](record)
-        if args.keep:
-            keep(name, record)
-    if brax := parts.get("brax"):
-        figures["learners"] = plot_learners(read(KEPT / f"large_{brax['rover']}.json") or large, brax)
-    for name, figure in figures.items():
-        figure.savefig(args.out / f"rl_{name}.png", dpi=110 if name == "paper" else 120)
-    if args.ship:
-        assert large is not None and large["rover"] == args.ship, "the folder holds another rover's training"
-        lines.append(f"shipped {ship_large(large, args.folders)}")
-    print("\n".join(lines))
+            PLOTS[name](record).savefig(to, dpi=110 if name == "paper" else 120)
+        elif name.startswith("large_") and record["rover"] in name:
+            plot_progress(record["seeds"], to)
 
 
 if __name__ == "__main__":

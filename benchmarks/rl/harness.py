@@ -1,4 +1,4 @@
-"""What the learning benchmarks share: time, files, the command line, trainings made ready, and how they are scored."""
+"""What the learning benchmarks share: time, files, trainings made ready, and how they are scored."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import argparse
 import dataclasses
 import json
 import math
+import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,7 +21,7 @@ import mujoco
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from benchmarks.provenance import commit
+from benchmarks.provenance import commit, tree
 from lunar_mjx.agents.configs import Training, get_training, override
 from lunar_mjx.agents.evaluate import Evaluator
 from lunar_mjx.agents.learner import Learner
@@ -27,33 +29,19 @@ from lunar_mjx.agents.run import environment_of, learner_agent, unseen_params
 from lunar_mjx.agents.train import Result, RunConfig, plain, train
 from lunar_mjx.commands.train import env_options, pairs
 from lunar_mjx.envs import make
+from lunar_mjx.files import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ROOT / "benchmarks" / "rl"
 """Where the records lie that the documentation quotes."""
-COMMIT = commit()
+COMMIT, TREE = commit(), tree()
 """As the process began: files may change while it runs."""
 FINAL, DURING = 54321, 12345
 """Seeds of the episodes of final scores, and of scores during training."""
 AHEAD = ("height_scan", "far_scan", "plan")
 """Blocks of observations that come from what the rover sees ahead."""
-SMALL_TASK = {
-    "large": {"terrain": "flat", "goal_distance": (2.0, 4.0), "episode_time": 10.0, "places": 256},
-    "ladder": {"worlds": 2, "episode_time": 20.0},
-}
-SMALL_TRAINING = {
-    "envs": 64,
-    "batch": 256,
-    "updates": 2,
-    "actor_layers": (64, 64),
-    "critic_layers": (64, 64),
-    "atoms": 21,
-    "epoch_steps": 24,
-    "buffer_steps": 64,
-    "minibatches": 2,
-    "passes": 1,
-}
-"""What --tiny measures, for two CPU cores; of the training, what it has."""
+EXPERIMENTS: dict[str, dict[str, Any]] = tomllib.loads((KEPT / "experiments.toml").read_text(encoding="utf-8"))
+"""Settings of each part of `measure.py`."""
 
 
 class Clock:
@@ -93,18 +81,14 @@ def read(path: Path) -> Any:
 
 def write(path: Path, record: Any) -> None:
     """Writes a record so that a kill never leaves half of one."""
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(plain(record), separators=(",", ":")) + "\n", encoding="utf-8")
-    part.replace(path)
+    write_text(path, json.dumps(plain(record), separators=(",", ":")) + "\n")
 
 
-def save(out: Path, name: str, record: Mapping[str, Any]) -> dict[str, Any]:
-    """Writes a record with the commit, device and versions that it was measured on; returns it with these."""
+def save(out: Path, name: str, record: Mapping[str, Any]) -> None:
+    """Writes a record with the commit, device and versions that it was measured on."""
     device = {"device": jax.devices()[0].device_kind, "devices": jax.device_count()}
     about = {**device, "jax": jax.__version__, "mujoco": mujoco.__version__}
-    whole = {"about": about, "commit": COMMIT, **record}
-    write(out / f"{name}.json", whole)
-    return whole
+    write(out / f"{name}.json", {"about": about, "commit": COMMIT, "tree": TREE, **record})
 
 
 def say(text: str) -> None:
@@ -133,36 +117,13 @@ def reached(scores: Iterable[Mapping[str, Any]], target: float) -> dict[str, Any
     return {"seconds_to_target": first.get("elapsed_s"), "steps_to_target": first.get("steps")}
 
 
-# The command line
+def command(*words: Any) -> None:
+    """Runs a `lunar-mjx` command, as a user types it.
 
-
-def options(doc: str | None, out: Path | None = None) -> argparse.ArgumentParser:
-    """A command line with what every benchmark that trains takes; `out` must be given where it is None."""
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
-    add("--out", type=Path, default=out, required=out is None)
-    add("--seconds", type=float, help="for everything, compiling among it")
-    add("--tiny", action="store_true", help="small enough for two CPU cores")
-    add("--rover", help="another than the training's")
-    add("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
-    add("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment, as JSON")
-    return parser
-
-
-def training_of(args: argparse.Namespace, name: str, learner: str | None = None) -> Training:
-    """A training by its name or file, with the settings of the command line."""
-    training = get_training(name, learner)
-    options = {**training.options, **({"rover": args.rover} if args.rover else {})}
-    small, unseen = {}, dict(training.unseen)
-    if args.tiny:
-        config = (training.train, training.train.algorithm)
-        known = {f.name for c in config for f in dataclasses.fields(c)} - set(getattr(config[1], "UNUSED", ()))
-        small = {k: v for k, v in SMALL_TRAINING.items() if k in known}
-        less = SMALL_TASK.get(str(options.get("task")).partition("/")[0], {})
-        options |= less
-        unseen |= {k: v for k, v in less.items() if k == "terrain"}
-    training = override(training, **{**small, **pairs("--set", args.set)})
-    return dataclasses.replace(training, options={**options, **env_options(args.env)}, unseen=unseen)
+    Raises:
+      subprocess.CalledProcessError: it fails.
+    """
+    subprocess.run([sys.executable, "-m", "lunar_mjx.cli", *map(str, words)], check=True)
 
 
 # Trainings and their scores
@@ -178,6 +139,14 @@ def in_threads(*calls: Callable[[], Any]) -> list[float]:
 
     with ThreadPoolExecutor() as pool:
         return [w.result() for w in [pool.submit(timed, call) for call in calls]]
+
+
+def training_of(args: argparse.Namespace, name: str, learner: str | None = None) -> Training:
+    """A training by its name or file, with the settings of the command line."""
+    training = override(get_training(name, learner), **pairs("--set", args.set))
+    options = {**training.options, **({"rover": args.rover} if args.rover else {}), **env_options(args.env)}
+    unseen = {**training.unseen, **({"terrain": args.unseen_terrain} if args.unseen_terrain else {})}
+    return dataclasses.replace(training, options=options, unseen=unseen)
 
 
 class Judge:
@@ -299,3 +268,28 @@ def trained(
     if seen < rows[-1]["steps"]:
         judged(result.state)
     return result, *best[1:]
+
+
+def last_policies(
+    arms: Mapping[str, tuple[Setup, Any]],
+    tests: Mapping[str, tuple[Judge, Any]],
+    clock: Clock,
+    args: argparse.Namespace,
+) -> Iterator[dict[str, Any]]:
+    """Trains every arm from every seed, one after another while there is time, and scores last policies in every test.
+
+    Args:
+      arms: a compiled setup, and the parameters of the environment to train on, of the shapes of the setup's own.
+      tests: a judge, and the parameters that it scores on.
+
+    Yields:
+      A row with the arm, seed, steps, s, return in training, and scores by test.
+    """
+    for seed, name in in_time(clock, [(seed, name) for seed in args.seeds for name in arms]):
+        setup, params = arms[name]
+        setup.env.params = params
+        result = train(setup.learner, RunConfig(int(args.steps), seed, None, math.inf, quiet=True))
+        policy, last = setup.policy(result.state), result.rows[-1]
+        scores = {test: judge(where, policy, FINAL)["policy"] for test, (judge, where) in tests.items()}
+        about = {"seed": seed, "arm": name, "steps": last["steps"], "train_s": last["elapsed_s"]}
+        yield {**about, "episode_return": last.get("episode_return"), "scores": scores}

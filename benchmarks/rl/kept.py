@@ -1,15 +1,24 @@
-"""What the repository keeps of measurements: their records here, and policies with their cards in `models`."""
+"""What the repository keeps of measurements: their records here, and policies with their cards in `models`.
+
+    python benchmarks/rl/kept.py runs/rung/ladder-3.json                         # its seeds join the kept record
+    python benchmarks/rl/kept.py runs/sac/ladder-1.json --name ladder-1-sac      # apart from other learners
+    python benchmarks/rl/kept.py runs/a/large-td3.json runs/b/large-td3.json     # seeds of both runs
+    python benchmarks/rl/kept.py --ship runs/rung/ladder-3_seed0.npz             # to models/, with a card
+
+A policy is shipped from the folder of its run, whose record lies beside it.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import shutil
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from harness import KEPT, percent, reached, read, when, write
+from harness import KEPT, percent, reached, read, say, when, write
 
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.envs.ladder.rungs import get_rung
@@ -19,11 +28,8 @@ SCORED = ("steps", "elapsed_s", "success", "low", "high")
 COLUMNS = {"rows": (*SCORED, "episode_return"), "epochs": SCORED, "unseen": SCORED}
 """What a seed's epochs and its scores during training are called, and which of their numbers figures read."""
 MOST_EPOCHS = 40
-"""Of a training on a rung, whose curve no figure draws."""
-SAME = {
-    "large": ("rover", "environment", "train", "agents", "about"),
-    "rung": ("training", "environment", "train", "learner", "begin_with"),
-}
+"""Of a training whose curve no figure draws."""
+ALIKE = ("rover", "training", "environment", "train", "learner", "begin_with")
 """What runs have alike whose seeds stand side by side."""
 MOST_BYTES = 2_000_000
 """Of a shipped policy."""
@@ -45,127 +51,116 @@ def few(epochs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return epochs[:: -math.ceil(max(len(epochs), 1) / MOST_EPOCHS)][::-1]
 
 
-def require_alike(kind: str, records: Iterable[dict[str, Any]]) -> None:
+def require_alike(records: Sequence[dict[str, Any]]) -> None:
     """Raises ValueError for runs of different trainings, environments or settings."""
     first, *others = records
-    for same in SAME[kind]:
+    for same in ALIKE:
         for other in others:
             if (there := other.get(same)) != (here := first.get(same)):
-                raise ValueError(f"{kind}: {same} is not the same in all runs: {here}; {there}")
+                raise ValueError(f"{same} is not the same in all runs: {here}; {there}")
 
 
-def keep(name: str, record: dict[str, Any], home: Path = KEPT) -> Path:
-    """Writes what is kept of a record; returns the file."""
+def keep(paths: Sequence[Path], name: str = "", home: Path = KEPT) -> Path:
+    """Writes what is kept of a run's records; returns the file.
+
+    Args:
+      paths: of records; of several, finished seeds stand side by side. name: of the kept record. home: its folder.
+    """
+    records = [read(path) for path in paths]
+    record, name = records[0], name or paths[0].stem
+    if "untrained" in record:
+        record = large(records)
+        name = f"large_{record['rover']}" if name == record["training"] else name
+    elif "rate" in record:
+        (run,), took = record.pop("seeds"), {"made_s": record.pop("worlds_s"), "compile_s": max(record["compile_s"])}
+        record = {**record, **took, **run, "epochs": few(run["epochs"])}
+    elif "learner" in record:
+        record = rung([*filter(None, [read(home / f"{name}.json")]), *records])
     write(home / f"{name}.json", rounded(record))
     return home / f"{name}.json"
 
 
-def read_large(folders: Iterable[Path]) -> dict[str, Any] | None:
-    """The record of part `large` as it is kept; finished seeds of further runs join those of the first."""
-    records = [as_kept(r) for r in (read(folder / "large.json") for folder in folders) if r]
-    if not records:
-        return None
-    require_alike("large", records)
-    return {**records[0], "seeds": [seed for record in records for seed in record["seeds"]]}
+def rung(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One record of trainings, with finished seeds of all; a seed told twice is the later's."""
+    require_alike(records)
+    seeds = {}
+    for record in records:
+        about = {k: record[k] for k in ("commit", "tree", "worlds_s", "compile_s") if k in record}
+        about["device"] = record["about"]["device"]
+        done = [run for run in record["seeds"] if "final" in run]
+        seeds |= {run["seed"]: {**about, **run, "epochs": few(run["epochs"])} for run in done}
+    shared = {k: records[0][k] for k in ("about", *ALIKE) if k in records[0]}
+    return {**shared, "seeds": [seeds[n] for n in sorted(seeds)]}
 
 
-def as_kept(record: dict[str, Any]) -> dict[str, Any]:
-    """A record of part `large` by what its figure, table and card tell."""
-    runs, seeds = [run for run in record["seeds"] if "final" in run], []
+def large(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One record of runs of part `large`, with finished seeds of all, by what its figures and pages tell."""
+    require_alike(records)
+    first, runs, seeds = records[0], [run for r in records for run in r["seeds"] if "final" in run], []
     for run in runs:
         unseen = [{**score["rows"]["policy"], **when(score), "train": score["train"]} for score in run["scores"]]
         at, rows = next(s for s in unseen if s["steps"] == run["final"]["steps"]), run["final"]["rows"]
         about = {"seed": run["seed"], "rows": run["epochs"], "unseen": unseen, "final": rows["policy"]}
         about |= {"blanked": rows["policy, scans blanked"], "kept": {**when(at), "train_score": at["train"]}}
         about |= {"train_s": run["epochs"][-1]["elapsed_s"], "steps": run["epochs"][-1]["steps"]}
-        seeds.append({**about, **reached(unseen, record["target"])})
-    agents = {k: v for k, v in runs[0]["final"]["rows"].items() if not k.startswith("policy")} if runs else {}
-    agents = {"untrained": record["untrained"], **agents}
-    return {**record, "compile_epoch_s": record["compile_s"][0], "agents": agents, "seeds": seeds}
+        seeds.append({**about, **reached(unseen, first["target"])})
+    agents = {k: v for run in runs[:1] for k, v in run["final"]["rows"].items() if not k.startswith("policy")}
+    agents = {"untrained": first["untrained"], **agents}
+    return {**first, "compile_epoch_s": first["compile_s"][0], "agents": agents, "seeds": seeds}
 
 
-def keep_rung(paths: Iterable[Path], home: Path = KEPT, name: str = "") -> Path:
-    """The kept record of a training on a rung, with finished seeds of further runs; a seed told twice is the later's.
-
-    Args:
-      paths: of the runs' records. home: folder of kept records. name: of the kept record, the training's unless told.
-
-    Raises:
-      ValueError: runs of different trainings, environments, settings, learners or beginnings.
-    """
-    records = [read(path) for path in paths]
-    name = name or records[0]["training"]
-    if before := read(home / f"{name}.json"):
-        records.insert(0, before)
-    require_alike("rung", records)
-    seeds = {}
-    for record in records:
-        about = {k: record[k] for k in ("commit", "tree", "worlds_s", "compile_s") if k in record}
-        about["device"] = record["about"]["device"]
-        seeds |= {
-            run["seed"]: {**about, **run, "epochs": few(run["epochs"])} for run in record["seeds"] if "final" in run
-        }
-    shared = {k: records[0][k] for k in ("about", *SAME["rung"]) if k in records[0]}
-    return keep(name, {**shared, "seeds": [seeds[n] for n in sorted(seeds)]}, home)
-
-
-def ship(path: Path, to: Path, card: str, record: dict[str, Any], final: dict[str, Any], **words: Any) -> Path:
-    """Copies a policy into its rover's folder and writes its card; returns the copy.
-
-    Args:
-      path: of the policy. to: the copy. card: name of the text `card_NAME.txt`. record: of the policy's training.
-      final: the policy's last score. words: more that the text names.
-    """
+def ship(path: Path) -> Path:
+    """Copies a policy that measure.py wrote into its rover's folder and writes its card; returns the copy."""
     assert path.stat().st_size < MOST_BYTES, "the policy is too large to ship"
-    shutil.copyfile(path, to)
-    words |= {"record": record, "policy": load_policy(path), "size": to.stat().st_size / 1e6}
-    ended = {k: round(v, 4) for k, v in final["ends"].items()}
-    words |= {"options": json.dumps(words["policy"].environment["options"])}
-    words |= {"unseen": json.dumps(record["environment"]["unseen"]), "ends": json.dumps(ended)}
-    text = Path(__file__).with_name(f"card_{card}.txt").read_text(encoding="utf-8")
-    to.with_name("POLICY.md" if to.stem == "policy" else f"{to.stem}.md").write_text(text.format(**words), "utf-8")
-    return to
-
-
-def ship_large(record: dict[str, Any], folders: Iterable[Path]) -> Path:
-    """Ships the policy of part `large` that scored best on the ground of its training, and keeps the record."""
-    best = max(record["seeds"], key=lambda s: s["kept"]["train_score"]["success"])
-    found = (folder / f"large_seed{best['seed']}.npz" for folder in folders)
-    path = next(p for p in found if p.is_file() and load_policy(p).notes["steps"] == best["kept"]["steps"])
-    keep(f"large_{record['rover']}", record)
-    rows = {"this policy": best["final"], **record["agents"]}
-    words = {
-        "run": best,
-        "steps": best["kept"]["steps"] / 1e6,
-        "others": ", ".join(str(s["seed"]) for s in record["seeds"] if s is not best) or "none",
-        "trained": percent(best["kept"]["train_score"]),
-        "rows": "\n".join(f"| {name} | {percent(score)} |" for name, score in rows.items()),
-    }
-    return ship(path, shipped("models") / record["rover"] / "policy.npz", "large", record, best["final"], **words)
-
-
-def ship_rung(path: Path) -> Path:
-    """Ships a policy whose training's record is kept."""
-    policy, training = load_policy(path), path.stem.partition("_")[0]
-    options, record = policy.environment["options"], read(KEPT / f"{training}.json")
+    policy, record = load_policy(path), read(path.with_name(f"{path.stem.partition('_seed')[0]}.json"))
+    options = policy.environment["options"]
     run = next(r for r in record["seeds"] if r["seed"] == policy.notes["seed"])
-    final, number, rover = run["final"], int(options["task"].rpartition("/")[2]), options.get("rover", "luvmi_x")
-    assert final["steps"] == policy.notes["steps"], f"{path}: not the policy that the kept record scores"
-    rows = {"this policy": final["rows"]["policy"], **{k: v for k, v in final["rows"].items() if k != "policy"}}
+    final, (task, _, number) = run["final"], options["task"].partition("/")
+    assert final["steps"] == policy.notes["steps"], f"{path}: not the policy that the record's last score is of"
+    rows = final["rows"]
+    own, rover = rows["policy"], options.get("rover", "luvmi_x")
+    costs = ("spl", "collisions_per_km", "wh_per_km", "slip")
     words = {
+        "record": record,
         "run": run,
         "rover": rover,
-        "training": training,
-        "number": number,
-        "rung": get_rung(number),
+        "training": record["training"],
+        "options": json.dumps(options),
+        "unseen": json.dumps(record["environment"]["unseen"]),
         "learner": record["learner"].removesuffix("Config"),
+        "compile_s": max(record["compile_s"]),
         "steps": final["steps"] / 1e6,
-        "compile_s": max(run["compile_s"]),
+        "size": path.stat().st_size / 1e6,
+        "ends": json.dumps({k: round(v, 4) for k, v in own["ends"].items()}),
         "rows": "\n".join(
-            f"| {name} | {percent(r)} | {r['spl']:.2f} | {r['collisions_per_km']:.0f} | {r['wh_per_km']:.0f} "
-            f"| {r['slip']:.2f} |"
-            for name, r in rows.items()
+            " | ".join([f"| {name}", percent(row), *(f"{row[k]:.2f}" for k in costs if row[k] is not None)]) + " |"
+            for name, row in {"this policy": own, **rows}.items()
+            if name != "policy"
         ),
     }
-    to = shipped("models") / rover / f"{training}.npz"
-    return ship(path, to, "rung", record, final["rows"]["policy"], **words)
+    if task == "ladder":
+        words |= {"number": number, "rung": get_rung(int(number))}
+    else:
+        chosen = next(s for s in run["scores"] if s["steps"] == final["steps"])
+        words["trained"] = percent(chosen["train"])
+    card = Path(__file__).with_name(f"card_{'rung' if task == 'ladder' else 'large'}.txt").read_text(encoding="utf-8")
+    to = shipped("models") / rover / (f"{record['training']}.npz" if task == "ladder" else "policy.npz")
+    to.with_name("POLICY.md" if to.stem == "policy" else f"{to.stem}.md").write_text(card.format(**words), "utf-8")
+    return Path(shutil.copyfile(path, to))
+
+
+def main() -> None:
+    """Keeps records, or ships a policy."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("records", type=Path, nargs="*", help="that measure.py wrote")
+    parser.add_argument("--name", default="", help="of the kept record; the file's unless told")
+    parser.add_argument("--ship", type=Path, metavar="NPZ", help="a policy that goes to models/")
+    args = parser.parse_args()
+    if args.records:
+        say(str(keep(args.records, args.name)))
+    if args.ship:
+        say(str(ship(args.ship)))
+
+
+if __name__ == "__main__":
+    main()

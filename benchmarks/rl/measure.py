@@ -1,86 +1,72 @@
-"""What training costs and what it comes to, measured in one command; every part saves as it goes.
+"""What training costs and what it comes to: one part of it in one command, which saves as it goes.
 
-    python benchmarks/rl/measure.py --out runs/proof                       # all parts in 9 minutes on one GPU
-    python benchmarks/rl/measure.py --out runs/proof --part large --seconds 300 --rover viper
-    python benchmarks/rl/measure.py --out runs/tiny --tiny                 # the same code on two CPU cores
+    python benchmarks/rl/measure.py large --rover viper --out runs/large              # one GPU
+    python benchmarks/rl/measure.py large short --unseen-terrain flat --steps 30000 --episodes 64 --every 10 --last 5 \
+        --out runs/short                                                             # the same code on two CPU cores
+    python benchmarks/rl/measure.py rung ladder-3 --seeds 1 2 --steps 60e6 --every inf --out runs/rung
 
-Parts, each with its own JSON file:
-`large`: TD3 from thousands of rovers, scored on unseen ground, goals and soil, seed after seed while time is left;
-agents that learn nothing on the same episodes; learner updates per second; the best policy as .npz.
-`rates`: environment steps per second, with observation, reward, reset and randomisation, against the bare physics.
-`paper`: TD3 and DDPG on the paper's own task with one rover each, five seeds each, on CPU cores beside the GPU.
-`scaling`: steps of whole training per second on 1, 2, 4, ... devices of the host, the same share for each device.
-`brax`: brax's PPO and SAC in the same environment, with the same scores.
+Parts, each with its own JSON file; `experiments.toml` holds their settings:
+`large`: TD3 from thousands of rovers, scored on unseen ground, goals and soil beside agents that learn nothing.
+`rung`: a training on a rung of the ladder, scored beside agents that learn nothing.
+`depth`: rate of an environment with depth pictures, and a student distilled in it, beside its teacher.
 `realism`: TD3 trained with and without the thermal and soil effects, each scored with and without them.
-`all` is paper, large and rates.
+`fit`, `posterior`: training on what a log left open, beside wide ranges and the nominal soil.
+`brax`: brax's PPO and SAC in the same environment, with the same scores.
+`paper`: TD3 and DDPG on the paper's own task with one rover each, on CPU cores.
+`rates`: environment steps per second, with observation, reward, reset and randomisation, against the bare physics.
+`tune`: settings of the reactive rule on the ladder's training worlds; rungs are scored beside the best of them.
+`export`: how far exported policies are from their own, and how long an action takes.
+`sensors`, `escape`: scores that `lunar-mjx evaluate` gives, gathered in one record.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import math
+from pathlib import Path
 
-import paper
-from brax_learners import brax
-from harness import Clock, options, save, say
-from large import large
-from rates import rates, scaling
-from realism import realism
-
-PARTS = {
-    "all": (None, 535.0),
-    "large": (large, 300.0),
-    "rates": (rates, 200.0),
-    "paper": (None, 400.0),
-    "scaling": (scaling, 150.0),
-    "brax": (brax, 340.0),
-    "realism": (realism, 300.0),
-}
-"""What measures a part, and s that it may take."""
-LARGE = 0.7
-"""Share of what is left that `large` takes of `all`; `rates` takes the rest."""
-SPARE = 20.0
-"""s before the end at which the last part of `all` and the runs on CPU cores stop."""
+from harness import EXPERIMENTS, Clock, say
 
 
 def words() -> argparse.Namespace:
-    """The command line."""
-    parser = options(__doc__)
-    parser.set_defaults(rover="luvmi_x")
+    """The command line, with the settings of its part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("--part", choices=PARTS, default="all")
-    add("--seeds", type=int, default=5)
-    add("--first-seed", type=int, default=0)
-    add("--steps", type=int, default=2_000_000_000, help="most environment steps of a seed")
-    add("--seed-seconds", type=float, default=150.0, help="most s of one seed of part large")
-    add("--eval-every", type=float, default=15.0, help="s of training")
-    add("--target", type=float, default=0.95)
+    add("part", choices=EXPERIMENTS)
+    add("training", nargs="?", help="another than the part's: a shipped one by name, or a file like it")
+    add("--out", type=Path, required=True)
+    add("--name", help="of the files; the training's unless told")
+    add("--seconds", type=float, help="for everything, compiling among it")
+    add("--rover", help="another than the training's")
+    add("--learner", help="another algorithm than the training's")
+    add("--begin-with", default="", help="policy that trainings begin with, as of `lunar-mjx train`")
+    add("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings of the training")
+    add("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment, as JSON")
     add("--unseen-terrain", help="on which policies are scored, such as world:heldout_boulders")
-    add("--only", nargs="*", help="of part realism, such as 3/with 4/without (seed/effects)")
-    add("--rows", nargs="*", help="of part rates, such as 17/5/65536 (numbers/decimation/rovers)")
-    add("--variants", nargs="*", default=list(paper.DEFAULT), choices=list(paper.VARIANTS), help="of part paper")
-    args = parser.parse_args()
-    if args.tiny:
-        args.seeds, args.steps, args.eval_every = min(args.seeds, 2), min(args.steps, 4000), 1.0
-    return args
+    add("--seeds", type=int, nargs="+", help="one after another, as many as there is time for")
+    add("--steps", type=float, help="of the environment, of each training; the training's own unless told")
+    add("--seed-seconds", type=float, help="most s of training of one seed")
+    add("--last", type=float, help="s of all that are kept for the last scores")
+    add("--every", type=float, help="s of training between scores; inf: the final one alone")
+    add("--episodes", type=int, help="of each row of a score")
+    add("--repeats", type=int, help="of rates")
+    add("--target", type=float, default=0.95, help="success whose time is told")
+    add("--stop-at", type=float, default=math.inf, help="success of the policy at which a training stops")
+    add("--only", nargs="+", help="variants of `paper`, rows of `rates` and others by name, arms")
+    common = {"seconds": math.inf, "seed_seconds": math.inf, "episodes": 256, "repeats": 9, "seeds": [0]}
+    told = parser.parse_args()
+    parser.set_defaults(**common | {k: v for k, v in EXPERIMENTS[told.part].items() if k in told})
+    return parser.parse_args()
 
 
 def main() -> None:
-    """Measures the parts that are asked for."""
+    """Measures the part that is asked for."""
     args = words()
     args.out.mkdir(parents=True, exist_ok=True)
-    measure, period = PARTS[args.part]
-    clock = Clock(args.seconds or period)
-    pool, pending = paper.start(args, clock.left - SPARE) if args.part in ("all", "paper") else (None, [])
-    try:
-        if measure is not None:
-            measure(args, clock)
-        if args.part == "all":
-            large(args, Clock(LARGE * clock.left))
-            rates(args, Clock(clock.left - SPARE))
-    finally:
-        if pool is not None:
-            save(args.out, "paper", paper.merged(pending, clock.left))
-            pool.terminate()
+    module, _, function = EXPERIMENTS[args.part]["measure"].partition(":")
+    clock = Clock(args.seconds)
+    getattr(importlib.import_module(module), function)(args, clock)
     say(f"done in {clock.spent:.0f} s")
 
 

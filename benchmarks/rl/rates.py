@@ -1,53 +1,52 @@
-"""Parts `rates` and `scaling` of measure.py: steps per second of the environment, and of training on more devices."""
+"""Part `rates` of measure.py: environment steps per second, with all that belongs to them, against the bare physics.
+
+    python benchmarks/rl/measure.py rates --out runs/rates                                      # one GPU
+    python benchmarks/rl/measure.py rates --only 17/5/64 --env terrain=flat --out runs/rates    # two CPU cores
+
+A row is numbers that are observed / physics steps per action / rovers.
+"""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from harness import SMALL_TASK, Clock, in_threads, in_time, save, say, training_of
-from jax.sharding import Mesh
-from tables import table_rates, table_scaling
+from harness import Clock, in_time, save, say
 
-from lunar_mjx.agents.learner import AXIS, Learner
-from lunar_mjx.envs import make, make_navigation, split_keys
+from lunar_mjx.commands.train import env_options
+from lunar_mjx.envs import make_navigation, split_keys
 from lunar_mjx.envs.navigation.observations import PAPER_OBSERVATION
 
-PLAN = (
-    ("17 numbers", 5, (65536, 1024, 2048, 4096, 8192, 16384, 32768, 262144)),
-    ("17 numbers", 50, (65536,)),
-    ("all observations", 50, (65536, 4096)),
-    ("all observations", 5, (65536,)),
-)
-"""Observation, physics steps per action, and numbers of rovers."""
+FEW = {"observations": PAPER_OBSERVATION, "privileged": ()}
+"""Options of an environment with 17 observations."""
 
 
 def rates(args: argparse.Namespace, clock: Clock) -> None:
     """Compiles every row in threads, and measures."""
-    few = {"observations": PAPER_OBSERVATION, "privileged": ()}
-    plan = [(seen, every, size) for seen, every, sizes in PLAN for size in sizes]
-    plan = [row for row in plan if args.rows is None or f"{row[0][:2]}/{row[1]}/{row[2]}" in args.rows]
-    plan = [("17 numbers", 5, 8)] if args.tiny else plan
+    plan = [(numbers, int(every), int(size)) for numbers, every, size in (row.split("/") for row in args.only)]
     made = {}
-    for seen, every in {row[:2] for row in plan}:
-        less = {**(few if seen == "17 numbers" else {}), **(SMALL_TASK["large"] if args.tiny else {})}
-        made[seen, every] = make_navigation("large", args.rover, decimation=every, **{"places": 2048, **less})
+    for numbers, every in {row[:2] for row in plan}:
+        options = {"places": 2048, **(FEW if numbers == "17" else {}), **env_options(args.env)}
+        made[numbers, every] = make_navigation("large", args.rover, decimation=every, **options)
+    steps = {every: max(20, 1000 // every) for _, every, _ in plan}
     with ThreadPoolExecutor(8) as pool:
-        steps = {every: 4 if args.tiny else max(20, 1000 // every) for _, every, _ in plan}
         ready = list(pool.map(lambda row: Rate(made[row[:2]], row[2], steps[row[1]]), plan))
     say(f"rates: {len(ready)} rows compiled after {clock.spent:.0f} s")
     rows: list[dict[str, Any]] = []
     waiting = dict(zip(plan, ready, strict=True))
-    for seen, every, size in in_time(clock, plan):
-        row = waiting.pop((seen, every, size)).measure(1 if args.tiny else 5)
+    for numbers, every, size in in_time(clock, plan):
+        row = waiting.pop((numbers, every, size)).measure(args.repeats)
+        seen = "17 numbers" if numbers == "17" else "all observations"
         rows.append({"observation": seen, "decimation": every, "rovers": size, **row})
-        say(table_rates(save(args.out, "rates", {"rover": args.rover, "rows": rows}))[-1])
+        save(args.out, "rates", {"rover": args.rover, "rows": rows})
+        million, bare = row["env_steps_per_s"] / 1e6, row["bare_steps_per_s"] / 1e6
+        say(f"{seen}, {every}, {size:,} rovers: {million:.2f} M/s, bare {bare:.2f} M/s, ratio {row['ratio']:.3f}")
 
 
 class Driven:
@@ -83,83 +82,65 @@ class Driven:
         self.program = self.program.lower(self.env.params, state, jax.random.PRNGKey(0)).compile()
         return state
 
-    def __call__(self, params: Any, state: Any, key: Any) -> Any:
-        return self.program(params, state, key)
-
     def staggered(self, state: Any) -> Any:
         """The state with episodes at every stage, so that as many end in one step as in the next."""
         share = jax.random.uniform(jax.random.PRNGKey(1), (self.size,))
         inner = dataclasses.replace(state.inner, waited=share * self.env.config.stuck_time)
         return dataclasses.replace(state, inner=inner)
 
+    def timed(self, state: Any, repeats: int, beside: Callable[[], Any] = lambda: None) -> Any:
+        """s of repetitions after a first one, s of `beside` after each, and how many episodes ended in each.
+
+        Args:
+          state: of all rovers; used up. beside: what is timed in turns with this.
+        """
+        state, taken = self.staggered(state), []
+        for i in range(repeats + 1):
+            begin = time.monotonic()
+            state, ended = jax.block_until_ready(self.program(self.env.params, state, jax.random.PRNGKey(i)))
+            middle = time.monotonic()
+            beside()
+            taken.append((middle - begin, time.monotonic() - middle, int(ended)))
+        return map(list, zip(*taken[1:], strict=True))
+
 
 class Rate:
     """The environment under random actions, and its physics alone under the same changes; compiled when made."""
 
     def __init__(self, env: Any, size: int, steps: int):
-        self.env, self.size, self.steps, self._key = env, size, steps, jax.random.PRNGKey(0)
+        self._driven, key = Driven(env, size, steps), jax.random.PRNGKey(0)
         decimation = env.config.decimation
-        shares = jax.random.uniform(self._key, (steps, env.action_size), minval=-1.0)
-        controls = env.actions.controls(shares)
+        controls = env.actions.controls(jax.random.uniform(key, (steps, env.action_size), minval=-1.0))
 
         def bare(params: Any, state: Any) -> Any:
             return env.system.rollout_batch(params.system, state, controls, decimation, report=lambda t: None)[0]
 
         self._reset = jax.jit(env.reset).lower(env.params, jax.ShapeDtypeStruct((size, 2), jnp.uint32)).compile()
-        self._drive = Driven(env, size, steps)
-        state = self._drive.compile()
+        state = self._driven.compile()
         self._bare = jax.jit(bare, donate_argnums=1).lower(env.params, state.inner.physics).compile()
 
     def measure(self, repeats: int) -> dict[str, Any]:
         """Best of several repetitions, in turns."""
-        params = self.env.params
-        state = jax.block_until_ready(self._reset(params, split_keys(self._key, self.size)))
-        state = self._drive.staggered(state)
+        driven = self._driven
+        params, size, steps = driven.env.params, driven.size, driven.size * driven.steps
+        state = jax.block_until_ready(self._reset(params, split_keys(jax.random.PRNGKey(0), size)))
         physics = jax.tree.map(jnp.copy, state.inner.physics)
-        held = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / self.size
-        ours, naked, ended = [], [], 0
-        for _ in range(repeats + 1):
-            begin = time.monotonic()
-            state, ended = jax.block_until_ready(self._drive(params, state, self._key))
-            middle = time.monotonic()
+        held = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / size
+
+        def beside() -> None:
+            nonlocal physics
             physics = jax.block_until_ready(self._bare(params, physics))
-            ours.append(middle - begin)
-            naked.append(time.monotonic() - middle)
-        steps, best, bare = self.size * self.steps, min(ours[1:]), min(naked[1:])
-        memory = self._drive.program.memory_analysis()
+
+        seconds, naked, ended = driven.timed(state, repeats, beside)
+        best, bare, memory = min(seconds), min(naked), driven.program.memory_analysis()
         return {
             "env_steps_per_s": steps / best,
-            "physics_steps_per_s": steps * self.env.config.decimation / best,
+            "physics_steps_per_s": steps * driven.env.config.decimation / best,
             "bare_steps_per_s": steps / bare,
             "ratio": bare / best,
-            "resets_per_step": int(ended) / self.steps,
-            "seconds": ours[1:],
-            "bare_seconds": naked[1:],
+            "resets_per_step": ended[-1] / driven.steps,
+            "seconds": seconds,
+            "bare_seconds": naked,
             "state_bytes_per_rover": held,
-            "temporary_bytes_per_rover": getattr(memory, "temp_size_in_bytes", 0) / self.size,
+            "temporary_bytes_per_rover": getattr(memory, "temp_size_in_bytes", 0) / size,
         }
-
-
-def scaling(args: argparse.Namespace, clock: Clock) -> None:
-    """Whole training epochs per second on more and more devices, the same rovers and transitions on each."""
-    training = training_of(args, "large-td3")
-    env, own = make(training.environment, **training.options), training.train
-    learners = {}
-    for count in [2**i for i in range(jax.device_count().bit_length())]:
-        config = dataclasses.replace(own, envs=own.envs * count, batch=own.batch * count)
-        learners[count] = Learner(env, config, Mesh(np.array(jax.devices()[:count]), (AXIS,)))
-    in_threads(*(learner.compile for learner in learners.values()))
-    say(f"scaling: compiled after {clock.spent:.0f} s")
-    rows: list[dict[str, Any]] = []
-    for count, learner in learners.items():
-        config, state, best = learner.config, learner.init(0), float("inf")
-        for i in range(2 if args.tiny else 9):
-            begin = time.monotonic()
-            state, _ = jax.block_until_ready(learner.epoch(env.params, state))
-            if i:
-                best = min(best, time.monotonic() - begin)
-        rate = config.envs * config.epoch_steps / best
-        row = {"devices": count, "steps_per_s": rate, "updates_per_s": config.updates * config.epoch_steps / best}
-        rows.append({**row, "efficiency": rate / count / (rows[0]["steps_per_s"] if rows else rate)})
-        say(table_scaling(save(args.out, "scaling", {"rover": args.rover, "rows": rows}))[-1])
-        del state

@@ -8,14 +8,10 @@ policy is then scored in both, on unseen ground and goals; in the whole one with
 from __future__ import annotations
 
 import argparse
-import math
 from typing import Any
 
-from harness import FINAL, Clock, Judge, Setup, in_threads, in_time, save, say, trained, training_of
-from large import episodes_of
-from tables import table_realism
+from harness import Clock, Judge, Setup, in_threads, last_policies, percent, save, say, training_of
 
-from lunar_mjx.agents.train import RunConfig
 from lunar_mjx.envs import NavigationEnv
 
 THERMAL = (
@@ -26,8 +22,6 @@ THERMAL = (
     "housing_conduction",
     "housing_radiation",
 )
-STEPS = 10_000_000
-"""Environment steps of each training: twice what the first score of 95 % takes."""
 
 
 def plainer(model: Any) -> Any:
@@ -40,21 +34,17 @@ def plainer(model: Any) -> Any:
 
 def realism(args: argparse.Namespace, clock: Clock) -> None:
     """Trains with and without the effects, seed after seed while time is left."""
-    training = training_of(args, "large-td3")
+    training = training_of(args, args.training)
     whole = Setup(training)
     setups = {"without": Setup(training, NavigationEnv(plainer(whole.env.model), whole.env.config)), "with": whole}
-    judges = {n: Judge(s.env, episodes_of(args), {"policy": s.policies()["policy"]}) for n, s in setups.items()}
+    judges = {n: Judge(s.env, args.episodes, {"policy": s.policies()["policy"]}) for n, s in setups.items()}
     in_threads(*(lambda n=n, s=s: s.compile(judges[n]) for n, s in setups.items()))
     say(f"realism: compiled after {clock.spent:.0f} s")
-    steps = 3200 if args.tiny else STEPS
     effects = {n: s.env.model.effect_names for n, s in setups.items()}
-    record: dict[str, Any] = {"rover": args.rover, **whole.about, "effects": effects, "steps": steps, "seeds": []}
-    jobs = [f"{seed}/{name}" for seed in range(args.first_seed, args.first_seed + args.seeds) for name in setups]
-    for job in in_time(clock, [job for job in jobs if args.only is None or job in args.only]):
-        seed, _, name = job.partition("/")
-        run = RunConfig(steps, int(seed), None, math.inf, quiet=True)
-        _, policy, last = trained(setups[name], run, math.inf, lambda *_: 0.0)
-        scores = {n: judge(setups[n].unseen, policy, FINAL)["policy"] for n, judge in judges.items()}
-        row = {"seed": int(seed), "trained": name, "scores": scores, "train_s": last["elapsed_s"]}
-        record["seeds"].append({**row, "steps": last["steps"], "episode_return": last["episode_return"]})
-        say("\n".join(table_realism(save(args.out, "realism", record))))
+    record = {"rover": args.rover, **whole.about, "effects": effects, "steps": int(args.steps), "seeds": []}
+    arms = {n: (s, s.env.params) for n, s in setups.items() if args.only is None or n in args.only}
+    for row in last_policies(arms, {n: (judge, setups[n].unseen) for n, judge in judges.items()}, clock, args):
+        record["seeds"].append({"trained": row.pop("arm"), **row})
+        save(args.out, "realism", record)
+        for tested, score in row["scores"].items():
+            say(f"seed {row['seed']} trained {record['seeds'][-1]['trained']}, tested {tested}: {percent(score)}")

@@ -25,8 +25,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import COMMIT, FINAL, SMALL_TASK, say, write
-from tables import table_sb3
+from harness import COMMIT, FINAL, ends, percent, say, write
 
 from lunar_mjx.agents.configs import get_training
 from lunar_mjx.agents.evaluate import evaluate
@@ -34,6 +33,7 @@ from lunar_mjx.agents.play import open_agent
 from lunar_mjx.agents.policy import Policy, save_policy
 from lunar_mjx.agents.run import environment_of, unseen_params
 from lunar_mjx.backends.pybullet import PyBulletBackend
+from lunar_mjx.commands.train import env_options
 from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
 from lunar_mjx.envs import NavigationEnv, make
 from lunar_mjx.envs.gymnasium_env import SingleEnv
@@ -138,8 +138,19 @@ def keep_policy(model: Any, env: BulletNavigation, path: Path, record: dict[str,
     save_policy(Policy(params, None, None, network, {**TASK, "options": record["options"]}, notes), path)
 
 
-def train(args: argparse.Namespace) -> None:
+def main() -> None:
     """Trains until the CPU time is over, and scores the policy."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--out", type=Path, required=True)
+    add("--rover", default="luvmi_x")
+    add("--seed", type=int, default=0)
+    add("--steps", type=int, default=10_000_000)
+    add("--cpu-seconds", type=float, default=3600.0, help="of this process, after which it stops")
+    add("--score", type=int, default=128, help="episodes that score the last policy")
+    add("--env", nargs="*", default=[], metavar="NAME=VALUE", help="options of the environment, as JSON")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     import pybullet
     import stable_baselines3
     import torch
@@ -147,8 +158,7 @@ def train(args: argparse.Namespace) -> None:
 
     torch.set_num_threads(1)
     options = {**TASK["options"], "rover": args.rover}
-    less = {**SMALL_TASK["large"], "episode_time": 2.0} if args.tiny else {}
-    env = BulletNavigation({**options, "randomise": (), **less})
+    env = BulletNavigation({**options, "randomise": (), **env_options(args.env)})
     noise = NormalActionNoise(np.zeros(env.env.action_size), np.full(env.env.action_size, 0.3))
     model = stable_baselines3.TD3(
         "MlpPolicy", env, action_noise=noise, seed=args.seed, device="cpu", buffer_size=200_000
@@ -164,23 +174,8 @@ def train(args: argparse.Namespace) -> None:
     own, agent, unseen = open_agent(str(args.out / "policy_sb3.npz"))
     record["final"] = evaluate(own, agent, args.score, FINAL, unseen_params(own, unseen)).record()
     write(args.out / "sb3.json", record)
-    say("\n".join(table_sb3(record)))
-
-
-def main() -> None:
-    """Trains and scores."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
-    add("--out", type=Path, required=True)
-    add("--rover", default="luvmi_x")
-    add("--seed", type=int, default=0)
-    add("--steps", type=int, default=10_000_000)
-    add("--cpu-seconds", type=float, default=3600.0, help="of this process, after which it stops")
-    add("--score", type=int, default=128, help="episodes that score the last policy")
-    add("--tiny", action="store_true")
-    args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    train(args)
+    say(f"{record['steps']:,} steps, {len(record['episodes'])} episodes in {record['cpu_s'] / 60:.0f} min of CPU time")
+    say(f"its policy on unseen ground: {percent(record['final'])} of {args.score}, {ends(record['final'])}")
 
 
 if __name__ == "__main__":

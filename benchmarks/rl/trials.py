@@ -1,18 +1,52 @@
-"""Trainings from several seeds with the same programs, scored beside agents that learn nothing."""
+"""Parts `large` and `rung` of measure.py: trainings from several seeds, scored beside agents that learn nothing.
+
+    python benchmarks/rl/measure.py large --out runs/large
+    python benchmarks/rl/measure.py rung ladder-3 --out runs/rung
+
+Rows of a score are of one program and the same unseen episodes: the policy, the policy with all that comes from its
+scans blanked, and rules that learn nothing, the reactive one as it was tuned (`ladder.json`, on rung 3 alone). The
+final score is of other episodes than those by which the best policy was chosen; with `--every inf` nothing is chosen.
+`large` chooses by the score on the ground and soils of the training, so that unseen ground chooses nothing.
+"""
 
 from __future__ import annotations
 
+import argparse
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness import COMMIT, DURING, FINAL, Clock, Judge, Setup, ends, in_threads, percent, save, say, trained, when
+from harness import (
+    COMMIT,
+    DURING,
+    EXPERIMENTS,
+    FINAL,
+    KEPT,
+    TREE,
+    Clock,
+    Judge,
+    Setup,
+    ends,
+    in_threads,
+    in_time,
+    percent,
+    read,
+    save,
+    say,
+    trained,
+    training_of,
+    when,
+)
 
-from benchmarks.provenance import tree
 from lunar_mjx.agents.configs import Training
 from lunar_mjx.agents.policy import policy_of, save_policy
 from lunar_mjx.agents.train import RunConfig
+from lunar_mjx.envs import make_agent
+from lunar_mjx.envs.scripted import Reactive, reactive_rule
+
+NEEDED = {"mapper": "plan", "reactive": "height_scan"}
+"""Blocks of observations that rules steer by: the way on the rover's own map, and the ground ahead."""
 
 
 class Trials:
@@ -22,107 +56,125 @@ class Trials:
     cut off leaves what it had.
 
     Args:
-      training: what to train. name: of the files. out: folder that they go to. clock: of everything.
-      episodes: of each row of a score. rules: makes agents that learn nothing for an environment.
-      begin_with: policy that all seeds begin with, if any.
-      seen: choose the best policy by its score on the ground and soils of its training, and score it alone meanwhile;
-        else by the unseen ones, beside the other agents.
-      agents: makes the policy's agents for a `Setup`, the one that is trained first; `Setup.policies` if None.
-      last: choose nothing; the last policy is the one that is scored and kept.
-      beside: called with the `Setup` while the rest compiles, if given.
+      args: the command line. training: what to train. clock: of everything.
+      rules: makes agents that learn nothing for an environment.
+      choose_by: the best policy is that with the best score on `unseen` ground, beside the other agents; with the best
+        score on the ground and soils of its training, `seen`, where it is scored alone; or it is the `last` one.
+      agents: makes the policy's agents for a `Setup`, the one that is trained first.
+      beside: called with the `Setup` while the rest compiles.
     """
 
     def __init__(
         self,
+        args: argparse.Namespace,
         training: Training,
-        name: str,
-        out: Path,
         clock: Clock,
-        episodes: int,
         rules: Callable[[Any], Mapping[str, Any]],
-        seen: bool = False,
-        begin_with: str = "",
+        choose_by: str = "unseen",
         agents: Callable[[Setup], Mapping[str, Any]] = Setup.policies,
-        last: bool = False,
         beside: Callable[[Setup], Any] = lambda _: None,
     ):
-        self.name, self.out, self.clock, self.seen, self.last, files = name, out, clock, seen, last, tree()
-        self.begin_with = begin_with
-        out.mkdir(parents=True, exist_ok=True)
+        self.args, self.clock, self.choose_by = args, clock, choose_by
+        self.name = args.name or Path(args.training).stem
         self.setup = Setup(training)
         env, policies = self.setup.env, agents(self.setup)
         self.own = next(iter(policies))
-        self.judge = Judge(env, episodes, policies, rules(env))
-        self.during = Judge(env, episodes, {self.own: policies[self.own]}) if seen else self.judge
-        worlds_s = clock.spent
-        judges = dict.fromkeys((self.judge, self.during))
+        alone = {self.own: policies[self.own]}
+        self.judge = Judge(env, args.episodes, policies, rules(env))
+        self.during = Judge(env, args.episodes, alone) if choose_by == "seen" else self.judge
+        worlds_s, judges = clock.spent, dict.fromkeys((self.judge, self.during))
         compile_s = in_threads(lambda: self.setup.compile(*judges), lambda: beside(self.setup))
         say(f"worlds {worlds_s:.0f} s, compiled after {compile_s}, {clock.left:.0f} s left")
         learner = type(training.train.algorithm).__name__
-        about = {"tree": files, "training": name, **self.setup.about, "learner": learner}
-        about |= {"begin_with": begin_with} if begin_with else {}
+        about = {"training": self.name, **self.setup.about, "learner": learner}
+        about |= {"begin_with": args.begin_with} if args.begin_with else {}
         self.record: dict[str, Any] = {**about, "worlds_s": worlds_s, "compile_s": compile_s, "seeds": []}
 
     def save(self) -> None:
         """Writes the record."""
-        save(self.out, self.name, self.record)
+        save(self.args.out, self.name, self.record)
 
     def store(self, seed: int, state: Any, row: Mapping[str, Any], score: Any, word: str = "") -> None:
         """Writes the policy of a state; `word` ends the file's name."""
         # whoever drives the policy makes as many worlds as the rung has, not all that it was trained in
         made = {k: v for k, v in self.setup.environment["options"].items() if k != "worlds"}
-        notes = {"score": score, "seed": seed, "commit": COMMIT, "tree": self.record["tree"], **when(row)}
+        notes = {"score": score, "seed": seed, "commit": COMMIT, "tree": TREE, **when(row)}
         policy = policy_of(self.setup.learner, state, {**self.setup.environment, "options": made}, notes)
-        save_policy(policy, self.out / f"{self.name}_seed{seed}{word}.npz")
+        save_policy(policy, self.args.out / f"{self.name}_seed{seed}{word}.npz")
 
-    def __call__(self, seed: int, steps: int, seconds: float, every: float, target: float = math.inf) -> Any:
-        """The last state of a seed's training, which ends after environment steps, s, or with a policy of a success.
-
-        Args:
-          every: s of training between scores; with none but the last (inf) nothing is chosen.
-        """
+    def __call__(self, seed: int) -> None:
+        """Trains a seed, for as long as the command line and the clock allow, and scores it."""
         best, unseen, run = -1.0, self.setup.unseen, {"seed": seed, "scores": [], "epochs": []}
         self.record["seeds"].append(run)
 
         def look(policy: Any, state: Any, epochs: list[dict[str, Any]]) -> float:
             nonlocal best
-            row, run["epochs"] = epochs[-1], plainly(epochs)
+            row, run["epochs"] = epochs[-1], epochs
             found = self.during(unseen, policy, DURING)
             score = {**when(row), "seed": DURING, "rows": found}
             chosen = found[self.own]
-            if self.seen:
+            if self.choose_by == "seen":
                 score["train"] = chosen = self.during(self.setup.env.params, policy, DURING)[self.own]
-            good = row["steps"] if self.last else chosen["success"]
+            good = row["steps"] if self.choose_by == "last" else chosen["success"]
             run["scores"].append(score)
             self.store(seed, state, row, found[self.own], "_last")
             if good > best:
                 best = good
                 self.store(seed, state, row, found[self.own])
             self.save()
-            how = "nothing is chosen" if self.last else f"the best is chosen by {percent(chosen)}"
-            say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s: {how}")
-            shown(found, "    ")
+            say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s, {self.choose_by} {percent(chosen)}")
+            shown(found)
             return good
 
-        config = RunConfig(steps, seed, seconds, math.inf, quiet=True, begin_with=self.begin_with)
-        result, policy, row = trained(self.setup, config, every, look, target)
+        args = self.args
+        seconds = min(args.seed_seconds, max(1.0, self.clock.left - args.last))
+        config = RunConfig(int(args.steps), seed, seconds, math.inf, quiet=True, begin_with=args.begin_with)
+        result, policy, row = trained(self.setup, config, args.every, look, args.stop_at)
         found, last = self.judge(unseen, policy, FINAL), result.rows[-1]
-        run["final"], run["epochs"] = {**when(row), "seed": FINAL, "rows": found}, plainly(result.rows)
-        if math.isinf(every):
+        run["final"], run["epochs"] = {**when(row), "seed": FINAL, "rows": found}, result.rows
+        if math.isinf(args.every):
             self.store(seed, result.state, row, found[self.own])
         self.save()
-        shown(found, f"seed {seed} final ")
-        say(f"done after {self.clock.spent:.0f} s, {last['steps']:.3g} steps, {last['steps_per_s']:.3g} steps/s")
-        return result.state
+        say(f"seed {seed} after {self.clock.spent:.0f} s, {last['steps']:.3g} steps, {last['steps_per_s']:.3g} steps/s")
+        shown(found)
 
 
-def plainly(epochs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Epochs without the terms of their reward."""
-    return [{k: v for k, v in row.items() if not k.startswith("reward_")} for row in epochs]
-
-
-def shown(rows: Mapping[str, Any], before: str) -> None:
+def shown(rows: Mapping[str, Any]) -> None:
     """Prints the rows of a score."""
     for agent, one in rows.items():
         costs = "" if one["spl"] is None else f"SPL {one['spl']:.2f}, {one['collisions_per_km']:.0f}/km, "
-        say(f"{before}{agent}: {percent(one)}, {costs}{ends(one)}")
+        say(f"    {agent}: {percent(one)}, {costs}{ends(one)}")
+
+
+def rules(env: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Agents that learn nothing, as far as the environment shows what they steer by; the reactive one with its best
+    settings on this rung where it has been tuned."""
+    found = {name: make_agent(name, env) for name in names if name not in NEEDED or NEEDED[name] in env.blocks}
+    if tuned := read(KEPT / "ladder.json")["tuned"].get(str(env.config.rung)):
+        found.pop("reactive", None)
+        found["reactive, tuned"] = reactive_rule(env, Reactive(**tuned["rows"][0]["settings"]))
+    return found
+
+
+def made(args: argparse.Namespace, clock: Clock, choose_by: str) -> Trials:
+    """The trials of a part, with the training and rules that the command line and the part's settings tell."""
+    training = training_of(args, args.training, args.learner)
+    args.steps = args.steps or training.steps
+    return Trials(args, training, clock, lambda env: rules(env, EXPERIMENTS[args.part]["rules"]), choose_by)
+
+
+def rung(args: argparse.Namespace, clock: Clock) -> None:
+    """Trains seed after seed while there is time for a whole one; the best is chosen on unseen ground."""
+    trials = made(args, clock, "unseen")
+    for seed in in_time(clock, args.seeds):
+        trials(seed)
+
+
+def large(args: argparse.Namespace, clock: Clock) -> None:
+    """So with the policy before its training; the best is chosen on the ground of the training."""
+    trials = made(args, clock, "seen")
+    setup, policy = trials.setup, trials.setup.policy(trials.setup.learner.init(10_000))
+    untrained = trials.judge(setup.unseen, policy, FINAL)["policy"]
+    trials.record |= {"rover": args.rover, "target": args.target, "untrained": untrained}
+    for seed in in_time(clock, args.seeds):
+        trials(seed)

@@ -120,7 +120,7 @@ LADDER = {
     3: {"PPO": "ladder-3"},
     4: {"PPO, begun with rung 3's": "ladder-4", "PPO, begun anew": "ladder-4-scratch"},
 }
-"""Kept records of trainings on rungs of the ladder (`benchmarks/rl/rung.py --keep`), by rung and by how was trained."""
+"""Kept records of trainings on rungs of the ladder (`benchmarks/rl/kept.py`), by rung and by how was trained."""
 
 
 def _seeds(name: str) -> list[dict[str, Any]]:
@@ -153,7 +153,7 @@ def _ladder(number: int) -> str:
 
 
 def depth() -> str:
-    """Who arrives with a depth picture in place of the height scan, on two tasks (`benchmarks/rl/depth.py --keep`)."""
+    """Who arrives with a depth picture in place of the height scan, on two tasks (`benchmarks/rl/kept.py`)."""
     kept = {"`large`": "large-depth", "rung 3": "ladder-3-depth"}
     agents = {
         "teacher": "teacher, sees the height scan",

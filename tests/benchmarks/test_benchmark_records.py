@@ -27,7 +27,8 @@ def benchmarks():
 
 
 def test_the_page_quotes_what_realism_is_worth():
-    from tables import percent, realism_cells
+    from figures import realism_cells
+    from harness import percent
 
     cells = realism_cells(record("realism"))
     assert len(cells) == 4
@@ -38,7 +39,7 @@ def test_the_page_quotes_what_realism_is_worth():
 
 
 def test_the_page_quotes_what_boulders_are_to_viper():
-    from tables import percent
+    from harness import percent
 
     found = record("large_viper_boulders")
     policy, straight = found["seeds"][0]["final"], found["agents"]["scripted"]
@@ -61,7 +62,7 @@ def test_the_page_quotes_the_rates():
 
 
 def test_the_page_quotes_the_papers_own_task():
-    from tables import first_good, variants
+    from figures import first_good, variants
 
     for algorithms in variants(record("paper")).values():
         for runs in algorithms.values():
@@ -121,7 +122,7 @@ def test_the_page_quotes_what_a_log_is_worth_to_a_training(name):
 
 
 def test_the_page_quotes_what_late_and_drifting_sensors_cost():
-    from tables import percent
+    from harness import percent
 
     rows = {name: row["score"] for name, row in record("sensors")["rows"].items()}
     assert set(rows) > {"exact", "delay 0.3 s, drift 2 %"}
@@ -156,7 +157,7 @@ def test_rung_3_tells_those_apart_that_the_page_says_it_does():
 
 
 def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypatch):
-    import rung
+    import measure
     import trials
 
     from lunar_mjx.agents.policy import load_policy
@@ -185,11 +186,11 @@ def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypa
             return {"policy": one}
 
     monkeypatch.setattr(trials, "Judge", Judge)
-    monkeypatch.setattr(rung, "rules", lambda env: {})
-    words = ["rung.py", "point", "--seeds", "3", "4", "--steps", "300", "--every", "inf", "--out", str(tmp_path)]
+    monkeypatch.setattr(trials, "rules", lambda env, names: {})
+    words = ["measure.py", "rung", "point", "--seeds", "3", "4", "--steps", "300", "--every", "inf"]
     settings = ["--set", "envs=4", "epoch_steps=8", "batch=8", "buffer_steps=64", "random_steps=4", "updates=1"]
-    monkeypatch.setattr(sys, "argv", [*words, *settings])
-    rung.main()
+    monkeypatch.setattr(sys, "argv", [*words, *settings, "--out", str(tmp_path)])
+    measure.main()
     told = json.loads((tmp_path / "point.json").read_text())
     assert [run["seed"] for run in told["seeds"]] == [3, 4] and len(compiled) == 1
     assert scored == [trials.FINAL, trials.FINAL], "with no scores before the last nothing is chosen"
@@ -207,7 +208,7 @@ def _leaves(policy):
 
 
 def test_seeds_of_further_runs_join_the_kept_record_unless_settings_differ(tmp_path):
-    from kept import keep_rung as keep
+    from kept import keep
 
     def run(folder, seeds, steps, rate=1.0, **more):
         found = [{"seed": n, "epochs": [{"steps": 1, "kl": 2.0}], "final": {"steps": steps}} for n in seeds]
@@ -218,8 +219,8 @@ def test_seeds_of_further_runs_join_the_kept_record_unless_settings_differ(tmp_p
         path.write_text(json.dumps({**told, "seeds": [*found, *more.get("cut", [])]}))
         return path
 
-    keep([run("a", [0, 1], 10)], tmp_path)
-    kept = json.loads(keep([run("b", [3, 1], 20, cut=[{"seed": 4, "epochs": []}])], tmp_path).read_text())
+    keep([run("a", [0, 1], 10)], home=tmp_path)
+    kept = json.loads(keep([run("b", [3, 1], 20, cut=[{"seed": 4, "epochs": []}])], home=tmp_path).read_text())
     assert [(s["seed"], s["commit"], s["final"]["steps"]) for s in kept["seeds"]] == [
         (0, "a", 10),
         (1, "b", 20),
@@ -227,13 +228,13 @@ def test_seeds_of_further_runs_join_the_kept_record_unless_settings_differ(tmp_p
     ]
     assert kept["seeds"][0]["epochs"] == [{"steps": 1}] and kept["seeds"][0]["device"] == "GPU"
     with pytest.raises(ValueError, match="train is not the same"):
-        keep([run("c", [5], 20, rate=2.0)], tmp_path)
+        keep([run("c", [5], 20, rate=2.0)], home=tmp_path)
     for more in ({"learner": "SACConfig"}, {"begin_with": "luvmi_x/ladder-3"}):
         other = run(f"d{next(iter(more))}", [0], 20)
         other.write_text(json.dumps(json.loads(other.read_text()) | more))
         with pytest.raises(ValueError, match=f"{next(iter(more))} is not the same"):
-            keep([other], tmp_path)
-        own = json.loads(keep([other], tmp_path, "mine-other" + next(iter(more))).read_text())
+            keep([other], home=tmp_path)
+        own = json.loads(keep([other], "mine-other" + next(iter(more)), tmp_path).read_text())
         assert own.items() >= more.items() and own["training"] == "mine"
 
 

@@ -29,7 +29,7 @@ def harness():
 
 @pytest.fixture(scope="module")
 def setup(harness):
-    args = argparse.Namespace(rover=None, tiny=False, set=SMALL, env=[])
+    args = argparse.Namespace(rover=None, unseen_terrain=None, set=SMALL, env=[])
     return harness.Setup(harness.training_of(args, "point"))
 
 
@@ -84,28 +84,29 @@ def test_what_is_kept_of_a_record_has_few_digits_and_few_columns():
 
 
 def test_a_training_scored_on_its_own_ground_is_kept_as_figures_read_it(harness, tmp_path):
-    from kept import read_large
+    from kept import keep
     from trials import Trials
 
     from lunar_mjx.agents.policy import load_policy
 
-    args = argparse.Namespace(rover=None, tiny=False, set=SMALL, env=[])
+    told = {"training": "point", "out": tmp_path, "name": "", "begin_with": "", "stop_at": math.inf, "episodes": 4}
+    times = {"steps": 96, "seed_seconds": 60.0, "last": 0.0, "every": 0.0}
+    args = argparse.Namespace(rover=None, unseen_terrain=None, set=SMALL, env=[], **told, **times)
     rules = {"scripted": make_agent("scripted", make("point"))}
-    trials = Trials(
-        harness.training_of(args, "point"), "large", tmp_path, harness.Clock(60.0), 4, lambda _: rules, seen=True
-    )
+    trials = Trials(args, harness.training_of(args, "point"), harness.Clock(60.0), lambda _: rules, "seen")
     trials.record |= {"rover": "none", "target": 0.0, "untrained": {"success": 0.0}}
-    trials(3, 96, 60.0, 0.0)
-    record = read_large([tmp_path])
+    trials(3)
+    record = harness.read(keep([tmp_path / "point.json"], home=tmp_path))
     (run,) = record["seeds"]
     assert run["steps"] == 96 and [s["steps"] for s in run["unseen"]] == [r["steps"] for r in run["rows"]] == [
         32,
         64,
         96,
     ]
-    best = max(s["train"]["success"] for s in run["unseen"])
+    seen = harness.read(tmp_path / "point.json")["seeds"][0]["scores"]
+    best = max(s["train"]["success"] for s in seen)
     assert run["kept"]["train_score"]["success"] == best and run["steps_to_target"] == 32
-    assert load_policy(tmp_path / "large_seed3.npz").notes["steps"] == run["kept"]["steps"]
+    assert load_policy(tmp_path / "point_seed3.npz").notes["steps"] == run["kept"]["steps"]
     assert list(record["agents"]) == ["untrained", "scripted"] and record["agents"]["scripted"]["episodes"] == 4
 
 

@@ -1,13 +1,12 @@
-"""Measures exported policies: how far their graphs are from the policy, and how long an action takes on one core.
+"""Part `export` of measure.py: how far exported policies' graphs are from the policy, and how long an action takes.
 
-python benchmarks/rl/export.py --out benchmarks/rl/export.json
+python benchmarks/rl/measure.py export --out runs/export        # a core
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
-import json
 import tempfile
 import time
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import jax.export
 import numpy as np
-from harness import KEPT, save, say
+from harness import Clock, save, say
 
 from lunar_mjx.agents.export.write import NODE, export_policy
 from lunar_mjx.agents.policy import load_policy, shipped_policy
@@ -24,10 +23,8 @@ COUNT, SEED = 2000, 0
 """Observations, drawn around the training's mean with 1.5 of its deviations."""
 
 
-def measure(rover: str) -> dict[str, Any]:
+def measured(path: Path) -> dict[str, float]:
     """Greatest errors of both graphs, and times of the exported folder's own node, ms."""
-    path = shipped_policy(rover)
-    assert path is not None, f"{rover} ships no policy"
     policy = load_policy(path)
     assert policy.mean is not None and policy.deviation is not None
     drawn = np.random.default_rng(SEED).normal(0.0, 1.5, (COUNT, policy.network["obs"]))
@@ -44,22 +41,19 @@ def measure(rover: str) -> dict[str, Any]:
             begin = time.perf_counter()
             actions.append(taken.act(row))
             times.append(1e3 * (time.perf_counter() - begin))
-        read = jax.export.deserialize(bytearray((folder / "policy.stablehlo").read_bytes()))
-        other = np.asarray(read.call(obs))
-    errors = {"onnx_error": np.stack(actions) - wanted, "stablehlo_error": other - wanted}
-    spent = {"median_ms": np.median(times), "p99_ms": np.quantile(times, 0.99)}
-    return {k: float(np.abs(v).max()) for k, v in errors.items()} | {k: float(v) for k, v in spent.items()}
+        graph = jax.export.deserialize(bytearray((folder / "policy.stablehlo").read_bytes()))
+        other = np.asarray(graph.call(obs))
+    return {
+        "onnx_error": float(np.abs(np.stack(actions) - wanted).max()),
+        "stablehlo_error": float(np.abs(other - wanted).max()),
+        "median_ms": float(np.median(times)),
+        "p99_ms": float(np.quantile(times, 0.99)),
+    }
 
 
-def main() -> None:
-    """Measures and writes."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=KEPT / "export.json")
-    out = parser.parse_args().out
-    rows = {rover: measure(rover) for rover in ("luvmi_x", "viper")}
-    say(json.dumps(rows))
-    save(out.parent, out.stem, {"seed": SEED, "observations": COUNT, "rovers": rows})
-
-
-if __name__ == "__main__":
-    main()
+def export(args: argparse.Namespace, _: Clock) -> None:
+    """Measures the policies that ship with rovers."""
+    paths = {rover: shipped_policy(rover) for rover in ("luvmi_x", "viper")}
+    rows = {rover: measured(path) for rover, path in paths.items() if path is not None}
+    say(str(rows))
+    save(args.out, "export", {"seed": SEED, "observations": COUNT, "rovers": rows})
