@@ -32,15 +32,14 @@ def about(variant: str) -> dict[str, Any]:
     return {"options": {**like, **found.get("options", {})}, "settings": found.get("settings", {})}
 
 
-def alone(cores: Any) -> None:
-    """Puts a process onto a core of its own, without the GPU."""
-    os.sched_setaffinity(0, {cores.get()})
+def run(args: argparse.Namespace, core: int, variant: str, name: str, seed: int, seconds: float) -> dict[str, Any]:
+    """One training: its settings, every episode, and the successes of its policy without noise.
+
+    Puts the process onto a core of its own, without the GPU.
+    """
+    os.sched_setaffinity(0, {core})
     os.environ |= {"CUDA_VISIBLE_DEVICES": "", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
     jax.config.update("jax_platforms", "cpu")
-
-
-def run(args: argparse.Namespace, variant: str, name: str, seed: int, seconds: float) -> dict[str, Any]:
-    """One training: its settings, every episode, and the successes of its policy without noise."""
     clock = Clock(seconds)
     told = about(variant)
     training = override(training_of(args, name), epoch_steps=250, **told["settings"])
@@ -65,25 +64,21 @@ def run(args: argparse.Namespace, variant: str, name: str, seed: int, seconds: f
 def paper(args: argparse.Namespace, clock: Clock) -> None:
     """Trains every variant, algorithm and seed in a process of its own; leaves those that take too long."""
     jobs = [
-        (args, variant, name, seed, clock.left)
+        (variant, name, seed)
         for variant in args.only
         for seed in range(VARIANTS[variant]["seeds"])
         for name in VARIANTS[variant].get("algorithms", ("paper-td3", "paper-ddpg"))
     ]
     cores = sorted(os.sched_getaffinity(0))
     jobs = jobs[: max(2, len(cores))]
-    context = multiprocessing.get_context("spawn")
-    queue = context.SimpleQueue()
-    for i in range(len(jobs)):
-        queue.put(cores[i % len(cores)])
     say(f"paper: {len(jobs)} runs of {clock.left:.0f} s on CPU cores")
     train: dict[str, Any] = {}
     found: dict[str, Any] = {MAIN: {**about(MAIN), "runs": {}}}
     # compiling, before which a run looks at no clock, has a minute more
     deadline = time.monotonic() + clock.left + 60.0
-    with context.Pool(len(jobs), alone, (queue,)) as pool:
-        for job, promise in [(job, pool.apply_async(run, job)) for job in jobs]:
-            _, variant, name, seed, _ = job
+    with multiprocessing.get_context("spawn").Pool(len(jobs), maxtasksperchild=1) as pool:
+        words = [(args, cores[i % len(cores)], *job, clock.left) for i, job in enumerate(jobs)]
+        for (variant, name, seed), promise in zip(jobs, [pool.apply_async(run, w) for w in words], strict=True):
             try:
                 told = promise.get(max(0.1, deadline - time.monotonic()))
             except Exception as error:  # whatever ended it, the others count

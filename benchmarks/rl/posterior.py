@@ -15,11 +15,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
-import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import pandas
 from harness import KEPT, Clock, Judge, Setup, command, ends, in_threads, last_policies, percent, save, say, training_of
 
 from lunar_mjx.envs import make
@@ -115,20 +114,17 @@ def posterior(args: argparse.Namespace, clock: Clock) -> None:
 def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Means over seeds with their standard errors, by arm; and of the posterior's lead over each other arm, by pairs of
     the same seed."""
-    by = {arm: {r["seed"]: r["score"] for r in rows if r["arm"] == arm} for arm in ARMS}
+    scores = pandas.DataFrame([{"arm": r["arm"], "seed": r["seed"], **r["score"]} for r in rows])
+    by = {arm: of_arm.set_index("seed") for arm, of_arm in scores.groupby("arm")}
     found: dict[str, Any] = {}
-    for arm, scores in by.items():
-        if not scores:
-            continue
-        found[arm] = {k: mean([s[k] for s in scores.values()]) for k in ("success", "episode_return", "episode_time")}
-        pairs = [seed for seed in scores if seed in by["posterior"]]
-        if arm != "posterior" and pairs:
-            lead = [by["posterior"][seed]["success"] - scores[seed]["success"] for seed in pairs]
-            found[arm]["posterior_leads_by"] = mean(lead)
+    for arm in [arm for arm in ARMS if arm in by]:
+        found[arm] = {k: mean(by[arm][k]) for k in ("success", "episode_return", "episode_time")}
+        if arm != "posterior" and "posterior" in by:
+            found[arm]["posterior_leads_by"] = mean((by["posterior"]["success"] - by[arm]["success"]).dropna())
     return found
 
 
-def mean(values: Sequence[float]) -> dict[str, Any]:
+def mean(values: pandas.Series) -> dict[str, Any]:
     """Mean, its standard error (None of one value), and how many values."""
-    error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
-    return {"mean": statistics.fmean(values), "error": error, "seeds": len(values)}
+    error = float(values.sem()) if len(values) > 1 else None
+    return {"mean": float(values.mean()), "error": error, "seeds": len(values)}

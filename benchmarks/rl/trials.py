@@ -156,25 +156,15 @@ def rules(env: Any, names: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def made(args: argparse.Namespace, clock: Clock, choose_by: str) -> Trials:
-    """The trials of a part, with the training and rules that the command line and the part's settings tell."""
-    training = training_of(args, args.training, args.learner)
+def measure(args: argparse.Namespace, clock: Clock) -> None:
+    """Trains seed after seed while there is time for a whole one; where the ground of the training chooses the best,
+    the policy before its training is scored, too."""
+    training, plan = training_of(args, args.training, args.learner), EXPERIMENTS[args.part]
     args.steps = args.steps or training.steps
-    return Trials(args, training, clock, lambda env: rules(env, EXPERIMENTS[args.part]["rules"]), choose_by)
-
-
-def rung(args: argparse.Namespace, clock: Clock) -> None:
-    """Trains seed after seed while there is time for a whole one; the best is chosen on unseen ground."""
-    trials = made(args, clock, "unseen")
-    for seed in in_time(clock, args.seeds):
-        trials(seed)
-
-
-def large(args: argparse.Namespace, clock: Clock) -> None:
-    """So with the policy before its training; the best is chosen on the ground of the training."""
-    trials = made(args, clock, "seen")
-    setup, policy = trials.setup, trials.setup.policy(trials.setup.learner.init(10_000))
-    untrained = trials.judge(setup.unseen, policy, FINAL)["policy"]
-    trials.record |= {"rover": args.rover, "target": args.target, "untrained": untrained}
+    trials = Trials(args, training, clock, lambda env: rules(env, plan["rules"]), plan["choose_by"])
+    if plan["choose_by"] == "seen":
+        setup, policy = trials.setup, trials.setup.policy(trials.setup.learner.init(10_000))
+        untrained = trials.judge(setup.unseen, policy, FINAL)["policy"]
+        trials.record |= {"rover": args.rover, "target": args.target, "untrained": untrained}
     for seed in in_time(clock, args.seeds):
         trials(seed)
