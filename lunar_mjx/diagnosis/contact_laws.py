@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 
 from lunar_mjx.diagnosis.build_problem import FINER_FORMS
 from lunar_mjx.diagnosis.weighed.form import SearchSettings
@@ -51,6 +52,24 @@ def with_law(model: Model, law: str) -> Model:
     for part in LAWS[law]:
         model = model.add(part, "contact law")
     return model
+
+
+def no_addition(present: Collection[str], name: str) -> str:
+    """Why an effect adds nothing to the contact law of a model, or "".
+
+    Args:
+      present: names of the model's effects. name: of the effect.
+    """
+    if name in _CONTACT:
+        return "is part of another contact law"
+    if "granular_resistance" in present and name in OF_REECE | FINER_FORMS:
+        return "changes a stress that granular_resistance does not have"
+    return ""
+
+
+def log_shares(laws: int) -> list[float]:
+    """Log prior probability of each of some contact laws: the model's own has half of it, its rivals share the rest."""
+    return [0.0] if laws == 1 else [math.log(0.5), *[math.log(0.5 / (laws - 1))] * (laws - 1)]
 
 
 def better_law(forms: Mapping[str, float], model: Model, sure: float = SearchSettings().sure) -> str | None:

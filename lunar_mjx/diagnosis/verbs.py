@@ -219,7 +219,7 @@ def why(
                 {
                     tuple(sorted(h.effects)): (own.residual(h.refit.u), own.predicted(h.refit.u))
                     for h in model_search.hypotheses
-                    if h.refitted and h.effects
+                    if h.refitted and h.effects and h.form == own.name
                 },
             )
         _record_opening(run, "why", own.observations, own.coordinates, own.baseline, rows)

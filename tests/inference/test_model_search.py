@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -128,6 +129,32 @@ def test_a_promise_that_a_refit_has_broken_is_not_believed_beside_other_effects(
         assert any(h.refitted and "twin" in h.effects for h in found.hypotheses), "no promise was put to the test"
         estimates = [h for h in found.hypotheses if "twin" in h.effects and not h.refitted]
         assert estimates and all(h.log_posterior < found.best.log_posterior - 5.0 for h in estimates)
+
+
+class Gated(ToyForm):
+    """A toy whose `twin` acts where `wave` does and hardly alone, where its slope promises much."""
+
+    # with the odds of one effect among three hundred a promise must be large to be tried at all
+    terms = tuple(
+        dataclasses.replace(t, log_prior=math.log(0.0033)) for t in ToyForm.terms if t.name not in ("square", "level")
+    )
+
+    @staticmethod
+    def curve(u):
+        """The toy's curve (n,)."""
+        open_ = np.clip(u[3] / 0.5, 0.0, 1.0)
+        alone = 0.01 * np.tanh(u[4] / 0.01) - 5.0 * u[4] ** 2
+        return curve(np.array([*u[:4], open_ * u[4] + (1.0 - open_) * alone]))
+
+
+def test_an_effect_that_acts_beside_another_alone_is_found_there():
+    """Broken promises beside sets without the other say little of what it does there."""
+    plain = np.array([0.5, -0.4, 0.0, 0.0, 0.0])
+    noise = measured(5) - curve(plain)
+    for amount in (0.3, 2.0):
+        value = Gated.curve(plain + np.array([0.0, 0.0, 0.0, 0.8, amount])) + noise
+        found = search([Gated(value)], most_refits=20, most_terms=4, window=4.0)
+        assert set(conclude(found, 0.95).effects) == {"twin", "wave"}
 
 
 class Rival(ToyForm):

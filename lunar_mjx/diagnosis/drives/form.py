@@ -496,7 +496,7 @@ class DriveForm(MeasuredForm):
         # A trial begins where its effect acts, whatever that costs: at its null it may have no slope.
         if near is not None and start is not None and start is not self._trial:
             u = self._better_start(u, near, free)
-        first = self._seen is None
+        first = frozenset() not in self._slopes
         if first:
             if effects:
                 raise EvidenceError("the model as it is has not been refitted")
@@ -685,6 +685,9 @@ class DriveForm(MeasuredForm):
 
     def _take_kept(self) -> bool:
         """Whether an earlier refit of these drives has left errors of channels, which are taken then."""
+        if self._rival_of is not None:
+            self._take_errors(self._rival_of)
+            return True
         kept, self.kept = self.kept, {}
         # Noise that is learnt from a refit is not among what is kept.
         if not kept or self.drives.noise_unlearnt or kept["jitter_s"] not in self.settings.jitters_s:
@@ -699,17 +702,21 @@ class DriveForm(MeasuredForm):
         return True
 
     def _begin_beside(self, own: DriveForm) -> None:
-        """Takes the errors of the measurements from a rival's refit, and begins where that ended."""
+        """Begins where a rival's refit ended, with the noise that it has learnt."""
         self.drives.take_noise(own.drives)
-        self.observations = self.drives.observations
-        self.kept = {
-            "jitter_s": own.jitter_s,
-            "channel_errors": dict(own.channel_errors),
-            "error_times_s": dict(own.error_times_s),
-        }
         there = {c.key: amount for c, amount in zip(own.coordinates, own._base, strict=True)}
         mine = {*self.baseline, *self.drives.ground}
         self.start = np.array([there.get(c.key, 0.0) if i in mine else 0.0 for i, c in enumerate(self.coordinates)])
+
+    def _take_errors(self, own: DriveForm) -> None:
+        """Takes the measurements with the very errors that a rival is weighed with.
+
+        Errors of the same sizes would not do: those of times go with how fast a form's own predictions change.
+        """
+        self.drives.about(self.start)
+        self.observations, self.jitter_s = own.observations, own.jitter_s
+        self.channel_errors, self.error_times_s = own.channel_errors, own.error_times_s
+        self.kept = {"jitter_s": own.jitter_s}
 
     def _settled(self, free: np.ndarray) -> np.ndarray:
         """A refit (coordinates,) with errors that are known, from the start or the model's own parameters as given."""

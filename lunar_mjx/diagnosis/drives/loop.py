@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from lunar_mjx.diagnosis.build_problem import candidates_of
-from lunar_mjx.diagnosis.contact_laws import CLOSED_FORM, LAWS, contact_laws
+from lunar_mjx.diagnosis.contact_laws import CLOSED_FORM, LAWS, contact_laws, log_shares
 from lunar_mjx.diagnosis.drives.form import LEARNT, DriveForm
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
@@ -58,6 +58,8 @@ def build_drives(
     for law in [name for name in laws if rivals and own == CLOSED_FORM and name != own]:
         beside = DriveProblem(logs, laws[law], wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
         forms.append(DriveForm(beside, settings, progress, law, form))
+    for one, prior in zip(forms, log_shares(len(forms)), strict=True):
+        one.log_prior = prior
     return Problem(forms, drives.effects, drives.not_tested, settings, drives.unused)
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lunar_mjx.diagnosis.candidates import usable
+from lunar_mjx.diagnosis.contact_laws import no_addition
 from lunar_mjx.diagnosis.drives.baseline import BASELINE, baseline_coordinates, unfit
 from lunar_mjx.diagnosis.drives.differences import Differences
 from lunar_mjx.diagnosis.drives.instruments import (
@@ -101,7 +102,10 @@ class DriveProblem:
         """
         self.logs, self.model, self.progress = tuple(logs), model, progress
         self._discrepancy = dict(discrepancy or {})
-        self.effects, self.not_tested = usable(model.effects, candidates, unfit)
+        present = [e.name for e in model.effects]
+        self.effects, self.not_tested = usable(
+            model.effects, candidates, lambda name, effect: unfit(name, effect) or no_addition(present, name)
+        )
         self.bench = Bench(model, self.logs, chunk, engine)
         self._stamped: tuple[Observations | None, bytes] = None, b""
         coordinates = baseline_coordinates(model, baseline)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from lunar_mjx.diagnosis import build_problem
 from lunar_mjx.diagnosis.candidates import usable
-from lunar_mjx.diagnosis.contact_laws import LAWS, OF_REECE, contact_laws, with_law
+from lunar_mjx.diagnosis.contact_laws import LAWS, contact_laws, log_shares, no_addition, with_law
 from lunar_mjx.diagnosis.runs import HYPOTHESES_FILE, Run
 from lunar_mjx.diagnosis.tables import problem as tables
 from lunar_mjx.diagnosis.tables.settings import TableSettings
@@ -73,18 +72,16 @@ def build_tables(
     laws = contact_laws(run.model, settings.laws if rivals else ())
     for number, (name, model) in enumerate(laws.items()):
         bed = WheelBed.of_first_wheel(model, gravity)
-        grains = "granular_resistance" in bed.parameters
-        foreign = OF_REECE | build_problem.FINER_FORMS if grains else frozenset()
-        mine = {n: e for n, e in candidates.items() if not e.replaces and n not in foreign}
+        present = [e.name for e in bed.effects]
+        mine = {n: e for n, e in candidates.items() if not e.replaces and not no_addition(present, n)}
         effects, left = usable(bed.effects, mine, tables._unfit)
         refused = left if number == 0 else refused
         union = bed
         for effect in effects.values():
             union = union.with_effect(effect, **effect.null())
         coordinates, baseline, places = tables._coordinates(bed, effects, tables.BASELINE, {})
-        # prior probability: the model's own law has half of it, its rivals share the other half
-        share = 1.0 if len(laws) == 1 else 0.5 if number == 0 else 0.5 / (len(laws) - 1)
-        forms.append(WheelForm(name, data, union, coordinates, baseline, places, settings, math.log(share)))
+        prior = log_shares(len(laws))[number]
+        forms.append(WheelForm(name, data, union, coordinates, baseline, places, settings, prior))
         all_effects |= effects
     return Tables(tuple(forms), all_effects, refused, settings, _not_used(run.model))
 

@@ -171,6 +171,7 @@ class _Search:
       refits: number made. begun: form, effects, and effects of the refit at whose end it began, of each.
       reasons: "form with effects: reason" of each refit whose solver failed.
       record: nats that refits of each effect beside a form have been promised, and how many of these they kept.
+      asked: form and effects of sets beside which a doubted effect was refitted.
       over: whether time was up within a refit.
     """
 
@@ -187,6 +188,7 @@ class _Search:
     begun: set[tuple[str, frozenset[str], frozenset[str]]] = dataclasses.field(default_factory=set)
     reasons: list[str] = dataclasses.field(default_factory=list)
     record: dict[tuple[str, str], tuple[float, float]] = dataclasses.field(default_factory=dict)
+    asked: set[tuple[str, frozenset[str]]] = dataclasses.field(default_factory=set)
     over: bool = False
 
     @property
@@ -227,7 +229,8 @@ class _Search:
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
         # order of what it promises there. Else one form's many neighbours would take the refits that tell which it is.
         other_forms = [f for f in self.forms if best.refitted and (f.name, best.effects) not in self.done]
-        other_forms = [f for f in other_forms if f not in late]
+        # nor beside one that has not been refitted as it is, or could not be
+        other_forms = [f for f in other_forms if self.done.get((f.name, frozenset())) is not None]
         other_forms = [f for f in other_forms if best.effects <= {t.name for t in f.terms}]
         promise = {f.name: _carried_over(listed, best, f.name) for f in other_forms}
         other_forms.sort(key=lambda f: -promise[f.name])
@@ -249,6 +252,11 @@ class _Search:
         better = self.promising(by_name[best.form], best, rivals)
         if better is not None:
             self.refit(by_name[best.form], better.effects, better)
+            return True
+        doubted = self.doubted(best)
+        if doubted is not None:
+            self.asked.add((best.form, best.effects))
+            self.refit(by_name[best.form], doubted.effects, doubted)
             return True
         untried = self.untried(best)
         if untried:
@@ -334,6 +342,22 @@ class _Search:
             if new is not None and new.log_posterior > max(old.log_posterior, best.log_posterior - self.window):
                 found.append(new)
         return max(found, key=lambda h: h.log_posterior, default=None)
+
+    def doubted(self, best: Hypothesis) -> Hypothesis | None:
+        """The set with one effect more that would come near the best one if its promise were kept in full.
+
+        Refits of that effect beside other sets have broken their promises, which says little of this one: it may do
+        nothing by itself, and much beside what the best set has. It is asked once about each set.
+        """
+        if (best.form, best.effects) in self.asked:
+            return None
+        found = [
+            (h.promise.believed(1.0), h)
+            for h in self.known.values()
+            if h.promise is not None and _one_more(h, best) and (h.form, h.effects) not in self.done
+        ]
+        promised, h = max(found, key=lambda pair: pair[0], default=(-math.inf, None))
+        return h if promised > best.log_posterior - self.window else None
 
     def ranked(self, complete: bool) -> ModelSearch:
         """What is known, most probable first."""

@@ -27,6 +27,7 @@ from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.deadline import Deadline, TimeUp
+from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.weighing.search import search
 from lunar_mjx.model import make_model
 from tests.inference.toy_problem import coordinate, manoeuvres
@@ -172,6 +173,39 @@ def test_a_rival_law_is_asked_before_anything_is_named_with_the_same_errors():
     own = DriveForm(toy, settings)  # type: ignore[arg-type]
     search([own, DriveForm(other, settings, name="finer", beside=own)], 8, 7, 4.0)  # type: ignore[arg-type]
     assert other.rows == 1, "nothing but its own making"
+
+
+def test_a_law_that_predicts_the_same_is_as_probable_whatever_its_rates():
+    """Times that scatter widen the noise by how fast predictions change: both laws are weighed with the same widths."""
+    settings = DriveSettings()
+    toy, other = Toy({"a": 0.5, "lag": 0.7}), Toy({})
+    rng = np.random.default_rng(4)
+    rate = 100.0 * np.abs(rng.standard_normal(LOGS * SAMPLES))
+    noisy = toy.observations.value + 0.02 * rate * rng.standard_normal(len(rate))
+    toy.observations = other.observations = dataclasses.replace(toy.observations, value=noisy)
+    toy.rate, other.rate = rate, 1.1 * rate
+    own = DriveForm(toy, settings)  # type: ignore[arg-type]
+    rival = DriveForm(other, settings, name="finer", beside=own)  # type: ignore[arg-type]
+    found = search([own, rival], settings.most_refits, settings.most_terms, settings.window)
+    assert own.jitter_s == 0.02
+    best = {n: max(h.log_posterior for h in found.hypotheses if h.form == n) for n in (own.name, "finer")}
+    assert best["finer"] == pytest.approx(best[own.name], abs=0.1)
+
+
+def test_a_law_whose_own_refit_failed_is_asked_no_further(monkeypatch):
+    settings = DriveSettings()
+    toy, other = Toy({"a": 0.5, "lag": 0.7}), Toy({})
+    other.observations = toy.observations
+    own = DriveForm(toy, settings)  # type: ignore[arg-type]
+    rival = DriveForm(other, settings, name="finer", beside=own)  # type: ignore[arg-type]
+
+    def diverges(*_args, **_kwargs):
+        raise EvidenceError("a rover's simulation diverged")
+
+    monkeypatch.setattr(rival, "_find_ground", diverges)
+    found = search([own, rival], settings.most_refits, settings.most_terms, settings.window)
+    assert conclude(found, settings.sure).effects == ("lag",)
+    assert found.failed == ("finer: a rover's simulation diverged",)
 
 
 @pytest.mark.parametrize(
