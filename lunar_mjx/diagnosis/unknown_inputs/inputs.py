@@ -62,6 +62,11 @@ def _moment_y(ctx, a, value):
     return dataclasses.replace(value, moment=value.moment._replace(y=moment))
 
 
+def _shear(ctx, a, value):
+    more = 1.0 + a
+    return dataclasses.replace(value, force=value.force * more, moment=value.moment * more)
+
+
 def _push(ctx, a, value):
     forward = ctx.frame.forward
     return dataclasses.replace(value, force=value.force + forward * a)
@@ -91,6 +96,7 @@ PROBES: Mapping[str, tuple[str, Act, float, str]] = {
     "wheel_shear: longitudinal force": ("wheel_shear", _force_x, 0.05, "1"),
     "wheel_shear: lateral force": ("wheel_shear", _force_y, 0.05, "1"),
     "wheel_shear: driving moment": ("wheel_shear", _moment_y, 0.05, "1"),
+    "wheel_shear: shear at a crawl": ("wheel_shear", _shear, 0.3, "1"),
     "body_wrench: push": ("body_wrench", _push, 5.0, "N"),
     "body_wrench: pitching moment": ("body_wrench", _tilt, 2.0, "N m"),
     "heat: winding": ("heat", _winding, 0.5, "W"),
@@ -116,12 +122,21 @@ QUANTITY_SIZES: Mapping[str, float] = {
     "load": 100.0,
     "loss": 1.0,
     "travel speed": 0.2,
+    "below 1 cm/s": 1.0,
+    "below 3 cm/s": 1.0,
+    "below 10 cm/s": 1.0,
 }
 """Usual sizes of the quantities that an unknown input may follow: A, rad/s, slip, N, m/s; signs
 follow the motion."""
 
 _AT_REST = 0.03
 """rad/s of a joint below which it has hardly a direction."""
+
+
+def _below(speed: float) -> Callable[[Any, Any], Any]:
+    """What is 1 where rim and hub stand still, and fades above a speed, m/s."""
+    return lambda ctx, value: jnp.exp(-(jnp.abs(ctx.contact.rim_speed) + jnp.abs(ctx.contact.v_x)) / (2.0 * speed))
+
 
 _READ: Mapping[str, Callable[[Any, Any], Any]] = {
     "constant": lambda ctx, value: 1.0,
@@ -138,6 +153,9 @@ _READ: Mapping[str, Callable[[Any, Any], Any]] = {
     "load": lambda ctx, value: value.load,
     "loss": lambda ctx, value: jnp.abs(ctx.command.current),
     "travel speed": lambda ctx, value: ctx.velocity.dot(ctx.frame.forward),
+    "below 1 cm/s": _below(0.01),
+    "below 3 cm/s": _below(0.03),
+    "below 10 cm/s": _below(0.1),
 }
 
 
@@ -158,6 +176,8 @@ FOLLOWS: Mapping[str, tuple[str, ...]] = {
     "wheel_shear: longitudinal force": ("constant", "signed slip", "wheel speed"),
     "wheel_shear: lateral force": ("constant", "lateral slip"),
     "wheel_shear: driving moment": ("constant", "signed slip", "wheel speed"),
+    # How shear begins as a wheel starts, no law of steady driving tells, and every simulator rounds it off somewhere.
+    "wheel_shear: shear at a crawl": ("below 1 cm/s", "below 3 cm/s", "below 10 cm/s"),
     "body_wrench: push": ("constant", "travel speed"),
     "body_wrench: pitching moment": ("constant",),
     "heat: winding": ("constant", "loss"),

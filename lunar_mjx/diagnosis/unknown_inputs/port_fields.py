@@ -24,6 +24,7 @@ WORDS: Mapping[str, str] = {
     "wheel_shear: longitudinal force": "shear force along the wheel",
     "wheel_shear: lateral force": "side force",
     "wheel_shear: driving moment": "driving torque",
+    "wheel_shear: shear at a crawl": "shear of wheels that crawl",
     "body_wrench: push": "force on the body",
     "body_wrench: pitching moment": "pitching moment on the body",
     "heat: winding": "heat of the windings",
@@ -31,9 +32,9 @@ WORDS: Mapping[str, str] = {
 }
 """Fields of discrepancy, and what is "good to so many per cent" in the user's words."""
 
-ADDED, DRAWN = 0.25, 0.1
+ADDED, DRAWN, CRAWLING = 0.25, 0.1, 15.0
 """Sizes over that of the field: of a force that is added, over the load; of the wheel's deformation, over its radius
-(as for tables)."""
+(as for tables); of the shear of wheels that hardly move, of which no more than the order is known."""
 SHARES: Mapping[str, float] = {
     "geometry: wheel radius": DRAWN,
     "wheel_normal: load": ADDED,
@@ -41,6 +42,7 @@ SHARES: Mapping[str, float] = {
     "wheel_shear: longitudinal force": ADDED,
     "wheel_shear: lateral force": ADDED,
     "wheel_shear: driving moment": ADDED,
+    "wheel_shear: shear at a crawl": CRAWLING,
     "body_wrench: push": ADDED,
     "body_wrench: pitching moment": ADDED,
 }
