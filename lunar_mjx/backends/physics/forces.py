@@ -195,7 +195,8 @@ class ForceModel:
         if "shear_state" in effects:  # the soil remembers its shear displacement, which a standing wheel keeps
             kept = state["shear_state"]
             c.contact["soil_slip"] = clamp(kept["direction"] * kept["slip_x"], -1.0, 1.0)
-            c.contact["soil_slid"] = np.minimum(np.abs(kept["slip_x"]), 1.0)
+            slid = np.abs(kept["direction"] * kept["slip_x"]) + np.maximum(np.abs(kept["slip_x"]) - 1.0, 0.0)
+            c.contact["soil_slid"] = np.minimum(slid, 1.0)
         c.soil = soil.local_soil(c, self._uniform, self._soil)
         if "slip_sinkage" in effects:
             outdoors.slip_sinkage(c, effects["slip_sinkage"], c.soil)

@@ -169,8 +169,11 @@ def _remembered_slip(x, contact):
     The slip of a wheel that creeps changes within a millimetre per second from none to full. Soil that answered to it
     at once would shake a parked rover for ever; it is displaced over a contact length instead.
     """
-    slip, slid = jnp.clip(x.direction * x.slip_x, -1.0, 1.0), jnp.minimum(jnp.abs(x.slip_x), 1.0)
-    return dataclasses.replace(contact, soil_slip=slip, soil_slid=slid)
+    slip = x.direction * x.slip_x
+    # More than a whole slip is that of opposed rim and hub, whose lean is small. So is that of a wheel that never
+    # rolled, which has displaced its soil and slid over none.
+    slid = jnp.abs(slip) + jnp.maximum(jnp.abs(x.slip_x) - 1.0, 0.0)
+    return dataclasses.replace(contact, soil_slip=jnp.clip(slip, -1.0, 1.0), soil_slid=jnp.minimum(slid, 1.0))
 
 
 @effect(
