@@ -72,7 +72,7 @@ class Contact:
       soil_slip: the slip as the soil remembers it, within [-1, 1]: its shear displacement over the contact length. It
         tends to the slip while the wheel rolls on and stays when it stops; the slip itself where no effect keeps it.
         Where rim and hub are opposed it passes over from skidding to driving, through 0.
-      soil_slid: size of that shear displacement, within [0, 1], whichever way it is called.
+      soil_slid: the size of `soil_slip`, and 1 where rim and hub are opposed: soil is sheared in full there.
     """
 
     sinkage: Float[Array, "wheel"]
