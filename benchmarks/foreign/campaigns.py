@@ -76,8 +76,8 @@ def compile_part(job: Job, folder: Path, part: int, of: int) -> None:
     drives = form.drives
     if part == 0:
         _ = drives.step_error  # the model as it is, also with half the time step: no row below moves nothing else
-    moved = [np.zeros(0, int), *drives.inputs.values()]
-    programs = [np.concatenate(moved), *(np.concatenate([form.candidates[e] for e in p]) for p in form.parts)]
+    given = form.discrepancy
+    programs = [given, *(np.concatenate([given, *(form.candidates[e] for e in p)]) for p in form.parts)]
     # the first part has two programs already
     for which in programs[(part - 1) % of :: of]:
         row = drives.origin()[None]

@@ -217,7 +217,7 @@ def why(
             write_refits(
                 run.folder,
                 {
-                    tuple(sorted(h.effects)): (own.residual(h.refit.u), own.predicted(h.refit.u))
+                    tuple(sorted(h.effects)): (own.residual(own.bare(h.refit.u)), own.predicted(own.bare(h.refit.u)))
                     for h in model_search.hypotheses
                     if h.refitted and h.effects and h.form == own.name
                 },

@@ -103,10 +103,11 @@ class DriveForm(MeasuredForm):
         self.name, self.log_prior, self.late = name, 0.0, beside is not None
         self._rival_of = beside
         labels = list(drives.inputs)
-        self._inputs = np.concatenate([np.zeros(0, int), *(drives.inputs[label] for label in labels)])
-        self._label = np.repeat(np.arange(len(labels)), [len(drives.inputs[label]) for label in labels])
-        count = len(drives.coordinates) - len(self._inputs)
-        self.coordinates = drives.coordinates[:count]
+        self.discrepancy = np.concatenate([np.zeros(0, int), *(drives.inputs[label] for label in labels)])
+        self.coordinates = drives.coordinates
+        # (coordinates,) field of discrepancy that a coordinate is the common part of, or -1
+        self._field_of = np.full(len(self.coordinates), -1)
+        self._field_of[self.discrepancy] = np.repeat(np.arange(len(labels)), [len(drives.inputs[k]) for k in labels])
         self.baseline, self.candidates = drives.baseline, dict(drives.candidates)
         self.observations = drives.observations
         self.words = {label: WORDS[label] for label in labels}
@@ -122,14 +123,18 @@ class DriveForm(MeasuredForm):
             for i in places:
                 if self.coordinates[i].amplitude:
                     self._std[i] = self.effect_size(self.coordinates[i])
-        self._size = np.array([usual.size(label, q) for label in labels for q in FOLLOWS[label]])
+        # Variances add up to one, so that a field's size means the same whatever share of it is a log's own.
+        sizes = np.array([usual.size(label, q) for label in labels for q in FOLLOWS[label]])
+        self._std[self.discrepancy] = sizes / np.array([self.coordinates[i].scale for i in self.discrepancy])
+        self._own_size = math.sqrt(settings.own_share) * self._std[self.discrepancy]
+        self._std[self.discrepancy] *= math.sqrt(1.0 - settings.own_share)
         kinds = [error_kind(s.channel) for s in self.observations.series]
         self.noise_names = tuple(dict.fromkeys(kinds))
         self._group = np.empty(len(self.observations), int)
         for s, name in zip(self.observations.series, kinds, strict=True):
             self._group[s.start : s.stop] = self.noise_names.index(name)
         self._fit = self.observations.in_split("fit")
-        self._seen: np.ndarray | None = None  # (n, coordinates + inputs) derivatives at the base, SI
+        self._seen: np.ndarray | None = None  # (n, coordinates) derivatives at the base, SI
         self._secants: np.ndarray | None = None  # (n, coordinates) changes by a usual amount there, over that amount
         # (n, m) SI columns at size 1, (m,) field of each; the last ones are those of the ground
         self._fields: tuple[np.ndarray, np.ndarray] | None = None
@@ -156,12 +161,9 @@ class DriveForm(MeasuredForm):
 
     # --- predictions and derivatives ---------------------------------------------------------------------------------
 
-    def _whole(self, u: np.ndarray) -> np.ndarray:
-        return np.concatenate([u, np.zeros((*u.shape[:-1], len(self._inputs)))], axis=-1)
-
     def predicted(self, u: np.ndarray) -> np.ndarray:
         """See `MeasuredForm`."""
-        return self.drives.predict(self._whole(u)[None])[0]
+        return self.drives.predict(u[None])[0]
 
     def jacobian(self, u: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Predictions (n,) at (coordinates,) and their derivatives (n, free).
@@ -170,27 +172,37 @@ class DriveForm(MeasuredForm):
         stand in it as knowledge. Where a slope says so much, the one to the other side is taken as well, and of each
         reading's two the flatter: the other has the jump.
         """
-        value, slopes = self.drives.jacobian(self._whole(u), free)
+        value, slopes = self.drives.jacobian(u, free)
         slopes = np.where(np.isfinite(slopes), slopes, 0.0)
         reach = np.abs(slopes) * self._std[free] / self.observations.sigma()[:, None]
         steep = np.flatnonzero(reach.max(axis=0, initial=0.0) > DRIVE_REFIT.steep)
         if len(steep):
-            other = self.drives.jacobian(self._whole(u), free[steep], side=-1)[1]
+            other = self.drives.jacobian(u, free[steep], side=-1)[1]
             first = slopes[:, steep]
             slopes[:, steep] = np.where(np.isfinite(other) & (np.abs(other) < np.abs(first)), other, first)
         return value, slopes
 
+    def _moved(self, u: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """(n, free) derivatives at a place (coordinates,); those by discrepancy where they were last taken.
+
+        They are as many as all others, and change less: discrepancy is small wherever a descent leads.
+        """
+        own = self._field_of[free] < 0
+        slopes = np.zeros((len(self.observations), len(free))) if self._seen is None else self._seen[:, free]
+        slopes[:, own] = self.jacobian(u, free[own])[1]
+        return slopes
+
     def _see_inputs(self, u: np.ndarray) -> np.ndarray:
-        """(n, coordinates + inputs) signatures of unmapped ground and unknown inputs at a place; others are 0."""
-        count, ground = len(self.coordinates), self.drives.ground
-        seen = np.zeros((len(self.observations), count + len(self._inputs)))
+        """(n, coordinates) derivatives by unmapped ground and unknown inputs at a place; others are 0."""
+        ground = self.drives.ground
+        seen = np.zeros((len(self.observations), len(self.coordinates)))
         if len(ground):
             self.progress("signatures of unmapped ground", math.nan)
             seen[:, ground] = self.jacobian(u, ground)[1]
         self.progress("signatures of unknown inputs", math.nan)
         # to first order in inputs of a hundredth of what is usual
-        scales = np.array([self.drives.coordinates[i].scale for i in self._inputs])
-        seen[:, count:] = self._changes(u, self._inputs, 1e-3 * self._size / scales) / 1e-3  # of a field of size 1
+        steps = 1e-3 * self._std[self.discrepancy]
+        seen[:, self.discrepancy] = self._changes(u, self.discrepancy, steps) / steps
         return seen
 
     def _see(self, u: np.ndarray) -> None:
@@ -264,10 +276,10 @@ class DriveForm(MeasuredForm):
         assert self._seen is not None and self._secants is not None and self._fields is not None
         columns, residual = self._columns(u, free, slopes)
         count, number = len(self.coordinates), self._fields[1]
-        scale = np.concatenate([self._std, found.tau[number]])
+        scale = np.concatenate([self._prior_std(found.tau), found.tau[number]])
         whole = np.column_stack([columns * scale, self._secants * self._std, residual])
         white = self.observations.whiten(whole)[self._fit] / found.noise[self._group[self._fit], None]
-        always = np.concatenate([self.baseline, np.arange(count, len(scale))]).astype(int)
+        always = np.concatenate([self._free(frozenset()), np.arange(count, len(scale))]).astype(int)
         # What the rest takes up, the priors counted as observations.
         rest = white[:, always]
         factor = linalg.cho_factor(np.eye(len(always)) + rest.T @ rest)
@@ -300,8 +312,8 @@ class DriveForm(MeasuredForm):
 
     def _changes(self, u: np.ndarray, which: Sequence[int] | np.ndarray, steps: np.ndarray) -> np.ndarray:
         """(n, m) changes of the predictions by a step of each of some coordinates alone; 0 where a rover diverged."""
-        rows = np.repeat(self._whole(u)[None], 1 + len(which), axis=0)
-        rows[1 + np.arange(len(which)), which] = steps
+        rows = np.repeat(u[None], 1 + len(which), axis=0)
+        rows[1 + np.arange(len(which)), which] += steps
         values = self.drives.predict(rows)
         change = values[1:] - values[:1]
         change[~np.isfinite(change).all(axis=1)] = 0.0
@@ -327,25 +339,24 @@ class DriveForm(MeasuredForm):
     def _field_columns(
         self, observations: Observations, but: frozenset[str] = frozenset()
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns (n, m) of all fields at size 1, SI units, and the field (m,) of each: in common, and of every log.
+        """Columns (n, m) of all fields at size 1, SI units, and the field (m,) of each: of every log for itself.
 
-        They are turned so that few are left which the observations' noise does not hide.
+        They are turned so that few are left which the observations' noise does not hide. What all logs have in common
+        are coordinates, which a refit moves: a linear estimate of them would hold for no more than a per cent or two.
 
         Args:
           observations: with the channels' errors. but: effects that are no part of what is usual.
         """
         assert self._seen is not None
         settings = self.settings
-        seen = self._seen[:, len(self.coordinates) :]
-        # Variances add up to one, so that a field's size means the same whatever share of it is a log's own.
-        common, own = math.sqrt(1.0 - settings.own_share), math.sqrt(settings.own_share)
         columns, number = [np.zeros((len(observations), 0))], [np.zeros(0, int)]
         for k in range(len(self.words)):
-            mine = seen[:, self._label == k]
-            parts = [common * mine]
+            own = self._field_of[self.discrepancy] == k
+            mine = self._seen[:, self.discrepancy[own]] * self._own_size[own]
+            parts = []
             for part in observations.of_log.values():
                 alone = np.zeros_like(mine)
-                alone[part] = own * mine[part]
+                alone[part] = mine[part]
                 parts.append(alone)
             whole = np.column_stack(parts)
             turned = whole @ rotation(observations.whiten(whole), settings.least_length / settings.unlisted_discrepancy)
@@ -382,7 +393,7 @@ class DriveForm(MeasuredForm):
           effects: of a refit.
         """
         assert self._seen is not None
-        seen = self._seen[:, : len(self.coordinates)].copy()
+        seen = self._seen.copy()
         seen[:, free] = slopes
         return np.column_stack([seen, self._fields_beside(effects)[0]]), self.observations.value - self.predicted(u)
 
@@ -416,10 +427,10 @@ class DriveForm(MeasuredForm):
         return Linear(
             gram=Gram.of(columns[fit], residual[fit], self._group[fit], kinds),
             held_out=held,
-            amplitudes=Amplitudes(std, np.concatenate([np.full(count, -1), field_of]), mean),
+            amplitudes=Amplitudes(std, np.concatenate([self._field_of, field_of]), mean),
             low=low,
             high=high,
-            always=np.concatenate([self.baseline, np.arange(count, len(std))]).astype(int),
+            always=np.concatenate([self._free(frozenset()), np.arange(count, len(std))]).astype(int),
             effects=self.candidates,
             at=at,
             calibration=self._instruments,
@@ -432,7 +443,13 @@ class DriveForm(MeasuredForm):
         )
 
     def _free(self, effects: frozenset[str]) -> np.ndarray:
-        return self.drives.free([e for e in self.candidates if e in effects])
+        """Places that a refit with some effects moves: those of the model, of common discrepancy, and of them."""
+        own = [places for name, places in self.candidates.items() if name in effects]
+        return np.concatenate([self.baseline, self.discrepancy, *own])
+
+    def _prior_std(self, tau: np.ndarray) -> np.ndarray:
+        """(coordinates,) prior standard deviations where discrepancy has sizes (fields,)."""
+        return np.where(self._field_of < 0, self._std, self._std * tau[self._field_of])
 
     def measuring(self, value: np.ndarray, start: np.ndarray) -> DriveForm:
         """A form of this model against other measurements.
@@ -551,20 +568,22 @@ class DriveForm(MeasuredForm):
         there, (low, high) = start.copy(), self.drives.bounds(free)
         there[free] = np.clip(near.u[free], low, high)
         rows = np.stack([start, there, there])
-        own = np.setdiff1d(free, self.baseline)
+        own = np.setdiff1d(free, self._free(frozenset()))
         rows[2, own] = start[own]
         cost = self._cost(near.u, free, self.observations, self._sizes_of(near))
-        values = self.drives.predict(self._whole(rows))
+        values = self.drives.predict(rows)
         costs = [cost.chi2(cost.white(cost.wanted - v), row[free]) for v, row in zip(values, rows, strict=True)]
         return rows[int(np.argmin(costs))]
 
     def alone(self, refit: Refit) -> np.ndarray:
-        """See `MeasuredForm`; with the derivatives of the refit, from there and from the parameters as given.
+        """See `MeasuredForm`; with the derivatives of the refit, from its parameters and from those as given.
 
         A refit that leaves much to discrepancy may predict worse without it than the model as given does.
         """
         free, slopes = self._slopes[refit.effects]
-        given = refit.u.copy()
+        free, slopes = free[self._field_of[free] < 0], slopes[:, self._field_of[free] < 0]
+        fitted = self.bare(refit.u)
+        given = fitted.copy()
         given[[i for i in self.baseline if not self.coordinates[i].nuisance]] = 0.0
         centre = np.array([self.coordinates[i].centre for i in free])
 
@@ -573,7 +592,7 @@ class DriveForm(MeasuredForm):
             # a simulation that diverged is no candidate
             return float(np.nan_to_num(left @ left, nan=np.inf) + np.sum(((u[free] - centre) / self._std[free]) ** 2))
 
-        starts = [u for u in (refit.u, given) if math.isfinite(cost(u))]
+        starts = [u for u in (fitted, given) if math.isfinite(cost(u))]
         return min((self._descend(u, free, self.observations, slopes=slopes, once=True)[0] for u in starts), key=cost)
 
     def _choose_errors(
@@ -590,10 +609,11 @@ class DriveForm(MeasuredForm):
         assert self._fields is not None
         columns, residual = self._columns(u, free, slopes)
         count, number = len(self.coordinates), self._fields[1]
-        always = np.concatenate([self.baseline, np.arange(count, columns.shape[1])]).astype(int)
+        mine = self._free(frozenset())
+        always = np.concatenate([mine, np.arange(count, columns.shape[1])])
         std = np.concatenate([self._std, np.ones(len(number))])[always]
-        field = np.concatenate([np.full(count, -1), number])[always]
-        own = [self.coordinates[i].centre - u[i] for i in self.baseline]
+        field = np.concatenate([self._field_of, number])[always]
+        own = [self.coordinates[i].centre - u[i] for i in mine]
         prior = Amplitudes(std, field, np.concatenate([own, self._centre(u, len(number))]))
         columns = columns[:, always]
         fields, noises = self._usual_fields(), self._noise_sizes()
@@ -636,7 +656,7 @@ class DriveForm(MeasuredForm):
     def _guess(self, free: np.ndarray, near: Refit | None) -> np.ndarray:
         """(n, free) derivatives as far as they are known: those of a similar refit, and signatures of what is new."""
         assert self._seen is not None
-        known = self._seen[:, : len(self.coordinates)].copy()
+        known = self._seen.copy()
         places, slopes = self._slopes[frozenset() if near is None else near.effects]
         known[:, places] = slopes
         return known[:, free]
@@ -667,8 +687,8 @@ class DriveForm(MeasuredForm):
             # A law that errs by more than noise says little of its constants. Held to noise and usual errors these
             # would leave their priors by many deviations, for places where wheels stick and slip and no slope holds.
             drives.about(u)
-            slopes = self.jacobian(u, free)[1]
             self._seen = self._see_inputs(u)
+            slopes = self._moved(u, free)
             self._take_fields()
             before = self.channel_errors, self.error_times_s
             found = self._choose_errors(u, free, slopes, (usual_jitter,))
@@ -677,7 +697,7 @@ class DriveForm(MeasuredForm):
             u, slopes, _ = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
             u = self._find_ground(u, free)
         if drives.noise_unlearnt:
-            drives.learn_noise(self._whole(u))
+            drives.learn_noise(u)
             # what is learnt of the noise is in what the drives hold from now on
             errors = self._errors_with(usual_jitter)
             self.observations = errors.at(errors.usual)
@@ -705,7 +725,7 @@ class DriveForm(MeasuredForm):
         """Begins where a rival's refit ended, with the noise that it has learnt."""
         self.drives.take_noise(own.drives)
         there = {c.key: amount for c, amount in zip(own.coordinates, own._base, strict=True)}
-        mine = {*self.baseline, *self.drives.ground}
+        mine = {*self._free(frozenset()), *self.drives.ground}
         self.start = np.array([there.get(c.key, 0.0) if i in mine else 0.0 for i, c in enumerate(self.coordinates)])
 
     def _take_errors(self, own: DriveForm) -> None:
@@ -722,16 +742,16 @@ class DriveForm(MeasuredForm):
         """A refit (coordinates,) with errors that are known, from the start or the model's own parameters as given."""
         given, own = self.start.copy(), [i for i in self.baseline if not self.coordinates[i].nuisance]
         # A rival's parameters make up for what it lacks; where this form has that, they are far off.
-        given[own] = 0.0
+        given[own], given[self.discrepancy] = 0.0, 0.0
         cost = self._cost(self.start, free, self.observations, None)
         rows = np.stack([self.start, given])
-        values = self.drives.predict(self._whole(rows))
+        values = self.drives.predict(rows)
         costs = [cost.chi2(cost.white(cost.wanted - v), row[free]) for v, row in zip(values, rows, strict=True)]
         u = rows[int(np.argmin(costs))]
         for _ in range(self.settings.most_rounds):
             self.drives.about(u)
-            slopes = self.jacobian(u, free)[1]
             self._seen = self._see_inputs(u)
+            slopes = self._moved(u, free)
             self._take_fields()
             found = self._linear(u, frozenset(), slopes).evidence(frozenset())[1]
             u, _, _ = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
@@ -747,7 +767,7 @@ class DriveForm(MeasuredForm):
         """Takes all derivatives at a refit (coordinates,) of the model as it is, and returns it."""
         self._see(u)
         self._take_fields()
-        self._slopes[frozenset()] = free, self.jacobian(u, free)[1]
+        self._slopes[frozenset()] = free, self._moved(u, free)
         self._ground = u[self.drives.ground]
         return u
 
@@ -757,11 +777,12 @@ class DriveForm(MeasuredForm):
         Of drives that are held out nothing counts but pose: their ground is mapped, not fitted.
 
         Args:
-          u: the place. free: what else may move, and is not moved.
+          u: the place. free: what else may move, and is not moved; discrepancy stays as it is.
         """
         ground, observations = self.drives.ground, self.observations
         if not len(ground):
             return u
+        free = free[self._field_of[free] < 0]
         self.progress("ground that nobody mapped", math.nan)
         value, slopes = self.jacobian(u, np.concatenate([free, ground]))
         pose = np.zeros(len(observations), bool)
@@ -792,10 +813,11 @@ class DriveForm(MeasuredForm):
             columns, number = self._fields_beside(frozenset(e for e, own in self.candidates.items() if own[0] in free))
             misfit = observations.whiten(columns)[self._fit] * sizes[0][number] * weight[:, None]
             offset = columns @ self._centre(u, len(number))
+        std = self._std if sizes is None else self._prior_std(sizes[0])
         factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
         centre = np.array([self.coordinates[i].centre for i in free])
         wanted = observations.value - offset
-        return _Cost(observations, self._fit, wanted, weight, misfit, factor, self._std[free], centre)
+        return _Cost(observations, self._fit, wanted, weight, misfit, factor, std[free], centre)
 
     def _descend(
         self,
@@ -824,13 +846,13 @@ class DriveForm(MeasuredForm):
         """
         settings, cost = self.settings, self._cost(u, free, observations, sizes)
         white, inner, wanted, std, centre = cost.white, cost.inner, cost.wanted, cost.std, cost.centre
+        # Scales of inputs are another rover's: their prior alone bounds them.
+        scaled = self._field_of[free] < 0
         low, high = self.drives.bounds(free)
 
         if slopes is None:
-            value, slopes = self.jacobian(u, free)
-        else:
-            value = self.predicted(u)
-        residual = white(wanted - value)
+            slopes = self.jacobian(u, free)[1]
+        residual = white(wanted - self.predicted(u))
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
         present_chi2 = cost.chi2(residual, u[free])
@@ -847,7 +869,7 @@ class DriveForm(MeasuredForm):
                         for d in dampings
                     ]
                     steps = [
-                        s * min(1.0, settings.longest_step / max(float(np.abs(s).max(initial=0.0)), 1e-300))
+                        s * min(1.0, settings.longest_step / max(float(np.abs(s[scaled]).max(initial=0.0)), 1e-300))
                         for s in steps
                     ]
                     # Shorter ones promise less: there is nothing left to gain where these slopes hold.
@@ -855,7 +877,7 @@ class DriveForm(MeasuredForm):
                         break
                     rows = np.repeat(u[None], trials, axis=0)
                     rows[:, free] = np.clip(u[free] + steps, low, high)
-                    residuals = [white(wanted - v) for v in self.drives.predict(self._whole(rows))]
+                    residuals = [white(wanted - v) for v in self.drives.predict(rows)]
                     reached = [cost.chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]
                     best = int(np.argmin(reached))
                     gained = present_chi2 - reached[best]
@@ -871,9 +893,9 @@ class DriveForm(MeasuredForm):
                     break
                 # slopes that are new earn new trust
                 damping = min(damping, 1.0)
-                slopes, guessed = self.jacobian(u, free)[1], False
+                slopes, guessed = self._moved(u, free), False
         except TimeUp:
-            if not set(self.baseline) >= set(free):
+            if not set(self._free(frozenset())) >= set(free):
                 raise
         jacobian = white(slopes)
         normal = inner(jacobian, jacobian) + np.diag(std**-2)

@@ -173,7 +173,8 @@ class DriveProblem:
         It is the model as given until then. Where that errs much, an instrument's scale there is one of other signals.
         """
         self._reference = self.origin()
-        self._reference[self.baseline], self._reference[self.ground] = u[self.baseline], u[self.ground]
+        for places in (self.baseline, self.ground, *self.inputs.values()):
+            self._reference[places] = u[places]
         self._rate, self._step_error, self._instruments = None, None, {}
 
     def _standing_shows(self) -> frozenset[int]:
@@ -236,6 +237,11 @@ class DriveProblem:
             self._stamped = self.observations, stamp_of_observations(self.observations)
         return self._stamped[1]
 
+    @property
+    def _there(self) -> Bench:
+        """The bench that simulates the place of `about`."""
+        return self._bench_for(self._reference[None])
+
     def _direction(self, c: Coordinate) -> np.ndarray:
         if is_instrument(c):
             return self._instrument(c)
@@ -244,7 +250,7 @@ class DriveProblem:
     def _instrument(self, c: Coordinate) -> np.ndarray:
         """(n,) what one unit of an instrument's error adds, see `about`."""
         if c.key not in self._instruments:
-            predicted = self._simulations(self.bench, self._reference[None], silent)[0]
+            predicted = self._simulations(self._there, self._reference[None], silent)[0]
             if c.name.startswith(USUAL):
                 direction = usual_errors(self.observations, predicted, self.rate)[c.name.removeprefix(USUAL)]
             else:
@@ -263,14 +269,15 @@ class DriveProblem:
 
     def _rate_there(self) -> np.ndarray:
         sides = []
-        interval = [run.every * run.model.timestep for run in self.bench.runs]
+        bench = self._there
+        interval = [run.every * run.model.timestep for run in bench.runs]
         for side in (-1.0, 1.0):
             series = [
                 dataclasses.replace(s, time=np.asarray(s.time) + side * interval[s.log])
                 for s in self.observations.series
             ]
             at = dataclasses.replace(self.observations, series=tuple(series))
-            simulated = self._run(self.bench, 1, self._values(self._reference[None]), silent, at)
+            simulated = self._run(bench, 1, self._values(self._reference[None]), silent, at)
             sides.append(from_first(simulated, self.observations)[0])
         apart = np.empty(len(self.observations))
         for s in self.observations.series:
@@ -287,7 +294,7 @@ class DriveProblem:
         # the integrator is of first order: halving the step halves its error, so that twice the change is all of it
         if self._step_error is None:
             there = self._reference[None]
-            coarse, fine = (self._simulations(b, there, silent)[0] for b in (self.bench, self.bench.halved()))
+            coarse, fine = (self._simulations(b, there, silent)[0] for b in (self._there, self._there.halved()))
             two_step_error = 2.0 * (fine - coarse)
             self._step_error = np.where(np.isfinite(two_step_error), two_step_error, 0.0)
         return self._step_error

@@ -268,13 +268,13 @@ def _in_drives(
         se = math.sqrt(len(held)) * float(np.std(held, ddof=1)) if len(held) > 1 else 0.0
         # without manoeuvres left out the evidence itself judges: it is what each measurement predicts of the next
         gained = (sum(held), se) if held else (after - before, 0.0)
-        residual = form.residual(refit.u)
+        residual = form.residual(form.bare(refit.u))
         # At the noise where the fit asks for no more of it than the stated size is uncertain.
         quiet = bool(np.max(posterior.noise) < 1.0 + DriveSettings().stated_spread)
         suggestion = _suggestion([part], 2.0 * (after - before), gained, answer.errors(form, residual), quiet, t.length)
         rows.append((suggestion, (t,)))
     rows.sort(key=lambda row: -(row[0].chi2 - FORMULA_SEARCH.penalty * row[0].length))
-    return answer.errors(form, form.residual(base.u)), rows, scored
+    return answer.errors(form, form.residual(form.bare(base.u))), rows, scored
 
 
 def _of_trial(trial: Trial, base: Fit) -> Row:

@@ -150,11 +150,11 @@ def comparison(problem: Problem, start: np.ndarray, refit: Refit, alone: np.ndar
 
     Args:
       problem: whose own form is told of. start: (n,) residuals of the model as given, as told. refit: of the form.
-      alone: (coordinates,) where the model alone predicts best; where the refit stands if None.
+      alone: (coordinates,) where the model alone predicts best; where the refit stands, without discrepancy, if None.
     """
     form = problem.own
     observations = form.observations
-    alone = refit.u if alone is None else alone
+    alone = form.bare(refit.u) if alone is None else alone
     residual = form.told(alone)
     rows = []
     for s in observations.series:
@@ -204,7 +204,7 @@ def parameter_table(form: MeasuredForm, u: np.ndarray, covariance: np.ndarray, p
     """Fitted values and standard deviations by effect and name, with units and the values that the model came with."""
     table: dict[str, Any] = {}
     for k, i in enumerate(places):
-        if i >= len(form.coordinates):
+        if i >= len(form.coordinates) or i in form.discrepancy:
             continue
         c = form.coordinates[i]
         entry = table.setdefault(c.effect, {"value": {}, "std": {}, "given": {}, "unit": {}})

@@ -108,6 +108,7 @@ class MeasuredForm(Form):
       observations: what was measured.
       coordinates: everything that a refit may move. baseline: places of those of the model as it is.
       candidates: places by effect that may be missing.
+      discrepancy: places of amounts of discrepancy that are simulated.
       words: fields of discrepancy, and what is "good to so many per cent" in the user's words.
       shares: what a field's size is "good to", over that size, where not 1.
       skipped: candidates that the time did not suffice to look at.
@@ -120,6 +121,7 @@ class MeasuredForm(Form):
     candidates: Mapping[str, np.ndarray]
     words: Mapping[str, str]
     shares: Mapping[str, float] = MappingProxyType({})
+    discrepancy: np.ndarray = np.zeros(0, int)
     skipped: tuple[str, ...] = ()
     writing: float = 0.0
 
@@ -180,6 +182,12 @@ class MeasuredForm(Form):
     def origin(self) -> np.ndarray:
         """(coordinates,) the model as given."""
         return np.zeros(len(self.coordinates))
+
+    def bare(self, u: np.ndarray) -> np.ndarray:
+        """A place (coordinates,) without its discrepancy: what the model itself predicts there."""
+        out = u.copy()
+        out[self.discrepancy] = 0.0
+        return out
 
     def residual(self, u: np.ndarray) -> np.ndarray:
         """(n,) whitened residuals, measured less predicted."""
