@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -253,12 +253,11 @@ class NoiseSize:
 
 
 class _At(NamedTuple):
-    """The log density of the sizes at a place: its value and gradient, what gives its negative Hessian, and the
-    amplitudes there."""
+    """The log density of the sizes at a place: its value, gradient and negative Hessian, and the amplitudes there."""
 
     value: float
     gradient: np.ndarray
-    hessian: Callable[[], np.ndarray]
+    hessian: np.ndarray
     mean: np.ndarray
     covariance: np.ndarray
 
@@ -431,38 +430,31 @@ def infer(
     # sizes are positive, and their posterior is nearer to a normal one in the logarithm: Laplace's method is used there
     x = np.log(np.concatenate([usual, np.ones(len(noises))] if start is None else [*start]))
     here = _density(x, gram, amplitudes, fields, noises)
-    hessian, exact = _positive(here.hessian()), True
     promised = np.inf
     for _ in range(SIZE_DESCENT.most_steps):
-        step = np.linalg.solve(hessian, here.gradient)
+        step = _newton_step(here)
         # What the quadratic model gains: gradient times step, less the half of it that the curvature takes back.
         promised = 0.5 * float(here.gradient @ step)
-        if promised >= SIZE_DESCENT.settled:
-            # in the logarithms a long step leaves the region in which the density is near its quadratic
-            step *= min(1.0, SIZE_DESCENT.longest / max(float(np.abs(step).max()), 1e-300))
-            for _ in range(30):
-                there = _density(x + step, gram, amplitudes, fields, noises)
-                if there.value >= here.value:
-                    break
-                step *= 0.5
-            else:
-                there = here  # no step gains: rounding is reached
-            gained, change = there.value - here.value, here.gradient - there.gradient
-            if there is not here:
-                x, here = x + step, there
-            if gained >= SIZE_DESCENT.settled:
-                # The curvature costs ten times what value and gradient do: it follows the gradients' change (Broyden,
-                # Fletcher, Goldfarb and Shanno 1970), and is taken anew where by these all has settled.
-                hessian, exact = _followed(hessian, step, change), False
-                continue
-        if exact:
+        if promised < SIZE_DESCENT.settled:
             break
-        hessian, exact = _positive(here.hessian()), True
+        # in the logarithms a long step leaves the region in which the density is near its quadratic
+        step *= min(1.0, SIZE_DESCENT.longest / max(float(np.abs(step).max()), 1e-300))
+        for _ in range(30):
+            there = _density(x + step, gram, amplitudes, fields, noises)
+            if there.value >= here.value:
+                break
+            step *= 0.5
+        else:
+            break  # no step gains: rounding is reached
+        gained = there.value - here.value
+        x, here = x + step, there
+        if gained < SIZE_DESCENT.settled:
+            break
     else:
         if promised > SIZE_DESCENT.bearable:
             raise EvidenceError(f"sizes of discrepancy and noise did not settle: a step still promises {promised:.2g}")
     # a size is never taken to be known worse than to a factor of 20: Laplace's volume would have no end there
-    hessian = _positive(here.hessian())
+    hessian = _positive(here.hessian)
     log_evidence = here.value + 0.5 * len(x) * _LOG_2PI - 0.5 * float(np.linalg.slogdet(hessian)[1])
     spread = np.sqrt(np.diag(np.linalg.inv(hessian)))
     many = len(fields)
@@ -527,12 +519,8 @@ def _climb(
     return best
 
 
-def _followed(hessian: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """A negative Hessian that a step's change of the gradient corrects; as it was where that curves upward."""
-    along, bent = hessian @ step, float(step @ change)
-    if bent <= 0.1 * float(step @ step):
-        return hessian
-    return hessian - np.outer(along, along) / float(step @ along) + np.outer(change, change) / bent
+def _newton_step(here: _At) -> np.ndarray:
+    return np.linalg.solve(_positive(here.hessian), here.gradient)
 
 
 def _positive(hessian: np.ndarray) -> np.ndarray:
@@ -568,8 +556,7 @@ def _condition(
     # standardised by the prior, the matrix is 1 or more in every direction: an amplitude that the data do not see, or a
     # discrepancy of size zero, cannot make it singular
     factor = linalg.cholesky(np.eye(k) + scale[:, None] * inner * scale, lower=True, check_finite=False)
-    covariance = linalg.lapack.dpotri(factor, lower=1)[0] if k else np.zeros((0, 0))
-    covariance = np.tril(covariance) + np.tril(covariance, -1).T
+    covariance = linalg.cho_solve((factor, True), np.eye(k), check_finite=False)
     mean = covariance @ downhill
     # log |V| by Sylvester's identity: the determinant of the small matrix in place of one as large as the data.
     log_det = 2.0 * float(np.sum(np.log(np.diag(factor))))
@@ -603,29 +590,47 @@ def _density(
     trace = np.empty(many + groups)
     power = np.empty(many + groups)
     trace[:many], power[:many] = member @ np.diag(absorbed), member @ mean**2
+    weight = mean[:, None] * member.T  # (k, fields): V^-1/2 of each field's share, in standardised amplitudes
     own = np.empty((k, groups))
     seen = scale[:, None] * gram.matrix[:, :k, :k] * scale / noise[:, None, None] ** 2
+    filtered = inverse @ seen
     place = shift + scale * mean
     for c in range(groups):
         a = gram.matrix[c]
         left = a[:k, k] - a[:k, :k] @ place
         own[:, c] = scale * left / noise[c] ** 2
         power[many + c] = (a[k, k] - place @ a[:k, k] - place @ left) / noise[c] ** 2
-        trace[many + c] = gram.count[c] - np.sum(inverse * seen[c])
+        trace[many + c] = gram.count[c] - np.trace(filtered[c])
+    quadratic = np.empty((many + groups, many + groups))
+    traces = np.empty_like(quadratic)
+    back = inverse @ own
+    quadratic[:many, :many] = weight.T @ absorbed @ weight
+    quadratic[:many, many:] = weight.T @ back
+    quadratic[many:, many:] = np.diag(power[many:]) - own.T @ back
+    # The trace of a product of two blocks of a symmetric matrix is the sum of its squared entries between them.
+    traces[:many, :many] = member @ absorbed**2 @ member.T
+    # Traces of products of two filters: one product of matrices whose rows are the filters' entries.
+    traces[many:, many:] = filtered.reshape(groups, k * k) @ filtered.transpose(0, 2, 1).reshape(groups, k * k).T
+    traces[:many, many:] = member @ np.einsum("gij,ij->gi", filtered, inverse).T
+    for c in range(groups):
+        # V^-1 V_c is the identity less the filter; squared, it leaves the count less twice the filter's trace, beside
+        # the above.
+        traces[many + c, many + c] += gram.count[c] - 2.0 * np.trace(filtered[c])
+    quadratic[many:, :many], traces[many:, :many] = quadratic[:many, many:].T, traces[:many, many:].T
     gradient = power - trace
-    curved = np.zeros(many + groups)  # by the priors
+    hessian = 4.0 * quadratic - 2.0 * traces + np.diag(2.0 * (trace - power))
     for i, field in enumerate(fields):
         if field.log_std > 0.0:
             off = (x[i] - math.log(field.usual)) / field.log_std
             value -= 0.5 * off**2 + math.log(field.log_std) + 0.5 * _LOG_2PI
             gradient[i] -= off / field.log_std
-            curved[i] = 1.0 / field.log_std**2
+            hessian[i, i] += 1.0 / field.log_std**2
             continue
         # Half-normal prior of tau with the Jacobian of its logarithm.
         share = (tau[i] / field.usual) ** 2
         value += 0.5 * math.log(2.0 / math.pi) + x[i] - math.log(field.usual) - 0.5 * share
         gradient[i] += 1.0 - share
-        curved[i] = 2.0 * share
+        hessian[i, i] += 2.0 * share
     for c, prior in enumerate(noises):
         i = many + c
         if prior.freedom > 0.0:
@@ -634,32 +639,9 @@ def _density(
             value += math.log(2.0) + half * math.log(half) - math.lgamma(half) - 2.0 * half * x[i]
             value -= half * math.exp(-2.0 * x[i])
             gradient[i] += 2.0 * half * (math.exp(-2.0 * x[i]) - 1.0)
-            curved[i] = 4.0 * half * math.exp(-2.0 * x[i])
+            hessian[i, i] += 4.0 * half * math.exp(-2.0 * x[i])
         else:
             value -= 0.5 * (x[i] / prior.log_std) ** 2 + math.log(prior.log_std) + 0.5 * _LOG_2PI
             gradient[i] -= x[i] / prior.log_std**2
-            curved[i] = 1.0 / prior.log_std**2
-
-    def hessian() -> np.ndarray:
-        """The negative Hessian here: the rest is needed for each step, this for few of them."""
-        weight = mean[:, None] * member.T  # (k, fields): V^-1/2 of each field's share, in standardised amplitudes
-        filtered = inverse @ seen
-        quadratic = np.empty((many + groups, many + groups))
-        traces = np.empty_like(quadratic)
-        back = inverse @ own
-        quadratic[:many, :many] = weight.T @ absorbed @ weight
-        quadratic[:many, many:] = weight.T @ back
-        quadratic[many:, many:] = np.diag(power[many:]) - own.T @ back
-        # The trace of a product of two blocks of a symmetric matrix is the sum of its squared entries between them.
-        traces[:many, :many] = member @ absorbed**2 @ member.T
-        # Traces of products of two filters: one product of matrices whose rows are the filters' entries.
-        traces[many:, many:] = filtered.reshape(groups, k * k) @ filtered.transpose(0, 2, 1).reshape(groups, k * k).T
-        traces[:many, many:] = member @ np.einsum("gij,ij->gi", filtered, inverse).T
-        for c in range(groups):
-            # V^-1 V_c is the identity less the filter; squared, it leaves the count less twice the filter's trace,
-            # beside the above.
-            traces[many + c, many + c] += gram.count[c] - 2.0 * np.trace(filtered[c])
-        quadratic[many:, :many], traces[many:, :many] = quadratic[:many, many:].T, traces[:many, many:].T
-        return 4.0 * quadratic - 2.0 * traces + np.diag(2.0 * (trace - power) + curved)
-
+            hessian[i, i] += 1.0 / prior.log_std**2
     return _At(value, gradient, hessian, place, scale[:, None] * inverse * scale)

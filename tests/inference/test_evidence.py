@@ -83,7 +83,7 @@ def test_gradient_and_hessian_are_derivatives(drawn):
     slope = np.array([(at(x + h).value - at(x - h).value) / 2e-5 for h in step])
     bend = np.array([(at(x - h).gradient - at(x + h).gradient) / 2e-5 for h in step])
     np.testing.assert_allclose(at(x).gradient, slope, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(at(x).hessian(), bend, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(at(x).hessian, bend, rtol=1e-5, atol=1e-5)
 
 
 def test_posterior_is_that_of_the_dense_gaussian(drawn):

@@ -200,9 +200,10 @@ class DriveForm(MeasuredForm):
             self.progress("signatures of unmapped ground", math.nan)
             seen[:, ground] = self.jacobian(u, ground)[1]
         self.progress("signatures of unknown inputs", math.nan)
-        # to first order in inputs of a hundredth of what is usual
+        # Over a hundredth of what is usual; of the two sides the flatter, since the other has met a jump.
         steps = 1e-3 * self._std[self.discrepancy]
-        seen[:, self.discrepancy] = self._changes(u, self.discrepancy, steps) / steps
+        sides = [self._changes(u, self.discrepancy, s) / s for s in (steps, -steps)]
+        seen[:, self.discrepancy] = np.where(np.abs(sides[0]) < np.abs(sides[1]), *sides)
         return seen
 
     def _see(self, u: np.ndarray) -> None:

@@ -225,7 +225,8 @@ def test_rows_of_the_waterfall_fit_a_phone():
 
 def test_a_factor_on_the_models_own_values_is_recorded_as_such():
     known = dataclasses.replace(Coordinate("soil", "n", 1.0, 0.1, 0.5, 2.0), unit="1")
-    form = SimpleNamespace(coordinates=(known, dataclasses.replace(known, name="cohesion", factor=True)))
+    coordinates = (known, dataclasses.replace(known, name="cohesion", factor=True))
+    form = SimpleNamespace(coordinates=coordinates, discrepancy=())
     table = parameter_table(cast(Any, form), np.zeros(2), np.eye(2), np.arange(2))
     assert table["soil"]["unit"] == {"n": "1", "cohesion": FACTOR_UNIT}
 
