@@ -930,8 +930,9 @@ class _Cost:
 
     def inner(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Products of whitened columns under the covariance of noise and discrepancy."""
-        # Woodbury's identity: the covariance of the data is as large as they are, and is never made.
-        return a.T @ b - (self.misfit.T @ a).T @ linalg.cho_solve(self.factor, self.misfit.T @ b)
+        # Woodbury's identity: the covariance of the data is as large as they are, and is never made. It is applied to
+        # what is narrower, which saves most of the work where that is a residual.
+        return a.T @ (b - self.misfit @ linalg.cho_solve(self.factor, self.misfit.T @ b))
 
     def chi2(self, residual: np.ndarray, x: np.ndarray) -> float:
         """Of a whitened residual (fitted,) at a place (free,); infinite where the simulation diverged."""
