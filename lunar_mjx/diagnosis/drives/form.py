@@ -182,16 +182,6 @@ class DriveForm(MeasuredForm):
             slopes[:, steep] = np.where(np.isfinite(other) & (np.abs(other) < np.abs(first)), other, first)
         return value, slopes
 
-    def _moved(self, u: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """(n, free) derivatives at a place (coordinates,); those by discrepancy where they were last taken.
-
-        They are as many as all others, and change less: discrepancy is small wherever a descent leads.
-        """
-        own = self._field_of[free] < 0
-        slopes = np.zeros((len(self.observations), len(free))) if self._seen is None else self._seen[:, free]
-        slopes[:, own] = self.jacobian(u, free[own])[1]
-        return slopes
-
     def _see_inputs(self, u: np.ndarray) -> np.ndarray:
         """(n, coordinates) derivatives by unmapped ground and unknown inputs at a place; others are 0."""
         ground = self.drives.ground
@@ -689,7 +679,7 @@ class DriveForm(MeasuredForm):
             # would leave their priors by many deviations, for places where wheels stick and slip and no slope holds.
             drives.about(u)
             self._seen = self._see_inputs(u)
-            slopes = self._moved(u, free)
+            slopes = self.jacobian(u, free)[1]
             self._take_fields()
             before = self.channel_errors, self.error_times_s
             found = self._choose_errors(u, free, slopes, (usual_jitter,))
@@ -752,7 +742,7 @@ class DriveForm(MeasuredForm):
         for _ in range(self.settings.most_rounds):
             self.drives.about(u)
             self._seen = self._see_inputs(u)
-            slopes = self._moved(u, free)
+            slopes = self.jacobian(u, free)[1]
             self._take_fields()
             found = self._linear(u, frozenset(), slopes).evidence(frozenset())[1]
             u, _, _ = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
@@ -768,7 +758,7 @@ class DriveForm(MeasuredForm):
         """Takes all derivatives at a refit (coordinates,) of the model as it is, and returns it."""
         self._see(u)
         self._take_fields()
-        self._slopes[frozenset()] = free, self._moved(u, free)
+        self._slopes[frozenset()] = free, self.jacobian(u, free)[1]
         self._ground = u[self.drives.ground]
         return u
 
@@ -894,7 +884,7 @@ class DriveForm(MeasuredForm):
                     break
                 # slopes that are new earn new trust
                 damping = min(damping, 1.0)
-                slopes, guessed = self._moved(u, free), False
+                slopes, guessed = self.jacobian(u, free)[1], False
         except TimeUp:
             if not set(self._free(frozenset())) >= set(free):
                 raise
