@@ -174,13 +174,16 @@ class DriveForm(MeasuredForm):
         """
         value, slopes = self.drives.jacobian(u, free)
         slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-        reach = np.abs(slopes) * self._std[free] / self.observations.sigma()[:, None]
-        steep = np.flatnonzero(reach.max(axis=0, initial=0.0) > DRIVE_REFIT.steep)
+        steep = self._steep(slopes, free)
         if len(steep):
             other = self.drives.jacobian(u, free[steep], side=-1)[1]
-            first = slopes[:, steep]
-            slopes[:, steep] = np.where(np.isfinite(other) & (np.abs(other) < np.abs(first)), other, first)
+            slopes[:, steep] = _flatter(slopes[:, steep], other)
         return value, slopes
+
+    def _steep(self, slopes: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Which of some coordinates' slopes (n, m) say more of a reading than any can be true."""
+        reach = np.abs(slopes) * self._std[which] / self.observations.sigma()[:, None]
+        return np.flatnonzero(reach.max(axis=0, initial=0.0) > DRIVE_REFIT.steep)
 
     def _see_inputs(self, u: np.ndarray) -> np.ndarray:
         """(n, coordinates) derivatives by unmapped ground and unknown inputs at a place; others are 0."""
@@ -190,10 +193,14 @@ class DriveForm(MeasuredForm):
             self.progress("signatures of unmapped ground", math.nan)
             seen[:, ground] = self.jacobian(u, ground)[1]
         self.progress("signatures of unknown inputs", math.nan)
-        # Over a hundredth of what is usual; of the two sides the flatter, since the other has met a jump.
+        # to first order in inputs of a hundredth of what is usual
         steps = 1e-3 * self._std[self.discrepancy]
-        sides = [self._changes(u, self.discrepancy, s) / s for s in (steps, -steps)]
-        seen[:, self.discrepancy] = np.where(np.abs(sides[0]) < np.abs(sides[1]), *sides)
+        slopes = self._changes(u, self.discrepancy, steps) / steps
+        steep = self._steep(slopes, self.discrepancy)
+        if len(steep):
+            back = -steps[steep]
+            slopes[:, steep] = _flatter(slopes[:, steep], self._changes(u, self.discrepancy[steep], back) / back)
+        seen[:, self.discrepancy] = slopes
         return seen
 
     def _see(self, u: np.ndarray) -> None:
@@ -929,6 +936,11 @@ class _Cost:
         if not np.isfinite(residual).all():
             return np.inf
         return float(self.inner(residual, residual)) + float(np.sum(((x - self.centre) / self.std) ** 2))
+
+
+def _flatter(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Of slopes to two sides the flatter ones, reading by reading."""
+    return np.where(np.isfinite(other) & (np.abs(other) < np.abs(one)), other, one)
 
 
 def _promised(step: np.ndarray, normal: np.ndarray, downhill: np.ndarray) -> float:
