@@ -4,8 +4,9 @@
     python benchmarks/rl/kept.py runs/sac/ladder-1.json --name ladder-1-sac      # apart from other learners
     python benchmarks/rl/kept.py runs/a/large-td3.json runs/b/large-td3.json     # seeds of both runs
     python benchmarks/rl/kept.py --ship runs/rung/ladder-3_seed0.npz             # to models/, with a card
+    python benchmarks/rl/kept.py --ship runs/escape/field/policy.npz             # to models/, too
 
-A policy is shipped from the folder of its run, whose record lies beside it.
+A policy is shipped from the folder of its run, whose record lies beside it, or a folder above it (part `escape`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from harness import KEPT, percent, reached, read, say, when, write
+from harness import KEPT, ends, percent, reached, read, say, when, write
 
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.envs.ladder.rungs import get_rung
@@ -33,6 +34,8 @@ ALIKE = ("rover", "training", "environment", "train", "learner", "begin_with")
 """What runs have alike whose seeds stand side by side."""
 MOST_BYTES = 2_000_000
 """Of a shipped policy."""
+SOILS = {"closed form": "consistent", "stress integral": "field"}
+"""Models of the soil, as rows of part `escape` begin with them, and the preset of each."""
 
 
 def rounded(value: Any) -> Any:
@@ -112,6 +115,8 @@ def large(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def ship(path: Path) -> Path:
     """Copies a policy that measure.py wrote into its rover's folder and writes its card; returns the copy."""
     assert path.stat().st_size < MOST_BYTES, "the policy is too large to ship"
+    if load_policy(path).environment["options"]["task"] == "escape":
+        return ship_escape(path)
     policy, record = load_policy(path), read(path.with_name(f"{path.stem.partition('_seed')[0]}.json"))
     options = policy.environment["options"]
     run = next(r for r in record["seeds"] if r["seed"] == policy.notes["seed"])
@@ -146,6 +151,45 @@ def ship(path: Path) -> Path:
     card = Path(__file__).with_name(f"card_{'rung' if task == 'ladder' else 'large'}.txt").read_text(encoding="utf-8")
     to = shipped("models") / rover / (f"{record['training']}.npz" if task == "ladder" else "policy.npz")
     to.with_name("POLICY.md" if to.stem == "policy" else f"{to.stem}.md").write_text(card.format(**words), "utf-8")
+    return Path(shutil.copyfile(path, to))
+
+
+def ship_escape(path: Path, home: Path | None = None) -> Path:
+    """Does the same for a policy of part `escape`, which `lunar-mjx train` wrote into a folder beside the record.
+
+    Args:
+      path: of the policy. home: folder of the rovers' folders; that of the models that ship if left out.
+    """
+    policy, record, run = load_policy(path), read(path.parents[1] / "escape.json"), read(path.with_name("curve.json"))
+    options, rows = policy.environment["options"], record["rows"]
+    assert run["rows"][-1]["steps"] == policy.notes["steps"], f"{path}: not the policy that the training ended with"
+    soil = next(name for name, preset in SOILS.items() if preset == options["preset"])
+    own, rover = f"TD3 of the {soil}", options.get("rover", "luvmi_x")
+    scores = {
+        agent: [rows[f"{name}, {agent}"]["score"] for name in SOILS]
+        for agent in dict.fromkeys(name.partition(", ")[2] for name in rows)
+    }
+    words = {
+        "record": record,
+        "run": run,
+        "rover": rover,
+        "training": run["training"],
+        "options": json.dumps(options),
+        "preset": options["preset"],
+        "soil": soil,
+        "notes": policy.notes,
+        "size": path.stat().st_size / 1e6,
+        "episodes": scores[own][0]["episodes"],
+        "columns": " | ".join(SOILS),
+        "ends": "; ".join(f"{name} {json.dumps(ends(s))}" for name, s in zip(SOILS, scores[own], strict=True)),
+        "rows": "\n".join(
+            f"| {name} | {' | '.join(map(percent, row))} |"
+            for name, row in {"this policy": scores.pop(own), **scores}.items()
+        ),
+    }
+    card = Path(__file__).with_name("card_escape.txt").read_text(encoding="utf-8")
+    to = (home or shipped("models")) / rover / f"{run['training']}.npz"
+    to.with_suffix(".md").write_text(card.format(**words), "utf-8")
     return Path(shutil.copyfile(path, to))
 
 

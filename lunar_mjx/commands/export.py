@@ -24,7 +24,7 @@ from lunar_mjx.errors import bad_input
 
 def policy(
     agent: Annotated[
-        str, typer.Argument(help="policy.npz, or a shipped policy: luvmi_x, viper, luvmi_x/ladder-3.")
+        str, typer.Argument(help="policy.npz, or a shipped policy: luvmi_x, viper, luvmi_x/ladder-3, luvmi_x/escape.")
     ] = "luvmi_x",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("runs/export"),
     only: Annotated[list[str] | None, typer.Option(help="onnx or stablehlo; both if left out.")] = None,

@@ -136,8 +136,8 @@ def train(
 AgentArgument = Annotated[
     str,
     typer.Argument(
-        help="policy.npz, a shipped policy (luvmi_x, viper, luvmi_x/ladder-3), or zero, random, scripted, rocking, "
-        "reactive, mapper, planner."
+        help="policy.npz, a shipped policy (luvmi_x, viper, luvmi_x/ladder-3, luvmi_x/escape), or zero, random, "
+        "scripted, rocking, reactive, mapper, planner."
     ),
 ]
 AgentOption = Annotated[str | None, typer.Option("--agent", help="The same as an option, for agents without a policy.")]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.model import make_model
 
 ROOT = Path(__file__).parents[2]
@@ -262,6 +264,33 @@ def test_the_page_quotes_how_fast_pictures_are_and_what_they_are_worth():
         assert rows["student"] > 0.95 * rows["teacher"]
         points[name] = round(rows["student"] - rows["blanked"])
     assert f"The picture is worth {points['rung 3']} points there and {points['large']} on `large`" in PAGE
+
+
+def test_the_page_and_the_card_of_the_shipped_policy_quote_who_gets_out_of_holes(tmp_path):
+    from harness import EXPERIMENTS, percent
+    from kept import SOILS, ship_escape
+
+    found, page = record("escape"), (ROOT / "docs" / "how_to" / "escape.md").read_text(encoding="utf-8")
+    rows = {name: row["score"] for name, row in found["rows"].items()}
+    assert list(rows) == list(EXPERIMENTS["escape"]["rows"]) and {s["episodes"] for s in rows.values()} == {256}
+    assert found["commit"] in page
+    for agent in ("zero", "random", "scripted", "rocking", "TD3 of the closed form", "TD3 of the stress integral"):
+        assert f"| {' | '.join(percent(rows[f'{soil}, {agent}']) for soil in SOILS)} |" in page
+    assert rows["stress integral, TD3 of the closed form"]["success"] == 0.0, "what does not transfer"
+
+    shipped = ROOT / "models" / "luvmi_x" / "escape.npz"
+    notes = load_policy(shipped).notes
+    assert f"TD3 with the stress integral, {notes['steps']:,} steps, {notes['elapsed_s']:.0f} s" in page
+    run = tmp_path / "field"
+    run.mkdir()
+    shutil.copyfile(shipped, run / "policy.npz")
+    told = {"training": "escape", "wall_s": 272.9, "rows": [{"steps": notes["steps"]}]}
+    (run / "curve.json").write_text(json.dumps(told))
+    (tmp_path / "escape.json").write_text(json.dumps(found))
+    (tmp_path / "luvmi_x").mkdir()
+    again = ship_escape(run / "policy.npz", tmp_path)
+    assert again.read_bytes() == shipped.read_bytes()
+    assert again.with_suffix(".md").read_text("utf-8") == shipped.with_suffix(".md").read_text("utf-8")
 
 
 def test_rung_1_is_kept_by_learner():
