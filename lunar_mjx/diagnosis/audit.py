@@ -135,7 +135,7 @@ def _sizes(form: DriveForm, base: Refit) -> dict[str, float]:
 def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, seed: int) -> dict[str, Any]:
     # Seeded by its number, a case is the same whichever call of the audit comes to it.
     rng = np.random.default_rng([seed, number])
-    truth, u, amount = NULL, base.u.copy(), 0.0
+    truth, u, amount = NULL, form.bare(base.u), 0.0
     if number % 2 and sizes:
         names = sorted(sizes)
         truth = names[int(rng.integers(len(names)))]
@@ -149,7 +149,7 @@ def _case(form: DriveForm, base: Refit, sizes: dict[str, float], number: int, se
     case: dict[str, Any] = {"truth": truth, "amount": amount}
     if not np.isfinite(clean).all():
         return {**case, "verdict": "", "effects": [], "outcome": "diverged"}
-    drawn = form.measuring(clean + draw_noise(form.drives.observations, rng), base.u)
+    drawn = form.measuring(clean + draw_noise(form.drives.observations, rng), form.bare(base.u))
     settings = form.settings
     try:
         model_search = search([drawn], settings.most_refits, settings.most_terms, settings.window)

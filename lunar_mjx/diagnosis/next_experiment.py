@@ -159,7 +159,8 @@ class _Knowledge:
 
     def __init__(self, form: DriveForm, run: Run, names: Sequence[str]):
         base = kept_start(run, form, frozenset())
-        base = form.refit(frozenset(), None, None).u if base is None else base
+        # Discrepancy is no part of a hypothesis: a plan that told amounts of it apart would tell no effects apart.
+        base = form.bare(form.refit(frozenset(), None, None).u if base is None else base)
         kept = run.load(HYPOTHESES_FILE) or {}
         self.place: dict[str, dict[str, float]] = {}
         for name in names:
@@ -168,6 +169,7 @@ class _Knowledge:
             if entry is not None:
                 for i, c in enumerate(form.coordinates):
                     u[i] = entry["u"].get(c.key, u[i])
+                u = form.bare(u)
             elif name != NOTHING:
                 places = form.candidates[name]
                 low, high = form.drives.bounds(places)

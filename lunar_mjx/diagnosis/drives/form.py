@@ -123,22 +123,20 @@ class DriveForm(MeasuredForm):
             for i in places:
                 if self.coordinates[i].amplitude:
                     self._std[i] = self.effect_size(self.coordinates[i])
-        # Variances add up to one, so that a field's size means the same whatever share of it is a log's own.
+        # (discrepancy,) standard deviations of a log's amounts at size 1: what logs share and what each has for itself
         sizes = np.array([usual.size(label, q) for label in labels for q in FOLLOWS[label]])
-        self._std[self.discrepancy] = sizes / np.array([self.coordinates[i].scale for i in self.discrepancy])
-        self._own_size = math.sqrt(settings.own_share) * self._std[self.discrepancy]
-        self._std[self.discrepancy] *= math.sqrt(1.0 - settings.own_share)
+        self._whole_size = sizes / np.array([self.coordinates[i].scale for i in self.discrepancy])
         kinds = [error_kind(s.channel) for s in self.observations.series]
         self.noise_names = tuple(dict.fromkeys(kinds))
         self._group = np.empty(len(self.observations), int)
         for s, name in zip(self.observations.series, kinds, strict=True):
             self._group[s.start : s.stop] = self.noise_names.index(name)
         self._fit = self.observations.in_split("fit")
+        fitted = [bool(self._fit[part.start]) for part in self.observations.of_log.values()]
+        self._share = _Share.of(settings.own_share, fitted)
+        self._std[self.discrepancy] = math.sqrt(self._share.mean) * self._whole_size
         self._seen: np.ndarray | None = None  # (n, coordinates) derivatives at the base, SI
         self._secants: np.ndarray | None = None  # (n, coordinates) changes by a usual amount there, over that amount
-        # (n, m) SI columns at size 1, (m,) field of each; the last ones are those of the ground
-        self._fields: tuple[np.ndarray, np.ndarray] | None = None
-        self._beside: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}  # the same beside a refit's effects
         self.jitter_s = USUAL_ERRORS.jitter_s
         kinds = [usual_kind(c) for c in self.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
@@ -193,8 +191,8 @@ class DriveForm(MeasuredForm):
             self.progress("signatures of unmapped ground", math.nan)
             seen[:, ground] = self.jacobian(u, ground)[1]
         self.progress("signatures of unknown inputs", math.nan)
-        # to first order in inputs of a hundredth of what is usual
-        steps = 1e-3 * self._std[self.discrepancy]
+        # to first order in inputs of a fiftieth of what is usual
+        steps = 1e-3 * self._whole_size
         slopes = self._changes(u, self.discrepancy, steps) / steps
         steep = self._steep(slopes, self.discrepancy)
         if len(steep):
@@ -245,7 +243,6 @@ class DriveForm(MeasuredForm):
             places = self.candidates[name]
             self._seen[:, places], self._secants[:, places] = seen[:, places], secants[:, places]
         self.skipped = tuple(name for name in self.skipped if name in skipped)
-        self._take_fields()
 
     def _tamed(self, places: np.ndarray, slopes: np.ndarray, secants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives (n, m) and secants (n, m) of candidates, where either tells nothing the other in its place.
@@ -271,15 +268,16 @@ class DriveForm(MeasuredForm):
         Args:
           u, free, slopes: as for `_columns`. found: sizes of discrepancy and noise there.
         """
-        assert self._seen is not None and self._secants is not None and self._fields is not None
-        columns, residual = self._columns(u, free, slopes)
-        count, number = len(self.coordinates), self._fields[1]
+        assert self._seen is not None and self._secants is not None
+        columns, residual, number = self._columns(u, free, slopes)
+        count = len(self.coordinates)
         scale = np.concatenate([self._prior_std(found.tau), found.tau[number]])
         whole = np.column_stack([columns * scale, self._secants * self._std, residual])
         white = self.observations.whiten(whole)[self._fit] / found.noise[self._group[self._fit], None]
         always = np.concatenate([self._free(frozenset()), np.arange(count, len(scale))]).astype(int)
         # What the rest takes up, the priors counted as observations.
         rest = white[:, always]
+        white[:, -1] -= rest @ (self._prior_mean(u, len(number)) / scale)[always]
         factor = linalg.cho_factor(np.eye(len(always)) + rest.T @ rest)
         left = white - rest @ linalg.cho_solve(factor, rest.T @ white)
 
@@ -317,46 +315,30 @@ class DriveForm(MeasuredForm):
         change[~np.isfinite(change).all(axis=1)] = 0.0
         return change.T
 
-    def _take_fields(self) -> None:
-        """Makes the columns of all fields from the signatures as they are now."""
-        self._fields, self._beside = self._field_columns(self.observations), {}
-
-    def _fields_beside(self, effects: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Columns (n, m) of all fields beside a refit's effects, SI units at size 1, and the field (m,) of each.
-
-        Where an effect has its own refit, what is usual has none of it: the difference of its derivatives here and
-        there would be one more freedom, which no other hypothesis has.
-        """
-        assert self._fields is not None
-        if not effects:
-            return self._fields
-        if effects not in self._beside:
-            self._beside[effects] = self._field_columns(self.observations, effects)
-        return self._beside[effects]
-
     def _field_columns(
-        self, observations: Observations, but: frozenset[str] = frozenset()
+        self, observations: Observations, inputs: np.ndarray, but: frozenset[str] = frozenset()
     ) -> tuple[np.ndarray, np.ndarray]:
         """Columns (n, m) of all fields at size 1, SI units, and the field (m,) of each: of every log for itself.
 
-        They are turned so that few are left which the observations' noise does not hide. What all logs have in common
-        are coordinates, which a refit moves: a linear estimate of them would hold for no more than a per cent or two.
+        They are turned so that few are left which the observations' noise does not hide. The mean over the fitted logs
+        is a coordinate, which a refit moves: a linear estimate of it would hold for no more than a per cent or two.
 
         Args:
-          observations: with the channels' errors. but: effects that are no part of what is usual.
+          observations: with the channels' errors. inputs: (n, discrepancy) derivatives there.
+          but: effects that are no part of what is usual: where an effect has its own refit, the difference of its
+            derivatives here and there would be one more freedom, which no other hypothesis has.
         """
         assert self._seen is not None
-        settings = self.settings
+        settings, share = self.settings, self._share
         columns, number = [np.zeros((len(observations), 0))], [np.zeros(0, int)]
+        # (n, amounts) what each log has of every amount beside the mean: rows of a log are alike
+        apart = np.zeros((len(observations), share.apart.shape[1]))
+        for part, own in zip(observations.of_log.values(), share.apart, strict=True):
+            apart[part] = own
         for k in range(len(self.words)):
             own = self._field_of[self.discrepancy] == k
-            mine = self._seen[:, self.discrepancy[own]] * self._own_size[own]
-            parts = []
-            for part in observations.of_log.values():
-                alone = np.zeros_like(mine)
-                alone[part] = mine[part]
-                parts.append(alone)
-            whole = np.column_stack(parts)
+            mine = inputs[:, own] * self._whole_size[own]
+            whole = (apart[:, :, None] * mine[:, None, :]).reshape(len(mine), -1)
             turned = whole @ rotation(observations.whiten(whole), settings.least_length / settings.unlisted_discrepancy)
             columns.append(turned)
             number.append(np.full(turned.shape[1], k))
@@ -381,19 +363,36 @@ class DriveForm(MeasuredForm):
         mean[len(mean) - len(ground) :] = -u[ground]
         return mean
 
+    def _prior_mean(self, u: np.ndarray, count: int) -> np.ndarray:
+        """(coordinates + m,) prior mean of all that `_columns` has columns of, relative to a place; see `_centre`."""
+        return np.concatenate([[c.centre for c in self.coordinates] - u, self._centre(u, count)])
+
+    def _inputs(self, free: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+        """(n, discrepancy) derivatives by discrepancy among those (n, free) of some coordinates."""
+        return slopes[:, self._field_of[free] >= 0]
+
     def _columns(
         self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, effects: frozenset[str] = frozenset()
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Derivatives (n, k) by all that hypotheses hold, and residuals (n,), SI units, around a place (coordinates,).
 
         Args:
-          u: the place. free: coordinates whose derivatives (n, free) there are the `slopes`; others keep signatures.
-          effects: of a refit.
+          u: the place. free: coordinates, discrepancy among them, whose derivatives (n, free) there are the `slopes`;
+            others keep signatures. effects: of a refit.
+
+        Returns:
+          The derivatives, the residuals, and the field (m,) of each of the last columns.
         """
         assert self._seen is not None
         seen = self._seen.copy()
         seen[:, free] = slopes
-        return np.column_stack([seen, self._fields_beside(effects)[0]]), self.observations.value - self.predicted(u)
+        residual = self.observations.value - self.predicted(u)
+        # Of a mean over other logs a held-out one is expected to have a share alone.
+        held_out, inputs, known = ~self._fit, self._inputs(free, slopes), self._share.known
+        residual[held_out] += (1.0 - known) * inputs[held_out] @ u[self.discrepancy]
+        seen[np.ix_(held_out, self.discrepancy)] *= known
+        columns, number = self._field_columns(self.observations, inputs, effects)
+        return np.column_stack([seen, columns]), residual, number
 
     def _linear(self, u: np.ndarray, effects: frozenset[str], slopes: np.ndarray, unkept: float = 0.0) -> Linear:
         """Everything that hypotheses need around a place (coordinates,) with some effects.
@@ -401,8 +400,9 @@ class DriveForm(MeasuredForm):
         Args:
           u: the place. effects: those of the refit. slopes: (n, free) derivatives there. unkept: see `Linear`.
         """
-        settings, count, field_of = self.settings, len(self.coordinates), self._fields_beside(effects)[1]
-        columns, residual = map(self.observations.whiten, self._columns(u, self._free(effects), slopes, effects))
+        settings, count = self.settings, len(self.coordinates)
+        columns, residual, field_of = self._columns(u, self._free(effects), slopes, effects)
+        columns, residual = self.observations.whiten(columns), self.observations.whiten(residual)
         std = np.concatenate([self._std, np.ones(len(field_of))])
         low, high = np.full(len(std), -np.inf), np.full(len(std), np.inf)
         # Where the step's error or a reading before its command would have to be more than all there is, the model is
@@ -411,11 +411,7 @@ class DriveForm(MeasuredForm):
         bounded = np.concatenate([self.baseline, *(i for i in self.candidates.values())]).astype(int)
         bounded = bounded[[i in self.baseline or self.coordinates[i].amplitude for i in bounded]]
         low[bounded], high[bounded] = np.array([self.coordinates[i].bounds() for i in bounded]).T - u[bounded]
-        at, mean = np.zeros(len(std)), np.zeros(len(std))
-        mean[:count] = [c.centre for c in self.coordinates]
-        # Amplitudes are counted from the refit: the prior's centre lies at its distance from there.
-        mean[:count] -= u
-        mean[count:] = self._centre(u, len(field_of))
+        at = np.zeros(len(std))
         for places in self.candidates.values():
             at[places] = u[places]
         kinds, fit, observations = len(self.noise_names), self._fit, self.observations
@@ -425,7 +421,8 @@ class DriveForm(MeasuredForm):
         return Linear(
             gram=Gram.of(columns[fit], residual[fit], self._group[fit], kinds),
             held_out=held,
-            amplitudes=Amplitudes(std, np.concatenate([self._field_of, field_of]), mean),
+            # Amplitudes are counted from the refit: the prior's centre lies at its distance from there.
+            amplitudes=Amplitudes(std, np.concatenate([self._field_of, field_of]), self._prior_mean(u, len(field_of))),
             low=low,
             high=high,
             always=np.concatenate([self._free(frozenset()), np.arange(count, len(std))]).astype(int),
@@ -550,7 +547,6 @@ class DriveForm(MeasuredForm):
             if not self.kept:
                 self._see_again(u)
             self._choose_signatures(u, free, slopes, found)
-            self._take_fields()
             linear = self._linear(u, effects, slopes)
             self._base = u
         return Refit(self.name, effects, u, linear)
@@ -568,18 +564,19 @@ class DriveForm(MeasuredForm):
         rows = np.stack([start, there, there])
         own = np.setdiff1d(free, self._free(frozenset()))
         rows[2, own] = start[own]
-        cost = self._cost(near.u, free, self.observations, self._sizes_of(near))
+        inputs = self._inputs(*self._slopes[near.effects])
+        cost = self._cost(near.u, free, self.observations, self._sizes_of(near), inputs)
         values = self.drives.predict(rows)
         costs = [cost.chi2(cost.white(cost.wanted - v), row[free]) for v, row in zip(values, rows, strict=True)]
         return rows[int(np.argmin(costs))]
 
     def alone(self, refit: Refit) -> np.ndarray:
-        """See `MeasuredForm`; with the derivatives of the refit, from its parameters and from those as given.
+        """See `MeasuredForm`; from the refit's parameters and from those as given.
 
         A refit that leaves much to discrepancy may predict worse without it than the model as given does.
         """
-        free, slopes = self._slopes[refit.effects]
-        free, slopes = free[self._field_of[free] < 0], slopes[:, self._field_of[free] < 0]
+        free = self._slopes[refit.effects][0]
+        free = free[self._field_of[free] < 0]
         fitted = self.bare(refit.u)
         given = fitted.copy()
         given[[i for i in self.baseline if not self.coordinates[i].nuisance]] = 0.0
@@ -591,7 +588,7 @@ class DriveForm(MeasuredForm):
             return float(np.nan_to_num(left @ left, nan=np.inf) + np.sum(((u[free] - centre) / self._std[free]) ** 2))
 
         starts = [u for u in (fitted, given) if math.isfinite(cost(u))]
-        return min((self._descend(u, free, self.observations, slopes=slopes, once=True)[0] for u in starts), key=cost)
+        return min((self._descend(u, free, self.observations, once=True)[0] for u in starts), key=cost)
 
     def _choose_errors(
         self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, jitters_s: Sequence[float]
@@ -604,15 +601,12 @@ class DriveForm(MeasuredForm):
         Returns:
           Sizes of discrepancy and noise with these errors.
         """
-        assert self._fields is not None
-        columns, residual = self._columns(u, free, slopes)
-        count, number = len(self.coordinates), self._fields[1]
-        mine = self._free(frozenset())
+        columns, residual, number = self._columns(u, free, slopes)
+        count, mine = len(self.coordinates), self._free(frozenset())
         always = np.concatenate([mine, np.arange(count, columns.shape[1])])
         std = np.concatenate([self._std, np.ones(len(number))])[always]
         field = np.concatenate([self._field_of, number])[always]
-        own = [self.coordinates[i].centre - u[i] for i in mine]
-        prior = Amplitudes(std, field, np.concatenate([own, self._centre(u, len(number))]))
+        prior = Amplitudes(std, field, self._prior_mean(u, len(number))[always])
         columns = columns[:, always]
         fields, noises = self._usual_fields(), self._noise_sizes()
 
@@ -687,7 +681,6 @@ class DriveForm(MeasuredForm):
             drives.about(u)
             self._seen = self._see_inputs(u)
             slopes = self.jacobian(u, free)[1]
-            self._take_fields()
             before = self.channel_errors, self.error_times_s
             found = self._choose_errors(u, free, slopes, (usual_jitter,))
             if (self.channel_errors, self.error_times_s) == before:
@@ -741,7 +734,7 @@ class DriveForm(MeasuredForm):
         given, own = self.start.copy(), [i for i in self.baseline if not self.coordinates[i].nuisance]
         # A rival's parameters make up for what it lacks; where this form has that, they are far off.
         given[own], given[self.discrepancy] = 0.0, 0.0
-        cost = self._cost(self.start, free, self.observations, None)
+        cost = self._cost(self.start, free, self.observations, self._rival_of._sizes if self._rival_of else None)
         rows = np.stack([self.start, given])
         values = self.drives.predict(rows)
         costs = [cost.chi2(cost.white(cost.wanted - v), row[free]) for v, row in zip(values, rows, strict=True)]
@@ -750,7 +743,6 @@ class DriveForm(MeasuredForm):
             self.drives.about(u)
             self._seen = self._see_inputs(u)
             slopes = self.jacobian(u, free)[1]
-            self._take_fields()
             found = self._linear(u, frozenset(), slopes).evidence(frozenset())[1]
             u, _, _ = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
             u = self._find_ground(u, free)
@@ -764,7 +756,6 @@ class DriveForm(MeasuredForm):
     def _see_all(self, u: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Takes all derivatives at a refit (coordinates,) of the model as it is, and returns it."""
         self._see(u)
-        self._take_fields()
         self._slopes[frozenset()] = free, self.jacobian(u, free)[1]
         self._ground = u[self.drives.ground]
         return u
@@ -801,14 +792,25 @@ class DriveForm(MeasuredForm):
         return out
 
     def _cost(
-        self, u: np.ndarray, free: np.ndarray, observations: Observations, sizes: tuple[np.ndarray, np.ndarray] | None
+        self,
+        u: np.ndarray,
+        free: np.ndarray,
+        observations: Observations,
+        sizes: tuple[np.ndarray, np.ndarray] | None,
+        inputs: np.ndarray | None = None,
     ) -> _Cost:
-        """What a descent from a place minimises; arguments as for `_descend`."""
+        """What a descent from a place minimises.
+
+        Args:
+          u, free, observations, sizes: as for `_descend`.
+          inputs: (n, discrepancy) derivatives; None where logs have no discrepancy of their own.
+        """
         noise = np.ones(len(self.noise_names)) if sizes is None else sizes[1]
         weight = 1.0 / noise[self._group[self._fit]]
         misfit, offset = np.zeros((len(weight), 0)), np.zeros(len(observations))
-        if sizes is not None and self._fields is not None:
-            columns, number = self._fields_beside(frozenset(e for e, own in self.candidates.items() if own[0] in free))
+        if sizes is not None and inputs is not None:
+            effects = frozenset(e for e, own in self.candidates.items() if own[0] in free)
+            columns, number = self._field_columns(observations, inputs, effects)
             misfit = observations.whiten(columns)[self._fit] * sizes[0][number] * weight[:, None]
             offset = columns @ self._centre(u, len(number))
         std = self._std if sizes is None else self._prior_std(sizes[0])
@@ -842,14 +844,14 @@ class DriveForm(MeasuredForm):
           EvidenceError: the simulation diverged at the start.
           TimeUp: before the descent of some effects had ended, or before that of the model as it is had begun.
         """
-        settings, cost = self.settings, self._cost(u, free, observations, sizes)
+        if slopes is None:
+            slopes = self.jacobian(u, free)[1]
+        settings = self.settings
+        cost = self._cost(u, free, observations, sizes, None if sizes is None else self._inputs(free, slopes))
         white, inner, wanted, std, centre = cost.white, cost.inner, cost.wanted, cost.std, cost.centre
         # Scales of inputs are another rover's: their prior alone bounds them.
         scaled = self._field_of[free] < 0
         low, high = self.drives.bounds(free)
-
-        if slopes is None:
-            slopes = self.jacobian(u, free)[1]
         residual = white(wanted - self.predicted(u))
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
@@ -936,6 +938,37 @@ class _Cost:
         if not np.isfinite(residual).all():
             return np.inf
         return float(self.inner(residual, residual)) + float(np.sum(((x - self.centre) / self.std) ** 2))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Share:
+    """How the amounts of discrepancy in several logs hang together, in variances over those of a log's amount.
+
+    A log's amount is one that all logs share and one of its own. The mean over the fitted logs is what a refit moves:
+    were it the shared amount alone, equal own amounts would stand for part of a mean, and to first order.
+
+    Attributes:
+      mean: variance of the mean over the fitted logs. known: what a held-out log is expected to have, over that mean.
+      apart: (logs, amounts) what independent amounts of unit variance give to each log beside that.
+    """
+
+    mean: float
+    known: float
+    apart: np.ndarray
+
+    @classmethod
+    def of(cls, own: float, fitted: Sequence[bool]) -> _Share:
+        """Of logs that are fitted or held out, where a share of the variance is each log's own."""
+        fit, held_out = np.flatnonzero(fitted), np.flatnonzero(~np.array(fitted))
+        mean = 1.0 - own + own / len(fit)
+        known = (1.0 - own) / mean
+        apart = np.zeros((len(fitted), len(fit) - 1 + len(held_out) + 1))
+        # contrasts of the fitted logs: an orthonormal basis of what has no mean
+        apart[fit, : len(fit) - 1] = math.sqrt(own) * linalg.helmert(len(fit)).T
+        apart[held_out, len(fit) - 1 + np.arange(len(held_out))] = math.sqrt(own)
+        # what these logs share and the mean does not tell
+        apart[held_out, -1] = math.sqrt((1.0 - own) * (1.0 - known))
+        return cls(mean, known, apart)
 
 
 def _flatter(one: np.ndarray, other: np.ndarray) -> np.ndarray:

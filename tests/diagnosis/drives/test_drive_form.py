@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lunar_mjx.diagnosis import audit
 from lunar_mjx.diagnosis.build_problem import FINER_FORMS
 from lunar_mjx.diagnosis.candidates import usable
 from lunar_mjx.diagnosis.drives import form as module
@@ -166,6 +167,45 @@ def test_discrepancy_is_simulated_so_that_its_bend_is_no_effect(monkeypatch, amo
     assert (said.verdict, said.effects) == (Verdict.NOISE_ONLY, ()), said.sentence
     assert abs(found.best.refit.u[form.discrepancy[1]]) > 0.5 * amount * USUAL.size(LABEL, FOLLOWS[LABEL][1])
     assert form.alone(found.best.refit)[form.discrepancy] == pytest.approx(0.0), "no part of the model"
+
+
+@pytest.mark.parametrize("fitted", [1, 2, 4])
+def test_an_input_that_bends_is_no_effect_however_few_drives_there_are(monkeypatch, fitted):
+    """What equal amounts of every log's own explained of a mean was linear: `drag` got a probability of 0.75."""
+    monkeypatch.setattr(Bent, "bend", 300.0)
+    toy = Bent({"a": 0.5}, unlisted=0.3)
+    split = tuple("fit" if i < fitted else "select" if i >= LOGS - 2 else "no" for i in range(LOGS))
+    toy.observations = dataclasses.replace(toy.observations, unit_split=split, split=split)
+    _, found, _ = asked(toy)
+    assert sum(p for term, p in found.inclusion().items() if term.name == "drag") < 0.05
+
+
+@pytest.mark.parametrize(("amount", "bend"), [(0.2, 300.0), (0.4, 100.0), (0.6, 30.0)])
+def test_an_effect_is_named_beside_an_input_that_bends(monkeypatch, amount, bend):
+    """With derivatives by inputs of another place a second refit of the model as it is stood for the effect."""
+    monkeypatch.setattr(Bent, "bend", bend)
+    _, _, said = asked(Bent({"a": 0.5, "drag": 0.9}, unlisted=amount))
+    assert (said.verdict, said.effects) == (Verdict.KNOWN, ("drag",)), said.sentence
+
+
+@pytest.mark.parametrize("own", [0.0, 0.5, 1.0])
+def test_logs_share_what_the_settings_say(own):
+    fitted = [True, True, False, True, False]
+    share = module._Share.of(own, fitted)
+    mean = np.where(fitted, 1.0, share.known)
+    covariance = share.mean * np.outer(mean, mean) + share.apart @ share.apart.T
+    np.testing.assert_allclose(covariance, (1.0 - own) + own * np.eye(len(fitted)), atol=1e-12)
+
+
+def test_a_model_whose_drives_have_all_inputs_to_themselves_is_refitted():
+    form = DriveForm(Toy({"a": 1.5}), DriveSettings.of({"own_share": 1.0}))  # type: ignore[arg-type]
+    assert form.refit(frozenset(), None, None).u[0] == pytest.approx(1.5, abs=0.2)
+
+
+def test_an_audit_draws_worlds_without_the_discrepancy_that_was_fitted():
+    form = DriveForm(Toy({"b": 0.4}, unlisted=1.2), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    assert audit._case(form, base, audit._sizes(form, base), 0, 7)["outcome"] == "silent, rightly"
 
 
 class Finer(Toy):
@@ -631,7 +671,8 @@ def test_what_is_usual_has_none_of_an_effect_that_was_refitted():
 
     def left(effects: frozenset[str]) -> float:
         """Share of the effect's signature that the columns of usual effects cannot give."""
-        columns, number = form._fields_beside(effects)
+        inputs = form._seen[:, form.discrepancy]  # type: ignore[index]
+        columns, number = form._field_columns(form.observations, inputs, effects)
         mine = columns[:, number == usual]
         return float(np.linalg.norm(drag - mine @ np.linalg.lstsq(mine, drag, rcond=None)[0]) / np.linalg.norm(drag))
 
