@@ -440,12 +440,16 @@ def infer(
         # in the logarithms a long step leaves the region in which the density is near its quadratic
         step *= min(1.0, SIZE_DESCENT.longest / max(float(np.abs(step).max()), 1e-300))
         for _ in range(30):
-            there = _density(x + step, gram, amplitudes, fields, noises)
-            if there.value >= here.value:
+            try:
+                there = _density(x + step, gram, amplitudes, fields, noises)
+            except (EvidenceError, linalg.LinAlgError):
+                there = None  # sizes at which rounding spoils the density are no place to go to
+            if there is not None and there.value >= here.value:
                 break
             step *= 0.5
         else:
             break  # no step gains: rounding is reached
+        assert there is not None
         gained = there.value - here.value
         x, here = x + step, there
         if gained < SIZE_DESCENT.settled:

@@ -264,6 +264,25 @@ def test_derivatives_that_rounding_spoils_are_no_proof():
         infer(gram, Amplitudes.of(np.ones(1)), (), [NoiseSize("x")])
 
 
+def test_sizes_at_which_rounding_spoils_the_density_are_gone_around(monkeypatch):
+    """The first step overshoots to a fifth of the noise. On a foreign Husky such a one ended `compare` with an error."""
+    rng = np.random.default_rng(3)
+    gram = Gram.of(rng.normal(size=(200, 1)), 0.5 * rng.normal(size=200))
+    wanted = infer(gram, Amplitudes.of(np.ones(1)), (), [NoiseSize("x", 3.0)])
+    condition, refused = evidence._condition, []
+
+    def steep(gram, amplitudes, tau, noise):
+        if noise[0] < 0.4:
+            refused.append(noise[0])
+            raise EvidenceError("too steep")
+        return condition(gram, amplitudes, tau, noise)
+
+    monkeypatch.setattr(evidence, "_condition", steep)
+    found = infer(gram, Amplitudes.of(np.ones(1)), (), [NoiseSize("x", 3.0)])
+    assert refused and found.noise == pytest.approx(wanted.noise, rel=1e-4)
+    assert found.log_evidence == pytest.approx(wanted.log_evidence, abs=1e-6)
+
+
 def test_the_most_probable_level_of_slow_errors_is_taken(drawn):
     """Each level in turn tells what the search over levels has to find."""
     columns, residual, group, amplitudes = drawn
