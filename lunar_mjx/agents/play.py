@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from lunar_mjx.agents.policy import load_policy, shipped_policy, taught_in
+from lunar_mjx.agents.policy import load_policy, shipped_policies, shipped_policy, taught_in
 from lunar_mjx.cameras.chase import Chase, wheel_tracks
 from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs import TASKS, NavigationEnv, make, make_agent, split_keys
@@ -90,7 +90,7 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
             "agent",
             name,
             "is no rover with a trained policy",
-            f"give a policy.npz, a rover that ships one, luvmi_x/ladder-3, or one of {', '.join(AGENTS)}",
+            f"give a policy.npz, one that ships ({', '.join(shipped_policies())}), or one of {', '.join(AGENTS)}",
         )
     policy = load_policy(path)
     made_in = policy.environment

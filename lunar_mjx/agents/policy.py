@@ -56,6 +56,12 @@ def shipped_policy(name: str) -> Path | None:
     return path if path.is_file() else None
 
 
+def shipped_policies() -> list[str]:
+    """Names that `shipped_policy` knows, sorted."""
+    files = shipped("models").glob("*/*.npz")
+    return sorted(f.parent.name if f.stem == "policy" else f"{f.parent.name}/{f.stem}" for f in files)
+
+
 def taught_in(policy: Policy, source: str | Path) -> tuple[NavigationConfig, str | None]:
     """The navigation task that a policy was trained in, and its rover; None where only a model's file names it.
 

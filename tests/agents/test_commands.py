@@ -87,6 +87,7 @@ def test_plays_a_policy_of_the_ladder_in_its_unseen_worlds(run, tmp_path):
         (("train", "point", "--coordinator", "h:1"), "--processes = 1 is below 2"),
         (("train", "point", "--coordinator", "h:1", "--processes", 2, "--process", 2), "is not one of 0 to 1"),
         (("evaluate", "clever"), "is no rover with a trained policy"),
+        (("play", "clever"), "one that ships (luvmi_x, luvmi_x/escape, luvmi_x/ladder-3, viper)"),
         (("evaluate", "missing.npz"), "missing.npz"),
         (("play", "zero", "--task", "easy"), "paper, consistent, large"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lunar_mjx.agents.configs import get_training
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.model import make_model
 
@@ -281,6 +283,9 @@ def test_the_page_and_the_card_of_the_shipped_policy_quote_who_gets_out_of_holes
     shipped = ROOT / "models" / "luvmi_x" / "escape.npz"
     notes = load_policy(shipped).notes
     assert f"TD3 with the stress integral, {notes['steps']:,} steps, {notes['elapsed_s']:.0f} s" in page
+    # what the training's own steps suffice for
+    for steps in re.findall(r"100 % from ([\d,]+) steps on in closed form and from ([\d,]+) on", page)[0]:
+        assert get_training("escape").steps > int(steps.replace(",", ""))
     run = tmp_path / "field"
     run.mkdir()
     shutil.copyfile(shipped, run / "policy.npz")

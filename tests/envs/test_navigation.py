@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 from lunar_mjx.agents.configs import get_training
 from lunar_mjx.agents.evaluate import Evaluator
-from lunar_mjx.agents.policy import load_policy, shipped_policy
+from lunar_mjx.agents.policy import load_policy, shipped_policies, shipped_policy
 from lunar_mjx.agents.run import unseen_params
 from lunar_mjx.envs import make_agent, make_navigation, split_keys
 from lunar_mjx.envs.gymnasium_env import NAVIGATION
@@ -189,6 +189,7 @@ def test_a_policy_of_another_training_ships_by_its_name():
     action = policy.act(jnp.asarray(policy.mean)[None])
     assert action.shape == (1, 6) and (abs(action) <= 1.0).all()
     assert shipped_policy("viper/ladder-3") is None and shipped_policy("luvmi_x/policy") == shipped_policy("luvmi_x")
+    assert "luvmi_x/ladder-3" in shipped_policies() and None not in map(shipped_policy, shipped_policies())
 
 
 def test_the_height_scan_misses_no_rock():
