@@ -84,11 +84,15 @@ def write_drive_log(
 ) -> Path:
     """Writes the log `folder/log` with the channels of `lunar-mjx log simulate`, as its instruments read them.
 
+    A channel's stated noise has two parts: white noise of the instrument, and the numerical error as a first-order
+    process of the size and correlation time that `numerical_error` finds. Two drives tell the error's size and memory
+    to first order, and no more of its shape: where it is one-sided for all of a drive, it counts as one error of that
+    size, not as an offset. Errors of different channels count as independent.
+
     Args:
       folder: must exist, without `log` in it.
       model: that drove. plan: its manoeuvre.
-      driven: the drive. control: the same with larger voxels, for the numerical error, which is added to the
-        stated noise.
+      driven: the drive. control: the same with larger voxels, for the numerical error, see above.
       settings: of sand and numerics, plain data for the log's [source]; `rover` names it, `terrain` the plane.
       recording: noise of the instruments and its like. seed: of the noise.
 
@@ -111,7 +115,10 @@ def write_drive_log(
     for channel, (std, slow) in error.items():
         if std > 0.0:
             instrument = noise[channel].std if channel in noise else 0.0
-            noise[channel] = Noise(float(np.hypot(instrument, std)), "datasheet", slow)
+            both = float(np.hypot(instrument, std))
+            # Two parts: one process of this size with the error's memory would expect of every reading that it goes on
+            # where the last one was, and call white noise of the instruments many sigma.
+            noise[channel] = Noise(both, "datasheet", slow, (std / both) ** 2 if slow > 0.0 else 1.0)
     rounded = {c: [float(f"{v:.3g}") for v in e] for c, e in error.items()}
     source = {
         "who": f"lunar-mjx {__version__}, rover in a soil of particles",
