@@ -21,11 +21,23 @@ class Noise:
       std: standard deviation of one sample, in the channel's unit.
       source: datasheet, rest or replicate.
       correlation_time_s: of a first-order autoregressive part; 0 for white noise.
+      correlated_share: of the variance, which that part has; the rest is white. 1: no white part is stated.
     """
 
     std: float
     source: str
     correlation_time_s: float = 0.0
+    correlated_share: float = 1.0
+
+    @property
+    def white(self) -> float:
+        """Standard deviation of the part without memory, in the channel's unit; 0 where none is stated."""
+        return self.std * float(np.sqrt(1.0 - self.correlated_share)) if self.correlation_time_s > 0.0 else self.std
+
+    @property
+    def coloured(self) -> float:
+        """Standard deviation of the autoregressive part, in the channel's unit."""
+        return self.std * float(np.sqrt(self.correlated_share)) if self.correlation_time_s > 0.0 else 0.0
 
 
 @dataclasses.dataclass(frozen=True)

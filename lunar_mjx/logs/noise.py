@@ -102,8 +102,9 @@ def noise_of(log: Log, channel: str) -> ChannelNoise | None:
     """
     stated = log.noise.get(channel)
     if stated is not None and stated.std > 0.0:
+        share = stated.correlated_share if stated.correlation_time_s > 0.0 else 0.0
         # Not 1: a covariance without any white part is next to singular.
-        share = 0.99 if stated.correlation_time_s > 0.0 else 0.0
+        share = 0.99 if share == 1.0 else share
         return ChannelNoise(stated.std, share, stated.correlation_time_s, stated.source)
     # What is asked about is the drive; its noise is larger than that at rest.
     return estimated_noise(log, channel, moving=True) or estimated_noise(log, channel, moving=False)

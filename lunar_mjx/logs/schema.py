@@ -24,6 +24,8 @@ independent readings.
 SPLITS = ("fit", "select", "test")
 NOISE_SOURCES = ("datasheet", "rest", "replicate", "vibration", "ripple", "estimate")
 """Where a stated noise comes from; the last three are what a drive shows of an IMU, of currents and of all else."""
+NOISE_KEYS = ("std", "source", "correlation_time_s", "correlated_share")
+"""What a log states of a channel's noise."""
 MIRROR = {"lf": "rf", "rf": "lf", "lm": "rm", "rm": "lm", "lr": "rr", "rr": "lr", "left": "right", "right": "left"}
 """The corner on the other side, or the other side."""
 IMPOSED = ("wheel_speed",)

@@ -137,6 +137,8 @@ def noise_tables(noise: Mapping[str, Noise]) -> dict[str, dict[str, Any]]:
         # White noise is what the field's absence means.
         if entry.correlation_time_s:
             tables[name]["correlation_time_s"] = float(entry.correlation_time_s)
+            if entry.correlated_share < 1.0:
+                tables[name]["correlated_share"] = float(entry.correlated_share)
     return tables
 
 

@@ -55,6 +55,14 @@ def test_coloured_noise_stated_as_such_passes(tmp_path: Path) -> None:
     assert check(make_log(tmp_path / "a", change, seconds=120.0, noise=given)) == []
 
 
+def test_white_noise_beside_a_slow_error_that_rest_does_not_show_passes(tmp_path: Path) -> None:
+    std = noise()["position_*"].std
+    both = 20.0 * std
+    joined, apart = Noise(both, "datasheet", 30.0), Noise(both, "datasheet", 30.0, 1.0 - (std / both) ** 2)
+    assert check(make_log(tmp_path / "apart", noise={**noise(), "position_*": apart})) == []
+    assert check(make_log(tmp_path / "joined", noise={**noise(), "position_*": joined}))
+
+
 def test_a_log_without_noise_or_attitude_passes(tmp_path: Path) -> None:
     def change(tables: Tables) -> None:
         drop = [c for c in tables["drive"] if c.startswith(("quaternion", "roll", "pitch", "yaw", "gyro"))]

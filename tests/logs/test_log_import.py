@@ -17,6 +17,7 @@ import pytest
 
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import import_log, read_log
+from lunar_mjx.logs.log import Noise
 from lunar_mjx.logs.readers import bags
 from lunar_mjx.logs.readers.bags import field, stamp
 from tests.cli_harness import Run
@@ -30,6 +31,8 @@ ambient_temperature_degC = -20.0
 [log.noise."joint_*"]
 std = 0.001
 source = "datasheet"
+correlation_time_s = 2.0
+correlated_share = 0.3
 
 [tables.drive]
 topic = "/joint_states"
@@ -62,7 +65,7 @@ def map_file(tmp_path: Path) -> Path:
 def expect(folder: Path) -> None:
     """What every recording below holds."""
     log = read_log(folder)
-    assert log.rover == "luvmi_x" and log.noise["joint_lf_drive_angle_rad"].std == 0.001
+    assert log.rover == "luvmi_x" and log.noise["joint_lf_drive_angle_rad"] == Noise(0.001, "datasheet", 2.0, 0.3)
     drive, odometry = log.tables["drive"], log.tables["odometry"]
     k = np.arange(COUNT)
     np.testing.assert_allclose(drive.time_s, 0.05 * k, atol=1e-9)

@@ -93,7 +93,10 @@ def test_what_is_stated_counts_and_says_how_well(tmp_path: Path, run: Run) -> No
     log = make(tmp_path / "a", columns, noise=stated)
     one, two = noise_of(log, "gyro_x_rad_s"), noise_of(log, "gyro_y_rad_s")
     assert one is not None and (one.std, one.source, one.log_std) == (0.2, "datasheet", 0.3)
-    assert two is not None and two.correlation_time_s == 0.4 and two.source == "vibration"
+    assert two is not None and two.correlation_time_s == 0.4 and two.source == "vibration" and two.share == 0.99
+    log.noise["gyro_y_rad_s"] = Noise(0.3, "vibration", 0.4, 0.2)  # type: ignore[index]
+    two = noise_of(log, "gyro_y_rad_s")
+    assert two is not None and two.share == 0.2
     table = noise_table([log])
     assert set(table["gyro_x_rad_s"]) == {"stated", "drive", "rest"}
     assert noise_of(log, "joint_left_drive_speed_rad_s") is None, "a wheel that turns evenly shows none"

@@ -8,12 +8,11 @@ import time
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.signal import lfilter
 
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, check, read_log
 from lunar_mjx.logs.recorder.instruments import INSTRUMENTS, Recording
-from lunar_mjx.logs.recorder.particle_drive import STATES, joined, numerical_error, record_sand_drive, refuse_other
+from lunar_mjx.logs.recorder.particle_drive import STATES, numerical_error, record_sand_drive, refuse_other
 from lunar_mjx.manoeuvres import commands, load_manoeuvre
 from lunar_mjx.model import make_model
 from lunar_mjx.wheel_bed.particles.settings import Numerics, Sand
@@ -75,13 +74,10 @@ def test_the_log_is_fit_to_be_used(tmp_path):
     force = log.channel("wheel_lf_force_z_N")
     assert force is not None
     wrong = 2.0 * (0.03 - 0.02) * 4.0 / SpringBed.stiffness * float(np.sqrt(np.mean(force[1] ** 2)))
-    error = json.loads(log.source["numerical_error"])
-    error, stated = error["wheel_lf_sinkage_m"], log.noise["wheel_lf_sinkage_m"]
-    assert error[0] == pytest.approx(wrong, rel=0.1) and error[1] > 0.2
-    sinkage = log.channel("wheel_lf_sinkage_m")
-    assert sinkage is not None
-    step = float(np.median(np.diff(sinkage[0])))
-    assert (stated.std, stated.correlation_time_s) == pytest.approx(joined(sheet, error, step), rel=0.05)
+    stated = log.noise["wheel_lf_sinkage_m"]
+    # the instrument's white noise and the slow error stand apart
+    assert stated.white == pytest.approx(sheet) and stated.coloured == pytest.approx(wrong, rel=0.1)
+    assert stated.correlation_time_s > 0.2
     facts = json.loads((tmp_path / "out" / "drive.json").read_text())
     assert facts["numerics"]["voxel"] == 0.02 and facts["control"]["driven_s"] == pytest.approx(2.0)
     assert len(pd.read_csv(tmp_path / "out" / "surface.csv")) == 1
@@ -135,26 +131,6 @@ def test_what_is_kept_of_another_drive_is_refused(tmp_path):
 def test_an_end_before_it_stands_is_told(tmp_path):
     with pytest.raises(UserError, match="ended before the rover stood; run the same command again"):
         recorded(tmp_path, seconds=0.0)
-
-
-@pytest.mark.parametrize(("white", "slow"), [(0.3, 0.05), (0.3, 0.3), (0.05, 0.3), (0.3, 0.0), (0.0, 0.3)])
-def test_white_noise_beside_a_slow_error_is_neither_improbable_nor_a_thousand_witnesses(white, slow):
-    """As one process with the error's correlation time white noise read 2 to 6 sigma."""
-    step, time_s, count = 0.05, 3.0, 2000
-    rng, keep = np.random.default_rng(0), np.exp(-0.05 / 3.0)
-    error = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(3 * count))[-count:]
-    values = white * rng.standard_normal(count) + slow * error
-    std, stated = joined(white, (slow, time_s), step)
-    rho = np.exp(-step / stated) if stated else 0.0
-
-    def innovations(x: np.ndarray) -> np.ndarray:
-        return (x[1:] - rho * x[:-1]) / (std * np.sqrt(1.0 - rho**2))
-
-    assert 0.3 < np.mean(innovations(values) ** 2) < 1.3
-    # how well an offset is known: as by the two processes themselves, whose spectra add at its frequency
-    ratio = np.tanh(0.5 * step / time_s)
-    offset = np.sqrt((white**2 + slow**2 / ratio) / count)
-    assert np.sum(innovations(np.ones(count)) ** 2) ** -0.5 == pytest.approx(offset, rel=0.05)
 
 
 def test_numerical_error_of_a_channel():

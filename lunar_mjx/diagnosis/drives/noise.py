@@ -149,7 +149,9 @@ class Noises:
             return size * estimate.white, size * estimate.coloured, estimate.correlation_time_s
         std = stated_or_typical(log, channel)
         if self._stated(log, channel):
-            return 0.1 * std, std, log.noise[channel].correlation_time_s
+            noise = log.noise[channel]
+            # Where no white part is stated, a little of it: a covariance without any is next to singular.
+            return noise.white or 0.1 * std, noise.coloured, noise.correlation_time_s
         colour = self.colours.get(_kind(log, channel), self.common)
         return std * np.sqrt(1.0 - colour.share), std * np.sqrt(colour.share), colour.correlation_time
 

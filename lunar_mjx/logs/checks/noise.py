@@ -158,20 +158,20 @@ def _contradiction(log: Log, name: str, noise: Noise, std: float, correlation: f
     assert samples is not None, name
     values = samples[1]
     step = quantum(values)
+    # Spans of seconds may show nothing of a slow part.
+    least = noise.white or noise.std
     # Rounding adds the variance of a uniform error.
-    expected = float(np.hypot(noise.std, step / np.sqrt(12.0)))
-    ratio = std / expected
+    ratio, quiet = (std / float(np.hypot(s, step / np.sqrt(12.0))) for s in (noise.std, least))
     if noise.correlation_time_s > 0.0 or correlation > 0.5:
         independent = min(independent, 10.0)  # spans of a few seconds hold few correlation times
-    statistic, freedom = independent * ratio**2, independent
     # Both large and sure: with many samples 10 % is sure, with few a factor of two is chance.
-    if ratio > NOISE_LIMITS.factor and stats.chi2.sf(statistic, freedom) < VALUE_LIMITS.chance:
+    if ratio > NOISE_LIMITS.factor and stats.chi2.sf(independent * ratio**2, independent) < VALUE_LIMITS.chance:
         side = "is noisier than stated"
     elif (
-        ratio < 1.0 / NOISE_LIMITS.quieter
+        quiet < 1.0 / NOISE_LIMITS.quieter
         and correlation < NOISE_LIMITS.white
-        and step < noise.std
-        and stats.chi2.cdf(statistic, freedom) < VALUE_LIMITS.chance
+        and step < least
+        and stats.chi2.cdf(independent * quiet**2, independent) < VALUE_LIMITS.chance
     ):
         side = "is quieter than stated"
     else:

@@ -22,6 +22,7 @@ from lunar_mjx.logs.schema import (
     GREATEST_GRAVITY,
     IMPOSED,
     LATEST,
+    NOISE_KEYS,
     NOISE_SOURCES,
     SPLITS,
     find_channel,
@@ -386,18 +387,24 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
     patterns: list[tuple[str, Noise]] = []
     for key in fields.values:
         entry = fields.table(key)
-        entry.known(("std", "source", "correlation_time_s"))
+        entry.known(NOISE_KEYS)
         source = entry.choice("source", NOISE_SOURCES) or "datasheet"
         std, correlation = entry.number("std"), entry.number("correlation_time_s", 0.0)
         require_within(fields.path, f"{fields.field(key)}.correlation_time_s", abs(correlation), 0.0, LATEST)
         if std < 0.0 or correlation < 0.0:
             raise bad_input(fields.path, fields.field(key), entry.values, "has a negative entry", "give zero or more")
+        share = entry.number("correlated_share", 1.0)
+        require_within(fields.path, f"{fields.field(key)}.correlated_share", share, 0.0, 1.0, above=True)
+        if share < 1.0 and correlation == 0.0:
+            problem = "is of a part that has no correlation time"
+            remedy = "add correlation_time_s, or leave it out"
+            raise bad_input(fields.path, f"{fields.field(key)}.correlated_share", share, problem, remedy)
         if std < LEAST_NOISE:
             remedy = "state what is measured, or a digit's last place over sqrt(12)"
             raise bad_input(fields.path, f"{fields.field(key)}.std", std, "is less than any instrument's noise", remedy)
         # Kept for later: exact names win over patterns, in whatever order they stand.
         if "*" in key:
-            patterns.append((key, Noise(std, source, correlation)))
+            patterns.append((key, Noise(std, source, correlation, share)))
             continue
         column = parse_column(key, str(fields.path)) if channels is not None else None
         if channels is not None and column is None and key not in channels:
@@ -412,7 +419,7 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
                 fields.path, f"{fields.field(key)}.std", std, "is more than the channel's whole range", "check its unit"
             )
         # Noise takes the unit's scale, never its offset.
-        exact[name] = Noise(std * abs(scale), source, correlation)
+        exact[name] = Noise(std * abs(scale), source, correlation, share)
     for pattern, noise in patterns:
         for name in channels or ():
             if fnmatchcase(name, pattern):

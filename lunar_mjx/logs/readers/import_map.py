@@ -13,7 +13,7 @@ from lunar_mjx.logs.log import Noise
 from lunar_mjx.logs.readers.clocks import FASTEST_HZ, UNITS, TimeColumn
 from lunar_mjx.logs.readers.folder import FARTHEST_M, TOP
 from lunar_mjx.logs.readers.table_files import SEPARATORS, Layout
-from lunar_mjx.logs.schema import NOISE_SOURCES, parse_column
+from lunar_mjx.logs.schema import NOISE_KEYS, NOISE_SOURCES, parse_column
 from lunar_mjx.toml_fields import Fields
 
 SHIPPED = Path(__file__).resolve().parent / "maps"
@@ -427,9 +427,11 @@ def _pair(entry: Fields, key: str) -> tuple[float, float] | None:
 
 
 def _noise(entry: Fields) -> Noise:
-    entry.known(("std", "source", "correlation_time_s"))
+    # values are checked where the log that is written is read back
+    entry.known(NOISE_KEYS)
     source = entry.choice("source", NOISE_SOURCES) or "datasheet"
-    return Noise(entry.number("std"), source, entry.number("correlation_time_s", 0.0))
+    correlation, share = entry.number("correlation_time_s", 0.0), entry.number("correlated_share", 1.0)
+    return Noise(entry.number("std"), source, correlation, share)
 
 
 def file_pattern(pattern: str) -> re.Pattern[str]:

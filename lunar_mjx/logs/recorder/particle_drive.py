@@ -72,27 +72,6 @@ def numerical_error(tables: Mapping[str, Any], control: Mapping[str, Any] | None
     return found
 
 
-def joined(white: float, slow: tuple[float, float], step: float) -> tuple[float, float]:
-    """The first-order process that stands for white noise beside a slow error: standard deviation, correlation time, s.
-
-    A log states one of each for a channel. This process has the two's spectrum at both ends, where samples are told
-    apart and where offsets are; between these it has more, at most by the ratio of the two.
-
-    Args:
-      white: standard deviation of the white noise. slow: of the error, with its correlation time, s.
-      step: s; between samples.
-    """
-    std, time_s = slow
-    if std <= 0.0 or time_s <= 0.0:
-        return math.hypot(white, std), 0.0
-    # (1 - rho) / (1 + rho): what the spectrum of a process of unit variance is at its fast end, and one over it at the
-    # slow one
-    ratio = math.tanh(0.5 * step / time_s)
-    fast, steady = white**2 + std**2 * ratio, white**2 + std**2 / ratio
-    both = math.sqrt(fast / steady)
-    return (fast * steady) ** 0.25, 0.5 * step / math.atanh(both) if both < 1.0 else 0.0
-
-
 def write_drive_log(
     folder: str | Path,
     model: Model,
@@ -105,11 +84,15 @@ def write_drive_log(
 ) -> Path:
     """Writes the log `folder/log` with the channels of `lunar-mjx log simulate`, as its instruments read them.
 
+    A channel's stated noise has two parts: white noise of the instrument, and the numerical error as a first-order
+    process of the size and correlation time that `numerical_error` finds. Two drives tell the error's size and memory
+    to first order, and no more of its shape: where it is one-sided for all of a drive, it counts as one error of that
+    size, not as an offset. Errors of different channels count as independent.
+
     Args:
       folder: must exist, without `log` in it.
       model: that drove. plan: its manoeuvre.
-      driven: the drive. control: the same with larger voxels, for the numerical error, which is added to the
-        stated noise.
+      driven: the drive. control: the same with larger voxels, for the numerical error, see above.
       settings: of sand and numerics, plain data for the log's [source]; `rover` names it, `terrain` the plane.
       recording: noise of the instruments and its like. seed: of the noise.
 
@@ -129,12 +112,13 @@ def write_drive_log(
     if control is not None:
         error = numerical_error(_tables(model, driven, clean), _tables(model, control, clean))
     noise = recording.noise([c for t in tables.values() for c in t.columns if c != "time_s"])
-    steps = {c: float(np.median(np.diff(t["time_s"]))) for t in tables.values() for c in t.columns}
-    for channel, slow in error.items():
-        if slow[0] > 0.0:
+    for channel, (std, slow) in error.items():
+        if std > 0.0:
             instrument = noise[channel].std if channel in noise else 0.0
-            std, time_s = joined(instrument, slow, steps[channel])
-            noise[channel] = Noise(std, "datasheet", time_s)
+            both = float(np.hypot(instrument, std))
+            # Two parts: one process of this size with the error's memory would expect of every reading that it goes on
+            # where the last one was, and call white noise of the instruments many sigma.
+            noise[channel] = Noise(both, "datasheet", slow, (std / both) ** 2 if slow > 0.0 else 1.0)
     rounded = {c: [float(f"{v:.3g}") for v in e] for c, e in error.items()}
     source = {
         "who": f"lunar-mjx {__version__}, rover in a soil of particles",

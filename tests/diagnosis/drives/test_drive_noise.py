@@ -103,6 +103,33 @@ def test_a_stated_correlation_time_stays() -> None:
     assert noises.refined(observations, residual).series == observations.series
 
 
+@pytest.mark.parametrize(
+    ("white", "slow", "tau", "step", "count", "joined"),
+    [
+        (0.3, 0.0077, 47.0, 1.0, 50, 27.0),  # temperatures of a drive through particles
+        (1e-3, 2.6e-5, 0.24, 0.05, 1000, 4.5),  # its steering angles
+        (0.005, 0.13, 32.0, 0.05, 1000, 0.37),  # its positions
+        (1.0, 1.0, 10.0, 0.05, 1000, 28.0),
+    ],
+)
+def test_white_noise_beside_a_slow_error_reads_one_sigma(white, slow, tau, step, count, joined) -> None:
+    """As one process of the whole size with the error's memory it reads `joined` in place of 1."""
+    rng, time, std = np.random.default_rng(7), step * np.arange(count), float(np.hypot(white, slow))
+    share = (slow / std) ** 2
+    drawn = std * np.stack([coloured(rng, time, share, tau) for _ in range(300)], axis=1)
+    read = {}
+    for stated in (share, 1.0):
+        log = FakeLog({"roll_deg": (time, drawn[:, 0])}, {"roll_deg": Noise(std, "datasheet", tau, stated)})
+        series = (Series(0, "roll_deg", 0, count, time, *Noises([log])(log, "roll_deg")),)
+        seen = Observations(drawn[:, 0], series, ("log",), ("fit",), np.zeros(count, int), ("fit",), ("log",))
+        residual, offset = seen.whiten(drawn), seen.whiten(np.ones(count))
+        read[stated] = float(np.mean(residual**2)), float(np.std(offset @ residual) / np.linalg.norm(offset))
+    assert read[share][0] == pytest.approx(1.0, abs=0.05)
+    # evidence of a constant offset that is not there
+    assert read[share][1] == pytest.approx(1.0, abs=0.15)
+    assert read[1.0][0] == pytest.approx(joined, rel=0.2)
+
+
 def as_observations(logs, noises) -> tuple[Observations, np.ndarray]:
     """All channels as observations, and the residual of a model that ramps as they do but for a slow misfit."""
     series, parts, at = [], [], 0
