@@ -442,7 +442,7 @@ def infer(
         for _ in range(30):
             try:
                 there = _density(x + step, gram, amplitudes, fields, noises)
-            except (EvidenceError, linalg.LinAlgError):
+            except EvidenceError:
                 there = None  # sizes at which rounding spoils the density are no place to go to
             if there is not None and there.value >= here.value:
                 break
@@ -559,7 +559,10 @@ def _condition(
     downhill = scale * (across - inner @ shift)
     # standardised by the prior, the matrix is 1 or more in every direction: an amplitude that the data do not see, or a
     # discrepancy of size zero, cannot make it singular
-    factor = linalg.cholesky(np.eye(k) + scale[:, None] * inner * scale, lower=True, check_finite=False)
+    try:
+        factor = linalg.cholesky(np.eye(k) + scale[:, None] * inner * scale, lower=True, check_finite=False)
+    except linalg.LinAlgError:
+        raise EvidenceError("derivatives are too steep to compute with") from None
     covariance = linalg.cho_solve((factor, True), np.eye(k), check_finite=False)
     mean = covariance @ downhill
     # log |V| by Sylvester's identity: the determinant of the small matrix in place of one as large as the data.

@@ -265,7 +265,7 @@ def test_derivatives_that_rounding_spoils_are_no_proof():
 
 
 def test_sizes_at_which_rounding_spoils_the_density_are_gone_around(monkeypatch):
-    """The first step overshoots to a fifth of the noise. On a foreign Husky such a one ended `compare` with an error."""
+    """The first step overshoots to a fifth of the noise. On a foreign Husky such a one ended `compare`."""
     rng = np.random.default_rng(3)
     gram = Gram.of(rng.normal(size=(200, 1)), 0.5 * rng.normal(size=200))
     wanted = infer(gram, Amplitudes.of(np.ones(1)), (), [NoiseSize("x", 3.0)])

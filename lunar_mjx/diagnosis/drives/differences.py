@@ -21,10 +21,14 @@ class Differences:
     Args:
       coordinates: of the problem. which: (m,) places of those that the Jacobian is of.
       side: 1 for steps upwards where bounds allow, -1 for steps downwards.
+      steps: (coordinates,) size of each one's step in scales; `STEP` for all if None.
     """
 
-    def __init__(self, coordinates: Sequence[Coordinate], which: np.ndarray, side: int = 1):
-        self._coordinates, self._which, self._side = coordinates, which, side
+    def __init__(
+        self, coordinates: Sequence[Coordinate], which: np.ndarray, side: int = 1, steps: np.ndarray | None = None
+    ):
+        self._coordinates, self._which = coordinates, which
+        self._steps = side * (np.full(len(coordinates), STEP) if steps is None else steps)
         self._own = [int(i) for i in which if coordinates[i].log_index >= 0 and not is_linear(coordinates[i])]
         self._shared = [int(i) for i in which if coordinates[i].log_index < 0 and not is_linear(coordinates[i])]
         self._kinds = sorted({coordinates[i].name for i in self._own})
@@ -42,7 +46,7 @@ class Differences:
     def _step(self, u: np.ndarray, i: int) -> float:
         # Inwards at a bound, beyond which the model need not make sense.
         low, high = self._coordinates[i].bounds()
-        step = self._side * STEP
+        step = self._steps[i]
         return step if low <= u[i] + step <= high else -step
 
     def jacobian(

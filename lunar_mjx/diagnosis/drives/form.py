@@ -135,6 +135,10 @@ class DriveForm(MeasuredForm):
         fitted = [bool(self._fit[part.start]) for part in self.observations.of_log.values()]
         self._share = _Share.of(settings.own_share, fitted)
         self._std[self.discrepancy] = math.sqrt(self._share.mean) * self._whole_size
+        # (coordinates,) steps of derivatives, in scales. Inputs act on every reading, at all times: to first order in a
+        # fiftieth of what is usual a jump of a reading is little, where over a short step it is a slope of thousands.
+        self._steps = np.full(len(self.coordinates), STEP)
+        self._steps[self.discrepancy] = 1e-3 * self._whole_size
         self._seen: np.ndarray | None = None  # (n, coordinates) derivatives at the base, SI
         self._secants: np.ndarray | None = None  # (n, coordinates) changes by a usual amount there, over that amount
         self.jitter_s = USUAL_ERRORS.jitter_s
@@ -170,11 +174,11 @@ class DriveForm(MeasuredForm):
         stand in it as knowledge. Where a slope says so much, the one to the other side is taken as well, and of each
         reading's two the flatter: the other has the jump.
         """
-        value, slopes = self.drives.jacobian(u, free)
+        value, slopes = self.drives.jacobian(u, free, steps=self._steps)
         slopes = np.where(np.isfinite(slopes), slopes, 0.0)
         steep = self._steep(slopes, free)
         if len(steep):
-            other = self.drives.jacobian(u, free[steep], side=-1)[1]
+            other = self.drives.jacobian(u, free[steep], side=-1, steps=self._steps)[1]
             slopes[:, steep] = _flatter(slopes[:, steep], other)
         return value, slopes
 
@@ -191,14 +195,7 @@ class DriveForm(MeasuredForm):
             self.progress("signatures of unmapped ground", math.nan)
             seen[:, ground] = self.jacobian(u, ground)[1]
         self.progress("signatures of unknown inputs", math.nan)
-        # to first order in inputs of a fiftieth of what is usual
-        steps = 1e-3 * self._whole_size
-        slopes = self._changes(u, self.discrepancy, steps) / steps
-        steep = self._steep(slopes, self.discrepancy)
-        if len(steep):
-            back = -steps[steep]
-            slopes[:, steep] = _flatter(slopes[:, steep], self._changes(u, self.discrepancy[steep], back) / back)
-        seen[:, self.discrepancy] = slopes
+        seen[:, self.discrepancy] = self.jacobian(u, self.discrepancy)[1]
         return seen
 
     def _see(self, u: np.ndarray) -> None:
@@ -778,8 +775,10 @@ class DriveForm(MeasuredForm):
         for s in observations.series:
             pose[s.start : s.stop] = s.channel in POSE
         rows, kinds = self._fit | pose, len(self.noise_names)
-        columns = observations.whiten(slopes)[rows]
-        residual = observations.whiten(observations.value - value)[rows]
+        columns, residual = observations.whiten(slopes), observations.whiten(observations.value - value)
+        # A held-out drive whose simulation diverges there tells nothing of its ground.
+        rows &= np.isfinite(residual)
+        columns, residual = columns[rows], residual[rows]
         field = np.concatenate([np.full(len(free), -1), np.zeros(len(ground), int)])
         std = np.concatenate([self._std[free], np.ones(len(ground))])
         mean = np.array([self.coordinates[i].centre - u[i] for i in [*free, *ground]])

@@ -212,13 +212,16 @@ class DriveProblem:
                 out[:, part] += np.outer(amount, self._direction(c)[part])
         return out
 
-    def jacobian(self, u: np.ndarray, which: np.ndarray, side: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    def jacobian(
+        self, u: np.ndarray, which: np.ndarray, side: int = 1, steps: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Predictions (n,) at (coordinates,), and their derivatives (n, m) by some coordinates per unit of them.
 
         Args:
           u: the place. which: coordinates. side: 1 or -1, to which steps are taken.
+          steps: (coordinates,) their sizes in scales; short ones if None.
         """
-        differences = Differences(self.coordinates, which, side)
+        differences = Differences(self.coordinates, which, side, steps)
         values = self.predict(differences.rows(u))
         return values[0], differences.jacobian(u, values, self.observations, self._direction)
 
