@@ -198,7 +198,7 @@ class Amplitudes:
     Attributes:
       std: (k,) standard deviation, in units of the field's size where there is a field; finite and positive.
       field: (k,) number of the discrepancy field that an amplitude belongs to, or -1.
-      mean: (k,) prior mean relative to the refit; zero for those of fields.
+      mean: (k,) prior mean relative to the refit.
     """
 
     std: np.ndarray

@@ -79,9 +79,9 @@ DRIVE_REFIT = DriveRefit()
 class DriveForm(MeasuredForm):
     """A rover's model against drives.
 
-    Derivatives are difference quotients between rovers of one batch. Those of the model's own parameters and of the
-    effects in a refit are taken where it stands; those of other candidates and of unknown inputs once, where the model
-    as it is has been refitted.
+    Derivatives are difference quotients between rovers of one batch. Those of the model's own parameters, of
+    unknown inputs and of the effects in a refit are taken where it stands; those of other candidates once, where the
+    model as it is has been refitted.
     """
 
     def __init__(
