@@ -216,7 +216,7 @@ class Breakaway(Toy):
 
 
 def test_derivatives_by_inputs_step_over_jumps():
-    """Columns as steep as a jump over a short step made three of 21 foreign campaigns end with an error."""
+    """Columns as steep as a jump over a short step made two of 21 foreign campaigns end with an error."""
     toy = Breakaway({"a": 0.5})
     form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
     place, size = form.discrepancy[1:2], form._whole_size[1]
