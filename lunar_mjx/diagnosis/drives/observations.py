@@ -31,9 +31,18 @@ def default_splits(logs: Sequence[Log]) -> list[str]:
 def observations_of(
     bench: Bench, logs: Sequence[Log], splits: Mapping[str, str], channels: Sequence[str] | None, noise: Noises
 ) -> Observations:
-    """Measurements of the channels that a bench models (all of them if `channels` is None), with their noise."""
-    value, series, unit, at = [], [], [], 0
+    """Measurements of the channels that a bench models (all of them if `channels` is None), with their noise.
+
+    Raises:
+      UserError: no log is left to be fitted.
+    """
+    names = tuple(log.name for log in logs)
     default = default_splits(logs)
+    split = tuple(splits.get(n, d) for n, d in zip(names, default, strict=True))
+    if "fit" not in split:
+        said = ", ".join(f"{n}={s}" for n, s in zip(names, split, strict=True))
+        raise bad_input("compare", "split", said, "leaves no drive to fit", "give one of them the split fit")
+    value, series, unit, at = [], [], [], 0
     for number, (log, run) in enumerate(zip(logs, bench.runs, strict=True)):
         for channel in bench.channels(number):
             if channels is not None and channel not in channels:
@@ -51,8 +60,6 @@ def observations_of(
             value.append(measured)
             unit.append(np.full(len(time), number))
             at += len(time)
-    names = tuple(log.name for log in logs)
-    split = tuple(splits.get(n, d) for n, d in zip(names, default, strict=True))
     return Observations(
         value=np.concatenate(value),
         series=tuple(series),

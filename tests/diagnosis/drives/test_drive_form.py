@@ -16,6 +16,7 @@ from lunar_mjx.diagnosis.drives import form as module
 from lunar_mjx.diagnosis.drives import loop
 from lunar_mjx.diagnosis.drives.baseline import unfit
 from lunar_mjx.diagnosis.drives.form import DriveForm, _bounded_step
+from lunar_mjx.diagnosis.drives.observations import observations_of
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotation
@@ -195,6 +196,12 @@ def test_logs_share_what_the_settings_say(own):
     mean = np.where(fitted, 1.0, share.known)
     covariance = share.mean * np.outer(mean, mean) + share.apart @ share.apart.T
     np.testing.assert_allclose(covariance, (1.0 - own) + own * np.eye(len(fitted)), atol=1e-12)
+
+
+def test_drives_of_which_none_is_to_be_fitted_are_refused():
+    logs = [SimpleNamespace(name=name, split=None) for name in ("a", "b")]
+    with pytest.raises(UserError, match="split = 'a=test, b=select' leaves no drive to fit; give one of them"):
+        observations_of(None, logs, {"a": "test", "b": "select"}, None, None)  # type: ignore[arg-type]
 
 
 def test_a_model_whose_drives_have_all_inputs_to_themselves_is_refitted():
