@@ -475,6 +475,18 @@ def infer(
     )
 
 
+def log_density(gram: Gram, amplitudes: Amplitudes, tau: np.ndarray, noise: np.ndarray) -> float:
+    """Log density of measurements at given sizes (fields,) of discrepancy and (groups,) of noise.
+
+    Args:
+      gram, amplitudes: as for `infer`. tau, noise: the sizes.
+
+    Raises:
+      EvidenceError: rounding spoils it.
+    """
+    return _condition(gram, amplitudes, tau, noise)[0]
+
+
 def infer_levels(
     levels: Levels,
     amplitudes: Amplitudes,

@@ -110,7 +110,16 @@ def diagnose(
         # Matrices of some hundred rows are factored faster by one thread than by several that wait for each other.
         with threadpool_limits(1, "blas"):
             found = search(
-                problem.forms, settings.most_refits, settings.most_terms, settings.window, progress, over, provisional
+                problem.forms,
+                settings.most_refits,
+                settings.most_terms,
+                settings.window,
+                progress,
+                over,
+                provisional,
+                settings.least_signal,
+                settings.unlisted_share,
+                settings.most_scored,
             )
     except TimeUp:
         said = f"{seconds:.0f} s did not suffice to refit the model as it is, so nothing is said; give more --seconds."
@@ -305,7 +314,8 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         sentence += " The search ended by its time or its number of refits: what it did not refit is an estimate."
     skipped = problem.own.skipped
     if not found.complete:
-        conclusion, sentence = _unrefitted(conclusion, sentence, [h.effects for h in found.hypotheses if h.refitted])
+        refitted = [h.effects for h in found.hypotheses if h.refitted]
+        conclusion, sentence = _unrefitted(conclusion, sentence, refitted, found.challenged)
     if skipped:
         conclusion, sentence = _without(conclusion, sentence, skipped)
     held = account(_held_out(found, best, own))
@@ -360,11 +370,17 @@ def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[C
     return said, "Of what was looked at: " + sentence + skipped_sentence
 
 
-def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]]) -> tuple[Conclusion, str]:
-    """A conclusion and its sentence where time or refits did not suffice for a refit with all that it names.
+def _unrefitted(
+    said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]], challenged: bool
+) -> tuple[Conclusion, str]:
+    """A conclusion and its sentence where time or refits did not suffice for all that a name needs.
 
     A first-order estimate about a model that misfits by many sigma is no name: on seven foreign campaigns of drives
-    whose searches ended so, six such names were wrong, each with more than 99 %.
+    whose searches ended so, six such names were wrong, each with more than 99 %. Nor is a refit that has found a better
+    optimum, until the model without the effect has been refitted from there.
+
+    Args:
+      said, sentence: what would be said. refitted: effects of each refit. challenged: see `ModelSearch`.
     """
     named = {e for e in said.effects if not e.startswith("calibration: ")}
     if said.verdict is Verdict.UNKNOWN and (estimates := named.difference(*refitted)):
@@ -376,12 +392,18 @@ def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[st
         )
         rest = tuple(e for e in said.effects if e not in estimates)
         return dataclasses.replace(said, effects=rest, sentence=told), told + sentence.removeprefix(said.sentence)
-    if said.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE) or any(named <= effects for effects in refitted):
+    if said.verdict not in NAMING or not named or challenged:
         return said, sentence
-    told = (
-        f"A first-order estimate points to {' and '.join(sorted(named))}. No refit with it was made, so nothing is "
-        "named; give more --seconds, or name the candidates with --only."
-    )
+    if any(named <= effects for effects in refitted) or said.verdict is Verdict.KNOWN_CLASS:
+        told = (
+            f"The refits that were made point to {' and '.join(sorted(named))}. One without it, begun where the best "
+            "of them ended, was not made, so nothing is named; give more --seconds."
+        )
+    else:
+        told = (
+            f"A first-order estimate points to {' and '.join(sorted(named))}. No refit with it was made, so nothing is "
+            "named; give more --seconds, or name the candidates with --only."
+        )
     taken_back = {"verdict": Verdict.UNDECIDABLE, "effects": (), "further": (), "probability": 0.0, "sentence": told}
     return dataclasses.replace(said, **taken_back), told + sentence.removeprefix(said.sentence)
 

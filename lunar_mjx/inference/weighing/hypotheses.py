@@ -9,11 +9,22 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lunar_mjx.inference.evidence import Amplitudes, Evidence, Field, Gram, NoiseSize, infer, moved
+from lunar_mjx.inference.evidence import (
+    Amplitudes,
+    Evidence,
+    EvidenceError,
+    Field,
+    Gram,
+    NoiseSize,
+    infer,
+    log_density,
+    moved,
+)
 
 EFFECT, UNLISTED, CALIBRATION = "effect", "unlisted", "calibration"
 
@@ -90,6 +101,30 @@ class Linear:
         Raises:
           EvidenceError: the sizes did not settle.
         """
+        gram, prior, fields, places, back = self._model(terms)
+        inferred = infer(gram, prior, fields, self.noises, start)
+        value = inferred.log_evidence + inferred.log_inside(self.low[places], self.high[places]) - self.unkept
+        if self.judged is not None:
+            held = self.judged if back is None else shifted(self.judged, back)
+            value += inferred.log_score(held.select(places))
+        return value, inferred, places
+
+    def at_sizes(self, terms: frozenset[Term], sizes: tuple[np.ndarray, np.ndarray]) -> float:
+        """Log density of the fitted measurements by a set of terms at given sizes of discrepancy and noise.
+
+        Priors are not truncated, nor is anything `judged`: this tells which sets are worth an `evidence`, which takes
+        ten times as long. Minus infinity where rounding spoils it.
+        """
+        gram, prior, *_ = self._model(terms)
+        try:
+            return log_density(gram, prior, *sizes)
+        except EvidenceError:
+            return -math.inf
+
+    def _model(
+        self, terms: frozenset[Term]
+    ) -> tuple[Gram, Amplitudes, tuple[Field, ...], np.ndarray, np.ndarray | None]:
+        """Statistics, prior, fields and columns of a set of terms, and what moves the refit's other effects to null."""
         named = {t.name for t in terms if t.kind == EFFECT}
         own = [self.effects[name] for name in self.effects if name in named]
         unlisted = {t.name for t in terms if t.kind == UNLISTED}
@@ -97,12 +132,13 @@ class Linear:
         places = np.concatenate([self.always, *own]).astype(int)
         # An effect of the refit that is no term of this hypothesis goes back to its null.
         gone = [p for name, p in self.effects.items() if name not in named and np.any(self.at[p] != 0.0)]
-        gram, discrepancy_back = self.gram, np.zeros(self.gram.width)
-        for p in gone:
-            # From where the refit stands to zero amplitude, by the linear model.
-            discrepancy_back[p] = -self.at[p]
+        gram, back = self.gram, None
         if gone:
-            gram = shifted(gram, discrepancy_back)
+            back = np.zeros(self.gram.width)
+            for p in gone:
+                # From where the refit stands to zero amplitude, by the linear model.
+                back[p] = -self.at[p]
+            gram = shifted(gram, back)
         std = self.amplitudes.std.copy()
         for t in terms:
             if t.kind == CALIBRATION:
@@ -110,12 +146,7 @@ class Linear:
         # an instrument that errs more than usual has the columns of every hypothesis, with a wider prior
         prior = Amplitudes(std, self.amplitudes.field, self.amplitudes.mean).select(places)
         fields = tuple(Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields)
-        inferred = infer(gram.select(places), prior, fields, self.noises, start)
-        value = inferred.log_evidence + inferred.log_inside(self.low[places], self.high[places]) - self.unkept
-        if self.judged is not None:
-            held = self.judged if not gone else shifted(self.judged, discrepancy_back)
-            value += inferred.log_score(held.select(places))
-        return value, inferred, places
+        return gram.select(places), prior, fields, places, back
 
     def shows(self) -> dict[str, float]:
         """Length in sigma of each effect's signature at its prior size that the form's own parameters cannot absorb.

@@ -2,9 +2,8 @@
 
 Best first: around each refit all neighbours (one term more, one less) are scored in linear approximation; the most
 probable set that has not been refitted is refitted next, until no other comes near the best. So every accepted effect
-is challenged by a refit without it, and a greedy step that led into a trap is undone. Where the set without it promises
-more around the refit with it than its own refit has reached, it is refitted again, from there: a descent that found a
-better optimum on its way must not be taken for what the effect is worth.
+is challenged by a refit without it, from where the refit with it has ended, and a greedy step that led into a trap is
+undone: a descent that found a better optimum on its way must not be taken for what the effect is worth.
 
 What an effect promises is believed in the share that its refits have kept. Else some larger set, of which there are
 always more than refits, would stand in front of those that were refitted by a promise that has been broken already.
@@ -93,6 +92,7 @@ class ModelSearch:
       hypotheses: all that were evaluated, most probable first. probability: of each, together 1.
       refits: made. failed: "form with effects: reason" of each refit whose solver failed.
       complete: whether no hypothesis near the best was left without a refit.
+      challenged: whether every set with one effect less than the best one was refitted from where its refit ended.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -100,6 +100,7 @@ class ModelSearch:
     refits: int
     failed: tuple[str, ...]
     complete: bool
+    challenged: bool = True
 
     @property
     def best(self) -> Hypothesis:
@@ -138,6 +139,7 @@ def search(
     provisional: Callable[[ModelSearch], None] = lambda found: None,
     least_signal: float = LEAST_SIGNAL,
     unlisted_share: float = UNLISTED_SHARE,
+    most_scored: float = math.inf,
 ) -> ModelSearch:
     """Looks for the most probable sets of terms.
 
@@ -148,11 +150,12 @@ def search(
       progress: told of every refit. stop: whether to begin no further refit.
       provisional: given what is known after every refit but the first.
       least_signal: see `LEAST_SIGNAL`. unlisted_share: see `UNLISTED_SHARE`.
+      most_scored: effects beside a set that are scored with sizes of their own; the others are less probable by far.
 
     Raises:
       EvidenceError: no form could be fitted. TimeUp: before the first one was.
     """
-    under_way = _Search(forms, most_refits, most_terms, window, least_signal, unlisted_share, progress)
+    under_way = _Search(forms, most_refits, most_terms, window, least_signal, unlisted_share, most_scored, progress)
     under_way.begin()
     complete = False
     while not complete and under_way.may_refit and not stop():
@@ -165,7 +168,7 @@ class _Search:
     """A search under way: what is asked of it, and what it knows.
 
     Attributes:
-      forms, most_refits, most_terms, window, least_signal, unlisted_share, progress: as for `search`.
+      forms, most_refits, most_terms, window, least_signal, unlisted_share, most_scored, progress: as for `search`.
       known: the best evidence of each set of terms beside each form.
       done: the best refit by form and effects; None where the solver failed.
       refits: number made. begun: form, effects, and effects of the refit at whose end it began, of each.
@@ -181,6 +184,7 @@ class _Search:
     window: float
     least_signal: float
     unlisted_share: float
+    most_scored: float
     progress: Callable[[str, float], None]
     known: dict[tuple[str, Terms], Hypothesis] = dataclasses.field(default_factory=dict)
     done: dict[tuple[str, frozenset[str]], Refit | None] = dataclasses.field(default_factory=dict)
@@ -244,14 +248,9 @@ class _Search:
             return True
         # What leaving an effect out costs is told by a refit: where several do the work of one another, the linear
         # estimate about the full set is much too high, and a set that grew around a wrong first step would stand.
-        rivals = [best.effects - {e} for e in sorted(best.effects)]
-        unchallenged = [r for r in rivals if (best.form, r) not in self.done]
+        unchallenged = self.unchallenged(best)
         if unchallenged:
             self.refit(by_name[best.form], unchallenged[0], best)
-            return True
-        better = self.promising(by_name[best.form], best, rivals)
-        if better is not None:
-            self.refit(by_name[best.form], better.effects, better)
             return True
         doubted = self.doubted(best)
         if doubted is not None:
@@ -305,6 +304,11 @@ class _Search:
             self.done[key] = None
             self.reasons.append(f"{label}: no evidence around its refit")
 
+    def unchallenged(self, best: Hypothesis) -> list[frozenset[str]]:
+        """Sets with one effect less than a refitted one, beside which no refit has begun where that one's has ended."""
+        rivals = [best.effects - {e} for e in sorted(best.effects)]
+        return [r for r in rivals if (best.form, r, best.effects) not in self.begun]
+
     def hold(self, promise: Promise, reached: Hypothesis) -> None:
         """Holds a promise against what its refit has reached, and all others of the same effect with it."""
         if promise.gain <= 0.0:
@@ -323,25 +327,6 @@ class _Search:
             return h
         promised, kept = self.record[h.form, h.promise.effect]
         return dataclasses.replace(h, log_posterior=h.promise.believed(kept / promised))
-
-    def promising(self, form: Form, best: Hypothesis, rivals: Iterable[frozenset[str]]) -> Hypothesis | None:
-        """The set of effects that promises most around a refit beyond what its own has reached; None if none does.
-
-        The promise is the linear estimate: it costs no refit where all refits are at one optimum.
-
-        Args:
-          form: of the model. best: around whose refit. rivals: sets of effects that have been refitted.
-        """
-        found = []
-        for names in rivals:
-            terms = _listed(form, names)
-            old = self.known.get((form.name, terms))
-            if old is None or not old.refitted or (form.name, names, best.effects) in self.begun:
-                continue
-            new = self.estimate(form, best.refit, terms, _sizes(old))
-            if new is not None and new.log_posterior > max(old.log_posterior, best.log_posterior - self.window):
-                found.append(new)
-        return max(found, key=lambda h: h.log_posterior, default=None)
 
     def doubted(self, best: Hypothesis) -> Hypothesis | None:
         """The set with one effect more that would come near the best one if its promise were kept in full.
@@ -366,7 +351,8 @@ class _Search:
         order = sorted(alive, key=lambda h: -h.log_posterior)
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
-        return ModelSearch(tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete)
+        challenged = order[0].refitted and not self.unchallenged(order[0])
+        return ModelSearch(tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete, challenged)
 
     def untried(self, best: Hypothesis) -> list[str]:
         """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.
@@ -422,9 +408,21 @@ class _Search:
             # A neighbour of what is hopeless may still be the truth where nothing has been found yet.
             if root is not base and root.log_posterior < top - self.window:
                 continue
-            scored((root.terms | {t} for t in effects if t not in own), root)
+            more = [root.terms | {t} for t in effects if t not in own]
+            scored(self.likely(made, more, root), root)
             scored((root.terms - {t} for t in own), root)
         return True
+
+    def likely(self, made: Refit, choices: Sequence[Terms], beside: Hypothesis) -> Sequence[Terms]:
+        """Of sets of terms the most probable ones at the sizes of a set around the same refit, as many as are scored.
+
+        Sizes settle anew for each set that is scored, which takes far longer than a look at given ones.
+        """
+        if len(choices) <= self.most_scored:
+            return choices
+        sizes = _sizes(beside)
+        looks = [(made.linear.at_sizes(terms, sizes), k) for k, terms in enumerate(choices)]
+        return [choices[k] for _, k in sorted(looks, reverse=True)[: int(self.most_scored)]]
 
     def score(
         self,

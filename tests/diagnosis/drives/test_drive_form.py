@@ -430,16 +430,22 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     assert found.refits == 1
     assert said.effects == ("drag",), "the linear estimate tells it, too"
     refitted = [h.effects for h in found.hypotheses if h.refitted]
-    told, sentence = _unrefitted(said, said.sentence, refitted)
+    assert not found.challenged
+    told, sentence = _unrefitted(said, said.sentence, refitted, found.challenged)
     assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
     assert sentence.startswith("A first-order estimate points to drag. No refit with it was made")
     assert "%" not in sentence and "is missing" not in sentence
-    assert _unrefitted(said, said.sentence, [*refitted, frozenset({"drag", "lag"})]) == (said, said.sentence)
+    # a refit with it is a name once the model without it has been refitted from there
+    more = [*refitted, frozenset({"drag", "lag"})]
+    told, sentence = _unrefitted(said, said.sentence, more, False)
+    assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
+    assert sentence.startswith("The refits that were made point to drag. One without it")
+    assert _unrefitted(said, said.sentence, more, True) == (said, said.sentence)
     # beside something unlisted it is no name either, and the port stands
     beside = Conclusion(
         Verdict.UNKNOWN, ("drag", "lag"), True, "soil", 0.99, "It acts at soil. Beside it drag and lag help."
     )
-    told, sentence = _unrefitted(beside, beside.sentence + " More.", [frozenset({"lag"})])
+    told, sentence = _unrefitted(beside, beside.sentence + " More.", [frozenset({"lag"})], False)
     assert (told.verdict, told.effects, told.port) == (Verdict.UNKNOWN, ("lag",), "soil")
     assert sentence.startswith("It acts at soil. A first-order estimate points to drag beside it, which is not named")
     assert sentence.endswith(" More.")
@@ -545,6 +551,27 @@ def test_a_jump_within_the_step_of_a_derivative_is_no_slope():
     toy.edge = place[0] + 1e-9
     assert abs(toy.jacobian(place, free)[1][7, 0] - smooth[7, 0]) > 1e4
     np.testing.assert_allclose(form.jacobian(place, free)[1], smooth, atol=1e-3)
+
+
+class Stumbling(Toy):
+    """A toy of which every fifth reading jumps by three sigma, to and fro over a hundredth of a scale."""
+
+    def predict(self, u):
+        out = super().predict(u)
+        out[:, ::5] += 3.0 * np.sign(np.sin(3e2 * np.atleast_2d(u)[:, :1] + np.arange(out[:, ::5].shape[1])))
+        return out
+
+
+def test_readings_that_no_slope_tells_are_noisier_and_others_are_not():
+    toy = Stumbling({"a": 1.5, "b": -0.8})
+    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    told = form.observations.sigma() / toy.observations.sigma()
+    stumbles = np.arange(len(told)) % 5 == 0
+    assert np.median(told[stumbles]) > 2.0 > 1.3 > np.max(told[~stumbles])
+    plain = DriveForm(toy, DriveSettings(draws=0))  # type: ignore[arg-type]
+    without = plain.refit(frozenset(), None, None)
+    assert abs(base.u[0] - 1.5) < 0.05 < abs(without.u[0] - 1.5)
 
 
 class Turning(Toy):
