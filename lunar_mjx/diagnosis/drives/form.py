@@ -15,7 +15,8 @@ from scipy import linalg
 from lunar_mjx.diagnosis.drives.channel_errors import ChannelErrors, error_kind
 from lunar_mjx.diagnosis.drives.differences import STEP
 from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS, usual_kind
-from lunar_mjx.diagnosis.drives.observations import with_jitter
+from lunar_mjx.diagnosis.drives.nuisances import is_linear
+from lunar_mjx.diagnosis.drives.observations import with_errors
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.simulation.program import cores
@@ -141,6 +142,7 @@ class DriveForm(MeasuredForm):
         self._steps[self.discrepancy] = 1e-3 * self._whole_size
         self._seen: np.ndarray | None = None  # (n, coordinates) derivatives at the base, SI
         self._secants: np.ndarray | None = None  # (n, coordinates) changes by a usual amount there, over that amount
+        self._strays = np.zeros(len(self.observations))  # what predictions do that no slope tells, see `_learn_strays`
         self.jitter_s = USUAL_ERRORS.jitter_s
         kinds = [usual_kind(c) for c in self.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
@@ -630,7 +632,7 @@ class DriveForm(MeasuredForm):
 
     def _errors_with(self, jitter_s: float) -> ChannelErrors:
         """Observations whose times scatter by so many seconds, with each size of their channels' errors."""
-        seen = with_jitter(self.drives.observations, self.drives.rate, jitter_s)
+        seen = with_errors(self.drives.observations, np.hypot(jitter_s * self.drives.rate, self._strays))
         return ChannelErrors(seen, self._group, len(self.noise_names), self.settings)
 
     def _usual_fields(self) -> tuple[Field, ...]:
@@ -678,18 +680,50 @@ class DriveForm(MeasuredForm):
             drives.about(u)
             self._seen = self._see_inputs(u)
             slopes = self.jacobian(u, free)[1]
+            self._learn_strays(u, free, slopes)
             before = self.channel_errors, self.error_times_s
             found = self._choose_errors(u, free, slopes, (usual_jitter,))
             if (self.channel_errors, self.error_times_s) == before:
                 break
-            u, slopes, _ = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
+            u, slopes, _ = self._descend(
+                u, free, self.observations, (found.tau, found.noise), slopes, most=self.settings.few_jacobians
+            )
             u = self._find_ground(u, free)
         if drives.noise_unlearnt:
             drives.learn_noise(u)
             # what is learnt of the noise is in what the drives hold from now on
             errors = self._errors_with(usual_jitter)
             self.observations = errors.at(errors.usual)
-        return self._see_all(u, free)
+        return self._see_all(u, free, anew=True)
+
+    def _learn_strays(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> None:
+        """Takes as noise what predictions do over probable places that slopes do not tell.
+
+        Where a wheel sticks or slips, meets an edge or begins to turn, a prediction jumps with every little change: no
+        slope holds for such a reading, and a descent that believes one is led by jumps. Other readings have none of
+        this noise (statistical linearisation: Garcia-Fernandez et al. 2015).
+
+        Args:
+          u, free, slopes: as for `_columns`.
+        """
+        usual = np.array([f.usual for f in self._usual_fields()]), np.ones(len(self.noise_names))
+        cost = self._cost(u, free, self.observations, usual, self._inputs(free, slopes))
+        white = cost.white(slopes)
+        normal = cost.inner(white, white) + np.diag(cost.std**-2)
+        # the same draws at each place: two looks at one place tell the same
+        draws = np.random.default_rng(0).standard_normal((len(free), self.settings.draws))
+        moves = linalg.solve_triangular(np.linalg.cholesky(normal).T, draws).T
+        # What belongs to a held-out drive alone, such as its start, no measurement has told.
+        held_out = [k for k, part in self.observations.of_log.items() if not self._fit[part.start]]
+        moves[:, [self.coordinates[i].log_index in held_out for i in free]] = 0.0
+        low, high = self.drives.bounds(free)
+        rows = np.repeat(u[None], 1 + len(moves), axis=0)
+        rows[1:, free] = np.clip(u[free] + moves, low, high)
+        here, *there = self.drives.predict(rows)
+        strays = [p - here - slopes @ (row[free] - u[free]) for p, row in zip(there, rows[1:], strict=True)]
+        # A simulation that diverged is no probable place.
+        strays = [s for s in strays if np.isfinite(s).all()]
+        self._strays = np.sqrt(np.mean(np.square(strays), axis=0)) if strays else np.zeros(len(here))
 
     def _take_kept(self) -> bool:
         """Whether an earlier refit of these drives has left errors of channels, which are taken then."""
@@ -701,6 +735,9 @@ class DriveForm(MeasuredForm):
         if not kept or self.drives.noise_unlearnt or kept["jitter_s"] not in self.settings.jitters_s:
             return False
         self.drives.about(self.start)
+        free = self._free(frozenset())
+        self._seen = self._see_inputs(self.start)
+        self._learn_strays(self.start, free, self.jacobian(self.start, free)[1])
         errors = self._errors_with(kept["jitter_s"])
         levels = errors.at_shares(kept["channel_errors"], kept["error_times_s"])
         if levels is None:
@@ -750,10 +787,16 @@ class DriveForm(MeasuredForm):
         self.observations = errors.at(levels)
         self.channel_errors, self.error_times_s = errors.shares(levels), errors.times_s(levels)
 
-    def _see_all(self, u: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Takes all derivatives at a refit (coordinates,) of the model as it is, and returns it."""
+    def _see_all(self, u: np.ndarray, free: np.ndarray, anew: bool = False) -> np.ndarray:
+        """Takes all derivatives at a refit (coordinates,) of the model as it is, and returns it.
+
+        Args:
+          u: the refit. free: what it moved. anew: whether what predictions do beside slopes is learnt there, too.
+        """
         self._see(u)
         self._slopes[frozenset()] = free, self.jacobian(u, free)[1]
+        if anew:
+            self._learn_strays(u, free, self._slopes[frozenset()][1])
         self._ground = u[self.drives.ground]
         return u
 
@@ -827,6 +870,7 @@ class DriveForm(MeasuredForm):
         slopes: np.ndarray | None = None,
         guessed: bool = False,
         once: bool = False,
+        most: int | None = None,
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """The most probable coordinates at given sizes of discrepancy and noise, the derivatives near them, and the
         decrease of chi-square that these still promise.
@@ -837,7 +881,7 @@ class DriveForm(MeasuredForm):
           u: (coordinates,) where from. free: places of what moves. observations: with the channels' errors.
           sizes: None for noise alone.
           slopes: (n, free) derivatives, if known. guessed: whether these are to be taken anew before the end.
-          once: whether no others than these are taken.
+          once: whether no others than these are taken. most: Jacobians at most; as the settings say if None.
 
         Raises:
           EvidenceError: the simulation diverged at the start.
@@ -848,8 +892,9 @@ class DriveForm(MeasuredForm):
         settings = self.settings
         cost = self._cost(u, free, observations, sizes, None if sizes is None else self._inputs(free, slopes))
         white, inner, wanted, std, centre = cost.white, cost.inner, cost.wanted, cost.std, cost.centre
-        # Scales of inputs are another rover's: their prior alone bounds them.
-        scaled = self._field_of[free] < 0
+        # Slopes of instruments hold however far they move, and scales of inputs are another rover's.
+        linear = np.array([is_linear(self.coordinates[i]) for i in free], bool)
+        scaled = (self._field_of[free] < 0) & ~linear
         low, high = self.drives.bounds(free)
         residual = white(wanted - self.predicted(u))
         if not np.isfinite(residual).all():
@@ -857,7 +902,7 @@ class DriveForm(MeasuredForm):
         present_chi2 = cost.chi2(residual, u[free])
         damping, trials = DRIVE_REFIT.damping, min(len(DRIVE_REFIT.factors), self.drives.together)
         try:
-            for _ in range(settings.most_jacobians):
+            for _ in range(settings.most_jacobians if most is None else most):
                 jacobian, first = white(slopes), present_chi2
                 normal = inner(jacobian, jacobian) + np.diag(std**-2)
                 while True:
@@ -885,8 +930,10 @@ class DriveForm(MeasuredForm):
                         continue
                     damping = max(DRIVE_REFIT.softer * dampings[best], DRIVE_REFIT.damping)
                     u, residual, present_chi2 = rows[best], residuals[best], reached[best]
-                    # A step that keeps less than a third of its promise has left where these slopes hold.
-                    if gained < 0.3 * _promised(steps[best], normal, downhill):
+                    # A step that keeps less than a third of its promise has left where these slopes hold; what gains a
+                    # tenth of what they have gained so far gains more with new ones, which take as long as five steps.
+                    kept, little = gained / _promised(steps[best], normal, downhill), 0.1 * (first - present_chi2)
+                    if kept < 0.3 or (gained < little and not once):
                         break
                 if once or (not guessed and first - present_chi2 < settings.settled):
                     break

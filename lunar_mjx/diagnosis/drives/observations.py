@@ -121,15 +121,14 @@ def with_discrepancy(
     return dataclasses.replace(observations, series=tuple(map(widened, observations.series)))
 
 
-def with_jitter(observations: Observations, rate: np.ndarray, jitter_s: float) -> Observations:
-    """Observations whose white noise holds what times that scatter make of signals that change.
+def with_errors(observations: Observations, error: np.ndarray) -> Observations:
+    """Observations whose white noise holds errors of single readings, such as those of times that scatter.
 
     Args:
-      observations: of drives. rate: (n,) change by time, per second. jitter_s: standard deviation of the times.
+      observations: of drives. error: (n,) standard deviation of each reading's own error, in its channel's unit.
     """
 
     def widened(s: Series) -> Series:
-        # To first order an error of time is one of the signal, times its rate.
-        return dataclasses.replace(s, white=np.hypot(s.white, jitter_s * rate[s.start : s.stop]))
+        return dataclasses.replace(s, white=np.hypot(s.white, error[s.start : s.stop]))
 
     return dataclasses.replace(observations, series=tuple(map(widened, observations.series)))

@@ -53,12 +53,18 @@ class DriveSettings(SearchSettings):
     # --- effort ------------------------------------------------------------------------------------------------------
     most_refits: int = 8
     """1; refits of a search, each of which simulates some hundred drives."""
+    most_scored: int = 8
+    """1; effects beside a set that are scored with sizes of their own, each of which takes a second or more."""
     most_rounds: int = 2
     """1; rounds of refit and re-linearisation."""
-    most_jacobians: int = 12
+    few_jacobians: int = 2
+    """1; Jacobians of a descent after which errors of channels are chosen anew: it need not arrive before these are."""
+    most_jacobians: int = 5
     """1; Jacobians of one descent."""
     settled: float = 2.0
     """chi-square; what a further step must promise, and what the steps with one Jacobian must gain: a nat, a quarter of
     the `window`."""
+    draws: int = 8
+    """1; probable places at which a prediction is held against what slopes tell of it; 0: slopes hold for all."""
     longest_step: float = 3.0
     """scale; longest step of a coordinate."""

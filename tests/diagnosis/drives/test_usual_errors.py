@@ -14,7 +14,7 @@ from lunar_mjx.diagnosis.drives.instruments import (
     usual_kind,
     usual_nuisances,
 )
-from lunar_mjx.diagnosis.drives.observations import with_jitter
+from lunar_mjx.diagnosis.drives.observations import with_errors
 from tests.inference.toy_problem import manoeuvres
 
 
@@ -49,7 +49,7 @@ def test_times_that_scatter_count_where_a_signal_changes():
     rate = np.zeros(200)
     rate[40:45] = 8.0
     rng = np.random.default_rng(5)
-    seen = with_jitter(observations, rate, 0.005)
+    seen = with_errors(observations, 0.005 * rate)
     error = rate * 0.005 * rng.standard_normal(200) + 0.01 * rng.standard_normal(200)
     weighed, taken_for_noise = (np.sqrt(np.mean(o.whiten(error)[40:45] ** 2)) for o in (seen, observations))
     assert weighed < 2.0 < taken_for_noise

@@ -28,7 +28,7 @@ from lunar_mjx.model.sun import make_sun
 if TYPE_CHECKING:
     from lunar_mjx.logs import Log
 
-CHUNK = {"cpu": 16, "gpu": 512}
+CHUNK = {"cpu": 32, "gpu": 512}
 """Rovers simulated at once. (2,048 with 44 effects and channels of 50 Hz need more than 22 GiB.)"""
 
 _AT_ONCE = frozenset({"motor_current", "motor_voltage", "motor_torque", "bus_voltage"})
