@@ -113,6 +113,7 @@ def parser() -> argparse.ArgumentParser:
     driven.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     driven.add_argument("--minutes", type=float, default=60.0)
     driven.add_argument("--limit", type=float, default=0.0, help="seconds for one campaign, made and answered; 0: none")
+    driven.add_argument("--setting", action="append", default=[], help="NAME=VALUE for `compare`, to ablate a rule")
     driven.add_argument("--cold", action="store_true", help="compile nothing beforehand")
     driven.add_argument("-o", "--out", type=Path, required=True)
     driven.set_defaults(do=drives)

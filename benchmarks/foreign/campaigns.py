@@ -18,8 +18,9 @@ import multiprocessing
 import os
 import time
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from . import drive_cases, pool, work
@@ -85,11 +86,14 @@ def compile_part(job: Job, folder: Path, part: int, of: int) -> None:
         drives.predict(row)
 
 
-def ask(job: Job, folder: Path, until: float) -> tuple[dict[str, Any], dict[str, Any]]:
+def ask(
+    job: Job, folder: Path, until: float, settings: Mapping[str, str] = MappingProxyType({})
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of one campaign, and its verdict.
 
     Args:
       job: which campaign. folder: of the set. until: `time.monotonic` by which the answer is to be there.
+      settings: of `compare`.
     """
     spent = time.process_time()
     make(job, folder)
@@ -97,7 +101,7 @@ def ask(job: Job, folder: Path, until: float) -> tuple[dict[str, Any], dict[str,
     truth = json.loads((folder / "truth" / f"{name}.json").read_text(encoding="utf-8"))
     out = folder / "runs" / name
     out.mkdir(parents=True, exist_ok=True)
-    answer = _answer(folder / "logs" / name, out, until)
+    answer = _answer(folder / "logs" / name, out, until, settings)
     path = out / "run" / "verdict.json"
     verdict = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     what = said(answer, verdict)
@@ -123,7 +127,7 @@ def ask(job: Job, folder: Path, until: float) -> tuple[dict[str, Any], dict[str,
     return row, {"case": name, **verdict}
 
 
-def _answer(logs: Path, out: Path, until: float) -> dict[str, Any]:
+def _answer(logs: Path, out: Path, until: float, settings: Mapping[str, str]) -> dict[str, Any]:
     """What the tool says about the logs of a folder by `compare` and `why`, until a `time.monotonic`."""
     from lunar_mjx.cli import main
 
@@ -136,7 +140,8 @@ def _answer(logs: Path, out: Path, until: float) -> dict[str, Any]:
         contextlib.redirect_stderr(text),
     ):
         try:
-            status = work._verb(main, "compare", str(logs), "-o", str(run))
+            extra = [w for k, v in settings.items() for w in ("--setting", f"{k}={v}")]
+            status = work._verb(main, "compare", str(logs), "-o", str(run), *extra)
             seconds["compare"] = time.monotonic() - began
             if status:
                 answer["verdict"] = "BAD_DATA" if status == 10 else "CRASH"
@@ -168,9 +173,11 @@ def drives(args: argparse.Namespace) -> None:
     head, dirty = work.commit()
     places = multiprocessing.get_context("spawn").Queue()
     allowed = sorted(os.sched_getaffinity(0))
+    each = max(1, len(allowed) // args.processes)  # cores
     for k in range(args.processes):
-        places.put(allowed[-1 - k % len(allowed)])
-    processes = pool.Pool(args.processes, _begin, places, folder, until, args.limit)
+        places.put({allowed[(k * each + i) % len(allowed)] for i in range(each)})
+    settings = dict(s.split("=", 1) for s in args.setting)
+    processes = pool.Pool(args.processes, _begin, places, folder, until, args.limit, settings)
     try:
         first = {j[5]: j for j in reversed(todo)}  # of every rover
         if not args.cold:
@@ -189,10 +196,10 @@ def drives(args: argparse.Namespace) -> None:
             hidden = ", ".join(row["truth"]["hidden"]) or "nothing"
             about_it = f"{row['case']}  {row['truth']['rover']:<8} {hidden:<20} {row['verdict']:<12}"
             print(f"{time.monotonic() - begun:5.0f} s  {about_it} {', '.join(row['effects'])}", flush=True)
-            score_rows(folder, about, rows, {})
+            score_rows(folder, about, rows, settings)
     finally:
         processes.end()
-        score_rows(folder, about, rows, {}, show=True)
+        score_rows(folder, about, rows, settings, show=True)
     print(f"{len(rows)} rows, {time.monotonic() - begun:.0f} s", flush=True)
 
 
@@ -204,16 +211,16 @@ def _report(answers: Iterable[tuple[Any, Any]], begun: float) -> None:
 
 
 class _Process:
-    """What a process of the pool works on: folder of the set, and by when."""
+    """What a process of the pool works on: folder of the set, by when, and settings of `compare`."""
 
-    folder = Path()
+    folder, settings = Path(), {}
     until = limit_s = 0.0
 
 
-def _begin(places: Any, folder: Path, until: float, limit_s: float) -> None:
-    # Cores are counted by what a process may use: one each, so that none makes threads for all.
-    os.sched_setaffinity(0, {places.get()})
-    _Process.folder, _Process.until, _Process.limit_s = folder, until, limit_s
+def _begin(places: Any, folder: Path, until: float, limit_s: float, settings: Mapping[str, str]) -> None:
+    # Cores are counted by what a process may use: its own share, so that none makes threads for all.
+    os.sched_setaffinity(0, places.get())
+    _Process.folder, _Process.until, _Process.limit_s, _Process.settings = folder, until, limit_s, settings
 
 
 def _make(job: Job) -> None:
@@ -228,7 +235,7 @@ def _ask(job: Job) -> tuple[dict[str, Any], dict[str, Any]] | None:
     """As `ask`; None where too little time is left."""
     now = time.monotonic()
     end = min(_Process.until - WRITING, now + (_Process.limit_s or math.inf))
-    return ask(job, _Process.folder, end) if end - now > LEAST_SECONDS else None
+    return ask(job, _Process.folder, end, _Process.settings) if end - now > LEAST_SECONDS else None
 
 
 def _name(job: Job) -> str:
