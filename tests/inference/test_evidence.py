@@ -20,6 +20,7 @@ from lunar_mjx.inference.evidence import (
     infer,
     infer_levels,
     log_box,
+    log_density,
 )
 
 N, OWN, EACH = 60, 3, 8
@@ -317,3 +318,14 @@ def test_amplitudes_within_bounds_are_those_of_bounded_least_squares(drawn):
     best = optimize.lsq_linear(root, root @ found.mean, (low, high), tol=1e-12).x
     np.testing.assert_allclose(found.within(low, high), best, atol=1e-6)
     np.testing.assert_array_equal(found.within(low - 9.0, high + 9.0), found.mean)
+
+
+def test_the_density_at_given_sizes_is_that_of_a_normal_distribution():
+    rng = np.random.default_rng(5)
+    columns, residual, group = rng.standard_normal((30, 4)), rng.standard_normal(30), np.arange(30) % 2
+    amplitudes = Amplitudes.of([0.5, 2.0, 1.0, 3.0], field=[-1, 0, 0, -1], mean=[0.3, 0.0, 0.0, -0.2])
+    tau, noise = np.array([0.7]), np.array([1.3, 0.8])
+    std = amplitudes.std * np.append(tau, 1.0)[amplitudes.field]
+    covariance = (columns * std**2) @ columns.T + np.diag(noise[group] ** 2)
+    wanted = stats.multivariate_normal(columns @ amplitudes.mean, covariance).logpdf(residual)
+    assert log_density(Gram.of(columns, residual, group, 2), amplitudes, tau, noise) == pytest.approx(wanted, abs=1e-9)

@@ -244,3 +244,19 @@ def test_a_set_promises_beside_another_form_what_its_last_effects_gained():
     known += [hypothesis("two", "", -60.0), hypothesis("two", "a", -35.0), hypothesis("two", "b", 0.0)]
     assert _carried_over(known, known[2], "two") == -35.0 + (-10.0 + 40.0)
     assert _carried_over(known, known[2], "three") == -np.inf
+
+
+def test_a_search_that_ends_before_a_name_was_challenged_says_so():
+    value = measured(0, wave=0.8)
+    early = search([ToyForm(value)], most_refits=2, most_terms=4, window=4.0)
+    assert early.best.refitted and early.best.effects == {"wave"}
+    assert not early.challenged and not early.complete
+    assert look(value).challenged
+
+
+def test_few_sets_are_scored_with_sizes_of_their_own_and_the_best_is_among_them():
+    value = measured(0, wave=0.8)
+    few = search([ToyForm(value)], 12, 4, 4.0, most_scored=1)
+    assert few.best.effects == {"wave"}
+    assert few.best.log_posterior == pytest.approx(look(value).best.log_posterior, abs=1e-6)
+    assert len(few.hypotheses) < len(look(value).hypotheses)
