@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -118,19 +118,23 @@ class Observations:
         """
         flat = columns.reshape(len(self), -1)
         out = np.empty_like(flat, dtype=float)
-        batches: dict[tuple[int, bytes], list[Series]] = {}
         for s in self.series:
             part = slice(s.start, s.stop)
-            if s.time is None or s.coloured <= 0.0 or s.correlation_time <= 0.0:
+            if not _is_slow(s):
                 out[part] = flat[part] / np.sqrt(np.square(s.white) + s.coloured**2).reshape(-1, 1)
                 if s.chain is not None:
                     out[part] = s.chain.whiten(out[part])
-            else:
-                # Series sampled at one clock share the filter's loop over time, which is what costs.
-                batches.setdefault((s.stop - s.start, np.asarray(s.time).tobytes()), []).append(s)
-        for group in batches.values():
+        for group in self._clocks():
             _innovations(group, flat, out)
         return out.reshape(columns.shape)
+
+    def _clocks(self) -> list[list[Series]]:
+        """Series with slow noise by their clock: they share the filter's loop over time, which is what costs."""
+        batches: dict[tuple[int, bytes], list[Series]] = {}
+        for s in self.series:
+            if _is_slow(s):
+                batches.setdefault((s.stop - s.start, np.asarray(s.time).tobytes()), []).append(s)
+        return list(batches.values())
 
     def log_widths(self) -> np.ndarray:
         """(n,) log of what `whiten` divides every innovation by, in the channels' units.
@@ -139,40 +143,47 @@ class Observations:
         """
         out = np.empty(len(self))
         for s in self.series:
-            white = np.broadcast_to(np.square(s.white), s.stop - s.start)
-            if s.time is None or s.coloured <= 0.0 or s.correlation_time <= 0.0:
-                out[s.start : s.stop] = 0.5 * np.log(white + s.coloured**2)
-                continue
-            # The filter's variances alone, as in `_innovations`: they do not depend on what was measured.
-            keep = np.exp(-np.diff(np.asarray(s.time)) / s.correlation_time) ** 2
-            variance = s.coloured**2
-            for i, own in enumerate(white):
-                if i:
-                    variance = keep[i - 1] * variance + s.coloured**2 * (1.0 - keep[i - 1])
-                out[s.start + i] = 0.5 * np.log(variance + own)
-                variance *= own / (variance + own)
+            if not _is_slow(s):
+                out[s.start : s.stop] = 0.5 * np.log(np.square(s.white) + s.coloured**2)
+        for group in self._clocks():
+            for i, (total, _, _) in enumerate(_filter(group)):
+                out[[s.start + i for s in group]] = 0.5 * np.log(total)
         return out
 
 
-def _innovations(group: Sequence[Series], flat: np.ndarray, out: np.ndarray) -> None:
-    """Kalman filter of a white noise plus an Ornstein-Uhlenbeck process, for series that share their times."""
+def _is_slow(s: Series) -> bool:
+    """Whether a series has noise that lasts, which a filter over its times whitens."""
+    return s.time is not None and s.coloured > 0.0 and s.correlation_time > 0.0
+
+
+def _filter(group: Sequence[Series]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Variance (series,) of every innovation, share (series,) of the slow noise's mean that is left from the time
+    before, and the filter's gain (series,), time by time: none of them depends on what was measured."""
     time = np.asarray(group[0].time)
-    data = np.stack([flat[s.start : s.stop] for s in group], axis=1)  # (time, series, column)
-    result = np.empty_like(data, dtype=float)
     white = np.stack([np.broadcast_to(np.square(s.white), time.shape) for s in group], axis=1)
     power = np.array([s.coloured**2 for s in group])
     tau = np.array([s.correlation_time for s in group])
     # The process begins in its stationary state: nothing is known of its past.
-    mean, variance = np.zeros_like(data[0], dtype=float), power.copy()
+    variance, decay = power.copy(), np.ones(len(group))
     for i in range(len(time)):
         if i:
             decay = np.exp(-(time[i] - time[i - 1]) / tau)
-            mean, variance = decay[:, None] * mean, decay**2 * variance + power * (1.0 - decay**2)
+            variance = decay**2 * variance + power * (1.0 - decay**2)
         total = variance + white[i]
+        gain = variance / total
+        yield total, decay, gain
+        variance = (1.0 - gain) * variance
+
+
+def _innovations(group: Sequence[Series], flat: np.ndarray, out: np.ndarray) -> None:
+    """Kalman filter of a white noise plus an Ornstein-Uhlenbeck process, for series that share their times."""
+    data = np.stack([flat[s.start : s.stop] for s in group], axis=1)  # (time, series, column)
+    result = np.empty_like(data, dtype=float)
+    mean = np.zeros_like(data[0], dtype=float)
+    for i, (total, decay, gain) in enumerate(_filter(group)):
+        mean = decay[:, None] * mean
         innovation = data[i] - mean
         result[i] = innovation / np.sqrt(total)[:, None]
-        gain = variance / total
         mean = mean + gain[:, None] * innovation
-        variance = (1.0 - gain) * variance
     for j, s in enumerate(group):
         out[s.start : s.stop] = result[:, j]
