@@ -34,7 +34,7 @@ def test_a_campaign_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_nothing_is_begun_for_which_there_is_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ends = []
-    monkeypatch.setattr(campaigns, "ask", lambda job, folder, until: ends.append(until - now))
+    monkeypatch.setattr(campaigns, "ask", lambda job, folder, until, settings: ends.append(until - now))
     now = 1000.0
     monkeypatch.setattr(campaigns.time, "monotonic", lambda: now)
     for left, limit in ((300.0, 0.0), (500.0, 0.0), (5000.0, 400.0)):

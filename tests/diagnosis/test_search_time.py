@@ -16,7 +16,7 @@ def test_a_search_leaves_time_for_what_comes_after_it(writing, end, monkeypatch)
     """Of 120 s, with refits of 10 s: a tenth, or the last refit and four times as long as one."""
     clock = [7.0]
 
-    def search(forms, most_refits, most_terms, window, progress, stop, provisional):
+    def search(forms, most_refits, most_terms, window, progress, stop, *_):
         clock[0] += 20.0  # the model as it is, and with what is exchanged
         while not stop():
             clock[0] += 10.0
