@@ -371,7 +371,7 @@ def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[C
 
 
 def _unrefitted(
-    said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]], challenged: bool
+    said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]], challenged: frozenset[str]
 ) -> tuple[Conclusion, str]:
     """A conclusion and its sentence where time or refits did not suffice for all that a name needs.
 
@@ -392,12 +392,13 @@ def _unrefitted(
         )
         rest = tuple(e for e in said.effects if e not in estimates)
         return dataclasses.replace(said, effects=rest, sentence=told), told + sentence.removeprefix(said.sentence)
-    if said.verdict not in NAMING or not named or challenged:
+    if said.verdict not in NAMING or named <= challenged:
         return said, sentence
     if any(named <= effects for effects in refitted) or said.verdict is Verdict.KNOWN_CLASS:
         told = (
-            f"The refits that were made point to {' and '.join(sorted(named))}. One without it, begun where the best "
-            "of them ended, was not made, so nothing is named; give more --seconds."
+            f"The refits that were made point to {' and '.join(sorted(named))}. The one without "
+            f"{' or '.join(sorted(named - challenged))}, begun where they ended, was not made, so nothing is named; "
+            "give more --seconds."
         )
     else:
         told = (

@@ -2,8 +2,9 @@
 
 Best first: around each refit all neighbours (one term more, one less) are scored in linear approximation; the most
 probable set that has not been refitted is refitted next, until no other comes near the best. So every accepted effect
-is challenged by a refit without it, from where the refit with it has ended, and a greedy step that led into a trap is
-undone: a descent that found a better optimum on its way must not be taken for what the effect is worth.
+is challenged by a refit without it, from where the refit with it has ended, as soon as it leads, and a greedy step that
+led into a trap is undone: a descent that found a better optimum on its way must not be taken for what the effect is
+worth.
 
 What an effect promises is believed in the share that its refits have kept. Else some larger set, of which there are
 always more than refits, would stand in front of those that were refitted by a promise that has been broken already.
@@ -92,7 +93,7 @@ class ModelSearch:
       hypotheses: all that were evaluated, most probable first. probability: of each, together 1.
       refits: made. failed: "form with effects: reason" of each refit whose solver failed.
       complete: whether no hypothesis near the best was left without a refit.
-      challenged: whether every set with one effect less than the best one was refitted from where its refit ended.
+      challenged: effects beside the best one's form without which some set was refitted from where one with them ended.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -100,7 +101,7 @@ class ModelSearch:
     refits: int
     failed: tuple[str, ...]
     complete: bool
-    challenged: bool = True
+    challenged: frozenset[str] = frozenset()
 
     @property
     def best(self) -> Hypothesis:
@@ -228,6 +229,13 @@ class _Search:
         # door on no effect before that has been refitted.
         listed = [h for h in self.known.values() if not any(t.kind == UNLISTED for t in h.terms)]
         best = max(listed, key=lambda h: h.log_posterior)
+        # Before anything else beside a new name, the set without it from there: it may have found a better optimum.
+        leads = max((h for h in listed if h.refitted), key=lambda h: h.log_posterior)
+        doubtful = [leads.effects - {e} for e in sorted(leads.effects - self.challenged(leads.form))]
+        if doubtful:
+            self.refit(by_name[leads.form], doubtful[0], leads)
+            provisional(self.ranked(False))
+            return True
         near = [h for h in listed if h.log_posterior > best.log_posterior - self.window]
         open_ = [h for h in near if (h.form, h.effects) not in self.done]
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
@@ -248,9 +256,10 @@ class _Search:
             return True
         # What leaving an effect out costs is told by a refit: where several do the work of one another, the linear
         # estimate about the full set is much too high, and a set that grew around a wrong first step would stand.
-        unchallenged = self.unchallenged(best)
-        if unchallenged:
-            self.refit(by_name[best.form], unchallenged[0], best)
+        rivals = [best.effects - {e} for e in sorted(best.effects)]
+        rivals = [r for r in rivals if (best.form, r, best.effects) not in self.begun]
+        if rivals:
+            self.refit(by_name[best.form], rivals[0], best)
             return True
         doubted = self.doubted(best)
         if doubted is not None:
@@ -304,10 +313,9 @@ class _Search:
             self.done[key] = None
             self.reasons.append(f"{label}: no evidence around its refit")
 
-    def unchallenged(self, best: Hypothesis) -> list[frozenset[str]]:
-        """Sets with one effect less than a refitted one, beside which no refit has begun where that one's has ended."""
-        rivals = [best.effects - {e} for e in sorted(best.effects)]
-        return [r for r in rivals if (best.form, r, best.effects) not in self.begun]
+    def challenged(self, form: str) -> frozenset[str]:
+        """Effects beside a form of which a refit without has begun at the end of one with."""
+        return frozenset(e for name, less, more in self.begun if name == form and less < more for e in more - less)
 
     def hold(self, promise: Promise, reached: Hypothesis) -> None:
         """Holds a promise against what its refit has reached, and all others of the same effect with it."""
@@ -351,7 +359,7 @@ class _Search:
         order = sorted(alive, key=lambda h: -h.log_posterior)
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
-        challenged = order[0].refitted and not self.unchallenged(order[0])
+        challenged = self.challenged(order[0].form)
         return ModelSearch(tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete, challenged)
 
     def untried(self, best: Hypothesis) -> list[str]:
