@@ -31,7 +31,8 @@ class ChannelErrors:
     A level is a size of the slow errors, how long they last, and a scatter; every group of channels has one of its own.
 
     Attributes:
-      log_prior: (levels,) half-Cauchy in the size, for nobody knows the order of what a model leaves out (Gelman 2006).
+      log_prior: (levels,) half-Cauchy in size and scatter, for nobody knows the order of what a model leaves out
+        (Gelman 2006).
       usual: (groups,) level of the usual size and scatter. none: (groups,) level of none and the usual scatter.
     """
 
@@ -62,8 +63,11 @@ class ChannelErrors:
         self._fit = observations.in_split("fit")
         self._made: dict[tuple[int, ...], Observations] = {}
         size = np.array([size for size, _, _ in self._levels])
-        # every time is as probable as another, and every scatter
-        self.log_prior = -np.log1p((size / settings.usual_error) ** 2)
+        scatter = np.array([jitter_s for _, _, jitter_s in self._levels])
+        # every time is as probable as another
+        self.log_prior = -np.log1p((size / settings.usual_error) ** 2) - np.log1p(
+            (scatter / USUAL_ERRORS.jitter_s) ** 2
+        )
         self.log_prior -= np.log(len(settings.error_times_s)) * (size > 0.0)
         jitter = self._each * int(np.argmin(np.abs(np.array(jitters_s) - USUAL_ERRORS.jitter_s)))
         usual = int(np.argmin(np.abs(size[: self._each] - settings.usual_error)))

@@ -605,9 +605,12 @@ class DriveForm(MeasuredForm):
         # At the usual errors a scatter would stand for their being larger, and beside a scatter that is usual they for
         # its being so.
         found, at = climbed(errors.sizes(errors.usual), [errors.usual, errors.none])
-        for tried in (errors.scatters, errors.sizes) if scatters and len(self.settings.jitters_s) > 1 else ():
-            least = tried(at)[0]
-            found, at = climbed(tried(at), [at, least], (found.tau, found.noise))
+        if scatters and len(self.settings.jitters_s) > 1:
+            # One scatter for all kinds: of eleven kinds some would always find one that fits their noise.
+            sizes = found.tau, found.noise
+            ends = [climbed(row[None], [row], sizes) for row in errors.scatters(at)]
+            found, at = max(ends, key=lambda end: end[0].log_evidence)
+            found, at = climbed(errors.sizes(at), [at], (found.tau, found.noise))
         self._take(errors, at)
         return found
 

@@ -315,7 +315,7 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
     skipped = problem.own.skipped
     if not found.complete:
         refitted = [h.effects for h in found.hypotheses if h.refitted]
-        conclusion, sentence = _unrefitted(conclusion, sentence, refitted, found.challenged)
+        conclusion, sentence = _unrefitted(conclusion, sentence, refitted)
     if skipped:
         conclusion, sentence = _without(conclusion, sentence, skipped)
     held = account(_held_out(found, best, own))
@@ -370,17 +370,11 @@ def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[C
     return said, "Of what was looked at: " + sentence + skipped_sentence
 
 
-def _unrefitted(
-    said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]], challenged: frozenset[str]
-) -> tuple[Conclusion, str]:
-    """A conclusion and its sentence where time or refits did not suffice for all that a name needs.
+def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]]) -> tuple[Conclusion, str]:
+    """A conclusion and its sentence where time or refits did not suffice for a refit with all that it names.
 
     A first-order estimate about a model that misfits by many sigma is no name: on seven foreign campaigns of drives
-    whose searches ended so, six such names were wrong, each with more than 99 %. Nor is a refit that has found a better
-    optimum, until the model without the effect has been refitted from there.
-
-    Args:
-      said, sentence: what would be said. refitted: effects of each refit. challenged: see `ModelSearch`.
+    whose searches ended so, six such names were wrong, each with more than 99 %.
     """
     named = {e for e in said.effects if not e.startswith("calibration: ")}
     if said.verdict is Verdict.UNKNOWN and (estimates := named.difference(*refitted)):
@@ -392,19 +386,12 @@ def _unrefitted(
         )
         rest = tuple(e for e in said.effects if e not in estimates)
         return dataclasses.replace(said, effects=rest, sentence=told), told + sentence.removeprefix(said.sentence)
-    if said.verdict not in NAMING or named <= challenged:
+    if said.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE) or any(named <= effects for effects in refitted):
         return said, sentence
-    if any(named <= effects for effects in refitted) or said.verdict is Verdict.KNOWN_CLASS:
-        told = (
-            f"The refits that were made point to {' and '.join(sorted(named))}. The one without "
-            f"{' or '.join(sorted(named - challenged))}, begun where they ended, was not made, so nothing is named; "
-            "give more --seconds."
-        )
-    else:
-        told = (
-            f"A first-order estimate points to {' and '.join(sorted(named))}. No refit with it was made, so nothing is "
-            "named; give more --seconds, or name the candidates with --only."
-        )
+    told = (
+        f"A first-order estimate points to {' and '.join(sorted(named))}. No refit with it was made, so nothing is "
+        "named; give more --seconds, or name the candidates with --only."
+    )
     taken_back = {"verdict": Verdict.UNDECIDABLE, "effects": (), "further": (), "probability": 0.0, "sentence": told}
     return dataclasses.replace(said, **taken_back), told + sentence.removeprefix(said.sentence)
 

@@ -431,21 +431,16 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     assert said.effects == ("drag",), "the linear estimate tells it, too"
     refitted = [h.effects for h in found.hypotheses if h.refitted]
     assert not found.challenged
-    told, sentence = _unrefitted(said, said.sentence, refitted, found.challenged)
+    told, sentence = _unrefitted(said, said.sentence, refitted)
     assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
     assert sentence.startswith("A first-order estimate points to drag. No refit with it was made")
     assert "%" not in sentence and "is missing" not in sentence
-    # a refit with it is a name once the model without it has been refitted from there
-    more = [*refitted, frozenset({"drag", "lag"})]
-    told, sentence = _unrefitted(said, said.sentence, more, frozenset({"lag"}))
-    assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
-    assert sentence.startswith("The refits that were made point to drag. The one without drag, begun where they ended")
-    assert _unrefitted(said, said.sentence, more, frozenset({"drag"})) == (said, said.sentence)
+    assert _unrefitted(said, said.sentence, [*refitted, frozenset({"drag", "lag"})]) == (said, said.sentence)
     # beside something unlisted it is no name either, and the port stands
     beside = Conclusion(
         Verdict.UNKNOWN, ("drag", "lag"), True, "soil", 0.99, "It acts at soil. Beside it drag and lag help."
     )
-    told, sentence = _unrefitted(beside, beside.sentence + " More.", [frozenset({"lag"})], frozenset())
+    told, sentence = _unrefitted(beside, beside.sentence + " More.", [frozenset({"lag"})])
     assert (told.verdict, told.effects, told.port) == (Verdict.UNKNOWN, ("lag",), "soil")
     assert sentence.startswith("It acts at soil. A first-order estimate points to drag beside it, which is not named")
     assert sentence.endswith(" More.")
