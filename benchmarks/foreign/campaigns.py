@@ -18,7 +18,7 @@ import multiprocessing
 import os
 import time
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -173,9 +173,8 @@ def drives(args: argparse.Namespace) -> None:
     head, dirty = work.commit()
     places = multiprocessing.get_context("spawn").Queue()
     allowed = sorted(os.sched_getaffinity(0))
-    each = max(1, len(allowed) // args.processes)  # cores
-    for k in range(args.processes):
-        places.put({allowed[(k * each + i) % len(allowed)] for i in range(each)})
+    for cores in core_shares(allowed, args.processes):
+        places.put(cores)
     settings = dict(s.split("=", 1) for s in args.setting)
     processes = pool.Pool(args.processes, _begin, places, folder, until, args.limit, settings)
     try:
@@ -201,6 +200,12 @@ def drives(args: argparse.Namespace) -> None:
         processes.end()
         score_rows(folder, about, rows, settings, show=True)
     print(f"{len(rows)} rows, {time.monotonic() - begun:.0f} s", flush=True)
+
+
+def core_shares(cores: Sequence[int], processes: int) -> list[set[int]]:
+    """Cores of each process: as many as there are for each, or one that several share."""
+    each = max(1, len(cores) // processes)
+    return [{cores[(k * each + i) % len(cores)] for i in range(each)} for k in range(processes)]
 
 
 def _report(answers: Iterable[tuple[Any, Any]], begun: float) -> None:

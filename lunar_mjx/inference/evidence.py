@@ -129,7 +129,7 @@ class Levels:
       count: (groups,) number of measurements.
       matrix: (levels, groups, k + 1, k + 1) as that of `Gram`, whitened with each size.
       log_scale: (levels, groups) sum of the logarithms of what whitening divides by.
-      log_prior: (levels, groups) log prior density of each size.
+      log_prior: (levels,) log prior density of each size.
       starts: (m, groups) levels to begin at, of which the one counts that leads to the most probable end.
     """
 
@@ -146,7 +146,7 @@ class Levels:
     def log_weight(self, levels: np.ndarray) -> float:
         """What is added to the log evidence of measurements whitened at a level (groups,) of each group."""
         # Every size whitens into units of its own; their Jacobian makes evidences at different sizes comparable.
-        return float(np.sum((self.log_prior - self.log_scale)[levels, np.arange(len(levels))]))
+        return float(np.sum(self.log_prior[levels] - self.log_scale[levels, np.arange(len(levels))]))
 
     def improved(self, found: Evidence, noises: Sequence[NoiseSize]) -> tuple[np.ndarray, np.ndarray]:
         """Most probable levels and factors on the noise, (groups,) each, if the amplitudes are as found (a step of EM).
@@ -160,7 +160,7 @@ class Levels:
         x, log_prior = np.empty_like(square), np.empty_like(square)
         for g, prior in enumerate(noises):
             x[:, g], log_prior[:, g] = _most_probable_noise(square[:, g], float(self.count[g]), prior)
-        value = -0.5 * square * np.exp(-2.0 * x) - self.count * x + log_prior - self.log_scale + self.log_prior
+        value = -0.5 * square * np.exp(-2.0 * x) - self.count * x + log_prior - self.log_scale + self.log_prior[:, None]
         # Given the amplitudes, groups are independent: each takes its best level without regard to the others.
         at = np.argmax(value, axis=0)
         return at, np.exp(x[at, np.arange(len(at))])

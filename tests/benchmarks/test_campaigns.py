@@ -53,3 +53,8 @@ def test_a_chassis_as_built_is_a_body(rover: str) -> None:
         factors = np.array(case.setups[0].build.inertia)
         assert np.all(np.abs(factors - 1.0) <= 0.15 + 1e-12)
         assert np.all(2.0 * factors * nominal <= np.sum(factors * nominal) + 1e-12)
+
+
+def test_processes_share_the_cores() -> None:
+    assert campaigns.core_shares(range(2, 8), 3) == [{2, 3}, {4, 5}, {6, 7}]
+    assert campaigns.core_shares([0, 1], 3) == [{0}, {1}, {0}]

@@ -292,7 +292,7 @@ def test_the_most_probable_level_of_slow_errors_is_taken(drawn):
     stretches = [np.ones(N), np.sqrt(1.0 + 4.0 * extra**2), np.full(N, 3.0)]
     grams = [Gram.of(columns / s[:, None], residual / s, group, 2) for s in stretches]
     scale = np.array([np.bincount(group, np.log(s), minlength=2) for s in stretches])
-    log_prior = np.repeat([[0.0], [-1.0], [-2.0]], 2, axis=1)
+    log_prior = np.array([0.0, -1.0, -2.0])
     matrix = np.stack([g.matrix for g in grams])
     alone = {}
     for first in range(3):

@@ -246,12 +246,16 @@ def test_a_set_promises_beside_another_form_what_its_last_effects_gained():
     assert _carried_over(known, known[2], "three") == -np.inf
 
 
-def test_a_search_that_ends_before_a_name_was_challenged_says_so():
-    value = measured(0, wave=0.8)
-    early = search([ToyForm(value)], most_refits=2, most_terms=4, window=4.0)
-    assert early.best.refitted and early.best.effects == {"wave"}
-    assert not early.challenged and not early.complete
-    assert look(value).challenged == {"wave"}
+def test_a_name_is_challenged_from_its_own_end_before_anything_else_is_tried():
+    tried = []
+
+    class Watched(ToyForm):
+        def refit(self, effects, near, start):
+            tried.append((set(effects), None if near is None else set(near.effects)))
+            return super().refit(effects, near, start)
+
+    search([Watched(measured(0, wave=0.8))], 12, 4, 4.0)
+    assert tried[:3] == [(set(), None), ({"wave"}, set()), (set(), {"wave"})]
 
 
 def test_few_sets_are_scored_with_sizes_of_their_own_and_the_best_is_among_them():

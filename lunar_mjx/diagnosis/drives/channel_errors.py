@@ -1,4 +1,4 @@
-"""Errors that a model's channels have beyond its ports, of a size that the drives themselves tell.
+"""Errors that a model's channels have beyond its ports: slow, and of a size that the drives themselves tell.
 
 A hill that no map has, play in a joint, a link that bends: what a rover's model leaves out shows in its channels as a
 course over seconds. Taken for white noise it would be a thousand independent witnesses, and some effect or other would
@@ -10,88 +10,61 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS
-from lunar_mjx.diagnosis.drives.observations import with_discrepancy, with_errors
+from lunar_mjx.diagnosis.drives.observations import with_discrepancy
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.inference.evidence import Gram, Levels
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.logs.schema import parse_name
 
-LEARNT = ("channel_errors", "error_times_s", "jitter_s")
-"""What is kept of a channel's errors: size of the slow ones, over what it does; how long they last, s; scatter, s."""
-
 
 class ChannelErrors:
-    """Observations with each size that the errors of their channels may have: slow ones, and the scatter of times.
-
-    A level is a size of the slow errors, how long they last, and a scatter; every group of channels has one of its own.
+    """Observations with each size that the slow errors of their channels may have.
 
     Attributes:
-      log_prior: (levels,) half-Cauchy in size and scatter, for nobody knows the order of what a model leaves out
-        (Gelman 2006).
-      usual: (groups,) level of the usual size and scatter. none: (groups,) level of none and the usual scatter.
+      log_scale: (levels, groups) sum of the logarithms of what whitening divides the fitted ones by.
+      log_prior: (levels,) of the sizes and times: half-Cauchy in the size, for nobody knows the order of what a model
+        leaves out (Gelman 2006).
     """
 
-    def __init__(
-        self,
-        observations: Observations,
-        group: np.ndarray,
-        kinds: int,
-        settings: DriveSettings,
-        rate: np.ndarray | None = None,
-        jitters_s: Sequence[float] = (0.0,),
-    ):
+    def __init__(self, observations: Observations, group: np.ndarray, kinds: int, settings: DriveSettings):
         """Makes them.
 
         Args:
           observations: with noise alone. group: (n,) noise group of each. kinds: number of groups.
           settings: sizes that are tried, and their prior.
-          rate: (n,) change of each by time, 1/s, where scatters are tried. jitters_s: those, s.
         """
         self._observations, self._group, self._kinds = observations, group, kinds
-        self._rate = np.zeros(len(observations)) if rate is None else rate
-        # how long nothing lasts is no question
-        sizes = [(size, t) for t in settings.error_times_s for size in settings.errors if size > 0.0]
-        sizes.insert(0, (0.0, settings.error_times_s[0]))
-        self._each, self._scatters = len(sizes), len(jitters_s)
-        self._levels = [(size, t, jitter_s) for jitter_s in jitters_s for size, t in sizes]
+        # size and time of each level; how long nothing lasts is no question
+        self._levels = [(size, t) for t in settings.error_times_s for size in settings.errors if size > 0.0]
+        self._levels.insert(0, (0.0, settings.error_times_s[0]))
         self._spread = spread(observations)
         self._fit = observations.in_split("fit")
         self._made: dict[tuple[int, ...], Observations] = {}
-        size = np.array([size for size, _, _ in self._levels])
-        scatter = np.array([jitter_s for _, _, jitter_s in self._levels])
+        sizes = np.array([size for size, _ in self._levels])
         # every time is as probable as another
-        self.log_prior = -np.log1p((size / settings.usual_error) ** 2) - np.log1p(
-            (scatter / USUAL_ERRORS.jitter_s) ** 2
-        )
-        self.log_prior -= np.log(len(settings.error_times_s)) * (size > 0.0)
-        jitter = self._each * int(np.argmin(np.abs(np.array(jitters_s) - USUAL_ERRORS.jitter_s)))
-        usual = int(np.argmin(np.abs(size[: self._each] - settings.usual_error)))
-        self.usual, self.none = np.full(kinds, jitter + usual), np.full(kinds, jitter)
+        self.log_prior = -np.log1p((sizes / settings.usual_error) ** 2)
+        self.log_prior -= np.log(len(settings.error_times_s)) * (sizes > 0.0)
+        scales = [self.at(np.full(kinds, level)).log_widths()[self._fit] for level in range(len(sizes))]
+        self.log_scale = np.array([np.bincount(group[self._fit], s, minlength=kinds) for s in scales])
+        self.usual = np.full(kinds, int(np.argmin(np.abs(sizes - settings.usual_error))))
 
-    def sizes(self, at: np.ndarray) -> np.ndarray:
-        """(m, groups) levels of every size and time, with the scatter of a level (groups,) of each group."""
-        return at // self._each * self._each + np.arange(self._each)[:, None]
+    def shares(self, levels: np.ndarray) -> dict[str, float]:
+        """The size of a channel's errors, as a share of what it does, at a level (groups,) of each group."""
+        return {s.channel: self._levels[levels[self._group[s.start]]][0] for s in self._observations.series}
 
-    def scatters(self, at: np.ndarray) -> np.ndarray:
-        """(m, groups) levels of every scatter, with the size and time of a level (groups,) of each group."""
-        return at % self._each + self._each * np.arange(self._scatters)[:, None]
+    def times_s(self, levels: np.ndarray) -> dict[str, float]:
+        """How long a channel's errors last, s, at a level (groups,) of each group."""
+        return {s.channel: self._levels[levels[self._group[s.start]]][1] for s in self._observations.series}
 
-    def told(self, levels: np.ndarray) -> dict[str, dict[str, float]]:
-        """What is kept of a level (groups,) of each group, by channel: `LEARNT`."""
-        by_channel = {s.channel: self._levels[levels[self._group[s.start]]] for s in self._observations.series}
-        return {name: {c: level[k] for c, level in by_channel.items()} for k, name in enumerate(LEARNT)}
-
-    def at_told(self, told: Mapping[str, Mapping[str, float]]) -> np.ndarray | None:
-        """(groups,) levels of which `told` tells; None where it tells of others than are tried."""
+    def at_shares(self, shares: Mapping[str, float], times_s: Mapping[str, float]) -> np.ndarray | None:
+        """(groups,) levels at which channels have such errors, as `shares` and `times_s` tell them; None for none."""
         found = np.full(self._kinds, -1)
         for s in self._observations.series:
-            size, time_s, jitter_s = (told[name].get(s.channel, math.nan) for name in LEARNT)
-            level = size, time_s, jitter_s
+            level = shares.get(s.channel, math.nan), times_s.get(s.channel, math.nan)
             if level not in self._levels:
                 return None
             found[self._group[s.start]] = self._levels.index(level)
@@ -101,34 +74,31 @@ class ChannelErrors:
         """The observations with errors of a level (groups,) of each group."""
         key = tuple(int(level) for level in levels)
         if key not in self._made:
-            shares, times, _ = self.told(levels).values()
-            jitter_s = np.array([self._levels[level][2] for level in levels])
-            # To first order an error of time is one of the signal, times its rate.
-            made = with_errors(self._observations, jitter_s[self._group] * self._rate)
-            chosen = {c: share * self._spread[c] for c, share in shares.items() if share > 0.0}
+            times, made = self.times_s(levels), self._observations
+            chosen = {c: share * self._spread[c] for c, share in self.shares(levels).items() if share > 0.0}
             for time_s in sorted({times[c] for c in chosen}):
                 made = with_discrepancy(made, {c: v for c, v in chosen.items() if times[c] == time_s}, time_s)
             self._made[key] = made
         return self._made[key]
 
-    def levels(
-        self, columns: np.ndarray, residual: np.ndarray, tried: np.ndarray, starts: Sequence[np.ndarray]
-    ) -> Levels:
-        """Statistics of the fitted observations at some levels.
+    def log_weight(self, levels: np.ndarray) -> float:
+        """See `Levels.log_weight`."""
+        return float(np.sum(self.log_prior[levels] - self.log_scale[levels, np.arange(len(levels))]))
+
+    def levels(self, columns: np.ndarray, residual: np.ndarray, start: np.ndarray | None = None) -> Levels:
+        """Statistics of the fitted observations at every size.
 
         Args:
           columns: (n, k) derivatives of the predictions, SI units. residual: (n,) measured less predicted.
-          tried: (m, groups) levels. starts: levels (groups,) among these to begin at, of which the best end counts.
+          start: (groups,) levels to begin at; the usual size and none if None.
         """
-        whole, number, grams, scales = np.column_stack([columns, residual]), self._group[self._fit], [], []
-        for row in tried:
-            seen = self.at(row)
-            white = seen.whiten(whole)[self._fit]
+        whole, number, grams = np.column_stack([columns, residual]), self._group[self._fit], []
+        for level in range(len(self._levels)):
+            white = self.at(np.full(self._kinds, level)).whiten(whole)[self._fit]
             grams.append(Gram.of(white[:, :-1], white[:, -1], number, self._kinds))
-            scales.append(np.bincount(number, seen.log_widths()[self._fit], minlength=self._kinds))
         matrix = np.stack([g.matrix for g in grams])
-        begin = np.stack([np.argmax(tried == at, axis=0) for at in starts])
-        return Levels(grams[0].count, matrix, np.stack(scales), self.log_prior[tried], begin)
+        starts = np.stack([self.usual, np.zeros_like(self.usual)] if start is None else [start])
+        return Levels(grams[0].count, matrix, self.log_scale, self.log_prior, starts)
 
 
 def spread(observations: Observations) -> dict[str, float]:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from scipy import linalg, ndimage
 
-from lunar_mjx.diagnosis.drives.channel_errors import LEARNT, ChannelErrors, error_kind
+from lunar_mjx.diagnosis.drives.channel_errors import ChannelErrors, error_kind
 from lunar_mjx.diagnosis.drives.differences import STEP
-from lunar_mjx.diagnosis.drives.instruments import usual_kind
+from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS, usual_kind
 from lunar_mjx.diagnosis.drives.nuisances import is_linear
 from lunar_mjx.diagnosis.drives.observations import with_errors
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
@@ -45,6 +45,8 @@ USUAL_EFFECTS = "effects of usual size"
 """The field of all effects that no hypothesis names: every rover has a little of each."""
 GROUND = "height of the ground"
 """The field of ground that nobody mapped, in wheel radii."""
+LEARNT = frozenset({"jitter_s", "channel_errors", "error_times_s"})
+"""What `DriveForm.learnt` tells of the errors with which all hypotheses are weighed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,11 +143,13 @@ class DriveForm(MeasuredForm):
         self._seen: np.ndarray | None = None  # (n, coordinates) derivatives at the base, SI
         self._secants: np.ndarray | None = None  # (n, coordinates) changes by a usual amount there, over that amount
         self._strays = np.zeros(len(self.observations))  # what predictions do that no slope tells, see `_learn_strays`
+        self.jitter_s = USUAL_ERRORS.jitter_s
         kinds = [usual_kind(c) for c in self.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
         self._slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}
         self._sizes: tuple[np.ndarray, np.ndarray] | None = None
-        self.channel_errors: Mapping[str, Mapping[str, float]] = {name: {} for name in LEARNT}  # as they are kept
+        self.channel_errors: Mapping[str, float] = {}
+        self.error_times_s: Mapping[str, float] = {}
         self.start = self.origin()  # where the first refit begins
         self.kept: Mapping[str, Any] = {}  # what `learnt` told of that place; then it has been refitted already
         self._trial: np.ndarray | None = None  # where a refit begins for which an effect is to act
@@ -470,12 +474,17 @@ class DriveForm(MeasuredForm):
           refit: of this form.
 
         Returns:
-          `log_evidence`; by channel `channel_errors`, shares of what it does, `error_times_s`, how long these last, and
-          `jitter_s`, scatter of its times, s.
+          `log_evidence`; `jitter_s`, scatter of times, s; `channel_errors`, shares of what a channel does, and
+          `error_times_s`, how long these last, by channel.
         """
         value = refit.linear.evidence(self.listed(refit.effects))[0]
         widths = float(np.sum(self.observations.log_widths()[self._fit]))
-        return {"log_evidence": value - widths, **self.channel_errors}
+        return {
+            "log_evidence": value - widths,
+            "jitter_s": self.jitter_s,
+            "channel_errors": dict(self.channel_errors),
+            "error_times_s": dict(self.error_times_s),
+        }
 
     def limit(self, until: float) -> None:
         """See `MeasuredForm`."""
@@ -511,7 +520,7 @@ class DriveForm(MeasuredForm):
             if self.kept:
                 found = self._linear(u, effects, slopes).evidence(self.listed(effects))[1]
             else:
-                found = self._choose_errors(u, free, slopes, scatters=True)
+                found = self._choose_errors(u, free, slopes, self.settings.jitters_s)
             self._sizes = found.tau, found.noise
         terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
         best: tuple[float, np.ndarray, np.ndarray, Linear, Evidence] | None = None
@@ -580,11 +589,13 @@ class DriveForm(MeasuredForm):
         starts = [u for u in (fitted, given) if math.isfinite(cost(u))]
         return min((self._descend(u, free, self.observations, once=True)[0] for u in starts), key=cost)
 
-    def _choose_errors(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, scatters: bool = False) -> Evidence:
-        """Takes errors of channels of the most probable size: by the model with what is usual.
+    def _choose_errors(
+        self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, jitters_s: Sequence[float]
+    ) -> Evidence:
+        """Takes scatter of times, then errors of channels, of the most probable size: by the model with what is usual.
 
         Args:
-          u, free, slopes: as for `_columns`. scatters: whether scatters of times are tried, or left as they are usual.
+          u, free, slopes: as for `_columns`. jitters_s: scatters that are tried.
 
         Returns:
           Sizes of discrepancy and noise with these errors.
@@ -596,29 +607,34 @@ class DriveForm(MeasuredForm):
         field = np.concatenate([self._field_of, number])[always]
         prior = Amplitudes(std, field, self._prior_mean(u, len(number))[always])
         columns = columns[:, always]
-        fields, noises, errors = self._usual_fields(), self._noise_sizes(), self._errors()
+        fields, noises = self._usual_fields(), self._noise_sizes()
 
-        def climbed(tried: np.ndarray, starts: Sequence[np.ndarray], sizes: Any = None) -> tuple[Evidence, np.ndarray]:
-            found = infer_levels(errors.levels(columns, residual, tried, starts), prior, fields, noises, sizes)
-            return found, tried[found.levels, np.arange(len(noises))]
+        def climbed(errors: ChannelErrors, begin: np.ndarray | None, sizes: Any) -> tuple[Evidence, np.ndarray]:
+            found = infer_levels(errors.levels(columns, residual, begin), prior, fields, noises, sizes)
+            assert found.levels is not None
+            return found, found.levels
 
-        # At the usual errors a scatter would stand for their being larger, and beside a scatter that is usual they for
-        # its being so.
-        found, at = climbed(errors.sizes(errors.usual), [errors.usual, errors.none])
-        if scatters and len(self.settings.jitters_s) > 1:
-            # One scatter for all kinds: of eleven kinds some would always find one that fits their noise.
-            sizes = found.tau, found.noise
-            ends = [climbed(row[None], [row], sizes) for row in errors.scatters(at)]
-            found, at = max(ends, key=lambda end: end[0].log_evidence)
-            found, at = climbed(errors.sizes(at), [at], (found.tau, found.noise))
-        self._take(errors, at)
-        return found
+        # The usual scatter with the errors that go best with it; then every other one with these errors, and with those
+        # that go best with the scatter that gains. At the usual errors a scatter would stand for their being larger.
+        made = {s: self._errors_with(s) for s in jitters_s}
+        self.jitter_s = min(jitters_s, key=lambda s: abs(s - USUAL_ERRORS.jitter_s))
+        best, levels = climbed(made[self.jitter_s], None, None)
+        for jitter_s in [s for s in jitters_s if s != self.jitter_s]:
+            errors = made[jitter_s]
+            white = errors.at(levels).whiten(np.column_stack([columns, residual]))[self._fit]
+            gram = Gram.of(white[:, :-1], white[:, -1], self._group[self._fit], len(noises))
+            value = infer(gram, prior, fields, noises, (best.tau, best.noise)).log_evidence
+            if value + errors.log_weight(levels) > best.log_evidence:
+                self.jitter_s = jitter_s
+                best, levels = climbed(errors, levels, (best.tau, best.noise))
+        self._take(made[self.jitter_s], levels)
+        return best
 
-    def _errors(self) -> ChannelErrors:
-        """Observations with each size of their channels' errors."""
-        drives, settings = self.drives, self.settings
-        seen = with_errors(drives.observations, self._strays)
-        return ChannelErrors(seen, self._group, len(self.noise_names), settings, drives.rate, settings.jitters_s)
+    def _errors_with(self, jitter_s: float) -> ChannelErrors:
+        """Observations whose times scatter by so many seconds, with each size of their channels' errors."""
+        # To first order an error of time is one of the signal, times its rate.
+        seen = with_errors(self.drives.observations, np.hypot(jitter_s * self.drives.rate, self._strays))
+        return ChannelErrors(seen, self._group, len(self.noise_names), self.settings)
 
     def _usual_fields(self) -> tuple[Field, ...]:
         """What is usual: discrepancy at every port, a little of every effect, and ground that nobody mapped."""
@@ -647,10 +663,10 @@ class DriveForm(MeasuredForm):
         Returns:
           (coordinates,) the refit.
         """
-        drives = self.drives
+        drives, usual_jitter = self.drives, USUAL_ERRORS.jitter_s
         if self._take_kept():
             return self._see_all(self.start if self._rival_of is None else self._settled(free), free)
-        errors = self._errors()
+        errors = self._errors_with(usual_jitter)
         self.observations = errors.at(errors.usual)
         # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after it,
         # and a descent that moves everything at once follows them into soil that nothing brings it back from.
@@ -666,9 +682,9 @@ class DriveForm(MeasuredForm):
             self._seen = self._see_inputs(u)
             slopes = self.jacobian(u, free)[1]
             self._learn_strays(u, free, slopes)
-            before = self.channel_errors
-            found = self._choose_errors(u, free, slopes)
-            if self.channel_errors == before:
+            before = self.channel_errors, self.error_times_s
+            found = self._choose_errors(u, free, slopes, (usual_jitter,))
+            if (self.channel_errors, self.error_times_s) == before:
                 break
             u, slopes, _ = self._descend(
                 u, free, self.observations, (found.tau, found.noise), slopes, most=self.settings.few_jacobians
@@ -677,7 +693,7 @@ class DriveForm(MeasuredForm):
         if drives.noise_unlearnt:
             drives.learn_noise(u)
             # what is learnt of the noise is in what the drives hold from now on
-            errors = self._errors()
+            errors = self._errors_with(usual_jitter)
             self.observations = errors.at(errors.usual)
         return self._see_all(u, free, anew=True)
 
@@ -721,17 +737,17 @@ class DriveForm(MeasuredForm):
             return True
         kept, self.kept = self.kept, {}
         # Noise that is learnt from a refit is not among what is kept.
-        if not kept or self.drives.noise_unlearnt:
+        if not kept or self.drives.noise_unlearnt or kept["jitter_s"] not in self.settings.jitters_s:
             return False
         self.drives.about(self.start)
         free = self._free(frozenset())
         self._seen = self._see_inputs(self.start)
         self._learn_strays(self.start, free, self.jacobian(self.start, free)[1])
-        errors = self._errors()
-        levels = errors.at_told(kept)
+        errors = self._errors_with(kept["jitter_s"])
+        levels = errors.at_shares(kept["channel_errors"], kept["error_times_s"])
         if levels is None:
             return False
-        self.kept = kept
+        self.kept, self.jitter_s = kept, kept["jitter_s"]
         self._take(errors, levels)
         return True
 
@@ -748,8 +764,9 @@ class DriveForm(MeasuredForm):
         Errors of the same sizes would not do: those of times go with how fast a form's own predictions change.
         """
         self.drives.about(self.start)
-        self.observations, self.channel_errors = own.observations, own.channel_errors
-        self.kept = own.channel_errors
+        self.observations, self.jitter_s = own.observations, own.jitter_s
+        self.channel_errors, self.error_times_s = own.channel_errors, own.error_times_s
+        self.kept = {"jitter_s": own.jitter_s}
 
     def _settled(self, free: np.ndarray) -> np.ndarray:
         """A refit (coordinates,) with errors that are known, from the start or the model's own parameters as given."""
@@ -773,7 +790,7 @@ class DriveForm(MeasuredForm):
     def _take(self, errors: ChannelErrors, levels: np.ndarray) -> None:
         """Holds the measurements with errors of a level (groups,) of each group from now on."""
         self.observations = errors.at(levels)
-        self.channel_errors = errors.told(levels)
+        self.channel_errors, self.error_times_s = errors.shares(levels), errors.times_s(levels)
 
     def _see_all(self, u: np.ndarray, free: np.ndarray, anew: bool = False) -> np.ndarray:
         """Takes all derivatives at a refit (coordinates,) of the model as it is, and returns it.

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from lunar_mjx.diagnosis.build_problem import candidates_of
 from lunar_mjx.diagnosis.contact_laws import CLOSED_FORM, LAWS, contact_laws, log_shares
-from lunar_mjx.diagnosis.drives.channel_errors import LEARNT
-from lunar_mjx.diagnosis.drives.form import DriveForm
+from lunar_mjx.diagnosis.drives.form import LEARNT, DriveForm
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.fitted_model import fitted_model
@@ -49,8 +48,7 @@ def build_drives(
     kept = kept_start(run, form, frozenset())
     if kept is not None:
         told = run.load(COMPARISON_FILE) or {}
-        # Runs of before kept one scatter for all channels: what they learnt is learnt anew.
-        form.start, form.kept = kept, told if all(isinstance(told.get(name), Mapping) for name in LEARNT) else {}
+        form.start, form.kept = kept, told if LEARNT.issubset(told) else {}
     forms, laws = [form], contact_laws(run.model, settings.laws)
     own = next(iter(laws))
     if settings.laws and own not in LAWS:

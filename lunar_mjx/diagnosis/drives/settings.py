@@ -35,9 +35,9 @@ class DriveSettings(SearchSettings):
     """s; how long such an error lasts, which are tried: where a law is off, a wheel's speed errs for about a second,
     and its angle, as the sum of that, for all of a drive."""
     jitters_s: tuple[float, ...] = (0.0, 0.002, 0.005, 0.02)
-    """s; scatter of the times of single readings that is tried, one for all channels. Of a foreign campaign of a
-    Husky with nothing hidden `compare` tells a log evidence of 63,497 with 0.02 and of 56,806 with
-    `--setting jitters_s=0`; on one of LUVMI-X it finds none."""
+    """s; scatter of the times of single readings that is tried. Of a foreign campaign of a Husky with nothing hidden
+    `compare` tells a log evidence of 63,497 with 0.02 and of 56,806 with `--setting jitters_s=0`; on one of LUVMI-X
+    it finds none."""
     least_length: float = 0.3
     """sigma; a direction in which even an unlisted discrepancy is shorter is left out."""
     secant: float = 0.3

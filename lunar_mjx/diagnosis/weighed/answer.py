@@ -314,8 +314,7 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         sentence += " The search ended by its time or its number of refits: what it did not refit is an estimate."
     skipped = problem.own.skipped
     if not found.complete:
-        refitted = [h.effects for h in found.hypotheses if h.refitted]
-        conclusion, sentence = _unrefitted(conclusion, sentence, refitted)
+        conclusion, sentence = _unrefitted(conclusion, sentence, [h.effects for h in found.hypotheses if h.refitted])
     if skipped:
         conclusion, sentence = _without(conclusion, sentence, skipped)
     held = account(_held_out(found, best, own))

@@ -48,7 +48,8 @@ class SearchSettings:
     window: float = 4.0
     """nat; hypotheses further below the best are not refitted: 2 per cent of its probability."""
     most_scored: int = 100
-    """1; effects beside a set that are scored with sizes of their own, the best by a look at the set's sizes: all."""
+    """1; effects beside a set that are scored with sizes of their own, the likeliest at the set's sizes: of a table
+    every one is."""
     least_signal: float = LEAST_SIGNAL
     """sigma; length of a signature at its prior size below which no data can speak for or against an effect."""
     unlisted_share: float = UNLISTED_SHARE

@@ -93,7 +93,6 @@ class ModelSearch:
       hypotheses: all that were evaluated, most probable first. probability: of each, together 1.
       refits: made. failed: "form with effects: reason" of each refit whose solver failed.
       complete: whether no hypothesis near the best was left without a refit.
-      challenged: effects beside the best one's form without which some set was refitted from where one with them ended.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -101,7 +100,6 @@ class ModelSearch:
     refits: int
     failed: tuple[str, ...]
     complete: bool
-    challenged: frozenset[str] = frozenset()
 
     @property
     def best(self) -> Hypothesis:
@@ -314,7 +312,7 @@ class _Search:
             self.reasons.append(f"{label}: no evidence around its refit")
 
     def challenged(self, form: str) -> frozenset[str]:
-        """Effects beside a form of which a refit without has begun at the end of one with."""
+        """Effects beside a form without which some set was refitted from where the one with them had ended."""
         return frozenset(e for name, less, more in self.begun if name == form and less < more for e in more - less)
 
     def hold(self, promise: Promise, reached: Hypothesis) -> None:
@@ -359,8 +357,7 @@ class _Search:
         order = sorted(alive, key=lambda h: -h.log_posterior)
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
-        challenged = self.challenged(order[0].form)
-        return ModelSearch(tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete, challenged)
+        return ModelSearch(tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete)
 
     def untried(self, best: Hypothesis) -> list[str]:
         """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.
