@@ -554,8 +554,8 @@ def _condition(
     """Log density of the measurements at given sizes.
 
     Returns:
-      The log density; (k,) standardised posterior mean; (k, k) standardised posterior covariance; (k,) prior standard
-      deviations that standardise.
+      The log density; (k,) posterior mean relative to the refit, in prior standard deviations; (k, k) standardised
+      posterior covariance; (k,) prior standard deviations that standardise.
 
     Raises:
       EvidenceError: rounding spoils it.
@@ -566,9 +566,10 @@ def _condition(
     # number.
     whole = np.einsum("g,gij->ij", 1.0 / noise**2, gram.matrix)
     inner, across = whole[:k, :k], whole[:k, k]
-    shift = amplitudes.mean
-    square = float(whole[k, k] - 2.0 * shift @ across + shift @ inner @ shift)
-    downhill = scale * (across - inner @ shift)
+    # Counted from the refit, where residuals are small. From the prior's mean, steep slopes would make the residual a
+    # million sigma long, and rounding would leave its chi-square uncertain by hundreds.
+    centre = amplitudes.mean / scale
+    square, downhill = float(whole[k, k] + centre @ centre), scale * across + centre
     # standardised by the prior, the matrix is 1 or more in every direction: an amplitude that the data do not see, or a
     # discrepancy of size zero, cannot make it singular
     try:
@@ -576,11 +577,12 @@ def _condition(
     except linalg.LinAlgError:
         raise EvidenceError("derivatives are too steep to compute with") from None
     covariance = linalg.cho_solve((factor, True), np.eye(k), check_finite=False)
-    mean = covariance @ downhill
+    half = linalg.solve_triangular(factor, downhill, lower=True, check_finite=False)
+    mean = linalg.solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
     # log |V| by Sylvester's identity: the determinant of the small matrix in place of one as large as the data.
     log_det = 2.0 * float(np.sum(np.log(np.diag(factor))))
     size = float(np.sum(gram.count * (_LOG_2PI + 2.0 * np.log(noise))))
-    chi_square = square - float(downhill @ mean)
+    chi_square = square - float(half @ half)
     # No chi-square is negative. Slopes taken across a jump can be so steep that rounding makes it so, and the
     # hypothesis would win by any number.
     if chi_square < -SIZE_DESCENT.rounding * (1.0 + abs(square)):
@@ -599,8 +601,8 @@ def _density(
     """
     many, groups, k = len(fields), len(noises), gram.width
     tau, noise = np.exp(x[:many]), np.exp(x[many:])
-    value, mean, inverse, scale = _condition(gram, amplitudes, tau, noise)
-    shift = amplitudes.mean
+    value, found, inverse, scale = _condition(gram, amplitudes, tau, noise)
+    mean, place = found - amplitudes.mean / scale, scale * found
     member = np.array([amplitudes.field == f for f in range(many)], float).reshape(many, k)
     # share of each amplitude's prior that the measurements have taken away
     # Identity less posterior covariance in prior units: 0 where the data are silent, 1 where they know all.
@@ -613,7 +615,6 @@ def _density(
     own = np.empty((k, groups))
     seen = scale[:, None] * gram.matrix[:, :k, :k] * scale / noise[:, None, None] ** 2
     filtered = inverse @ seen
-    place = shift + scale * mean
     for c in range(groups):
         a = gram.matrix[c]
         left = a[:k, k] - a[:k, :k] @ place

@@ -329,3 +329,24 @@ def test_the_density_at_given_sizes_is_that_of_a_normal_distribution():
     covariance = (columns * std**2) @ columns.T + np.diag(noise[group] ** 2)
     wanted = stats.multivariate_normal(columns @ amplitudes.mean, covariance).logpdf(residual)
     assert log_density(Gram.of(columns, residual, group, 2), amplitudes, tau, noise) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_steep_slopes_and_a_far_prior_mean_cost_no_digits():
+    """Slopes of 1e5 sigma whose prior lies ten deviations from the refit: exact by a dense sum in units that hold it."""
+    rng = np.random.default_rng(5)
+    n = 400
+    steep = rng.normal(size=(n, 3)) * 1e4
+    plain = rng.normal(size=(n, 4))
+    columns = np.column_stack([steep, steep @ [0.5, -0.3, 0.2] + 1e-2 * rng.normal(size=n), plain])
+    residual = rng.normal(size=n)
+    far = np.array([10.0, -8.0, 9.0, 5.0, 0.0, 0.0, 0.0, 0.0])
+    prior = Amplitudes.of(np.ones(8), mean=far)
+    # Exact: the posterior by least squares on all rows, priors among them, and the determinant by singular values.
+    whole = np.vstack([columns, np.eye(8)])
+    wanted = np.concatenate([residual, far])
+    best = np.linalg.lstsq(whole, wanted, rcond=None)[0]
+    chi_square = float(np.sum((wanted - whole @ best) ** 2))
+    log_det = 2.0 * float(np.sum(np.log(np.linalg.svd(whole, compute_uv=False))))
+    exact = -0.5 * (n * math.log(2.0 * math.pi) + chi_square + log_det)
+    found = log_density(Gram.of(columns, residual), prior, np.zeros(0), np.ones(1))
+    assert found == pytest.approx(exact, abs=1e-3)

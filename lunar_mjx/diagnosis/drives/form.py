@@ -276,9 +276,11 @@ class DriveForm(MeasuredForm):
         always = np.concatenate([self._free(frozenset()), np.arange(count, len(scale))]).astype(int)
         # What the rest takes up, the priors counted as observations.
         rest = white[:, always]
-        white[:, -1] -= rest @ (self._prior_mean(u, len(number)) / scale)[always]
+        seen = rest.T @ white
+        # Amounts are counted from the refit: from the prior's mean rounding would hide the residual.
+        seen[:, -1] += (self._prior_mean(u, len(number)) / scale)[always]
         factor = linalg.cho_factor(np.eye(len(always)) + rest.T @ rest)
-        left = white - rest @ linalg.cho_solve(factor, rest.T @ white)
+        left = white - rest @ linalg.cho_solve(factor, seen)
 
         def explained(places: np.ndarray) -> tuple[float, np.ndarray]:
             """Log evidence of columns of `white` at these sizes, and the amounts, over the prior's, with it."""
