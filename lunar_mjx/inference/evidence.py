@@ -229,11 +229,14 @@ class Field:
       usual: scale of tau's half-normal prior, in the unit of the amplitudes (such as 0.05 for 5 % of a stress).
       log_std: standard deviation of log tau where other measurements have told tau; if positive, tau has a log-normal
         distribution about `usual` in place of the half-normal one.
+      freedom: if positive, tau has the scaled inverse-chi distribution of that freedom: amplitudes of this field have
+        Student's t distribution, of scale `usual`.
     """
 
     name: str
     usual: float
     log_std: float = 0.0
+    freedom: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -646,6 +649,10 @@ def _density(
             gradient[i] -= off / field.log_std
             hessian[i, i] += 1.0 / field.log_std**2
             continue
+        if field.freedom > 0.0:
+            added = _log_inverse_chi(x[i] - math.log(field.usual), field.freedom)
+            value, gradient[i], hessian[i, i] = value + added[0], gradient[i] + added[1], hessian[i, i] + added[2]
+            continue
         # Half-normal prior of tau with the Jacobian of its logarithm.
         share = (tau[i] / field.usual) ** 2
         value += 0.5 * math.log(2.0 / math.pi) + x[i] - math.log(field.usual) - 0.5 * share
@@ -654,14 +661,17 @@ def _density(
     for c, prior in enumerate(noises):
         i = many + c
         if prior.freedom > 0.0:
-            # freedom / s^2 is chi-square of that freedom; this is its density in x = log s, the Jacobian within.
-            half = 0.5 * prior.freedom
-            value += math.log(2.0) + half * math.log(half) - math.lgamma(half) - 2.0 * half * x[i]
-            value -= half * math.exp(-2.0 * x[i])
-            gradient[i] += 2.0 * half * (math.exp(-2.0 * x[i]) - 1.0)
-            hessian[i, i] += 4.0 * half * math.exp(-2.0 * x[i])
+            added = _log_inverse_chi(x[i], prior.freedom)
+            value, gradient[i], hessian[i, i] = value + added[0], gradient[i] + added[1], hessian[i, i] + added[2]
         else:
             value -= 0.5 * (x[i] / prior.log_std) ** 2 + math.log(prior.log_std) + 0.5 * _LOG_2PI
             gradient[i] -= x[i] / prior.log_std**2
             hessian[i, i] += 1.0 / prior.log_std**2
     return _At(value, gradient, hessian, place, scale[:, None] * inverse * scale)
+
+
+def _log_inverse_chi(x: float, freedom: float) -> tuple[float, float, float]:
+    """Log density of the logarithm x of a size s, gradient and negative Hessian: freedom / s^2 is chi-square."""
+    half, square = 0.5 * freedom, math.exp(-2.0 * x)
+    value = math.log(2.0) + half * math.log(half) - math.lgamma(half) - 2.0 * half * x - half * square
+    return value, 2.0 * half * (square - 1.0), 4.0 * half * square

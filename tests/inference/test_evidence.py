@@ -350,3 +350,18 @@ def test_steep_slopes_and_a_far_prior_mean_cost_no_digits():
     exact = -0.5 * (n * math.log(2.0 * math.pi) + chi_square + log_det)
     found = log_density(Gram.of(columns, residual), prior, np.zeros(0), np.ones(1))
     assert found == pytest.approx(exact, abs=1e-3)
+
+
+def test_an_amplitude_of_student_t_size_has_cauchys_prior():
+    """Amplitudes of a field of freedom 1 have Cauchy's density: with one exact column the evidence is its value."""
+    field = Field("effect", 1.0, freedom=1.0)
+    column, sigma = np.full((40, 1), 5.0), 1.0 / (5.0 * math.sqrt(40.0))
+    for amount in (0.5, 9.0, 60.0):
+        gram = Gram.of(column, column[:, 0] * amount)
+        found = infer(gram, Amplitudes.of([1.0], [0]), (field,), (NoiseSize("y", 1e-3),))
+        # The likelihood is a normal density of the amplitude, as narrow as sigma.
+        exact = stats.cauchy.logpdf(amount) + math.log(sigma) + 0.5 * math.log(2.0 * math.pi)
+        exact -= 20.0 * math.log(2.0 * math.pi)
+        assert found.log_evidence == pytest.approx(exact, abs=0.35)
+    gaussian = infer(gram, Amplitudes.of([1.0]), (), (NoiseSize("y", 1e-3),))
+    assert gaussian.log_evidence < found.log_evidence - 1000.0

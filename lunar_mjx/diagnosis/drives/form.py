@@ -435,6 +435,8 @@ class DriveForm(MeasuredForm):
             noises=self._noise_sizes(),
             wide=settings.unlisted_discrepancy,
             far=1.0,
+            amount=np.append([c.amplitude for c in self.coordinates], np.zeros(len(std) - count)).astype(bool),
+            freedom=settings.effect_freedom,
             unkept=unkept,
         )
 
@@ -863,6 +865,7 @@ class DriveForm(MeasuredForm):
             misfit = observations.whiten(columns)[self._fit] * sizes[0][number] * weight[:, None]
             offset = columns @ self._centre(u, len(number))
         std = self._std if sizes is None else self._prior_std(sizes[0])
+        std = self.effect_std(u, std, self.settings.effect_freedom)
         factor = linalg.cho_factor(np.eye(misfit.shape[1]) + misfit.T @ misfit, lower=True)
         centre = np.array([self.coordinates[i].centre for i in free])
         wanted = observations.value - offset

@@ -274,6 +274,8 @@ class WheelForm(MeasuredForm):
             noises=tuple(NoiseSize(_NAMES[q], s) for q, s in data.noise_std.items()),
             wide=settings.unlisted_discrepancy,
             far=settings.bad_calibration,
+            amount=np.append([c.amplitude for c in self.coordinates], np.zeros(len(std) - count)).astype(bool),
+            freedom=settings.effect_freedom,
         )
         return linear, columns, residual
 
@@ -429,7 +431,7 @@ class WheelForm(MeasuredForm):
         covariance = columns @ columns.T
         covariance[np.diag_indices(len(noise))] += noise**2
         factor = linalg.cholesky(covariance, lower=True, check_finite=False)
-        std = linear.amplitudes.std[free]
+        std = self.effect_std(u, linear.amplitudes.std[: len(u)], linear.freedom)[free]
         centre = np.array([self.coordinates[i].centre for i in free])
 
         def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

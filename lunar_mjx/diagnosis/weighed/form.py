@@ -35,6 +35,9 @@ class SearchSettings:
     """1; scale of the half-normal prior of a discrepancy where something unlisted acts at its port."""
     effect_size: float = 1.0
     """1; prior standard deviation of an effect's amplitude, over its nominal size."""
+    effect_freedom: float = 1.0
+    """1; degrees of freedom of Student's t prior of an effect's amplitudes, 1 for Cauchy's: a nominal size is a guess.
+    0: Gaussian."""
     effect_odds: float = 0.01
     """1; prior odds of each effect of the catalogue: of some fifteen, one is missing in every seventh table."""
     unlisted_odds: float = 0.005
@@ -181,6 +184,23 @@ class MeasuredForm(Form):
         """Prior standard deviation of an effect's amplitude, in scales."""
         del c
         return 1.0
+
+    def effect_std(self, u: np.ndarray, std: np.ndarray, freedom: float) -> np.ndarray:
+        """(coordinates,) prior standard deviations for a descent from (coordinates,), where effects have Student's t.
+
+        A Gaussian that is as wide as the amplitudes there are far draws them like the t distribution (EM: Lange et al.
+        1989). It is never narrower than the nominal one: a descent that begins at an effect's null says nothing of its
+        size.
+
+        Args:
+          u: the place. std: (coordinates,) nominal ones. freedom: of the distribution; 0 for a Gaussian.
+        """
+        out = std.copy()
+        for places in self.candidates.values() if freedom > 0.0 else ():
+            own = [i for i in places if self.coordinates[i].amplitude]
+            square = float(np.sum((u[own] / std[own]) ** 2))
+            out[own] *= max(1.0, math.sqrt((freedom + square) / (freedom + len(own))))
+        return out
 
     def origin(self) -> np.ndarray:
         """(coordinates,) the model as given."""

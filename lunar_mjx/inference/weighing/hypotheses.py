@@ -27,6 +27,8 @@ from lunar_mjx.inference.evidence import (
 )
 
 EFFECT, UNLISTED, CALIBRATION = "effect", "unlisted", "calibration"
+_SIZES = (1.0, 3.0, 10.0)
+"""Sizes of effects, over their nominal ones, at which a set is looked at before it is scored."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +65,8 @@ class Linear:
       wide: scale of tau's prior where something unlisted acts at a port. far: factor on the prior of an instrument that
         errs more than usual.
       judged: statistics of measurements that no fit sees and by whose prediction every hypothesis is weighed as well.
+      amount: (k,) whether a column is the amplitude of an effect, whose size is known by its nominal one alone; none
+        where None. freedom: of Student's t prior of an effect's amplitudes; they are Gaussian where it is 0.
       unkept: nats that the derivatives promise beyond the refit and that its descent could not reach: no hypothesis
         around it is credited with them.
     """
@@ -83,6 +87,8 @@ class Linear:
     far: float
     added: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     judged: Gram | None = None
+    amount: np.ndarray | None = None
+    freedom: float = 0.0
     unkept: float = 0.0
 
     def evidence(
@@ -102,7 +108,20 @@ class Linear:
           EvidenceError: the sizes did not settle.
         """
         gram, prior, fields, places, back = self._model(terms)
+        given = len(self.fields)
+        if start is not None:
+            start = np.append(start[0], np.ones(len(fields) - given)), start[1]
         inferred = infer(gram, prior, fields, self.noises, start)
+        if len(fields) > given:
+            # Sizes of effects belong to this hypothesis alone: for whoever reads on they are part of the prior.
+            effect, std = prior.field >= given, prior.std.copy()
+            std[effect] *= inferred.tau[prior.field[effect]]
+            inferred = dataclasses.replace(
+                inferred,
+                tau=inferred.tau[:given],
+                tau_log_std=inferred.tau_log_std[:given],
+                amplitudes=Amplitudes(std, np.where(effect, -1, prior.field), prior.mean),
+            )
         value = inferred.log_evidence + inferred.log_inside(self.low[places], self.high[places]) - self.unkept
         if self.judged is not None:
             held = self.judged if back is None else shifted(self.judged, back)
@@ -115,9 +134,12 @@ class Linear:
         Priors are not truncated, nor is anything `judged`: this tells which sets are worth an `evidence`, which takes
         ten times as long. Minus infinity where rounding spoils it.
         """
-        gram, prior, *_ = self._model(terms)
+        gram, prior, fields, *_ = self._model(terms)
+        more = np.arange(len(self.fields), len(fields))
         try:
-            return log_density(gram, prior, *sizes)
+            # of a few sizes of its effects the best: for a choice among sets that will do
+            by_size = [log_density(gram, prior, np.append(sizes[0], np.full(len(more), s)), sizes[1]) for s in _SIZES]
+            return max(by_size[: len(_SIZES) if len(more) else 1])
         except EvidenceError:
             return -math.inf
 
@@ -145,8 +167,17 @@ class Linear:
                 std[self.calibration[t.name]] *= self.far
         # an instrument that errs more than usual has the columns of every hypothesis, with a wider prior
         prior = Amplitudes(std, self.amplitudes.field, self.amplitudes.mean).select(places)
-        fields = tuple(Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields)
-        return gram.select(places), prior, fields, places, back
+        fields = [Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields]
+        if self.freedom > 0.0 and self.amount is not None:
+            # What is nominal is a guess: an amplitude ten times as large is rare, and no miracle (Jeffreys 1961).
+            by_column = np.full(self.gram.width, -1)
+            for name in [n for n in self.effects if n in named and np.any(self.amount[self.effects[n]])]:
+                own = self.effects[name]
+                by_column[own[self.amount[own]]] = len(fields)
+                fields.append(Field(name, 1.0, freedom=self.freedom))
+            field = by_column[places]
+            prior = Amplitudes(prior.std, np.where(field >= 0, field, prior.field), prior.mean)
+        return gram.select(places), prior, tuple(fields), places, back
 
     def shows(self) -> dict[str, float]:
         """Length in sigma of each effect's signature at its prior size that the form's own parameters cannot absorb.
