@@ -332,7 +332,7 @@ def test_the_density_at_given_sizes_is_that_of_a_normal_distribution():
 
 
 def test_steep_slopes_and_a_far_prior_mean_cost_no_digits():
-    """Slopes of 1e5 sigma whose prior lies ten deviations from the refit: exact by a dense sum in units that hold it."""
+    """Slopes of 1e5 sigma whose prior lies ten deviations from the refit: exact by least squares on all rows."""
     rng = np.random.default_rng(5)
     n = 400
     steep = rng.normal(size=(n, 3)) * 1e4

@@ -264,3 +264,33 @@ def test_few_sets_are_scored_with_sizes_of_their_own_and_the_best_is_among_them(
     assert few.best.effects == {"wave"}
     assert few.best.log_posterior == pytest.approx(look(value).best.log_posterior, abs=1e-6)
     assert len(few.hypotheses) < len(look(value).hypotheses)
+
+
+def test_an_effect_ten_times_its_nominal_size_is_rare_and_no_miracle():
+    form = ToyForm(measured(0, square=1.0))
+    linear = form.linear(np.zeros(5))
+    # An amplitude of prior size 0.1, of which the truth holds ten.
+    std = linear.amplitudes.std.copy()
+    std[EFFECTS["square"]] = 0.1
+    gaussian = dataclasses.replace(linear, amplitudes=dataclasses.replace(linear.amplitudes, std=std))
+    amount = np.zeros(gaussian.gram.width, bool)
+    amount[list(EFFECTS.values())] = True
+    cauchy = dataclasses.replace(gaussian, amount=amount, freedom=1.0)
+    terms = frozenset(t for t in form.terms if t.name == "square")
+    base, sizes, _ = gaussian.evidence(frozenset())
+    assert cauchy.evidence(frozenset())[0] == base
+    gains, found = {}, {}
+    for name, one in (("gaussian", gaussian), ("cauchy", cauchy)):
+        value, found[name], places = one.evidence(terms, (sizes.tau, sizes.noise))
+        gains[name] = value - base
+        # Sizes of effects stay within: discrepancies are told as before, and the prior of whoever reads on is Gaussian.
+        assert len(found[name].tau) == len(one.fields)
+        assert np.array_equal(found[name].amplitudes.field >= 0, one.amplitudes.field[places] >= 0)
+    # Ten deviations cost 50 nats, and under Cauchy's prior log(1 + 100), which is 5.
+    assert gains["cauchy"] - gains["gaussian"] > 20.0
+    own = int(np.flatnonzero(places == EFFECTS["square"])[0])
+    assert found["cauchy"].mean[own] == pytest.approx(1.0, abs=0.1)
+    assert found["cauchy"].mean[own] > found["gaussian"].mean[own]
+    # A look at a few sizes picks about as well.
+    looked = [one.at_sizes(terms, (sizes.tau, sizes.noise)) for one in (gaussian, cauchy)]
+    assert looked[1] - looked[0] > 20.0

@@ -339,6 +339,25 @@ def test_a_name_has_to_help_drives_that_chose_nothing(everywhere: bool, verdict:
     assert details["held_out_of_usual"]["units"] == 16
     assert (after.effects, "not named" in sentence) == ((("drag",), False) if everywhere else ((), True))
     assert _held_to_account(said, said.sentence, found, 0.0) == (said, said.sentence, {})
+    # What is said to help beside something unlisted is a name as well.
+    something = "Something that no listed effect explains acts at motor_torque."
+    beside = dataclasses.replace(said, verdict=Verdict.UNKNOWN, sentence=f"{something} Beside it drag helps.")
+    after, sentence, _ = _held_to_account(beside, f"{beside.sentence} What remains is usual.", found, 0.95)
+    assert (after.verdict, after.effects) == (Verdict.UNKNOWN, ("drag",) if everywhere else ())
+    assert sentence.startswith(something) and sentence.endswith(" What remains is usual.")
+    assert ("drag helps" in sentence, "not named" in sentence) == (everywhere, not everywhere)
+
+
+def test_a_descent_draws_far_amplitudes_as_students_t_does():
+    form = DriveForm(Toy({"drag": 0.9}), DriveSettings())  # type: ignore[arg-type]
+    std, u = np.ones(len(form.coordinates)), form.origin()
+    (drag,) = form.candidates["drag"]
+    assert np.array_equal(form.effect_std(u, std, 1.0), std), "an effect at its null keeps its nominal width"
+    u[drag] = 9.0
+    # The slope of log(1 + a^2) is that of a Gaussian of variance (1 + a^2) / 2.
+    assert form.effect_std(u, std, 1.0)[drag] == pytest.approx(np.sqrt(41.0))
+    assert np.array_equal(form.effect_std(u, std, 0.0), std)
+    assert np.array_equal(np.delete(form.effect_std(u, std, 1.0), drag), np.delete(std, drag))
 
 
 def test_what_no_effect_does_is_unlisted_at_its_port():
