@@ -435,7 +435,7 @@ class DriveForm(MeasuredForm):
             noises=self._noise_sizes(),
             wide=settings.unlisted_discrepancy,
             far=1.0,
-            amount=np.append([c.amplitude for c in self.coordinates], np.zeros(len(std) - count)).astype(bool),
+            amount=self.amounts(len(std)),
             freedom=settings.effect_freedom,
             unkept=unkept,
         )

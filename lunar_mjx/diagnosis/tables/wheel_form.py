@@ -274,7 +274,7 @@ class WheelForm(MeasuredForm):
             noises=tuple(NoiseSize(_NAMES[q], s) for q, s in data.noise_std.items()),
             wide=settings.unlisted_discrepancy,
             far=settings.bad_calibration,
-            amount=np.append([c.amplitude for c in self.coordinates], np.zeros(len(std) - count)).astype(bool),
+            amount=self.amounts(len(std)),
             freedom=settings.effect_freedom,
         )
         return linear, columns, residual

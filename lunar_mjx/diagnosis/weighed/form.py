@@ -37,7 +37,7 @@ class SearchSettings:
     """1; prior standard deviation of an effect's amplitude, over its nominal size."""
     effect_freedom: float = 1.0
     """1; degrees of freedom of Student's t prior of an effect's amplitudes, 1 for Cauchy's: a nominal size is a guess.
-    0: Gaussian."""
+    0: Gaussian. Drives in windows have the Gaussian whatever it says."""
     effect_odds: float = 0.01
     """1; prior odds of each effect of the catalogue: of some fifteen, one is missing in every seventh table."""
     unlisted_odds: float = 0.005
@@ -184,6 +184,12 @@ class MeasuredForm(Form):
         """Prior standard deviation of an effect's amplitude, in scales."""
         del c
         return 1.0
+
+    def amounts(self, columns: int) -> np.ndarray:
+        """(columns,) whether each is the amplitude of a coordinate, of which the first columns are."""
+        out = np.zeros(columns, bool)
+        out[: len(self.coordinates)] = [c.amplitude for c in self.coordinates]
+        return out
 
     def effect_std(self, u: np.ndarray, std: np.ndarray, freedom: float) -> np.ndarray:
         """(coordinates,) prior standard deviations for a descent from (coordinates,), where effects have Student's t.

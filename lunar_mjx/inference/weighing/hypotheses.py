@@ -135,11 +135,11 @@ class Linear:
         ten times as long. Minus infinity where rounding spoils it.
         """
         gram, prior, fields, *_ = self._model(terms)
-        more = np.arange(len(self.fields), len(fields))
+        more = len(fields) - len(self.fields)
+        # of a few sizes of its effects the best: for a choice among sets that will do
+        tried = [np.append(sizes[0], np.full(more, size)) for size in (_SIZES if more else _SIZES[:1])]
         try:
-            # of a few sizes of its effects the best: for a choice among sets that will do
-            by_size = [log_density(gram, prior, np.append(sizes[0], np.full(len(more), s)), sizes[1]) for s in _SIZES]
-            return max(by_size[: len(_SIZES) if len(more) else 1])
+            return max(log_density(gram, prior, tau, sizes[1]) for tau in tried)
         except EvidenceError:
             return -math.inf
 
