@@ -422,8 +422,7 @@ def _held_to_account(
     Drives that chose a name have bent it to whatever else is wrong there. One that says nothing of other drives is not
     known to be missing, nor is it known that it is not.
     """
-    beside = said.verdict is Verdict.UNKNOWN and bool(said.effects)
-    if not sure or not (said.verdict in NAMING or beside):
+    if not sure or said.verdict not in NAMING:
         return said, sentence, {}
     held = account(gains_on_held_out(found))
     details = {"held_out_of_usual": held.to_dict("units")}
@@ -431,15 +430,6 @@ def _held_to_account(
         return said, sentence + " No drive was held out that could bear it out.", details
     if held.helps(sure):
         return said, sentence, details
-    if beside:
-        # That something unlisted acts stands, for it needs no name.
-        told = said.sentence.partition(" Beside it ")[0]
-        told += (
-            f" Beside it {', '.join(said.effects)} would help the fitted drives. Those that were held out do not bear "
-            f"it out (log density {held.gain:+.1f} +- {held.se:.1f} over {held.units} pieces), so it is not named."
-        )
-        rest = sentence.removeprefix(said.sentence)
-        return dataclasses.replace(said, effects=(), sentence=told), told + rest, details
     names = ", ".join([*said.effects, *(["something unlisted"] if said.unlisted else [])])
     sentence = (
         f"By the fitted drives alone: {sentence} Those that were held out do not bear it out (log density "

@@ -339,13 +339,6 @@ def test_a_name_has_to_help_drives_that_chose_nothing(everywhere: bool, verdict:
     assert details["held_out_of_usual"]["units"] == 16
     assert (after.effects, "not named" in sentence) == ((("drag",), False) if everywhere else ((), True))
     assert _held_to_account(said, said.sentence, found, 0.0) == (said, said.sentence, {})
-    # What is said to help beside something unlisted is a name as well.
-    something = "Something that no listed effect explains acts at motor_torque."
-    beside = dataclasses.replace(said, verdict=Verdict.UNKNOWN, sentence=f"{something} Beside it drag helps.")
-    after, sentence, _ = _held_to_account(beside, f"{beside.sentence} What remains is usual.", found, 0.95)
-    assert (after.verdict, after.effects) == (Verdict.UNKNOWN, ("drag",) if everywhere else ())
-    assert sentence.startswith(something) and sentence.endswith(" What remains is usual.")
-    assert ("drag helps" in sentence, "not named" in sentence) == (everywhere, not everywhere)
 
 
 def test_a_descent_draws_far_amplitudes_as_students_t_does():
