@@ -37,7 +37,7 @@ class SearchSettings:
     """1; prior standard deviation of an effect's amplitude, over its nominal size."""
     effect_freedom: float = 1.0
     """1; degrees of freedom of Student's t prior of an effect's amplitudes, 1 for Cauchy's: a nominal size is a guess.
-    0: Gaussian. Drives in windows have the Gaussian whatever it says."""
+    0: Gaussian, which drives in windows always have."""
     effect_odds: float = 0.01
     """1; prior odds of each effect of the catalogue: of some fifteen, one is missing in every seventh table."""
     unlisted_odds: float = 0.005

@@ -258,6 +258,12 @@ def test_settings_and_a_known_error_of_the_model_are_honoured(tmp_path):
         assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.parametrize("name", ["usual_discrepancy", "effect_size", "effect_freedom"])
+def test_a_setting_that_no_window_reads_is_refused(name):
+    with pytest.raises(UserError, match=f"{name}.* is not read where wheel speeds are imposed.* leave it out"):
+        WindowSettings.of({name: "2"})
+
+
 def test_what_no_window_holds_is_named_with_the_reason(tmp_path):
     """Positions without a heading were left out without a word."""
     place, heading = {"position_x_m": 1.0, "position_y_m": 2.0}, {"yaw_deg": 5.0}

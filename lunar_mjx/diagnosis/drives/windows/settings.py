@@ -26,8 +26,9 @@ class WindowSettings(SearchSettings):
 
     @classmethod
     def of(cls: type[SettingsKind], changed: Mapping[str, Any]) -> SettingsKind:
-        """See `SearchSettings`; sizes that nothing reads here are refused: `DIFFERENCES` has others."""
-        for name in ("usual_discrepancy", "effect_size"):
+        """See `SearchSettings`; what nothing reads here is refused: `DIFFERENCES` has other sizes, and their prior is a
+        Gaussian."""
+        for name in ("usual_discrepancy", "effect_size", "effect_freedom"):
             if name in changed:
                 problem = "is not read where wheel speeds are imposed"
                 raise bad_input("settings", name, changed[name], problem, "leave it out")
