@@ -98,7 +98,6 @@ BAD_RESULTS = [
     ("comparison.json", {"parameters": 5}),
     ("comparison.json", {"parameters": {"soil": 5}}),
     ("comparison.json", {"parameters": {"soil": {"value": 5}}}),
-    ("comparison.json", {"jitter_s": "x"}),
     ("comparison.json", {"channel_errors": 5}),
     ("comparison.json", {"error_times_s": {"yaw_deg": None}}),
     ("verdict.json", {"evidence": [{}]}),

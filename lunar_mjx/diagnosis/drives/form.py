@@ -5,16 +5,17 @@ from __future__ import annotations
 import concurrent.futures
 import copy
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import linalg, ndimage
+from scipy import linalg
 
 from lunar_mjx.diagnosis.drives.channel_errors import ChannelErrors, error_kind
 from lunar_mjx.diagnosis.drives.differences import STEP
-from lunar_mjx.diagnosis.drives.instruments import USUAL_ERRORS, usual_kind
+from lunar_mjx.diagnosis.drives.instruments import usual_kind
 from lunar_mjx.diagnosis.drives.nuisances import is_linear
 from lunar_mjx.diagnosis.drives.observations import with_errors
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
@@ -38,6 +39,7 @@ from lunar_mjx.inference.evidence import (
 )
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.observations import Observations
+from lunar_mjx.inference.single_errors import single_errors
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Refit, Term
 
 OWN_FORM = "the model"
@@ -45,7 +47,7 @@ USUAL_EFFECTS = "effects of usual size"
 """The field of all effects that no hypothesis names: every rover has a little of each."""
 GROUND = "height of the ground"
 """The field of ground that nobody mapped, in wheel radii."""
-LEARNT = frozenset({"jitter_s", "channel_errors", "error_times_s"})
+LEARNT = frozenset({"channel_errors", "error_times_s"})
 """What `DriveForm.learnt` tells of the errors with which all hypotheses are weighed."""
 
 
@@ -110,7 +112,6 @@ class DriveForm(MeasuredForm):
         self._field_of = np.full(len(self.coordinates), -1)
         self._field_of[self.discrepancy] = np.repeat(np.arange(len(labels)), [len(drives.inputs[k]) for k in labels])
         self.baseline, self.candidates = drives.baseline, dict(drives.candidates)
-        self.observations = drives.observations
         self.words = {label: WORDS[label] for label in labels}
         self.shares = SHARES
         self.terms = (
@@ -127,6 +128,7 @@ class DriveForm(MeasuredForm):
         # (discrepancy,) standard deviations of a log's amounts at size 1: what logs share and what each has for itself
         sizes = np.array([usual.size(label, q) for label in labels for q in FOLLOWS[label]])
         self._whole_size = sizes / np.array([self.coordinates[i].scale for i in self.discrepancy])
+        self._hold(Errors(drives.observations))
         kinds = [error_kind(s.channel) for s in self.observations.series]
         self.noise_names = tuple(dict.fromkeys(kinds))
         self._group = np.empty(len(self.observations), int)
@@ -142,14 +144,10 @@ class DriveForm(MeasuredForm):
         self._steps[self.discrepancy] = 1e-3 * self._whole_size
         self._seen: np.ndarray | None = None  # (n, coordinates) derivatives at the base, SI
         self._secants: np.ndarray | None = None  # (n, coordinates) changes by a usual amount there, over that amount
-        self._strays = np.zeros(len(self.observations))  # what predictions do that no slope tells, see `_learn_strays`
-        self.jitter_s = USUAL_ERRORS.jitter_s
         kinds = [usual_kind(c) for c in self.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
         self._slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}
         self._sizes: tuple[np.ndarray, np.ndarray] | None = None
-        self.channel_errors: Mapping[str, float] = {}
-        self.error_times_s: Mapping[str, float] = {}
         self.start = self.origin()  # where the first refit begins
         self.kept: Mapping[str, Any] = {}  # what `learnt` told of that place; then it has been refitted already
         self._trial: np.ndarray | None = None  # where a refit begins for which an effect is to act
@@ -168,6 +166,11 @@ class DriveForm(MeasuredForm):
     def predicted(self, u: np.ndarray) -> np.ndarray:
         """See `MeasuredForm`."""
         return self.drives.predict(u[None])[0]
+
+    def told(self, u: np.ndarray) -> np.ndarray:
+        """See `MeasuredForm`: a reading that is far off is told so, whatever error of its own it is weighed with."""
+        plain = self.errors.plain
+        return plain.whiten(plain.value - self.predicted(u))
 
     def jacobian(self, u: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Predictions (n,) at (coordinates,) and their derivatives (n, free).
@@ -478,17 +481,20 @@ class DriveForm(MeasuredForm):
           refit: of this form.
 
         Returns:
-          `log_evidence`; `jitter_s`, scatter of times, s; `channel_errors`, shares of what a channel does, and
-          `error_times_s`, how long these last, by channel.
+          `log_evidence`; `channel_errors`, shares of what a channel does, and `error_times_s`, how long these last, by
+          channel.
         """
         value = refit.linear.evidence(self.listed(refit.effects))[0]
-        widths = float(np.sum(self.observations.log_widths()[self._fit]))
         return {
-            "log_evidence": value - widths,
-            "jitter_s": self.jitter_s,
-            "channel_errors": dict(self.channel_errors),
-            "error_times_s": dict(self.error_times_s),
+            "log_evidence": value + self._log_scale(),
+            "channel_errors": dict(self.errors.by_channel),
+            "error_times_s": dict(self.errors.times_s),
         }
+
+    def _log_scale(self) -> float:
+        """What turns a log evidence in sigma of normal noise into one of the fitted measurements in their units, under
+        Student's noise."""
+        return float(np.sum((self.errors.log_ratio - self.observations.log_widths())[self._fit]))
 
     def limit(self, until: float) -> None:
         """See `MeasuredForm`."""
@@ -520,29 +526,32 @@ class DriveForm(MeasuredForm):
             u = self._prepare(free)
         slopes = self._guess(free, near)
         if first:
-            # all hypotheses are weighed against measurements with the same errors
-            if self.kept:
-                found = self._linear(u, effects, slopes).evidence(self.listed(effects))[1]
-            else:
-                found = self._choose_errors(u, free, slopes, self.settings.jitters_s)
-            self._sizes = found.tau, found.noise
+            self._learn_errors(u, free, slopes)
         terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
-        best: tuple[float, np.ndarray, np.ndarray, Linear, Evidence] | None = None
+        best: tuple[float, np.ndarray, np.ndarray, Linear, Evidence, Errors] | None = None
         for number in range(self.settings.most_rounds):
             guessed = number == 0 and bool(effects)
-            u, slopes, promised = self._descend(u, free, self.observations, sizes, slopes, guessed=guessed)
+            u, slopes, promised = self._descend(u, free, sizes, slopes, guessed=guessed)
+            if first:
+                # all hypotheses are weighed against measurements with the same errors
+                self._learn_errors(u, free, slopes)
+                sizes = self._sizes
             # An effect is credited with what its refit has reached, not with what slopes promise that no step has kept.
             # The model as it is keeps its promise: what a descent that ended early has left is no effect's gain.
             linear = self._linear(u, effects, slopes, 0.5 * promised if effects else 0.0)
             value, found, _ = linear.evidence(terms, sizes)
+            value += self._log_scale()
             gained = math.inf if best is None else value - best[0]
             if best is None or gained > 0.0:
-                best = value, u, slopes, linear, found
+                best = value, u, slopes, linear, found, self.errors
             if gained < self.settings.settled:
                 break
             sizes = found.tau, found.noise
         assert best is not None
-        _, u, slopes, linear, found = best
+        _, u, slopes, linear, found, errors = best
+        self._hold(errors)
+        if first:
+            self._sizes = found.tau, found.noise
         self._slopes[effects] = free, slopes
         if first:
             # Signatures belong to the place around which hypotheses are weighed: a descent away from where they were
@@ -568,7 +577,7 @@ class DriveForm(MeasuredForm):
         own = np.setdiff1d(free, self._free(frozenset()))
         rows[2, own] = start[own]
         inputs = self._inputs(*self._slopes[near.effects])
-        cost = self._cost(near.u, free, self.observations, self._sizes_of(near), inputs)
+        cost = self._cost(near.u, free, self._sizes_of(near), inputs)
         values = self.drives.predict(rows)
         costs = [cost.chi2(cost.white(cost.wanted - v), row[free]) for v, row in zip(values, rows, strict=True)]
         return rows[int(np.argmin(costs))]
@@ -591,15 +600,45 @@ class DriveForm(MeasuredForm):
             return float(np.nan_to_num(left @ left, nan=np.inf) + np.sum(((u[free] - centre) / self._std[free]) ** 2))
 
         starts = [u for u in (fitted, given) if math.isfinite(cost(u))]
-        return min((self._descend(u, free, self.observations, once=True)[0] for u in starts), key=cost)
+        return min((self._descend(u, free, once=True)[0] for u in starts), key=cost)
 
-    def _choose_errors(
-        self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, jitters_s: Sequence[float]
-    ) -> Evidence:
-        """Takes scatter of times, then errors of channels, of the most probable size: by the model with what is usual.
+    def _learn_errors(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> None:
+        """Takes errors of single readings and of channels, of the most probable sizes, and sizes of what is usual.
+
+        Where a wheel sticks or slips, meets an edge or begins to turn, a prediction jumps with every little change, and
+        some readings are off by many times what others are. Normal noise would have to be as large as these for all.
 
         Args:
-          u, free, slopes: as for `_columns`. jitters_s: scatters that are tried.
+          u, free, slopes: as for `_columns`.
+        """
+        # A rival is weighed against measurements with the very errors of the model's own form.
+        if self._rival_of is None:
+            self._learn_single_errors(u, free, slopes)
+        # What an earlier run has found of the channels holds: all its hypotheses were weighed with it.
+        if self.kept:
+            found = self._linear(u, frozenset(), slopes).evidence(frozenset())[1]
+        else:
+            found = self._choose_channel_errors(u, free, slopes)
+        self._sizes = found.tau, found.noise
+
+    def _learn_single_errors(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> None:
+        """See `_learn_errors`: those of single readings, with errors of channels and all sizes as they are."""
+        settings, predicted = self.settings, self.predicted(u)
+        sizes = self._usual_sizes() if self._sizes is None else self._sizes
+        for _ in range(settings.single_rounds):
+            cost = self._cost(u, free, sizes, self._inputs(free, slopes))
+            left = self.observations.whiten(cost.wanted - predicted) / sizes[1][self._group]
+            left[self._fit] = cost.left(left[self._fit])
+            found = single_errors(
+                self.errors.plain, self.observations, left, self._group, self._fit, settings.noise_freedoms
+            )
+            self._hold(dataclasses.replace(self.errors, single=found.std, log_ratio=found.log_ratio))
+
+    def _choose_channel_errors(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> Evidence:
+        """Takes errors of channels of the most probable size: by the model with what is usual.
+
+        Args:
+          u, free, slopes: as for `_columns`.
 
         Returns:
           Sizes of discrepancy and noise with these errors.
@@ -610,35 +649,34 @@ class DriveForm(MeasuredForm):
         std = np.concatenate([self._std, np.ones(len(number))])[always]
         field = np.concatenate([self._field_of, number])[always]
         prior = Amplitudes(std, field, self._prior_mean(u, len(number))[always])
-        columns = columns[:, always]
-        fields, noises = self._usual_fields(), self._noise_sizes()
+        errors = self._channel_errors(self.errors.single)
+        levels = errors.levels(columns[:, always], residual)
+        found = infer_levels(levels, prior, self._usual_fields(), self._noise_sizes())
+        assert found.levels is not None
+        self._take(found.levels)
+        return found
 
-        def climbed(errors: ChannelErrors, begin: np.ndarray | None, sizes: Any) -> tuple[Evidence, np.ndarray]:
-            found = infer_levels(errors.levels(columns, residual, begin), prior, fields, noises, sizes)
-            assert found.levels is not None
-            return found, found.levels
-
-        # The usual scatter with the errors that go best with it; then every other one with these errors, and with those
-        # that go best with the scatter that gains. At the usual errors a scatter would stand for their being larger.
-        made = {s: self._errors_with(s) for s in jitters_s}
-        self.jitter_s = min(jitters_s, key=lambda s: abs(s - USUAL_ERRORS.jitter_s))
-        best, levels = climbed(made[self.jitter_s], None, None)
-        for jitter_s in [s for s in jitters_s if s != self.jitter_s]:
-            errors = made[jitter_s]
-            white = errors.at(levels).whiten(np.column_stack([columns, residual]))[self._fit]
-            gram = Gram.of(white[:, :-1], white[:, -1], self._group[self._fit], len(noises))
-            value = infer(gram, prior, fields, noises, (best.tau, best.noise)).log_evidence
-            if value + errors.log_weight(levels) > best.log_evidence:
-                self.jitter_s = jitter_s
-                best, levels = climbed(errors, levels, (best.tau, best.noise))
-        self._take(made[self.jitter_s], levels)
-        return best
-
-    def _errors_with(self, jitter_s: float) -> ChannelErrors:
-        """Observations whose times scatter by so many seconds, with each size of their channels' errors."""
-        # To first order an error of time is one of the signal, times its rate.
-        seen = with_errors(self.drives.observations, np.hypot(jitter_s * self.drives.rate, self._strays))
+    def _channel_errors(self, single: np.ndarray | float = 0.0) -> ChannelErrors:
+        """Observations with each size of their channels' errors, and with errors of single readings."""
+        seen = with_errors(self.drives.observations, np.broadcast_to(single, len(self.drives.observations)))
         return ChannelErrors(seen, self._group, len(self.noise_names), self.settings)
+
+    def _take(self, levels: np.ndarray) -> None:
+        """Holds the measurements with errors of a level (groups,) of each group of channels from now on."""
+        errors = self._channel_errors()
+        self._hold(
+            dataclasses.replace(
+                self.errors, plain=errors.at(levels), by_channel=errors.shares(levels), times_s=errors.times_s(levels)
+            )
+        )
+
+    def _hold(self, errors: Errors) -> None:
+        """Weighs the measurements with these errors from now on."""
+        self.errors, self.observations = errors, errors.observations
+
+    def _usual_sizes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Usual sizes of discrepancy (fields,) and of noise (groups,)."""
+        return np.array([f.usual for f in self._usual_fields()]), np.ones(len(self.noise_names))
 
     def _usual_fields(self) -> tuple[Field, ...]:
         """What is usual: discrepancy at every port, a little of every effect, and ground that nobody mapped."""
@@ -667,72 +705,33 @@ class DriveForm(MeasuredForm):
         Returns:
           (coordinates,) the refit.
         """
-        drives, usual_jitter = self.drives, USUAL_ERRORS.jitter_s
         if self._take_kept():
             return self._see_all(self.start if self._rival_of is None else self._settled(free), free)
-        errors = self._errors_with(usual_jitter)
-        self.observations = errors.at(errors.usual)
+        self._take(self._channel_errors().usual)
         # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after it,
         # and a descent that moves everything at once follows them into soil that nothing brings it back from.
         nuisances = free[[self.coordinates[i].nuisance for i in free]]
-        u, _, _ = self._descend(self.start, nuisances, self.observations)
+        u, _, _ = self._descend(self.start, nuisances)
         # Ground before soil: waves that nobody mapped cost a rover more torque than a few per cent of the soil's
         # constants do, which would follow them.
         u = self._find_ground(u, free)
         for _ in range(self.settings.most_rounds):
             # A law that errs by more than noise says little of its constants. Held to noise and usual errors these
             # would leave their priors by many deviations, for places where wheels stick and slip and no slope holds.
-            drives.about(u)
+            self.drives.about(u)
             self._seen = self._see_inputs(u)
             slopes = self.jacobian(u, free)[1]
-            self._learn_strays(u, free, slopes)
-            before = self.channel_errors, self.error_times_s
-            found = self._choose_errors(u, free, slopes, (usual_jitter,))
-            if (self.channel_errors, self.error_times_s) == before:
+            before = self.errors
+            self._learn_errors(u, free, slopes)
+            if (self.errors.by_channel, self.errors.times_s) == (before.by_channel, before.times_s):
                 break
-            u, slopes, _ = self._descend(
-                u, free, self.observations, (found.tau, found.noise), slopes, most=self.settings.few_jacobians
-            )
+            u, slopes, _ = self._descend(u, free, self._sizes, slopes, most=self.settings.few_jacobians)
             u = self._find_ground(u, free)
-        if drives.noise_unlearnt:
-            drives.learn_noise(u)
+        if self.drives.noise_unlearnt:
+            self.drives.learn_noise(u)
             # what is learnt of the noise is in what the drives hold from now on
-            errors = self._errors_with(usual_jitter)
-            self.observations = errors.at(errors.usual)
-        return self._see_all(u, free, anew=True)
-
-    def _learn_strays(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> None:
-        """Takes as noise what predictions do over probable places that slopes do not tell.
-
-        Where a wheel sticks or slips, meets an edge or begins to turn, a prediction jumps with every little change: no
-        slope holds for such a reading, and a descent that believes one is led by jumps. Other readings have none of
-        this noise (statistical linearisation: Garcia-Fernandez et al. 2015).
-
-        Args:
-          u, free, slopes: as for `_columns`.
-        """
-        usual = np.array([f.usual for f in self._usual_fields()]), np.ones(len(self.noise_names))
-        cost = self._cost(u, free, self.observations, usual, self._inputs(free, slopes))
-        white = cost.white(slopes)
-        normal = cost.inner(white, white) + np.diag(cost.std**-2)
-        # the same draws at each place: two looks at one place tell the same
-        draws = np.random.default_rng(0).standard_normal((len(free), self.settings.draws))
-        moves = linalg.solve_triangular(np.linalg.cholesky(normal).T, draws).T
-        # What belongs to a held-out drive alone, such as its start, no measurement has told.
-        held_out = [k for k, part in self.observations.of_log.items() if not self._fit[part.start]]
-        moves[:, [self.coordinates[i].log_index in held_out for i in free]] = 0.0
-        low, high = self.drives.bounds(free)
-        rows = np.repeat(u[None], 1 + len(moves), axis=0)
-        rows[1:, free] = np.clip(u[free] + moves, low, high)
-        here, *there = self.drives.predict(rows)
-        strays = [p - here - slopes @ (row[free] - u[free]) for p, row in zip(there, rows[1:], strict=True)]
-        # A simulation that diverged is no probable place.
-        strays = [s for s in strays if np.isfinite(s).all()]
-        self._strays = np.zeros(len(here))
-        for s in self.observations.series if strays else ():
-            # An angle goes astray for all that follows: what lasts is the channel's slow error.
-            own = _quick(np.array(strays)[:, s.start : s.stop], np.asarray(s.time), self.settings.error_times_s[0])
-            self._strays[s.start : s.stop] = np.sqrt(np.mean(own**2, axis=0))
+            self._take(self._channel_errors().usual)
+        return self._see_all(u, free)
 
     def _take_kept(self) -> bool:
         """Whether an earlier refit of these drives has left errors of channels, which are taken then."""
@@ -741,18 +740,14 @@ class DriveForm(MeasuredForm):
             return True
         kept, self.kept = self.kept, {}
         # Noise that is learnt from a refit is not among what is kept.
-        if not kept or self.drives.noise_unlearnt or kept["jitter_s"] not in self.settings.jitters_s:
+        if not kept or self.drives.noise_unlearnt:
             return False
-        self.drives.about(self.start)
-        free = self._free(frozenset())
-        self._seen = self._see_inputs(self.start)
-        self._learn_strays(self.start, free, self.jacobian(self.start, free)[1])
-        errors = self._errors_with(kept["jitter_s"])
-        levels = errors.at_shares(kept["channel_errors"], kept["error_times_s"])
+        levels = self._channel_errors().at_shares(kept["channel_errors"], kept["error_times_s"])
         if levels is None:
             return False
-        self.kept, self.jitter_s = kept, kept["jitter_s"]
-        self._take(errors, levels)
+        self.kept = kept
+        self.drives.about(self.start)
+        self._take(levels)
         return True
 
     def _begin_beside(self, own: DriveForm) -> None:
@@ -768,16 +763,15 @@ class DriveForm(MeasuredForm):
         Errors of the same sizes would not do: those of times go with how fast a form's own predictions change.
         """
         self.drives.about(self.start)
-        self.observations, self.jitter_s = own.observations, own.jitter_s
-        self.channel_errors, self.error_times_s = own.channel_errors, own.error_times_s
-        self.kept = {"jitter_s": own.jitter_s}
+        self._hold(own.errors)
+        self.kept = own.errors.by_channel
 
     def _settled(self, free: np.ndarray) -> np.ndarray:
         """A refit (coordinates,) with errors that are known, from the start or the model's own parameters as given."""
         given, own = self.start.copy(), [i for i in self.baseline if not self.coordinates[i].nuisance]
         # A rival's parameters make up for what it lacks; where this form has that, they are far off.
         given[own], given[self.discrepancy] = 0.0, 0.0
-        cost = self._cost(self.start, free, self.observations, self._rival_of._sizes if self._rival_of else None)
+        cost = self._cost(self.start, free, self._rival_of._sizes if self._rival_of else None)
         rows = np.stack([self.start, given])
         values = self.drives.predict(rows)
         costs = [cost.chi2(cost.white(cost.wanted - v), row[free]) for v, row in zip(values, rows, strict=True)]
@@ -787,25 +781,18 @@ class DriveForm(MeasuredForm):
             self._seen = self._see_inputs(u)
             slopes = self.jacobian(u, free)[1]
             found = self._linear(u, frozenset(), slopes).evidence(frozenset())[1]
-            u, _, _ = self._descend(u, free, self.observations, (found.tau, found.noise), slopes)
+            u, _, _ = self._descend(u, free, (found.tau, found.noise), slopes)
             u = self._find_ground(u, free)
         return u
 
-    def _take(self, errors: ChannelErrors, levels: np.ndarray) -> None:
-        """Holds the measurements with errors of a level (groups,) of each group from now on."""
-        self.observations = errors.at(levels)
-        self.channel_errors, self.error_times_s = errors.shares(levels), errors.times_s(levels)
-
-    def _see_all(self, u: np.ndarray, free: np.ndarray, anew: bool = False) -> np.ndarray:
+    def _see_all(self, u: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Takes all derivatives at a refit (coordinates,) of the model as it is, and returns it.
 
         Args:
-          u: the refit. free: what it moved. anew: whether what predictions do beside slopes is learnt there, too.
+          u: the refit. free: what it moved.
         """
         self._see(u)
         self._slopes[frozenset()] = free, self.jacobian(u, free)[1]
-        if anew:
-            self._learn_strays(u, free, self._slopes[frozenset()][1])
         self._ground = u[self.drives.ground]
         return u
 
@@ -846,16 +833,16 @@ class DriveForm(MeasuredForm):
         self,
         u: np.ndarray,
         free: np.ndarray,
-        observations: Observations,
         sizes: tuple[np.ndarray, np.ndarray] | None,
         inputs: np.ndarray | None = None,
     ) -> _Cost:
         """What a descent from a place minimises.
 
         Args:
-          u, free, observations, sizes: as for `_descend`.
+          u, free, sizes: as for `_descend`.
           inputs: (n, discrepancy) derivatives; None where logs have no discrepancy of their own.
         """
+        observations = self.observations
         noise = np.ones(len(self.noise_names)) if sizes is None else sizes[1]
         weight = 1.0 / noise[self._group[self._fit]]
         misfit, offset = np.zeros((len(weight), 0)), np.zeros(len(observations))
@@ -875,7 +862,6 @@ class DriveForm(MeasuredForm):
         self,
         u: np.ndarray,
         free: np.ndarray,
-        observations: Observations,
         sizes: tuple[np.ndarray, np.ndarray] | None = None,
         slopes: np.ndarray | None = None,
         guessed: bool = False,
@@ -888,8 +874,7 @@ class DriveForm(MeasuredForm):
         Levenberg-Marquardt with bounds; derivatives serve for further steps as long as these keep what they promise.
 
         Args:
-          u: (coordinates,) where from. free: places of what moves. observations: with the channels' errors.
-          sizes: None for noise alone.
+          u: (coordinates,) where from. free: places of what moves. sizes: None for noise alone.
           slopes: (n, free) derivatives, if known. guessed: whether these are to be taken anew before the end.
           once: whether no others than these are taken. most: Jacobians at most; as the settings say if None.
 
@@ -900,7 +885,7 @@ class DriveForm(MeasuredForm):
         if slopes is None:
             slopes = self.jacobian(u, free)[1]
         settings = self.settings
-        cost = self._cost(u, free, observations, sizes, None if sizes is None else self._inputs(free, slopes))
+        cost = self._cost(u, free, sizes, None if sizes is None else self._inputs(free, slopes))
         white, inner, wanted, std, centre = cost.white, cost.inner, cost.wanted, cost.std, cost.centre
         # Slopes of instruments hold however far they move, and scales of inputs are another rover's.
         linear = np.array([is_linear(self.coordinates[i]) for i in free], bool)
@@ -960,6 +945,29 @@ class DriveForm(MeasuredForm):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors of measurements that a model's own form has found, and with which all hypotheses are weighed.
+
+    Attributes:
+      plain: observations with noise and errors of channels.
+      single: (n,) standard deviation of each reading's own error beside these, in its channel's unit.
+      log_ratio: (n,) log density of a reading under Student's noise over that under normal noise with its own error.
+      by_channel, times_s: size of a channel's errors, as a share of what it does, and how long they last, s.
+    """
+
+    plain: Observations
+    single: np.ndarray | float = 0.0
+    log_ratio: np.ndarray | float = 0.0
+    by_channel: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    times_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    @functools.cached_property
+    def observations(self) -> Observations:
+        """The measurements with all these errors."""
+        return with_errors(self.plain, np.broadcast_to(self.single, len(self.plain)))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class _Cost:
     """Chi-square under the covariance of noise and discrepancy, and of the prior.
 
@@ -987,7 +995,11 @@ class _Cost:
         """Products of whitened columns under the covariance of noise and discrepancy."""
         # Woodbury's identity: the covariance of the data is as large as they are, and is never made. It is applied to
         # what is narrower, which saves most of the work where that is a residual.
-        return a.T @ (b - self.misfit @ linalg.cho_solve(self.factor, self.misfit.T @ b))
+        return a.T @ self.left(b)
+
+    def left(self, residual: np.ndarray) -> np.ndarray:
+        """What discrepancy of the most probable amounts leaves of a whitened residual (fitted, ...)."""
+        return residual - self.misfit @ linalg.cho_solve(self.factor, self.misfit.T @ residual)
 
     def chi2(self, residual: np.ndarray, x: np.ndarray) -> float:
         """Of a whitened residual (fitted,) at a place (free,); infinite where the simulation diverged."""
@@ -1025,13 +1037,6 @@ class _Share:
         # what these logs share and the mean does not tell
         apart[held_out, -1] = math.sqrt((1.0 - own) * (1.0 - known))
         return cls(mean, known, apart)
-
-
-def _quick(values: np.ndarray, time: np.ndarray, lasting: float) -> np.ndarray:
-    """(k, n) values less their medians over as many seconds as is lasting; as they are where that holds too few."""
-    within = round(lasting / float(np.median(np.diff(time)))) if len(time) > 1 else 1
-    # The mean would give every reading a share of its neighbour's jump.
-    return values if within < 3 else values - ndimage.median_filter(values, (1, within), mode="mirror")
 
 
 def _flatter(one: np.ndarray, other: np.ndarray) -> np.ndarray:

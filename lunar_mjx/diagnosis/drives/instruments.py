@@ -37,8 +37,6 @@ class UsualErrors:
     """A mounting less well known than this is no small angle: its axis tells nothing, and has no nuisance."""
     usual_clock_s: float = 0.005
     """Usual error between the clocks of kinds of channels, s: a quarter of a sampling interval of 50 Hz."""
-    jitter_s: float = 0.005
-    """Usual scatter of the times of single readings and commands, s: a period of a control loop of 200 Hz."""
 
 
 USUAL_ERRORS = UsualErrors()

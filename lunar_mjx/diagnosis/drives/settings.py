@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from lunar_mjx.diagnosis.weighed.form import SearchSettings
 
@@ -34,10 +35,6 @@ class DriveSettings(SearchSettings):
     error_times_s: tuple[float, ...] = (1.0, 10.0)
     """s; how long such an error lasts, which are tried: where a law is off, a wheel's speed errs for about a second,
     and its angle, as the sum of that, for all of a drive."""
-    jitters_s: tuple[float, ...] = (0.0, 0.002, 0.005, 0.02)
-    """s; scatter of the times of single readings that is tried. Of a foreign campaign of a Husky with nothing hidden
-    `compare` tells a log evidence of 63,497 with 0.02 and of 56,806 with `--setting jitters_s=0`; on one of LUVMI-X
-    it finds none."""
     least_length: float = 0.3
     """sigma; a direction in which even an unlisted discrepancy is shorter is left out."""
     secant: float = 0.3
@@ -50,6 +47,10 @@ class DriveSettings(SearchSettings):
     """s; length of the pieces of held-out drives each of which is one witness: as long as a wheel takes to meet ground
     that it has not touched."""
 
+    noise_freedoms: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0, math.inf)
+    """1; degrees of freedom of Student's noise of single readings that are tried for each kind of channel; infinite for
+    normal noise."""
+
     # --- effort ------------------------------------------------------------------------------------------------------
     most_refits: int = 8
     """1; refits of a search, each of which simulates some hundred drives."""
@@ -57,6 +58,8 @@ class DriveSettings(SearchSettings):
     """1; effects beside a set that are scored with sizes of their own, each of which takes a second or more."""
     most_rounds: int = 2
     """1; rounds of refit and re-linearisation."""
+    single_rounds: int = 3
+    """1; steps of EM by which errors of single readings settle, each time that they are learnt."""
     few_jacobians: int = 2
     """1; Jacobians of a descent after which errors of channels are chosen anew: it need not arrive before these are."""
     most_jacobians: int = 5
@@ -64,7 +67,5 @@ class DriveSettings(SearchSettings):
     settled: float = 2.0
     """chi-square; what a further step must promise, and what the steps with one Jacobian must gain: a nat, a quarter of
     the `window`."""
-    draws: int = 8
-    """1; probable places at which a prediction is held against what slopes tell of it; 0: slopes hold for all."""
     longest_step: float = 3.0
     """scale; longest step of a coordinate."""

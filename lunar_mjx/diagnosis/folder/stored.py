@@ -59,7 +59,6 @@ class _Comparison(_Stored):
     certificate: _Certificate | None = None
     parameters: dict[str, dict[str, dict[str, Any] | None]] | None = None
     # Of drives alone, where `why` goes on from them.
-    jitter_s: Number = 0.0
     channel_errors: dict[str, Number] = {}
     error_times_s: dict[str, Number] = {}
 
