@@ -629,9 +629,8 @@ class DriveForm(MeasuredForm):
             cost = self._cost(u, free, sizes, self._inputs(free, slopes))
             left = self.observations.whiten(cost.wanted - predicted) / sizes[1][self._group]
             left[self._fit] = cost.left(left[self._fit])
-            found = single_errors(
-                self.errors.plain, self.observations, left, self._group, self._fit, settings.noise_freedoms
-            )
+            freedoms = [freedom or math.inf for freedom in settings.noise_freedoms]
+            found = single_errors(self.errors.plain, self.observations, left, self._group, self._fit, freedoms)
             self._hold(dataclasses.replace(self.errors, single=found.std, log_ratio=found.log_ratio))
 
     def _choose_channel_errors(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> Evidence:

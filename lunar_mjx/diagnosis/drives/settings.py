@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 from lunar_mjx.diagnosis.weighed.form import SearchSettings
 
@@ -47,9 +46,9 @@ class DriveSettings(SearchSettings):
     """s; length of the pieces of held-out drives each of which is one witness: as long as a wheel takes to meet ground
     that it has not touched."""
 
-    noise_freedoms: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0, math.inf)
-    """1; degrees of freedom of Student's noise of single readings that are tried for each kind of channel; infinite for
-    normal noise."""
+    noise_freedoms: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0, 0.0)
+    """1; degrees of freedom of Student's noise of single readings that are tried for each kind of channel; 0 for normal
+    noise."""
 
     # --- effort ------------------------------------------------------------------------------------------------------
     most_refits: int = 8

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from types import SimpleNamespace
 from typing import Any
 
@@ -525,7 +526,7 @@ def test_what_is_learnt_beside_the_parameters_can_be_compared_between_settings()
     jolts = 6.0 * np.random.default_rng(9).standard_normal(LOGS * SAMPLES) * (np.arange(LOGS * SAMPLES) % 10 == 0)
     toy.observations = dataclasses.replace(toy.observations, value=toy.observations.value + jolts)
     found = []
-    for freedoms in (DriveSettings().noise_freedoms, (np.inf,)):
+    for freedoms in (DriveSettings().noise_freedoms, (0.0,)):
         form = DriveForm(toy, dataclasses.replace(DriveSettings(), noise_freedoms=freedoms))  # type: ignore[arg-type]
         found.append(form.learnt(form.refit(frozenset(), None, None)))
     assert set(found[0]["channel_errors"]) == {"y"}
@@ -570,7 +571,7 @@ def test_readings_that_are_far_off_have_errors_of_their_own():
     assert 5 < np.sum(off) < 0.1 * len(off)
     wider = form.observations.sigma() / toy.observations.sigma()
     assert np.min(wider[off]) > 2.0 > 1.2 > np.median(wider[~off])
-    plain = DriveForm(toy, DriveSettings(noise_freedoms=(np.inf,)))  # type: ignore[arg-type]
+    plain = DriveForm(toy, DriveSettings(noise_freedoms=(0.0,)))  # type: ignore[arg-type]
     without = plain.refit(frozenset(), None, None)
     assert abs(base.u[1] + 0.8) < 0.1 < abs(without.u[1] + 0.8)
 
@@ -732,3 +733,9 @@ def test_what_is_usual_has_none_of_an_effect_that_was_refitted():
 
     assert left(frozenset()) < 1e-6
     assert left(frozenset({"drag"})) > 0.9
+
+
+def test_a_run_s_record_holds_every_setting():
+    """A setting that JSON cannot tell would be read back as another one, or refused."""
+    told = json.loads(json.dumps(dataclasses.asdict(DriveSettings()), allow_nan=False))
+    assert DriveSettings.of(told) == DriveSettings()
