@@ -41,6 +41,7 @@ from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.single_errors import single_errors
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Refit, Term
+from lunar_mjx.logs.schema import parse_name
 
 OWN_FORM = "the model"
 USUAL_EFFECTS = "effects of usual size"
@@ -894,6 +895,8 @@ class DriveForm(MeasuredForm):
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
         present_chi2 = cost.chi2(residual, u[free])
+        # What is told of a model alone shows no change of its error by a two-thousandth.
+        settled = max(settings.settled, 1e-3 * present_chi2) if once else settings.settled
         damping, trials = DRIVE_REFIT.damping, min(len(DRIVE_REFIT.factors), self.drives.together)
         try:
             for _ in range(settings.most_jacobians if most is None else most):
@@ -911,7 +914,7 @@ class DriveForm(MeasuredForm):
                         for s in steps
                     ]
                     # Shorter ones promise less: there is nothing left to gain where these slopes hold.
-                    if _promised(steps[0], normal, downhill) < settings.settled:
+                    if _promised(steps[0], normal, downhill) < settled:
                         break
                     rows = np.repeat(u[None], trials, axis=0)
                     rows[:, free] = np.clip(u[free] + steps, low, high)
@@ -927,7 +930,7 @@ class DriveForm(MeasuredForm):
                     # A step that keeps less than a third of its promise has left where these slopes hold; what gains a
                     # tenth of what they have gained so far gains more with new ones, which take as long as five steps.
                     kept, little = gained / _promised(steps[best], normal, downhill), 0.1 * (first - present_chi2)
-                    if kept < 0.3 or (gained < little and not once):
+                    if kept < 0.3 or (gained < (settled if once else little)):
                         break
                 if once or (not guessed and first - present_chi2 < settings.settled):
                     break
@@ -1107,10 +1110,34 @@ def usual_of(drives: DriveProblem) -> Usual:
 
     weight = float(rover.mass) * float(model.gravity)
     load, radius = weight / len(rover.wheels), float(np.mean([w.radius for w in rover.wheels]))
-    torque = DRAWBAR * load * radius
-    current = torque / (own("gear_ratio") * own("gear_efficiency") * own("torque_constant"))
+    drawbar = DRAWBAR * load * radius
+    per_current = own("gear_ratio") * own("gear_efficiency") * own("torque_constant")
+    # A share of a torque is one of what acts: a skid-steer rover that turns needs several times a usual drawbar pull.
+    current = acting_current(drives.observations, {g.name: len(g.joints) for g in rover.drive_groups})
+    if not current:
+        current = drawbar / per_current
     commands = np.concatenate([r.commands[:, driven].ravel() for r in drives.bench.runs])
     moving = np.abs(commands[np.abs(commands) > 1e-6])
     # Not the largest, which may be a single jerk.
     speed = float(np.quantile(moving, 0.9)) if len(moving) else 1.0
-    return Usual(load, radius, speed, torque, current, own("resistance"), weight, 2.0 * radius)
+    return Usual(load, radius, speed, per_current * current, drawbar, current, own("resistance"), weight, 2.0 * radius)
+
+
+def acting_current(observations: Observations, shared: Mapping[str, int]) -> float:
+    """Median of the absolute current of a drive as measured, A; 0 where none is measured or it is not twice its noise.
+
+    Args:
+      observations: of drives. shared: number of wheels that a motor drives, by the name of its side; else one.
+    """
+    found, noise = [], []
+    for s in observations.series:
+        name = parse_name(s.channel)
+        if name is not None and name.quantity == "motor_current" and name.joint == "drive":
+            wheels = shared.get(name.corner, 1)
+            found.append(np.abs(observations.value[s.start : s.stop]) / wheels)
+            noise.append(np.broadcast_to(np.hypot(s.white, s.coloured), s.stop - s.start) / wheels)
+    if not found:
+        return 0.0
+    # Not the root mean square: where commands jump, rotors take tens of times what the ground does.
+    middle = float(np.median(np.concatenate(found)))
+    return middle if middle > 2.0 * float(np.median(np.concatenate(noise))) else 0.0

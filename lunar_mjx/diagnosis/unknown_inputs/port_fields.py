@@ -37,7 +37,6 @@ ADDED, DRAWN, CRAWLING = 0.25, 0.1, 15.0
 (as for tables); of the shear of wheels that hardly move, of which no more than the order is known."""
 SHARES: Mapping[str, float] = {
     "geometry: wheel radius": DRAWN,
-    "wheel_normal: load": ADDED,
     "wheel_normal: resistance": ADDED,
     "wheel_shear: longitudinal force": ADDED,
     "wheel_shear: lateral force": ADDED,
@@ -55,13 +54,17 @@ DRAWBAR = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Usual:
-    """What is usual on a rover, SI units: load of a wheel, its radius, its speed in rad/s, torque and current of its
-    drive, resistance of the winding, weight and half the wheelbase."""
+    """What is usual on a rover, SI units.
+
+    Load of a wheel, its radius and its speed in rad/s; torque that acts at its drive, and that of a usual drawbar pull;
+    current that acts; resistance of the winding; weight and half the wheelbase.
+    """
 
     load: float
     radius: float
     speed: float
     torque: float
+    drawbar_torque: float
     current: float
     resistance: float
     weight: float
@@ -71,7 +74,8 @@ class Usual:
     def amounts(self) -> Mapping[str, float]:
         """What an effect of usual size amounts to on this rover, by its unit: a joint's friction takes the torque, or
         at usual speed the damping, of a drawbar pull of a tenth of the load; forces are a tenth of a wheel's load."""
-        return {"N m": self.torque, "N m s/rad": self.torque / self.speed, "N": DRAWBAR * self.load}
+        torque = self.drawbar_torque
+        return {"N m": torque, "N m s/rad": torque / self.speed, "N": DRAWBAR * self.load}
 
     def size(self, label: str, quantity: str) -> float:
         """Amplitude, in the unit of an unknown input, of a field of size 1 that follows a quantity."""

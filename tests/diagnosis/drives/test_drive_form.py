@@ -31,12 +31,13 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.deadline import Deadline, TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
+from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.inference.weighing.search import search
 from lunar_mjx.model import make_model
 from tests.inference.toy_problem import coordinate, manoeuvres
 
 LOGS, SAMPLES, LABEL = 6, 80, "motor_torque"
-USUAL = Usual(40.0, 0.1, 2.0, 0.4, 0.5, 4.0, 240.0, 0.3)
+USUAL = Usual(40.0, 0.1, 2.0, 0.4, 0.3, 0.5, 4.0, 240.0, 0.3)
 RNG = np.random.default_rng(0)
 SHAPES = RNG.standard_normal((5 + len(FOLLOWS[LABEL]), LOGS * SAMPLES))
 SHAPES[5:] /= [[USUAL.size(LABEL, q)] for q in FOLLOWS[LABEL]]
@@ -388,14 +389,31 @@ def test_fields_are_relative_to_what_is_usual():
     assert USUAL.size("soil: stiffness", "slip") == pytest.approx(1.0)
 
 
+def test_a_usual_current_is_what_acts_at_one_wheel():
+    """A motor of a side drives two wheels; jerks are not usual, and readings that are noise alone tell no current."""
+    time, rng = np.arange(400) * 0.05, np.random.default_rng(3)
+    names = ("motor_left_drive_current_A", "motor_rf_drive_current_A", "joint_rf_drive_speed_rad_s")
+    values = (6.0 * np.sign(np.sin(time)), 3.0 + 0.5 * rng.standard_normal(400), np.full(400, 9.0))
+    values[1][::20] = 200.0
+
+    def acting(scale: float) -> float:
+        series = tuple(Series(0, c, 400 * i, 400 * (i + 1), time, 0.3, 0.4, 1.0) for i, c in enumerate(names))
+        unit, split = np.zeros(1200, int), ("fit",)
+        observations = Observations(scale * np.concatenate(values), series, ("a",), split, unit, split, ("a",))
+        return module.acting_current(observations, {"left": 2})
+
+    assert acting(1.0) == pytest.approx(3.0, rel=0.05)
+    assert acting(0.1) == 0.0
+
+
 def test_an_effect_is_as_large_as_the_rover_asks_for():
     """A friction that is usual for a small rover's drives is nothing to those of a large one."""
     form = DriveForm(Toy({}), DriveSettings())  # type: ignore[arg-type]
     torque = Coordinate("drag", "torque", 0.0, 0.1, 0.0, 50.0, unit="N m", amplitude=True)
-    assert form.effect_size(torque) == pytest.approx(USUAL.torque / 0.1)
+    assert form.effect_size(torque) == pytest.approx(USUAL.drawbar_torque / 0.1)
     assert form.effect_size(dataclasses.replace(torque, scale=10.0)) == 1.0  # never less than is nominal
     damping = dataclasses.replace(torque, scale=0.01, unit="N m s/rad")
-    assert form.effect_size(damping) == pytest.approx(USUAL.torque / USUAL.speed / 0.01)
+    assert form.effect_size(damping) == pytest.approx(USUAL.drawbar_torque / USUAL.speed / 0.01)
     assert form.effect_size(dataclasses.replace(torque, unit="rad")) == 1.0
 
 
