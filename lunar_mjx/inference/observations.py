@@ -150,6 +150,20 @@ class Observations:
                 out[[s.start + i for s in group]] = 0.5 * np.log(total)
         return out
 
+    def slow_variance(self) -> np.ndarray:
+        """(n,) variance of the correlated noise at every observation, as far as earlier ones have not told it.
+
+        With the white noise's it is the variance of an innovation, whose root is what `whiten` divides by.
+        """
+        out = np.empty(len(self))
+        for s in self.series:
+            if not _is_slow(s):
+                out[s.start : s.stop] = s.coloured**2
+        for group in self._clocks():
+            for i, (total, _, gain) in enumerate(_filter(group)):
+                out[[s.start + i for s in group]] = gain * total
+        return out
+
 
 def _is_slow(s: Series) -> bool:
     """Whether a series has noise that lasts, which a filter over its times whitens."""

@@ -51,9 +51,9 @@ def single_errors(
     """
     # Of an innovation's variance one part is the slow noise that earlier readings have not told; the rest is this
     # reading's own.
-    total, own = np.exp(2.0 * present.log_widths()), _white(plain)
-    usual = total - _white(present) + own
-    square = np.square(left) * total / usual
+    slow = present.slow_variance()
+    usual = slow + _white(plain)
+    square = np.square(left) * (slow + _white(present)) / usual
     # A simulation that diverged says nothing of its readings: they have all the error in the world.
     square = np.where(np.isfinite(square), np.minimum(square, 1e12), 1e12)
     std, log_ratio = np.empty(len(left)), np.empty(len(left))

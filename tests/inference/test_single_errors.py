@@ -73,3 +73,12 @@ def test_a_simulation_that_diverged_leaves_no_number_undefined():
     found = single_errors(plain, plain, left, np.zeros(COUNT, int), np.ones(COUNT, bool), (4.0,))
     assert np.isfinite(found.std).all() and np.isfinite(found.log_ratio).all()
     assert np.min(found.std[3:5]) > 1e4
+
+
+def test_errors_far_beyond_the_noise_settle():
+    """Beside an error of 1e12 sigma what is usual of a reading is lost to rounding, if it is told by a difference."""
+    value = 1e-3 * SIGMA * np.random.default_rng(5).standard_normal(COUNT)
+    value[200:210] += 1e12 * SIGMA * np.array([1.0, -1.0] * 5)
+    found, present = settled(observations(value, 1e-3), (4.0,))
+    assert np.isfinite(found.std).all() and np.isfinite(present.whiten(value)).all()
+    assert np.min(found.std[200:210]) > 1e4 > 2.0 * SIGMA > np.max(found.std[:200])

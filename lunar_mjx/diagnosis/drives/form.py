@@ -533,14 +533,21 @@ class DriveForm(MeasuredForm):
         for number in range(self.settings.most_rounds):
             guessed = number == 0 and bool(effects)
             u, slopes, promised = self._descend(u, free, sizes, slopes, guessed=guessed)
-            if first:
-                # all hypotheses are weighed against measurements with the same errors
-                self._learn_errors(u, free, slopes)
-                sizes = self._sizes
-            # An effect is credited with what its refit has reached, not with what slopes promise that no step has kept.
-            # The model as it is keeps its promise: what a descent that ended early has left is no effect's gain.
-            linear = self._linear(u, effects, slopes, 0.5 * promised if effects else 0.0)
-            value, found, _ = linear.evidence(terms, sizes)
+            try:
+                if first:
+                    # all hypotheses are weighed against measurements with the same errors
+                    self._learn_errors(u, free, slopes)
+                    sizes = self._sizes
+                # An effect is credited with what its refit has reached, not with what slopes promise that no step has
+                # kept. The model as it is keeps its promise: what a descent that ended early has left is no effect's
+                # gain.
+                linear = self._linear(u, effects, slopes, 0.5 * promised if effects else 0.0)
+                value, found, _ = linear.evidence(terms, sizes)
+            except EvidenceError:
+                # A place of which nothing can be told is not gone to; the one before it stands.
+                if best is None:
+                    raise
+                break
             value += self._log_scale()
             gained = math.inf if best is None else value - best[0]
             if best is None or gained > 0.0:

@@ -757,3 +757,20 @@ def test_a_run_s_record_holds_every_setting():
     """A setting that JSON cannot tell would be read back as another one, or refused."""
     told = json.loads(json.dumps(dataclasses.asdict(DriveSettings()), allow_nan=False))
     assert DriveSettings.of(told) == DriveSettings()
+
+
+def test_a_place_of_which_nothing_can_be_told_is_not_gone_to(monkeypatch):
+    """The first round of a refit stands where slopes at the end of the second are too steep to compute with."""
+    form = DriveForm(Toy({"a": 1.5, "b": -0.8}), DriveSettings())  # type: ignore[arg-type]
+    learnt, told = [], DriveForm._linear
+
+    def linear(self, u, effects, slopes, unkept=0.0):
+        learnt.append(self.errors)
+        if len(learnt) == 2:
+            raise EvidenceError("derivatives are too steep to compute with")
+        return told(self, u, effects, slopes, unkept)
+
+    monkeypatch.setattr(DriveForm, "_linear", linear)
+    base = form.refit(frozenset(), None, None)
+    assert base.u[:2] == pytest.approx([1.5, -0.8], abs=0.3)
+    assert len(learnt) == 3 and form.errors is learnt[0]
