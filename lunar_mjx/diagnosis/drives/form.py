@@ -70,6 +70,8 @@ class DriveRefit:
     """1; amount that is asked for, over that of a secant, from which the secant is the nearer one."""
     dead: float = 0.01
     """1; length of a derivative over that of the secant below which an effect does nothing at its null."""
+    visible: float = 1e-3
+    """1; share of the chi-square of a model alone that a step has to promise: half of it in the error that is told."""
     together: int = 8
     """Candidates whose signatures one program simulates: fewer are faster per rover, more are fewer programs to
     make."""
@@ -765,10 +767,7 @@ class DriveForm(MeasuredForm):
         self.start = np.array([there.get(c.key, 0.0) if i in mine else 0.0 for i, c in enumerate(self.coordinates)])
 
     def _take_errors(self, own: DriveForm) -> None:
-        """Takes the measurements with the very errors that a rival is weighed with.
-
-        Errors of the same sizes would not do: those of times go with how fast a form's own predictions change.
-        """
+        """Takes the measurements with the very errors that a rival is weighed with."""
         self.drives.about(self.start)
         self._hold(own.errors)
         self.kept = own.errors.by_channel
@@ -902,8 +901,7 @@ class DriveForm(MeasuredForm):
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
         present_chi2 = cost.chi2(residual, u[free])
-        # What is told of a model alone shows no change of its error by a two-thousandth.
-        settled = max(settings.settled, 1e-3 * present_chi2) if once else settings.settled
+        settled = max(settings.settled, DRIVE_REFIT.visible * present_chi2) if once else settings.settled
         damping, trials = DRIVE_REFIT.damping, min(len(DRIVE_REFIT.factors), self.drives.together)
         try:
             for _ in range(settings.most_jacobians if most is None else most):
