@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -121,27 +121,30 @@ class Gram:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Levels:
-    """Statistics of measurements whose slow errors have an unknown size, for each of some sizes.
+    """Measurements whose slow errors have an unknown size, one of some levels in each group.
 
     What a model leaves out beyond its ports shows as slow errors of whole groups of measurements.
 
     Attributes:
-      count: (groups,) number of measurements.
-      matrix: (levels, groups, k + 1, k + 1) as that of `Gram`, whitened with each size.
+      columns, residual: (n, k), (n,) as those of `Gram`, not whitened. group: (n,) number of each.
+      whiten: gives columns (n, m), whitened at a level (groups,) of each group.
       log_scale: (levels, groups) sum of the logarithms of what whitening divides by.
-      log_prior: (levels,) log prior density of each size.
+      log_prior: (levels,) log prior density of each level.
       starts: (m, groups) levels to begin at, of which the one counts that leads to the most probable end.
     """
 
-    count: np.ndarray
-    matrix: np.ndarray
+    columns: np.ndarray
+    residual: np.ndarray
+    group: np.ndarray
+    whiten: Callable[[np.ndarray, np.ndarray], np.ndarray]
     log_scale: np.ndarray
     log_prior: np.ndarray
     starts: np.ndarray
 
     def gram(self, levels: np.ndarray) -> Gram:
         """The statistics at a level (groups,) of each group."""
-        return Gram(self.count, self.matrix[levels, np.arange(len(levels))])
+        white = self.whiten(levels, np.column_stack([self.columns, self.residual]))
+        return Gram.of(white[:, :-1], white[:, -1], self.group, self.log_scale.shape[1])
 
     def log_weight(self, levels: np.ndarray) -> float:
         """What is added to the log evidence of measurements whitened at a level (groups,) of each group."""
@@ -153,17 +156,30 @@ class Levels:
 
         The two go together: errors that are too large make the noise seem too small, and would never be left alone.
         """
-        place = np.append(-found.mean, 1.0)
-        square = np.einsum("i,lgij,j->lg", place, self.matrix, place)
-        # The expected square, not the one at the mean: what the amplitudes may still be adds its trace (the E step).
-        square = square + np.einsum("lgij,ij->lg", self.matrix[..., :-1, :-1], found.covariance)
+        groups = self.log_scale.shape[1]
+        # The expected square, not the one at the mean: what the amplitudes may still be adds to it (the E step).
+        left = found.left(self.columns, self.residual)
+        square = np.empty_like(self.log_scale)
+        for level in range(len(square)):
+            each = expected_square(self.whiten(np.full(groups, level), left))
+            square[level] = np.bincount(self.group, each, minlength=groups)
+        count = np.bincount(self.group, minlength=groups).astype(float)
         x, log_prior = np.empty_like(square), np.empty_like(square)
         for g, prior in enumerate(noises):
-            x[:, g], log_prior[:, g] = _most_probable_noise(square[:, g], float(self.count[g]), prior)
-        value = -0.5 * square * np.exp(-2.0 * x) - self.count * x + log_prior - self.log_scale + self.log_prior[:, None]
+            x[:, g], log_prior[:, g] = _most_probable_noise(square[:, g], count[g], prior)
+        value = -0.5 * square * np.exp(-2.0 * x) - count * x + log_prior - self.log_scale + self.log_prior[:, None]
         # Given the amplitudes, groups are independent: each takes its best level without regard to the others.
         at = np.argmax(value, axis=0)
         return at, np.exp(x[at, np.arange(len(at))])
+
+
+_DRAWS = 24
+"""Draws by which what amplitudes may still be is told: of a hundred of them, to 3 %."""
+
+
+def expected_square(white: np.ndarray) -> np.ndarray:
+    """(n,) expected squares of whitened residuals, from what `Evidence.left` gives, whitened."""
+    return white[:, 0] ** 2 + np.sum(white[:, 1:] ** 2, axis=1) / max(white.shape[1] - 1, 1)
 
 
 def _most_probable_noise(square: np.ndarray, count: float, prior: NoiseSize) -> tuple[np.ndarray, np.ndarray]:
@@ -298,6 +314,18 @@ class Evidence:
         # p(new | old) = p(new, old) / p(old): the amplitudes are integrated over what the old ones say of them
         joint = _condition(self.gram + held_out, self.amplitudes, self.tau, self.noise)[0]
         return joint - _condition(self.gram, self.amplitudes, self.tau, self.noise)[0]
+
+    def left(self, columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        """(n, 1 + draws) what the mean leaves of a residual (n,), and what draws of the amplitudes about it change.
+
+        Their covariance would take as many columns (n, k) as there are amplitudes. The draws are the same each time,
+        and at right angles as far as there are so many, which tells a trace better than independent ones.
+        """
+        k = len(self.mean)
+        draws = np.linalg.qr(np.random.default_rng(0).standard_normal((k, min(_DRAWS, k))))[0]
+        size, turn = np.linalg.eigh(self.covariance)
+        drawn = (turn * np.sqrt(np.maximum(size, 0.0))) @ draws * math.sqrt(k / max(draws.shape[1], 1))
+        return np.column_stack([residual - columns @ self.mean, columns @ drawn])
 
     def within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """(k,) probable amplitudes within (k,) bounds, relative to the refit, at the sizes found.

@@ -36,7 +36,7 @@ class SingleErrors:
 def single_errors(
     plain: Observations,
     present: Observations,
-    left: np.ndarray,
+    square: np.ndarray,
     group: np.ndarray,
     counted: np.ndarray,
     freedoms: Sequence[float],
@@ -45,7 +45,7 @@ def single_errors(
 
     Args:
       plain: observations without such errors. present: with those of the step before.
-      left: (n,) innovations that the model leaves, by `present.whiten`, in sigma.
+      square: (n,) squares of the innovations that the model leaves, by `present.whiten`, in sigma: expected ones.
       group: (n,) group of each whose noise has the same degrees of freedom. counted: (n,) which of them tell these.
       freedoms: degrees of freedom that are tried; infinite for normal noise.
     """
@@ -53,10 +53,10 @@ def single_errors(
     # reading's own.
     slow = present.slow_variance()
     usual = slow + _white(plain)
-    square = np.square(left) * (slow + _white(present)) / usual
+    square = square * (slow + _white(present)) / usual
     # A simulation that diverged says nothing of its readings: they have all the error in the world.
     square = np.where(np.isfinite(square), np.minimum(square, 1e12), 1e12)
-    std, log_ratio = np.empty(len(left)), np.empty(len(left))
+    std, log_ratio = np.empty(len(square)), np.empty(len(square))
     found = np.empty(int(group.max()) + 1)
     for g in range(len(found)):
         mine = group == g

@@ -26,7 +26,7 @@ def settled(plain: Observations, freedoms=FREEDOMS, steps: int = 30):
     """Errors where EM has settled, and the measurements with them."""
     present, one, all_of_them = plain, np.zeros(len(plain), int), np.ones(len(plain), bool)
     for _ in range(steps):
-        found = single_errors(plain, present, present.whiten(plain.value), one, all_of_them, freedoms)
+        found = single_errors(plain, present, present.whiten(plain.value) ** 2, one, all_of_them, freedoms)
         white = np.hypot(SIGMA, found.std)
         present = dataclasses.replace(plain, series=(dataclasses.replace(plain.series[0], white=white),))
     return found, present
@@ -70,7 +70,7 @@ def test_a_simulation_that_diverged_leaves_no_number_undefined():
     left = np.zeros(COUNT)
     left[3:5] = np.inf, np.nan
     plain = observations(np.zeros(COUNT))
-    found = single_errors(plain, plain, left, np.zeros(COUNT, int), np.ones(COUNT, bool), (4.0,))
+    found = single_errors(plain, plain, left**2, np.zeros(COUNT, int), np.ones(COUNT, bool), (4.0,))
     assert np.isfinite(found.std).all() and np.isfinite(found.log_ratio).all()
     assert np.min(found.std[3:5]) > 1e4
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from lunar_mjx.diagnosis.drives.observations import with_discrepancy
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
-from lunar_mjx.inference.evidence import Gram, Levels
+from lunar_mjx.inference.evidence import Levels
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.logs.schema import parse_name
 
@@ -81,24 +81,22 @@ class ChannelErrors:
             self._made[key] = made
         return self._made[key]
 
-    def log_weight(self, levels: np.ndarray) -> float:
-        """See `Levels.log_weight`."""
-        return float(np.sum(self.log_prior[levels] - self.log_scale[levels, np.arange(len(levels))]))
-
     def levels(self, columns: np.ndarray, residual: np.ndarray, start: np.ndarray | None = None) -> Levels:
-        """Statistics of the fitted observations at every size.
+        """The fitted observations with each size of errors.
 
         Args:
           columns: (n, k) derivatives of the predictions, SI units. residual: (n,) measured less predicted.
           start: (groups,) levels to begin at; the usual size and none if None.
         """
-        whole, number, grams = np.column_stack([columns, residual]), self._group[self._fit], []
-        for level in range(len(self._levels)):
-            white = self.at(np.full(self._kinds, level)).whiten(whole)[self._fit]
-            grams.append(Gram.of(white[:, :-1], white[:, -1], number, self._kinds))
-        matrix = np.stack([g.matrix for g in grams])
+
+        def whiten(levels: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+            whole = np.zeros((len(self._fit), fitted.shape[1]))
+            whole[self._fit] = fitted
+            return self.at(levels).whiten(whole)[self._fit]
+
         starts = np.stack([self.usual, np.zeros_like(self.usual)] if start is None else [start])
-        return Levels(grams[0].count, matrix, self.log_scale, self.log_prior, starts)
+        fit = self._fit
+        return Levels(columns[fit], residual[fit], self._group[fit], whiten, self.log_scale, self.log_prior, starts)
 
 
 def spread(observations: Observations) -> dict[str, float]:

@@ -57,10 +57,8 @@ class DriveSettings(SearchSettings):
     """1; effects beside a set that are scored with sizes of their own, each of which takes a second or more."""
     most_rounds: int = 2
     """1; rounds of refit and re-linearisation."""
-    single_rounds: int = 3
-    """1; steps of EM by which errors of single readings settle, each time that they are learnt."""
-    few_jacobians: int = 2
-    """1; Jacobians of a descent after which errors of channels are chosen anew: it need not arrive before these are."""
+    most_steps: int = 15
+    """1; Jacobians of the model as it is, at each of which errors are learnt anew."""
     most_jacobians: int = 5
     """1; Jacobians of one descent."""
     settled: float = 2.0

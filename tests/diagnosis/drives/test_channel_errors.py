@@ -85,7 +85,7 @@ def test_how_long_errors_last_is_told_by_them(time_s):
         levels = errors.levels(drift, residual)
         alone = errors.levels(drift[:, :1], residual)
         own, rest = (
-            infer_levels(made, Amplitudes.of(np.ones(made.matrix.shape[-1] - 1)), (), [NoiseSize("y", 0.3)])
+            infer_levels(made, Amplitudes.of(np.ones(made.columns.shape[1])), (), [NoiseSize("y", 0.3)])
             for made in (levels, alone)
         )
         gains[times] = own.log_evidence - rest.log_evidence
