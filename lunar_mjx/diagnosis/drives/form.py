@@ -111,7 +111,7 @@ class DriveForm(MeasuredForm):
         self._rival_of = beside
         labels = list(drives.inputs)
         self.discrepancy = np.concatenate([np.zeros(0, int), *(drives.inputs[label] for label in labels)])
-        self.coordinates = drives.coordinates
+        self.coordinates, self.ground = drives.coordinates, drives.ground
         # (coordinates,) field that a coordinate belongs to, of discrepancy the common part, or -1
         self._field_of = np.full(len(self.coordinates), -1)
         self._field_of[self.discrepancy] = np.repeat(np.arange(len(labels)), [len(drives.inputs[k]) for k in labels])

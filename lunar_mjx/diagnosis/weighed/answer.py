@@ -210,10 +210,13 @@ def _rms(values: np.ndarray) -> float:
 
 
 def parameter_table(form: MeasuredForm, u: np.ndarray, covariance: np.ndarray, places: np.ndarray) -> dict[str, Any]:
-    """Fitted values and standard deviations by effect and name, with units and the values that the model came with."""
+    """Fitted values and standard deviations by effect and name, with units and the values that the model came with.
+
+    Amounts of fields, of which only the size is told, are no parameters.
+    """
     table: dict[str, Any] = {}
     for k, i in enumerate(places):
-        if i >= len(form.coordinates) or i in form.discrepancy:
+        if i >= len(form.coordinates) or i in form.discrepancy or i in form.ground:
             continue
         c = form.coordinates[i]
         entry = table.setdefault(c.effect, {"value": {}, "std": {}, "given": {}, "unit": {}})

@@ -114,7 +114,7 @@ class MeasuredForm(Form):
       observations: what was measured.
       coordinates: everything that a refit may move. baseline: places of those of the model as it is.
       candidates: places by effect that may be missing.
-      discrepancy: places of amounts of discrepancy that are simulated.
+      discrepancy: places of amounts of discrepancy that are simulated. ground: of those of ground that nobody mapped.
       words: fields of discrepancy, and what is "good to so many per cent" in the user's words.
       shares: what a field's size is "good to", over that size, where not 1.
       skipped: candidates that the time did not suffice to look at.
@@ -128,6 +128,7 @@ class MeasuredForm(Form):
     words: Mapping[str, str]
     shares: Mapping[str, float] = MappingProxyType({})
     discrepancy: np.ndarray = np.zeros(0, int)
+    ground: np.ndarray = np.zeros(0, int)
     skipped: tuple[str, ...] = ()
     writing: float = 0.0
 

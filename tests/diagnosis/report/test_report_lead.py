@@ -226,9 +226,16 @@ def test_rows_of_the_waterfall_fit_a_phone():
 def test_a_factor_on_the_models_own_values_is_recorded_as_such():
     known = dataclasses.replace(Coordinate("soil", "n", 1.0, 0.1, 0.5, 2.0), unit="1")
     coordinates = (known, dataclasses.replace(known, name="cohesion", factor=True))
-    form = SimpleNamespace(coordinates=coordinates, discrepancy=())
+    form = SimpleNamespace(coordinates=coordinates, discrepancy=(), ground=())
     table = parameter_table(cast(Any, form), np.zeros(2), np.eye(2), np.arange(2))
     assert table["soil"]["unit"] == {"n": "1", "cohesion": FACTOR_UNIT}
+
+
+def test_amounts_of_ground_and_discrepancy_are_no_parameters():
+    coordinates = tuple(Coordinate("soil", name, 1.0, 0.1, 0.5, 2.0) for name in ("n", "cohesion", "k_phi"))
+    form = SimpleNamespace(coordinates=coordinates, discrepancy=np.array([2]), ground=np.array([1]))
+    table = parameter_table(cast(Any, form), np.zeros(3), np.eye(4), np.arange(4))
+    assert list(table["soil"]["value"]) == ["n"]
 
 
 def test_starts_and_instruments_have_a_table_of_their_own():
