@@ -942,7 +942,7 @@ class DriveForm(MeasuredForm):
     def _step(
         self, cost: _Cost, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, damping: float, settled: float
     ) -> _Step:
-        """Steps with one Jacobian, as long as they keep what it promises: Levenberg-Marquardt with bounds.
+        """Steps with one Jacobian, as long as they gain and it promises more: Levenberg-Marquardt with bounds.
 
         Args:
           cost: what they lower. u, free, slopes: as for `_descend`. damping: of the first one.

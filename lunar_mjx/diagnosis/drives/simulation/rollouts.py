@@ -76,11 +76,6 @@ class Bench:
         other.params, other._stacked, other.deadline = self.params, None, self.deadline
         return other
 
-    @property
-    def workers(self) -> int:
-        """Chunks that are simulated at once."""
-        return max(1, cores()) if jax.default_backend() == "cpu" else 1
-
     @functools.cached_property
     def stamp(self) -> tuple[Any, ...]:
         """What all that it simulates depends on beside the rows: programs, and what the logs put into them."""
@@ -171,12 +166,13 @@ class Bench:
             full = np.concatenate([part, np.repeat(part[-1:], self.chunk - len(part), axis=0)])
             return logs.program(logs, full[:, 0], full[:, 1], values, len(part), self.deadline)
 
+        workers = cores() if jax.default_backend() == "cpu" else 1
         # the first part compiles alone, or every thread would compile the same program
-        if self.workers < 2 or len(parts) < 2 or not logs.program.compiled:
+        if workers < 2 or len(parts) < 2 or not logs.program.compiled:
             yield one(parts[0])
             parts = parts[1:]
         if parts:
-            with concurrent.futures.ThreadPoolExecutor(self.workers) as pool:
+            with concurrent.futures.ThreadPoolExecutor(max(workers, 1)) as pool:
                 yield from pool.map(one, parts)
 
 
