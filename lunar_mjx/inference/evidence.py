@@ -324,7 +324,7 @@ class Evidence:
         k = len(self.mean)
         draws = np.linalg.qr(np.random.default_rng(0).standard_normal((k, min(_DRAWS, k))))[0]
         size, turn = np.linalg.eigh(self.covariance)
-        drawn = (turn * np.sqrt(np.maximum(size, 0.0))) @ draws * math.sqrt(k / max(draws.shape[1], 1))
+        drawn = (turn * np.sqrt(np.maximum(size, 0.0))) @ draws * math.sqrt(k)
         return np.column_stack([residual - columns @ self.mean, columns @ drawn])
 
     def within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:

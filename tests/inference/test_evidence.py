@@ -310,6 +310,15 @@ def test_the_most_probable_level_of_slow_errors_is_taken(drawn):
     assert found.log_evidence == pytest.approx(max(alone.values()), abs=1e-4)
 
 
+def test_draws_tell_what_amplitudes_may_still_change(drawn):
+    columns, residual, group, amplitudes = drawn
+    found = infer(Gram.of(columns, residual, group, 2), amplitudes, FIELDS, NOISES)
+    told = evidence.expected_square(found.left(columns, residual)).sum()
+    exact = np.sum((residual - columns @ found.mean) ** 2) + np.trace(columns @ found.covariance @ columns.T)
+    spread = exact - np.sum((residual - columns @ found.mean) ** 2)
+    assert told == pytest.approx(exact, abs=0.1 * spread)
+
+
 def test_amplitudes_within_bounds_are_those_of_bounded_least_squares(drawn):
     """Amplitudes that no bound holds move to where they fit best beside those that one does."""
     columns, residual, group, amplitudes = drawn

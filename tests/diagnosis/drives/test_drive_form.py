@@ -586,7 +586,7 @@ class Stumbling(Toy):
 def test_readings_that_are_far_off_have_errors_of_their_own():
     toy = Stumbling({"a": 1.5, "b": -0.8})
     # no place has all the jumps of what was measured
-    toy.later = 0.7
+    toy.later = 1.6
     form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
     off = np.abs(form.told(base.u)) > 5.0
