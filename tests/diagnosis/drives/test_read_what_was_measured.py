@@ -186,3 +186,58 @@ def test_clocks_and_mountings_known_within_an_error(tmp_path: Path, model: Model
             if np.max(np.abs(truth - before)) > 3e-4:
                 # of the second order in the error, and at the ends of one-sided quotients
                 assert np.median(np.abs(after - truth)) < 0.25 * np.median(np.abs(before - truth)), (s.channel, which)
+
+
+def test_the_state_is_read_where_pieces_end(tmp_path: Path, model: Model) -> None:
+    turning = {"yaw_deg": (170.0 + 20.0 * TIME + 180.0) % 360.0 - 180.0, "gyro_z_rad_s": np.radians(20.0)}
+    moving = {
+        "position_x_m": 3.0 + 0.2 * TIME,
+        "world_velocity_x_m_s": 0.2,
+        "joint_lf_drive_angle_rad": 5.0 + 2.0 * TIME,
+    }
+    seen = log_run(make(tmp_path / "a", turning | moving), model).seen
+    ends = np.array([0.5, 1.0, 1.5])
+    np.testing.assert_allclose(seen["x"], 3.0 + 0.2 * ends, atol=1e-9)
+    np.testing.assert_allclose(seen["yaw"], np.radians(170.0 + 20.0 * ends), atol=1e-9)
+    np.testing.assert_allclose(seen["yaw_rate"], np.radians(20.0))
+    # counted from the mean of the first samples, as the model's from its first
+    np.testing.assert_allclose(seen["joint_angle"][:, 0], 2.0 * ends, atol=0.21)
+    # nothing that is measured from then on tells what it was
+    jumps = {"position_x_m": np.where(TIME > 0.999, 7.0, 3.0), "position_y_m": np.where(TIME > 0.899, np.nan, 0.0)}
+    late = log_run(make(tmp_path / "jumps", jumps), model).seen
+    np.testing.assert_allclose(late["x"], [3.0, 3.0, 7.0])
+    assert np.isfinite(late["y"]).tolist() == [True, True, False]
+    assert np.isnan(seen["y"]).all() and np.isnan(seen["velocity"][:, 1]).all() and np.isnan(seen["joint_speed"]).all()
+    askew = Rotation.from_euler("x", 20.0, degrees=True).as_quat(scalar_first=True).tolist()
+    assert np.isnan(log_run(make(tmp_path / "b", turning, imu={"quaternion": askew}), model).seen["yaw_rate"]).all()
+
+
+def test_simulations_resume_from_what_was_measured(tmp_path: Path, model: Model) -> None:
+    # another rover than the model's: half as fast again, turned, and elsewhere than its wheels would have gone
+    columns = {f"joint_{c}_drive_angle_rad": 1.5 * TIME for c in CORNERS}
+    columns |= {f"joint_{c}_drive_speed_rad_s": 1.5 for c in CORNERS}
+    columns |= {"position_x_m": 0.3 * TIME, "position_y_m": 0.1 * TIME, "yaw_deg": 15.0 * TIME}
+    columns |= {"world_velocity_x_m_s": 0.3, "world_velocity_y_m_s": 0.1, "position_z_m": 0.0}
+    log = make(tmp_path / "a", columns, terrain="slope:5deg")
+    rows = {w: DriveProblem([log], model, {}, window=w) for w in (0.0, 1.0)}
+    whole, resumed = (p.predict(p.origin()[None])[0] for p in rows.values())
+    for s in rows[0.0].observations.series:
+        own = slice(s.start, s.stop)
+        at = np.asarray(s.time)
+        np.testing.assert_array_equal(resumed[own][at < 0.999], whole[own][at < 0.999])
+        just = s.start + int(np.flatnonzero(at > 0.999)[0])
+        measured = rows[0.0].observations.value[just]
+        if s.channel in ("position_x_m", "position_y_m"):
+            assert abs(resumed[just] - measured) < 0.01 < abs(whole[just] - measured)
+        if s.channel == "yaw_deg":
+            assert abs(resumed[just] - measured) < 1.0 < abs(whole[just] - measured)
+        if s.channel.endswith("angle_rad"):
+            assert abs(resumed[just] - measured) < 0.2 < abs(whole[just] - measured)
+        if s.channel == "position_z_m":
+            # it goes along the slope: no jump into the ground that would throw it up
+            gone = resumed[own][at > 0.999]
+            assert np.all(np.abs(np.diff(gone)) < 0.005)
+            x = next(q for q in rows[0.0].observations.series if q.channel == "position_x_m")
+            rise = (resumed[x.start : x.stop] - whole[x.start : x.stop])[at > 0.999] * np.tan(np.radians(5.0))
+            np.testing.assert_allclose(gone - whole[own][at > 0.999], rise, atol=0.004)
+    assert rows[1.0].bench.stamp != rows[0.0].bench.stamp
