@@ -32,8 +32,12 @@ from lunar_mjx.report.style import BLUE, DARK_FIGURES, FONT, INK, MUTED, ORANGE,
 class StudioSizes:
     """How much a studio holds."""
 
-    most_values: int = 400_000
-    """Numbers in all traces of a page; longer series are thinned."""
+    most_values: int = 2_000_000
+    """Numbers in all traces of a page, about a byte each; longer series are thinned."""
+    # Steps that a trace is rounded to, within its range and between readings: a reader may zoom in twentyfold.
+    levels: int = 10_000
+    levels_of_residual: int = 2_000
+    levels_of_time: int = 20
     most_models: int = 14
     """Models to choose from: as many buttons as a reader looks through."""
     most_map: int = 2_000
@@ -54,6 +58,10 @@ _STYLE = {
     "shades": [colour for _, colour in SHADES],
 }
 """What the figures of the page look like."""
+_MISSING = -(2**40)
+"""Stands for no number in a coded trace."""
+_LARGEST = 1e200
+"""Above it a number is none: differences and steps of what a damaged run may hold would overflow."""
 _REST = "others"
 """Name of the hypotheses that are not listed one by one."""
 
@@ -104,7 +112,7 @@ def write_studio(run: str | Path, out: str | Path) -> Path:
         program=program,
         # By their digests, no other script can run in the page, whatever the texts of a run hold.
         allowed=" ".join(f"'sha256-{_digest(text)}'" for text in (program, plotly)),
-        data=packed(json.dumps(_page_data(result, result.traces), allow_nan=False)),
+        data=packed(json.dumps(_page_data(result, result.traces), allow_nan=False, separators=(",", ":"))),
         plotly=packed(plotly),
     )
     path = Path(out)
@@ -128,7 +136,8 @@ def _page_data(result: Result, traces: Traces) -> dict[str, Any]:
     channels = list(dict.fromkeys(c for c, _ in shown_cells))
     units = sorted({u for _, u in shown_cells})
     # Every model draws a prediction and a residual beside the measurement: the page grows with their number.
-    thin = max(1, int(np.ceil(len(o) * (2 + 2 * len(models)) / STUDIO_SIZES.most_values)))
+    said = [i for i, m in enumerate(models) if m.predicted is not None]
+    most = _share([len(at) for at in shown_cells.values()], STUDIO_SIZES.most_values // (2 + len(said) + len(models)))
     held = o.in_split("select", "test")
     fitted = o.in_split("fit")
     verdict = result.verdict or {}
@@ -142,19 +151,22 @@ def _page_data(result: Result, traces: Traces) -> dict[str, Any]:
         "style": _STYLE,
         "channels": [channel_label(c)[:60] for c in channels],
         "units": [_unit(o.unit_names[u], o.unit_split[u]) for u in units],
+        "missing": _MISSING,
         "base": base,
         "models": [
             {
                 "label": m.label[:160],
                 "kind": m.kind,
+                # Row of its prediction in the values of a panel, below what was measured.
+                "line": said.index(i) + 1 if i in said else None,
                 "fit": _rms(m.residual[fitted]),
                 "held": _rms(m.residual[held]),
                 "cells": [[None if at is None else _rms(m.residual[at]) for at in line] for line in grid],
             }
-            for m in models
+            for i, m in enumerate(models)
         ],
         "panels": [
-            [None if at is None else _panel(traces, models, at, thin, c) for at in line]
+            [None if at is None else _panel(traces, models, base, at, most, c) for at in line]
             for c, line in zip(channels, grid, strict=True)
         ],
         "map": _map(traces, models),
@@ -234,23 +246,74 @@ def _list(values: np.ndarray) -> list[float | None]:
     return [_short(v) for v in values.tolist()]
 
 
-def _panel(traces: Traces, models: Sequence[_Model], at: np.ndarray, thin: int, channel: str) -> dict[str, Any]:
+def _share(counts: Sequence[int], most: int) -> int:
+    """Readings of each series that are drawn, `most` in all at the utmost: short series leave theirs to long ones."""
+    left = most
+    for place, count in enumerate(sorted(counts)):
+        others = len(counts) - place
+        if count * others > left:
+            return max(left // others, 2)
+        left -= count
+    return max(counts, default=0)
+
+
+def _kept(residual: np.ndarray, most: int) -> np.ndarray:
+    """Places of at most `most` readings of a series: the lowest and the highest residual of each stretch.
+
+    A screen shows no more of a longer series, and nothing that sticks out is left out, as every tenth reading would.
+    """
+    count = len(residual)
+    if count <= most:
+        return np.arange(count)
+    ends = np.linspace(0, count, most // 2 + 1).astype(int)
+    stretch = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
+    # Sorted within stretches, so that each of them has its lowest first and its highest last.
+    order = np.lexsort((np.nan_to_num(residual), stretch))
+    return np.union1d(order[ends[:-1]], order[ends[1:] - 1])
+
+
+def _coded(rows: np.ndarray, ruler: int, steps: int) -> list[Any]:
+    """Rows of numbers in whole steps, less the row above, less the number before; with the number and size of step 0.
+
+    Models share the noise of what was measured, and what they differ by changes slowly: such differences pack into a
+    quarter of what the numbers do.
+
+    Args:
+      rows: (rows, n), NaN for no number. ruler: the row whose range is cut into `steps`.
+    """
+    known = np.abs(rows) < _LARGEST
+    ruled = rows[ruler][known[ruler]]
+    if not ruled.size or not np.ptp(ruled):
+        ruled = rows[known]
+    low, step = (float(ruled.min()), float(np.ptp(ruled)) / steps) if ruled.size else (0.0, 1.0)
+    step = step or 1.0
+    levels = np.clip(np.round((np.where(known, rows, low) - low) / step), _MISSING + 1, -_MISSING)
+    levels = np.where(known, levels, _MISSING).astype(np.int64)
+    return [low, step, np.diff(np.diff(levels, axis=0, prepend=0), axis=1, prepend=0).tolist()]
+
+
+def _panel(
+    traces: Traces, models: Sequence[_Model], base: int, at: np.ndarray, most: int, channel: str
+) -> dict[str, Any]:
     """Abscissa, measurements, and predictions and residuals by model, of one channel of one manoeuvre."""
     o = traces.observations
     x = o.place[at, 0] if o.place is not None else traces.time[at]
-    # By abscissa first: thinning an unsorted series would leave holes in the line.
-    order = np.argsort(x, kind="stable")[::thin]
-    at, x = at[order], x[order]
-    said = [m.predicted[at] for m in models if m.predicted is not None]
-    x, drawn = broken(x, o.value[at], *(m.residual[at] for m in models), *said)
-    predicted = iter(drawn[1 + len(models) :])
+    order = np.argsort(x, kind="stable")
+    # Gaps are found before thinning, whose own steps differ.
+    x, (places,) = broken(x[order], at[order])
+    gap = np.isnan(places)
+    at = np.where(gap, at[0], places).astype(int)
+    keep = np.union1d(_kept(np.where(gap, np.nan, models[base].residual[at]), most), np.flatnonzero(gap))
+    x, at, gap = x[keep], at[keep], gap[keep]
+    values = [o.value[at], *(m.predicted[at] for m in models if m.predicted is not None)]
+    residual, sizes = [m.residual[at] for m in models], STUDIO_SIZES
     return {
-        "x": _list(x),
+        "x": _coded(x[None], 0, sizes.levels_of_time * len(order)),
         "x_title": "slip ratio" if traces.is_table else "time, s",
         "y_title": plot_text(channel_label(channel)),
-        "measured": _list(drawn[0]),
-        "predicted": [None if m.predicted is None else _list(next(predicted)) for m in models],
-        "residual": [_list(v) for v in drawn[1 : 1 + len(models)]],
+        "values": _coded(np.where(gap, np.nan, values), 0, sizes.levels),
+        "residual": _coded(np.where(gap, np.nan, residual), base, sizes.levels_of_residual),
+        "drawn": [int((~gap).sum()), len(order)],
     }
 
 

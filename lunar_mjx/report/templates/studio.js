@@ -173,15 +173,26 @@ function showHeat() {
     button.tabIndex = r === row && c === column ? 0 : -1;
   }
 }
+// Rows of numbers as the page holds them: in steps, less the row above, less the number before.
+function numbers([low, step, rows]) {
+  let above = null;
+  return rows.map(row => {
+    let sum = 0;
+    above = row.map((v, i) => (sum += v) + (above ? above[i] : 0));
+    return above.map(level => level === data.missing ? null : low + step * level);
+  });
+}
 function showPanel() {
   const panel = data.panels[row][column], s = data.style;
+  const [x] = numbers(panel.x), values = numbers(panel.values), residual = numbers(panel.residual);
   const same = model === data.base, marks = data.table;
   const mode = marks ? "markers" : "lines", size = marks ? 10 : 4;
   const axis = {gridcolor: of(s.rule), linecolor: of(s.muted), zeroline: false, ticks: "outside", tickcolor: of(s.rule)};
-  const traces = [], measured = {x: panel.x, y: panel.measured, name: "measured", mode: marks ? "markers" : "lines+markers", marker: {color: of(s.ink), size: size - 2, symbol: "circle"}, line: {color: of(s.ink), width: 1}};
+  const traces = [], measured = {x: x, y: values[0], name: "measured", mode: marks ? "markers" : "lines+markers", marker: {color: of(s.ink), size: size - 2, symbol: "circle"}, line: {color: of(s.ink), width: 1}};
   const draw = (index, colour, symbol, dash, name) => {
-    if (panel.predicted[index]) traces.push({x: panel.x, y: panel.predicted[index], name: name, mode: mode, marker: {color: colour, symbol: symbol, size: size}, line: {color: colour, dash: dash, width: 2}});
-    traces.push({x: panel.x, y: panel.residual[index], name: name + ", residual", showlegend: !panel.predicted[index], mode: marks ? "markers" : "lines", marker: {color: colour, symbol: symbol, size: size}, line: {color: colour, dash: dash, width: 1.5}, yaxis: "y2"});
+    const line = data.models[index].line;
+    if (line !== null) traces.push({x: x, y: values[line], name: name, mode: mode, marker: {color: colour, symbol: symbol, size: size}, line: {color: colour, dash: dash, width: 2}});
+    traces.push({x: x, y: residual[index], name: name + ", residual", showlegend: line === null, mode: marks ? "markers" : "lines", marker: {color: colour, symbol: symbol, size: size}, line: {color: colour, dash: dash, width: 1.5}, yaxis: "y2"});
   };
   if (!same) draw(data.base, of(s.orange), "triangle-up", "dot", "refitted");
   draw(model, of(s.blue), "square", "solid", same ? "refitted" : model === 0 ? "as given" : "chosen model");

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from small_run import HOSTILE, POINTS, write_run
+from small_run import HOSTILE, POINTS, write_many, write_run
 
 from lunar_mjx.diagnosis.folder.refits import read_refits
 from lunar_mjx.diagnosis.report import falling, studio
@@ -130,6 +131,48 @@ def test_a_run_without_series_says_what_to_do(tmp_path):
     (folder / "series.npz").unlink()
     with pytest.raises(UserError, match="lunar-mjx compare"):
         studio.write_studio(folder, tmp_path / "studio.html")
+
+
+def decoded(coded: list, missing: int) -> np.ndarray:
+    low, step, rows = coded
+    levels = np.cumsum(np.cumsum(np.array(rows), axis=1), axis=0)
+    return np.where(levels == missing, np.nan, low + step * levels)
+
+
+def test_a_thinned_trace_keeps_what_sticks_out_and_the_page_its_size(tmp_path, monkeypatch):
+    most = 400_000
+    monkeypatch.setattr(studio, "STUDIO_SIZES", dataclasses.replace(studio.STUDIO_SIZES, most_values=most))
+    data = page_data(write_many(tmp_path / "run", samples=120))
+    panels = [p for line in data["panels"] for p in line]
+    rows = 2 + sum(m["line"] is not None for m in data["models"]) + len(data["models"])
+    assert 0.9 * most < sum(rows * p["drawn"][0] for p in panels) <= most
+    panel = data["panels"][data["channels"].index("gyro x, rad/s")][data["units"].index(unit_of(data, "point turn"))]
+    assert panel["drawn"][0] < panel["drawn"][1] == 120
+    residual = decoded(panel["residual"], data["missing"])
+    assert residual[data["base"]].max() == pytest.approx(80.0, abs=1.5)
+    x = decoded(panel["x"], data["missing"])[0]
+    assert (np.diff(x) > 0.0).all() and x[0] < 4.0 and x[-1] > 56.0
+    # short series are drawn whole, and leave their share to long ones
+    assert data["panels"][data["channels"].index("bus voltage, V")][0]["drawn"] == [12, 12]
+    for m in data["models"]:
+        assert decoded(panel["values"], data["missing"])[m["line"]].shape == residual[0].shape
+
+
+def unit_of(data: dict, name: str) -> dict:
+    return next(u for u in data["units"] if u["name"] == name)
+
+
+def test_traces_are_coded_to_less_than_a_pixel_whatever_they_hold():
+    rng = np.random.default_rng(1)
+    rows = np.vstack([rng.standard_normal(50), 1e6 * rng.standard_normal(50), np.full(50, np.nan), np.zeros(50)])
+    rows[0, 3], rows[1, 4], rows[1, 5] = np.nan, np.inf, -1e308
+    found = decoded(json.loads(json.dumps(studio._coded(rows, 0, 2000), allow_nan=False)), studio._MISSING)
+    known = np.abs(rows) < 1e300
+    assert (np.isfinite(found) == known).all()
+    step = float(np.ptp(rows[0][known[0]])) / 2000
+    assert np.abs(found - rows)[known].max() <= 0.501 * step
+    for still in (np.full((2, 4), 7.0), np.full((1, 3), np.nan)):
+        assert decoded(studio._coded(still, 0, 100), studio._MISSING) == pytest.approx(still, nan_ok=True)
 
 
 @pytest.mark.slow
