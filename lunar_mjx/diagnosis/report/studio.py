@@ -20,7 +20,7 @@ from lunar_mjx.diagnosis.report.explore import broken, cells, covariate_along
 from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result, Traces, read_result
 from lunar_mjx.diagnosis.report.reasons import reason
-from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, and_list, channel_label, plot_text
+from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, and_list, channel_label, kind_label, plot_text
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError
 from lunar_mjx.files import write_text
@@ -38,6 +38,8 @@ class StudioSizes:
     levels: int = 10_000
     levels_of_residual: int = 2_000
     levels_of_time: int = 20
+    most_rows: int = 24
+    """Channels that have a row each in the heat map; more are folded by kind."""
     most_models: int = 14
     """Models to choose from: as many buttons as a reader looks through."""
     most_map: int = 2_000
@@ -145,11 +147,14 @@ def _page_data(result: Result, traces: Traces) -> dict[str, Any]:
     # nothing.
     base = next((i for i, m in enumerate(models) if m.kind == "refit"), 0)
     grid = [[shown_cells.get((c, u)) for u in units] for c in channels]
+    residual = models[base].residual
     remains = [(k, d) for k, d in (verdict.get("discrepancy") or {}).items() if isinstance(d, Mapping)]
     return {
         "table": traces.is_table,
         "style": _STYLE,
         "channels": [channel_label(c)[:60] for c in channels],
+        "many": len(channels) > STUDIO_SIZES.most_rows,
+        "kinds": _kinds(channels, [[0.0 if at is None else _rms(residual[at]) or 0.0 for at in line] for line in grid]),
         "units": [_unit(o.unit_names[u], o.unit_split[u]) for u in units],
         "missing": _MISSING,
         "base": base,
@@ -244,6 +249,20 @@ def _short(value: float) -> float | None:
 
 def _list(values: np.ndarray) -> list[float | None]:
     return [_short(v) for v in values.tolist()]
+
+
+def _kinds(channels: Sequence[str], error: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+    """Kinds of channels with the rows of their channels; of many channels the worst kind and channel first.
+
+    Args:
+      channels: of the rows. error: of each row in every manoeuvre, in sigma.
+    """
+    if len(channels) <= STUDIO_SIZES.most_rows:
+        return [{"name": channel_label(c)[:60], "rows": [i]} for i, c in enumerate(channels)]
+    rows: dict[str, list[int]] = {}
+    for i in sorted(range(len(channels)), key=lambda i: -max(error[i])):
+        rows.setdefault(kind_label(channels[i]), []).append(i)
+    return [{"name": kind[:60], "rows": found} for kind, found in rows.items()]
 
 
 def _share(counts: Sequence[int], most: int) -> int:

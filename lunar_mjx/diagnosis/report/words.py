@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html
 import math
 from typing import Any
 
 from lunar_mjx.diagnosis.unknown_inputs.inputs import PROBES
-from lunar_mjx.logs.schema import STEADY_CHANNELS, find_channel
+from lunar_mjx.logs.schema import STEADY_CHANNELS, find_channel, parse_name
 
 SPLIT_NAMES = {
     "fit": "fitted",
@@ -52,8 +53,20 @@ def channel_label(channel: str) -> str:
     if channel_entry is None:
         return channel.replace("_", " ")
     kind, match = channel_entry
-    label = match[0].replace("_", " ")
-    return label if kind.unit == "1" else f"{label}, {kind.unit}"
+    return _with_unit(match[0], kind.unit)
+
+
+def kind_label(channel: str) -> str:
+    """Name of a channel's kind with its unit, such as "motor drive current, A": alike at all corners and axes."""
+    channel_entry, parts = find_channel(channel), parse_name(channel)
+    if channel in STEADY_CHANNELS or channel_entry is None or parts is None:
+        return channel_label(channel)
+    return _with_unit(str(dataclasses.replace(parts, corner="", axis="", unit="")), channel_entry[0].unit)
+
+
+def _with_unit(name: str, unit: str) -> str:
+    label = name.replace("_", " ")
+    return label if unit == "1" else f"{label}, {unit}"
 
 
 def port_label(label: str) -> str:

@@ -3,7 +3,9 @@
 const $ = id => document.getElementById(id);
 const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const isDark = matchMedia("(prefers-color-scheme: dark)").matches;
-let data, shades, model, other, row = 0, column = 0;
+let data, shades, model, other, row = 0, column = 0, waits = false;
+// Rows of the heat map as they lie in the page, and the kinds of channels that are unfolded.
+const lines = [], unfolded = new Set();
 
 // A colour of the light page as this page shows it.
 const of = colour => isDark && data.style.dark[colour] || colour;
@@ -89,18 +91,58 @@ function drawHeat() {
     if (unit.split !== "fitted") { add(cell, "br"); add(cell, "i", unit.split); }
   }
   const body = add(table, "tbody");
-  data.channels.forEach((name, r) => {
-    const line = add(body, "tr"), title = add(line, "th", name);
+  // One channel of a kind, or with `own` the kind itself, which shows the worst of its channels.
+  const draw = (name, rows, kind, own) => {
+    const line = add(body, "tr", undefined, own ? "kind" : kind === null ? "" : "member"), title = add(line, "th", own ? undefined : name);
     title.scope = "row";
+    lines.push({line: line, name: name, rows: rows, kind: kind, own: own});
     data.units.forEach((unit, c) => {
       const button = add(add(line, "td"), "button");
       button.type = "button";
-      button.dataset.row = r; button.dataset.column = c;
-      button.disabled = !data.panels[r][c];
-      button.addEventListener("click", () => chooseCell(r, c));
+      button.dataset.column = c;
+      if (!own) button.dataset.row = rows[0];
+      button.disabled = !rows.some(r => data.panels[r][c]);
+      button.addEventListener("click", () => chooseCell(worst(rows, c), c));
     });
+    return title;
+  };
+  data.kinds.forEach((kind, k) => {
+    if (kind.rows.length === 1) { draw(data.channels[kind.rows[0]], kind.rows, null, false); return; }
+    const button = add(draw(kind.name, kind.rows, k, true), "button", kind.name);
+    button.type = "button";
+    button.dataset.column = -1;
+    button.tabIndex = -1;
+    add(button, "span", " (" + kind.rows.length + ")", "note");
+    button.addEventListener("click", () => { if (!unfolded.delete(k)) unfolded.add(k); fold(); showHeat(); });
+    for (const r of kind.rows) draw(data.channels[r], [r], k, false);
   });
-  arrows(table, "button:not([disabled])", data.units.length);
+  arrows(table, "tr:not([hidden]) button:not([disabled])", data.units.length);
+  $("rows").hidden = !data.many;
+  $("filter").addEventListener("input", () => { fold(); showHeat(); table.parentNode.scrollTop = 0; });
+  $("unfold").addEventListener("click", () => {
+    if (unfolded.size) unfolded.clear();
+    else for (const {kind, own} of lines) if (own) unfolded.add(kind);
+    fold(); showHeat();
+  });
+  fold();
+}
+// The row of the worst error of the chosen model in a column.
+function worst(rows, c) {
+  const at = r => data.panels[r][c] ? data.models[model].cells[r][c] ?? -1 : -2;
+  return rows.reduce((a, b) => at(b) > at(a) ? b : a);
+}
+// Shows the channels that hold every word of the filter; without one, every kind and the channels of unfolded kinds.
+function fold() {
+  const words = $("filter").value.toLowerCase().split(/\s+/).filter(word => word);
+  let count = 0;
+  for (const {line, name, kind, own} of lines) {
+    const found = !own && words.every(word => name.toLowerCase().includes(word));
+    line.hidden = words.length ? !found : !own && kind !== null && !unfolded.has(kind);
+    count += found;
+    if (own) line.querySelector("th button").setAttribute("aria-expanded", unfolded.has(kind));
+  }
+  $("unfold").textContent = unfolded.size ? "Fold all" : "Unfold all";
+  $("found").textContent = words.length ? count + " of " + data.channels.length + " channels" : data.channels.length + " channels of " + data.kinds.length + " kinds";
 }
 // Arrow keys move the focus in a list, or in a table of so many columns; Home and End go to its ends.
 function arrows(box, what, columns) {
@@ -110,15 +152,14 @@ function arrows(box, what, columns) {
     let to;
     if (event.key === "Home") to = list[0];
     else if (event.key === "End") to = list[list.length - 1];
-    else if (columns > 1 && (event.key === "ArrowUp" || event.key === "ArrowDown")) {
-      const r = Number(list[at].dataset.row), c = list[at].dataset.column, step = event.key === "ArrowUp" ? -1 : 1;
-      for (let k = r + step; k >= 0 && k < data.channels.length && !to; k += step)
-        to = list.find(b => b.dataset.row === String(k) && b.dataset.column === c);
-    } else if (event.key === "ArrowLeft" || event.key === "ArrowUp") to = list[at - 1];
+    else if (columns > 1 && event.key === "ArrowUp")
+      to = list.slice(0, at).reverse().find(b => b.dataset.column === list[at].dataset.column);
+    else if (columns > 1 && event.key === "ArrowDown") to = list.slice(at + 1).find(b => b.dataset.column === list[at].dataset.column);
+    else if (event.key === "ArrowLeft" || event.key === "ArrowUp") to = list[at - 1];
     else if (event.key === "ArrowRight" || event.key === "ArrowDown") to = list[at + 1];
     else return;
     event.preventDefault();
-    if (to) { to.focus(); to.click(); }
+    if (to) { to.focus(); if (!to.hasAttribute("aria-expanded")) to.click(); }
   });
 }
 
@@ -163,15 +204,29 @@ function showWhy() {
 }
 function showHeat() {
   const found = data.models[model].cells, most = Math.max(...data.models[0].cells.flat().concat(data.models[data.base].cells.flat()).filter(v => v !== null));
-  for (const button of $("heat").querySelectorAll("button")) {
-    const r = Number(button.dataset.row), c = Number(button.dataset.column), value = found[r][c], look = shade(value, most);
+  for (const {line, name, rows} of lines.filter(l => !l.line.hidden)) for (const button of line.querySelectorAll("td button")) {
+    const c = Number(button.dataset.column), value = found[worst(rows, c)][c], look = shade(value, most);
     button.textContent = value === null ? "" : shown(value);
     button.style.backgroundColor = look ? look[0] : "transparent";
     button.style.color = look ? look[1] : "inherit";
-    button.setAttribute("aria-label", data.channels[r] + ", " + data.units[c].name + ": " + (value === null ? "not known" : shown(value) + " sigma"));
-    button.setAttribute("aria-pressed", r === row && c === column);
-    button.tabIndex = r === row && c === column ? 0 : -1;
+    button.setAttribute("aria-label", name + ", " + data.units[c].name + ": " + (value === null ? "not known" : shown(value) + " sigma"));
   }
+  showChoice();
+}
+// Marks the chosen field, or that of its folded kind, and lets Tab come to it.
+function showChoice() {
+  let first;
+  for (const {line, rows, kind, own} of lines) for (const button of line.querySelectorAll("td button")) {
+    const chosen = !line.hidden && !(own && unfolded.has(kind)) && rows.includes(row) && Number(button.dataset.column) === column;
+    button.setAttribute("aria-pressed", chosen);
+    button.tabIndex = chosen ? 0 : -1;
+    if (!line.hidden && !button.disabled && (chosen || !first)) first = button;
+  }
+  if (first) first.tabIndex = 0;
+  const at = m => shown(data.models[m].cells[row][column]) + " sigma", [drawn, all] = data.panels[row][column].drawn;
+  $("chosen").textContent = data.channels[row] + " in " + data.units[column].name + " (" + data.units[column].split + "): " + at(model) +
+    (model === data.base ? "" : ", refitted " + at(data.base)) + "." +
+    (drawn < all ? " Of " + all + " readings " + drawn + " are drawn: the lowest and the highest residual of each stretch." : "");
 }
 // Rows of numbers as the page holds them: in steps, less the row above, less the number before.
 function numbers([low, step, rows]) {
@@ -182,12 +237,14 @@ function numbers([low, step, rows]) {
     return above.map(level => level === data.missing ? null : low + step * level);
   });
 }
+const axes = () => ({gridcolor: of(data.style.rule), linecolor: of(data.style.muted), zeroline: false, ticks: "outside", tickcolor: of(data.style.rule)});
+const figure = () => ({paper_bgcolor: of(data.style.paper), plot_bgcolor: of(data.style.paper), font: {family: data.style.font, size: 13, color: of(data.style.ink)}, hovermode: "closest"});
+const config = () => ({displaylogo: false, responsive: true, displayModeBar: innerWidth > 820 ? "hover" : false, showLink: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"]});
 function showPanel() {
   const panel = data.panels[row][column], s = data.style;
   const [x] = numbers(panel.x), values = numbers(panel.values), residual = numbers(panel.residual);
   const same = model === data.base, marks = data.table;
   const mode = marks ? "markers" : "lines", size = marks ? 10 : 4;
-  const axis = {gridcolor: of(s.rule), linecolor: of(s.muted), zeroline: false, ticks: "outside", tickcolor: of(s.rule)};
   const traces = [], measured = {x: x, y: values[0], name: "measured", mode: marks ? "markers" : "lines+markers", marker: {color: of(s.ink), size: size - 2, symbol: "circle"}, line: {color: of(s.ink), width: 1}};
   const draw = (index, colour, symbol, dash, name) => {
     const line = data.models[index].line;
@@ -197,7 +254,7 @@ function showPanel() {
   if (!same) draw(data.base, of(s.orange), "triangle-up", "dot", "refitted");
   draw(model, of(s.blue), "square", "solid", same ? "refitted" : model === 0 ? "as given" : "chosen model");
   traces.push(measured);  // on top: models may lie on it
-  const base = {paper_bgcolor: of(s.paper), plot_bgcolor: of(s.paper), font: {family: s.font, size: 13, color: of(s.ink)}, hovermode: "closest"};
+  const axis = axes(), base = figure();
   const layout = Object.assign({}, base, {
     margin: {l: 62, r: 10, t: 44, b: 46}, legend: {orientation: "h", x: 0, y: 1.02, yanchor: "bottom"},
     xaxis: Object.assign({title: {text: panel.x_title}, anchor: "y2"}, axis),
@@ -205,10 +262,18 @@ function showPanel() {
     yaxis2: Object.assign({title: {text: "residual, sigma"}, domain: [0, 0.34], automargin: true}, axis),
     shapes: [{type: "rect", xref: "paper", yref: "y2", x0: 0, x1: 1, y0: -2, y1: 2, line: {width: 0}, fillcolor: "rgba(0,114,178,0.12)", layer: "below"}],
   });
-  const config = {displaylogo: false, responsive: true, displayModeBar: innerWidth > 820 ? "hover" : false, showLink: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"]};
-  Plotly.react("traces", traces, layout, config);
+  Plotly.react("traces", traces, layout, config());
   $("traces").setAttribute("aria-label", data.channels[row] + " in " + data.units[column].name + ", measured and predicted");
-  const map = data.map, place = $("place");
+  document.body.dataset.cell = row + "," + column;
+}
+// The map takes three times as long as the traces, which a reader sees at once while an arrow key is held.
+function showMapSoon() {
+  if (waits) return;
+  waits = true;
+  requestAnimationFrame(() => setTimeout(() => { waits = false; showMap(); }));
+}
+function showMap() {
+  const map = data.map, place = $("place"), axis = axes();
   if (!map) {
     if (!place.textContent) add(place, "p", "No position was measured, so there is no map.", "note");
     return;
@@ -218,12 +283,12 @@ function showPanel() {
   const inside = map.unit.map(u => u === column);
   const points = {x: map.x, y: map.y, mode: "markers", hovertemplate: "%{text} sigma<extra></extra>", text: map.error[model].map(shown), showlegend: false,
     marker: {color: error, colorscale: shades.map((colour, i) => [i / (shades.length - 1), colour]), cmin: Math.log10(0.7), cmax: top,
-      size: inside.map(v => v ? 12 : 7), line: {color: of(s.ink), width: inside.map(v => v ? 2 : 0.5)},
+      size: inside.map(v => v ? 12 : 7), line: {color: of(data.style.ink), width: inside.map(v => v ? 2 : 0.5)},
       colorbar: {title: {text: "sigma"}, tickvals: [0, 0.30103, 0.69897, 1, 1.30103, 2], ticktext: ["1", "2", "5", "10", "20", "100"], thickness: 12}}};
   const square = map.equal ? {scaleanchor: "x", scaleratio: 1} : {};
-  Plotly.react("place", [points], Object.assign({}, base, {
+  Plotly.react("place", [points], Object.assign(figure(), {
     margin: {l: 62, r: 10, t: 44, b: 46}, title: {text: "where: error over all channels", font: {size: 14}, x: 0, xanchor: "left"},
-    xaxis: Object.assign({title: {text: map.x_title}}, axis), yaxis: Object.assign({title: {text: map.y_title}}, axis, square)}), config);
+    xaxis: Object.assign({title: {text: map.x_title}}, axis), yaxis: Object.assign({title: {text: map.y_title}}, axis, square)}), config());
   place.setAttribute("aria-label", "Error by place; " + data.units[column].name + " is drawn larger");
 }
 function show() {
@@ -232,13 +297,12 @@ function show() {
     b.tabIndex = i === model ? 0 : -1;
   }
   for (const b of $("effects").querySelectorAll("button")) b.setAttribute("aria-pressed", Number(b.dataset.effect) === other);
-  showFall(); showWhy(); showHeat(); showPanel();
+  showFall(); showWhy(); showHeat(); showPanel(); showMap();
   document.body.dataset.model = model;
-  document.body.dataset.cell = row + "," + column;
 }
 function chooseModel(i) { model = i; other = data.effects.findIndex(e => e.model === i); if (other < 0) other = null; show(); }
 function chooseEffect(i) { other = i; if (data.effects[i].model !== null) model = data.effects[i].model; show(); }
-function chooseCell(r, c) { row = r; column = c; show(); }
+function chooseCell(r, c) { row = r; column = c; showChoice(); showPanel(); showMapSoon(); }
 
 (async () => {
   try {
@@ -252,13 +316,13 @@ function chooseCell(r, c) { row = r; column = c; show(); }
     if (data.remains.length) {
       add($("remains"), "p", "How far the model may be trusted: " + data.remains.map(r => r[1]).join("; ") + ".", "note");
     }
-    let worst = -1;
+    let most = -1;
     data.models[data.base].cells.forEach((line, r) => line.forEach((v, c) => {
-      if (v !== null && data.panels[r][c] && v > worst) { worst = v; row = r; column = c; }
+      if (v !== null && data.panels[r][c] && v > most) { most = v; row = r; column = c; }
     }));
     const first = data.effects.findIndex(e => e.status === "named" && e.model !== null);
     if (first >= 0) { other = first; model = data.effects[first].model; } else { other = null; model = data.base; }
-    if (worst >= 0) show();
+    if (most >= 0) show();
     document.body.dataset.ready = "true";
   } catch (error) {
     add(document.body, "p", "The studio could not be drawn (" + error + "); use a browser from 2023 or later.");

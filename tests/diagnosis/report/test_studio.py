@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_run import HOSTILE, POINTS, write_many, write_run
+from small_run import CORNERS, HOSTILE, POINTS, write_many, write_run
 
 from lunar_mjx.diagnosis.folder.refits import read_refits
 from lunar_mjx.diagnosis.report import falling, studio
@@ -139,6 +139,20 @@ def decoded(coded: list, missing: int) -> np.ndarray:
     return np.where(levels == missing, np.nan, low + step * levels)
 
 
+def test_of_many_channels_every_kind_has_a_row_the_worst_first(tmp_path):
+    data = page_data(write_many(tmp_path / "run", samples=40))
+    assert len(data["channels"]) == 95 and len(data["units"]) == 8 and data["many"]
+    kinds = {k["name"]: k["rows"] for k in data["kinds"]}
+    assert len(kinds) == 28 and sorted(r for rows in kinds.values() for r in rows) == list(range(95))
+    names = {k: [data["channels"][r] for r in rows] for k, rows in kinds.items()}
+    assert set(names["motor drive current, A"]) == {f"motor {c} drive current, A" for c in CORNERS}
+    assert set(names["gyro, rad/s"]) == {f"gyro {x}, rad/s" for x in "xyz"} and len(names["quaternion"]) == 4
+    worst = [max(data["models"][data["base"]]["cells"][r]) for rows in kinds.values() for r in rows[:1]]
+    assert worst == sorted(worst, reverse=True) and all(max(line) <= worst[0] for line in data["models"][1]["cells"])
+    few = page_data(write_run(tmp_path / "few", table=False))
+    assert not few["many"] and [k["rows"] for k in few["kinds"]] == [[0], [1], [2]]
+
+
 def test_a_thinned_trace_keeps_what_sticks_out_and_the_page_its_size(tmp_path, monkeypatch):
     most = 400_000
     monkeypatch.setattr(studio, "STUDIO_SIZES", dataclasses.replace(studio.STUDIO_SIZES, most_values=most))
@@ -231,5 +245,59 @@ def test_by_hand_in_a_browser(tmp_path, browser, table):
     browser.resize(360, 740)
     browser.wait("innerWidth === 360 && document.documentElement.scrollWidth <= 360")
     assert browser.value("document.title") == "Studio: run" and browser.value("document.images.length") == 0
+    assert browser.requests == [page.as_uri()]
+    assert not browser.problems
+
+
+@pytest.mark.slow
+def test_95_channels_of_eight_drives_by_hand(tmp_path, browser):
+    """Kinds unfold by key, the filter finds corners, every field opens, and all of it fits a phone and 5 MB."""
+    page = studio.write_studio(write_many(tmp_path / "run", samples=600), tmp_path / "studio.html")
+    assert page.stat().st_size < 5e6
+    browser.open(page.as_uri())
+    browser.wait("document.body?.dataset.ready")
+    shown = "document.querySelectorAll('#heat tbody tr:not([hidden])').length"
+    assert browser.value(shown) == 28
+    # what was chosen is drawn within a screen of the heat map's first row
+    top = "document.getElementById('{}').getBoundingClientRect().top"
+    assert browser.value(f"{top.format('h-detail')} - {top.format('heat')}") < 760
+    # the worst kind by keys: from its field to its name, unfolded, down to the first of its channels and its field
+    browser.value("document.querySelector('#heat tbody td button').focus()")
+    browser.press("ArrowLeft")
+    assert browser.value("document.activeElement.getAttribute('aria-expanded')") == "false"
+    browser.press("Enter")
+    browser.wait(f"{shown} === 32 && document.activeElement.getAttribute('aria-expanded') === 'true'")
+    browser.press("ArrowRight")
+    browser.press("ArrowDown")
+    first = browser.value("document.querySelector('#heat .member td button').dataset.row")
+    browser.wait(f"document.activeElement.dataset.row === '{first}' && document.body.dataset.cell === '{first},0'")
+    assert browser.value("document.querySelectorAll('#heat [aria-pressed=true]').length") == 1
+    assert browser.value("document.querySelectorAll('#heat [tabindex=\"0\"]').length") == 1
+    browser.value("document.getElementById('unfold').click()")
+    assert browser.value(shown) == 28
+    # a folded kind opens its worst channel
+    spike = browser.value("data.channels.indexOf('gyro x, rad/s')")
+    browser.value("lines.find(l => l.name === 'gyro, rad/s').line.querySelectorAll('td button')[3].click()")
+    browser.wait(f"document.body.dataset.cell === '{spike},3'")
+    assert "of each stretch" in browser.value("document.getElementById('chosen').textContent")
+    assert browser.value("Math.max(...document.getElementById('traces').data.at(-2).y)") > 75.0
+    box = "document.getElementById('filter')"
+    find = f"{box}.value = '{{}}'; {box}.dispatchEvent(new Event('input'))"
+    browser.value(find.format("LF current"))
+    assert browser.value(shown) == 3 and "3 of 95" in browser.value("document.getElementById('found').textContent")
+    browser.value(find.format("no such channel"))
+    assert browser.value(shown) == 0
+    browser.value(find.format(""))
+    # every field of every channel
+    opened = """(() => { document.getElementById('unfold').click(); let count = 0;
+      for (const b of document.querySelectorAll('#heat button[data-row]')) {
+        row = Number(b.dataset.row); column = Number(b.dataset.column); showChoice();
+        const panel = data.panels[row][column], rows = [...numbers(panel.values), ...numbers(panel.residual)];
+        count += rows.every(r => r.length === numbers(panel.x)[0].length && r.some(Number.isFinite)); }
+      return count; })()"""
+    assert browser.value(opened) == 95 * 8
+    browser.resize(360, 740)
+    browser.wait("innerWidth === 360 && document.documentElement.scrollWidth <= 360")
+    assert browser.collisions() == []
     assert browser.requests == [page.as_uri()]
     assert not browser.problems
