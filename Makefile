@@ -47,8 +47,9 @@ for-proofs: $(VENV)/dev.stamp
 	@timeout 180 $(PIP) install --quiet -c requirements-dev.txt $(PARTICLES) || echo "no Newton at hand: the proof on particles is skipped"
 	@timeout 180 $(PIP) install --quiet -c requirements-dev.txt -r requirements-docs.txt || echo "no MkDocs at hand: the proof on the site is skipped"
 
+PROOF_MINUTES ?= 50
 proofs: for-proofs
-	$(BIN)/python -m tests.proofs --minutes 50
+	$(BIN)/python -m tests.proofs --minutes $(PROOF_MINUTES)
 
 all-proofs: for-proofs
 	$(BIN)/python -m tests.proofs --all --record
