@@ -74,16 +74,6 @@ def _left_out(problem: Problem, fit: Fit) -> list[np.ndarray]:
     return [np.flatnonzero(group == g) for g in range(pieces)]
 
 
-def gain(problem: Problem, before: Fit, after: Fit, splits: tuple[str, ...] = ("fit", "select")) -> tuple[float, float]:
-    """Gain of the expected log density on manoeuvres left out, and its standard error over blocks.
-
-    Returns:
-      Sum over observations of half the drop of the squared predictive residual; its standard error.
-    """
-    old, new = predictive_residual(problem, before), predictive_residual(problem, after)
-    return predictive_gain(problem, before, after, old, new, splits)
-
-
 def predictive_gain(
     problem: Problem,
     before: Fit,
@@ -94,11 +84,14 @@ def predictive_gain(
 ) -> tuple[float, float]:
     """Gain of the expected log density on manoeuvres left out, and its standard error, from predictive residuals.
 
-    For models that are not of one problem, but of one set of measurements; else see `gain`.
+    The models are of one set of measurements, and need not be of one problem.
 
     Args:
       problem: whose measurements. before, after: the fits. old, new: (n,) their predictive residuals.
       splits: that judge.
+
+    Returns:
+      Sum over observations of half the drop of the squared predictive residual; its standard error.
     """
     keep = problem.observations.in_split(*splits)
     few = len(np.unique(problem.observations.unit[before.fitted])) < HELD_OUT.enough

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.inference.fitting import fit
-from lunar_mjx.inference.held_out import errors, gain, noise_test, predictive_residual
+from lunar_mjx.inference.held_out import errors, noise_test, predictive_gain, predictive_residual
 from tests.inference.toy_problem import Linear, manoeuvres
 
 RNG = np.random.default_rng(0)
@@ -38,14 +38,21 @@ def test_the_predictive_residual_is_that_of_a_fit_without_the_manoeuvre():
         np.testing.assert_allclose(predicted[mine], value[mine] - BASE[mine] @ u, atol=0.02)
 
 
+def gain(problem: Linear) -> tuple[float, float]:
+    """What the extra column gains on manoeuvres left out, and its standard error."""
+    before, after = (fit(problem, problem.free(more)) for more in ((), ("extra",)))
+    residuals = [predictive_residual(problem, one) for one in (before, after)]
+    return predictive_gain(problem, before, after, *residuals)
+
+
 def test_a_real_effect_gains_and_an_idle_one_does_not():
     real = problem_of(EXTRA + noise())
-    value, se = gain(real, fit(real, real.free()), fit(real, real.free(["extra"])))
+    value, se = gain(real)
     assert value > 3.0 * se
     # half the sum of the squares that the effect explains
     assert value == pytest.approx(0.5 * np.sum(EXTRA**2), rel=0.3)
     idle = problem_of(noise())
-    value, se = gain(idle, fit(idle, idle.free()), fit(idle, idle.free(["extra"])))
+    value, se = gain(idle)
     assert value < 2.0 * se + 1.0
 
 

@@ -24,7 +24,7 @@ from lunar_mjx.diagnosis.runs import (
     Run,
 )
 from lunar_mjx.diagnosis.verdict import Diagnosis, EffectEvidence, Verdict
-from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, label, probabilities, title
+from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, helps, label, probabilities, title
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm, Problem
 from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, account, gains_on_held_out
 from lunar_mjx.files import replacing
@@ -381,7 +381,7 @@ def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[st
     named = {e for e in said.effects if not e.startswith("calibration: ")}
     if said.verdict is Verdict.UNKNOWN and (estimates := named.difference(*refitted)):
         # What is unlisted is linear and needs no refit; what would help beside it does.
-        told = said.sentence.partition(" Beside it ")[0]
+        told = said.sentence.removesuffix(helps(said.helping)) + helps([e for e in said.helping if e not in estimates])
         told += (
             f" A first-order estimate points to {' and '.join(sorted(estimates))} beside it, which is not named, as no "
             "refit with it was made."

@@ -25,6 +25,7 @@ class Conclusion:
         wrong there, for a reader.
       probability: of the statement. sentence: it in words.
       further: beside `effects`, one of these is missing as well; together with something unlisted where `unlisted`.
+      helping: effects that are as sure beside something unlisted; the sentence ends with them (see `helps`).
     """
 
     verdict: Verdict
@@ -35,6 +36,15 @@ class Conclusion:
     sentence: str
     place: str | None = None
     further: tuple[str, ...] = ()
+    helping: tuple[str, ...] = ()
+
+
+def helps(names: Sequence[str]) -> str:
+    """That some effects help beside something unlisted, in words; nothing of none.
+
+    How much of them is real, no hypothesis tells.
+    """
+    return f" Beside it {_list(names)} {'help' if len(names) > 1 else 'helps'}." if names else ""
 
 
 def conclude(found: ModelSearch, sure: float, largest_class: int = LARGEST_CLASS) -> Conclusion:
@@ -53,11 +63,9 @@ def conclude(found: ModelSearch, sure: float, largest_class: int = LARGEST_CLASS
     if unlisted >= sure:
         names = tuple(map(label, named))
         said = _with(f"Something that no listed effect explains acts at {place}", unlisted)
-        # an effect beside something unlisted is said to help: how much of it is real, no hypothesis tells
-        if names:
-            said += f" Beside it {_list(names)} {'help' if len(names) > 1 else 'helps'}."
         effects = tuple(dict.fromkeys([*names, *_helpful(found)]))
-        return Conclusion(Verdict.UNKNOWN, effects, True, port, unlisted, said, place)
+        said += helps(names)
+        return Conclusion(Verdict.UNKNOWN, effects, True, port, unlisted, said, place, helping=names)
     if named:
         # each is sure by itself, and all of them together less so: this is the probability that is told
         p = found.probability_of(lambda h: set(named) <= h.terms)

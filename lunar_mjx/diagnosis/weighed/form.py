@@ -17,7 +17,7 @@ from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import NotTested
-from lunar_mjx.inference.weighing.hypotheses import EFFECT, Form, Refit, Term
+from lunar_mjx.inference.weighing.hypotheses import Form, Refit
 from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, UNLISTED_SHARE, Hypothesis
 
 SettingsKind = TypeVar("SettingsKind", bound="SearchSettings")
@@ -222,10 +222,6 @@ class MeasuredForm(Form):
     def residual(self, u: np.ndarray) -> np.ndarray:
         """(n,) whitened residuals, measured less predicted."""
         return self.observations.whiten(self.observations.value - self.predicted(u))
-
-    def listed(self, effects: frozenset[str]) -> frozenset[Term]:
-        """The terms of some effects."""
-        return frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -251,6 +251,10 @@ class Form(abc.ABC):
     exchanged: Sequence[str] = ()
     late: bool = False
 
+    def listed(self, effects: frozenset[str]) -> frozenset[Term]:
+        """The terms of some effects."""
+        return frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
+
     @abc.abstractmethod
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
         """Refits the form's parameters and those of some effects.

@@ -300,7 +300,7 @@ class _Search:
         self.refits += 1
         if made.failed:
             self.reasons.append(f"{label}: {made.failed}")
-        listed = _listed(form, effects)
+        listed = form.listed(effects)
         estimated = self.known.get((form.name, listed))
         if self.score_around(form, made, near):
             self.done[key] = made
@@ -385,7 +385,7 @@ class _Search:
         Returns:
           Whether this is the best refit of its set so far and has evidence; around another one nothing is scored.
         """
-        own = _listed(form, made.effects)
+        own = form.listed(made.effects)
         felt, shows = made.linear.felt(), made.linear.shows()
         unfitted = [t for t in form.terms if t.kind != EFFECT]
         unfitted = [t for t in unfitted if t.kind != UNLISTED or felt[t.name] >= self.least_signal]
@@ -483,11 +483,6 @@ class _Search:
         # terms are independent beforehand: each has its own odds, and a set the product of theirs
         prior = form.log_prior + sum(t.log_prior for t in terms)
         return Hypothesis(form.name, terms, value + prior, made, refitted, inferred, places)
-
-
-def _listed(form: Form, effects: frozenset[str]) -> Terms:
-    """The terms of some effects beside a form."""
-    return frozenset(t for t in form.terms if t.kind == EFFECT and t.name in effects)
 
 
 def _carried_over(listed: Sequence[Hypothesis], best: Hypothesis, form: str) -> float:

@@ -24,7 +24,7 @@ from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotation
 from lunar_mjx.diagnosis.verbs import explain
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unrefitted, _without
-from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude
+from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, helps
 from lunar_mjx.diagnosis.weighed.form import Problem, SearchSettings
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError
@@ -464,12 +464,13 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     assert "%" not in sentence and "is missing" not in sentence
     assert _unrefitted(said, said.sentence, [*refitted, frozenset({"drag", "lag"})]) == (said, said.sentence)
     # beside something unlisted it is no name either, and the port stands
-    beside = Conclusion(
-        Verdict.UNKNOWN, ("drag", "lag"), True, "soil", 0.99, "It acts at soil. Beside it drag and lag help."
-    )
+    both = ("drag", "lag")
+    beside = Conclusion(Verdict.UNKNOWN, both, True, "soil", 0.99, "It acts at soil." + helps(both), helping=both)
+    assert beside.sentence.endswith(" Beside it drag and lag help.")
     told, sentence = _unrefitted(beside, beside.sentence + " More.", [frozenset({"lag"})])
     assert (told.verdict, told.effects, told.port) == (Verdict.UNKNOWN, ("lag",), "soil")
-    assert sentence.startswith("It acts at soil. A first-order estimate points to drag beside it, which is not named")
+    # what a refit has held is still said to help
+    assert sentence.startswith("It acts at soil. Beside it lag helps. A first-order estimate points to drag beside it,")
     assert sentence.endswith(" More.")
 
 

@@ -15,7 +15,7 @@ from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.simulation import log_run
 from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import POSE as POSE_CHANNELS
-from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import UNMAPPED_GRID, is_ground, unmapped_ground
+from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import UNMAPPED_GRID, unmapped_ground
 from lunar_mjx.logs import read_campaign
 from lunar_mjx.manoeuvres.manoeuvre import wheel_places
 from lunar_mjx.model import make_model
@@ -112,8 +112,8 @@ def test_waves_under_a_drive_are_found_though_its_log_calls_them_flat(model, tmp
     form = _form(logs, model)
     u = form.refit(frozenset(), None, None).u
     assert _pose_error(form, u) < 1.5
-    assert any(is_ground(c) for c in form.coordinates)
+    assert len(form.ground)
     monkeypatch.setattr(log_run, "unmapped_ground", lambda log, model: None)
     level = _form(logs, model)
-    assert not any(is_ground(c) for c in level.coordinates)
+    assert not len(level.ground)
     assert _pose_error(level, level.refit(frozenset(), None, None).u) > 3.0

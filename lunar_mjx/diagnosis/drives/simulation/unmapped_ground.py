@@ -8,7 +8,6 @@ deviogram of natural ground (see `lunar_mjx.terrain.roughness`). Attitude, heigh
 from __future__ import annotations
 
 import dataclasses
-import re
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,6 @@ class UnmappedGrid:
 
 
 UNMAPPED_GRID = UnmappedGrid()
-_MODE = re.compile(r"ground \d+")
 POSE = ("position_z_m", "roll_deg", "pitch_deg")
 """Channels by which a rover tells the ground below it."""
 
@@ -107,11 +105,6 @@ def ground_coordinates(number: int, ground: UnmappedGround, radius: float) -> li
 def mode_name(k: int) -> str:
     """Name of the amount of a mode."""
     return f"ground {k}"
-
-
-def is_ground(c: Coordinate) -> bool:
-    """Whether a coordinate is the amount of a mode of unmapped ground."""
-    return c.nuisance and _MODE.fullmatch(c.name) is not None
 
 
 def _is_plane(terrain: Terrain) -> bool:
