@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from lunar_mjx.agents.evaluate import success_text
 from lunar_mjx.effects.base import PORTS, Effect
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.effects.joint.motor import WINDINGS
@@ -127,10 +128,6 @@ def _seeds(name: str) -> list[dict[str, Any]]:
     return json.loads((RECORDS / f"{name}.json").read_text(encoding="utf-8"))["seeds"]
 
 
-def _share(score: dict[str, Any]) -> str:
-    return f"{100 * score['success']:.1f} % ({100 * score['low']:.1f} to {100 * score['high']:.1f})"
-
-
 def _ladder(number: int) -> str:
     """Who arrives on a rung: each trained policy, and those that learn nothing, on the same unseen episodes."""
     finals = {
@@ -149,7 +146,7 @@ def _ladder(number: int) -> str:
     rows += [(text, newest[name]) for name, text in rules.items() if name in newest]
     numbers = {"spl": "{:.2f}", "collisions_per_km": "{:.0f}", "wh_per_km": "{:.0f}", "slip": "{:.2f}"}
     header = [f"{rows[0][1]['episodes']} episodes", "success", "SPL", "collisions/km", "W h/km", "mean slip"]
-    return table(header, [[n, _share(r), *(text.format(r[k]) for k, text in numbers.items())] for n, r in rows])
+    return table(header, [[n, success_text(r), *(text.format(r[k]) for k, text in numbers.items())] for n, r in rows])
 
 
 def depth() -> str:
@@ -167,7 +164,7 @@ def depth() -> str:
         for agent, text in agents.items():
             r = found[agent]
             costs = ["", ""] if r["spl"] is None else [f"{r['spl']:.2f}", f"{r['collisions_per_km']:.0f}"]
-            rows.append([task, text, _share(r), *costs, f"{r['episode_time']:.0f} s"])
+            rows.append([task, text, success_text(r), *costs, f"{r['episode_time']:.0f} s"])
     return table(["task", "256 episodes", "success", "SPL", "collisions/km", "mean episode"], rows)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -66,6 +67,20 @@ def wilson(successes: float, count: int) -> tuple[float, float]:
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
     half = EVALUATION.z / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
     return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def success_text(score: Mapping[str, Any]) -> str:
+    """The success of a score's record in percent, with its 95 % interval."""
+    return f"{100 * score['success']:.1f} % ({100 * score['low']:.1f} to {100 * score['high']:.1f})"
+
+
+def pooled(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Success and ends over the episodes of several scores' records together, with the 95 % interval."""
+    count = sum(r["episodes"] for r in records)
+    won = sum(r["success"] * r["episodes"] for r in records)
+    low, high = wilson(won, count)
+    ends = {k: sum(r["ends"][k] * r["episodes"] for r in records) / count for k in records[0]["ends"]}
+    return {"success": won / count, "low": low, "high": high, "episodes": count, "ends": ends}
 
 
 class Evaluator:
@@ -137,6 +152,41 @@ class Evaluator:
                 break
         result = {k: v.reshape(self.copies, self.episodes) for k, v in jax.device_get(carry[2]).items()}
         return [score({k: v[i] for k, v in result.items()}, self.env.control_interval) for i in range(self.copies)]
+
+
+class Judge:
+    """Scores several agents on the same episodes, side by side in one program.
+
+    Args:
+      env: the environment. episodes: of each agent.
+      policies: by name, functions of (policy, state, key) to actions; `policy` is whatever they share.
+      rules: by name, functions of (state, key) to actions.
+    """
+
+    def __init__(
+        self, env: Environment, episodes: int, policies: Mapping[str, Any], rules: Mapping[str, Agent] | None = None
+    ):
+        rules = rules or {}
+        self.names = (*policies, *rules)
+        row = jnp.repeat(jnp.arange(len(self.names)), episodes)
+
+        def act(policy: Any, state: Any, key: Any) -> Any:
+            actions = [agent(policy, state, key) for agent in policies.values()]
+            actions += [rule(state, key) for rule in rules.values()]
+            return jnp.take_along_axis(jnp.stack(actions), row[None, :, None], axis=0)[0]
+
+        self._evaluator = Evaluator(env, act, episodes, len(self.names))
+
+    def compile(self, env_params: Any, policy: Any = ()) -> None:
+        """Compiles ahead for the environment's parameters; shapes suffice for the policy."""
+        # without where the learner's devices hold it
+        shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), policy)
+        self._evaluator.compile(env_params, shapes)
+
+    def __call__(self, env_params: Any, policy: Any, seed: int) -> dict[str, dict[str, Any]]:
+        """The record of every agent's score, by name; arguments as of `Evaluator.scores`."""
+        scores = self._evaluator.scores(env_params, jax.device_put(policy), seed)
+        return {name: score.record() for name, score in zip(self.names, scores, strict=True)}
 
 
 def score(result: dict[str, np.ndarray], interval: float) -> Score:

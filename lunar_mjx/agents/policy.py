@@ -100,6 +100,20 @@ def policy_of(learner: Any, state: Any, environment: dict[str, Any], notes: dict
     return Policy(params, mean, deviation, network, environment, notes)
 
 
+def policy_of_sb3(model: Any, environment: dict[str, Any], notes: dict[str, Any]) -> Policy:
+    """The policy of a TD3 or DDPG of Stable-Baselines3: the actor's layers, so the same actions.
+
+    Args:
+      model: SB3's, with its default activation. environment: see `Policy`. notes: see `Policy`.
+    """
+    layers = [part for part in model.policy.actor.mu if hasattr(part, "weight")]
+    arrays = [{"kernel": a.weight.detach().numpy().T, "bias": a.bias.detach().numpy()} for a in layers]
+    network = {"obs": layers[0].in_features, "actions": layers[-1].out_features, "activation": "relu"}
+    network |= {"layers": [a.out_features for a in layers[:-1]], "layer_norm": False}
+    params = {"params": {f"hidden_{i}": layer for i, layer in enumerate(arrays)}}
+    return Policy(params, None, None, network, environment, notes)
+
+
 class _Network(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     obs: Annotated[int, Field(ge=1, le=100_000)]

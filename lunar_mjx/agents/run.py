@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from lunar_mjx.agents.configs import Training
 from lunar_mjx.agents.curves import plot_episodes, plot_progress
@@ -55,12 +57,23 @@ def soil_note(env: Any) -> str:
     return f"drawn from [posterior] as in training, not unseen: {', '.join(env.params.spread.parameters)}"
 
 
-def learner_agent(learner: Learner) -> Any:
-    """The learner's policy as an agent of `Evaluator`, whose parameters are those of `Learner.policy`."""
+def learner_agent(learner: Learner, blanked: Sequence[str] = ()) -> Any:
+    """The learner's policy as an agent of `Evaluator`, whose parameters are those of `Learner.policy`.
+
+    Args:
+      learner: the learner. blanked: blocks of observations that the policy sees at their mean, which tells what they
+        are worth to it; those that its environment lacks say nothing.
+    """
+    places = getattr(learner.env, "blocks", {})
+    blank = np.zeros(learner.env.observation_size, bool)
+    for name in set(blanked) & set(places):
+        blank[places[name]] = True
 
     def agent(params: Any, state: Any, key: Any) -> Any:
         weights, statistics = params
-        obs = state.obs if statistics is None else normalised(state.obs, *statistics)
+        mean = 0.0 if statistics is None else statistics[0]
+        obs = jnp.where(blank, mean, state.obs) if blank.any() else state.obs
+        obs = obs if statistics is None else normalised(obs, *statistics)
         return learner.agent.act(weights, obs)
 
     return agent

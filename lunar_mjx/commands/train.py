@@ -113,6 +113,7 @@ def train(
 
     # Before anything asks for devices: JAX must know its fellow processes by then.
     join(coordinator, processes, process)
+    from lunar_mjx.agents.evaluate import success_text
     from lunar_mjx.agents.run import run_training, soil_note
     from lunar_mjx.agents.train import RunConfig
 
@@ -123,8 +124,8 @@ def train(
         return
     score = report.score
     print(
-        f"success on unseen ground {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of "
-        f"{score.episodes} episodes, return {score.episode_return:.1f}"
+        f"success on unseen ground {success_text(score.record())} of {score.episodes} episodes, "
+        f"return {score.episode_return:.1f}"
     )
     if note := soil_note(report.result.learner.env):
         print(note)
@@ -173,7 +174,7 @@ def evaluate(
     from lunar_mjx.commands.options import select_device
 
     select_device(device)
-    from lunar_mjx.agents.evaluate import Evaluator
+    from lunar_mjx.agents.evaluate import Evaluator, success_text
     from lunar_mjx.agents.play import knowing, open_agent
     from lunar_mjx.agents.run import soil_note, unseen_params
 
@@ -186,9 +187,8 @@ def evaluate(
     act = knowing(wanted, made, params, act)
     score = Evaluator(made, lambda _, state, key: act(state, key), episodes)(params, (), seed)
     print(
-        f"success {100 * score.success:.1f} % ({100 * score.low:.1f} to {100 * score.high:.1f}) of {score.episodes} "
-        f"episodes, return {score.episode_return:.1f} +- {score.return_deviation:.1f}, "
-        f"{score.episode_time:.1f} s an episode"
+        f"success {success_text(score.record())} of {score.episodes} episodes, return {score.episode_return:.1f} "
+        f"+- {score.return_deviation:.1f}, {score.episode_time:.1f} s an episode"
     )
     print(", ".join(f"{name} {100 * share:.1f} %" for name, share in score.ends.items()))
     if not seen and (note := soil_note(made)):

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lunar_mjx.envs import make
+from lunar_mjx.envs.host_env import HostedEnv
 
 
 @pytest.mark.slow
-def test_pybullet_gives_the_same_observations_and_rewards(monkeypatch):
+def test_pybullet_gives_the_same_observations_and_rewards():
     pytest.importorskip("pybullet")
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks" / "rl"))
-    for name in ("JAX_PLATFORMS", "XLA_FLAGS"):  # the script sets them where they are not set
-        monkeypatch.setenv(name, "cpu" if name == "JAX_PLATFORMS" else "")
-    from sb3_bullet import BulletNavigation
+    from lunar_mjx.backends.pybullet import PyBulletBackend
 
     options = {
         "task": "large",
@@ -29,7 +24,7 @@ def test_pybullet_gives_the_same_observations_and_rewards(monkeypatch):
         "places": 64,
         "episode_time": 1.0,
     }
-    bullet, own = BulletNavigation(options), make("navigation", **options)
+    bullet, own = HostedEnv(PyBulletBackend, **options), make("navigation", **options)
     obs, _ = bullet.reset(seed=3)
     state, step = bullet._state, jax.jit(own.step)
     np.testing.assert_array_equal(obs, state.obs[0])
@@ -41,4 +36,3 @@ def test_pybullet_gives_the_same_observations_and_rewards(monkeypatch):
         assert reward == pytest.approx(float(state.reward[0]), abs=2e-3)
         assert truncated == (k == 9) and not terminated
     assert metrics["episode_length"] == 10.0 and np.hypot(*obs[:2]) > 0.0
-    sys.modules.pop("sb3_bullet")
