@@ -187,10 +187,10 @@ def test_no_import_circles_among_scripts() -> None:
 
 def test_script_imports_are_read_however_they_are_written() -> None:
     known = modules("benchmarks")
-    scripts = ("foreign.sets", "rl.depth")
+    scripts = ("foreign.sets", "rl.trials")
     found = {n: script_imports(f"benchmarks.{n}", known[f"benchmarks.{n}"], known) for n in scripts}
     assert {"benchmarks.foreign.bed", "benchmarks.foreign.work"} <= found["foreign.sets"]
-    assert {"benchmarks.rl.harness", "benchmarks.rl.trials"} <= found["rl.depth"]
+    assert {"benchmarks.rl.harness", "benchmarks.rl.rates"} <= found["rl.trials"]
 
 
 def test_rooms_take_only_what_belongs_to_them_from_outside() -> None:

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import KEPT, ROOT, percent, read, say
+from harness import KEPT, ROOT, read, say
 
 from lunar_mjx.agents.curves import draw_mean, moving_mean, new_figure, plot_progress
-from lunar_mjx.agents.evaluate import wilson
+from lunar_mjx.agents.evaluate import pooled, success_text
 from lunar_mjx.report.style import LINES, LIT, MUTED, styled
 
 DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
@@ -53,22 +53,13 @@ def realism_cells(record: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any
     }
 
 
-def pooled(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Success over the episodes of several seeds, with its interval."""
-    count = sum(r["episodes"] for r in records)
-    won = sum(r["success"] * r["episodes"] for r in records)
-    low, high = wilson(won, count)
-    ended = {k: float(np.mean([r["ends"][k] for r in records])) for k in records[0]["ends"]}
-    return {"success": won / count, "low": low, "high": high, "episodes": count, "ends": ended}
-
-
 def scores(record: Any, name: str) -> Iterator[str]:
     """A line for every score in a record, by where it stands there."""
     if isinstance(record, list):
         names = [" ".join(f"{k} {v[k]}" for k in ("arm", "trained", "seed") if k in v) for v in record]
         record = {name or str(i): v for i, (name, v) in enumerate(zip(names, record, strict=True))}
     if {"success", "low", "high", "episodes"} <= record.keys():
-        yield f"{name}: {percent(record)} of {record['episodes']:,}"
+        yield f"{name}: {success_text(record)} of {record['episodes']:,}"
         return
     for key, value in record.items():
         rows = isinstance(value, list) and value and isinstance(value[0], dict) and key not in CURVES
@@ -135,7 +126,7 @@ def plot_realism(record: dict[str, Any]) -> Any:
     figure, (axes,) = new_figure(1, 5.6, 3.2)
     cells = realism_cells(record)
     for (trained, tested), cell in cells.items():
-        say(f"trained {trained}, tested {tested}: {percent(cell)} of {cell['episodes']:,}")
+        say(f"trained {trained}, tested {tested}: {success_text(cell)} of {cell['episodes']:,}")
     at, bottom = np.arange(len(cells)), np.zeros(len(cells))
     for reason, hatch in REASONS.items():
         share = np.array([100.0 * c["ends"][reason] for c in cells.values()])

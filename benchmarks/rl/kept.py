@@ -19,9 +19,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from harness import KEPT, ends, percent, reached, read, say, when, write
+from harness import KEPT, ends, reached, read, say, when, write
 
-from lunar_mjx.agents.policy import load_policy
+from lunar_mjx.agents.evaluate import success_text
+from lunar_mjx.agents.policy import Policy, load_policy
 from lunar_mjx.envs.ladder.rungs import get_rung
 from lunar_mjx.resources import shipped
 
@@ -36,6 +37,8 @@ MOST_BYTES = 2_000_000
 """Of a shipped policy."""
 SOILS = {"closed form": "consistent", "stress integral": "field"}
 """Models of the soil, as rows of part `escape` begin with them, and the preset of each."""
+COSTS = ("spl", "collisions_per_km", "wh_per_km", "slip")
+"""Numbers of a score that a card tells beside the success."""
 
 
 def rounded(value: Any) -> Any:
@@ -54,20 +57,14 @@ def few(epochs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return epochs[:: -math.ceil(max(len(epochs), 1) / MOST_EPOCHS)][::-1]
 
 
-def require_alike(records: Sequence[dict[str, Any]]) -> None:
-    """Raises ValueError for runs of different trainings, environments or settings."""
-    first, *others = records
-    for same in ALIKE:
-        for other in others:
-            if (there := other.get(same)) != (here := first.get(same)):
-                raise ValueError(f"{same} is not the same in all runs: {here}; {there}")
-
-
 def keep(paths: Sequence[Path], name: str = "", home: Path = KEPT) -> Path:
     """Writes what is kept of a run's records; returns the file.
 
     Args:
       paths: of records; of several, finished seeds stand side by side. name: of the kept record. home: its folder.
+
+    Raises:
+      ValueError: runs of different trainings, environments or settings.
     """
     records = [read(path) for path in paths]
     record, name = records[0], name or paths[0].stem
@@ -83,114 +80,105 @@ def keep(paths: Sequence[Path], name: str = "", home: Path = KEPT) -> Path:
     return home / f"{name}.json"
 
 
+def finished(records: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """The finished seeds of records that are alike, each with its record."""
+    for same in ALIKE:
+        for other in records[1:]:
+            if (there := other.get(same)) != (here := records[0].get(same)):
+                raise ValueError(f"{same} is not the same in all runs: {here}; {there}")
+    return [(record, run) for record in records for run in record["seeds"] if "final" in run]
+
+
 def rung(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One record of trainings, with finished seeds of all; a seed told twice is the later's."""
-    require_alike(records)
     seeds = {}
-    for record in records:
+    for record, run in finished(records):
         about = {k: record[k] for k in ("commit", "tree", "worlds_s", "compile_s") if k in record}
         about["device"] = record["about"]["device"]
-        done = [run for run in record["seeds"] if "final" in run]
-        seeds |= {run["seed"]: {**about, **run, "epochs": few(run["epochs"])} for run in done}
+        seeds[run["seed"]] = {**about, **run, "epochs": few(run["epochs"])}
     shared = {k: records[0][k] for k in ("about", *ALIKE) if k in records[0]}
     return {**shared, "seeds": [seeds[n] for n in sorted(seeds)]}
 
 
 def large(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One record of runs of part `large`, with finished seeds of all, by what its figures and pages tell."""
-    require_alike(records)
-    first, runs, seeds = records[0], [run for r in records for run in r["seeds"] if "final" in run], []
-    for run in runs:
+    first, agents, seeds = records[0], {"untrained": records[0]["untrained"]}, []
+    for _, run in finished(records):
         unseen = [{**score["rows"]["policy"], **when(score), "train": score["train"]} for score in run["scores"]]
         at, rows = next(s for s in unseen if s["steps"] == run["final"]["steps"]), run["final"]["rows"]
         about = {"seed": run["seed"], "rows": run["epochs"], "unseen": unseen, "final": rows["policy"]}
         about |= {"blanked": rows["policy, scans blanked"], "kept": {**when(at), "train_score": at["train"]}}
         about |= {"train_s": run["epochs"][-1]["elapsed_s"], "steps": run["epochs"][-1]["steps"]}
+        # agents that learn nothing have the same episodes beside every seed
+        agents |= {k: v for k, v in rows.items() if not k.startswith("policy") and k not in agents}
         seeds.append({**about, **reached(unseen, first["target"])})
-    agents = {k: v for run in runs[:1] for k, v in run["final"]["rows"].items() if not k.startswith("policy")}
-    agents = {"untrained": first["untrained"], **agents}
     return {**first, "compile_epoch_s": first["compile_s"][0], "agents": agents, "seeds": seeds}
 
 
-def ship(path: Path) -> Path:
-    """Copies a policy that measure.py wrote into its rover's folder and writes its card; returns the copy."""
-    assert path.stat().st_size < MOST_BYTES, "the policy is too large to ship"
-    if load_policy(path).environment["options"]["task"] == "escape":
-        return ship_escape(path)
-    policy, record = load_policy(path), read(path.with_name(f"{path.stem.partition('_seed')[0]}.json"))
-    options = policy.environment["options"]
-    run = next(r for r in record["seeds"] if r["seed"] == policy.notes["seed"])
-    final, (task, _, number) = run["final"], options["task"].partition("/")
-    assert final["steps"] == policy.notes["steps"], f"{path}: not the policy that the record's last score is of"
-    rows = final["rows"]
-    own, rover = rows["policy"], options.get("rover", "luvmi_x")
-    costs = ("spl", "collisions_per_km", "wh_per_km", "slip")
-    words = {
-        "record": record,
-        "run": run,
-        "rover": rover,
-        "training": record["training"],
-        "options": json.dumps(options),
-        "unseen": json.dumps(record["environment"]["unseen"]),
-        "learner": record["learner"].removesuffix("Config"),
-        "compile_s": max(record["compile_s"]),
-        "steps": final["steps"] / 1e6,
-        "size": path.stat().st_size / 1e6,
-        "ends": json.dumps({k: round(v, 4) for k, v in own["ends"].items()}),
-        "rows": "\n".join(
-            " | ".join([f"| {name}", percent(row), *(f"{row[k]:.2f}" for k in costs if row[k] is not None)]) + " |"
-            for name, row in {"this policy": own, **rows}.items()
-            if name != "policy"
-        ),
-    }
-    if task == "ladder":
-        words |= {"number": number, "rung": get_rung(int(number))}
-    else:
-        chosen = next(s for s in run["scores"] if s["steps"] == final["steps"])
-        words["trained"] = percent(chosen["train"])
-    card = Path(__file__).with_name(f"card_{'rung' if task == 'ladder' else 'large'}.txt").read_text(encoding="utf-8")
-    to = shipped("models") / rover / (f"{record['training']}.npz" if task == "ladder" else "policy.npz")
-    to.with_name("POLICY.md" if to.stem == "policy" else f"{to.stem}.md").write_text(card.format(**words), "utf-8")
-    return Path(shutil.copyfile(path, to))
-
-
-def ship_escape(path: Path, home: Path | None = None) -> Path:
-    """Does the same for a policy of part `escape`, which `lunar-mjx train` wrote into a folder beside the record.
+def ship(path: Path, home: Path | None = None) -> Path:
+    """Copies a policy of a run into its rover's folder and writes its card; returns the copy.
 
     Args:
       path: of the policy. home: folder of the rovers' folders; that of the models that ship if left out.
     """
-    policy, record, run = load_policy(path), read(path.parents[1] / "escape.json"), read(path.with_name("curve.json"))
-    options, rows = policy.environment["options"], record["rows"]
-    assert run["rows"][-1]["steps"] == policy.notes["steps"], f"{path}: not the policy that the training ended with"
-    soil = next(name for name, preset in SOILS.items() if preset == options["preset"])
-    own, rover = f"TD3 of the {soil}", options.get("rover", "luvmi_x")
-    scores = {
-        agent: [rows[f"{name}, {agent}"]["score"] for name in SOILS]
-        for agent in dict.fromkeys(name.partition(", ")[2] for name in rows)
-    }
+    assert path.stat().st_size < MOST_BYTES, "the policy is too large to ship"
+    policy = load_policy(path)
+    options = policy.environment["options"]
+    task = options["task"].partition("/")[0]
+    words, rows = (escape_words if task == "escape" else trial_words)(path, policy)
+    words |= {"rover": options.get("rover", "luvmi_x"), "options": json.dumps(options)}
+    words |= {"notes": policy.notes, "size": path.stat().st_size / 1e6}
+    words["rows"] = "\n".join(f"| {' | '.join([name, *cells])} |" for name, cells in rows.items())
+    card = {"ladder": "rung", "escape": "escape"}.get(task, "large")
+    name = "policy" if card == "large" else words["training"]
+    folder = (home or shipped("models")) / words["rover"]
+    text = Path(__file__).with_name(f"card_{card}.txt").read_text(encoding="utf-8").format(**words)
+    (folder / ("POLICY.md" if name == "policy" else f"{name}.md")).write_text(text, "utf-8")
+    return Path(shutil.copyfile(path, folder / f"{name}.npz"))
+
+
+def trial_words(path: Path, policy: Policy) -> tuple[dict[str, Any], dict[str, list[str]]]:
+    """Words of the card of a policy of part `large` or `rung`, and the cells of its table's rows by agent."""
+    record = read(path.with_name(f"{path.stem.partition('_seed')[0]}.json"))
+    run = next(r for r in record["seeds"] if r["seed"] == policy.notes["seed"])
+    final, number = run["final"], policy.environment["options"]["task"].partition("/")[2]
+    assert final["steps"] == policy.notes["steps"], f"{path}: not the policy that the record's last score is of"
+    scores = dict(final["rows"])
+    own = scores.pop("policy")
     words = {
         "record": record,
         "run": run,
-        "rover": rover,
-        "training": run["training"],
-        "options": json.dumps(options),
-        "preset": options["preset"],
-        "soil": soil,
-        "notes": policy.notes,
-        "size": path.stat().st_size / 1e6,
-        "episodes": scores[own][0]["episodes"],
-        "columns": " | ".join(SOILS),
-        "ends": "; ".join(f"{name} {json.dumps(ends(s))}" for name, s in zip(SOILS, scores[own], strict=True)),
-        "rows": "\n".join(
-            f"| {name} | {' | '.join(map(percent, row))} |"
-            for name, row in {"this policy": scores.pop(own), **scores}.items()
-        ),
+        "training": record["training"],
+        "unseen": json.dumps(record["environment"]["unseen"]),
+        "learner": record["learner"].removesuffix("Config"),
+        "compile_s": max(record["compile_s"]),
+        "steps": final["steps"] / 1e6,
+        "ends": json.dumps({k: round(v, 4) for k, v in own["ends"].items()}),
     }
-    card = Path(__file__).with_name("card_escape.txt").read_text(encoding="utf-8")
-    to = (home or shipped("models")) / rover / f"{run['training']}.npz"
-    to.with_suffix(".md").write_text(card.format(**words), "utf-8")
-    return Path(shutil.copyfile(path, to))
+    if number:
+        words |= {"number": number, "rung": get_rung(int(number))}
+    else:
+        words["trained"] = success_text(next(s for s in run["scores"] if s["steps"] == final["steps"])["train"])
+    cells = {
+        name: [success_text(row), *(f"{row[k]:.2f}" for k in COSTS if row[k] is not None)]
+        for name, row in {"this policy": own, **scores}.items()
+    }
+    return words, cells
+
+
+def escape_words(path: Path, policy: Policy) -> tuple[dict[str, Any], dict[str, list[str]]]:
+    """The same of a policy of part `escape`, which `lunar-mjx train` wrote into a folder beside the record."""
+    record, run = read(path.parents[1] / "escape.json"), read(path.with_name("curve.json"))
+    preset, rows = policy.environment["options"]["preset"], record["rows"]
+    assert run["rows"][-1]["steps"] == policy.notes["steps"], f"{path}: not the policy that the training ended with"
+    soil = next(name for name, own in SOILS.items() if own == preset)
+    agents = dict.fromkeys(name.partition(", ")[2] for name in rows)
+    scores = {agent: [rows[f"{name}, {agent}"]["score"] for name in SOILS] for agent in agents}
+    own = scores.pop(f"TD3 of the {soil}")
+    words = {"record": record, "run": run, "training": run["training"], "preset": preset, "soil": soil}
+    words |= {"episodes": own[0]["episodes"], "columns": " | ".join(SOILS)}
+    words["ends"] = "; ".join(f"{name} {json.dumps(ends(s))}" for name, s in zip(SOILS, own, strict=True))
+    return words, {name: [success_text(s) for s in row] for name, row in {"this policy": own, **scores}.items()}
 
 
 def main() -> None:

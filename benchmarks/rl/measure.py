@@ -4,19 +4,10 @@
     python benchmarks/rl/measure.py large short --unseen-terrain flat --steps 30000 --episodes 64 --every 10 --last 5 \
         --out runs/short                                                             # the same code on two CPU cores
     python benchmarks/rl/measure.py rung ladder-3 --seeds 1 2 --steps 60e6 --every inf --out runs/rung
+    python benchmarks/rl/measure.py sensors --out runs/sensors                       # 3 minutes on two CPU cores
+    python benchmarks/rl/measure.py escape --steps 0 --episodes 32 --out runs/escape    # rules alone
 
 Parts, each with its own JSON file; `experiments.toml` holds their settings:
-`large`: TD3 from thousands of rovers, scored on unseen ground, goals and soil beside agents that learn nothing.
-`rung`: a training on a rung of the ladder, scored beside agents that learn nothing.
-`depth`: rate of an environment with depth pictures, and a student distilled in it, beside its teacher.
-`realism`: TD3 trained with and without the thermal and soil effects, each scored with and without them.
-`fit`, `posterior`: training on what a log left open, beside wide ranges and the nominal soil.
-`brax`: brax's PPO and SAC in the same environment, with the same scores.
-`paper`: TD3 and DDPG on the paper's own task with one rover each, on CPU cores.
-`rates`: environment steps per second, with observation, reward, reset and randomisation, against the bare physics.
-`tune`: settings of the reactive rule on the ladder's training worlds; rungs are scored beside the best of them.
-`export`: how far exported policies are from their own, and how long an action takes.
-`sensors`, `escape`: scores that `lunar-mjx evaluate` gives, gathered in one record.
 """
 
 from __future__ import annotations
@@ -25,19 +16,23 @@ import argparse
 import importlib
 import math
 from pathlib import Path
+from typing import Any
 
-from harness import EXPERIMENTS, Clock, say
+from harness import EXPERIMENTS, Clock, command, in_time, read, save, say
+
+from lunar_mjx.agents.evaluate import success_text
 
 
 def words() -> argparse.Namespace:
     """The command line, with the settings of its part."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    about = str(__doc__) + "".join(f"`{part}`: {found['about']}\n" for part, found in EXPERIMENTS.items())
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("part", choices=EXPERIMENTS)
     add("training", nargs="?", help="another than the part's: a shipped one by name, or a file like it")
     add("--out", type=Path, required=True)
     add("--name", help="of the files; the training's unless told")
-    add("--seconds", type=float, help="for everything, compiling among it")
+    add("--seconds", type=float, help="for everything, compiling among it; of `sb3` its CPU time")
     add("--rover", help="another than the training's")
     add("--learner", help="another algorithm than the training's")
     add("--begin-with", default="", help="policy that trainings begin with, as of `lunar-mjx train`")
@@ -58,6 +53,27 @@ def words() -> argparse.Namespace:
     told = parser.parse_args()
     parser.set_defaults(**common | {k: v for k, v in EXPERIMENTS[told.part].items() if k in told})
     return parser.parse_args()
+
+
+def gather(args: argparse.Namespace, clock: Clock) -> None:
+    """What `lunar-mjx evaluate` says, row by row, gathered in one record that is saved after every score.
+
+    The commands stand in `experiments.toml`; `{out}` is the folder. All rows have the same draws of unseen ground,
+    soils and goals: those of the seed that `evaluate` has by itself.
+    """
+    plan = EXPERIMENTS[args.part]
+    told = {"out": args.out, "seed": args.seeds[0], "steps": int(args.steps or 0), "fifth": args.seconds / 5}
+    for line in plan.get("first", ()) if args.steps else ():
+        command(*line.format(**told).split(), "--quiet")
+    # without a training, rules alone
+    names = [name for name, line in plan["rows"].items() if args.steps or "{out}" not in line]
+    rows: dict[str, Any] = {}
+    for name in in_time(clock, [name for name in names if args.only is None or name in args.only]):
+        words = plan["rows"][name].format(**told)
+        command(*words.split(), "--episodes", args.episodes, "--out", args.out / "row.json")
+        rows[name] = {"command": words, "score": read(args.out / "row.json")}
+        save(args.out, args.part, {"rows": rows})
+        say(f"{name}: {success_text(rows[name]['score'])}")
 
 
 def main() -> None:

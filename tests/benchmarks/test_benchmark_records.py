@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.agents.configs import get_training
+from lunar_mjx.agents.evaluate import success_text
 from lunar_mjx.agents.policy import load_policy
 from lunar_mjx.model import make_model
 
@@ -32,22 +33,19 @@ def benchmarks():
 
 def test_the_page_quotes_what_realism_is_worth():
     from figures import realism_cells
-    from harness import percent
 
     cells = realism_cells(record("realism"))
     assert len(cells) == 4
     for trained in ("with", "without"):
-        row = f"| {trained} | {percent(cells[trained, 'with'])} | {percent(cells[trained, 'without'])} |"
+        row = f"| {trained} | {success_text(cells[trained, 'with'])} | {success_text(cells[trained, 'without'])} |"
         assert row in PAGE
     assert cells["with", "with"]["low"] > cells["without", "with"]["success"], "what the effects are worth is no chance"
 
 
 def test_the_page_quotes_what_boulders_are_to_viper():
-    from harness import percent
-
     found = record("large_viper_boulders")
     policy, straight = found["seeds"][0]["final"], found["agents"]["scripted"]
-    assert f"| {percent(policy)} |" in PAGE and f"| {percent(straight)} |" in PAGE
+    assert f"| {success_text(policy)} |" in PAGE and f"| {success_text(straight)} |" in PAGE
     assert policy["success"] >= 0.95 and all(a["success"] < 0.5 for a in found["agents"].values())
     assert found["environment"]["unseen"]["terrain"] == "world:heldout_boulders"
 
@@ -82,7 +80,7 @@ def test_the_page_quotes_the_papers_own_task():
 
 
 def test_the_plainer_model_has_neither_heat_nor_soil():
-    from realism import THERMAL, plainer
+    from arms import THERMAL, plainer
 
     model = plainer(make_model("luvmi_x", "flat"))
     assert not set(THERMAL) & set(model.effect_names)
@@ -91,27 +89,27 @@ def test_the_plainer_model_has_neither_heat_nor_soil():
 
 
 def test_the_hidden_soil_is_a_likely_draw_of_the_kept_posterior_and_lies_in_all_ranges():
-    import posterior
+    import arms
     from scipy import stats
 
     from lunar_mjx.envs.navigation.config import SOIL_RANGES
     from lunar_mjx.model.file import load_model
 
-    fitted = load_model(posterior.FITTED)
-    rows = posterior.told(fitted)
-    assert set(posterior.TRUTH) <= {row["parameter"] for row in rows}
+    fitted = load_model(arms.FITTED)
+    rows = arms.told(fitted)
+    assert set(arms.TRUTH) <= {row["parameter"] for row in rows}
     off = np.array([np.log(row["hidden"] / row["fitted"]) for row in rows])
     assert all(fitted.posterior.log)
     assert off @ np.linalg.solve(fitted.posterior.covariance, off) < stats.chi2(len(off)).ppf(0.99)
     for r in SOIL_RANGES:
-        assert r.parameter not in posterior.TRUTH or r.low <= posterior.TRUTH[r.parameter] <= r.high
-    hidden = posterior.hidden(make_model("luvmi_x", "flat", "consistent"))
+        assert r.parameter not in arms.TRUTH or r.low <= arms.TRUTH[r.parameter] <= r.high
+    hidden = arms.hidden(make_model("luvmi_x", "flat", "consistent"))
     assert hidden.parameters["soil"]["k_phi"] == pytest.approx(0.6 * 8.2e5)
 
 
 @pytest.mark.parametrize("name", ["posterior_short", "posterior_large"])
 def test_the_page_quotes_what_a_log_is_worth_to_a_training(name):
-    from posterior import summary
+    from arms import summary
 
     found = record(name)
     again = summary(found["runs"])
@@ -126,16 +124,14 @@ def test_the_page_quotes_what_a_log_is_worth_to_a_training(name):
 
 
 def test_the_page_quotes_what_late_and_drifting_sensors_cost():
-    from harness import percent
-
     rows = {name: row["score"] for name, row in record("sensors")["rows"].items()}
     assert set(rows) > {"exact", "delay 0.3 s, drift 2 %"}
     for name, score in rows.items():
-        assert f"| {name}{' (as trained)' * (name == 'exact')} | {percent(score)} |" in PAGE
+        assert f"| {name}{' (as trained)' * (name == 'exact')} | {success_text(score)} |" in PAGE
 
 
 def test_arms_are_compared_by_pairs_of_one_seed():
-    from posterior import summary
+    from arms import summary
 
     def run(arm, seed, success):
         return {"arm": arm, "seed": seed, "score": {"success": success, "episode_return": 0.0, "episode_time": 1.0}}
@@ -269,15 +265,15 @@ def test_the_page_quotes_how_fast_pictures_are_and_what_they_are_worth():
 
 
 def test_the_page_and_the_card_of_the_shipped_policy_quote_who_gets_out_of_holes(tmp_path):
-    from harness import EXPERIMENTS, percent
-    from kept import SOILS, ship_escape
+    from harness import EXPERIMENTS
+    from kept import SOILS, ship
 
     found, page = record("escape"), (ROOT / "docs" / "how_to" / "escape.md").read_text(encoding="utf-8")
     rows = {name: row["score"] for name, row in found["rows"].items()}
     assert list(rows) == list(EXPERIMENTS["escape"]["rows"]) and {s["episodes"] for s in rows.values()} == {256}
     assert found["commit"] in page
     for agent in ("zero", "random", "scripted", "rocking", "TD3 of the closed form", "TD3 of the stress integral"):
-        assert f"| {' | '.join(percent(rows[f'{soil}, {agent}']) for soil in SOILS)} |" in page
+        assert f"| {' | '.join(success_text(rows[f'{soil}, {agent}']) for soil in SOILS)} |" in page
     assert rows["stress integral, TD3 of the closed form"]["success"] == 0.0, "what does not transfer"
 
     shipped = ROOT / "models" / "luvmi_x" / "escape.npz"
@@ -293,7 +289,7 @@ def test_the_page_and_the_card_of_the_shipped_policy_quote_who_gets_out_of_holes
     (run / "curve.json").write_text(json.dumps(told))
     (tmp_path / "escape.json").write_text(json.dumps(found))
     (tmp_path / "luvmi_x").mkdir()
-    again = ship_escape(run / "policy.npz", tmp_path)
+    again = ship(run / "policy.npz", tmp_path)
     assert again.read_bytes() == shipped.read_bytes()
     assert again.with_suffix(".md").read_text("utf-8") == shipped.with_suffix(".md").read_text("utf-8")
 

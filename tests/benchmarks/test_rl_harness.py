@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lunar_mjx.agents.evaluate import evaluate
-from lunar_mjx.agents.train import RunConfig
+from lunar_mjx.agents.evaluate import Judge, evaluate
 from lunar_mjx.envs import make, make_agent
 
 SMALL = ["envs=4", "epoch_steps=8", "batch=8", "buffer_steps=64", "random_steps=4", "updates=1"]
@@ -27,29 +26,47 @@ def harness():
     sys.path.remove(folder)
 
 
-@pytest.fixture(scope="module")
-def setup(harness):
-    args = argparse.Namespace(rover=None, unseen_terrain=None, set=SMALL, env=[])
-    return harness.Setup(harness.training_of(args, "point"))
+@pytest.fixture
+def trials(harness, tmp_path):
+    """Trials of the task without physics, scored on its own ground after every epoch."""
+    from trials import Trials
+
+    told = {"training": "point", "out": tmp_path, "name": "", "begin_with": "", "stop_at": math.inf, "episodes": 4}
+    times = {"steps": 96, "seed_seconds": 60.0, "last": 0.0, "every": 0.0}
+    args = argparse.Namespace(rover=None, unseen_terrain=None, set=SMALL, env=[], **told, **times)
+    rules = {"scripted": make_agent("scripted", make("point"))}
+    return Trials(args, harness.training_of(args, "point"), harness.Clock(60.0), lambda _: rules, "seen")
 
 
-def test_agents_side_by_side_score_as_each_alone(harness):
+def test_agents_side_by_side_score_as_each_alone():
     env = make("point")
     rules = {name: make_agent(name, env) for name in ("zero", "scripted")}
-    found = harness.Judge(env, 8, {}, rules)(env.params, (), 3)
+    found = Judge(env, 8, {}, rules)(env.params, (), 3)
     assert found == {name: evaluate(env, rule, 8, 3).record() for name, rule in rules.items()}
     assert found["zero"]["success"] < found["scripted"]["success"]
 
 
-def test_the_best_policy_of_a_training_is_chosen_and_a_good_one_ends_it(harness, setup):
-    told, run = iter((0.2, 0.9, 0.5)), RunConfig(96, quiet=True)
-    result, policy, row = harness.trained(setup, run, 0.0, lambda *_: next(told))
-    assert [r["steps"] for r in result.rows] == [32, 64, 96] and row["steps"] == 64 and policy is not None
-    told = iter((0.2, 0.9, 0.5))
-    result, _, row = harness.trained(setup, run, 0.0, lambda *_: next(told), target=0.9)
-    assert row["steps"] == result.rows[-1]["steps"] == 64
-    result, _, row = harness.trained(setup, run, math.inf, lambda *_: pytest.fail("nothing is looked at"))
-    assert row is result.rows[-1]
+def test_the_best_policy_of_a_training_is_chosen_and_a_good_one_ends_it(trials, monkeypatch):
+    shares = []
+
+    def scored(params, policy, seed):
+        share = shares.pop(0) if params is trials.setup.env.params else 0.0
+        return {"policy": {"success": share, "low": 0.0, "high": 1.0, "spl": None, "ends": {}}}
+
+    trials.setup.unseen = object()
+    monkeypatch.setattr(trials, "during", scored)
+    monkeypatch.setattr(trials, "judge", scored)
+    shares[:] = 0.2, 0.9, 0.5
+    trials(0)
+    (run,) = trials.record["seeds"]
+    assert [s["steps"] for s in run["scores"]] == [32, 64, 96] and run["final"]["steps"] == 64
+    trials.args.stop_at, shares[:] = 0.9, (0.2, 0.9, 0.5)
+    trials(1)
+    assert trials.record["seeds"][1]["epochs"][-1]["steps"] == 64
+    trials.args.every, shares[:] = math.inf, ()
+    trials(2)
+    run = trials.record["seeds"][2]
+    assert run["scores"] == [] and run["final"]["steps"] == run["epochs"][-1]["steps"] == 96
 
 
 def test_a_job_that_would_be_cut_short_is_not_begun(harness, capsys):
@@ -83,17 +100,11 @@ def test_what_is_kept_of_a_record_has_few_digits_and_few_columns():
     }
 
 
-def test_a_training_scored_on_its_own_ground_is_kept_as_figures_read_it(harness, tmp_path):
+def test_a_training_scored_on_its_own_ground_is_kept_as_figures_read_it(harness, trials, tmp_path):
     from kept import keep
-    from trials import Trials
 
     from lunar_mjx.agents.policy import load_policy
 
-    told = {"training": "point", "out": tmp_path, "name": "", "begin_with": "", "stop_at": math.inf, "episodes": 4}
-    times = {"steps": 96, "seed_seconds": 60.0, "last": 0.0, "every": 0.0}
-    args = argparse.Namespace(rover=None, unseen_terrain=None, set=SMALL, env=[], **told, **times)
-    rules = {"scripted": make_agent("scripted", make("point"))}
-    trials = Trials(args, harness.training_of(args, "point"), harness.Clock(60.0), lambda _: rules, "seen")
     trials.record |= {"rover": "none", "target": 0.0, "untrained": {"success": 0.0}}
     trials(3)
     record = harness.read(keep([tmp_path / "point.json"], home=tmp_path))
