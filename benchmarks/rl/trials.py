@@ -189,12 +189,14 @@ def depth(args: argparse.Namespace, clock: Clock) -> None:
         teacher = setup.learner.agent.teacher
         return {"student": student, "blanked": blanked, "teacher": lambda _, state, key: teacher.act(state.privileged)}
 
+    def rules(env: Any) -> dict[str, Any]:
+        return {"straight": make_agent("scripted", env)}
+
     def beside(setup: Setup) -> None:
         driven.append(Driven(setup.env, training.train.envs, RATED))
 
     args.steps = args.steps or training.steps
-    straight = lambda env: {"straight": make_agent("scripted", env)}  # noqa: E731
-    trials = Trials(args, training, clock, straight, "last", agents, beside)
+    trials = Trials(args, training, clock, rules, "last", agents, beside)
     # One device of several: the rate is of one, and a state over a mesh is none that the program was compiled for.
     state = jax.device_put(jax.device_get(trials.setup.learner.init(args.seeds[0]).env))
     trials.record["rate"] = rate = driven[0].rate(state, args.repeats)
