@@ -43,9 +43,7 @@ def build_drives(
     """
     settings = DriveSettings.of(run.settings)
     wanted = candidates_of(run, only) if candidates is None else candidates
-    drives = DriveProblem(
-        logs, run.model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy, window=settings.window_s
-    )
+    drives = DriveProblem(logs, run.model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
     form = DriveForm(drives, settings, progress)
     kept = kept_start(run, form, frozenset())
     if kept is not None:
@@ -58,15 +56,7 @@ def build_drives(
         raise bad_input("settings", "laws", ", ".join(settings.laws), problem, "leave it away")
     # the closed form is an approximation of the others: beside one of these it is no rival
     for law in [name for name in laws if rivals and own == CLOSED_FORM and name != own]:
-        beside = DriveProblem(
-            logs,
-            laws[law],
-            wanted,
-            run.splits,
-            progress=progress,
-            discrepancy=run.discrepancy,
-            window=settings.window_s,
-        )
+        beside = DriveProblem(logs, laws[law], wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
         forms.append(DriveForm(beside, settings, progress, law, form))
     for one, prior in zip(forms, log_shares(len(forms)), strict=True):
         one.log_prior = prior

@@ -82,7 +82,6 @@ class DriveProblem:
         engine: str = "auto",
         progress: Progress = silent,
         discrepancy: Mapping[str, float] | None = None,
-        window: float = 0.0,
     ):
         """Makes the problem.
 
@@ -97,7 +96,6 @@ class DriveProblem:
           engine: of the dynamics.
           progress: told of every chunk.
           discrepancy: known unexplained error of the model by channel, in its unit; a name may hold `*`.
-          window: s after which simulations resume from the measured state; 0 for never.
 
         Raises:
           UserError: a discrepancy of a channel that is not compared.
@@ -108,7 +106,7 @@ class DriveProblem:
         self.effects, self.not_tested = usable(
             model.effects, candidates, lambda name, effect: unfit(name, effect) or no_addition(present, name)
         )
-        self.bench = Bench(model, self.logs, chunk, engine, window=window)
+        self.bench = Bench(model, self.logs, chunk, engine)
         self._stamped: tuple[Observations | None, bytes] = None, b""
         coordinates = baseline_coordinates(model, baseline)
         self._noises = Noises(self.logs)

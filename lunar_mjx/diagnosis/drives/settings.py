@@ -50,11 +50,6 @@ class DriveSettings(SearchSettings):
     """1; degrees of freedom of Student's noise of single readings that are tried for each kind of channel; 0 for normal
     noise."""
 
-    window_s: float = 0.0
-    """s; after which simulations resume from the measured state, in half seconds; 0 for never. What errs then does so
-    within a window, and where a rover would have been after a minute no longer matters. Evidence of runs with other
-    windows does not compare: each window is told what was measured before it."""
-
     # --- effort ------------------------------------------------------------------------------------------------------
     most_refits: int = 8
     """1; refits of a search, each of which simulates some hundred drives."""

@@ -15,7 +15,7 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, log_model
 from lunar_mjx.logs import commands as log_commands
 from lunar_mjx.logs.schema import parse_name, suffix_of
-from lunar_mjx.logs.series import continuous, sigma
+from lunar_mjx.logs.series import sigma
 from lunar_mjx.model import ZERO_CELSIUS, Model
 from lunar_mjx.terrain.heightfield import slope
 
@@ -31,17 +31,11 @@ class LogStart:
     # s within which a first sample tells the start; noise that it must exceed to tell motion.
     near_start: float = 0.5
     sigmas: float = 5.0
-    just_before: float = 0.25
-    """s; samples so shortly before a time tell the state then. None at it or after it does: what is predicted from that
-    state must not have been told of itself."""
     starts_moving: float = 0.02
     """m/s of a rover, or of its wheels' rims, from which a log begins in motion: below, noise of a rover at rest."""
 
 
 LOG_START = LogStart()
-
-PIECE = 0.5
-"""Length of the pieces in which logs are simulated, s. A time of standing between two of them is interpolated."""
 
 READS_BEFORE = "reads_before"
 """Name of how far motors are read before a row's command takes effect: a share, which all logs have in common."""
@@ -71,8 +65,6 @@ class LogRun:
         `joint_speed` (joint,) rad/s, NaN where unknown.
       imu: how the IMU is mounted.
       ground: what nobody knows of the ground, where the log names no map.
-      seen: (pieces, ...) the measured state where each piece of `PIECE` ends, by name as `motion`, with `x`, `y` m,
-        `yaw` rad and `joint_angle` (joint,) rad since the log began; NaN where unknown.
     """
 
     model: Model
@@ -85,7 +77,6 @@ class LogRun:
     motion: Mapping[str, np.ndarray]
     imu: ImuMounting
     ground: UnmappedGround | None = None
-    seen: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
 def log_run(log: Log, model: Model) -> LogRun:
@@ -116,56 +107,7 @@ def log_run(log: Log, model: Model) -> LogRun:
     motion = start_motion(log, own, begin, start["yaw"])
     imu = ImuMounting(log.imu.position_m, log.imu.quaternion)
     ground = unmapped_ground(log, own)
-    piece = commands_of_piece(steps_per_command, own.timestep) * steps_per_command * own.timestep
-    seen = _seen(log, own, begin + piece * np.arange(1, math.ceil((end - begin) / piece)))
-    return LogRun(own, values, steps_per_command, begin, end, start, unknown, motion, imu, ground, seen)
-
-
-def commands_of_piece(every: int, timestep: float) -> int:
-    """Commands of a piece of a simulation, of so many time steps (s) each."""
-    return math.ceil(PIECE / (every * timestep) - 1e-9)
-
-
-def _seen(log: Log, model: Model, times: np.ndarray) -> dict[str, np.ndarray]:
-    """The measured state at some times (pieces,), as `LogRun.seen`."""
-
-    def at(*names: str, since: bool = False) -> np.ndarray:
-        for name in names:
-            samples = None if name in log.magnitudes else continuous(log, name)
-            if samples is not None:
-                first = float(np.mean(samples[1][:5])) if since else 0.0
-                return _carried_on(*samples, times) - first
-        return np.full(len(times), np.nan)
-
-    channels = joint_channels(model.rover)
-    driven = {w.drive for w in model.rover.wheels}
-    wheels = [j in driven for j in model.rover.joints]
-    unknown = np.full(len(times), np.nan)
-    # a gyro that is mounted askew hears rolling and pitching in its z
-    upright = log.imu.quaternion[0] > 1.0 - 1e-6
-    return {
-        "x": at("position_x_m"),
-        "y": at("position_y_m"),
-        "yaw": np.deg2rad(at("yaw_deg")),
-        "velocity": np.stack([at(f"world_velocity_{a}_m_s") for a in "xy"], axis=1),
-        "yaw_rate": at("gyro_z_rad_s") if upright else unknown,
-        "joint_angle": np.stack(
-            [at(f"joint_{c}_angle_rad", since=True) if w else unknown for c, w in zip(channels, wheels, strict=True)], 1
-        ),
-        "joint_speed": np.stack(
-            [at(*_speeds_of(c)) if w else unknown for c, w in zip(channels, wheels, strict=True)], axis=1
-        ),
-    }
-
-
-def _carried_on(time: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Values at some times by a straight line through the samples before each; NaN where these are fewer than three."""
-    out = np.full(len(times), np.nan)
-    for k, t in enumerate(times):
-        near = (time < t - 1e-9) & (time > t - LOG_START.just_before - 1e-9)
-        if near.sum() >= 3:
-            out[k] = np.polyval(np.polyfit(time[near] - t, values[near], 1), 0.0)
-    return out
+    return LogRun(own, values, steps_per_command, begin, end, start, unknown, motion, imu, ground)
 
 
 def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:

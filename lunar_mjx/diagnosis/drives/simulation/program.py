@@ -15,14 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.simulation.log_run import (
-    LOG_START,
-    PIECE,
-    STOOD,
-    ImuMounting,
-    LogRun,
-    commands_of_piece,
-)
+from lunar_mjx.diagnosis.drives.simulation.log_run import LOG_START, STOOD, ImuMounting, LogRun
 from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import UNMAPPED_GRID, mode_name
 from lunar_mjx.dynamics import System, build
 from lunar_mjx.dynamics.signals import measure, with_sides
@@ -30,11 +23,12 @@ from lunar_mjx.dynamics.state import Params
 from lunar_mjx.inference.coordinates import NUISANCE
 from lunar_mjx.inference.deadline import Deadline
 from lunar_mjx.model import Model
-from lunar_mjx.terrain.heightfield import gradient, height
 
 Rows = Mapping[tuple[str, str, int, bool], np.ndarray]
 """(rows,) values by effect, parameter, log (-1 for all) and whether they are factors."""
 
+PIECE = 0.5
+"""Length of the pieces in which logs are simulated, s. A time of standing between two of them is interpolated."""
 _FEWEST = 64
 """Rovers that come back from the device at least; else the next power of two, for few programs."""
 
@@ -60,7 +54,7 @@ class Program:
         with jax.enable_x64(True):
             self.system: System = build(model, engine)
         # Pieces of one length, the first of which settle the rover: one program serves logs of any length.
-        self.segment = commands_of_piece(every, self.system.dt)
+        self.segment = math.ceil(PIECE / (every * self.system.dt) - 1e-9)
         self.compiled = False
         self._reset = jax.jit(self._reset_all)
         self._drive = jax.jit(self._drive_all, static_argnames="shared")
@@ -68,8 +62,6 @@ class Program:
         self._set_moving = jax.jit(jax.vmap(self._in_motion))
         body = self.system.engine.mj_model
         self._joint_dofs = np.array([body.jnt_dofadr[body.joint(j).id] for j in model.rover.joints])
-        self._joint_places = np.array([body.jnt_qposadr[body.joint(j).id] for j in model.rover.joints])
-        self._resume = jax.jit(self._resume_all, static_argnames="shared")
 
     def length(self, commands: int) -> int:
         """Number of commands rounded up to whole pieces."""
@@ -120,35 +112,6 @@ class Program:
         moving = moving.at[self._joint_dofs].set(jnp.where(jnp.isnan(spin), moving[self._joint_dofs], spin))
         return dataclasses.replace(state, qvel=jnp.where(motion["moves"], moving, state.qvel))
 
-    def _resume_all(self, params: Params, state: Any, seen: Mapping[str, Any], shared: bool) -> Any:
-        return jax.vmap(self._resumed, (self._axes(params, shared), 0, 0))(params, state, seen)
-
-    def _resumed(self, params: Params, state: Any, seen: Mapping[str, Any]) -> Any:
-        """A rover's state with what was measured of it; what nothing measures, and all within it, is as it was.
-
-        It stays as high above the ground as it was, and goes along it.
-        """
-
-        def known(name: str, old: Any) -> Any:
-            return jnp.where(jnp.isnan(seen[name]), old, seen[name])
-
-        q, v = state.qpos, state.qvel
-        field = params.terrain.field
-        x, y = known("x", q[0]), known("y", q[1])
-        before, after = height(field, q[0], q[1]), height(field, x, y)
-        w, i, j, k = q[3], q[4], q[5], q[6]
-        yaw = jnp.arctan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
-        half = 0.5 * ((known("yaw", yaw) - yaw + jnp.pi) % (2.0 * jnp.pi) - jnp.pi)
-        c, s = jnp.cos(half), jnp.sin(half)
-        turned = jnp.stack([c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w])
-        q = q.at[:3].set(jnp.stack([x, y, q[2] + after - before])).at[3:7].set(turned)
-        q = q.at[self._joint_places].set(known("joint_angle", q[self._joint_places]))
-        level = known("velocity", v[:2])
-        rise = jnp.stack(gradient(field, x, y)) @ (level - v[:2])
-        v = v.at[:2].set(level).at[2].add(rise).at[5].set(known("yaw_rate", v[5]))
-        v = v.at[self._joint_dofs].set(known("joint_speed", v[self._joint_dofs]))
-        return dataclasses.replace(state, qpos=q, qvel=v)
-
     def __call__(
         self, logs: Logs, log: np.ndarray, row: np.ndarray, values: Rows, count: int, deadline: Deadline
     ) -> np.ndarray:
@@ -173,10 +136,7 @@ class Program:
             if logs.motion["moves"].any():
                 state = self._set_moving(state, {name: a[log] for name, a in logs.motion.items()})
             seen = []
-            for number, at in enumerate(range(0, commands.shape[1], self.segment)):
-                if number and logs.window and number % logs.window == 0:
-                    measured = {name: a[log, number - 1] for name, a in logs.seen.items()}
-                    state = self._resume(full, state, measured, shared=shared)
+            for at in range(0, commands.shape[1], self.segment):
                 if math.isfinite(deadline.until):
                     jax.block_until_ready(state)  # else all pieces are under way before the first has ended
                     deadline.check()
@@ -230,8 +190,6 @@ class Logs:
       commands: (logs, time, joint), the last ones repeated up to whole pieces.
       motion: (logs, ...) velocities at the start, by name, as in `LogRun`.
       modes: (logs, modes, rows, cols) of unmapped ground, whose amounts are in `start`; None where all is mapped.
-      seen: (logs, pieces, ...) measured states, as in `LogRun`. window: pieces after which a simulation resumes from
-        them; 0 for never.
     """
 
     program: Program
@@ -243,8 +201,6 @@ class Logs:
     commands: np.ndarray
     motion: Mapping[str, np.ndarray]
     modes: Any
-    seen: Mapping[str, np.ndarray]
-    window: int
 
     def rovers(self, log: np.ndarray, row: np.ndarray, values: Rows) -> tuple[Params, dict[str, np.ndarray]]:
         """Parameters (but for the ground) and starts of rovers: the logs' conditions with rows of values put in."""
@@ -263,10 +219,8 @@ class Logs:
         return params, start
 
 
-def stack_logs(
-    program: Program, numbers: Sequence[int], runs: Sequence[LogRun], params: Sequence[Params], window: int = 0
-) -> Logs:
-    """Makes logs of one program and one length ready; `window` as in `Logs`."""
+def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun], params: Sequence[Params]) -> Logs:
+    """Makes logs of one program and one length ready."""
     length = program.length(max(len(r.commands) for r in runs))
     terrains = [p.terrain for p in params]
     leaves = [jax.tree.leaves(t) for t in terrains]
@@ -295,14 +249,7 @@ def stack_logs(
         commands=np.stack([_padded(r.commands, length) for r in runs]),
         motion={name: np.stack([r.motion[name] for r in runs]) for name in runs[0].motion},
         modes=modes,
-        seen={name: _level([r.seen[name] for r in runs], length // program.segment) for name in runs[0].seen},
-        window=window,
     )
-
-
-def _level(seen: Sequence[np.ndarray], pieces: int) -> np.ndarray:
-    """(logs, pieces, ...) of arrays (pieces, ...), NaN beyond their ends."""
-    return np.stack([np.concatenate([a, np.full((pieces - len(a), *a.shape[1:]), np.nan)]) for a in seen])
 
 
 def cores() -> int:

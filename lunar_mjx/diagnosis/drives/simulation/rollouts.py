@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from lunar_mjx.diagnosis.drives.simulation.log_run import PIECE, READS_BEFORE, LogRun, log_run
+from lunar_mjx.diagnosis.drives.simulation.log_run import READS_BEFORE, LogRun, log_run
 from lunar_mjx.diagnosis.drives.simulation.program import Logs, Program, Rows, cores, stack_logs
 from lunar_mjx.diagnosis.drives.simulation.simulated_rows import stamp
 from lunar_mjx.dynamics.state import Ambient, Params
@@ -47,20 +47,10 @@ class Bench:
     Args:
       model: under no log's conditions. logs: of one rover. chunk: rovers simulated at once. engine: of the dynamics.
       like: bench of a model with the same time step, whose commands and starts are the same.
-      window: s after which simulations resume from the measured state; 0 for never.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        logs: Sequence[Log],
-        chunk: int | None,
-        engine: str,
-        like: Bench | None = None,
-        window: float = 0.0,
-    ):
+    def __init__(self, model: Model, logs: Sequence[Log], chunk: int | None, engine: str, like: Bench | None = None):
         self.logs, self.model, self.engine = tuple(logs), model, engine
-        self.window = (max(1, round(window / PIECE)) if window > 0.0 else 0) if like is None else like.window
         self.chunk = chunk or CHUNK.get(jax.default_backend(), 64)
         from lunar_mjx.logs import log_model
 
@@ -76,7 +66,7 @@ class Bench:
     def halved(self) -> Bench:
         """A bench of these logs that simulates with half the time step."""
         other = Bench.__new__(Bench)
-        other.logs, other.engine, other.chunk, other.window = self.logs, self.engine, self.chunk, self.window
+        other.logs, other.engine, other.chunk = self.logs, self.engine, self.chunk
         other.model = self.model.replace(timestep=0.5 * self.model.timestep)
         other.runs = [
             # Twice as many steps a command: it lasts as long in seconds.
@@ -93,8 +83,7 @@ class Bench:
             (r.commands, dict(r.start), dict(r.motion), r.begin, r.end, r.every, r.imu, r.ground and r.ground.modes)
             for r in self.runs
         ]
-        resumed = [dict(r.seen) for r in self.runs] if self.window else []
-        return *(logs.program.number for logs in self._groups()), stamp(self.params, given, self.window, resumed)
+        return *(logs.program.number for logs in self._groups()), stamp(self.params, given)
 
     def channels(self, number: int) -> list[str]:
         """Channels of a log that the model gives, in a fixed order."""
@@ -137,7 +126,7 @@ class Bench:
             self._stacked = []
             for n in groups.values():
                 runs, params = [self.runs[i] for i in n], [self.params[i] for i in n]
-                self._stacked.append(stack_logs(self._program(n[0]), n, runs, params, self.window))
+                self._stacked.append(stack_logs(self._program(n[0]), n, runs, params))
         return self._stacked
 
     def run(
