@@ -167,7 +167,10 @@ def trial_words(path: Path, policy: Policy) -> tuple[dict[str, Any], dict[str, l
 
 
 def escape_words(path: Path, policy: Policy) -> tuple[dict[str, Any], dict[str, list[str]]]:
-    """The same of a policy of part `escape`, which `lunar-mjx train` wrote into a folder beside the record."""
+    """Words of the card of a policy of part `escape`, and the cells of its table's rows by agent.
+
+    `lunar-mjx train` wrote the policy into a folder beside the record.
+    """
     record, run = read(path.parents[1] / "escape.json"), read(path.with_name("curve.json"))
     preset, rows = policy.environment["options"]["preset"], record["rows"]
     assert run["rows"][-1]["steps"] == policy.notes["steps"], f"{path}: not the policy that the training ended with"

@@ -40,9 +40,9 @@ class Conclusion:
 
 
 def helps(names: Sequence[str]) -> str:
-    """That some effects help beside something unlisted, in words; nothing of none.
+    """A sentence that effects help beside something unlisted, with a space before it; empty without effects.
 
-    How much of them is real, no hypothesis tells.
+    How much of each effect is real, no hypothesis tells.
     """
     return f" Beside it {_list(names)} {'help' if len(names) > 1 else 'helps'}." if names else ""
 
