@@ -157,6 +157,7 @@ class DriveForm(MeasuredForm):
         kinds = [usual_kind(c) for c in self.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
         self._slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = {}
+        self._frame: tuple[np.ndarray, np.ndarray] | None = None  # what moves at the base, and derivatives by it
         self._sizes: tuple[np.ndarray, np.ndarray] | None = None
         self.start = self.origin()  # where the first refit begins
         self.kept: Mapping[str, Any] = {}  # what `learnt` told of that place; then it has been refitted already
@@ -499,10 +500,10 @@ class DriveForm(MeasuredForm):
         Raises:
           TimeUp: before the refit had ended; that of the model as it is counts from wherever it has come.
         """
-        if frozenset() not in self._slopes:
+        if self._frame is None:
             if effects:
                 raise EvidenceError("the model as it is has not been refitted")
-            return self._own_refit()
+            start = self._own_refit()
         free = self._free(effects)
         u = self.origin()
         u[self.drives.ground] = self._base[self.drives.ground]
@@ -518,13 +519,9 @@ class DriveForm(MeasuredForm):
         terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
         best: tuple[float, np.ndarray, np.ndarray, Linear] | None = None
         for number in range(self.settings.most_rounds):
-            guessed = number == 0 and bool(effects)
-            u, slopes, promised = self._descend(u, free, sizes, slopes, guessed=guessed)
+            u, slopes = self._descend(u, free, sizes, slopes, guessed=number == 0 and bool(effects))
             try:
-                # An effect is credited with what its refit has reached, not with what slopes promise that no step has
-                # kept. The model as it is keeps its promise: what a descent that ended early has left is no effect's
-                # gain.
-                linear = self._linear(u, effects, slopes, 0.5 * promised if effects else 0.0)
+                linear = self._reached(u, effects, free, slopes)
                 value, found, _ = linear.evidence(terms, sizes)
             except EvidenceError:
                 # A place of which nothing can be told is not gone to; the one before it stands.
@@ -542,8 +539,34 @@ class DriveForm(MeasuredForm):
         self._slopes[effects] = free, slopes
         return Refit(self.name, effects, u, linear)
 
-    def _own_refit(self) -> Refit:
-        """The first refit: of the model as it is, with the errors that all hypotheses are weighed with.
+    def _reached(self, u: np.ndarray, effects: frozenset[str], free: np.ndarray, slopes: np.ndarray) -> Linear:
+        """What hypotheses need around the place of a refit, all with one discrepancy: that of the model as it is.
+
+        Derivatives of all but the effects' own are those at the base, since they jump from one place to the next. On a
+        foreign campaign of a Husky, places within a tenth of a posterior standard deviation of the base had evidences
+        264 to 405 nats below it with derivatives of their own, and 32 to 42 with the base's.
+        What derivatives promise beyond the place, which no step has kept, is credited to none.
+
+        Args:
+          u: the place. effects: of the refit. free, slopes: as for `_descend`.
+        """
+        assert self._frame is not None
+        framed, own = slopes.copy(), np.isin(free, self._frame[0])
+        framed[:, own] = self._frame[1]
+        linear = self._linear(u, effects, framed)
+        found = linear.evidence(self.listed(effects), self._sizes)[1]
+        cost = self._cost(u, free, (found.tau, found.noise), self._frame_inputs)
+        return dataclasses.replace(linear, unkept=0.5 * self._promise(cost, u, free, framed))
+
+    @property
+    def _frame_inputs(self) -> np.ndarray | None:
+        """(n, discrepancy) derivatives at the base; None where it has not been refitted."""
+        return None if self._frame is None else self._inputs(*self._frame)
+
+    def _own_refit(self) -> np.ndarray:
+        """(coordinates,) where the model as it is explains most, with the errors that all hypotheses are weighed with.
+
+        Derivatives there are the discrepancy of all hypotheses.
 
         Raises:
           EvidenceError, TimeUp: as for `refit`.
@@ -577,10 +600,11 @@ class DriveForm(MeasuredForm):
             u = self._approach(u, free)
         slopes = self._look(u, free)
         assert self._sizes is not None
-        self._slopes[frozenset()], self._base = (free, slopes), u
+        self._frame = self._slopes[frozenset()] = free, slopes
+        self._base = u
         if self.candidates:
             self._choose_signatures(u, free, slopes, self._sizes)
-        return Refit(self.name, frozenset(), u, self._linear(u, frozenset(), slopes))
+        return u
 
     def _approach(self, u: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Moves the model as it is to where its evidence is highest, errors and sizes with it.
@@ -643,8 +667,7 @@ class DriveForm(MeasuredForm):
         rows = np.stack([start, there, there])
         own = np.setdiff1d(free, self._free(frozenset()))
         rows[2, own] = start[own]
-        inputs = self._inputs(*self._slopes[near.effects])
-        cost = self._cost(near.u, free, self._sizes_of(near), inputs)
+        cost = self._cost(near.u, free, self._sizes_of(near), self._frame_inputs)
         return self._least(cost, rows, free)
 
     def alone(self, refit: Refit) -> np.ndarray:
@@ -878,9 +901,8 @@ class DriveForm(MeasuredForm):
         slopes: np.ndarray | None = None,
         guessed: bool = False,
         once: bool = False,
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """The most probable coordinates at given sizes of discrepancy and noise, the derivatives near them, and the
-        decrease of chi-square that these still promise.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The most probable coordinates at given sizes of discrepancy and noise, and the derivatives near them.
 
         Args:
           u: (coordinates,) where from. free: places of what moves.
@@ -895,8 +917,7 @@ class DriveForm(MeasuredForm):
         if slopes is None:
             slopes = self.jacobian(u, free)[1]
         settings, damping = self.settings, DRIVE_REFIT.damping
-        moved = sizes is not None and bool(np.isin(self.discrepancy, free).all())
-        cost = self._cost(u, free, sizes, self._inputs(free, slopes) if moved else None)
+        cost = self._cost(u, free, sizes, None if sizes is None else self._frame_inputs)
         settled = settings.settled
         if once:
             settled = max(settled, DRIVE_REFIT.visible * cost.chi2(self._left(cost, u), u[free]))
@@ -911,7 +932,7 @@ class DriveForm(MeasuredForm):
         except TimeUp:
             if not set(self._free(frozenset())) >= set(free):
                 raise
-        return u, slopes, self._promise(cost, u, free, slopes)
+        return u, slopes
 
     def _renewed(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> np.ndarray:
         """(n, free) derivatives at a place, of which those by ground are the ones that are known.

@@ -732,6 +732,20 @@ def test_an_effect_is_credited_with_what_its_refit_has_reached():
     assert lavish == pytest.approx(plain - 7.0)
 
 
+def test_slopes_of_a_place_do_not_change_what_is_told_of_it():
+    """Slopes across jumps, where wheels stick, differ at random; what hypotheses are weighed by must not."""
+    form = DriveForm(Rough({"a": 1.5, "b": -0.8}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    free = form._free(frozenset())
+    framed, own = [], []
+    for step in np.linspace(3e-4, 3e-3, 8):
+        slopes = form.drives.jacobian(base.u, free, steps=np.full(len(base.u), step))[1]
+        framed.append(form._reached(base.u, frozenset(), free, slopes).evidence(frozenset(), form._sizes)[0])
+        own.append(form._linear(base.u, frozenset(), slopes).evidence(frozenset(), form._sizes)[0])
+    assert np.ptp(framed) < 1e-9
+    assert np.ptp(own) > 1.0
+
+
 def test_a_refit_begins_where_the_model_itself_is_best():
     """An estimate that leads far from what it was made around is not where its refit begins."""
     form = DriveForm(Toy({"a": 0.8, "drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
@@ -781,7 +795,7 @@ def test_a_place_of_which_nothing_can_be_told_is_not_gone_to(monkeypatch):
     candidates, form.candidates = form.candidates, {}
     base = form.refit(frozenset(), None, None)
     form.candidates = candidates
-    assert len(looked) == 3 and base.u is looked[1]
+    assert len(looked) == 3 and form._base is looked[1]
     told, linear = [], DriveForm._linear
 
     def steep_again(self, u, *rest):
