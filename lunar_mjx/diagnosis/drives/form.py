@@ -86,9 +86,9 @@ DRIVE_REFIT = DriveRefit()
 class DriveForm(MeasuredForm):
     """A rover's model against drives.
 
-    Derivatives are difference quotients between rovers of one batch. Those of the model's own parameters, of
-    unknown inputs and of the effects in a refit are taken where it stands; those of other candidates once, where the
-    model as it is has been refitted.
+    Derivatives are difference quotients between rovers of one batch. Those that lead a descent are taken where it
+    stands. Hypotheses are weighed with those at one place, where the descent of the model as it is has learnt its
+    errors, but for those of a refit's own effects.
     """
 
     def __init__(
@@ -500,7 +500,8 @@ class DriveForm(MeasuredForm):
         Raises:
           TimeUp: before the refit had ended; that of the model as it is counts from wherever it has come.
         """
-        if self._frame is None:
+        first = self._frame is None
+        if first:
             if effects:
                 raise EvidenceError("the model as it is has not been refitted")
             start = self._own_refit()
@@ -519,7 +520,8 @@ class DriveForm(MeasuredForm):
         terms, sizes = self.listed(effects), self._sizes if near is None else self._sizes_of(near)
         best: tuple[float, np.ndarray, np.ndarray, Linear] | None = None
         for number in range(self.settings.most_rounds):
-            u, slopes = self._descend(u, free, sizes, slopes, guessed=number == 0 and bool(effects))
+            guessed = number == 0 and bool(effects)
+            u, slopes = self._descend(u, free, sizes, slopes, guessed=guessed, whole=not first)
             try:
                 linear = self._reached(u, effects, free, slopes)
                 value, found, _ = linear.evidence(terms, sizes)
@@ -537,15 +539,16 @@ class DriveForm(MeasuredForm):
         assert best is not None
         _, u, slopes, linear = best
         self._slopes[effects] = free, slopes
+        if first:
+            self._base = u
         return Refit(self.name, effects, u, linear)
 
     def _reached(self, u: np.ndarray, effects: frozenset[str], free: np.ndarray, slopes: np.ndarray) -> Linear:
         """What hypotheses need around the place of a refit, all with one discrepancy: that of the model as it is.
 
-        Derivatives of all but the effects' own are those at the base, since they jump from one place to the next. On a
-        foreign campaign of a Husky, places within a tenth of a posterior standard deviation of the base had evidences
-        264 to 405 nats below it with derivatives of their own, and 32 to 42 with the base's.
-        What derivatives promise beyond the place, which no step has kept, is credited to none.
+        Derivatives of all but the effects' own are those at the base. They jump from one place to the next, so that two
+        places which predict alike would have evidences hundreds of nats apart. What derivatives promise beyond the
+        place, which no step has kept, is credited to none.
 
         Args:
           u: the place. effects: of the refit. free, slopes: as for `_descend`.
@@ -688,7 +691,7 @@ class DriveForm(MeasuredForm):
             return float(np.nan_to_num(left @ left, nan=np.inf) + np.sum(((u[free] - centre) / self._std[free]) ** 2))
 
         starts = [u for u in (fitted, given) if math.isfinite(cost(u))]
-        return min((self._descend(u, free, once=True)[0] for u in starts), key=cost)
+        return min((self._descend(u, free, once=True, whole=bool(refit.effects))[0] for u in starts), key=cost)
 
     def _learn_errors(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray) -> _Learnt:
         """Takes errors of channels of the most probable sizes, and sizes of what is usual, with errors of single
@@ -901,6 +904,7 @@ class DriveForm(MeasuredForm):
         slopes: np.ndarray | None = None,
         guessed: bool = False,
         once: bool = False,
+        whole: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
         """The most probable coordinates at given sizes of discrepancy and noise, and the derivatives near them.
 
@@ -908,11 +912,11 @@ class DriveForm(MeasuredForm):
           u: (coordinates,) where from. free: places of what moves.
           sizes: None for noise alone.
           slopes: (n, free) derivatives, if known. guessed: whether these are to be taken anew before the end.
-          once: whether no others than these are taken.
+          once: whether no others than these are taken. whole: whether a descent that the time cuts short is none.
 
         Raises:
           EvidenceError: the simulation diverged at the start.
-          TimeUp: before the descent of some effects had ended, or before that of the model as it is had begun.
+          TimeUp: before the descent had begun, or had ended where it has to be `whole`.
         """
         if slopes is None:
             slopes = self.jacobian(u, free)[1]
@@ -930,7 +934,7 @@ class DriveForm(MeasuredForm):
                     break
                 slopes, guessed = self._renewed(u, free, slopes), False
         except TimeUp:
-            if not set(self._free(frozenset())) >= set(free):
+            if whole:
                 raise
         return u, slopes
 

@@ -317,7 +317,8 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         sentence += " The search ended by its time or its number of refits: what it did not refit is an estimate."
     skipped = problem.own.skipped
     if not found.complete:
-        conclusion, sentence = _unrefitted(conclusion, sentence, [h.effects for h in found.hypotheses if h.refitted])
+        refitted = [h.effects for h in found.hypotheses if h.refitted]
+        conclusion, sentence = _unrefitted(conclusion, sentence, refitted, found.unchallenged)
     if skipped:
         conclusion, sentence = _without(conclusion, sentence, skipped)
     held = account(_held_out(found, best, own))
@@ -372,11 +373,18 @@ def _without(said: Conclusion, sentence: str, skipped: Sequence[str]) -> tuple[C
     return said, "Of what was looked at: " + sentence + skipped_sentence
 
 
-def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]]) -> tuple[Conclusion, str]:
-    """A conclusion and its sentence where time or refits did not suffice for a refit with all that it names.
+def _unrefitted(
+    said: Conclusion, sentence: str, refitted: Sequence[frozenset[str]], unchallenged: frozenset[str]
+) -> tuple[Conclusion, str]:
+    """A conclusion and its sentence where time or refits did not suffice for what a name needs.
 
+    That is a refit with all that it names, and one without each effect from where that had ended.
     A first-order estimate about a model that misfits by many sigma is no name: on seven foreign campaigns of drives
-    whose searches ended so, six such names were wrong, each with more than 99 %.
+    whose searches ended so, six such names were wrong, each with more than 99 %. Nor is a refit by itself one: it may
+    have gone on where the descent without the effect had stopped.
+
+    Args:
+      said, sentence: what was concluded. refitted: sets of effects. unchallenged: see `ModelSearch`.
     """
     named = {e for e in said.effects if not e.startswith("calibration: ")}
     if said.verdict is Verdict.UNKNOWN and (estimates := named.difference(*refitted)):
@@ -388,12 +396,16 @@ def _unrefitted(said: Conclusion, sentence: str, refitted: Sequence[frozenset[st
         )
         rest = tuple(e for e in said.effects if e not in estimates)
         return dataclasses.replace(said, effects=rest, sentence=told), told + sentence.removeprefix(said.sentence)
-    if said.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE) or any(named <= effects for effects in refitted):
+    if said.verdict not in (Verdict.KNOWN, Verdict.MULTIPLE):
         return said, sentence
-    told = (
-        f"A first-order estimate points to {' and '.join(sorted(named))}. No refit with it was made, so nothing is "
-        "named; give more --seconds, or name the candidates with --only."
-    )
+    if not any(named <= effects for effects in refitted):
+        told = f"A first-order estimate points to {' and '.join(sorted(named))}. No refit with it was made"
+    elif doubtful := sorted(named & unchallenged):
+        told = f"A refit points to {' and '.join(sorted(named))}. From where it ended none was made without "
+        told += " and none without ".join(doubtful)
+    else:
+        return said, sentence
+    told += ", so nothing is named; give more --seconds, or name the candidates with --only."
     taken_back = {"verdict": Verdict.UNDECIDABLE, "effects": (), "further": (), "probability": 0.0, "sentence": told}
     return dataclasses.replace(said, **taken_back), told + sentence.removeprefix(said.sentence)
 

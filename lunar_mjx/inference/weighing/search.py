@@ -93,6 +93,7 @@ class ModelSearch:
       hypotheses: all that were evaluated, most probable first. probability: of each, together 1.
       refits: made. failed: "form with effects: reason" of each refit whose solver failed.
       complete: whether no hypothesis near the best was left without a refit.
+      unchallenged: effects of the best refit without which none was made from where that had ended.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -100,6 +101,7 @@ class ModelSearch:
     refits: int
     failed: tuple[str, ...]
     complete: bool
+    unchallenged: frozenset[str] = frozenset()
 
     @property
     def best(self) -> Hypothesis:
@@ -290,6 +292,8 @@ class _Search:
             if not self.known:
                 raise
             self.over = True
+            if near is not None:
+                self.begun.discard((*key, near.refit.effects))  # what was begun and not ended challenges nothing
             return
         # A solver that fails says nothing against a hypothesis: it is recorded and the search goes on.
         except (EvidenceError, ValueError, np.linalg.LinAlgError) as error:
@@ -357,7 +361,11 @@ class _Search:
         order = sorted(alive, key=lambda h: -h.log_posterior)
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
-        return ModelSearch(tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete)
+        leads = next((h for h in order if h.refitted), None)
+        unchallenged = leads.effects - self.challenged(leads.form) if leads else frozenset[str]()
+        return ModelSearch(
+            tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete, unchallenged
+        )
 
     def untried(self, best: Hypothesis) -> list[str]:
         """Effects that no refit has tried beside the best listed set, the one with the best linear estimate first.

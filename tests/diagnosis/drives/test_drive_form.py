@@ -458,20 +458,58 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     assert found.refits == 1
     assert said.effects == ("drag",), "the linear estimate tells it, too"
     refitted = [h.effects for h in found.hypotheses if h.refitted]
-    told, sentence = _unrefitted(said, said.sentence, refitted)
+    told, sentence = _unrefitted(said, said.sentence, refitted, frozenset())
     assert (told.verdict, told.effects) == (Verdict.UNDECIDABLE, ())
     assert sentence.startswith("A first-order estimate points to drag. No refit with it was made")
     assert "%" not in sentence and "is missing" not in sentence
-    assert _unrefitted(said, said.sentence, [*refitted, frozenset({"drag", "lag"})]) == (said, said.sentence)
+    refitted.append(frozenset({"drag", "lag"}))
+    assert _unrefitted(said, said.sentence, refitted, frozenset({"lag"})) == (said, said.sentence)
     # beside something unlisted it is no name either, and the port stands
     both = ("drag", "lag")
     beside = Conclusion(Verdict.UNKNOWN, both, True, "soil", 0.99, "It acts at soil." + helps(both), helping=both)
     assert beside.sentence.endswith(" Beside it drag and lag help.")
-    told, sentence = _unrefitted(beside, beside.sentence + " More.", [frozenset({"lag"})])
+    told, sentence = _unrefitted(beside, beside.sentence + " More.", [frozenset({"lag"})], frozenset())
     assert (told.verdict, told.effects, told.port) == (Verdict.UNKNOWN, ("lag",), "soil")
     # what a refit has held is still said to help
     assert sentence.startswith("It acts at soil. Beside it lag helps. A first-order estimate points to drag beside it,")
     assert sentence.endswith(" More.")
+
+
+class Stopped(Toy):
+    """A toy whose time can be over."""
+
+    over = False
+
+    def predict(self, u):
+        if self.over:
+            raise TimeUp
+        return super().predict(u)
+
+
+def test_a_name_without_its_challenge_is_none():
+    """A refit goes on where that without the effect had stopped: until both have, the effect has earned nothing."""
+    toy = Stopped({"a": 0.5, "drag": 0.9})
+    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    refit = form.refit
+
+    def hurried(effects, near, start):
+        toy.over = not effects and near is not None
+        try:
+            return refit(effects, near, start)
+        finally:
+            toy.over = False
+
+    form.refit = hurried  # type: ignore[method-assign]
+    settings = form.settings
+    found = search([form], settings.most_refits, settings.most_terms, settings.window)
+    assert not found.complete and found.refits == 2
+    assert found.unchallenged == {"drag"}, "a challenge that was cut is none"
+    problem = Problem((form,), dict.fromkeys(form.candidates, CATALOGUE["slip_sinkage"]), (), settings)
+    said = _diagnosis(problem, found, found.best)
+    assert (said.verdict, said.effects) == (Verdict.UNDECIDABLE, ())
+    assert said.sentence.startswith(
+        "A refit points to drag. From where it ended none was made without drag, so nothing"
+    )
 
 
 def test_an_estimate_is_no_name_where_candidates_were_skipped_as_well(monkeypatch):
@@ -792,10 +830,16 @@ def test_a_place_of_which_nothing_can_be_told_is_not_gone_to(monkeypatch):
         return learn(self, u, free, slopes)
 
     monkeypatch.setattr(DriveForm, "_learn_errors", steep)
+    starts, descend = [], DriveForm._descend
+    monkeypatch.setattr(
+        DriveForm, "_descend", lambda self, u, *a, **k: (starts.append(u), descend(self, u, *a, **k))[1]
+    )
     candidates, form.candidates = form.candidates, {}
     base = form.refit(frozenset(), None, None)
     form.candidates = candidates
-    assert len(looked) == 3 and form._base is looked[1]
+    # the first descent is that of the instruments
+    assert len(looked) == 3 and np.allclose(starts[1], looked[1], atol=1e-8)
+    assert not np.allclose(starts[1], looked[2], atol=1e-3)
     told, linear = [], DriveForm._linear
 
     def steep_again(self, u, *rest):
