@@ -976,7 +976,10 @@ class DriveForm(MeasuredForm):
         Raises:
           EvidenceError: the simulation diverged at the start.
         """
-        # Slopes of instruments hold however far they move, and scales of inputs are another rover's.
+        # Slopes of instruments hold however far they move, and scales of inputs are another rover's. The others have a
+        # box about the place: were the whole step shortened until the longest of them fits, one that does almost
+        # nothing, and so has far to go, would hold back all.
+        longest = self.settings.longest_step
         linear = np.array([is_linear(self.coordinates[i]) for i in free], bool)
         scaled = (self._field_of[free] < 0) & ~linear
         low, high = self.drives.bounds(free)
@@ -989,11 +992,11 @@ class DriveForm(MeasuredForm):
         while True:
             downhill = cost.inner(jacobian, residual) - (u[free] - cost.centre) / cost.std**2
             dampings = damping * np.array(DRIVE_REFIT.factors[:trials])
+            near = np.where(scaled, np.maximum(low, u[free] - longest), low)
+            far = np.where(scaled, np.minimum(high, u[free] + longest), high)
             steps = [
-                _bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], low, high) for d in dampings
+                _bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], near, far) for d in dampings
             ]
-            longest = self.settings.longest_step
-            steps = [s * min(1.0, longest / max(float(np.abs(s[scaled]).max(initial=0.0)), 1e-300)) for s in steps]
             # Shorter ones promise less: there is nothing left to gain where these slopes hold.
             if _promised(steps[0], normal, downhill) < settled:
                 break

@@ -135,6 +135,28 @@ def test_a_descent_ends_where_jumps_hide_what_its_slopes_promise():
     assert toy.rows < 100
 
 
+class Faint(Toy):
+    """A toy one of whose parameters does next to nothing, and has a hundred thousand scales to go."""
+
+    def __init__(self, truth: dict[str, float]):
+        super().__init__(truth)
+        own = list(self.coordinates)
+        own[1] = dataclasses.replace(own[1], prior=1e6)
+        self.coordinates = tuple(own)
+
+    def predict(self, u):
+        u = np.atleast_2d(u).copy()
+        u[:, 1] *= 1e-5
+        return super().predict(u)
+
+
+def test_a_parameter_that_does_next_to_nothing_holds_back_no_other():
+    """With steps shortened until the longest coordinate fits, `a` had not left its start."""
+    form = DriveForm(Faint({"a": 1.5, "b": 1.5e5}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    assert base.u[0] == pytest.approx(1.5, abs=0.3)
+
+
 def test_a_model_that_only_needs_a_refit_lacks_nothing():
     form, found, said = asked(Toy({"a": 1.5, "b": -0.8}))
     assert said.verdict is Verdict.NOISE_ONLY, said.sentence
