@@ -275,6 +275,7 @@ def rover_info(model: Model) -> RoverInfo:
     limits = np.array([rover.joint_limits[j] for j in rover.joints], float)
     points = np.asarray(rover.chassis_points, float)
     compiled = rover.compile()
+    dofs = [compiled.joint(j).dofadr[0] for j in rover.joints]
     center, half = chassis_boxes(compiled, compiled.body(rover.chassis).id)
     return RoverInfo(
         wheel_radius=np.array([w.radius for w in rover.wheels]),
@@ -288,8 +289,9 @@ def rover_info(model: Model) -> RoverInfo:
         chassis_points=Vec3(*points.T),
         box_center=Vec3(*center.T) if len(center) else None,
         box_half=Vec3(*half.T) if len(half) else None,
-        # MuJoCo's inverse weight is the joint's own inverse inertia in the whole mechanism at the reference pose.
-        joint_inertia=1.0 / compiled.dof_invweight0[[compiled.joint(j).dofadr[0] for j in rover.joints]],
+        # MuJoCo's inverse weight is the joint's own inverse inertia in the whole mechanism at the reference pose, to
+        # which the drawn rotor adds. The model's rotor may have another inertia.
+        joint_inertia=1.0 / compiled.dof_invweight0[dofs] - compiled.dof_armature[dofs],
         name=rover.name,
     )
 

@@ -75,3 +75,21 @@ def test_a_rover_stands_alike_after_alike_touchdowns():
     _, speeds = _parked()
     bends = np.abs(np.diff(speeds[3:], 2, axis=0)).max()
     assert 0.0 < bends < 5e-4
+
+
+def test_stiff_soil_does_not_shake_a_rover_that_stops():
+    """A drive cannot follow soil that is stiff and damps for long: its wheels had gone to and fro at 0.2 rad/s.
+
+    Parameters are such as refits try, within what is usual of each.
+    """
+    model = make_model("husky", terrain="flat", preset="consistent")
+    rotor = 0.3 * np.asarray(model.parameters["motor"]["rotor_inertia"])
+    model = model.set("motor", rotor_inertia=tuple(rotor)).set("shear_state", relaxation=0.14)
+    with jax.enable_x64(True):
+        system = build(model)
+        params = default_params(model)
+        commands = jnp.zeros((750, len(system.joint_names))).at[100:300].set(0.5)
+        start = system.reset(params)
+        speed = jax.device_get(jax.jit(system.rollout)(params, start, commands)[1].joint_speed)
+    assert np.abs(speed[300:]).max() > 0.1
+    assert np.abs(speed[-100:]).max() < 0.02

@@ -36,7 +36,12 @@ def _step(
     normal = functools.partial(type(normal), THETA_1 + zero, zero, THETA_1 / 2 + zero)(zero, zero, zero, zero)
     soil = dataclasses.replace(initial_soil(v_x), rock=rock)
     ctx = bare_context(
-        dt=dt, contact=contact, normal=normal, soil=soil, geometry=nominal_geometry(rover_info(RADIUS + zero, zero))
+        dt=dt,
+        contact=contact,
+        normal=normal,
+        soil=soil,
+        geometry=nominal_geometry(rover_info(RADIUS + zero, zero)),
+        rover=rover_info(RADIUS + zero, zero),
     )
     parameters = SimpleNamespace(**{**shear_state.nominal(), "damping_time": damping_time, "relaxation": relaxation})
     first = initial_wheel(contact)

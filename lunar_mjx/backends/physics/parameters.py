@@ -73,7 +73,8 @@ class Numbers:
       chassis_points: (point, 3) m, where the chassis can touch the ground, in its frame.
       box_center, box_half: (box, 3) m, the chassis' bounding boxes in its frame.
       feet: (wheel, 3) m, wheel centres in the chassis frame at zero joint angles.
-      standing_height: m. joint_inertia: torque per acceleration of each joint of the rover as drawn, (joint,) kg m2.
+      standing_height: m. joint_inertia: torque per acceleration of each joint of the rover as drawn, without
+        rotors, (joint,) kg m2.
     """
 
     effects: dict[str, SimpleNamespace]
@@ -145,6 +146,7 @@ def read_numbers(model: Model, backend: str = "backend") -> Numbers:
     kinds = ("drive", "steer", "suspension")
     limits = np.array([rover.joint_limits[j] for j in rover.joints], float)
     compiled = rover.compile()
+    dofs = [compiled.joint(j).dofadr[0] for j in rover.joints]
     center, half = _boxes(compiled, rover.chassis)
     noon, night, noon_time, period = model.ambient
     return Numbers(
@@ -168,7 +170,7 @@ def read_numbers(model: Model, backend: str = "backend") -> Numbers:
         box_half=half,
         feet=_feet(compiled, rover),
         standing_height=float(rover.standing_height),
-        joint_inertia=1.0 / compiled.dof_invweight0[[compiled.joint(j).dofadr[0] for j in rover.joints]],
+        joint_inertia=1.0 / compiled.dof_invweight0[dofs] - compiled.dof_armature[dofs],
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from lunar_mjx.backends.physics.contact import faster, side_speed
 from lunar_mjx.backends.physics.context import Context, Values
+from lunar_mjx.backends.physics.motor import largest_damping
 from lunar_mjx.backends.physics.vectors import clamp
 
 
@@ -25,6 +26,8 @@ class ClosedForm:
     deep: float = 1.5
     shortest: float = 0.05
     """Contact length, in radii, below which soil is too little touched to remember by how far it was sheared."""
+    damped: float = 0.4
+    """Share of J/dt that a wheel's damping by its sheared soil keeps below."""
 
 
 CLOSED_FORM = ClosedForm()
@@ -153,9 +156,9 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     contact, r = c.contact, c.geometry["radius"]
     theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
     # Plain differences: float64 has digits to spare, and the formula stays the source's.
-    length = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), CLOSED_FORM.shortest * r)
+    arc = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), CLOSED_FORM.shortest * r)
     # rock has no arc in the ground over which shear could build up: bristles take the place of soil
-    length = np.where(c.soil["rock"] > 0.5, p.rock_length, p.relaxation * length)
+    length = np.where(c.soil["rock"] > 0.5, p.rock_length, p.relaxation * arc)
     roll = faster(contact["rim_speed"], contact["v_x"])
     speed = np.abs(roll)
     share = speed / length
@@ -164,7 +167,13 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     # Divided by below; in float64 this is zero for all that matters.
     turned = np.maximum(share * c.dt, 1e-200)
     gain = -np.expm1(-turned) / turned / length
-    damped = p.damping_time * np.exp(-share * p.damping_time)
+    # soil that is stiffer than the drives' inertia takes in a step damps for a shorter time
+    area = c.geometry["width"] * r * theta_1
+    stiffness = c.soil["cohesion"] * area + c.normal["load"] * c.soil["tan_phi"]
+    stiffness = stiffness * arc / (c.soil["shear_modulus_x"] * length)
+    most = np.min(largest_damping(c)[c.numbers.group == 0], initial=np.inf)
+    damping_time = np.minimum(p.damping_time, CLOSED_FORM.damped * most / np.maximum(stiffness * r**2, 1e-24))
+    damped = damping_time * np.exp(-share * p.damping_time)
 
     def advance(value: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rate = gain * (source - speed * value)

@@ -1,7 +1,7 @@
 """Friction of bearing and gear at the joints (port `motor_torque`).
 
 Explicit forces of friction must not turn a joint around within a time step: the slope of every friction by speed
-stays below J/dt, J being the joint's inertia (of the rover as drawn, or the rotor's alone where that is unknown). Dry
+stays below J/dt, J being the joint's inertia with its rotor (the rotor's alone where the other is unknown). Dry
 friction is then spread over more speed than its parameter says, and viscous friction is weaker; below these limits
 (friction torque less than J omega_s/dt, damping less than J/dt: for a drive of VIPER 4 N m at 0.02 rad/s and 200 N m
 s/rad at a time step of 2 ms, for one of LUVMI-X 0.6 N m and 30 N m s/rad) nothing is changed. The energy lost here
@@ -18,18 +18,17 @@ from lunar_mjx.effects.base import Parameter, effect
 from lunar_mjx.effects.joint.motor import REFERENCE_TEMPERATURE
 
 _LEAST_INERTIA: Annotated[float, "kg m2"] = 1e-3
-"""kg m2 at a joint without a rotor's inertia."""
+"""kg m2 at a joint that weighs nothing."""
 
 
 def largest_damping(ctx) -> Any:
     """J/dt, N m s/rad: damping that an explicit step still takes without turning the joint around."""
-    motor, inertia = ctx.parameters.get("motor"), _LEAST_INERTIA
-    # the larger of the two: the drawn inertia of a joint may leave out its rotor, and a rotor alone its wheel
+    motor, inertia = ctx.parameters.get("motor"), 0.0
     if motor is not None:
-        inertia = jnp.maximum(motor.rotor_inertia * motor.gear_ratio**2, inertia)
+        inertia = motor.rotor_inertia * motor.gear_ratio**2
     if ctx.rover.joint_inertia is not None:
-        inertia = jnp.maximum(ctx.rover.joint_inertia, inertia)
-    return inertia / ctx.dt
+        inertia = inertia + ctx.rover.joint_inertia
+    return jnp.maximum(inertia, _LEAST_INERTIA) / ctx.dt
 
 
 def speed_sign(ctx, level: Any, scale: Any) -> Any:
