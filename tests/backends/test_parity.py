@@ -15,6 +15,7 @@ from lunar_mjx.backends.parity import compare as parity
 from lunar_mjx.backends.parity.page import verdict, write_parity_page
 from lunar_mjx.backends.parity.record import evaluate
 from lunar_mjx.backends.parity.study import kind_of, make_runner, run_study
+from lunar_mjx.backends.physics import soil
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 
@@ -48,6 +49,22 @@ def test_the_drive_moves_every_stage(luvmi):
     for name, value in least.items():
         assert np.abs(samples.stages[name]).max() > value, name
     assert np.abs(luvmi.of["flat, soft"][0].stages["housing_heat"]).max() > 1e-3
+
+
+def test_soil_too_stiff_for_a_drive_damps_alike(luvmi, monkeypatch):
+    """Little inertia and a short relaxation length: both engines cut the damping time, and by the same."""
+    rotor = np.asarray(luvmi.model.parameters["motor"]["rotor_inertia"])
+    model = luvmi.model.set("motor", rotor_inertia=tuple(0.1 * rotor)).set("shear_state", relaxation=0.05)
+    case = luvmi.cases[0]
+    samples = luvmi.of[case.name][0]
+    native, structured = (
+        runner.step_from(case, samples)[0]["wheel_force"]
+        for runner in (parity.native_runner(model, []), parity.JaxRunner("structured", model))
+    )
+    assert structured == pytest.approx(native, rel=1e-9, abs=1e-9)
+    monkeypatch.setattr(soil, "CLOSED_FORM", dataclasses.replace(soil.CLOSED_FORM, damped=1e9))
+    uncut = parity.native_runner(model, []).step_from(case, samples)[0]["wheel_force"]
+    assert np.abs(uncut - native).max() > 0.1
 
 
 @pytest.mark.parametrize("fault", FAULTS)

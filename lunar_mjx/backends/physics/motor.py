@@ -45,9 +45,9 @@ def winding(motor: SimpleNamespace, temperature: np.ndarray) -> tuple[np.ndarray
 
 def largest_damping(c: Context) -> np.ndarray:
     """J/dt, N m s/rad: the damping that an explicit step takes without turning a joint around."""
-    motor = c.numbers.effects["motor"]
-    rotor = motor.rotor_inertia * motor.gear_ratio**2
-    return np.maximum(c.numbers.joint_inertia, np.maximum(rotor, 1e-3)) / c.dt
+    motor = c.numbers.effects.get("motor")
+    rotor = 0.0 if motor is None else motor.rotor_inertia * motor.gear_ratio**2
+    return np.maximum(c.numbers.joint_inertia + rotor, 1e-3) / c.dt
 
 
 def voltage_limit(c: Context, p: SimpleNamespace, state: Values) -> Values:
