@@ -290,8 +290,8 @@ def rover_info(model: Model) -> RoverInfo:
         box_center=Vec3(*center.T) if len(center) else None,
         box_half=Vec3(*half.T) if len(half) else None,
         # MuJoCo's inverse weight is the joint's own inverse inertia in the whole mechanism at the reference pose, to
-        # which the drawn rotor adds. The model's rotor may have another inertia.
-        joint_inertia=1.0 / compiled.dof_invweight0[dofs] - compiled.dof_armature[dofs],
+        # which the drawn rotor adds. A motor's takes its place.
+        joint_inertia=1.0 / compiled.dof_invweight0[dofs] - ("motor" in model.parameters) * compiled.dof_armature[dofs],
         name=rover.name,
     )
 

@@ -250,8 +250,8 @@ class RoverInfo:
       mode: control mode of each joint: 0 position, 1 velocity, 2 torque, 3 current.
       position_gain: N m/rad. velocity_gain: N m s/rad.
       chassis_points: where the chassis can touch the ground, in its frame, m.
-      joint_inertia: torque per acceleration of each joint of the rover as drawn, without rotors, kg m2; None where
-        unknown.
+      joint_inertia: torque per acceleration of each joint of the rover as drawn, without rotors of motors, kg m2;
+        None where unknown.
       box_center, box_half: centres and half sides of the chassis' boxes, along the axes of its frame, m.
     """
 

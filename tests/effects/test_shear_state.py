@@ -15,7 +15,7 @@ import pytest
 
 from lunar_mjx.effects.context import Contact
 from lunar_mjx.effects.ports import initial_normal, initial_soil, initial_wheel, nominal_geometry
-from lunar_mjx.effects.wheel.closed_form import mean_decay, shear_state
+from lunar_mjx.effects.wheel.closed_form import _longest_damping_time, mean_decay, shear_state
 from lunar_mjx.spatial import Vec3
 from tests.effects.effects_harness import bare_context, rover_info
 
@@ -230,3 +230,20 @@ def test_mean_decay_keeps_its_digits() -> None:
     curve = np.where(q > 1e-4, (np.exp(-extended) * (1 + extended) - 1) / extended**2, -0.5 + extended / 3)
     assert np.max(np.abs(slope[:-1] / curve - 1)) < 1e-7
     assert slope[-1] == pytest.approx(-0.5)
+
+
+def test_derivatives_of_the_damping_time_are_finite_in_the_air_over_soil_without_strength() -> None:
+    """In single precision, where the square of a stiffness that is next to nothing is none."""
+    one = jnp.ones(1, np.float32)
+    info = dataclasses.replace(rover_info(RADIUS * one, one), joint_inertia=one)
+
+    def longest(load: Any) -> Any:
+        normal = dataclasses.replace(initial_normal(one), entrance=THETA_1 * one, theta_m=THETA_1 / 2 * one, load=load)
+        soil = dataclasses.replace(initial_soil(one), cohesion=0.0 * one, tan_phi=one)
+        geometry = nominal_geometry(info)
+        ctx = bare_context(dt=0.002, parameters={}, normal=normal, soil=soil, geometry=geometry, rover=info)
+        return jnp.minimum(0.1, _longest_damping_time(ctx, one, one)).sum()
+
+    assert float(longest(0.0 * one)) == pytest.approx(0.1)
+    assert np.isfinite(jax.grad(longest)(0.0 * one)).all()
+    assert float(longest(1e6 * one)) < 0.1

@@ -74,7 +74,7 @@ class Numbers:
       box_center, box_half: (box, 3) m, the chassis' bounding boxes in its frame.
       feet: (wheel, 3) m, wheel centres in the chassis frame at zero joint angles.
       standing_height: m. joint_inertia: torque per acceleration of each joint of the rover as drawn, without
-        rotors, (joint,) kg m2.
+        rotors of motors, (joint,) kg m2.
     """
 
     effects: dict[str, SimpleNamespace]
@@ -170,7 +170,7 @@ def read_numbers(model: Model, backend: str = "backend") -> Numbers:
         box_half=half,
         feet=_feet(compiled, rover),
         standing_height=float(rover.standing_height),
-        joint_inertia=1.0 / compiled.dof_invweight0[dofs] - compiled.dof_armature[dofs],
+        joint_inertia=1.0 / compiled.dof_invweight0[dofs] - ("motor" in model.parameters) * compiled.dof_armature[dofs],
     )
 
 

@@ -151,7 +151,8 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     """L dk/dt = v_slip - V_r k, exact over a step.
 
     L is the contact length times `relaxation`, and V_r the larger of |r omega| and |v_x|. The force
-    takes k plus `damping_time` times its mean rate, faded by exp(-V_r damping_time/L) when rolling.
+    takes k plus `damping_time` times its mean rate, faded by exp(-V_r damping_time/L) when rolling. On soil the time
+    is cut to what an explicit step takes without shaking a wheel at rest.
     """
     contact, r = c.contact, c.geometry["radius"]
     theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
@@ -172,8 +173,9 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     stiffness = c.soil["cohesion"] * area + c.normal["load"] * c.soil["tan_phi"]
     stiffness = stiffness * arc / (c.soil["shear_modulus_x"] * length)
     most = np.min(largest_damping(c)[c.numbers.group == 0], initial=np.inf)
-    damping_time = np.minimum(p.damping_time, CLOSED_FORM.damped * most / np.maximum(stiffness * r**2, 1e-24))
-    damped = damping_time * np.exp(-share * p.damping_time)
+    longest = CLOSED_FORM.damped * most / np.maximum(stiffness * r**2, 1e-12)
+    damping_time = np.where(c.soil["rock"] > 0.5, p.damping_time, np.minimum(p.damping_time, longest))
+    damped = damping_time * np.exp(-share * damping_time)
 
     def advance(value: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rate = gain * (source - speed * value)

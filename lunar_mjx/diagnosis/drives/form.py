@@ -997,8 +997,9 @@ class DriveForm(MeasuredForm):
             steps = [
                 _bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], near, far) for d in dampings
             ]
-            # Shorter ones promise less: there is nothing left to gain where these slopes hold.
-            if _promised(steps[0], normal, downhill) < settled:
+            # There is nothing left to gain where these slopes hold. (The least damped step need not promise most: in a
+            # box it may even lead uphill, as what it holds at a wall is never let go.)
+            if max(_promised(s, normal, downhill) for s in steps) < settled:
                 break
             rows = np.repeat(u[None], trials, axis=0)
             rows[:, free] = np.clip(u[free] + steps, low, high)

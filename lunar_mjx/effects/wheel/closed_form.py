@@ -223,7 +223,8 @@ def shear_state(ctx, p, x, wheel):
     length model, Bernard & Clover 1995, SAE 950311): k tends to the slip of eq. 8 while rolling, and keeps the
     displacement of a wheel that stands. The same for (1 - s) tan(beta) of eq. 11, and for the direction in which the
     contact leans: that of rim and hub, their sum within V_r where they are opposed. Integrated exactly over a step,
-    hence stable at any speed.
+    hence stable at any speed. The force takes k plus `damping_time` times its rate; on soil for no longer than keeps a
+    wheel at rest from shaking.
     """
     contact = ctx.contact
     rock = ctx.soil.rock > 0.5
@@ -233,9 +234,9 @@ def shear_state(ctx, p, x, wheel):
     roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
     # share of the way to the steady value, over the time that it would take at the first rate
     gained = mean_decay(jnp.abs(roll) * ctx.dt / length) / length
-    held = jnp.exp(-jnp.abs(roll) * p.damping_time / length)
-    lifted = airborne(contact)
     damping_time = jnp.minimum(p.damping_time, _longest_damping_time(ctx, arc, length))
+    held = jnp.exp(-jnp.abs(roll) * damping_time / length)
+    lifted = airborne(contact)
 
     def advance(value, speed):
         # (1 - exp(-V dt/L))/(V dt) in place of 1/L: the exact mean rate over the step, finite where V is 0
@@ -271,7 +272,9 @@ def _longest_damping_time(ctx, arc, length):
     stiffness = strength * arc / (soil.shear_modulus_x * length)
     # the least of all drives, as for the gains: wheels do not know which drive is theirs
     most = jnp.min(jnp.where(ctx.rover.joint_group == 0, largest_damping(ctx), jnp.inf))
-    return CONTACT.damped * most / jnp.maximum(stiffness * radius**2, CONTACT.tiny)
+    # not smaller: the derivative divides by the square, which float32 has to hold
+    longest = CONTACT.damped * most / jnp.maximum(stiffness * radius**2, 1e-12)
+    return jnp.where(soil.rock > 0.5, jnp.inf, longest)
 
 
 def lateral_slip_speed(contact):
