@@ -60,6 +60,13 @@ def drives(args: argparse.Namespace) -> None:
     run_drives(args)
 
 
+def told(args: argparse.Namespace) -> None:
+    """Tells how well who knows the law of a world tells what is hidden in its drives."""
+    from .drive_told import told as tell
+
+    tell(args)
+
+
 def experiments(args: argparse.Namespace) -> None:
     """Follows open verdicts with further sweeps."""
     from .experiments import experiments as follow
@@ -117,6 +124,13 @@ def parser() -> argparse.ArgumentParser:
     driven.add_argument("--cold", action="store_true", help="compile nothing beforehand")
     driven.add_argument("-o", "--out", type=Path, required=True)
     driven.set_defaults(do=drives)
+    known = verbs.add_parser("told", help="how far what is hidden in drives stands out, to who knows the law")
+    known.add_argument("--set", choices=("tune", "report"), required=True)
+    known.add_argument("--drives", type=int, default=24, help="campaigns of the set")
+    known.add_argument("--seed", type=int, help="as for make")
+    known.add_argument("--only", type=int, nargs="*", help="numbers of campaigns, such as 4 23; all if left out")
+    known.add_argument("-o", "--out", type=Path, required=True, help="folder of the set")
+    known.set_defaults(do=told)
     followed = verbs.add_parser("experiments", help="measure what `next` asks for, and ask again")
     followed.add_argument("--set", choices=("tune", "report"), required=True)
     followed.add_argument("--tables", type=int, default=60)

@@ -23,7 +23,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from . import drive_cases, pool, work
+from . import drive_cases, drive_told, pool, work
 from .rovers import ROVERS
 from .score import judge, said
 from .sets import campaign
@@ -51,7 +51,7 @@ def make(job: Job, folder: Path) -> None:
     sealed = folder / "truth" / f"{case.name}.json"
     if sealed.is_file():
         return
-    found, separable = drive_cases.make(case)
+    found, separable = drive_told.make(case)
     drive_cases.write(case, found, folder / "logs" / case.name)
     truth = drive_cases.summary(case) | {"separable": separable, "twins": []}
     sealed.parent.mkdir(parents=True, exist_ok=True)

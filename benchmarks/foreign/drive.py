@@ -83,7 +83,10 @@ class Motors:
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """One rollout: build, motors, ground, commands; soil's constants and damping as factors of the world's."""
+    """One rollout: build, motors, ground, commands; soil's constants as factors of the world's, and damping.
+
+    `misfit`: what is added to the weights of each of the world's fields, by the field's number, shape (2 wave,).
+    """
 
     build: Build
     motors: Motors
@@ -91,11 +94,21 @@ class Setup:
     command: Command
     soil: Mapping[str, float]
     damping: float
+    misfit: Mapping[int, np.ndarray] = dataclasses.field(default_factory=dict)
+
+
+_MISFIT = "misfit "
 
 
 def _rows(world: World, setups: Sequence[Setup]) -> dict[str, Any]:
-    """The soil's constants for every wheel of every rollout, shape (row, 1)."""
-    return {k: np.repeat([v * s.soil.get(k, 1.0) for s in setups], 4)[:, None] for k, v in world.soil.items()}
+    """The soil's constants for every wheel of every rollout, shape (row, 1), and what its misfits have beside the
+    world's, shape (row, 2 wave)."""
+    rows = {k: np.repeat([v * s.soil.get(k, 1.0) for s in setups], 4)[:, None] for k, v in world.soil.items()}
+    for n, field in enumerate(world.fields or ()):
+        if any(n in s.misfit for s in setups):
+            more = [s.misfit.get(n, np.zeros(len(field.weights))) for s in setups]
+            rows[_MISFIT + str(n)] = np.repeat(np.array(more), 4, axis=0)
+    return rows
 
 
 def _settled_motion(
@@ -150,8 +163,8 @@ def _contact(
         x = coordinates(moves.slip, rows.angle, np.ones_like(moves.slip), place[0, 0])[:, :-1]
         rim_place = place[0] / RIM
         pressure, ahead, left = (
-            v * (1.0 + f.by_rows_and_places(x, rim_place))
-            for v, f in zip((pressure, ahead, left), world.fields, strict=True)
+            v * (1.0 + f.by_rows_and_places(x, rim_place, soil.get(_MISFIT + str(n), 0.0)))
+            for n, (v, f) in enumerate(zip((pressure, ahead, left), world.fields, strict=True))
         )
     area = (moves.radius * world.width)[:, None] * rim.weight
     sine, cosine = np.sin(rim.theta), np.cos(rim.theta)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .cases import generator
-from .drive import Ground, Motors, Setup, simulate
+from .drive import Ground, Motors, Setup
 from .laws import GRANULAR_HOLDS
 from .misfit import Field
 from .rovers import CORNERS, ROVERS, Build, Rover
@@ -588,66 +588,6 @@ def _write_toml(
             lines += ["", f"[noise.{channel}]", f"std = {case.stated[quantity(channel)]:.6g}", 'source = "datasheet"']
     lines += ["", "[source]", 'who = "benchmarks.foreign"', 'licence = "CC0-1.0"', 'citation = ""']
     (log / "log.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-BASE = {
-    "linear": ("reece_phi", "friction_angle", "shear_x"),
-    "integral": ("reece_phi", "friction_angle", "shear_x"),
-    "granular": ("grain_stiffness", "rim_friction"),
-}
-
-
-def make(case: Campaign) -> tuple[dict[str, np.ndarray], dict[str, dict[str, float]]]:
-    """The drives of a campaign, and the sigma by which who is told the law separates what is hidden.
-
-    To first order: the difference that the effect makes, less what small changes of the base constants (soil, motor
-    constant, mass) can imitate.
-    """
-    truth = simulate(case.rover, case.world, case.setups, SECONDS)
-    if not case.hidden:
-        return truth, {}
-    bare_world = dataclasses.replace(case.world, effects={})
-    plain = []
-    for s in case.setups:
-        build = dataclasses.replace(s.build, payload=0.0, rotor_share=1.0)
-        if e := case.amounts.get("com_offset"):
-            build = dataclasses.replace(build, com=(build.com[0] - e["x"], build.com[1] - e["y"], build.com[2]))
-        plain.append(dataclasses.replace(s, build=build))
-    step, variants = 0.02, [plain]
-    for key in BASE[case.world.law]:
-        variants.append([dataclasses.replace(s, soil={key: 1.0 + step}) for s in plain])
-    for key in ("constant",):
-        variants.append(
-            [
-                dataclasses.replace(s, motors=dataclasses.replace(s.motors, **{key: getattr(s.motors, key) + step}))
-                for s in plain
-            ]
-        )
-    variants.append(
-        [dataclasses.replace(s, build=dataclasses.replace(s.build, mass=s.build.mass + step)) for s in plain]
-    )
-    every = simulate(case.rover, bare_world, [s for v in variants for s in v], SECONDS)
-    count = len(case.setups)
-    vectors = [
-        _whitened(case, {k: v[i * count : (i + 1) * count] for k, v in every.items()}, False)
-        for i in range(len(variants))
-    ]
-    target = _whitened(case, truth, True)
-    columns = np.stack([(v - vectors[0]) / step for v in vectors[1:]], axis=1)
-    system = np.concatenate([columns, np.eye(columns.shape[1]) / 0.3])
-    right = np.concatenate([target - vectors[0], np.zeros(columns.shape[1])])
-    best = np.linalg.lstsq(system, right, rcond=None)[0]
-    return truth, {case.hidden[0]: {"sigma": float(np.linalg.norm(right - system @ best))}}
-
-
-def _whitened(case: Campaign, found: Mapping[str, np.ndarray], sensors: bool) -> np.ndarray:
-    parts = []
-    for table in channels(case, found, sensors).values():
-        for channel, values in table.items():
-            # Neighbouring samples of one memory count for less.
-            less = np.sqrt((1.0 - case.memory) / (1.0 + case.memory))
-            parts.append((values / case.std[quantity(channel)] * less).ravel())
-    return np.concatenate(parts)
 
 
 def summary(case: Campaign) -> dict[str, Any]:

@@ -41,14 +41,15 @@ class Field:
         half = len(self.waves)
         return np.cos(phase) @ self.weights[:half] + np.sin(phase) @ self.weights[half:]
 
-    def by_rows_and_places(self, row: np.ndarray, place: np.ndarray) -> np.ndarray:
+    def by_rows_and_places(self, row: np.ndarray, place: np.ndarray, more: np.ndarray | float = 0.0) -> np.ndarray:
         """Values (row, place) where all rows have the same places: cos(a + b) taken apart, as a product of matrices.
 
         Args:
           row: all coordinates but the last, shape (row, coordinate - 1). place: the last one, shape (place,).
+          more: what each row's field has beside `weights`, shape (row, 2 wave).
         """
-        half = len(self.waves)
-        even, odd = self.weights[:half], self.weights[half:]
+        half, weights = len(self.waves), self.weights + more
+        even, odd = weights[..., :half], weights[..., half:]
         a, b = row @ self.waves[:, :-1].T, self.waves[:, -1:] * place
         cosine, sine = np.cos(a), np.sin(a)
         return (cosine * even + sine * odd) @ np.cos(b) + (cosine * odd - sine * even) @ np.sin(b)

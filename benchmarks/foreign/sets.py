@@ -52,7 +52,7 @@ def _make_tables(args: argparse.Namespace, folder: Path, seed: int) -> None:
 
 
 def _make_drives(args: argparse.Namespace, folder: Path, seed: int) -> None:
-    from . import drive_cases
+    from . import drive_cases, drive_told
     from .rovers import ROVERS
 
     shipped = [r for r in ROVERS if (ROOT / "models" / r).is_dir()]
@@ -63,7 +63,7 @@ def _make_drives(args: argparse.Namespace, folder: Path, seed: int) -> None:
         if sealed.is_file():
             continue
         case = drive_cases.draw(args.set, seed, number, *job)
-        found, separable = drive_cases.make(case)
+        found, separable = drive_told.make(case)
         drive_cases.write(case, found, folder / "logs" / name)
         truth = drive_cases.summary(case) | {"separable": separable, "twins": []}
         sealed.parent.mkdir(exist_ok=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.foreign import campaigns, drive_cases
+from benchmarks.foreign import campaigns, drive_cases, drive_told
 
 JOB = ("tune", 5, 1, "null", (), "husky")
 
@@ -23,7 +23,7 @@ def test_groups_and_rovers_alternate() -> None:
 
 def test_a_campaign_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
-    monkeypatch.setattr(drive_cases, "make", lambda case: made.append(case) or ({"position": np.zeros((5, 1, 3))}, {}))
+    monkeypatch.setattr(drive_told, "make", lambda case: made.append(case) or ({"position": np.zeros((5, 1, 3))}, {}))
     monkeypatch.setattr(drive_cases, "write", lambda case, found, folder: folder.mkdir(parents=True))
     campaigns.make(JOB, tmp_path)
     campaigns.make(JOB, tmp_path)
