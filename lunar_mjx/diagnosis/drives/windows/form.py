@@ -485,10 +485,14 @@ class WindowForm(MeasuredForm):
             linear, columns, residual = self.linearise(u, free)
             _, found, chosen = linear.evidence(terms, sizes)
             sizes = found.tau, found.noise
+            # The posterior mean of the linear model, relative to where it was taken, is the Gauss-Newton step, in a
+            # box: were the whole step shortened until its longest part fits, a parameter that does almost nothing, and
+            # so has far to go, would hold back all.
+            least, most = np.full(len(linear.low), -np.inf), np.full(len(linear.low), np.inf)
+            least[free] = np.maximum(low - u[free], -WINDOW_REFIT.longest_step)
+            most[free] = np.minimum(high - u[free], WINDOW_REFIT.longest_step)
             where = {int(p): k for k, p in enumerate(chosen)}
-            # The posterior mean of the linear model, relative to where it was taken, is the Gauss-Newton step.
-            step = np.array([found.mean[where[int(i)]] for i in free])
-            step *= min(1.0, WINDOW_REFIT.longest_step / max(float(np.abs(step).max()), 1e-12))
+            step = found.within(least[chosen], most[chosen])[[where[int(i)] for i in free]]
             cost = self._cost(linear, columns, sizes, free)
             before = cost(residual, u)
             for share in (1.0, 0.4, 0.15, 0.05):
