@@ -236,6 +236,11 @@ class Amplitudes:
         return Amplitudes(self.std[places], self.field[places], self.mean[places])
 
 
+WALL = 16
+"""1; power of what a half-normal prior's exponent holds, of sizes that are usual at most: at 1.2 of the usual size the
+density has fallen by 170 nats, below it by nearly nothing."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Field:
     """A discrepancy of unknown size tau.
@@ -247,12 +252,14 @@ class Field:
         distribution about `usual` in place of the half-normal one.
       freedom: if positive, tau has the scaled inverse-chi distribution of that freedom: amplitudes of this field have
         Student's t distribution, of scale `usual`.
+      bounded: whether tau is `usual` at most, in place of the half-normal prior.
     """
 
     name: str
     usual: float
     log_std: float = 0.0
     freedom: float = 0.0
+    bounded: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -681,11 +688,12 @@ def _density(
             added = _log_inverse_chi(x[i] - math.log(field.usual), field.freedom)
             value, gradient[i], hessian[i, i] = value + added[0], gradient[i] + added[1], hessian[i, i] + added[2]
             continue
-        # Half-normal prior of tau with the Jacobian of its logarithm.
-        share = (tau[i] / field.usual) ** 2
+        # Half-normal prior of tau, or a wall at its scale, with the Jacobian of its logarithm.
+        power = WALL if field.bounded else 1
+        share = (tau[i] / field.usual) ** (2 * power)
         value += 0.5 * math.log(2.0 / math.pi) + x[i] - math.log(field.usual) - 0.5 * share
-        gradient[i] += 1.0 - share
-        hessian[i, i] += 2.0 * share
+        gradient[i] += 1.0 - power * share
+        hessian[i, i] += 2.0 * power**2 * share
     for c, prior in enumerate(noises):
         i = many + c
         if prior.freedom > 0.0:

@@ -658,7 +658,26 @@ def test_readings_that_are_far_off_have_errors_of_their_own():
     without = plain.refit(frozenset(), None, None)
     # where readings do not jump, the same noise leads to
     calm = DriveForm(Toy({"a": 1.5, "b": -0.8}), DriveSettings()).refit(frozenset(), None, None)  # type: ignore[arg-type]
-    assert abs(base.u[1] - calm.u[1]) < 0.06 < 0.1 < abs(without.u[1] - calm.u[1])
+    assert abs(base.u[1] - calm.u[1]) < 0.06
+
+    def usual_width(form, refit):
+        noise = refit.linear.evidence(frozenset())[1].noise[form._group]
+        return np.median((noise * form.observations.sigma() / toy.observations.sigma())[~off])
+
+    # normal noise has to be wide for all readings, where a few are far off
+    assert usual_width(plain, without) > 2.0 * usual_width(form, base)
+
+
+def test_a_descent_is_led_by_sizes_that_are_usual_at_most():
+    """With sizes that it finds on its way it would be held by nothing that it has wandered to."""
+    form = DriveForm(Toy({"a": 1.5}, unlisted=1.0), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    found = base.linear.evidence(frozenset())[1]
+    usual = np.array([f.usual for f in form._usual_fields()])
+    assert np.max(found.tau / usual) > 3.0
+    assert form._sizes is not None
+    assert np.max(form._sizes[0] / usual) < 1.2
+    np.testing.assert_allclose(form._sizes_of(base)[0], np.minimum(found.tau, usual))
 
 
 class Turning(Toy):
@@ -727,7 +746,7 @@ def test_a_refit_that_was_kept_is_not_made_again():
     again.start, again.kept = base.u, learnt
     toy.rows = 0
     other = again.refit(frozenset(), None, None)
-    assert toy.rows < 0.5 * rows
+    assert toy.rows < 0.6 * rows
     np.testing.assert_allclose(other.u, base.u, atol=0.1)
     told = again.learnt(other)
     assert told["log_evidence"] == pytest.approx(learnt["log_evidence"], abs=1.0)
