@@ -99,8 +99,9 @@ def separable_blind(case: Campaign, truth: Mapping[str, np.ndarray], seconds: fl
     """Length in sigma of what a hidden effect does beside all that is uncertain without it; by what else were known.
 
     To first order about the world without the effect. Uncertain are constants of soil and motors, mass, inertia and
-    centre of mass, waves of the ground, what the law's stresses are off by, and the IMU's errors, each of the size with
-    which campaigns draw it. What cannot be seen beside these, nobody can name who is given the law's form only.
+    centre of mass, amplitudes of the ground's waves and of those by which the law's stresses are off, and the IMU's
+    errors, each of about the size with which campaigns draw it. Lengths and headings of these waves are known, so that
+    this is more than anybody sees who is given the law's form only.
 
     Args:
       case: campaign with something hidden. truth: its rollouts. seconds: length of these.
@@ -150,7 +151,8 @@ def told(args: argparse.Namespace) -> None:
     only = args.only or range(len(jobs))
     if wrong := [n for n in only if not 0 <= n < len(jobs)]:
         raise SystemExit(f"--only {wrong[0]}: the set has campaigns 0 to {len(jobs) - 1}; give numbers of these.")
-    rows: list[dict[str, Any]] = []
+    path = folder / "told.json"
+    rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     for number in only:
         case = drive_cases.draw(args.set, seed, number, *jobs[number])
         if not case.hidden:
@@ -158,12 +160,13 @@ def told(args: argparse.Namespace) -> None:
         truth = simulate(case.rover, case.world, case.setups, SECONDS)
         blind = separable_blind(case, truth)
         row = {"case": case.name, "rover": case.rover.name, "law": case.world.law, "hidden": list(case.hidden)}
+        rows = [r for r in rows if r["case"] != case.name]
         rows.append(row | {"sigma": separable(case, truth), "sigma_blind": blind.pop(""), "sigma_if_known": blind})
-        (folder / "told.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
         print(
             f"{case.name}  {case.hidden[0]}: {rows[-1]['sigma']:.0f} ({rows[-1]['sigma_blind']:.0f}) sigma", flush=True
         )
-    print(f"written to {folder / 'told.json'}" if rows else "Nothing is hidden in these campaigns.")
+    print(f"written to {path}" if rows else "Nothing is hidden in these campaigns.")
 
 
 def _common(case: Campaign, plain: list[Setup]) -> list[tuple[str, list[Setup]]]:

@@ -72,19 +72,31 @@ def test_density_at_given_sizes_is_that_of_the_dense_gaussian(drawn):
         assert found.value == pytest.approx(wanted, abs=1e-8)
 
 
-def test_gradient_and_hessian_are_derivatives(drawn):
+@pytest.mark.parametrize("bounded", [False, True])
+def test_gradient_and_hessian_are_derivatives(drawn, bounded):
     columns, residual, group, amplitudes = drawn
     gram = Gram.of(columns, residual, group, 2)
     x = np.log([0.6, 0.15, 1.2, 0.9])
+    fields = (Field("beyond the wall by a twentieth", 0.57, bounded=True), FIELDS[1]) if bounded else FIELDS
 
     def at(y):
-        return evidence._density(y, gram, amplitudes, FIELDS, NOISES)
+        return evidence._density(y, gram, amplitudes, fields, NOISES)
 
     step = 1e-5 * np.eye(4)
     slope = np.array([(at(x + h).value - at(x - h).value) / 2e-5 for h in step])
     bend = np.array([(at(x - h).gradient - at(x + h).gradient) / 2e-5 for h in step])
     np.testing.assert_allclose(at(x).gradient, slope, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(at(x).hessian, bend, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("start", [0.01, 0.1, 100.0])
+def test_a_bounded_size_ends_at_its_wall_wherever_it_begins(drawn, start):
+    columns, residual, group, amplitudes = drawn
+    gram = Gram.of(columns, residual, group, 2)
+    free = infer(gram, amplitudes, FIELDS, NOISES)
+    fields = (Field("far below what the measurements ask for", 0.1 * free.tau[0], bounded=True), FIELDS[1])
+    found = infer(gram, amplitudes, fields, NOISES, (np.array([start, 0.1]), np.ones(2)))
+    assert 0.9 < found.tau[0] / fields[0].usual < 1.2
 
 
 def test_posterior_is_that_of_the_dense_gaussian(drawn):

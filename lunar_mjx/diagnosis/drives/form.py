@@ -548,7 +548,9 @@ class DriveForm(MeasuredForm):
 
         Derivatives of all but the effects' own are those at the base. They jump from one place to the next, so that two
         places which predict alike would have evidences hundreds of nats apart. What derivatives promise beyond the
-        place, which no step has kept, is credited to none, but for so little that no further step was asked for it.
+        place by the sizes that led the descent, and no step has kept, is credited to none, but for so little that no
+        further step was asked for it. What larger discrepancy would explain is credited to all alike, as far as
+        derivatives tell it.
 
         Args:
           u: the place. effects: of the refit. free, slopes: as for `_descend`.
@@ -560,7 +562,7 @@ class DriveForm(MeasuredForm):
         found = linear.evidence(self.listed(effects), self._sizes)[1]
         cost = self._cost(u, free, self._led_by((found.tau, found.noise)), self._frame_inputs)
         promise = self._promise(cost, u, free, framed)
-        return dataclasses.replace(linear, unkept=0.5 * promise if promise > self.settings.settled else 0.0)
+        return dataclasses.replace(linear, unkept=0.5 * max(promise - self.settings.settled, 0.0))
 
     @property
     def _frame_inputs(self) -> np.ndarray | None:
@@ -737,7 +739,7 @@ class DriveForm(MeasuredForm):
             self._take(found.levels)
             value = found.log_evidence + float(np.sum((self.errors.log_ratio * np.ones(len(fit)))[fit]))
             learnt = _Learnt(value, found, columns, residual)
-        self._sizes = learnt.found.tau, learnt.found.noise
+        self._sizes = self._led_by((learnt.found.tau, learnt.found.noise))
         # Slopes by inputs are to hold as far as these may still be off; over shorter steps single readings jump. (Of 31
         # sigma that inputs of a campaign of LUVMI-X might still change, slopes over a thousandth left 9.3, these 5.9.)
         inputs = np.flatnonzero(np.isin(free, self.discrepancy))
