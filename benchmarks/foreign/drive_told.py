@@ -2,7 +2,7 @@
 
     python -m benchmarks.foreign told --set tune --drives 24 --only 4 23 -o build/foreign/tune_drives
 
-About ten minutes of a core for each campaign.
+Ten to fifteen minutes of a core for each campaign.
 """
 
 from __future__ import annotations

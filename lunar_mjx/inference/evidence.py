@@ -252,7 +252,7 @@ class Field:
         distribution about `usual` in place of the half-normal one.
       freedom: if positive, tau has the scaled inverse-chi distribution of that freedom: amplitudes of this field have
         Student's t distribution, of scale `usual`.
-      bounded: whether tau is `usual` at most, but for a sixth, in place of the half-normal prior; not normalised.
+      bounded: whether tau is `usual` or little more at most, in place of the half-normal prior; not normalised.
     """
 
     name: str

@@ -44,6 +44,7 @@ def test_what_is_known_beside_makes_an_effect_stand_out_more(case):
     assert found["imu"] < 1.05 * found[""]
 
 
+@pytest.mark.slow
 def test_nothing_stands_out_of_a_world_with_nothing_hidden(case):
     world, plain = drive_told.without(case)
     truth = simulate(case.rover, world, plain, SECONDS)

@@ -790,9 +790,7 @@ class DriveForm(MeasuredForm):
         """Sizes of discrepancy (fields,) and of noise (groups,) with which a descent is led, of those that were found.
 
         Those of discrepancy are no larger than usual: found where a descent stands, they are as large as what it has
-        not reached yet, and from then on nothing speaks against that. (On six foreign campaigns, one of them with
-        nothing wrong, they became 0.1 to 0.5, and descents that were led by usual ones ended up to 2,000 nats higher.)
-        Ground alone is as rough as it is.
+        not reached yet, and from then on nothing speaks against that. Ground alone is as rough as it is.
         """
         tau = np.minimum(sizes[0], self._usual_sizes()[0])
         if len(self.drives.ground):
