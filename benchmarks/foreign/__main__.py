@@ -19,8 +19,18 @@ import sys
 from pathlib import Path
 
 from . import cases
-from .sets import TWINS, make
+from .sets import TWINS
+from .sets import make as make_tables
 from .work import ask
+
+
+def make(args: argparse.Namespace) -> None:
+    """Writes logs and sealed truths."""
+    make_tables(args)
+    if args.drives:
+        from .drives.campaigns import make_all
+
+        make_all(args)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -55,14 +65,14 @@ def sweep(args: argparse.Namespace) -> None:
 
 def drives(args: argparse.Namespace) -> None:
     """Makes, asks and scores campaigns of drives on all cores."""
-    from .campaigns import drives as run_drives
+    from .drives.campaigns import drives as run_drives
 
     run_drives(args)
 
 
 def told(args: argparse.Namespace) -> None:
     """Tells how well who knows the law of a world tells what is hidden in its drives."""
-    from .drive_told import told as tell
+    from .drives.campaigns import tell
 
     tell(args)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from . import bed, cases, told
-from .work import ROOT, commit
+from .work import commit
 
 TUNE_SEED = 20261123
 TWIN_EVERY = 5
@@ -19,17 +19,10 @@ TWINS = {"loud": 1.3, "quiet": 1.0 / 1.3}
 
 
 def make(args: argparse.Namespace) -> None:
-    """Writes logs and sealed truths; goes on where it was stopped."""
+    """Writes logs and sealed truths of tables; goes on where it was stopped."""
     folder: Path = args.out
     folder.mkdir(parents=True, exist_ok=True)
-    about = campaign(folder, args.set, args.seed)
-    seed = int(about["seed"])
-    _make_tables(args, folder, seed)
-    if args.drives:
-        _make_drives(args, folder, seed)
-
-
-def _make_tables(args: argparse.Namespace, folder: Path, seed: int) -> None:
+    seed = int(campaign(folder, args.set, args.seed)["seed"])
     jobs = cases.plan(args.set, args.tables) if args.tables else []
     for number, (group, hidden) in enumerate(jobs):
         name = f"{args.set}-{number:03d}"
@@ -49,27 +42,6 @@ def _make_tables(args: argparse.Namespace, folder: Path, seed: int) -> None:
         sealed.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
         said = ", ".join(f"{k} {v['sigma']:.0f} ({v['sigma_blind']:.0f}) sigma" for k, v in truth["separable"].items())
         print(f"{name}  {group:<8} {case.world.law:<9} {said or 'nothing hidden'}", flush=True)
-
-
-def _make_drives(args: argparse.Namespace, folder: Path, seed: int) -> None:
-    from . import drive_cases, drive_told
-    from .rovers import ROVERS
-
-    shipped = [r for r in ROVERS if (ROOT / "models" / r).is_dir()]
-    jobs = drive_cases.plan(args.set, args.drives, shipped)
-    for number, job in enumerate(jobs):
-        name = f"{args.set}-drive-{number:03d}"
-        sealed = folder / "truth" / f"{name}.json"
-        if sealed.is_file():
-            continue
-        case = drive_cases.draw(args.set, seed, number, *job)
-        found, separable = drive_told.make(case)
-        drive_cases.write(case, found, folder / "logs" / name)
-        truth = drive_cases.summary(case) | {"separable": separable, "twins": []}
-        sealed.parent.mkdir(exist_ok=True)
-        sealed.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
-        said = ", ".join(f"{k} {v['sigma']:.0f} sigma" for k, v in separable.items())
-        print(f"{name}  {job[0]:<8} {case.rover.name:<8} {case.world.law:<9} {said or 'nothing hidden'}", flush=True)
 
 
 def campaign(folder: Path, which: str, seed: int | None) -> dict[str, Any]:

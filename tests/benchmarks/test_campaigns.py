@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.foreign import campaigns, drive_cases, drive_told
+from benchmarks.foreign.drives import campaigns, cases
 
 JOB = ("tune", 5, 1, "null", (), "husky")
 
@@ -23,8 +23,10 @@ def test_groups_and_rovers_alternate() -> None:
 
 def test_a_campaign_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
-    monkeypatch.setattr(drive_told, "make", lambda case: made.append(case) or ({"position": np.zeros((5, 1, 3))}, {}))
-    monkeypatch.setattr(drive_cases, "write", lambda case, found, folder: folder.mkdir(parents=True))
+    monkeypatch.setattr(
+        campaigns, "make_told", lambda case: made.append(case) or ({"position": np.zeros((5, 1, 3))}, {})
+    )
+    monkeypatch.setattr(cases, "write", lambda case, found, folder: folder.mkdir(parents=True))
     campaigns.make(JOB, tmp_path)
     campaigns.make(JOB, tmp_path)
     assert len(made) == 1
@@ -47,9 +49,9 @@ def test_nothing_is_begun_for_which_there_is_no_time(tmp_path: Path, monkeypatch
 @pytest.mark.parametrize("rover", ["luvmi_x", "viper", "husky"])
 def test_a_chassis_as_built_is_a_body(rover: str) -> None:
     """Each principal inertia is at most the sum of the other two, and within 15 % of the description's."""
-    nominal = np.array(drive_cases.ROVERS[rover].chassis_inertia)
+    nominal = np.array(cases.ROVERS[rover].chassis_inertia)
     for number in range(40):
-        case = drive_cases.draw("report", 7, number, "null", (), rover)
+        case = cases.draw("report", 7, number, "null", (), rover)
         factors = np.array(case.setups[0].build.inertia)
         assert np.all(np.abs(factors - 1.0) <= 0.15 + 1e-12)
         assert np.all(2.0 * factors * nominal <= np.sum(factors * nominal) + 1e-12)

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from benchmarks.foreign import drive_cases, drive_told
-from benchmarks.foreign.drive import simulate
+from benchmarks.foreign.drives import cases, told
+from benchmarks.foreign.drives.rollout import simulate
 from benchmarks.foreign.misfit import Field
 
 SECONDS = 0.4
@@ -17,7 +17,7 @@ SECONDS = 0.4
 @pytest.fixture(scope="module")
 def case():
     """One drive of a campaign, whose law is off by nothing: waves of a misfit would be most of the rollouts."""
-    whole = drive_cases.draw("tune", 5, 0, "single", ("coulomb_friction",), "husky")
+    whole = cases.draw("tune", 5, 0, "single", ("coulomb_friction",), "husky")
     return dataclasses.replace(
         whole, setups=whole.setups[1:2], world=dataclasses.replace(whole.world, fields=None), memory=0.0
     )
@@ -36,7 +36,7 @@ def test_a_misfit_of_a_row_adds_to_that_of_all():
 @pytest.mark.slow
 def test_what_is_known_beside_makes_an_effect_stand_out_more(case):
     truth = simulate(case.rover, case.world, case.setups, SECONDS)
-    found = drive_told.separable_blind(case, truth, SECONDS)
+    found = told.separable_blind(case, truth, SECONDS)
     assert 0.0 < found[""] < 0.9 * found["all"]
     assert set(found) == {"", "all", "soil", "motor", "build", "ground", "imu"}
     # a friction at the drives is what motor and soil can imitate, and no IMU
@@ -46,6 +46,6 @@ def test_what_is_known_beside_makes_an_effect_stand_out_more(case):
 
 @pytest.mark.slow
 def test_nothing_stands_out_of_a_world_with_nothing_hidden(case):
-    world, plain = drive_told.without(case)
+    world, plain = told.without(case)
     truth = simulate(case.rover, world, plain, SECONDS)
-    assert drive_told.separable_blind(case, truth, SECONDS)["all"] == pytest.approx(0.0, abs=1e-6)
+    assert told.separable_blind(case, truth, SECONDS)["all"] == pytest.approx(0.0, abs=1e-6)

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.foreign import drive_cases
-from benchmarks.foreign.drive import Ground, Motors, Setup, simulate, wheel_forces
-from benchmarks.foreign.rovers import CORNERS, ROVERS, Build, mjcf
+from benchmarks.foreign.drives import cases
+from benchmarks.foreign.drives.rollout import Ground, Motors, Setup, simulate, wheel_forces
+from benchmarks.foreign.drives.rovers import CORNERS, ROVERS, Build, mjcf
 from benchmarks.foreign.wheel import Rows, World, run
 
 LUVMI = ROVERS["luvmi_x"]
@@ -133,16 +133,16 @@ def test_effects_push_the_right_way(driven, name: str, amounts: dict[str, float]
 
 
 def test_campaigns_are_planned_drawn_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drive_cases, "SECONDS", 0.4)
-    report = drive_cases.plan("report", 60)
-    assert {h for _, hidden, _ in report for h in hidden} == set(drive_cases.REPORT_KNOWN + drive_cases.REPORT_OUTSIDE)
-    assert not set(drive_cases.TUNE_OUTSIDE) & set(drive_cases.REPORT_OUTSIDE)
+    monkeypatch.setattr(cases, "SECONDS", 0.4)
+    report = cases.plan("report", 60)
+    assert {h for _, hidden, _ in report for h in hidden} == set(cases.REPORT_KNOWN + cases.REPORT_OUTSIDE)
+    assert not set(cases.TUNE_OUTSIDE) & set(cases.REPORT_OUTSIDE)
     for number, job in enumerate(report):
-        assert drive_cases.draw("report", 1, number, *job).hidden == job[1]
-    case = drive_cases.draw("tune", 1, 0, "single", ("imu_bias",), "luvmi_x")
+        assert cases.draw("report", 1, number, *job).hidden == job[1]
+    case = cases.draw("tune", 1, 0, "single", ("imu_bias",), "luvmi_x")
     found = simulate(case.rover, case.world, case.setups, 0.4)
-    drive_cases.write(case, found, tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(drive_cases.SPLITS)
+    cases.write(case, found, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(cases.SPLITS)
     about = tomllib.loads((tmp_path / "climb" / "log.toml").read_text(encoding="utf-8"))
     assert about["rover"] == "luvmi_x" and about["terrain"] == "slope:6deg"
     head = (tmp_path / "climb" / "drive.csv").read_text(encoding="utf-8").splitlines()[0].split(",")

@@ -39,7 +39,7 @@ def rows(slip=(0.2,), angle=(0.0,), load=(60.0,), travel=0.05, gravity=9.80665) 
     return Rows(*grid, np.full(len(grid[0]), travel), np.full(len(grid[0]), gravity))
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda p: p.name)
+@pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.py")), ids=lambda p: p.name)
 def test_worlds_share_no_code_with_the_tool(path: Path) -> None:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     names = [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]

@@ -23,11 +23,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from . import drive_cases, drive_told, pool, work
+from .. import pool, work
+from ..score import judge, said
+from ..sets import campaign
+from ..sweep import KEPT, ROWS, score_rows
+from . import cases
+from .rollout import simulate
 from .rovers import ROVERS
-from .score import judge, said
-from .sets import campaign
-from .sweep import KEPT, ROWS, score_rows
+from .told import make as make_told
+from .told import separable, separable_blind
 
 VERDICTS = "verdicts.jsonl"
 LEAST_SECONDS = 300.0
@@ -41,21 +45,55 @@ Job = tuple[str, int, int, str, tuple[str, ...], str]
 
 def jobs(which: str, seed: int, count: int) -> list[Job]:
     """All campaigns in the order of the plan."""
-    plan = drive_cases.plan(which, count, [r for r in ROVERS if (work.ROOT / "models" / r).is_dir()])
+    plan = cases.plan(which, count, [r for r in ROVERS if (work.ROOT / "models" / r).is_dir()])
     return [(which, seed, n, group, hidden, rover) for n, (group, hidden, rover) in enumerate(plan)]
 
 
 def make(job: Job, folder: Path) -> None:
     """Draws and drives a campaign, and writes its logs and sealed truth as `make` does; nothing where it is there."""
-    case = drive_cases.draw(*job)
+    case = cases.draw(*job)
     sealed = folder / "truth" / f"{case.name}.json"
     if sealed.is_file():
         return
-    found, separable = drive_told.make(case)
-    drive_cases.write(case, found, folder / "logs" / case.name)
-    truth = drive_cases.summary(case) | {"separable": separable, "twins": []}
+    found, stands_out = make_told(case)
+    cases.write(case, found, folder / "logs" / case.name)
+    truth = cases.summary(case) | {"separable": stands_out, "twins": []}
     sealed.parent.mkdir(parents=True, exist_ok=True)
     sealed.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    sigma = ", ".join(f"{k} {v['sigma']:.0f} sigma" for k, v in stands_out.items()) or "nothing hidden"
+    print(f"{case.name}  {case.group:<8} {case.rover.name:<8} {case.world.law:<9} {sigma}", flush=True)
+
+
+def make_all(args: argparse.Namespace) -> None:
+    """Writes logs and sealed truths of all campaigns of a set; goes on where it was stopped."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    seed = int(campaign(args.out, args.set, args.seed)["seed"])
+    for job in jobs(args.set, seed, args.drives):
+        make(job, args.out)
+
+
+def tell(args: argparse.Namespace) -> None:
+    """Writes how far what is hidden in campaigns stands out, `told.json` in a set's folder, a row as soon as known."""
+    folder: Path = args.out
+    folder.mkdir(parents=True, exist_ok=True)
+    every = jobs(args.set, int(campaign(folder, args.set, args.seed)["seed"]), args.drives)
+    only = args.only or range(len(every))
+    if wrong := [n for n in only if not 0 <= n < len(every)]:
+        raise SystemExit(f"--only {wrong[0]}: the set has campaigns 0 to {len(every) - 1}; give numbers of these.")
+    path = folder / "told.json"
+    rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    for number in only:
+        case = cases.draw(*every[number])
+        if not case.hidden:
+            continue
+        truth = simulate(case.rover, case.world, case.setups, cases.SECONDS)
+        blind = separable_blind(case, truth)
+        row = {"case": case.name, "rover": case.rover.name, "law": case.world.law, "hidden": list(case.hidden)}
+        row |= {"sigma": separable(case, truth), "sigma_blind": blind.pop(""), "sigma_if_known": blind}
+        rows = [*(r for r in rows if r["case"] != case.name), row]
+        path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        print(f"{case.name}  {case.hidden[0]}: {row['sigma']:.0f} ({row['sigma_blind']:.0f}) sigma", flush=True)
+    print(f"written to {path}" if rows else "Nothing is hidden in these campaigns.")
 
 
 def compile_part(job: Job, folder: Path, part: int, of: int) -> None:

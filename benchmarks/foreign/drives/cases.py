@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from .cases import generator
-from .drive import Ground, Motors, Setup
-from .laws import GRANULAR_HOLDS
-from .misfit import Field
+from ..cases import generator
+from ..laws import GRANULAR_HOLDS
+from ..misfit import Field
+from ..wheel import World
+from .rollout import Ground, Motors, Setup
 from .rovers import CORNERS, ROVERS, Build, Rover
-from .wheel import World
 
 SECONDS = 8.0
 GROUPS: Mapping[str, float] = {"null": 0.25, "single": 0.55, "outside": 0.2}

@@ -1,29 +1,16 @@
-"""How far who is told a foreign world's own law can tell what is hidden in drives.
-
-    python -m benchmarks.foreign told --set tune --drives 24 --only 4 23 -o build/foreign/tune_drives
-
-Ten to fifteen minutes of a core for each campaign.
-"""
+"""How far who is told a foreign world's own law can tell what is hidden in drives (`benchmarks.foreign told`)."""
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import linalg
 
-from . import drive_cases
-from .drive import Ground, Setup, simulate
-from .drive_cases import SECONDS, Campaign, channels, quantity
-from .rovers import ROVERS
-from .sets import campaign
-from .wheel import World
-from .work import ROOT
+from ..wheel import World
+from .cases import SECONDS, Campaign, channels, quantity
+from .rollout import Ground, Setup, simulate
 
 BASE = {
     "linear": ("reece_phi", "friction_angle", "shear_x"),
@@ -140,33 +127,6 @@ def separable_blind(case: Campaign, truth: Mapping[str, np.ndarray], seconds: fl
     difference = (whitened(case, truth, True) - base).ravel()
     known = {kind: _left(system[:, which != kind], difference) for kind in dict.fromkeys(kinds)}
     return {"": _left(system, difference), "all": float(np.linalg.norm(difference)), **known}
-
-
-def told(args: argparse.Namespace) -> None:
-    """Writes how far what is hidden in campaigns stands out, `told.json` in a set's folder, a row as soon as known."""
-    folder: Path = args.out
-    folder.mkdir(parents=True, exist_ok=True)
-    seed = int(campaign(folder, args.set, args.seed)["seed"])
-    jobs = drive_cases.plan(args.set, args.drives, [r for r in ROVERS if (ROOT / "models" / r).is_dir()])
-    only = args.only or range(len(jobs))
-    if wrong := [n for n in only if not 0 <= n < len(jobs)]:
-        raise SystemExit(f"--only {wrong[0]}: the set has campaigns 0 to {len(jobs) - 1}; give numbers of these.")
-    path = folder / "told.json"
-    rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    for number in only:
-        case = drive_cases.draw(args.set, seed, number, *jobs[number])
-        if not case.hidden:
-            continue
-        truth = simulate(case.rover, case.world, case.setups, SECONDS)
-        blind = separable_blind(case, truth)
-        row = {"case": case.name, "rover": case.rover.name, "law": case.world.law, "hidden": list(case.hidden)}
-        rows = [r for r in rows if r["case"] != case.name]
-        rows.append(row | {"sigma": separable(case, truth), "sigma_blind": blind.pop(""), "sigma_if_known": blind})
-        path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-        print(
-            f"{case.name}  {case.hidden[0]}: {rows[-1]['sigma']:.0f} ({rows[-1]['sigma_blind']:.0f}) sigma", flush=True
-        )
-    print(f"written to {path}" if rows else "Nothing is hidden in these campaigns.")
 
 
 def _common(case: Campaign, plain: list[Setup]) -> list[tuple[str, list[Setup]]]:

@@ -9,10 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from .laws import LAWS, Rim
-from .misfit import RIM, coordinates
+from ..laws import LAWS, Rim
+from ..misfit import RIM, coordinates
+from ..wheel import _GAUSS, _GAUSS_WEIGHT, _LONG, _LONG_WEIGHT, Motion, Rows, World, softening
 from .rovers import CORNERS, Build, Rover, mjcf
-from .wheel import _GAUSS, _GAUSS_WEIGHT, _LONG, _LONG_WEIGHT, Motion, Rows, World, softening
 
 SETTLE = 1.2
 """Time that a rover stands before its log begins, s."""
